@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from finssim.robot.messages import Picture, Telemetry
+from finssim.robot.reading import Reading
 from finssim.robot.record_messages import TOPICS, Messages, definition
 from finssim.robot.recorder import Recorder
-from finssim.robot.robot import Reading
 from finssim.vehicles import load_vehicle
 
 ROUNDS, CALLS = 10, 300

@@ -152,8 +152,8 @@ HYDRODYNAMICS = ["calibrate", "hydrodynamics", "TRIALS", "--vehicle", "finsrov"]
         ([*HYDRODYNAMICS, "--out", "v.yaml", "--axes", "surg"], "unknown axis 'surg'"),
         ([*HYDRODYNAMICS, "--out", "v.yaml", "--method", "magic"], "unknown method 'magic'"),
         (
-            [*HYDRODYNAMICS, "--out", "v.yaml", "--method", "regression", "--full"],
-            "--full needs --method simulation",
+            [*HYDRODYNAMICS, "--out", "v.yaml", "--method", "regression", "--horizon", "5"],
+            "--horizon needs --method simulation",
         ),
         (
             [*HYDRODYNAMICS, "--out", "v.yaml", "--method", "regression", "--estimate", "thrust_lag"],

@@ -109,7 +109,6 @@ HOMES = {
         "calibration/replay/report.py",
         "calibration/vision/camera.py",
         "calibration/vision/pool_command.py",
-        "calibration/vision/report.py",
         "experiments/figures.py",
         "vehicles/picture.py",
     },

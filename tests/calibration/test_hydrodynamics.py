@@ -114,7 +114,7 @@ def test_options_belong_to_their_method(joystick):
     fitted, _ = joystick
     vehicle = load_vehicle("bluerov2_heavy")
     for options in (
-        {"method": "regression", "full": True},
+        {"method": "regression", "horizon": 5.0},
         {"method": "simulation", "known": {"yaw": 1.0}},
         {"method": "x"},
     ):

@@ -6,7 +6,7 @@ import pytest
 
 from finssim.experiments import metrics
 from finssim.experiments.pool_trial import Job
-from finssim.experiments.recorded import read_record
+from finssim.experiments.records import read_record
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -41,7 +41,7 @@ def test_what_is_finished_is_not_played_again(tmp_path):
         tmp_path,
         played.known,
         processes=1,
-        say=lambda part, what: told.append(part),
+        progress=lambda part, what: told.append(part),
         show=lambda job, result: shown.append((job.target, result["success"])),
     )
     assert marks(tmp_path) == ["P01", "P02", "P03"]

@@ -9,7 +9,7 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.control.guidance import Station
 from finssim.experiments.on_robot import OnRobot, RobotError, RobotTrial, session
-from finssim.experiments.recorded import read_record
+from finssim.experiments.records import read_record
 from finssim.experiments.transfer import T1, T2, transfer_experiment
 from finssim.pool import read_truth
 from finssim.robot.pilots import make_pilot

@@ -45,7 +45,7 @@ def done(tmp_path_factory):
     """One seed of 20 places and 40 pictures, with our renderer; its progress."""
     out, said = tmp_path_factory.mktemp("experiment") / "localization", []
     result = localization_experiment(
-        out=out, seeds=1, seed=1, locations=(5, 4), images=40, say=lambda *what: said.append(what)
+        out=out, seeds=1, seed=1, locations=(5, 4), images=40, progress=lambda *what: said.append(what)
     )
     return out, result, said
 
@@ -166,11 +166,11 @@ def test_equal_seeds_give_equal_results(tmp_path):
 def interrupting(words):
     """Progress that is Ctrl-C at its first mention of something."""
 
-    def say(part, what):
+    def progress(part, what):
         if what == words:
             raise KeyboardInterrupt
 
-    return say
+    return progress
 
 
 INTERRUPTED = {
@@ -185,7 +185,7 @@ def test_an_interruption_keeps_what_is_finished(tmp_path, words):
     """Whole seeds, the first as far as it came; the page says that it was interrupted, and links what is there."""
     out = tmp_path / "out"
     given = {"renderer": "geometry", "seeds": 3, "seed": 1, **TINY}
-    result = localization_experiment(out=out, say=interrupting(words), **given)
+    result = localization_experiment(out=out, progress=interrupting(words), **given)
     assert result["interrupted"] and result["seeds"] == INTERRUPTED[words] and result["seeds_asked_for"] == 3
     visits = {m["refractive"]["visits"] for m in result["results"].values()}
     assert visits <= {5, 6}  # of one seed each; a lifted tag may leave the picture
@@ -198,7 +198,7 @@ def test_an_interruption_keeps_what_is_finished(tmp_path, words):
 def test_an_interruption_before_anything_is_finished_leaves_nothing(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         localization_experiment(
-            out=tmp_path / "out", say=interrupting("seed 1, published conditions"), seeds=1, **TINY
+            out=tmp_path / "out", progress=interrupting("seed 1, published conditions"), seeds=1, **TINY
         )
     assert list(tmp_path.iterdir()) == []
 
@@ -236,7 +236,7 @@ def test_what_cannot_be_run_is_refused(tmp_path, options, words):
 def test_somebodys_folder_is_refused_before_the_work(tmp_path):
     (tmp_path / "thesis.tex").touch()
     with pytest.raises(OutputError, match="already holds files"):
-        localization_experiment(out=tmp_path, say=interrupting("seed 1, published conditions"))
+        localization_experiment(out=tmp_path, progress=interrupting("seed 1, published conditions"))
 
 
 def finssim(*words):

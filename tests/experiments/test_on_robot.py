@@ -9,7 +9,7 @@ from finssim.control.guidance import Station
 from finssim.experiments.on_robot import RobotTrial, Stages, start_bounds
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.robot.pilots import WrenchPilot
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from finssim.experiments.ablation import tables_of
 from finssim.experiments.tables import html_of, markdown_of
 from finssim.experiments.transfer import T1, T2, row_figures, scores, trained, transfer_experiment
 
@@ -42,7 +41,7 @@ def test_a_second_call_plays_nothing_again(small):
 def test_the_table_stands_beside_the_papers(small):
     """Theirs is marked, in every form, and the figure is on the page."""
     out, result = small
-    table = T1.table({**result, "rows": {"pid-paper": result["rows"]["pid"]}})
+    (table,) = T1.tables({**result, "rows": {"pid-paper": result["rows"]["pid"]}})
     assert [row[0] for row in table.rows][1:] == ["  paper: PID"]
     assert "paper: PID" in markdown_of([table])
     html = "".join(html_of([table], out))
@@ -115,12 +114,12 @@ def test_a_sentence_rests_on_three_plants_at_least(plants, sentences):
     assert len(found["sentences"]) == sentences
 
 
-def test_the_ablation_says_which_way_each_module_moves(small):
+def test_the_differences_say_which_way_each_module_moves(small):
     """With the paper's difference beside, where it has one."""
     _, result = small
     d = {"value": 0.03, "ci95": [0.02, 0.04], "count": 9}
     differences = {"no-fusion": {"success_rate": None, "e_p_m": d, "e_psi_deg": d}}
-    (shown,) = tables_of({"t1": {**result, "differences": differences, "sentences": []}})
+    _, shown = T1.tables({**result, "differences": differences})
     assert shown.rows[0] == [T1.rows["no-fusion"].title, "–", "+3.0 [+2.0, +4.0]", "+0.0 [+0.0, +0.0]"]
     assert shown.rows[1] == ["  paper", "+0", "-0.8", "+6.9"]
     assert T2.rows["pid"].paper is None

@@ -18,9 +18,9 @@ from finssim.learning.export import ExportError
 from finssim.learning.learners import learner_named
 from finssim.learning.recurrent import RecurrentNetwork
 from finssim.robot.pilots import make_pilot
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.tasks import StationKeeping
-from finssim.tasks.agents import NOWHERE, Known, WorldReadings, agent_for, expert_for, restarted
+from finssim.tasks.agents import NOWHERE, Known, agent_for, expert_for, known_in, restarted
 from finssim.tasks.observer import Observer
 from reference.guess import Guess
 from reference.policies import FINSROV, written
@@ -119,13 +119,12 @@ def test_an_agent_remembers_and_begins_anew_where_an_episode_does(policy):
     environment, task = finssim.make("t1", worlds=3, seed=4), StationKeeping()
     agent, run = agent_for(policy, FINSROV, task), Policy.load(policy)
     expert = expert_for(policy, FINSROV, task, "wrench6")
-    readings = WorldReadings(environment.arrays)
     played, shown, memory = agent.reset(3), expert.reset(3), run.reset(3)
     anew = np.array([False, True, False])
     for k in range(3):
         seen = environment.arrays.observation.numpy().copy()
         expected, memory = run.step(memory, seen)
-        action, played = agent.act(played, readings, NOWHERE)
+        action, played = agent.act(played, known_in(environment), NOWHERE)
         np.testing.assert_array_equal(action, expected)
         if k == 2:
             expected[1] = run.step(run.reset(3), seen)[0][1]

@@ -250,7 +250,7 @@ def test_only_the_same_training_is_resumed(tmp_path, capsys):
     assert "yet: starting from the beginning" in capsys.readouterr().err.replace("\n", " ")
 
 
-@pytest.mark.parametrize("learner", ["ppo", "torchrl-ppo"])
+@pytest.mark.parametrize("learner", ["ppo", pytest.param("torchrl-ppo", marks=pytest.mark.slow)])
 def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path, learner):
     """One sentence, and no policy."""
     options = {**SMALL, "settings": {**SMALL["settings"], "learning_rate": 1e30}}
@@ -374,6 +374,14 @@ def test_a_policy_that_begins_from_a_pid_holds_sooner(tmp_path):
     assert (result["success"], result["trials"]) == (8, 8) and result["e_p_m"] < 0.005
     again = train("t1", out=tmp_path / "again", seed=2, steps=50_000, init=folder, randomize="pool")
     assert evaluate_controller(again, load_plant("nominal")).result["success"] == 8
+
+
+def test_team_pursuit_begins_from_its_baseline_where_that_can_act(tmp_path):
+    """In the task's own action mode, unless another teacher or none is asked for."""
+    tiny = {"worlds": 8, "steps": 4096, "settings": {"hidden": [16]}}
+    for options, teacher in (({}, "formation"), ({"action": "wrench6"}, ""), ({"init": "none"}, "")):
+        folder = train("team-pursuit", out=tmp_path / "p", **tiny, **options)
+        assert Policy.load(folder).description.training["teacher"] == teacher
 
 
 @pytest.mark.parametrize(

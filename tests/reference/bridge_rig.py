@@ -4,7 +4,7 @@ import numpy as np
 
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.messages import CommandEcho, Telemetry
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 
 DT = 1.0 / 60.0
 LEVEL = (0.0, 0.0, 0.0, 1.0)

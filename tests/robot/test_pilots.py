@@ -14,11 +14,10 @@ from finssim.control.controllers import controller
 from finssim.control.guidance import Station, goal_at
 from finssim.control.modes import action_mode
 from finssim.control.policy import PolicyError
-from finssim.experiments.pool_trial import NoisyInput
 from finssim.geometry.rotations import quat_from_euler
 from finssim.robot.goals import GoalError, check_reachable, guide_of, station_of
 from finssim.robot.pilots import ModeSwitch, WrenchPilot, make_pilot
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.robot.runtime import Ticks
 from finssim.tasks import StationKeeping
 from finssim.tasks.observer import Observer
@@ -175,25 +174,34 @@ def test_who_is_neither_pid_nor_policy_is_refused():
         make_pilot("runs/nothing", VEHICLE)
 
 
-class Mirror:
-    """Gives back what it sees."""
+class Watched:
+    """An agent that keeps what it sees."""
 
-    name, period, needs_state = "mirror", 0.1, True
+    def __init__(self, agent):
+        self.agent, self.seen = agent, []
 
-    def reset(self):
-        pass
+    def __getattr__(self, name):
+        return getattr(self.agent, name)
 
-    def describe(self):
-        return {"name": self.name}
+    def act(self, memory, known, goal):
+        self.seen.append(np.concatenate([known.position[0], known.quaternion[0], known.nu[0]]))
+        return self.agent.act(memory, known, goal)
 
-    def act(self, reading, guide, t):
-        return np.concatenate([reading.position, reading.quaternion, reading.nu])
+
+def disturbed(**noise):
+    """A PID whose input is disturbed."""
+    pilot = make_pilot("pid", VEHICLE)
+    pilot.agent = Watched(pilot.agent)
+    pilot.disturb_input(**noise)
+    return pilot
 
 
 def test_noise_on_the_input_has_the_size_asked_for_and_touches_pose_alone():
     """Over 2000 decisions: 5 cm on each axis, 10 degrees of heading, tilt and velocity untouched."""
-    noisy = NoisyInput(Mirror(), position_std=0.05, yaw_std=math.radians(10.0), seed=3)
-    seen = np.array([noisy.act(READING, STATION, 0.0) for _ in range(2000)])
+    pilot = disturbed(position_std=0.05, yaw_std=math.radians(10.0), seed=3)
+    for _ in range(2000):
+        pilot.act(READING, STATION, 0.0)
+    seen = np.array(pilot.agent.seen)
     np.testing.assert_allclose(seen[:, :3].std(axis=0), 0.05, rtol=0.1)
     x, y, z, w = seen[:, 3:7].T
     yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -205,13 +213,15 @@ def test_noise_on_the_input_has_the_size_asked_for_and_touches_pose_alone():
 
 def test_noise_on_the_input_repeats_from_its_seed():
     """After a reset, and in another instance; another seed differs."""
-    a, b, c = (NoisyInput(Mirror(), seed=s) for s in (1, 1, 2))
-    first = a.act(READING, STATION, 0.0)
+    a, b, c = (disturbed(position_std=0.05, yaw_std=0.1, seed=s) for s in (1, 1, 2))
+    for pilot in (a, b, c):
+        pilot.act(READING, STATION, 0.0)
     a.reset()
-    assert np.array_equal(a.act(READING, STATION, 0.0), first)
-    assert np.array_equal(b.act(READING, STATION, 0.0), first)
-    assert not np.array_equal(c.act(READING, STATION, 0.0), first)
-    assert a.describe()["input_noise"]["seed"] == 1 and a.name == "mirror" and a.period == 0.1
+    a.act(READING, STATION, 0.0)
+    first, again = a.agent.seen
+    assert np.array_equal(again, first) and np.array_equal(b.agent.seen[0], first)
+    assert not np.array_equal(c.agent.seen[0], first)
+    assert a.describe()["input_noise"]["seed"] == 1
 
 
 def test_turns_stay_on_the_grid_of_their_start():

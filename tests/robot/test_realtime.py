@@ -14,7 +14,7 @@ from finssim.robot.link.transports import memory_pair
 from finssim.robot.messages import Picture
 from finssim.robot.pictures import TagFinder
 from finssim.robot.pilots import make_pilot
-from finssim.robot.runtime import HardwareRobot, Runtime
+from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import run_realtime
 from finssim.vehicles import load_vehicle
 from reference.rounds import Rounds, overhead, without_latency
@@ -155,25 +155,6 @@ def test_thrusters_stop_even_where_the_loop_breaks():
         world.run(world.runtime(), duration=60.0, show=show)
     enabled = [c.enable for c in world.commands()]
     assert any(enabled) and enabled[-3:] == [False] * 3
-
-
-def test_a_hardware_robot_reads_and_sends():
-    """Zeros before arming, limited thrusts after it, zeros after closing."""
-    world = Acted()
-    robot = HardwareRobot(VEHICLE, POOL, world.ours, world, clock=world.clock)
-    assert robot.send(np.full(8, 1.0)).tolist() == [0.0] * 8
-    assert robot.arm() != ""
-    for _ in range(60):
-        world.wait(1 / 60)
-        reading = robot.read()
-        robot.send(np.zeros(8))
-    assert reading.ready and robot.vehicle is VEHICLE
-    assert np.linalg.norm(reading.position - world.rounds.position(reading.time)) < 0.02
-    assert robot.arm() == ""
-    assert robot.send(np.full(8, 100.0)).max() < 10.0
-    world.commands()
-    robot.close()
-    assert world.closed and [c.enable for c in world.commands()] == [False] * 3
 
 
 def test_tags_are_found_beside_the_loop():

@@ -13,8 +13,7 @@ pytest.importorskip("rosbags")
 
 from finssim.robot.messages import Picture, Telemetry
 from finssim.robot.record_messages import RecordError
-from finssim.robot.record_reader import open_record
-from finssim.robot.record_show import play
+from finssim.robot.record_reader import open_record, play
 from finssim.robot.recorder import Recorder
 from finssim.vehicles import load_vehicle
 

@@ -19,8 +19,8 @@ from finssim.robot.messages import (
     TagCorners,
     Telemetry,
 )
+from finssim.robot.reading import Reading
 from finssim.robot.record_messages import TOPICS
-from finssim.robot.robot import Reading
 from finssim.vehicles import load_vehicle
 
 pytest.importorskip("mcap")
@@ -30,8 +30,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
 
 from finssim.robot.record_messages import Messages
-from finssim.robot.record_reader import open_record
-from finssim.robot.record_show import describe_record
+from finssim.robot.record_reader import describe_record, open_record
 from finssim.robot.recorder import Recorder
 
 VEHICLE = load_vehicle("finsrov")

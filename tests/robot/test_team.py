@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from finssim.control.guidance import Track
 from finssim.geometry.rotations import quat_from_euler
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.robot.team import Team, decode_track, encode_track
 
 HERE = Track(np.array([1.0, -2.0, -3.0]), quat_from_euler(0.1, -0.2, 2.0), np.arange(6.0) / 10.0, 4.0)

@@ -111,8 +111,7 @@ def test_a_drive_is_recorded(world, tmp_path):
     """Telemetry, commands and events; it becomes a trial that its shaft speeds drive."""
     pytest.importorskip("mcap")
     pytest.importorskip("rosbags")
-    from finssim.robot.record_reader import open_record
-    from finssim.robot.record_show import describe_record
+    from finssim.robot.record_reader import describe_record, open_record
     from finssim.robot.recorder import Recorder
 
     with Recorder(tmp_path / "drive.mcap", VEHICLE, {}) as recorder:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate, quat_multiply
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.ros2_worlds.ideal_sensors import IdealSensors
 from finssim.vehicles import load_vehicle
 

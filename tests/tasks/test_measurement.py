@@ -98,3 +98,16 @@ def test_what_is_not_drawn_keeps_the_given_noise():
 def test_a_gap_at_every_step_is_refused():
     with pytest.raises(ValueError, match="dropout of the measurement is 1.0, expected a probability below 1"):
         MeasurementNoise(dropout=1.0)
+
+
+def test_graded_noise_grows_from_none_in_the_first_world_to_all_in_the_last():
+    """The spread over many steps is in proportion to the world's number."""
+    env = environment(MeasurementNoise(position_std=0.1, delay=0.3, graded=True))
+    rows = []
+    for _ in range(200):
+        env.step(np.zeros((env.worlds, env.action_size)))
+        rows.append(env.arrays.position.numpy()[:, 0] - env.simulator.state.position.numpy()[:, 0])
+    spread = np.std(rows, axis=(0, 2))
+    assert spread[0] == 0.0
+    part = np.linspace(0.0, 1.0, env.worlds)
+    np.testing.assert_allclose(spread[-8:], 0.1 * part[-8:], rtol=0.15)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import SEVERITIES, Finding, finding
+from finssim.calibration.findings import SEVERITIES, Finding, finding, plain
 from finssim.calibration.motion.signals import (
     AttitudeSignal,
     Motion,
@@ -25,8 +24,8 @@ from finssim.calibration.motion.signals import (
     motion,
     up_in_body,
 )
-from finssim.calibration.motion.smoothing import longest_step, smooth
-from finssim.calibration.motion.synchronisation import Offset, stream_offsets
+from finssim.calibration.motion.smoothing import longest_step
+from finssim.calibration.motion.synchronisation import Offset, on_grid, stream_offsets
 from finssim.calibration.trials.inputs import Drive, drive, implausible
 from finssim.calibration.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
 from finssim.calibration.trials.trial_files import load_trial, trials_at
@@ -36,7 +35,7 @@ from finssim.vehicles import AXES, Vehicle, VehicleError, load_vehicle
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["check", "check_trials"]
+__all__ = ["as_object", "check", "check_trials", "print_reports", "together"]
 
 # What holds between the trials of a set: vehicles, roles, names, what all of them tell together.
 
@@ -164,8 +163,6 @@ class AxisReport:
     """log10 of the fastest over the slowest speed that stands out of the noise."""
     strongest: float
     """95th percentile of the wrench [N, N m]."""
-    levels: tuple[float, ...]
-    """Wrenches that were held for half a second or more [N, N m]."""
     work: float
     """Done by the inputs along this axis [J]; of a passive trial 0."""
     both_directions: bool
@@ -207,39 +204,10 @@ class TrialReport:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; numbers that are not finite become None."""
-        return {
-            "name": self.name,
-            "verdict": self.verdict,
-            "vehicle": self.vehicle,
-            "role": self.role,
-            "duration": _plain(self.duration),
-            "rows": self.rows,
-            "inputs": self.inputs,
-            "findings": [one.as_json() for one in self.findings],
-            "streams": [
-                {**vars(stream), "columns": list(stream.columns), **_numbers(stream)}
-                for stream in self.streams
-            ],
-            "axes": {
-                axis.axis: {
-                    **{key: value for key, value in vars(axis).items() if key not in ("axis", "tells")},
-                    **_numbers(axis),
-                    "levels": list(axis.levels),
-                    "tells": {name: {"can": told.can, "why": told.why} for name, told in axis.tells.items()},
-                }
-                for axis in self.axes
-            },
-            "offsets": self.offsets,
-            "sha256": self.sha256,
-        }
-
-
-def _plain(x: float) -> float | None:
-    return float(x) if math.isfinite(x) else None
-
-
-def _numbers(part: Any) -> dict[str, float | None]:
-    return {key: _plain(value) for key, value in vars(part).items() if isinstance(value, float)}
+        record = {key: value for key, value in asdict(self).items() if key != "axes"}
+        record |= {"verdict": self.verdict, "findings": [one.as_json() for one in self.findings]}
+        axes = {axis.axis: {k: v for k, v in asdict(axis).items() if k != "axis"} for axis in self.axes}
+        return {**plain(record), "axes": plain(axes)}
 
 
 # Reports of checked trials as tables for people, readable at a hundred columns.
@@ -324,7 +292,6 @@ def _axes(axes: Sequence[AxisReport]) -> Table:
         "noise",
         "decades",
         "input",
-        "levels",
         "both ways",
         "coast",
         "rest",
@@ -332,7 +299,7 @@ def _axes(axes: Sequence[AxisReport]) -> Table:
         table.add_column(name, justify="left" if name in ("axis", "velocity") else "right")
     for a in axes:
         if not a.source or a.fastest != a.fastest:
-            table.add_row(a.axis, a.source.removeprefix("derived ") or "[dim]unknown[/dim]", *[""] * 8)
+            table.add_row(a.axis, a.source.removeprefix("derived ") or "[dim]unknown[/dim]", *[""] * 7)
             continue
         style = "" if a.excited else "dim"
         table.add_row(
@@ -342,7 +309,6 @@ def _axes(axes: Sequence[AxisReport]) -> Table:
             f"{a.noise:.1g}",
             f"{a.decades:.1f}",
             f"{a.strongest:.3g}" if a.strongest > 1e-6 else "-",
-            str(len(a.levels)) if a.levels else "-",
             "yes" if a.both_directions else "no",
             f"{a.coasts:.1f} s",
             f"{a.rests:.1f} s",
@@ -629,29 +595,22 @@ SLOW = 8.0
 
 def with_tells(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> AxisReport:
     """The report with what the axis tells."""
-    wanted = ["m_eff", "d1", "d2", "bias"]
-    wanted += ["k"] if report.axis in ("roll", "pitch") else []
-    wanted += ["thrust_scale", "thrust_lag"]
-    wanted += ["buoyancy"] if report.axis == "heave" else []
-    blocked = _blocked(report, inputs)
-    if blocked:
-        return replace(report, tells={name: Told(can=False, why=blocked) for name in wanted})
-    by_name = {
-        "m_eff": _m_eff(report, motion, inputs, vehicle),
-        **_damping(report, inputs),
-        "bias": _bias(report, inputs),
-        "k": _k(report, motion, inputs),
-        "thrust_scale": _thrust_scale(report, inputs),
-        "thrust_lag": _thrust_lag(inputs),
-        "buoyancy": _buoyancy(report, inputs),
-    }
-    return replace(report, tells={name: by_name[name] for name in wanted})
+    own = {"k": ("roll", "pitch"), "buoyancy": ("heave",)}
+    names = [name for name in PARAMETERS if report.axis in own.get(name, AXES)]
+    if blocked := _blocked(report, inputs):
+        return replace(report, tells={name: Told(can=False, why=blocked) for name in names})
+    tells = (
+        _passive_tells(report)
+        if inputs.source == "passive"
+        else _driven_tells(report, motion, inputs, vehicle)
+    )
+    return replace(report, tells={name: Told(can=tells[name][0], why=tells[name][1]) for name in names})
 
 
 def _blocked(report: AxisReport, inputs: Drive) -> str:
     """Why the axis tells nothing at all, or nothing."""
     if not report.source:
-        return _no_velocity(report.axis)
+        return f"no velocity: {NO_VELOCITY[report.axis]}"
     if not np.isfinite(report.fastest):
         return "velocity and input are never known together"
     if report.excited and inputs.source != "passive" and report.coasts > 10.0 * report.driven:
@@ -665,102 +624,96 @@ def _blocked(report: AxisReport, inputs: Drive) -> str:
     return f"moves, but is hardly driven: wrench up to {report.strongest:.2g}"
 
 
-def _no_velocity(axis: str) -> str:
-    column = dict(zip(map(str, AXES), NU, strict=True))[axis]
-    other = {
-        "surge": " nor x, y with a heading",
-        "sway": " nor x, y with a heading",
-        "heave": ", z or depth",
-        "roll": " nor an attitude",
-        "pitch": " nor an attitude",
-        "yaw": " nor a heading",
-    }[axis]
-    return (
-        f"no velocity: neither {column}{other}"
-        if not other.startswith(",")
-        else f"no velocity: no {column}{other}"
-    )
+NO_VELOCITY = {
+    "surge": "neither u nor x, y with a heading",
+    "sway": "neither v nor x, y with a heading",
+    "heave": "no w, z or depth",
+    "roll": "neither p nor an attitude",
+    "pitch": "neither q nor an attitude",
+    "yaw": "neither r nor a heading",
+}
 
 
-def _m_eff(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> Told:
-    i = AXES.index(report.axis)
-    if inputs.source == "passive":
-        return _relative(report.axis)
+def _damping(report: AxisReport) -> dict[str, tuple[bool, str]]:
+    reason = f"{report.decades:.1f} decades of speed up to {report.fastest:.2g}"
+    if report.decades < SEPARATE:
+        reason += ": only their sum at that speed; more levels or a coast would part them"
+    elif report.decades < 1.0:
+        reason += ", less than one: intervals will be wide"
+    return dict.fromkeys(("d1", "d2"), (report.decades >= SEPARATE, reason))
+
+
+def _passive_tells(report: AxisReport) -> dict[str, tuple[bool, str]]:
+    """Parameter -> whether a trial without thrust tells it, and why."""
+    scale, nothing = "passive: sets the scale of the others", "passive: no thrust"
+    m_eff = {
+        "heave": (True, "passive: relative to the vehicle file's buoyancy excess"),
+        **dict.fromkeys(
+            ("roll", "pitch"), (True, "passive: relative to the vehicle file's restoring moment")
+        ),
+    }
+    unknown = (False, "passive, and no force along this axis is known: d1/m_eff and d2/m_eff alone")
+    return {
+        "m_eff": m_eff.get(report.axis, unknown),
+        **_damping(report),
+        "bias": (False, "passive: goes with the force that moves it"),
+        **dict.fromkeys(("k", "buoyancy"), (False, scale)),
+        **dict.fromkeys(("thrust_scale", "thrust_lag"), (False, nothing)),
+    }
+
+
+def _driven_tells(
+    report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle
+) -> dict[str, tuple[bool, str]]:
+    """Parameter -> whether a trial with inputs tells it, and why."""
+    i, q = AXES.index(report.axis), motion.quaternion
     n = max(1, round(SHORT * motion.rate))
     change = np.abs(motion.nu[n:, i] - motion.nu[:-n, i])
     fastest = float(np.nanmax(change)) if np.isfinite(change).any() else 0.0
     impulse = float(vehicle.rigid_body_mass_matrix()[i, i]) * fastest
-    if impulse < LEAST_INERTIA * report.strongest * SHORT or fastest < 3.0 * report.noise:
-        return Told(can=False, why="speeds hardly change: steps, pulses or coasts are missing")
-    return Told(can=True, why="the speed changes")
-
-
-def _relative(axis: str) -> Told:
-    if axis in ("roll", "pitch"):
-        return Told(can=True, why="passive: relative to the vehicle file's restoring moment")
-    if axis == "heave":
-        return Told(can=True, why="passive: relative to the vehicle file's buoyancy excess")
-    return Told(can=False, why="passive, and no force along this axis is known: d1/m_eff and d2/m_eff alone")
-
-
-def _damping(report: AxisReport, inputs: Drive) -> dict[str, Told]:
-    decades = f"{report.decades:.1f} decades of speed up to {report.fastest:.2g}"
-    if report.decades < SEPARATE:
-        one = f"{decades}: only their sum at that speed; more levels or a coast would part them"
-        return {"d1": Told(can=False, why=one), "d2": Told(can=False, why=one)}
-    short = "" if report.decades >= 1.0 else ", less than one: intervals will be wide"
-    return {"d1": Told(can=True, why=decades + short), "d2": Told(can=True, why=decades + short)}
-
-
-def _bias(report: AxisReport, inputs: Drive) -> Told:
-    if inputs.source == "passive":
-        return Told(can=False, why="passive: goes with the force that moves it")
+    turns = impulse >= LEAST_INERTIA * report.strongest * SHORT and fastest >= 3.0 * report.noise
+    bias = "one direction and no rest: goes with d1"
     if report.both_directions:
-        return Told(can=True, why="driven both ways")
-    if report.rests >= 1.0:
-        return Told(can=True, why=f"{report.rests:.1f} s of rest")
-    return Told(can=False, why="one direction and no rest: goes with d1")
-
-
-def _k(report: AxisReport, motion: Motion, inputs: Drive) -> Told:
-    if inputs.source == "passive":
-        return Told(can=False, why="passive: sets the scale of the others")
-    q = motion.quaternion
+        bias = "driven both ways"
+    elif report.rests >= 1.0:
+        bias = f"{report.rests:.1f} s of rest"
     known = np.isfinite(q).all(axis=1)
-    if known.sum() < 10:
-        return Told(can=False, why="no roll and pitch")
-    spread = float(np.std(2.0 * q[known, 0 if report.axis == "roll" else 1]))  # small angles about the mean
-    if spread < LEAST_TILT:
-        return Told(can=False, why=f"{report.axis} angle varies by {np.degrees(spread):.2g}° only")
-    return Told(can=True, why=f"{report.axis} angle varies by {np.degrees(spread):.2g}°")
-
-
-def _thrust_scale(report: AxisReport, inputs: Drive) -> Told:
-    if inputs.source == "passive":
-        return Told(can=False, why="passive: no thrust")
-    if report.axis in ("heave", "roll", "pitch"):
-        return Told(can=True, why="against the weight and centres of the vehicle file, if those are right")
-    return Told(can=False, why="goes with m_eff, d1, d2: doubling all of them changes nothing")
-
-
-def _thrust_lag(inputs: Drive) -> Told:
-    if inputs.source == "passive":
-        return Told(can=False, why="passive: no thrust")
-    if not inputs.commanded:
-        return Told(can=False, why="the inputs are what acted, after the lag")
+    # Small angles about the mean.
+    angle = 2.0 * float(np.std(q[known, 0 if report.axis == "roll" else 1])) if known.sum() >= 10 else 0.0
+    k = (
+        f"{report.axis} angle varies by {np.degrees(angle):.2g}°"
+        if known.sum() >= 10
+        else "no roll and pitch"
+    )
+    weighed = report.axis in ("heave", "roll", "pitch")
     rate = 1.0 / float(np.median(np.diff(inputs.t)))
-    if rate < SLOW:
-        return Told(can=False, why=f"inputs at {rate:.2g} Hz: a lag lies between two samples")
-    return Told(can=True, why=f"commands at {rate:.3g} Hz, by simulation")
-
-
-def _buoyancy(report: AxisReport, inputs: Drive) -> Told:
-    if inputs.source == "passive":
-        return Told(can=False, why="passive: sets the scale of the others")
-    if report.coasts >= 1.0 or report.rests >= 1.0 or report.both_directions:
-        what = f"{report.coasts:.1f} s of coasting" if report.coasts >= 1.0 else "driven both ways or at rest"
-        return Told(can=True, why=what)
-    return Told(can=False, why="one direction and no coast: goes with d1; dive and coast")
+    lag = f"commands at {rate:.3g} Hz, by simulation"
+    if not inputs.commanded:
+        lag = "the inputs are what acted, after the lag"
+    elif rate < SLOW:
+        lag = f"inputs at {rate:.2g} Hz: a lag lies between two samples"
+    floats = report.coasts >= 1.0 or report.rests >= 1.0 or report.both_directions
+    buoyancy = "one direction and no coast: goes with d1; dive and coast"
+    if floats:
+        coasts = report.coasts >= 1.0
+        buoyancy = f"{report.coasts:.1f} s of coasting" if coasts else "driven both ways or at rest"
+    return {
+        "m_eff": (
+            turns,
+            "the speed changes" if turns else "speeds hardly change: steps, pulses or coasts are missing",
+        ),
+        **_damping(report),
+        "bias": (report.both_directions or report.rests >= 1.0, bias),
+        "k": (angle >= LEAST_TILT, k if angle >= LEAST_TILT or known.sum() < 10 else f"{k} only"),
+        "thrust_scale": (
+            weighed,
+            "against the weight and centres of the vehicle file, if those are right"
+            if weighed
+            else "goes with m_eff, d1, d2: doubling all of them changes nothing",
+        ),
+        "thrust_lag": (inputs.commanded and rate >= SLOW, lag),
+        "buoyancy": (floats, buoyancy),
+    }
 
 
 # Whether a trial's numbers agree with each other: units, signs, axes.
@@ -821,21 +774,10 @@ def frame_findings(trial: Trial, vehicle: Vehicle, offsets: dict[str, Offset]) -
     ]
 
 
-def _on(trial: Trial, names: tuple[str, ...], t: Array, order: int = 2) -> tuple[Array, Array]:
-    """Smoothed columns and their slopes, (m, c) each; NaN where there are none."""
-    value, slope = np.full((len(t), len(names)), np.nan), np.full((len(t), len(names)), np.nan)
-    for i, name in enumerate(names):
-        at, y = trial.series(name)
-        if len(at) >= 5:
-            s = smooth(at, y[:, None], t, order=order)
-            value[:, i], slope[:, i] = s.value[:, 0], s.slope[:, 0]
-    return value, slope
-
-
 def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     if not trial.has("az") or trial.header.acceleration == "kinematic":
         return []
-    f, _ = _on(trial, ("ax", "ay", "az"), t)
+    f, _ = on_grid(trial, ("ax", "ay", "az"), t)
     f = np.nan_to_num(f[np.isfinite(f[:, 2])])
     mean = np.linalg.norm(f.mean(axis=0))
     for size, unit, scale in (
@@ -850,7 +792,7 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
             return [_upside_down(f.mean(axis=0))]
         return [finding("no_gravity")] if mean < 0.3 * g else []
     up = up_in_body(attitude.quaternion) if attitude.tilt else np.tile([0.0, 0.0, 1.0], (len(t), 1))
-    f, _ = _on(trial, ("ax", "ay", "az"), t)
+    f, _ = on_grid(trial, ("ax", "ay", "az"), t)
     good = np.isfinite(f).all(axis=1) & np.isfinite(up).all(axis=1)
     if good.sum() < FEWEST:
         return []
@@ -877,7 +819,7 @@ def _upside_down(felt: Array) -> Finding:
 
 def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     found = []
-    gyro, _ = _on(trial, ("p", "q", "r"), t)
+    gyro, _ = on_grid(trial, ("p", "q", "r"), t)
     for i, (rate, angle) in enumerate((("p", "roll"), ("q", "pitch"), ("r", "yaw"))):
         derived = attitude.rates[:, i]
         moving = (
@@ -931,7 +873,7 @@ def _heading(trial: Trial, late: float) -> list[Finding]:
 
 def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     found = []
-    _, up = _on(trial, ("z", "depth"), t, 3)
+    _, up = on_grid(trial, ("z", "depth"), t, 3)
     both = np.isfinite(up).all(axis=1)
     if (
         both.sum() >= FEWEST
@@ -954,7 +896,7 @@ def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]
 def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     if not (trial.has("x", "y", "u", "v") and attitude.heading):
         return []
-    _, world = _on(trial, ("x", "y"), t, 3)
+    _, world = on_grid(trial, ("x", "y"), t, 3)
     through = _through_world(trial, t, attitude)[:, :2]
     good = np.isfinite(world).all(axis=1) & np.isfinite(through).all(axis=1)
     if good.sum() < FEWEST or min(np.std(world[good]), np.std(through[good])) < 0.02:
@@ -974,7 +916,7 @@ def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Findin
 
 
 def _through_world(trial: Trial, t: Array, attitude: AttitudeSignal) -> Array:
-    nu, _ = _on(trial, ("u", "v", "w"), t)
+    nu, _ = on_grid(trial, ("u", "v", "w"), t)
     known = np.isfinite(attitude.turn).all(axis=1)
     through = quat_rotate(np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0]), np.nan_to_num(nu))
     if attitude.heading:
@@ -1030,7 +972,6 @@ def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle) -> AxisReport
         noise=np.nan,
         decades=0.0,
         strongest=0.0,
-        levels=(),
         work=0.0,
         both_directions=False,
         driven=0.0,
@@ -1056,7 +997,6 @@ def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle) -> AxisReport
         noise=noise,
         decades=float(max(0.0, np.log10(max(fastest, 1e-9) / max(slowest, noise, 1e-9)))),
         strongest=strongest,
-        levels=_levels(tau, motion.rate) if driven else (),
         work=0.0 if passive else float(np.sum((tau * nu)[known]) * dt),
         both_directions=bool(min((nu[known] > floor).sum(), (nu[known] < -floor).sum()) * dt > HOLD),
         driven=float((known & ~quiet).sum() * dt),
@@ -1070,21 +1010,6 @@ def _strong(values: Array, least: float) -> float:
     """95th percentile of the values above `least`; of all where none is."""
     above = values[values > least]
     return float(np.percentile(above if len(above) else values, 95.0))
-
-
-def _levels(tau: Array, rate: float) -> tuple[float, ...]:
-    """Wrenches that stay within a thirtieth of the strongest for `HOLD` seconds, without zero; at most twelve."""
-    most = float(np.nanmax(np.abs(tau)))
-    n = max(2, round(HOLD * rate))
-    if most == 0.0 or len(tau) < n:
-        return ()
-    windows = np.lib.stride_tricks.sliding_window_view(tau, n)
-    held = np.sort(np.mean(windows[np.ptp(windows, axis=-1) < most / 30.0], axis=-1))
-    if not len(held):
-        return ()
-    groups = np.split(held, np.flatnonzero(np.diff(held) > most / 15.0) + 1)
-    levels = [float(np.median(group)) for group in groups if abs(np.median(group)) > QUIET * most]
-    return tuple(levels) if len(levels) <= 12 else ()
 
 
 def work_findings(reports: list[AxisReport], motion: Motion, named: tuple[str, ...]) -> list[Finding]:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import yaml
 
-__all__ = ["SEVERITIES", "Finding", "finding", "sentences", "wordings"]
+__all__ = ["Finding", "finding", "plain", "sentences", "wordings"]
 
 Severity = Literal["refused", "care", "note"]
 """What a finding makes of a trial or fit: nothing can rest on it; something may not; worth knowing."""
@@ -70,7 +70,7 @@ class Finding:
             "code": self.code,
             "severity": self.severity,
             "subject": self.subject,
-            "values": {name: _plain(value) for name, value in self.values.items()},
+            "values": plain(self.values),
             "sentence": str(self),
         }
 
@@ -100,11 +100,16 @@ def sentences(findings: Iterable[Finding]) -> list[str]:
     ]
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any, digits: int = 17) -> Any:
+    """The same as JSON has it: lists, text, and numbers of so many significant digits, None where one is not finite."""
+    if isinstance(value, Mapping):
+        return {key: plain(item, digits) for key, item in value.items()}
+    value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
-    value = value.item() if hasattr(value, "item") else value
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return [plain(item, digits) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+    return value
 
 
 @cache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.findings import Finding
+from finssim.calibration.findings import Finding, plain
 from finssim.vehicles import Vehicle
 
 __all__ = ["Correlation", "Curve", "Estimate", "Fit"]
@@ -46,17 +45,8 @@ class Estimate:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; a number that is not finite becomes None."""
-
-        def plain(x: float) -> float | None:
-            return float(x) if math.isfinite(x) else None
-
-        return {
-            "estimate": plain(self.estimate),
-            "ci95": [plain(x) for x in self.ci95],
-            "unit": self.unit,
-            "identifiable": self.identifiable,
-            "note": self.note,
-        }
+        kept = {key: getattr(self, key) for key in ("estimate", "ci95", "unit", "identifiable", "note")}
+        return dict(plain(kept))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +56,10 @@ class Correlation:
     names: tuple[str, ...]
     matrix: Array
     """(n, n)"""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"names": list(self.names), "matrix": plain(self.matrix)}
 
 
 @dataclass(frozen=True, kw_only=True)

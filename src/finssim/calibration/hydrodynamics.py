@@ -64,7 +64,6 @@ def fit_hydrodynamics(
     *,
     axes: Sequence[str] | None = None,
     method: str = "auto",
-    full: bool = False,
     estimate: Sequence[str] = (),
     damping: str = "auto",
     known: Mapping[str, float] | None = None,
@@ -83,7 +82,6 @@ def fit_hydrodynamics(
         vehicle: Gives the rigid body, the motors and what is not fitted.
         axes: Axes to fit; those that the trials excite if None.
         method: One of `METHODS`.
-        full: Also couplings; simulation only.
         estimate: Further parameters: of the vehicle's terms, and by simulation only `ESTIMATE`.
         damping: `auto`, `linear`, `quadratic` or `both`.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²]; regression only.
@@ -98,7 +96,6 @@ def fit_hydrodynamics(
 
     known = dict(known or {})
     only_simulation = {
-        "couplings": full,
         "further estimates": any(word in ESTIMATE for word in estimate),
         "a horizon": horizon is not None,
     }
@@ -120,7 +117,7 @@ def fit_hydrodynamics(
         from finssim.calibration.simulation.fit import fit_by_simulation
 
         return fit_by_simulation(
-            trials, body, axes=axes, full=full, estimate=estimate, damping=damping, horizon=horizon, seed=seed,
+            trials, body, axes=axes, estimate=estimate, damping=damping, horizon=horizon, seed=seed,
             progress=progress,
         )  # fmt: skip
 

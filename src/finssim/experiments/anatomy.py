@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from finssim.experiments.campaign import Say, check_choices, run_jobs, write_json
+from finssim.experiments.campaign import Progress, check_choices, run_jobs, write_json
 from finssim.experiments.evaluate import Job, play
 from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
 from finssim.experiments.plants import Plant, load_plant
@@ -99,7 +99,7 @@ def anatomy(
     vehicle: str = "finsrov",
     steps: Annotated[int | None, (1, None)] = None,
     processes: Annotated[int | None, (1, None)] = None,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """How wrong may one thing be? Controllers of T1 in plants where it is wrong by growing amounts, and all at once.
 
@@ -115,7 +115,7 @@ def anatomy(
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         steps: Control steps to learn from, all worlds together; what the task needs if not given.
         processes: Plants at once; as many as processors if not given.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
 
     Returns:
         `causes`: cause -> row -> figures at every amount; `foreign`: row -> figures; the jobs are in the directory.
@@ -126,7 +126,7 @@ def anatomy(
     folder, run_seeds = Path(out), range(seed, seed + seeds)
     controllers = controllers_of(
         {name: T1.rows[name] for name in names}, run_seeds, folder, vehicle, steps,
-        lambda part, what: say(TRAINING_SHARE * part, what),
+        lambda part, what: progress(TRAINING_SHARE * part, what),
     )  # fmt: skip
     plants = {
         (name, k): Plant(name=f"{name}-{k}", **CAUSES[name].plant(amount))
@@ -143,7 +143,7 @@ def anatomy(
     ]  # fmt: skip
     results = run_jobs(
         jobs, folder / "trials", play, processes=processes,
-        say=lambda part, what: say(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
+        progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
     )  # fmt: skip
     played: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for job, one in zip(jobs, results, strict=True):

@@ -17,7 +17,7 @@ import warp as wp
 
 from finssim.engine import Simulator
 from finssim.engine.launch import default_threads
-from finssim.experiments.campaign import Say
+from finssim.experiments.campaign import Progress
 from finssim.experiments.tables import Table
 from finssim.provenance import provenance
 from finssim.tasks import Environment, StationKeeping
@@ -146,14 +146,14 @@ def machine() -> dict[str, Any]:
     return {"processor": model, "threads": default_threads(), "load_1min": load, **provenance()}
 
 
-def bench(*, device: str = "cpu", say: Say = lambda part, what: None) -> dict[str, Any]:
+def bench(*, device: str = "cpu", progress: Progress = lambda part, what: None) -> dict[str, Any]:
     """Measure this machine's speed: physics steps/s, environment steps/s, mesh faces/s.
 
     Example: finssim bench --json > bench.json
 
     Args:
         device (DEVICE): Where to compute: cpu or cuda.
-        say: Told the share that is done and what is measured next.
+        progress: Told the share that is done and what is measured next.
     """
     plan: dict[tuple[str, str], Callable[[], float | None]] = {
         ("physics", f"{model}/{worlds}"): partial(physics_rate, model, worlds, device=device)
@@ -169,7 +169,7 @@ def bench(*, device: str = "cpu", say: Say = lambda part, what: None) -> dict[st
     plan["memory", ""] = partial(memory_mb, MEMORY_WORLDS)
     figures: dict[tuple[str, str], Any] = {}
     for (kind, name), figure in plan.items():
-        say(len(figures) / len(plan), f"{kind} {name}".strip())
+        progress(len(figures) / len(plan), f"{kind} {name}".strip())
         figures[kind, name] = figure()
     physics, reference = figures["physics", f"calibrated/{WORLDS[-1]}"], figures["MuJoCo", ""]
     return {

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress as Bar
 
 from finssim.control.controllers import CONTROLLERS
 from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
@@ -33,7 +33,7 @@ from finssim.yaml_file import json_value, read_json
 
 __all__ = [
     "Job",
-    "Say",
+    "Progress",
     "Show",
     "check_choices",
     "progress_bar",
@@ -43,7 +43,7 @@ __all__ = [
     "write_json",
 ]
 
-Say = Callable[..., None]
+Progress = Callable[..., None]
 """Told the share that is done, and what comes next as text."""
 
 WATCH = 1.0
@@ -64,8 +64,8 @@ def run_experiment(
 
     Args:
         name: What the bar is called.
-        work: The experiment, which writes its directory `out`, if it has one, itself; called with `say`, if it takes
-            that, and the options.
+        work: The experiment, which writes its directory `out`, if it has one, itself; called with `progress`, if
+            it takes that, and the options.
         tables: Those of its result.
         as_json: Print one JSON object in place of the tables.
         bar: Show it; False where the work has a line of its own on the screen.
@@ -75,9 +75,9 @@ def run_experiment(
         What `work` returned.
     """
     start_warp()
-    if {"say", "options"} & set(inspect.signature(work).parameters):
-        with progress_bar(name, shown=bar) as say:
-            result = work(say=say, **options)
+    if {"progress", "options"} & set(inspect.signature(work).parameters):
+        with progress_bar(name, shown=bar) as progress:
+            result = work(progress=progress, **options)
     else:
         result = work(**options)
     if as_json:
@@ -91,12 +91,12 @@ def run_experiment(
 
 
 @contextmanager
-def progress_bar(name: str, *, shown: bool = True) -> Iterator[Say]:
+def progress_bar(name: str, *, shown: bool = True) -> Iterator[Progress]:
     """A bar on standard error where that is a terminal; told the share that is done and, perhaps, what comes next."""
     screen = Console(stderr=True)
-    with Progress(console=screen, transient=True, disable=not shown or not screen.is_terminal) as progress:
-        task = progress.add_task(name, total=1.0)
-        yield lambda part, what=name: progress.update(task, completed=part, description=what)
+    with Bar(console=screen, transient=True, disable=not shown or not screen.is_terminal) as bar:
+        task = bar.add_task(name, total=1.0)
+        yield lambda part, what=name: bar.update(task, completed=part, description=what)
 
 
 def check_choices(
@@ -198,7 +198,7 @@ def run_jobs(
     play: Play,
     *,
     processes: int | None = None,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
     show: Show = lambda job, result: None,
 ) -> list[dict[str, Any]]:
     """Play what has no result yet; after Ctrl-C or a kill the next call goes on where this one was.
@@ -208,7 +208,7 @@ def run_jobs(
         folder: Takes KEY.json of each, made if missing.
         play: A function of a module, as it is called in other processes; any function with `processes=1`.
         processes: As many as there are processors if None; 1: in this process, one after the other.
-        say: Told the share that is done and what is left.
+        progress: Told the share that is done and what is left.
         show: Called with each trial that is played now and its result, as soon as there is one.
 
     Returns:
@@ -222,7 +222,7 @@ def run_jobs(
         for left, ((_, job), outcome) in zip(reversed(range(len(missing))), played, strict=True):
             if (result := outcome.result()) is not None:
                 show(job, result)
-            say(1.0 - left / len(files), f"{left} trials left")
+            progress(1.0 - left / len(files), f"{left} trials left")
     return [kept_result(files[job.key()]) for job in jobs if files[job.key()].is_file()]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.policy import Policy, PolicyDescription
-from finssim.experiments.campaign import Say, run_jobs, write_json
+from finssim.experiments.campaign import Progress, run_jobs, write_json
 from finssim.experiments.evaluate import Job, play
 from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
 from finssim.experiments.plants import load_plant
@@ -30,7 +30,7 @@ from finssim.experiments.tables import Table
 from finssim.provenance import provenance
 from finssim.tasks import TASKS
 
-__all__ = ["MEASURES", "CompareError", "compare", "tables_of"]
+__all__ = ["MEASURES", "CompareError", "compare", "draw_training", "tables_of"]
 
 CURVES_FILE = "curves.csv"
 SEED_AT_END = re.compile(r"[-_]?(?:seed|s)?[-_]?\d+$")
@@ -261,9 +261,7 @@ CURVE_RESAMPLES = 200
 
 def draw_comparison(groups: Sequence[Group], result: Mapping[str, Any], path: Path) -> Path:
     """Write the figure."""
-    runs = [run for group in groups for run in group.runs]
-    curves = [name for name in CURVES if all(_drawable(run, name) for run in runs)][:2]
-    measures = list(result["measures"])
+    curves, measures = _curves_of(groups), list(result["measures"])
     height = 0.42 * len(groups) + 0.9
     columns = max(len(measures), len(curves))
     figure = new_figure(2.4 + 2.6 * columns, height + 3.4)
@@ -306,6 +304,22 @@ def _intervals(
     axes.set_title(TITLES.get(name, name), fontsize=10)
     axes.set_xlabel("less is better" if result["measures"][name] else "more is better", fontsize=8)
     clean(axes)
+
+
+def draw_training(words: Sequence[str], path: Path) -> Path:
+    """Write a figure of learning curves alone; runs as of `groups_of`."""
+    groups = groups_of(words)
+    curves = _curves_of(groups)
+    figure = new_figure(3.6 * max(len(curves), 1), 3.0)
+    for axes, name in zip(figure.subplots(1, max(len(curves), 1), squeeze=False)[0], curves, strict=False):
+        _draw_curves(axes, groups, name, legend=len(groups) > 1)
+    return save_figure(figure, path)
+
+
+def _curves_of(groups: Sequence[Group]) -> list[str]:
+    """The first two of `CURVES` that every run has."""
+    runs = [run for group in groups for run in group.runs]
+    return [name for name in CURVES if all(_drawable(run, name) for run in runs)][:2]
 
 
 def _drawable(run: Run, name: str) -> bool:
@@ -360,7 +374,7 @@ def compare(
     plant: str = "nominal",
     trials: Annotated[int | None, (1, 100_000)] = None,
     seed: int = 42,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Compare trainings over seeds: interquartile means with intervals, who is likely better, learning curves.
 
@@ -374,7 +388,7 @@ def compare(
         plant (FILE|NAME): What differs from the vehicle file, as for evaluate.
         trials: Trials of each run; as many as evaluate makes if not given.
         seed: Seed of every random number; equal seeds give equal results.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
 
     Raises:
         CompareError, EvaluationError, PolicyError, PlantError, VehicleError, OutputError: As they say.
@@ -388,7 +402,7 @@ def compare(
         )
         for group in groups for run in group.runs
     ]  # fmt: skip
-    results = run_jobs(jobs, out / "evaluations", play, say=say)
+    results = run_jobs(jobs, out / "evaluations", play, progress=progress)
     scored = {(job.row, job.seed): r["per_trial"] for job, r in zip(jobs, results, strict=True)}
     result = {
         **comparison(groups, scored, measures),

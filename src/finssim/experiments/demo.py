@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import shutil
@@ -28,12 +27,12 @@ from finssim.calibration.trials.trial import Trial
 from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Pool
-from finssim.experiments.campaign import Say, run_jobs, write_json
+from finssim.experiments.campaign import Progress, run_jobs, write_json
+from finssim.experiments.compare import draw_training
 from finssim.experiments.evaluate import CAPTION, Evaluation, by_target, cells, comparison_table
 from finssim.experiments.excitation import pool_trials, trials_on_robot
 from finssim.experiments.figures import (
     COLORS,
-    clean,
     draw_envelopes,
     error_envelope,
     legend_below,
@@ -240,28 +239,6 @@ def camera_view(job: Job, series: Path, at: float, seed: int, path: Path) -> Non
         x, y = np.concatenate([tag.corners for tag in tags]).mean(axis=0)
         close.set(xlim=(x - ZOOM, x + ZOOM), ylim=(y + ZOOM, y - ZOOM))
     save_figure(figure, path)
-
-
-def _training_curve(curves: Sequence[Mapping[str, Any]]) -> Any:
-    """Mean return and share of episodes held, against control steps and wall time, of rows of `curves.csv`."""
-    figure = new_figure(7.2, 3.0)
-    axes = figure.subplots()
-    # Episodes last as long as several updates: before the first ends there is no return to show.
-    rows = [row for row in curves if row["mean_length"] > 0.0]
-    steps = np.array([row["steps"] for row in rows]) / 1e6
-    share = axes.twinx()
-    axes.plot(steps, [row["mean_return"] for row in rows], color=BLUE, linewidth=1.6)
-    share.plot(steps, [100.0 * row["held"] for row in rows], color=ORANGE, linewidth=1.6)
-    clean(axes)
-    axes.set_xlabel("control steps, all worlds [million]")
-    axes.set_ylabel("mean return of an episode", color=BLUE)
-    share.set_ylabel("episodes held [%]", color=ORANGE)
-    share.set_ylim(-3.0, 103.0)
-    share.spines[["top"]].set_visible(False)
-    if rows:
-        last = rows[-1]
-        axes.set_title(f"{last['steps'] / 1e6:.1f} million steps in {last['seconds']:.0f} s", fontsize=10)
-    return figure
 
 
 def _paths(trials: Sequence[PlayedTrial]) -> Any:
@@ -530,7 +507,7 @@ class _Demonstration:
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     @contextmanager
-    def _working(self, text: str) -> Iterator[Say]:
+    def _working(self, text: str) -> Iterator[Progress]:
         """Show what is done, and how far it is."""
         self.tell(text)
         with self.console.status(text) as status:
@@ -559,7 +536,7 @@ class _Demonstration:
         else:
             spec = draw_plant(standing, PLANT, SEVERITY)
             spec.write(self.folder / PLANT_FILE)
-            with self._working("recording trials in the virtual pool") as say:
+            with self._working("recording trials in the virtual pool") as progress:
 
                 def show(run: Any, result: Mapping[str, Any]) -> None:
                     unit = "m/s" if run.programme.axes[0] in AXES[:3] else "rad/s"
@@ -570,7 +547,7 @@ class _Demonstration:
                 def simulated(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
                     return pool_trials(
                         plans, folder, vehicle=str(rough), pool_vehicle=self.name, plant=PLANT, severity=SEVERITY,
-                        seed=seed, leave_out=True, processes=self.processes, say=say, show=show,
+                        seed=seed, leave_out=True, processes=self.processes, progress=progress, show=show,
                     )  # fmt: skip
 
                 result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=simulated)
@@ -603,8 +580,10 @@ class _Demonstration:
         if self.robot is not None:
             results = run_on_robot(jobs, place, self.robot, attendant=self.attendant, console=self.console)
         else:
-            with self._working("holding setpoints in the virtual pool") as say:
-                results = run_jobs(jobs, place, play, processes=self.processes, say=say, show=self._show)
+            with self._working("holding setpoints in the virtual pool") as progress:
+                results = run_jobs(
+                    jobs, place, play, processes=self.processes, progress=progress, show=self._show
+                )
             if pictures:
                 series = place / pictures[0].key()
                 camera_view(pictures[0], series, VIEW_AT, self.seed, self.folder / "camera.png")
@@ -626,13 +605,11 @@ class _Demonstration:
         folder, policy = self.folder, evaluations[0]
         for evaluation in evaluations:
             write_json(folder / f"{evaluation.result['controller']['name']}.json", evaluation.result)
-        with (folder / "policy" / "curves.csv").open(encoding="utf-8", newline="") as file:
-            curves = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
         compared = [e for e in evaluations if e.result["trials"] == policy.result["trials"]]
         envelopes = {e.label: error_envelope(e.trials) for e in compared}
         save_figure(draw_envelopes(envelopes), folder / "envelopes.png")
         save_figure(_paths(policy.trials), folder / "paths.png")
-        save_figure(_training_curve(curves), folder / "training.png")
+        draw_training([str(folder / "policy")], folder / "training.png")
         title = f"Station keeping of {policy.result['vehicle']['name']}"
         origin = {
             "vehicle": policy.result["vehicle"],

@@ -359,7 +359,7 @@ def _recorded(
     truth: Path | None,
 ) -> Evaluation:
     """The evaluation of records of one controller."""
-    from finssim.experiments.recorded import read_record
+    from finssim.experiments.records import read_record
 
     if len(trajectories) > 1:
         raise EvaluationError("records follow one trajectory each: give at most one --trajectory")

@@ -25,7 +25,7 @@ from finssim.control import ControlError
 from finssim.control.allocation import Allocator
 from finssim.control.controllers import controller
 from finssim.control.guidance import Goal, Guide, Measured, Station, goal_at
-from finssim.experiments.campaign import Job, Say, Show, progress_bar, run_jobs
+from finssim.experiments.campaign import Job, Progress, Show, progress_bar, run_jobs
 from finssim.experiments.on_robot import (
     Attendant,
     OnRobot,
@@ -40,6 +40,7 @@ from finssim.files import atomic_directory, atomic_write
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import draw_plant
 from finssim.pool.plant_spec import Basin
+from finssim.pool.run import make_plan
 from finssim.quiet import start_warp
 from finssim.robot.perception import Perception
 from finssim.robot.recorder import Recorder
@@ -349,16 +350,21 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     record = path / f"{run.target}.mcap"
     record.parent.mkdir(parents=True, exist_ok=True)
     record.unlink(missing_ok=True)
-    vehicle, standing = load_vehicle(run.vehicle), load_vehicle(run.pool_vehicle)
+    vehicle, seed = load_vehicle(run.vehicle), noise_seed(run.seed, run.row, run.target)
+    pool = make_plan(run.pool_vehicle, str(run.plant), run.severity, camera="corners", seed=seed)  # type: ignore[arg-type]
     place = place_of(run.programme, vehicle, run.water)
     trial = programme_trial(run.programme, vehicle, place, hold=run.hold)
     about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
     with Recorder(record, vehicle, about, pictures="none") as recorder:
         outcome = play_in_pool(
-            trial, Station(place.position, place.yaw), vehicle, standing, recorder=recorder,
-            estimator={"mode": ESTIMATOR}, plant=run.plant, severity=run.severity,
-            seed=noise_seed(run.seed, run.row, run.target),
-        )  # fmt: skip
+            trial,
+            Station(place.position, place.yaw),
+            vehicle,
+            pool,
+            seed=seed,
+            recorder=recorder,
+            mode=ESTIMATOR,
+        )
     t, pilot = outcome.runtime.t, outcome.trial.pilot
     assert isinstance(pilot, ProgrammePilot)
     return {
@@ -375,7 +381,7 @@ def pool_trials(
     *,
     leave_out: bool = False,
     processes: int | None = None,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
     show: Show = lambda job, result: None,
     **settings: Any,
 ) -> dict[str, list[Trial]]:
@@ -386,7 +392,7 @@ def pool_trials(
         folder: Takes ROLE/NAME, the trials, and ROLE/records/NAME.mcap.
         leave_out: Leave out the trials that the bridge stopped, instead of refusing all; `show` is given their fault.
         processes: As many as there are processors if None.
-        say: Told the share that is done and what is left.
+        progress: Told the share that is done and what is left.
         show: Given each run and its result, of `play_programme`, as soon as there is one.
         settings: Of every `PoolRun`.
 
@@ -407,7 +413,9 @@ def pool_trials(
         place_of(run.programme, body, runs[0].water)
     trials: dict[str, list[Trial]] = {role: [] for role in plans}
     with tempfile.TemporaryDirectory() as scratch:
-        results = run_jobs(runs, Path(scratch), play_programme, processes=processes, say=say, show=show)
+        results = run_jobs(
+            runs, Path(scratch), play_programme, processes=processes, progress=progress, show=show
+        )
         for run, result in zip(runs, results, strict=True):
             if result["fault"] and leave_out:
                 continue
@@ -505,10 +513,13 @@ def excite(
     elif pool is not None:
         body, pool_vehicle = load_vehicle(vehicle), pool_vehicle or vehicle
         played, severity = programmes(axes, body, seed=seed, **plan), severity or "realistic"
-        with atomic_directory(out, replaces=PLAN_FILE) as folder, progress_bar("playing programmes") as say:
+        with (
+            atomic_directory(out, replaces=PLAN_FILE) as folder,
+            progress_bar("playing programmes") as progress,
+        ):
             pool_trials(
                 {"fit": played}, folder, vehicle=vehicle, pool_vehicle=pool_vehicle, plant=pool,
-                severity=severity, seed=seed, say=say,
+                severity=severity, seed=seed, progress=progress,
             )  # fmt: skip
             for made in (folder / "fit").iterdir():
                 made.rename(folder / made.name)

@@ -22,11 +22,12 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.experiments.campaign import Job, Say, check_choices, run_jobs, write_json
-from finssim.experiments.pool_trial import noise_seed, stand_in_pool
+from finssim.experiments.campaign import Job, Progress, check_choices, run_jobs, write_json
+from finssim.experiments.pool_trial import noise_seed
 from finssim.experiments.reliability import Pair, ReliabilityError, await_flush, await_thrust, pair
 from finssim.experiments.tables import Table
 from finssim.pool import VirtualPool, read_truth
+from finssim.pool.run import make_plan
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.bridge import Bridge, BridgeSettings
@@ -443,13 +444,9 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
     start, goal, when, _ = MOTIONS[job.motion]
     box = inset(vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
     workspace = {"workspace_lower": box[0], "workspace_upper": box[1]}
-    pool, site = stand_in_pool(
-        vehicle,
-        station_of(start),
-        plant=job.plant,
-        severity=job.severity,
-        seed=noise_seed(job.seed, job.target),
-    )
+    seed = noise_seed(job.seed, job.target)
+    plan = make_plan(vehicle, str(job.plant), job.severity, camera="corners", seed=seed)  # type: ignore[arg-type]
+    pool, site = plan.standing(station_of(start), seed=seed), plan.calibrated
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "run.mcap"
         with Recorder(record, vehicle, {"command": "finssim experiment faults"}) as recorder:
@@ -744,7 +741,7 @@ def faults_experiment(
     severity: str = "realistic",
     vehicle: str = "finsrov",
     processes: Annotated[int | None, (1, None)] = None,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Break one thing after another while a vehicle drives: time until thrust is gone [s], place in the workspace [m].
 
@@ -760,7 +757,7 @@ def faults_experiment(
         severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         processes: Trials at once; as many as processors if not given.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
 
     Returns:
         What `faults.json` holds; `ok`: every trial passed, and every control failed.
@@ -782,17 +779,21 @@ def faults_experiment(
     weight = KILL_WEIGHT * len(kills)
     share, folder, body = weight / (weight + len(jobs)), Path(out), load_vehicle(vehicle)
     if kills:
-        say(0.0, f"{len(kills)} kills in real time")
+        progress(0.0, f"{len(kills)} kills in real time")
     # A kill has the machine to itself.
     results = run_jobs(
-        kills, folder / "trials", play_kill, processes=1, show=lambda job, _: say(0.5 * share, job.target)
+        kills,
+        folder / "trials",
+        play_kill,
+        processes=1,
+        show=lambda job, _: progress(0.5 * share, job.target),
     )
     results += run_jobs(
         jobs,
         folder / "trials",
         play,
         processes=processes,
-        say=lambda part, what: say(share + (1.0 - share) * part, what),
+        progress=lambda part, what: progress(share + (1.0 - share) * part, what),
     )
     rows = {name: [r for r in results if r["job"]["row"] == name] for name in names}
     result = {

@@ -17,7 +17,7 @@ from finssim.calibration.vision.pool_command import pool_record
 from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
 from finssim.calibration.vision.pool_model import Settings
 from finssim.calibration.vision.survey import Observations, observe, read_survey
-from finssim.experiments.campaign import Say, check_choices, write_json
+from finssim.experiments.campaign import Progress, check_choices, write_json
 from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
 from finssim.experiments.metrics import PAPER
 from finssim.experiments.statistics import bootstrap
@@ -704,7 +704,7 @@ def localization_experiment(
     renderer: str = "own",
     seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
     **size: Any,
 ) -> dict[str, Any]:
     """Locate a tag at places that the calibration has not seen, by refractive and pinhole methods: RMSE, P95 [cm].
@@ -719,7 +719,7 @@ def localization_experiment(
         renderer (NAME): own, or geometry (no pictures: exact corners with noise).
         seeds: Repetitions with other errors.
         seed: Seed of every random number; equal seeds give equal results.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
         size: Of `draw_campaign`: locations (places along and across the pool) and images; as published if not given.
 
     Returns:
@@ -739,13 +739,13 @@ def localization_experiment(
     try:
         for k in range(seeds):
             for j, name in enumerate(CONDITIONS):
-                say((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
+                progress((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
                 drawn[name].append(_one(name, seed + k, renderer, size))
-            say((k + 0.8) / seeds, f"seed {seed + k}, another depth")
+            progress((k + 0.8) / seeds, f"seed {seed + k}, another depth")
             campaign = lifted(runs[k].campaign, LIFT)  # the same calibration, the tag at another depth
             higher.append(_scored(campaign, list(pictures(campaign, renderer)), runs[k].found))
             if not swept:
-                say((k + 0.9) / seeds, "sensitivity")
+                progress((k + 0.9) / seeds, "sensitivity")
                 swept.update(_swept(runs[0], renderer))
     except KeyboardInterrupt:
         if not runs:

@@ -25,8 +25,8 @@ from finssim.robot.goals import check_reachable, place_of
 from finssim.robot.link.transports import DEFAULT_BIND
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, WrenchPilot, make_pilot
+from finssim.robot.reading import Reading
 from finssim.robot.recorder import Recorder, recording
-from finssim.robot.robot import Reading
 from finssim.robot.runtime import Runtime
 from finssim.robot.teleop import Keyboard
 from finssim.robot.wiring import Drive, Wiring, connected

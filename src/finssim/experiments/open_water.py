@@ -4,28 +4,31 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Mapping
-from contextlib import closing
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from finssim.control.guidance import Station
 from finssim.control.trajectories import Trajectory
-from finssim.experiments.campaign import Say, check_choices, write_json
+from finssim.experiments.campaign import Progress, check_choices, write_json
+from finssim.experiments.on_robot import RobotTrial
+from finssim.experiments.pool_trial import play_in_pool
 from finssim.experiments.tables import Table
-from finssim.geometry.rotations import quat_from_yaw, quat_yaw
-from finssim.pool import PlantSpec, VirtualPool, draw_plant, read_truth
-from finssim.pool.draw_plant import positioning_of, site_of
+from finssim.geometry.rotations import quat_yaw
+from finssim.pool import read_truth
+from finssim.pool.draw_plant import positioning_of
+from finssim.pool.plant_spec import Severity
+from finssim.pool.run import make_plan
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
-from finssim.robot.lockstep import run_lockstep
-from finssim.robot.perception import LET_IN_STD, Perception
+from finssim.robot.perception import LET_IN_STD
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle
-from finssim.vehicles.defaults import vehicle_at
 
 __all__ = ["open_water", "tables_of"]
 
@@ -35,8 +38,6 @@ DEPTH = -5.0
 """Height of the way [m]."""
 SIDE = 10.0
 """Of the square [m]."""
-GETTING_READY = 10.0
-"""Longest time until the estimator knows where the vehicle is [s]."""
 PERIOD = 0.5
 """Between compared estimates [s]."""
 INSIDE = 5.991
@@ -74,9 +75,10 @@ def way_of(shape: str, duration: float, speed: float) -> Trajectory:
 
 def swim(
     vehicle: Vehicle,
-    spec: PlantSpec,
     way: Trajectory,
     *,
+    plant: int = 1,
+    severity: Severity = "realistic",
     positioning: str = "none",
     controller: str = "pid",
     seed: int = 1,
@@ -85,8 +87,9 @@ def swim(
 
     Args:
         vehicle: Of the catalogue or a file; it is equipped by `vehicle_at`.
-        spec: Drawn for the pool.
         way: What is followed, by its own estimate.
+        plant: Seed of the vehicle's plant.
+        severity: nominal, realistic or hard.
         positioning: none, motion-capture or usbl.
         controller: PID.
         seed: Of instruments and wire.
@@ -100,9 +103,8 @@ def swim(
         ValueError: The robot was never ready.
     """
     start_warp()
-    equipped = vehicle_at("open-water", vehicle)
-    start = np.random.default_rng([seed, 0x57A]).normal(0.0, LET_IN_STD, 2).tolist()
-    perception = Perception(equipped, None, mode="error-state", let_in=start)
+    plan = make_plan(vehicle, str(plant), severity, camera="none", seed=seed, site="open-water")
+    let_in = np.random.default_rng([seed, 0x57A]).normal(0.0, LET_IN_STD, 2).tolist()
     rows: list[tuple[float, ...]] = []
 
     def watch(runtime: Runtime) -> None:
@@ -110,24 +112,23 @@ def swim(
         reading = runtime.reading
         if reading is None or math.isnan(runtime.t) or (rows and reading.time < rows[-1][0] + PERIOD - 1e-6):
             return
-        estimate = perception.estimator.estimate(reading.time)
+        estimate = runtime.perception.estimator.estimate(reading.time)
         P = estimate.P[:2, :2].ravel().tolist()
         rows.append((reading.time, *estimate.x[:2].tolist(), estimate.yaw, *P))
 
-    pilot = make_pilot(controller, equipped, task="t2")
-    runtime = Runtime(equipped, None, pilot, way, arm=True, perception=perception)
+    trial = RobotTrial(
+        name=way.name,
+        pilot=make_pilot(controller, plan.vehicle, task="t2"),
+        guide=way,
+        duration=way.duration,
+        over=lambda runtime: runtime.t >= way.duration,
+        watch=watch,
+    )
     with tempfile.TemporaryDirectory() as folder:
-        world = VirtualPool(
-            equipped,
-            site_of("open-water", spec),
-            positioning=positioning_of(positioning, seed),
-            start=((0.0, 0.0, DEPTH), quat_from_yaw(0.0)),
-            seed=seed,
-            truth=Path(folder) / "truth",
-        )
-        over: Callable[[Runtime], bool] = lambda r: r.t >= way.duration or r.bridge.state == "fault"  # noqa: E731
-        with closing(world):
-            run_lockstep(runtime, world, GETTING_READY + way.duration, show=watch, until=over)
+        runtime = play_in_pool(
+            trial, Station((0.0, 0.0, DEPTH), 0.0), plan.vehicle, replace(plan, positioning=positioning), seed=seed,
+            truth=Path(folder) / "truth", mode="error-state", let_in=let_in,
+        ).runtime  # fmt: skip
         truth = read_truth(Path(folder) / "truth")
     if not rows:
         raise ValueError(f"open water: never armed: {runtime.refusal or 'no state'}")
@@ -162,8 +163,8 @@ def open_water(
     positioning: str = "none",
     seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
-    severity: str = "realistic",
-    say: Say = lambda part, what: None,
+    severity: Severity = "realistic",
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Drift of Doppler log, depth, IMU and compass in open water [m], and whether the estimator's ellipse holds it.
 
@@ -179,15 +180,14 @@ def open_water(
         seeds: Ways, each with its own water and noise.
         seed: Seed of every random number; equal seeds give equal results.
         severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
     """
     ours, way = load_vehicle(vehicle), way_of(shape, 60.0 * minutes, speed)
     positioning_of(positioning, seed)  # refuses what is none
     trials = []
     for k, s in enumerate(range(seed, seed + seeds)):
-        say(k / seeds, f"seed {s}")
-        plant = draw_plant(ours, s, severity)  # type: ignore[arg-type]
-        trials.append(swim(ours, plant, way, positioning=positioning, seed=s))
+        progress(k / seeds, f"seed {s}")
+        trials.append(swim(ours, way, plant=s, severity=severity, positioning=positioning, seed=s))
     result = {
         "experiment": "open-water",
         "vehicle": {"name": ours.name, "sha256": ours.sha256},

@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.control.guidance import Guide, Measured, Station, Track
+from finssim.control.guidance import Station
 from finssim.experiments import campaign
 from finssim.experiments.evaluate import Evaluation, summary_of
 from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room
@@ -32,18 +31,16 @@ from finssim.experiments.on_robot import (
     fault_of,
     session,
 )
-from finssim.experiments.recorded import RecordedError, read_record
+from finssim.experiments.records import DriveError, read_record
 from finssim.experiments.trials import PERIOD, Motion, Trial, guide_of, localization_errors
-from finssim.geometry.rotations import quat_from_yaw, quat_multiply
-from finssim.localization.pool import Pool
-from finssim.pool import VirtualPool, draw_plant, read_truth
-from finssim.pool.camera import PoolCamera, camera_of
+from finssim.pool import read_truth
+from finssim.pool.run import PoolPlan, make_plan
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.goals import check_reachable
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.perception import Perception
-from finssim.robot.pilots import Pilot, make_pilot
+from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.tasks import task_named
@@ -54,66 +51,13 @@ from finssim.vehicles.defaults import room
 __all__ = [
     "HARDWARE",
     "Job",
-    "NoisyInput",
     "noise_seed",
     "play",
     "play_in_pool",
     "played_trial",
     "pool_evaluation",
     "run_on_robot",
-    "stand_in_pool",
 ]
-
-
-# What an ablation takes away from a pilot: noise on the state that it sees.
-
-
-Array = NDArray[np.float64]
-
-
-class NoisyInput:
-    """A pilot that sees its position and heading with independent errors, drawn anew for every decision.
-
-    The published ablation "+ localization noise" has 5 cm per axis and 10 degrees; it touches the controller's input
-    alone.
-    """
-
-    def __init__(
-        self,
-        pilot: Pilot,
-        *,
-        position_std: float = 0.05,
-        yaw_std: float = math.radians(10.0),
-        seed: int = 0,
-    ) -> None:
-        """
-        Args:
-            pilot: Who decides.
-            position_std: Standard deviation of each coordinate [m].
-            yaw_std: Of the heading [rad].
-            seed: Of the errors; `reset` starts them again.
-        """
-        self._pilot, self._stds, self._seed = pilot, (position_std, yaw_std), seed
-        self.name, self.period, self.needs_state = pilot.name, pilot.period, pilot.needs_state
-        self._random = np.random.default_rng(seed)
-
-    def describe(self) -> dict[str, Any]:
-        """The pilot and the noise."""
-        position_std, yaw_std = self._stds
-        noise = {"position_std_m": position_std, "yaw_std_rad": yaw_std, "seed": self._seed}
-        return {**self._pilot.describe(), "input_noise": noise}
-
-    def reset(self) -> None:
-        """Forget what was before, the errors too."""
-        self._random = np.random.default_rng(self._seed)
-        self._pilot.reset()
-
-    def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,)."""
-        position_std, yaw_std = self._stds
-        moved = np.asarray(reading.position, float) + self._random.normal(0.0, position_std, 3)
-        turned = quat_multiply(quat_from_yaw(self._random.normal(0.0, yaw_std)), reading.quaternion)
-        return self._pilot.act(Track(moved, turned, np.asarray(reading.nu, float)), guide, t)
 
 
 HARDWARE = "hardware"
@@ -154,48 +98,16 @@ def noise_seed(*words: Any) -> int:
     return zlib.crc32(" ".join(map(str, words)).encode()) & 0x7FFFFFFF
 
 
-def stand_in_pool(
-    vehicle: Vehicle,
-    start: Station,
-    *,
-    plant: int,
-    severity: Any,
-    seed: int,
-    camera: Any = "corners",
-    truth: Path | None = None,
-) -> tuple[VirtualPool, Pool]:
-    """A vehicle at rest at its start in a drawn pool, and the site as its calibration has it.
-
-    Args:
-        vehicle: Around which the pool's own is drawn.
-        start: Where it is.
-        plant: Seed of the pool: vehicle, camera and water.
-        severity: nominal, realistic or hard.
-        seed: Of the noise.
-        camera: pictures or corners.
-        truth: File of the truth; none if None.
-    """
-    true_site, known_site, settings = camera_of(vehicle, plant, severity)
-    pool = VirtualPool(
-        vehicle,
-        draw_plant(vehicle, plant, severity),
-        camera=PoolCamera(vehicle, true_site, mode=camera, settings=settings, seed=seed),
-        start=(np.asarray(start.position), quat_from_yaw(start.yaw)),
-        seed=seed,
-        truth=truth,
-    )
-    return pool, known_site
-
-
 def play_in_pool(
     trial: RobotTrial,
     start: Station,
     vehicle: Vehicle,
-    standing: Vehicle,
+    plan: PoolPlan,
     *,
+    seed: int,
+    truth: Path | None = None,
     recorder: Recorder | None = None,
-    estimator: Mapping[str, Any],
-    **pool: Any,
+    **estimator: Any,
 ) -> Outcome:
     """Play a trial by the robot's whole software in lock-step with a pool.
 
@@ -203,15 +115,16 @@ def play_in_pool(
         trial: What to do.
         start: Where the vehicle is, at rest.
         vehicle: As the robot knows it.
-        standing: Around which the pool's own is drawn.
+        plan: Of the pool and the vehicle in it.
+        seed: Of the noise.
+        truth: File of the truth; none if None.
         recorder: Takes it down.
         estimator: Options of `Perception`.
-        pool: As of `stand_in_pool`.
     """
-    world, site = stand_in_pool(standing, start, **pool)
-    perception = Perception(vehicle, site, **estimator)
+    world = plan.standing(start, seed=seed, truth=truth)
+    perception = Perception(vehicle, plan.calibrated, **estimator)
     runtime = Runtime(
-        vehicle, site, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
+        vehicle, plan.calibrated, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
     )
     longest = GETTING_READY + trial.duration
     with closing(world):
@@ -237,9 +150,9 @@ def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial,
     first = guide.at(0.0)
     *place, yaw = in_room(T1_START, standing) if job.task == "t1" else (*first.position, float(first.yaw))
     duration = guide.duration if math.isfinite(guide.duration) else job.duration
-    pilot: Pilot = make_pilot(job.controller, vehicle, task=job.task)
+    pilot = make_pilot(job.controller, vehicle, task=job.task)
     if job.position_noise or job.yaw_noise:
-        pilot = NoisyInput(pilot, position_std=job.position_noise, yaw_std=job.yaw_noise, seed=seed)
+        pilot.disturb_input(position_std=job.position_noise, yaw_std=job.yaw_noise, seed=seed)
     trial = RobotTrial(
         name=f"{job.row}, {job.target}",
         pilot=pilot,
@@ -283,15 +196,19 @@ def play(job: Job, path: Path) -> dict[str, Any]:
     """
     start_warp()
     began = time.perf_counter()
-    vehicle, standing = load_vehicle(job.vehicle), load_vehicle(job.pool_vehicle)
+    vehicle = load_vehicle(job.vehicle)
+    plan = make_plan(
+        job.pool_vehicle,
+        str(job.plant),
+        job.severity,
+        camera=job.camera,
+        seed=noise_seed(job.seed, job.target),
+    )  # type: ignore[arg-type]
     seed = noise_seed(job.seed, job.target)
     trial, start = job_trial(job, vehicle, seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "truth"
-        outcome = play_in_pool(
-            trial, start, vehicle, standing, estimator={"fusion": job.fusion}, plant=job.plant,
-            severity=job.severity, seed=seed, camera=job.camera, truth=file,
-        )  # fmt: skip
+        outcome = play_in_pool(trial, start, vehicle, plan, seed=seed, truth=file, fusion=job.fusion)
         truth = read_truth(file)
     t = truth.time - outcome.runtime.started
     rows = np.flatnonzero((t >= 0.0) & (t <= trial.duration + 1e-6))
@@ -405,7 +322,7 @@ def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | No
         return None
     try:
         motion = read_record(record, job.task, vehicle, guide=trial.guide, duration=trial.duration).estimate
-    except RecordedError:  # stopped before its first decision
+    except DriveError:  # stopped before its first decision
         nowhere = np.full((2, 4), np.nan)
         motion = Motion(t=np.array([0.0, 0.1]), position=nowhere[:, :3], quaternion=nowhere)
     where = {"robot": opened.robot.title, "record": record.name}

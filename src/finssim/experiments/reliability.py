@@ -22,10 +22,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.experiments.campaign import Say, check_choices, write_json
-from finssim.experiments.pool_trial import stand_in_pool
+from finssim.experiments.campaign import Progress, check_choices, write_json
 from finssim.experiments.tables import Table
 from finssim.pool import TruthError, read_truth
+from finssim.pool.run import make_plan
 from finssim.provenance import provenance
 from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep
@@ -259,7 +259,7 @@ def soak(
     seed: int = 1,
     severity: str = "realistic",
     vehicle: str = "finsrov",
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Keep a station for hours in lock-step and watch the memory [MiB]. Ctrl-C ends it with what is known until then.
 
@@ -273,7 +273,7 @@ def soak(
         seed: Seed of every random number; equal seeds give equal results.
         severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        say: Told the share that is done and how it goes.
+        progress: Told the share that is done and how it goes.
 
     Returns:
         What `soak.json` holds: `verdict`, `slope_mib_per_h`, first and last memory [MiB], errors [m], and totals.
@@ -281,7 +281,8 @@ def soak(
     duration, folder = 3600.0 * hours, Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     body, station = load_vehicle(vehicle), station_of(GOAL)
-    pool, site = stand_in_pool(body, station, plant=seed, severity=severity, seed=seed)
+    plan = make_plan(body, str(seed), severity, camera="corners", seed=seed)  # type: ignore[arg-type]
+    pool, site = plan.standing(station, seed=seed), plan.calibrated
     runtime = Runtime(body, site, make_pilot("pid", body), station, arm=True)
     began = time.perf_counter()
     samples: list[tuple[float, ...]] = []
@@ -299,7 +300,7 @@ def soak(
             writer.writerow([*(f"{value:.4f}" for value in row), runtime.bridge.state])
             file.flush()
             text = f"{row[0] / 3600.0:.2f} h, {row[2]:.1f} MiB, {runtime.bridge.state}"
-            say(min(pool.time / duration, 1.0), text)
+            progress(min(pool.time / duration, 1.0), text)
 
         run_lockstep(
             runtime, pool, duration, gentle=True, show=sample, until=lambda r: r.bridge.state == "fault"
@@ -397,7 +398,7 @@ def timing(
     policy: str = "pid",
     seed: int = 1,
     vehicle: str = "finsrov",
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Time the robot beside its pool on this machine: decisions missed, picture to command [ms], lock-step speed.
 
@@ -411,7 +412,7 @@ def timing(
         policy (DIR|pid|pid-paper): A policy's directory, or pid, or pid-paper.
         seed: Seed of every random number; equal seeds give equal results.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
 
     Returns:
         What `timing.json` holds: `realtime` (what the robot told at the end, and what the pool said), `lockstep` (times
@@ -423,9 +424,9 @@ def timing(
     check_choices([camera], CAMERAS, "camera", ReliabilityError)
     lockstep = {}
     for k, mode in enumerate(CAMERAS):
-        say(0.1 * k, f"lock-step, {mode}")
+        progress(0.1 * k, f"lock-step, {mode}")
         lockstep[mode] = lockstep_speed(vehicle, mode, seed=seed, policy=policy)  # type: ignore[arg-type]
-    realtime = _realtime(60.0 * minutes, camera, policy, seed, vehicle, say)
+    realtime = _realtime(60.0 * minutes, camera, policy, seed, vehicle, progress)
     told = realtime["robot"]
     p99 = told["latency_s"]["p99"]
     result = {
@@ -466,7 +467,8 @@ def lockstep_speed(
         duration: Vehicle time [s]; long enough for the camera if None.
     """
     body, station = load_vehicle(vehicle), station_of(STATION)
-    pool, site = stand_in_pool(body, station, plant=seed, severity="realistic", seed=seed, camera=camera)
+    plan = make_plan(body, str(seed), "realistic", camera=camera, seed=seed)
+    pool, site = plan.standing(station, seed=seed), plan.calibrated
     runtime = Runtime(body, site, make_pilot(policy, body), station, arm=True)
     run_lockstep(runtime, pool, WARM_UP)
     before, began = pool.time, time.perf_counter()
@@ -474,7 +476,9 @@ def lockstep_speed(
     return (pool.time - before) / (time.perf_counter() - began)
 
 
-def _realtime(seconds: float, camera: str, policy: str, seed: int, vehicle: str, say: Say) -> dict[str, Any]:
+def _realtime(
+    seconds: float, camera: str, policy: str, seed: int, vehicle: str, progress: Progress
+) -> dict[str, Any]:
     world = ["--plant", str(seed), "--camera", camera]
     ours = ["--policy", policy, "--duration", str(seconds)]
     with (
@@ -482,7 +486,7 @@ def _realtime(seconds: float, camera: str, policy: str, seed: int, vehicle: str,
         pair(Path(folder), vehicle, STATION, pool=world, robot=ours) as both,
     ):
         robot = both.robot
-        _wait(robot, seconds, say)
+        _wait(robot, seconds, progress)
         if robot.running or not robot.said:
             raise ReliabilityError(f"the robot did not end: {robot.complained.strip()[-300:]}")
         robot.end()
@@ -490,10 +494,10 @@ def _realtime(seconds: float, camera: str, policy: str, seed: int, vehicle: str,
         return {"robot": json.loads(robot.said), "pool": both.pool.said.splitlines()}
 
 
-def _wait(robot: Process, seconds: float, say: Say) -> None:
+def _wait(robot: Process, seconds: float, progress: Progress) -> None:
     began = time.monotonic()
     while robot.running and (passed := time.monotonic() - began) < seconds + PATIENCE:
-        say(0.2 + 0.8 * min(passed / seconds, 1.0), f"real time: {passed / 60.0:.1f} min")
+        progress(0.2 + 0.8 * min(passed / seconds, 1.0), f"real time: {passed / 60.0:.1f} min")
         time.sleep(0.5)
 
 

@@ -22,7 +22,7 @@ from finssim.calibration.replay.replay import Replay, replay
 from finssim.calibration.replay.report import DEFINITION, MODEL_LABELS, draw_response_envelopes
 from finssim.calibration.trials.trial import Trial
 from finssim.engine import Simulator, TetherLine
-from finssim.experiments.campaign import Say, write_json
+from finssim.experiments.campaign import Progress, write_json
 from finssim.experiments.figures import save_figure
 from finssim.experiments.metrics import PAPER
 from finssim.experiments.plants import PlantError
@@ -251,7 +251,7 @@ def replay_experiment(
     plant: ReplayPlant | None = None,
     repeats: Annotated[int, "python"] = REPEATS,
     axes: Annotated[Sequence[str], "python"] = AXES,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Identify on half of the trials of a plant outside the model class, replay three models on the other half.
 
@@ -268,7 +268,7 @@ def replay_experiment(
         plant: The hidden plant; the shipped one if None.
         repeats: Of every level and direction, an even number.
         axes: Which are excited, fitted and replayed.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
 
     Returns:
         What `replay_experiment.json` holds.
@@ -290,7 +290,7 @@ def replay_experiment(
             done.append(
                 experiment_seed(
                     body, water, seed + k, repeats, axes,
-                    lambda part, what, k=k: say((k + part) / seeds, f"seed {k + 1} of {seeds}: {what}"),
+                    lambda part, what, k=k: progress((k + part) / seeds, f"seed {k + 1} of {seeds}: {what}"),
                 )
             )  # fmt: skip
     except KeyboardInterrupt:
@@ -332,19 +332,19 @@ def experiment_seed(
     seed: int,
     repeats: int = REPEATS,
     axes: Sequence[str] = AXES,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> SeedResult:
     """One seed of the experiment; arguments as for `replay_experiment`, `say` is told the share that is done."""
-    say(0.0, "trials")
+    progress(0.0, "trials")
     plan = programmes(axes, vehicle, kind="published", repeats=repeats)
     trials = plant.trials(plan, vehicle, seed)
     fitted, held_out = trials[0::2], trials[1::2]
-    say(0.35, "identification")
+    progress(0.35, "identification")
     fit = regress(fitted, vehicle, axes=axes, seed=seed)
     found = calibrated(fit)
-    say(0.6, "replay")
+    progress(0.6, "replay")
     same = replay(held_out, found, hydrodynamics=MODELS)
-    say(0.85, "replay of other levels")
+    progress(0.85, "replay of other levels")
     sweeps = plant.trials(programmes(axes, vehicle, kind="validation"), vehicle, seed + 1_000_000)
     return SeedResult(seed, fit, found, same, replay(sweeps, found, hydrodynamics=MODELS))
 

@@ -23,7 +23,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from rich.console import Console
 
-from finssim.experiments.campaign import Say, keep_result, kept_result, spread, write_json
+from finssim.experiments.campaign import Progress, keep_result, kept_result, spread, write_json
 from finssim.experiments.compare import MEASURES
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
@@ -264,7 +264,7 @@ def sweep(
     out: Path,
     address: str | None = None,
     processes: Annotated[int | None, (1, None)] = None,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Train every setting with every seed on one machine or many, and evaluate each policy; goes on where it was.
 
@@ -277,7 +277,7 @@ def sweep(
         out (DIR): Directory of the runs; those that it has are kept.
         address (ADDRESS): Of a Ray cluster to join, HOST:PORT or auto; this machine alone if not given.
         processes: Trainings at once on this machine; one a processor if not given.
-        say: Told the share that is done.
+        progress: Told the share that is done.
 
     Returns:
         What `sweep.json` has: `rows` (name, seed, run, training_s, machine, plants; or `error`), `ok`, provenance.
@@ -295,7 +295,7 @@ def sweep(
     with closing(played):
         for job, outcome in played if missing else ():
             rows[job.key] = row = _keep(job, outcome, runs)
-            say(len(rows) / len(jobs), f"{len(rows)} of {len(jobs)} trainings")
+            progress(len(rows) / len(jobs), f"{len(rows)} of {len(jobs)} trainings")
             if not screen.is_terminal:
                 error = f": {row['error']}" if "error" in row else ""
                 screen.print(f"{len(rows)} of {len(jobs)}: {job.key}{error}", highlight=False)

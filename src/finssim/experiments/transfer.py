@@ -15,7 +15,7 @@ from finssim.calibration.output.ranges import write_ranges
 from finssim.control.controllers import COSTLY
 from finssim.control.policy import Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.campaign import Say, check_choices, run_jobs, write_json
+from finssim.experiments.campaign import Progress, check_choices, run_jobs, write_json
 from finssim.experiments.evaluate import T1_COLUMNS, cells
 from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
 from finssim.experiments.identify import identify
@@ -53,6 +53,10 @@ INTERVALS = "intervals"
 RANGES_FILE = "ranges.yaml"
 FEWEST_UNITS = 3
 """Plants and seeds on which a sentence about a difference rests at least; below it there are numbers alone."""
+DIFFERENCES_NOTE = (
+    "Each figure is the mean of row less reference, over pairs of trials with the same pool, seed and target; in "
+    "brackets 95 % from a bootstrap of plants and seeds. paper: the difference of its rows, on hardware, single runs."
+)
 FORGETFUL = {"integral": False, "history": 0, "last_action": False}
 """Settings of the learner, for policies as the paper's."""
 
@@ -142,7 +146,25 @@ class Spec:
             for key in self.differences
         }
 
-    def table(self, result: Mapping[str, Any]) -> Table:
+    def tables(self, result: Mapping[str, Any]) -> list[Table]:
+        """The table of a result, and that of the differences from the reference row, where there are some."""
+        units = {key: MEASURES[key] for key in self.differences}
+        rows = []
+        for name, differences in result["differences"].items():
+            row, theirs = self.rows[name], self.paper_differences(self.rows[name])
+            texts = (figure_text(differences[key], f"+{u[4]}", u[2]) for key, u in units.items())
+            rows.append([row.title, *texts])
+            if theirs is not None:
+                rows.append(["  paper", *(f"{u[2] * theirs[key]:+{u[4]}}" for key, u in units.items())])
+        differences = Table(
+            title=f"{self.name.upper()}: differences from {self.rows[self.base].title}",
+            heads=["", *(heading for _, heading, *_ in units.values())],
+            rows=rows,
+            note=DIFFERENCES_NOTE,
+        )
+        return [self._table(result), *([differences] if rows else [])]
+
+    def _table(self, result: Mapping[str, Any]) -> Table:
         """The table of a result; on hardware its rows say so."""
         hardware, rows = result.get("robot"), []
         for name, of_row in result["rows"].items():
@@ -189,7 +211,7 @@ def transfer_experiment(
     processes: Annotated[int | None, (1, None)] = None,
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Train what the rows need, play every target in every plant with every seed, and write the table.
 
@@ -212,7 +234,7 @@ def transfer_experiment(
         processes: Trials at once; as many as processors if not given.
         robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
         attendant: The person beside that robot, instead of the terminal's keyboard.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
 
     Returns:
         What NAME.json holds.
@@ -233,7 +255,7 @@ def transfer_experiment(
     chosen = {name: spec.rows[name] for name in rows}
     pools, run_seeds, folder = range(seed, seed + plants), range(seed, seed + seeds), Path(out)
     controllers = controllers_of(
-        chosen, run_seeds, folder, vehicle, steps, lambda part, what: say(TRAINING_SHARE * part, what)
+        chosen, run_seeds, folder, vehicle, steps, lambda part, what: progress(TRAINING_SHARE * part, what)
     )
     if robot is not None:  # there is one plant, and nobody chose its severity
         pools, severity, camera = range(1), HARDWARE, HARDWARE
@@ -247,7 +269,7 @@ def transfer_experiment(
     if robot is None:
         results = run_jobs(
             jobs, folder / "trials", play, processes=processes,
-            say=lambda part, what: say(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
+            progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
         )  # fmt: skip
     else:
         results = run_on_robot(jobs, folder / "trials", robot, attendant=attendant)
@@ -260,7 +282,7 @@ def transfer_experiment(
         "vehicle": {"name": body.name, "sha256": body.sha256},
         **scores(spec, by_row), "trials": results, "provenance": provenance(),
     }  # fmt: skip
-    write_json(folder / f"{spec.name}.json", result, [spec.table(result)])
+    write_json(folder / f"{spec.name}.json", result, spec.tables(result))
     spec.draw(by_row, folder)
     return result
 
@@ -271,7 +293,7 @@ def controllers_of(
     folder: Path,
     vehicle: str,
     steps: int | None,
-    say: Say,
+    progress: Progress,
 ) -> dict[tuple[str, int], str]:
     """Who steers, by row and seed: a policy's directory in `policies` of the folder, or the name of a PID.
 
@@ -282,14 +304,14 @@ def controllers_of(
     """
     trainings = list(dict.fromkeys(row.training for row in rows.values() if row.training))
     if any(training.randomize == INTERVALS for training in trainings):
-        say(0.0, "identifying the vehicle, for the ranges of its intervals")
+        progress(0.0, "identifying the vehicle, for the ranges of its intervals")
         ranges = folder / "identification" / RANGES_FILE
         if not ranges.is_file():
             with atomic_directory(ranges.parent, replaces=RANGES_FILE) as place:
                 found = identify(place, vehicle, seed=seeds[0], shown=ranges.parent)
                 write_ranges(found.fit, place / RANGES_FILE, found.vehicle)
         trainings = [replace(t, randomize=str(ranges)) if t.randomize == INTERVALS else t for t in trainings]
-    policies = trained(trainings, seeds, folder / "policies", vehicle=vehicle, steps=steps, say=say)
+    policies = trained(trainings, seeds, folder / "policies", vehicle=vehicle, steps=steps, progress=progress)
     return {
         (name, seed): str(policies[row.training.name, seed]) if row.training else row.controller
         for name, row in rows.items()
@@ -304,7 +326,7 @@ def trained(
     *,
     vehicle: str,
     steps: int | None = None,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[tuple[str, int], Path]:
     """Policy directories of every training and seed; what is finished in the folder is not trained again.
 
@@ -314,7 +336,7 @@ def trained(
         folder: Where the directories are and come.
         vehicle: Name or file.
         steps: Control steps of each; the task's own if None.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
 
     Returns:
         (name, seed) -> directory.
@@ -323,7 +345,7 @@ def trained(
     policies: dict[tuple[str, int], Path] = {}
     for done, (training, seed) in enumerate(plan):
         policies[training.name, seed] = place = folder / f"{training.name}-seed{seed}"
-        say(done / len(plan), f"training {training.name}, seed {seed}")
+        progress(done / len(plan), f"training {training.name}, seed {seed}")
         if not finished(place):
             train(
                 training.task, out=place, vehicle=vehicle, hydrodynamics=training.hydrodynamics,
@@ -603,5 +625,5 @@ def t2(*, trajectories: Annotated[Sequence[str] | None, ","] = None, **options: 
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """The table of either."""
-    return [SPECS[result["experiment"]].table(result)]
+    """Those of either."""
+    return SPECS[result["experiment"]].tables(result)

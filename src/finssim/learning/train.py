@@ -66,7 +66,8 @@ def train(
             pursuit, team-pursuit or formation; or one's own, FILE.py:CLASS.
         out: Directory of the policy; an earlier policy there is replaced when done.
         learner (NAME): Who learns: ppo (FinsSim's own), sb3-ppo, sb3-sac, sb3-recurrent-ppo or rsl-rl; one agent also
-            torchrl-ppo, several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail.
+            torchrl-ppo, several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; or one's own,
+            FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         action (MODE): What the policy commands: wrench6, wrench4 or thruster8; the task's own if not given.
@@ -79,8 +80,9 @@ def train(
         steps: Control steps to learn from, all worlds together; what the task needs if not given.
         until (SHARE): Share of successes, such as 0.95, at which the training is done before its steps are: of the held
             episodes, in two evaluations one after the other.
-        init (NAME|DIR): Whom the policy imitates before it learns by itself: a baseline of the task, such as pid, or a
-            policy directory. Of ppo; --set taught=SHARE says for how much of the training.
+        init (NAME|DIR): Whom the policy imitates before it learns by itself: a baseline of the task, such as pid, a
+            policy directory, or none; team-pursuit and formation have their baselines if not given. Of ppo; --set
+            taught=SHARE says for how much of the training.
         settings (NAME=VALUE): Change of a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be
             given several times.
         resume: Go on from the last checkpoint of a training that was killed.
@@ -125,12 +127,7 @@ def train(
     randomized = randomization is not None
     plan, changes = _level_plan(settings if isinstance(settings, Mapping) else settings_of_words(settings))
     values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=changes)
-    if init is not None:
-        if not hasattr(values, "teacher"):
-            raise TrainingError(
-                f"learner '{learner}' imitates nobody before it learns: leave init out, or take ppo"
-            )
-        values = replace(values, teacher=str(init))
+    values = _taught(values, init, learner, mode_name == the_task.action)
 
     def worlds_of(count: int, ranges: Randomization | None, its_seed: int, **more: Any) -> Environment:
         return make(
@@ -178,6 +175,19 @@ def train(
     place = (interrupted or _place_beside(Path(out), side)) if stopped else Path(out)
     _finish(loop, place, stopped, console, place if stopped else shown or place, time.perf_counter() - began)
     return place
+
+
+def _taught(values: Any, init: str | Path | None, learner: str, own_action: bool) -> Any:
+    """The settings with whom to imitate first; the task's own teacher acts in the task's own action mode alone."""
+    if not hasattr(values, "teacher"):
+        if init is None:
+            return values
+        raise TrainingError(
+            f"learner '{learner}' imitates nobody before it learns: leave init out, or take ppo"
+        )
+    if init is not None:
+        return replace(values, teacher="" if str(init) == "none" else str(init))
+    return values if own_action else replace(values, teacher="")
 
 
 def _level_plan(settings: Mapping[str, Any]) -> tuple[LevelPlan | None, dict[str, Any]]:

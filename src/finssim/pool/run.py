@@ -75,9 +75,14 @@ class PoolPlan:
             truth=truth,
         )
 
+    def standing(self, start: Station, *, seed: int, truth: Path | None = None) -> VirtualPool:
+        """The living pool with its own camera, for lock-step; arguments as of `world`."""
+        eye = self.camera.camera() if self.camera is not None else None
+        return self.world(eye, start=start, seed=seed, truth=truth)
+
 
 def make_plan(
-    vehicle: str,
+    vehicle: str | Vehicle,
     plant: str,
     severity: Severity,
     *,
@@ -88,7 +93,7 @@ def make_plan(
     """Draw a plant and its camera, or read the plant from its file.
 
     Args:
-        vehicle: Name or file.
+        vehicle: A vehicle, its name or file.
         plant: Seed, or a plant file, whose own severity and seed then also make the camera.
         severity: Of a drawn plant.
         camera: What it sends.
@@ -98,7 +103,7 @@ def make_plan(
     Raises:
         PlantSpecError: The plant cannot be made, or there is no such severity or camera.
     """
-    ours = load_vehicle(vehicle)
+    ours = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
     spec, ours = site_of(site, spec), vehicle_at(site, ours)
     if site == "open-water" and camera != "none":

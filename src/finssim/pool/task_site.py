@@ -32,8 +32,8 @@ from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.lockstep import run_together
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import AgentPilot, Pilot
+from finssim.robot.reading import Reading
 from finssim.robot.recorder import Recorder
-from finssim.robot.robot import Reading
 from finssim.robot.runtime import Runtime
 from finssim.robot.team import Team, encode_track
 from finssim.tasks.arrays import TaskArrays

@@ -24,7 +24,7 @@ from finssim.control.motor_map import MotorMap
 from finssim.geometry.rotations import quat_inverse_rotate, quat_to_matrix
 from finssim.robot.link.frames import StatusFlag
 from finssim.robot.messages import CommandEcho, Telemetry, ThrusterCommand
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 
 __all__ = [

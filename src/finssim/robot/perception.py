@@ -48,7 +48,7 @@ from finssim.robot.messages import (
     Picture,
     Telemetry,
 )
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 
 __all__ = ["Aboard", "Perception", "Stuck", "Unfused", "Unlocated"]

@@ -12,9 +12,10 @@ import numpy.typing as npt
 from finssim.control import ControlError
 from finssim.control.allocation import Allocator
 from finssim.control.controllers import CONTROLLERS
-from finssim.control.guidance import Goal, Guide, Known, Measured, goal_at
+from finssim.control.guidance import Goal, Guide, Known, Measured, Track, goal_at
 from finssim.control.modes import action_mode, mode_from_dict
 from finssim.control.policy import PolicyError, read_description
+from finssim.geometry.rotations import quat_from_yaw, quat_multiply
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:
@@ -80,11 +81,12 @@ class AgentPilot:
         """
         self.agent, self.observer, self.period, self.name = agent, observer, agent.period, agent.name
         self.mode = action_mode(agent.action, vehicle, agent.wrench_scale)
+        self._input_noise: dict[str, float] = {}
         self.reset()
 
     def describe(self) -> dict[str, Any]:
         """Who it is, as plain data."""
-        about = self.agent.describe()
+        about = self.agent.describe() | ({"input_noise": self._input_noise} if self._input_noise else {})
         if self.observer is None:
             return about
         task = self.observer.task
@@ -98,11 +100,30 @@ class AgentPilot:
         """Forget what was seen and done."""
         self._memory = self.agent.reset(1)
         self.observation = self.action = np.zeros(0, np.float32)
+        self._random = np.random.default_rng(round(self._input_noise.get("seed", 0)))
         if self.observer is not None:
             self.observer.restart()
 
+    def disturb_input(self, *, position_std: float, yaw_std: float, seed: int = 0) -> None:
+        """From now on see position and heading with independent errors, drawn anew for every decision.
+
+        The published ablation "+ localization noise" has 5 cm per axis and 10 degrees; it touches the controller's
+        input alone.
+
+        Args:
+            position_std: Standard deviation of each coordinate [m].
+            yaw_std: Of the heading [rad].
+            seed: Of the errors; `reset` starts them again.
+        """
+        self._input_noise = {"position_std_m": position_std, "yaw_std_rad": yaw_std, "seed": seed}
+        self.reset()
+
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
         """Wanted thrusts in canonical order [N], (n,)."""
+        if self._input_noise:
+            moved = reading.position + self._random.normal(0.0, self._input_noise["position_std_m"], 3)
+            turn = quat_from_yaw(self._random.normal(0.0, self._input_noise["yaw_std_rad"]))
+            reading = Track(moved, quat_multiply(turn, reading.quaternion), np.asarray(reading.nu, float))
         if self.observer is not None:
             previous = self.action if self.action.size else None
             self.observation = self.observer.observe(reading, guide, t, previous)

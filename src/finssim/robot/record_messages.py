@@ -29,7 +29,7 @@ from finssim.robot.messages import (
     Picture,
     Telemetry,
 )
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import with_navigation
 

@@ -23,8 +23,8 @@ from finssim.mcap_repair import END
 from finssim.provenance import provenance
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry
 from finssim.robot.pictures import jpeg
+from finssim.robot.reading import Reading
 from finssim.robot.record_messages import METADATA, TOPICS, Messages, definition, offered_qos
-from finssim.robot.robot import Reading
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["RecordSink", "Recorder", "recording"]

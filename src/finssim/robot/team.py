@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from finssim.control.guidance import Track
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.robot.runtime import Ticks
 
 __all__ = ["LONGEST_NAME", "Team", "decode_track", "encode_track"]

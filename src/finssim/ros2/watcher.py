@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import rclpy
 
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.ros2.nodes.remote import Readings, RemoteBridge
 from finssim.ros2.nodes.robot_node import LISTENING, RobotNode
 

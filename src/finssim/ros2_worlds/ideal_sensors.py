@@ -6,7 +6,7 @@ import numpy as np
 
 from finssim.geometry.rotations import quat_conjugate, quat_multiply, quat_rotate, quat_to_matrix
 from finssim.robot.messages import Telemetry
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.sensors.depth import ATMOSPHERE
 from finssim.vehicles import Vehicle
 

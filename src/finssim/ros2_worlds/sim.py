@@ -12,7 +12,7 @@ from finssim.engine import Simulator
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import station_of
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.ros2.nodes.bridge_topics import BridgeTopics
 from finssim.ros2.nodes.frames import Frames
 from finssim.ros2.nodes.robot_node import RobotNode

@@ -44,8 +44,8 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = [
     "BASELINES", "NOWHERE", "Agent", "AgentError", "Baseline", "BaselineAgent", "BaselineError", "ConsensusFormation",
-    "FormationPursuit", "Known", "LeadPursuit", "PidAgent", "PolicyAgent", "Readings", "StationPid", "TargetPid",
-    "TrackingPid", "WorldReadings", "agent_for", "baseline", "expert_for", "memory_from",
+    "FormationPursuit", "Known", "LeadPursuit", "PidAgent", "PolicyAgent", "StationPid", "TargetPid",
+    "TrackingPid", "agent_for", "baseline", "expert_for", "known_in", "memory_from",
     "memory_leaves", "restarted", "rollout",
 ]  # fmt: skip
 
@@ -493,17 +493,35 @@ def baseline(task: str, name: str, vehicle: Vehicle | str = "finsrov") -> Baseli
     return have[name](vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle))
 
 
-def memory_leaves(memory: Any) -> list[Any]:
-    """The arrays of a baseline's memory, which is arrays in tuples or dataclasses, in their order; of None none."""
+def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
+    """A baseline's memory, which is arrays in tuples or dataclasses, or None, with a function applied to every array.
+
+    Args:
+        function: Takes an array and those of `others` in its place.
+        memory: Its classes are those of the result.
+        others: Memories of the same baseline.
+    """
     if memory is None or isinstance(memory, np.ndarray):
-        return [] if memory is None else [memory]
+        return None if memory is None else function(memory, *others)
     if is_dataclass(memory) and not isinstance(memory, type):
-        memory = tuple(getattr(memory, field.name) for field in fields(memory))
+        parts = {
+            field.name: mapped(function, *(getattr(one, field.name) for one in (memory, *others)))
+            for field in fields(memory)
+        }
+        return replace(memory, **parts)
     if not isinstance(memory, tuple):
         raise TypeError(
             f"memory of a baseline is a {type(memory).__name__}, expected arrays in tuples or dataclasses"
         )
-    return [leaf for part in memory for leaf in memory_leaves(part)]
+    children = [mapped(function, *each) for each in zip(memory, *others, strict=True)]
+    return type(memory)(*children) if hasattr(memory, "_fields") else tuple(children)
+
+
+def memory_leaves(memory: Any) -> list[Any]:
+    """The arrays of a baseline's memory in their order; of None none."""
+    leaves: list[Any] = []
+    mapped(leaves.append, memory)
+    return leaves
 
 
 def memory_from(leaves: Iterable[Any], fresh: Any) -> Any:
@@ -514,16 +532,7 @@ def memory_from(leaves: Iterable[Any], fresh: Any) -> Any:
         fresh: A memory of the same baseline, whose classes are taken.
     """
     rest = iter(leaves)
-
-    def made(part: Any) -> Any:
-        if part is None or isinstance(part, np.ndarray):
-            return None if part is None else next(rest)
-        if is_dataclass(part) and not isinstance(part, type):
-            return replace(part, **{field.name: made(getattr(part, field.name)) for field in fields(part)})
-        parts = [made(child) for child in part]
-        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
-
-    return made(fresh)
+    return mapped(lambda _: next(rest), fresh)
 
 
 def restarted(memory: Any, fresh: Any, mask: NDArray[Any]) -> Any:
@@ -537,10 +546,7 @@ def restarted(memory: Any, fresh: Any, mask: NDArray[Any]) -> Any:
     Returns:
         The rows of `fresh` where mask is true, those of `memory` elsewhere.
     """
-    pairs = zip(memory_leaves(memory), memory_leaves(fresh), strict=True)
-    return memory_from(
-        [np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old) for old, new in pairs], fresh
-    )
+    return mapped(lambda old, new: np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old), memory, fresh)
 
 
 # Agents.
@@ -558,54 +564,19 @@ class AgentError(ValueError):
     """An agent that does not exist, or that acts otherwise than it is asked to."""
 
 
-class Readings(Protocol):
-    """What is known of n vehicles at a time; a `Measured` for controllers."""
-
-    @property
-    def observation(self) -> NDArray[Any]:
-        """Of the task, (n, size)."""
-
-    @property
-    def position(self) -> Array:
-        """Body origins, world frame [m], (n, 3)."""
-
-    @property
-    def quaternion(self) -> Array:
-        """Body to world, xyzw, (n, 4)."""
-
-    @property
-    def nu(self) -> Array:
-        """Body frame [m/s, rad/s], (n, 6)."""
-
-
-class WorldReadings:
-    """What an environment measured: of every agent its observation, of the first vehicle of each world its state."""
-
-    def __init__(self, arrays: Any, agents: int = 1) -> None:
-        """
-        Args:
-            arrays: Of the environment.
-            agents: In each world.
-        """
-        self._arrays, self._agents = arrays, agents
-
-    @property
-    def observation(self) -> NDArray[np.float32]:
-        """A row for each agent of each world."""
-        observed: NDArray[np.float32] = self._arrays.observation.numpy()
-        return observed.reshape(len(observed) * self._agents, -1)
-
-    position = property(lambda self: self._first(self._arrays.position))
-    quaternion = property(lambda self: self._first(self._arrays.quaternion))
-    nu = property(lambda self: self._first(self._arrays.velocity))
-
-    @staticmethod
-    def _first(array: Any) -> Array:
-        return np.asarray(array.numpy()[:, 0], dtype=float)
+def known_in(environment: Environment) -> Known:
+    """What an environment measured: the observation of every agent of every world, the state of the first vehicle."""
+    arrays = environment.arrays
+    observed: NDArray[np.float32] = arrays.observation.numpy()
+    state = (arrays.position, arrays.quaternion, arrays.velocity)
+    return Known(
+        observed.reshape(len(observed) * environment.agents, -1),
+        *(np.asarray(array.numpy()[:, 0], dtype=float) for array in state),
+    )
 
 
 class Agent(Protocol):
-    """Sees readings and goals, nothing else, and keeps no state: its memory goes in with every call and comes back."""
+    """Sees what is known and a goal, and keeps no state: its memory goes in with every call and comes back."""
 
     name: str
     period: float
@@ -618,7 +589,7 @@ class Agent(Protocol):
     def reset(self, n: int) -> Any:
         """Memory before the first of n episodes' actions: arrays with n rows, in tuples or dataclasses; or None."""
 
-    def act(self, memory: Any, readings: Readings, goal: Goal) -> tuple[NDArray[np.float32], Any]:
+    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions (n, size) and the memory after."""
 
     def describe(self) -> dict[str, Any]:
@@ -661,9 +632,9 @@ class PolicyAgent:
         """Memory of the policy, if it has one."""
         return self.policy.reset(n)
 
-    def act(self, memory: Any, readings: Readings, goal: Goal) -> tuple[NDArray[np.float32], Any]:
+    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions for the environment's observations, a row for each agent of each world."""
-        return self.policy.step(memory, readings.observation)
+        return self.policy.step(memory, known.observation)
 
     def describe(self) -> dict[str, Any]:
         """Name, network, and what it was trained in."""
@@ -697,9 +668,9 @@ class PidAgent:
         """Memory before the first of n episodes' actions: empty integrals."""
         return self.controller.reset(n)
 
-    def act(self, memory: Any, readings: Readings, goal: Goal) -> tuple[NDArray[np.float32], Any]:
+    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Wrench of each world, as a part of the limits; more than a limit is limited axis by axis."""
-        tau, memory = self.controller.command(memory, readings, goal)
+        tau, memory = self.controller.command(memory, known, goal)
         return part_of_limits(tau, self._limits), memory
 
     def describe(self) -> dict[str, Any]:
@@ -718,9 +689,9 @@ class BaselineAgent(PidAgent):
         self.controller = baseline(task.name, name, vehicle)
         self.period = self.controller.period
 
-    def act(self, memory: Any, readings: Readings, goal: Goal) -> tuple[NDArray[np.float32], Any]:
+    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions, a row for each agent of each world."""
-        action, memory = self.controller.act(memory, readings.observation)
+        action, memory = self.controller.act(memory, known.observation)
         return np.clip(action / self.scale, -1.0, 1.0).astype(np.float32), memory
 
 
@@ -803,7 +774,7 @@ def rollout(
     """
     worlds, agents = environment.worlds, environment.agents
     shape = (worlds, -1) if agents == 1 else (worlds, agents, -1)
-    readings, memory = WorldReadings(environment.arrays, agents), agent.reset(worlds * agents)
+    memory = agent.reset(worlds * agents)
     step: Step | None = None
     with nullcontext() if record is None else Recorder(environment.simulator, record) as recorder:
         for k in range(steps + 1):
@@ -811,5 +782,5 @@ def rollout(
             if recorder is not None:
                 recorder.record()
             if k < steps:
-                action, memory = agent.act(memory, readings, goal(k * agent.period))
+                action, memory = agent.act(memory, known_in(environment), goal(k * agent.period))
                 step = environment.step(np.asarray(action, dtype=np.float32).reshape(shape))

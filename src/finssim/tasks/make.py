@@ -25,7 +25,7 @@ from finssim.tasks.team_pursuit import TeamPursuit
 from finssim.tasks.trajectory_tracking import TrajectoryTracking
 from finssim.vehicles import Vehicle
 
-__all__ = ["OBSERVED", "TASKS", "make", "observed", "own_task", "task_named"]
+__all__ = ["OBSERVED", "TASKS", "make", "observed", "own_class", "own_task", "task_named"]
 
 
 # Every task by name.
@@ -56,14 +56,9 @@ def own_task(words: str, **settings: Any) -> Task:
     Raises:
         EnvironmentSetupError: There is no such file, module or name; its code fails; or it makes no task.
     """
-    place, _, name = words.rpartition(":")
-    module = _of_file(Path(place)) if place.endswith(".py") else _of_import(place)
-    found = getattr(module, name, None)
-    if not callable(found):
-        have = [key for key, value in vars(module).items() if _is_task_class(value, module)]
-        raise EnvironmentSetupError(f"{place} has no task '{name}'; tasks there: {', '.join(have) or 'none'}")
+    made = own_class(words, Task, "task")
     try:
-        task = found(**settings)
+        task = made(**settings)
     except TypeError as error:
         raise EnvironmentSetupError(f"task '{words}' cannot be made: {error}") from error
     if not isinstance(task, Task):
@@ -73,8 +68,30 @@ def own_task(words: str, **settings: Any) -> Task:
     return task
 
 
-def _is_task_class(value: Any, module: ModuleType) -> bool:
-    return isinstance(value, type) and issubclass(value, Task) and value.__module__ == module.__name__
+def own_class(words: str, base: type, what: str) -> Any:
+    """A class (or any other callable) of somebody's own file or module.
+
+    Args:
+        words: FILE.py:NAME or MODULE:NAME.
+        base: Class whose subclasses are listed where there is no such name.
+        what: What it is, in messages.
+
+    Raises:
+        EnvironmentSetupError: There is no such file, module or name, or its code fails.
+    """
+    place, _, name = words.rpartition(":")
+    module = _of_file(Path(place)) if place.endswith(".py") else _of_import(place)
+    found = getattr(module, name, None)
+    if not callable(found):
+        have = [
+            key
+            for key, value in vars(module).items()
+            if isinstance(value, type) and issubclass(value, base) and value.__module__ == module.__name__
+        ]
+        raise EnvironmentSetupError(
+            f"{place} has no {what} '{name}'; {what}s there: {', '.join(have) or 'none'}"
+        )
+    return found
 
 
 def _of_file(path: Path) -> ModuleType:

@@ -40,6 +40,8 @@ class MeasurementNoise:
     """Probability that a control step brings nothing new, below 1."""
     delay: float = 0.0
     """How old it is [s], taken to the nearest control step; nothing is older than the episode."""
+    graded: bool = False
+    """Whether worlds differ, from none of all this in the first to all of it in the last."""
 
     def __post_init__(self) -> None:
         values = tuple(getattr(self, field.name) for field in fields(self))
@@ -82,10 +84,11 @@ def connect_measured(present: bool, state: State, arrays: TaskArrays) -> None:
 
 
 def measurements(noise: MeasurementNoise, shape: tuple[int, int], device: wp.Device) -> Packed:
-    """The same errors for every vehicle of every world, (worlds, vehicles); randomisation writes others."""
+    """The errors of every vehicle of every world, (worlds, vehicles); randomisation writes others."""
     seen = Packed(Measurement, shape, device)
+    part = np.linspace(0.0, 1.0, shape[0])[:, None] if noise.graded and shape[0] > 1 else 1.0
     for name, array in seen.fields.items():
-        array.assign(np.full(shape, getattr(noise, name), dtype=np.float32))
+        array.assign(np.full(shape, getattr(noise, name) * part, dtype=np.float32))
     return seen
 
 

@@ -132,9 +132,15 @@ class StationKeeping(PoolTask):
     """... for this long [s]."""
     reward: Reward = field(default_factory=Reward)
     training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02, delay=0.1
+        position_std=0.01,
+        yaw_std=math.radians(1.0),
+        velocity_std=0.02,
+        rate_std=0.02,
+        delay=0.1,
+        graded=True,
     )
-    """About what an estimate is off by, and how late it comes: with exact states, gains are learnt that chatter."""
+    """Up to twice what an estimate is off by, and as late: with exact states alone, gains are learnt that chatter; with
+    noise alone, vehicles that hardly damp their turning are held only while it shakes them."""
 
     def success_rule(self) -> str:
         """See `Task`."""

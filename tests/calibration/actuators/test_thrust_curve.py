@@ -1,6 +1,7 @@
 """Thrust curves: tables as benches and manufacturers write them, c± with honest intervals, the vehicle they make."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -148,7 +149,7 @@ def test_a_log_of_held_levels_gives_its_settled_parts(tmp_path):
     )
     table = read_table(path)
     assert len(table.speed) == 11
-    fit = fit_thruster([table], FINSROV, thrusters=["V_LF"])
+    fit = fit_thruster([replace(table, name="V_LF")], FINSROV)
     assert fit.estimates["V_LF.c_plus"].estimate == pytest.approx(1.1e-4, rel=5e-3)
     assert [one.values["offset"] for one in fit.findings if one.code == "load_cell_offset"] == [
         pytest.approx(0.4, abs=0.005)
@@ -160,13 +161,13 @@ def test_a_slow_sweep_is_used_row_by_row(tmp_path):
     rpm = np.concatenate([np.linspace(0, 2600, 900), np.linspace(2600, 0, 900)])
     force = 1.1e-4 * (rpm * RPM) ** 2 + 0.1 * rng.standard_normal(1800)
     path = write(
-        tmp_path / "sweep.csv",
+        tmp_path / "V_LF.csv",
         "t,rpm,force (N)",
         np.arange(1800) * 0.2,
         rpm + 5 * rng.standard_normal(1800),
         force,
     )
-    fit = fit_thruster([path], FINSROV, thrusters=["V_LF"])
+    fit = fit_thruster([path], FINSROV)
     assert fit.estimates["V_LF.c_plus"].estimate == pytest.approx(1.1e-4, rel=0.01)
     dead = fit.estimates["V_LF.dead_rpm_plus"]
     assert not dead.identifiable, "a continuous sweep shows no gap"
@@ -302,7 +303,7 @@ def test_groups_and_thrusters_are_told_by_file_names(tmp_path):
         (tmp_path / name / "sweep.csv").write_bytes(path.read_bytes())
     again = fit_thruster([tmp_path / "CC/sweep.csv", tmp_path / "CCW/sweep.csv"], FINSROV)
     assert again.changes == fit.changes and set(again.trials) == {"CC/sweep", "CCW/sweep"}
-    one = fit_thruster([paths[0]], FINSROV, thrusters=["H_LF"])
+    one = fit_thruster([paths[0].rename(tmp_path / "H_LF.csv")], FINSROV)
     assert set(one.changes) and all(path.startswith("thrusters.H_LF.") for path in one.changes)
 
 
@@ -352,8 +353,6 @@ def test_a_limit_of_the_vehicle_file_stays_where_the_table_does_not_reach_it(tmp
     ("arguments", "said"),
     [
         ({"group": "XL"}, "no propeller group 'XL': it has CC, CCW"),
-        ({"thrusters": ["T9"]}, "no thruster 'T9'"),
-        ({"thrusters": ["V_LF"], "group": "CC"}, "both given"),
         ({"voltage": 25.0}, "no table at 25 V; there are 16 V"),
     ],
 )

@@ -14,8 +14,8 @@ from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.trials.inputs import drive
 from finssim.geometry.rotations import quat_from_euler
 from finssim.robot.messages import Telemetry
+from finssim.robot.reading import Reading
 from finssim.robot.recorder import Recorder
-from finssim.robot.robot import Reading
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("finsrov")

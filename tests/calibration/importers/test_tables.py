@@ -9,8 +9,8 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers import import_trials
 from finssim.calibration.importers.assemble import read_map
 from finssim.calibration.importers.dispatch import read_trials
+from finssim.calibration.trials.conversion import factor
 from finssim.calibration.trials.trial_files import load_trial
-from finssim.calibration.trials.units import factor
 from finssim.files import OutputError
 
 HINSDALE = Path(__file__).parents[2] / "data" / "hinsdale"

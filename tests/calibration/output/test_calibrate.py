@@ -12,7 +12,7 @@ from rich.console import Console
 from calibration.made_fits import SET, made_fit
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.output.calibrate import all_findings, calibrated, concerns, kept, number_in
-from finssim.calibration.output.report import fit_json, print_fit, state_text
+from finssim.calibration.output.report import fit_json, fit_report, state_text
 from finssim.calibration.output.vehicle_file import number_origins, write_vehicle
 from finssim.vehicles import load_vehicle
 
@@ -143,7 +143,7 @@ def test_the_table_fits_a_hundred_columns():
     """Every parameter, its interval, what the file had and what became of it, on lines of 100 columns at most."""
     fit = made_fit()
     text = io.StringIO()
-    print_fit(fit, calibrated(fit), Console(file=text, width=100), fit.findings)
+    fit_report(fit, calibrated(fit), fit.findings).show(Console(file=text, width=100))
     lines = text.getvalue().splitlines()
     assert max(map(len, lines)) <= 100
     (row,) = (line for line in lines if line.strip().startswith("surge.d1"))

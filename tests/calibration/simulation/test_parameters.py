@@ -15,13 +15,12 @@ VEHICLES = {
 }
 
 
-def made(name, axes, full, extras=()):
+def made(name, axes, extras=()):
     vehicle = VEHICLES[name]
     return Parameters(
         vehicle,
         axes=axes,
         damping=dict.fromkeys(axes, "both"),
-        full=full,
         extras=extras,
         biases=axes,
     )
@@ -34,14 +33,13 @@ def vectors(p, seed):
     return p.start * rng.choice([0.0, 1.0], (20, 1)) + rng.choice([-1.0, 0.0, 1.0], size.shape) * size
 
 
-@pytest.mark.parametrize("full", [False, True], ids=["diagonal", "full"])
 @pytest.mark.parametrize("name", VEHICLES)
 @settings(max_examples=15)
 @given(seed=st.integers(0, 10_000), chosen=st.sets(st.sampled_from(AXES), min_size=1))
-def test_any_vector_is_positive_definite_and_takes_energy_out(name, full, seed, chosen):
+def test_any_vector_is_positive_definite_and_takes_energy_out(name, seed, chosen):
     """M_RB + M_A is symmetric and positive definite; nu · (D1 + D2 diag|nu|) nu >= 0 for velocities of all sizes."""
     axes = tuple(a for a in AXES if a in chosen)
-    p = made(name, axes, full)
+    p = made(name, axes)
     M_A, D1, D2 = p.matrices(vectors(p, seed))
     M = p.M_RB + M_A
     np.testing.assert_allclose(M, np.swapaxes(M, 1, 2), rtol=1e-9, atol=1e-12 * np.abs(M).max())
@@ -60,11 +58,10 @@ def test_any_vector_is_positive_definite_and_takes_energy_out(name, full, seed, 
         assert (power >= -1e-9 * size).all()
 
 
-@pytest.mark.parametrize("full", [False, True], ids=["diagonal", "full"])
 @pytest.mark.parametrize("name", VEHICLES)
-def test_the_start_is_the_vehicle_file(name, full):
+def test_the_start_is_the_vehicle_file(name):
     """Added mass, damping, buoyancy and stiffness of the start vector are those the simulator makes of the file."""
-    p = made(name, AXES, full, ("k", "buoyancy_excess", "thrust_scale"))
+    p = made(name, AXES, ("k", "buoyancy_excess", "thrust_scale"))
     plants = p.plants(p.start)
     own = vehicle_parameters(VEHICLES[name], "calibrated")
     np.testing.assert_allclose(
@@ -75,14 +72,13 @@ def test_the_start_is_the_vehicle_file(name, full):
     assert not plants.bias.any()
     if VEHICLES[name].body.center_of_buoyancy[2] > VEHICLES[name].body.center_of_gravity[2]:
         np.testing.assert_allclose(plants.fields["r_b"][0, 0], own["r_b"], atol=1e-9)
-    if not full:
-        np.testing.assert_allclose(plants.fields["D1"][0, 0], own["D1"])
-        np.testing.assert_allclose(plants.fields["D2"][0, 0], own["D2"])
+    np.testing.assert_allclose(plants.fields["D1"][0, 0], own["D1"])
+    np.testing.assert_allclose(plants.fields["D2"][0, 0], own["D2"])
 
 
 def test_what_is_not_free_stays():
     """A fit of surge leaves every entry of the other axes as the file has it."""
-    p = made("bluerov2", ("surge",), False)
+    p = made("bluerov2", ("surge",))
     M_A, D1, D2 = p.matrices(p.start + 3.0)
     rest = ~np.eye(6, dtype=bool)[0]
     assert (M_A[0, 0, 0], D1[0, 0, 0], D2[0, 0, 0]) == pytest.approx((8.5, 7.03, 21.18))
@@ -92,7 +88,7 @@ def test_what_is_not_free_stays():
 
 def test_a_bias_acts_against_the_motion_at_the_reference_point():
     """M nu_dot + D nu + b = tau: a bias b of surge pushes with -b at the reference point, and so turns the origin."""
-    p = made("finsrov", ("surge",), False)
+    p = made("finsrov", ("surge",))
     x = p.start.copy()
     x[p.names.index("surge.bias")] = 2.0
     np.testing.assert_allclose(p.plants(x).bias[0, 0], [-2.0, 0, 0, 0, -2.0 * -0.08, 0], atol=1e-12)
@@ -100,7 +96,7 @@ def test_a_bias_acts_against_the_motion_at_the_reference_point():
 
 def test_stiffness_is_the_restoring_moment_of_the_plant():
     """k = B (z_b - z_r) - W (z_g - z_r), whatever else is free."""
-    p = made("finsrov", ("roll",), False, ("k", "buoyancy_excess"))
+    p = made("finsrov", ("roll",), ("k", "buoyancy_excess"))
     x = p.start.copy()
     x[p.names.index("k")], x[p.names.index("buoyancy_excess")] = 5.0, 3.0
     f, v = p.plants(x).fields, VEHICLES["finsrov"]
@@ -113,6 +109,6 @@ def test_stiffness_is_the_restoring_moment_of_the_plant():
 def test_what_cannot_be_estimated_is_refused():
     """Unknown words and sets without coefficients say what there is."""
     with pytest.raises(CalibrationError, match="cannot estimate 'colour'"):
-        made("finsrov", ("surge",), False, ("colour",))
+        made("finsrov", ("surge",), ("colour",))
     with pytest.raises(CalibrationError, match="no damping coefficients"):
         Parameters(VEHICLES["finsrov"], axes=("surge",), damping={"surge": "both"}, hydrodynamics="mesh")

@@ -166,7 +166,7 @@ def test_a_lens_taken_as_exact_is_said(pool, capsys, options):
     """As a note in the table and a finding in JSON, unless somebody told its errors or it is fitted."""
     files = {"camera": pool / "camera.yaml", "out": pool / "pool.yaml", "water_height": 1.0}
     run([pool / "points.csv"], **files, **options)
-    assert ("- the lens is taken as exact" in capsys.readouterr().out) == (not options)
+    assert ("· the lens is taken as exact" in capsys.readouterr().out) == (not options)
     run([pool / "points.csv"], **files, **options, as_json=True)
     said = json.loads(capsys.readouterr().out)
     assert ("lens_exact" in {one["code"] for one in said["findings"]}) == (not options)

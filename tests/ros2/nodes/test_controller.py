@@ -20,7 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from finssim.control.allocation import Allocator
 from finssim.control.controllers import controller
 from finssim.control.guidance import Station, goal_at
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.ros2.nodes.controller import Controller
 from finssim.ros2.nodes.conversions import force_of, nanoseconds
 from finssim.ros2.nodes.ros_messages import RosMessages, ros_type

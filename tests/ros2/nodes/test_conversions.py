@@ -20,7 +20,7 @@ from finssim.robot.messages import (
     TagCorners,
     Telemetry,
 )
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.ros2.codec import codec_of
 from finssim.ros2.nodes.conversions import (
     aid_of,

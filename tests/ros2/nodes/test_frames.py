@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.geometry.rotations import quat_from_euler, quat_rotate, quat_to_euler
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.ros2.nodes.frames import OPTICAL, Odometer, Pose
 
 DT = 1.0 / 60.0

@@ -20,7 +20,7 @@ from finssim.geometry.rotations import quat_from_euler, quat_to_matrix, quat_yaw
 from finssim.localization.pool import write_pool
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.robot.messages import Picture
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.ros2.nodes.conversions import nanoseconds, tags_of, xyz, xyzw
 from finssim.ros2.nodes.frames import Pose
 from finssim.ros2.nodes.localizer import Localizer

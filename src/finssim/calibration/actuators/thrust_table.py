@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
+from finssim.calibration.trials.conversion import TIME_UNITS, UNITS
 from finssim.calibration.trials.trial import Trial
-from finssim.calibration.trials.units import TIME_UNITS, UNITS
 from finssim.text_table import TextTable, read_text_table
 
 __all__ = ["STANDING", "ThrustTable", "find_steps", "levels", "read_table", "tables_of_trial"]

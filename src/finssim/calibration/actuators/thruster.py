@@ -48,8 +48,6 @@ class Side:
     """[N]"""
     samples: int
     rejected: int
-    per_table: tuple[float, ...]
-    """c of every table alone."""
 
 
 def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
@@ -99,7 +97,6 @@ def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
         rmse=float(np.sqrt(np.mean(error**2))),
         samples=int(np.count_nonzero(keep)),
         rejected=int(np.count_nonzero(~keep)),
-        per_table=per_table,
     )
 
 
@@ -603,35 +600,23 @@ class Target(NamedTuple):
 
 
 def find_targets(
-    tables: Sequence[ThrustTable], vehicle: Vehicle, thrusters: Sequence[str] | None, group: str | None
+    tables: Sequence[ThrustTable], vehicle: Vehicle, group: str | None
 ) -> tuple[list[Target], list[Finding]]:
     """Targets with their tables, and findings.
 
-    What the caller names comes first. Otherwise a table speaks about the thruster that its columns name; or about the
-    thruster or group whose name is a word of its file's name (`H_LF.csv`, `run2-CCW.csv`); or about all thrusters.
+    A group that the caller names comes first. Otherwise a table speaks about the thruster that its columns name; or
+    about the thruster or group whose name is a word of its file's name (`H_LF.csv`, `run2-CCW.csv`); or about all.
 
     Raises:
-        CalibrationError: Unknown names, or both kinds of names given.
+        CalibrationError: Unknown names.
     """
     groups = {thruster.group for thruster in vehicle.thrusters.values()} - {""}
-    if thrusters is not None and group is not None:
-        raise CalibrationError("thrusters and group are both given, expected one of them")
     if group is not None:
         if group not in groups:
             raise CalibrationError(
                 f"{vehicle.name} has no propeller group '{group}': it has {', '.join(sorted(groups)) or 'none'}"
             )
         return [Target(group, _members(vehicle, group), tuple(tables))], []
-    if thrusters is not None:
-        unknown = [name for name in thrusters if name not in vehicle.thrusters]
-        if unknown or not thrusters:
-            raise CalibrationError(
-                f"{vehicle.name} has no thruster '{', '.join(unknown)}': it has {', '.join(vehicle.thrusters)}"
-            )
-        named = {table.thruster for table in tables}
-        if named <= set(thrusters):
-            return [_own(name, tables) for name in thrusters if name in named], []
-        return [Target(name, (name,), tuple(tables)) for name in thrusters], []
     found: dict[str, list[ThrustTable]] = {}
     for table in tables:
         found.setdefault(_spoken_of(table, vehicle, groups), []).append(table)
@@ -653,10 +638,6 @@ def find_targets(
     ], []
 
 
-def _own(name: str, tables: Sequence[ThrustTable]) -> Target:
-    return Target(name, (name,), tuple(table for table in tables if table.thruster == name))
-
-
 def _members(vehicle: Vehicle, group: str) -> tuple[str, ...]:
     return tuple(name for name, thruster in vehicle.thrusters.items() if thruster.group == group)
 
@@ -668,7 +649,7 @@ def _spoken_of(table: ThrustTable, vehicle: Vehicle, groups: set[str]) -> str:
     if table.thruster is not None and len(vehicle.thrusters) > 1:
         raise CalibrationError(
             f"{table.name}: {vehicle.name} has no thruster '{table.thruster}': its thrusters are "
-            f"{', '.join(vehicle.thrusters)}; rename the columns, or say thrusters="
+            f"{', '.join(vehicle.thrusters)}: rename the columns"
         )
     for known in (list(vehicle.thrusters), sorted(groups)):
         said = [
@@ -954,7 +935,6 @@ def fit_thruster(
     tables: Iterable[ThrustTable | Trial | str | os.PathLike[str]],
     vehicle: Vehicle,
     *,
-    thrusters: Sequence[str] | None = None,
     group: str | None = None,
     columns: Mapping[str, str] | None = None,
     voltage: float | None = None,
@@ -966,7 +946,6 @@ def fit_thruster(
     Args:
         tables: CSV files (see `read_table`), folders of bench trials, or what was read from them.
         vehicle: Whose thrusters they are.
-        thrusters: Thrusters that the tables speak about, instead of what columns and file names say.
         group: Propeller group that all tables speak about.
         columns: What the headers do not tell; see `read_table`.
         voltage: At which the numbers shall hold [V], and for tables without a voltage column the voltage they were
@@ -984,7 +963,7 @@ def fit_thruster(
     if not read:
         raise CalibrationError("no table given: name at least one CSV file of speeds and thrusts")
     _refuse_duplicates(read)
-    found, findings = find_targets(read, vehicle, thrusters, group)
+    found, findings = find_targets(read, vehicle, group)
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
     quality: dict[str, dict[str, float]] = {}
@@ -1015,7 +994,6 @@ def fit_thruster(
         settings={
             "voltage": voltage,
             "pool_voltages": pool_voltages,
-            "thrusters": thrusters,
             "group": group,
             "seed": seed,
         },

@@ -17,7 +17,7 @@ from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.vehicle import Axis
 
-__all__ = ["Programme", "RATE", "programmes", "which_axes"]
+__all__ = ["Programme", "RATE", "programmes", "travel", "which_axes"]
 
 Array = NDArray[np.float64]
 

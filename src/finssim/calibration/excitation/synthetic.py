@@ -37,7 +37,7 @@ from finssim.physics.types import vec6
 from finssim.sensors import SensorSuite
 from finssim.vehicles import Vehicle
 
-__all__ = ["NOISE_PROFILES", "NoiseProfile", "Recording", "record", "simulate_programme", "trials_of"]
+__all__ = ["NoiseProfile", "Recording", "record", "simulate_programme", "trials_of"]
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from finssim.geometry.frames import FROM_FOSSEN
 from finssim.vehicles import Vehicle
 from finssim.vehicles.part import did_you_mean
 
-__all__ = ["FRAMES", "NEUTRAL", "STICKS", "mixed_pulses", "outputs_of"]
+__all__ = ["NEUTRAL", "STICKS", "mixed_pulses", "outputs_of"]
 
 NEUTRAL = 1500.0
 """Pulse width of no thrust [µs]."""

@@ -14,7 +14,17 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.importers.ardusub_outputs import FRAMES, NEUTRAL, STICKS, mixed_pulses, outputs_of
-from finssim.calibration.trials.conversion import SAME_ROW, in_our_frames, merged, ordered, tidy_quaternions
+from finssim.calibration.trials.conversion import (
+    EXTRA_COLUMNS,
+    GRAVITY,
+    SAME_ROW,
+    TIME_UNITS,
+    factor,
+    in_our_frames,
+    merged,
+    ordered,
+    tidy_quaternions,
+)
 from finssim.calibration.trials.trial import (
     COLUMNS,
     INPUT_PREFIXES,
@@ -26,7 +36,6 @@ from finssim.calibration.trials.trial import (
     Trial,
     column_of,
 )
-from finssim.calibration.trials.units import EXTRA_COLUMNS, GRAVITY, TIME_UNITS, factor
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.vehicles import load_vehicle

@@ -31,9 +31,9 @@ from finssim.calibration.importers.assemble import (
     split_table,
     trial_of,
 )
+from finssim.calibration.trials.conversion import TIME_UNITS, factor
 from finssim.calibration.trials.trial import Array, Trial, column_of
 from finssim.calibration.trials.trial_files import Table, read_table
-from finssim.calibration.trials.units import TIME_UNITS, factor
 from finssim.files import plain_name
 from finssim.mcap_metadata import mcap_metadata
 from finssim.mcap_repair import whole_mcap
@@ -41,7 +41,7 @@ from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import json_value
 
-__all__ = ["FORMATS", "import_trials", "print_folders", "read_trials"]
+__all__ = ["import_trials", "print_folders", "read_trials"]
 
 TABLES = (".csv", ".tsv", ".txt", ".dat", ".parquet", ".pq")
 TIME_NAMES = ("t", "time", "time_s", "time_secs", "timestamp", "stamp")

@@ -7,6 +7,7 @@ derived where the other columns allow it, and NaN where they do not. Nothing is 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,8 @@ from finssim.geometry.rotations import (
 from finssim.vehicles import Vehicle
 
 __all__ = [
-    "AttitudeSignal", "Motion", "accelerometer_place", "attitude_samples", "attitude_signal",
-    "holds_gravity", "motion",
+    "ACCELERATION", "AttitudeSignal", "Motion", "accelerometer_place", "attitude_samples",
+    "attitude_signal", "holds_gravity", "motion", "up_in_body",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -122,22 +123,6 @@ STEEPEST = 0.3
 """Cosine of the tilt below which a vertical velocity tells nothing of heave."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Velocities:
-    """Velocity and position of the body origin, (m, ...) on the grid."""
-
-    nu: Array
-    """(m, 6)"""
-    raw: Array
-    """(m, 6)"""
-    source: tuple[str, ...]
-    noise_std: Array
-    """(6,)"""
-    position: Array
-    """World frame [m], (m, 3)."""
-    findings: tuple[Finding, ...]
-
-
 @dataclass
 class _Column:
     """One column on the grid; all NaN if the trial does not have it."""
@@ -149,8 +134,8 @@ class _Column:
     slope_std: float = np.nan
 
 
-def velocities(trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSignal) -> Velocities:
-    """Velocity and position of the body origin.
+def velocities(trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSignal) -> dict[str, Any]:
+    """Velocity and position of the body origin: the fields of `Motion` that follow from the measured columns.
 
     Args:
         trial: The trial.
@@ -184,14 +169,14 @@ def velocities(trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSign
         if name:
             nu[:, i], source[i] = column, name
             noise[i] = stds[2] if i == 2 else stds[:2].mean()
-    return Velocities(
-        nu=nu,
-        raw=raw,
-        source=tuple(source),
-        noise_std=noise,
-        position=position,
-        findings=tuple(findings),
-    )
+    return {
+        "nu": nu,
+        "raw": raw,
+        "nu_source": tuple(source),
+        "noise_std": noise,
+        "position": position,
+        "findings": tuple(findings),
+    }
 
 
 def arm_velocity(omega: Array, arm: Array) -> Array:
@@ -370,20 +355,16 @@ def motion(trial: Trial, vehicle: Vehicle) -> Motion:
     t = trial.t[0] + np.arange(int(np.floor(trial.duration * rate + 1e-6)) + 1) / rate
     attitude = attitude_signal(trial, t)
     found = velocities(trial, vehicle, t, attitude)
+    found["findings"] = (*inputs.findings, *found["findings"])
     tau = applied_wrench(inputs, vehicle, t)
     return Motion(
         t=t,
         rate=rate,
-        nu=found.nu,
-        raw=found.raw,
         quaternion=attitude.quaternion,
-        position=found.position,
         tau=tau,
         phase=_phase(trial, t),
-        valid=_valid(tau, found),
-        nu_source=found.source,
-        noise_std=found.noise_std,
-        findings=(*inputs.findings, *found.findings),
+        valid=_valid(tau, found["nu"]),
+        **found,
     )
 
 
@@ -404,7 +385,7 @@ def _phase(trial: Trial, t: Array) -> NDArray[np.str_]:
     return trial.phase[np.maximum(np.searchsorted(trial.t, t + 1e-9, side="right") - 1, 0)]
 
 
-def _valid(tau: Array, found: Velocities) -> NDArray[np.bool_]:
-    known = np.isfinite(found.nu)
+def _valid(tau: Array, nu: Array) -> NDArray[np.bool_]:
+    known = np.isfinite(nu)
     counted = known.mean(axis=0) >= MOST if known.any() else np.zeros(len(NU), bool)
     return np.asarray(np.isfinite(tau).all(axis=1) & known.any(axis=1) & known[:, counted].all(axis=1))

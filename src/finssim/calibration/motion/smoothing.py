@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.fft import dst
 from scipy.linalg import solveh_banded
 
-__all__ = ["longest_step", "smooth", "stretches", "without_spikes"]
+__all__ = ["longest_step", "smooth", "spans_of", "stretches", "without_spikes"]
 
 Array = NDArray[np.float64]
 
@@ -72,6 +72,12 @@ def stretches(t: Array, max_gap: float) -> list[slice]:
     """Runs of samples with no step longer than `max_gap`."""
     edges = [0, *(np.flatnonzero(np.diff(t) > max_gap) + 1), len(t)]
     return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False) if b > a]
+
+
+def spans_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Runs of samples that are true, [begin, end) each."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(b), int(e)) for b, e in edges.reshape(-1, 2)]
 
 
 def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:

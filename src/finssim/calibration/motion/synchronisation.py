@@ -19,7 +19,7 @@ from finssim.calibration.trials.trial import Trial
 from finssim.geometry.rotations import quat_rotate
 from finssim.vehicles import Vehicle
 
-__all__ = ["Offset", "stream_offsets"]
+__all__ = ["Offset", "on_grid", "stream_offsets"]
 
 Array = NDArray[np.float64]
 
@@ -71,29 +71,29 @@ def stream_offsets(trial: Trial, vehicle: Vehicle) -> dict[str, Offset]:
     t = np.arange(trial.t[0], trial.t[-1], 1.0 / RATE)
     if len(t) < 10:
         return {}
-    omega, _ = _on_grid(trial, ("p", "q", "r"), t, 2)
+    omega, _ = on_grid(trial, ("p", "q", "r"), t, 2)
     attitude = attitude_signal(trial, t)
     found = {"attitude": _offset("rates", omega, attitude.rates)}
     if found["attitude"] is not None:  # the others are compared through the attitude as it should be
         attitude = attitude_signal(trial, t - found["attitude"].seconds)
-    nu, nu_slope = _on_grid(trial, ("u", "v", "w"), t, 2)
+    nu, nu_slope = on_grid(trial, ("u", "v", "w"), t, 2)
     reference, predicted = _predicted(trial, vehicle, t, attitude.quaternion, nu, nu_slope, omega)
-    measured = _on_grid(trial, ACCELERATION, t, 2)[0]
+    measured = on_grid(trial, ACCELERATION, t, 2)[0]
     if not _sampled_together(trial):
         found["acceleration"] = _offset(reference, predicted, measured)
     elif reference == "velocity":
         weight = _gravity(trial, vehicle, attitude.quaternion)
         found["velocity"] = _offset("acceleration", measured - weight, predicted - weight)
-    nu = _on_grid(trial, ("u", "v", "w"), t - _seconds(found.get("velocity")), 2)[0]
+    nu = on_grid(trial, ("u", "v", "w"), t - _seconds(found.get("velocity")), 2)[0]
     through_world = quat_rotate(attitude.turn, nu)
     if not attitude.tilt:
         through_world[:, 2] = np.nan
-    found["position"] = _offset("velocity", through_world, _on_grid(trial, ("x", "y", "z"), t, 3)[1])
+    found["position"] = _offset("velocity", through_world, on_grid(trial, ("x", "y", "z"), t, 3)[1])
     if trial.has("z"):
-        vertical = _on_grid(trial, ("z",), t - _seconds(found["position"]), 3)[1]
+        vertical = on_grid(trial, ("z",), t - _seconds(found["position"]), 3)[1]
     else:
         vertical = through_world[:, 2:]
-    depth = _on_grid(trial, ("depth",), t, 3)[1]
+    depth = on_grid(trial, ("depth",), t, 3)[1]
     found["depth"] = _offset("position" if trial.has("z") else "velocity", vertical, -depth)
     return {group: offset for group, offset in found.items() if offset is not None}
 
@@ -110,8 +110,8 @@ def _sampled_together(trial: Trial) -> bool:
     return bool(np.sum(rates & felt) >= 0.9 * np.sum(felt))
 
 
-def _on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int) -> tuple[Array, Array]:
-    """Values and slopes of columns, (m, c) each; NaN where there are none."""
+def on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int = 2) -> tuple[Array, Array]:
+    """Columns of a trial, smoothed, and their slopes at times t (m,), (m, c) each; NaN where there are none."""
     value, slope = np.full((len(t), len(columns)), np.nan), np.full((len(t), len(columns)), np.nan)
     for i, name in enumerate(columns):
         at, y = trial.series(name)
@@ -132,7 +132,7 @@ def _predicted(
     if np.isfinite(v).any(axis=0).all():
         group = "velocity"
         turning = np.nan_to_num(omega)
-        turning_dot = np.nan_to_num(_on_grid(trial, ("p", "q", "r"), t, 2)[1])
+        turning_dot = np.nan_to_num(on_grid(trial, ("p", "q", "r"), t, 2)[1])
         r = accelerometer_place(trial, vehicle)
         a = v_dot + np.cross(turning, v) + np.cross(turning_dot, r) + np.cross(turning, np.cross(turning, r))
     else:

@@ -16,7 +16,7 @@ from finssim.calibration.output.vehicle_file import Key, file_tree, folded, leav
 from finssim.provenance import provenance
 from finssim.vehicles import CalibrationRecord, Provenance, Vehicle, VehicleError, check_vehicle
 
-__all__ = ["all_findings", "calibrated", "concerns", "estimate_at", "kept", "number_in"]
+__all__ = ["SCALED", "all_findings", "calibrated", "concerns", "estimate_at", "kept", "number_in"]
 
 
 SCALED = ("c_plus", "c_minus", "force_min", "force_max")

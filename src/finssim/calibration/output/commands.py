@@ -11,11 +11,11 @@ from rich.console import Console
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Fit
-from finssim.calibration.output.calibrate import all_findings, calibrated, kept
+from finssim.calibration.output.calibrate import all_findings, calibrated
 from finssim.calibration.output.report import (
     command_line,
     fit_json,
-    print_fit,
+    fit_report,
     progress_bar,
     publish,
     refuse_places,
@@ -107,7 +107,6 @@ def calibrate_hydrodynamics(
     out: Path,
     axes: str | None = None,
     method: str = "auto",
-    full: bool = False,
     estimate: str = "",
     damping: str = "auto",
     fix: str = "",
@@ -129,7 +128,6 @@ def calibrate_hydrodynamics(
         method (METHOD): regression: each axis by its equation of motion; simulation: what simulates the trials best;
             auto: the regression where it replays the trials very well, else the simulation unless that replays them
             worse.
-        full: Also couplings between axes (simulation method).
         estimate (NAMES): Also fit, of thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k (simulation
             method); or parameters of the vehicle's terms, such as lift.coefficient (either method).
         damping (KIND): Drag: linear, quadratic, both, or auto to choose.
@@ -154,7 +152,7 @@ def calibrate_hydrodynamics(
         from finssim.calibration.simulation.fit import ESTIMATE
 
         words = [name for name in further if name in ESTIMATE]
-        for given, option in ((full, "--full"), (words, "--estimate"), (horizon is not None, "--horizon")):
+        for given, option in ((words, "--estimate"), (horizon is not None, "--horizon")):
             if given:
                 raise CalibrationError(
                     f"{option} {ONLY_SIMULATION}: a regression looks at one axis at a time"
@@ -175,7 +173,6 @@ def calibrate_hydrodynamics(
             body,
             axes=chosen,
             method=method,
-            full=full,
             estimate=further,
             damping=damping,
             known=known,
@@ -256,14 +253,8 @@ def _finish(
 
         write_ranges(fit, ranges, vehicle)
 
-    def show(console: Console) -> None:
-        print_fit(fit, vehicle, console, findings)
-        if unchanged := kept(fit, vehicle):
-            text = f"not identifiable, so the file keeps its own: {', '.join(unchanged)}"
-            console.print(text, highlight=False, markup=False)
-
     record = fit_json(fit, vehicle, out=out, findings=findings) if as_json else None
-    publish(record, show, (out, report, ranges))
+    publish(record, fit_report(fit, vehicle, findings).show, (out, report, ranges))
     if fit.interrupted:
         raise KeyboardInterrupt
     return vehicle

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,10 +40,6 @@ class Factor(NamedTuple):
     low: float
     high: float
     why: str
-
-    def text(self) -> str:
-        """As a YAML list."""
-        return f"[{self.low:.4g}, {self.high:.4g}]"
 
 
 def write_ranges(fit: Fit, path: str | os.PathLike[str], vehicle: Vehicle | None = None) -> None:
@@ -150,38 +146,26 @@ def _given(vehicle: Vehicle, path: str) -> bool:
 
 
 def _text(fit: Fit, vehicle: Vehicle) -> str:
-    factors = range_factors(fit, vehicle)
-    record = vehicle.calibrations[-1]
+    record, tree = vehicle.calibrations[-1], dict[str, Any]()
+    for entry, factor in range_factors(fit, vehicle).items():
+        _place(tree, entry, factor)
     lines = [
         "# Factors on the numbers of the calibrated vehicle. told: 95 % interval over the estimate, at least",
         "# 2 % to either side; not told by the trials, or guessed: half to double; not asked for: 0.9 to 1.1.",
         f'source: "95 % intervals, {record.sentence()}; vehicle {vehicle.sha256[:16]}"',
+        *_lines(tree),
     ]
-    for family in FAMILIES:
-        rows: dict[str, Factor] = {
-            axis: factors[f"{family}.{axis}"] for axis in AXES if f"{family}.{axis}" in factors
-        }
-        lines += _mapping(family, "axes", rows)
-    of_terms = [
-        path.split(".") for path in vehicle.hydrodynamic_set("calibrated").term_scalars if path in factors
-    ]
-    for term in dict.fromkeys(path[0] for path in of_terms if len(path) > 1):
-        own = {path[1]: factors[".".join(path)] for path in of_terms if path[0] == term}
-        lines += _mapping(term, None, own)
-    for key in ("volume", "time_constant", "delay", *(path[0] for path in of_terms if len(path) == 1)):
-        if key in factors:
-            lines.append(f"{key}: {factors[key].text()}  # {factors[key].why}")
-    thrust = {key: factors[f"thrust.{key}"] for key in ("all", "each") if f"thrust.{key}" in factors}
-    lines += _mapping("thrust", None, thrust)
     return "\n".join(lines) + "\n"
 
 
-def _mapping(head: str, inner: str | None, rows: dict[str, Factor]) -> Sequence[str]:
-    if not rows:
-        return []
-    pad = "  " if inner is None else "    "
-    body = [f"{pad}{key}: {factor.text()}  # {factor.why}" for key, factor in rows.items()]
-    return [f"{head}:", *([] if inner is None else [f"  {inner}:"]), *body]
+def _lines(tree: Mapping[str, Any], pad: str = "") -> Iterator[str]:
+    """YAML of factors, each with its reason."""
+    for key, node in tree.items():
+        if isinstance(node, Factor):
+            yield f"{pad}{key}: [{node.low:.4g}, {node.high:.4g}]  # {node.why}"
+        else:
+            yield f"{pad}{key}:"
+            yield from _lines(node, pad + "  ")
 
 
 Array = NDArray[np.float64]
@@ -355,12 +339,12 @@ def _correlation(of: Mapping[str, str], found: Mapping[str, Any] | None) -> tupl
     return names, R / np.outer(scale, scale)
 
 
-def _place(tree: dict[str, Any], entry: str, drawn: dict[str, list[float]]) -> None:
-    family, _, axis = entry.partition(".")
-    if axis in AXES:
-        tree.setdefault(family, {}).setdefault("axes", {})[axis] = drawn
-    else:
-        tree.setdefault(family, {})[axis] = drawn
+def _place(tree: dict[str, Any], entry: str, drawn: Any) -> None:
+    """Put what is drawn where a ranges file has it: `linear_damping.surge` under `axes` of its family."""
+    *above, key = entry.split(".")
+    for name in [*above, "axes"] if key in AXES else above:
+        tree = tree.setdefault(name, {})
+    tree[key] = drawn
 
 
 def _short(numbers: Any) -> list[float]:

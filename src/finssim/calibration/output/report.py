@@ -10,33 +10,36 @@ import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, sentences
+from finssim.calibration.findings import Finding, plain, sentences
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
 from finssim.calibration.output.calibrate import kept, number_in
 from finssim.files import atomic_directory, atomic_write, refuse_unwritable
-from finssim.page import RECORD_FILE, Page
+from finssim.page import RECORD_FILE, Page, Pictures
 from finssim.provenance import provenance
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
-    from rich.console import Console
+
+    from finssim.geometry.optics import Lens
 
 __all__ = [
-    "BLUE", "GRAY", "ORANGE", "command_line", "draw_correlation", "fit_json", "interval_text",
-    "new_figure", "number_text", "png", "print_fit", "progress_bar", "publish", "refuse_places",
-    "state_text", "write_report",
+    "AS_GIVEN", "BLUE", "ExtraTable", "GRAY", "HEADS", "ORANGE", "Report", "command_line",
+    "draw_correlation", "fit_json", "fit_report", "interval_text", "new_figure", "number_text",
+    "picture_axes", "png", "progress_bar", "publish", "refuse_places", "state_text", "write_report",
 ]  # fmt: skip
 
 
@@ -225,6 +228,12 @@ def _draw(figure: Figure, cell: SubplotSpec, curve: Curve) -> None:
         axes.spines[["top", "right"]].set_visible(False)
 
 
+def picture_axes(axes: Axes, lens: Lens) -> None:
+    """Axes of pixels over a lens's picture."""
+    axes.set(xlim=(-0.5, lens.width - 0.5), ylim=(lens.height - 0.5, -0.5), aspect="equal")
+    axes.set(xlabel="u [px]", ylabel="v [px]")
+
+
 def new_figure(width: float, height: float, constrained: bool = True) -> Figure:
     """An empty figure.
 
@@ -241,7 +250,8 @@ def new_figure(width: float, height: float, constrained: bool = True) -> Figure:
     return figure
 
 
-HEADS = ("parameter", "estimate", "95 % interval", "unit", "file had", "state")
+HEADS = ("parameter", "estimate", "95 % interval", "unit")
+"""Of every table of estimates; what follows differs."""
 
 QUALITY = {
     "r2": "R²",
@@ -274,16 +284,8 @@ def fit_json(
         "vehicle": {"name": fit.vehicle.name, "sha256": fit.vehicle.sha256},
         "parameters": {name: estimate.as_json() for name, estimate in fit.estimates.items()},
         "kept": kept(fit, vehicle),
-        "quality": {
-            what: {key: _finite(value) for key, value in figures.items()}
-            for what, figures in fit.quality.items()
-        },
-        "correlation": None
-        if fit.correlation is None
-        else {
-            "names": list(fit.correlation.names),
-            "matrix": [[_finite(x) for x in row] for row in fit.correlation.matrix],
-        },
+        "quality": plain(fit.quality),
+        "correlation": None if fit.correlation is None else fit.correlation.as_json(),
         "findings": [one.as_json() for one in findings],
         "trials": dict(fit.trials),
         "settings": vehicle.calibrations[-1].settings,
@@ -294,47 +296,10 @@ def fit_json(
     }
 
 
-def print_fit(fit: Fit, vehicle: Vehicle, console: Console, findings: Sequence[Finding] = ()) -> None:
-    """Print estimates, figures of the fit and findings; fits 100 columns.
-
-    Args:
-        fit: The fit.
-        vehicle: `calibrated(fit)`.
-        console: Where to print.
-        findings: The fit's and those about the calibrated vehicle.
-    """
-    console.print(f"{fit.vehicle.name}: {vehicle.calibrations[-1].sentence()}", highlight=False, markup=False)
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in HEADS:
-        right = heading in ("estimate", "file had")
-        table.add_column(heading, justify="right" if right else "left", overflow="fold")
-    notes: dict[str, list[str]] = {}
-    for row, estimate in zip(estimate_rows(fit, vehicle), fit.estimates.values(), strict=True):
-        table.add_row(*map(escape, row), style="" if estimate.identifiable else "yellow")
-        if estimate.note:
-            notes.setdefault(estimate.note, []).append(row[0])
-    console.print(table)
-    for what, figures in fit.quality.items():
-        console.print(f"  {what}: {quality_text(figures, whole=False)}", highlight=False, markup=False)
-    for note, names in notes.items():
-        console.print(f"· {', '.join(names)}: {note}", highlight=False, markup=False)
-    for sentence in sentences(findings):
-        console.print(f"! {sentence}", highlight=False, markup=False, style="yellow")
-
-
-def estimate_rows(fit: Fit, vehicle: Vehicle) -> list[tuple[str, ...]]:
-    """Texts of the table of estimates, in the order of `HEADS`."""
-    return [
-        (
-            name,
-            number_text(e.estimate),
-            interval_text(e),
-            e.unit,
-            number_text(file_number(e, fit.vehicle)),
-            state_text(e, fit, vehicle),
-        )
-        for name, e in fit.estimates.items()
-    ]
+def _cells(e: Estimate, fit: Fit, vehicle: Vehicle) -> tuple[str, ...]:
+    """Texts of an estimate, in the order of the heads."""
+    before = number_text(file_number(e, fit.vehicle))
+    return e.name, number_text(e.estimate), interval_text(e), e.unit, before, state_text(e, fit, vehicle)
 
 
 def number_text(value: float | None) -> str:
@@ -389,8 +354,97 @@ def quality_text(figures: Mapping[str, float], *, whole: bool = True) -> str:
     return ", ".join(f"{QUALITY.get(key, key.replace('_', ' '))} {number_text(figures[key])}" for key in keys)
 
 
-def _finite(value: Any) -> float | None:
-    return float(value) if math.isfinite(value) else None
+AS_GIVEN = "as given"
+"""Note of a number that was not estimated: the table on the terminal leaves it out."""
+
+ExtraTable = tuple[Sequence[str], Sequence[Sequence[str]], Sequence[str]]
+"""Heads, rows, and a class of the page's style for each row."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """A calibration for people, on the terminal and on a page."""
+
+    title: str
+    """Of the page."""
+    headline: str
+    """Above the table on the terminal."""
+    heads: Sequence[str]
+    """Of the table of estimates."""
+    estimates: Sequence[Estimate]
+    cells: Callable[[Estimate], tuple[str, ...]]
+    """Texts of an estimate, in the order of `heads`."""
+    summary: Sequence[str]
+    """The figures that say how good the calibration is, one sentence each."""
+    findings: Sequence[Finding]
+    reading: str
+    """What the intervals mean."""
+    advice_title: str = "Advice"
+    remarks: Sequence[str] = ()
+    """On the estimates, below their table."""
+
+    @property
+    def notes(self) -> list[str]:
+        """Remarks, and findings worth knowing."""
+        return [*self.remarks, *sentences(one for one in self.findings if one.severity == "note")]
+
+    @property
+    def advice(self) -> list[str]:
+        """Findings that ask for something."""
+        return sentences(one for one in self.findings if one.severity != "note")
+
+    def show(self, console: Console) -> None:
+        """Print estimates, figures and findings; fits 100 columns."""
+        table = Table(box=box.SIMPLE_HEAD)
+        for heading in self.heads:
+            right = heading in ("estimate", "file had")
+            table.add_column(heading, justify="right" if right else "left", overflow="fold")
+        for estimate in self.estimates:
+            if estimate.note != AS_GIVEN:
+                style = "" if estimate.identifiable else "yellow"
+                table.add_row(*map(Text, self.cells(estimate)), style=style)
+        console.print(self.headline, highlight=False, markup=False)
+        console.print(table)
+        for line in [*(f"  {sentence}" for sentence in self.summary), *(f"· {note}" for note in self.notes)]:
+            console.print(line, highlight=False, markup=False)
+        for sentence in self.advice:
+            console.print(f"! {sentence}", highlight=False, markup=False, style="yellow")
+
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        record: Mapping[str, Any],
+        pictures: Pictures,
+        repeat: Sequence[str],
+        tables: Mapping[str, ExtraTable] | None = None,
+    ) -> None:
+        """Write `report.html`, `report.md`, the pictures as PNG and `fit.json`.
+
+        Args:
+            folder: Directory to make; an earlier report there is replaced.
+            record: What `fit.json` holds.
+            pictures: File name -> what the picture shows, and the PNG.
+            repeat: Lines of the section on how to repeat it.
+            tables: Further tables, after the pictures, by their headings.
+
+        Raises:
+            OutputError: The directory holds other files, or cannot be written.
+        """
+        page = Page(self.title)
+        for sentence in self.summary:
+            page.lead(sentence)
+        page.items(self.advice_title, self.advice)
+        page.heading("Estimates")
+        kinds = ["" if e.identifiable or e.note == AS_GIVEN else "doubt" for e in self.estimates]
+        page.table(self.heads, [self.cells(e) for e in self.estimates], kinds, last="words")
+        for note in (*self.notes, self.reading):
+            page.note(note)
+        page.pictures(pictures)
+        for heading, (heads, rows, kinds) in (tables or {}).items():
+            page.heading(heading)
+            page.table(heads, rows, kinds, last="words")
+        page.code("How to repeat it", repeat)
+        page.write(folder, record, pictures)
 
 
 READING = (
@@ -399,6 +453,44 @@ READING = (
     "and not alone. `file kept`: the trials do not determine it, and the vehicle file keeps its own. Score the result "
     "on trials that the fit has not seen with `finssim replay` before relying on it."
 )
+
+
+def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> Report:
+    """The report of a fit that ends in a vehicle file.
+
+    Args:
+        fit: The fit.
+        vehicle: `calibrated(fit)`.
+        findings: The fit's and those about the calibrated vehicle.
+    """
+    told = sum(e.identifiable for e in fit.estimates.values())
+    interrupted = " The fit was interrupted before it converged." if fit.interrupted else ""
+    notes: dict[str, list[str]] = {}
+    for name, estimate in fit.estimates.items():
+        if estimate.note:
+            notes.setdefault(estimate.note, []).append(name)
+    unchanged = ", ".join(f"{name} {number_text(value)}" for name, value in kept(fit, vehicle).items())
+    sentence = vehicle.calibrations[-1].sentence()
+    undrawn = len(fit.curves) - MOST_CURVES
+    return Report(
+        title=f"Calibration of {fit.vehicle.name}: {sentence}",
+        headline=f"{fit.vehicle.name}: {sentence}",
+        heads=(*HEADS, "file had", "state"),
+        estimates=list(fit.estimates.values()),
+        cells=lambda e: _cells(e, fit, vehicle),
+        summary=[
+            f"{told} of {len(fit.estimates)} parameters are determined by the data.{interrupted}",
+            *(f"{what}: {quality_text(figures, whole=False)}" for what, figures in fit.quality.items()),
+        ],
+        findings=findings,
+        reading=READING,
+        advice_title="Findings",
+        remarks=[
+            *(f"{', '.join(names)}: {note}" for note, names in notes.items()),
+            *([f"not identifiable, so the vehicle file keeps: {unchanged}"] if unchanged else []),
+            *([f"{undrawn} more curves are not drawn"] if undrawn > 0 else []),
+        ],
+    )
 
 
 def write_report(
@@ -423,30 +515,11 @@ def write_report(
     Raises:
         OutputError: The directory holds other files, or cannot be written.
     """
-    record, pictures = vehicle.calibrations[-1], fit_pictures(fit)
-    page = Page(f"Calibration of {fit.vehicle.name}: {record.sentence()}")
-    told = sum(e.identifiable for e in fit.estimates.values())
-    interrupted = " The fit was interrupted before it converged." if fit.interrupted else ""
-    page.lead(f"{told} of {len(fit.estimates)} parameters are determined by the data.{interrupted}")
-    kinds = ["" if e.identifiable else "doubt" for e in fit.estimates.values()]
-    page.table(HEADS, estimate_rows(fit, vehicle), kinds)
-    notes: dict[str, list[str]] = {}
-    for name, estimate in fit.estimates.items():
-        notes.setdefault(estimate.note, []).append(name)
-    for note, names in notes.items():
-        page.note(f"{', '.join(names)}: {note}" if note else "")
-    unchanged = ", ".join(f"{name} {number_text(value)}" for name, value in kept(fit, vehicle).items())
-    page.note(f"The vehicle file keeps: {unchanged}." if unchanged else "")
-    page.note(READING)
-    page.items("Findings", sentences(findings))
-    if fit.quality:
-        page.heading("Quality")
-        page.table(("", ""), [(what, quality_text(f)) for what, f in fit.quality.items()], last="words")
-    page.pictures(pictures)
-    undrawn = len(fit.curves) - MOST_CURVES
-    page.note(f"{undrawn} more curves are not drawn." if undrawn > 0 else "")
-    page.heading("Trials")
-    page.table(("name", "SHA-256 of its numbers"), list(fit.trials.items()), last="code")
+    record = vehicle.calibrations[-1]
+    quality = [(what, quality_text(figures)) for what, figures in fit.quality.items()]
+    trials = list(fit.trials.items())
+    tables: dict[str, ExtraTable] = {"Quality": (("", ""), quality, [""] * len(quality))} if quality else {}
+    tables["Trials"] = (("name", "SHA-256 of its numbers"), trials, [""] * len(trials))
     repeat = [
         *([command] if command else []),
         f"FinsSim {record.finssim}, revision {record.revision or 'not from a checkout'}",
@@ -454,5 +527,5 @@ def write_report(
         f"vehicle before: {fit.vehicle.name}, sha256 {fit.vehicle.sha256}",
         f"vehicle after: sha256 {vehicle.sha256}",
     ]
-    page.code("How to repeat and cite it", repeat)
-    page.write(folder, fit_json(fit, vehicle, out=out, findings=findings), pictures)
+    as_object = fit_json(fit, vehicle, out=out, findings=findings)
+    fit_report(fit, vehicle, findings).write(folder, as_object, fit_pictures(fit), repeat, tables)

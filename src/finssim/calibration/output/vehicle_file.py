@@ -20,7 +20,7 @@ from finssim.files import atomic_write
 from finssim.vehicles import Provenance, Vehicle, load_vehicle
 from finssim.vehicles.terms import TERMS
 
-__all__ = ["file_tree", "folded", "leaves", "number_origins", "numbers", "write_vehicle"]
+__all__ = ["Key", "file_tree", "folded", "leaves", "number_origins", "numbers", "write_vehicle"]
 
 Key = tuple[str, ...]
 

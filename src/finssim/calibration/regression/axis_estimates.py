@@ -16,7 +16,10 @@ from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.terms import unit_of
 
-__all__ = ["AxisResult", "BIAS_NOTE", "CERTAIN", "axis_result", "hydrostatics", "term_estimate"]
+__all__ = [
+    "AxisResult", "BIAS_NOTE", "CERTAIN", "LARGE_DELAY", "USEFUL", "curves_of", "drag_known",
+    "hydrostatics", "late_velocity", "outside", "quality", "term_estimate", "trim", "worthless",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -58,39 +61,46 @@ def worthless(data: AxisData, figures: dict[str, float], chosen: Selection) -> s
     return ""
 
 
-def damping_known(data: AxisData, chosen: Selection, before: tuple[float, float]) -> bool:
-    """Whether the drag is known at the speeds of the trials, at their median and near their top.
-
-    To `USEFUL_DRAG`, or well enough to exclude that of the vehicle file.
+def drag_known(
+    d: Array,
+    free: NDArray[np.bool_],
+    covariances: Sequence[Array],
+    quantile: float,
+    speeds: Sequence[float],
+    before: tuple[float, float],
+) -> bool:
+    """Whether the drag of an axis is known at some speeds: to `USEFUL_DRAG`, or to exclude that of the vehicle file.
 
     Args:
-        data: The trials.
-        chosen: The model.
+        d: d1 [N s/m, N m s] and d2 [N s²/m², N m s²], (2,).
+        free: Which of them were fitted, (2,).
+        covariances: Of those that were; the widest counts.
+        quantile: Half widths of an interval, in standard deviations.
+        speeds: At which the drag has to be known [m/s, rad/s].
         before: d1 and d2 of the file.
     """
-    from scipy.stats import t
-
-    fit = chosen.fit
-    found = (
-        (fit.covariance.local, fit.covariance.trials)
-        if fit.covariance.alone.any()
-        else (fit.covariance.trials,)
-    )
-    dof = fit.covariance.dof[np.isin(np.flatnonzero(fit.terms), (D1, D2))]
-    quantile = float(t.ppf(0.975, min(float(np.min(dof, initial=np.inf)), 1e6)))
-    for speed in np.percentile(_moving(data, chosen), [50.0, 95.0]):
-        weights = np.zeros(len(fit.terms))
-        weights[[D1, D2]] = speed, speed**2
-        force, w = float(weights @ fit.theta), weights[fit.terms]
+    for speed in speeds:
+        powers = np.array([speed, speed**2])
+        force, w = float(powers @ d), powers[free]
         with np.errstate(invalid="ignore"):
-            std = np.sqrt(max(w @ covariance @ w for covariance in found))
-        if not (np.isfinite(std) and force > 0.0):
+            half = quantile * np.sqrt(max(max(w @ C @ w for C in covariances), 0.0))
+        if not (np.isfinite(half) and force > 0.0):
             return False
-        close = quantile * std < USEFUL_DRAG * force
-        excluded = abs(before[0] * speed + before[1] * speed**2 - force) > quantile * std
-        if not close and not excluded:
+        if not (half < USEFUL_DRAG * force or abs(powers @ before - force) > half):
             return False
     return True
+
+
+def _damping_known(data: AxisData, chosen: Selection, before: tuple[float, float]) -> bool:
+    """`drag_known` at the median and near the top of the speeds of the trials."""
+    from scipy.stats import t
+
+    fit, C = chosen.fit, chosen.fit.covariance
+    at = np.flatnonzero(np.isin(np.flatnonzero(fit.terms), (D1, D2)))
+    covariances = [V[np.ix_(at, at)] for V in ((C.local, C.trials) if C.alone.any() else (C.trials,))]
+    quantile = float(t.ppf(0.975, min(float(np.min(C.dof[at], initial=np.inf)), 1e6)))
+    speeds = np.percentile(_moving(data, chosen), [50.0, 95.0]).tolist()
+    return drag_known(fit.theta[[D1, D2]], fit.terms[[D1, D2]], covariances, quantile, speeds, before)
 
 
 def _moving(data: AxisData, chosen: Selection) -> Array:
@@ -197,63 +207,42 @@ BIAS_NOTE = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class AxisResult:
-    """What the report says of one axis."""
-
-    estimates: dict[str, Estimate]
-    changes: dict[str, Any]
-    quality: dict[str, float]
-    findings: list[Finding]
-    curves: list[Curve] = field(default_factory=list)
-    worthless: str = ""
-    """Why nothing that was found can be believed; empty where it can."""
-
-
-def axis_result(data: AxisData, chosen: Selection, file: Matrices) -> AxisResult:
-    """Estimates of an axis.
+    """What the report says of one axis.
 
     What the data know well is written, and so is what they know badly where the vehicle file's number lies outside the
     interval: a wide interval is a better answer than a number that it excludes.
-
-    Args:
-        data: Its trials.
-        chosen: The model and its intervals.
-        file: The vehicle as its file has it.
     """
-    axis = AXES[data.axis]
-    low, high = speed_range(data, chosen)
-    speeds = {"low": low, "high": high, "unit": "m/s" if data.axis < 3 else "rad/s"}
-    draft = _Draft(data=data, chosen=chosen, file=file)
-    draft.inertia()
-    draft.added_mass(float(file.M_RB[data.axis, data.axis]))
-    draft.damping(speeds)
-    if data.restoring:
-        draft.add("k", K, "N m/rad", "body.center_of_buoyancy.2")
-    draft.bias()
-    if 0.0 < low and high < DECADE * low:
-        draft.findings.append(finding("few_speeds", axis, **speeds))
-    draft.findings += axis_findings(axis, data, chosen)
-    figures = quality(data, chosen)
-    reason = worthless(data, figures, chosen)
-    if reason:
-        draft.believe_nothing(reason)
-    return AxisResult(
-        estimates=draft.estimates, changes=draft.changes, quality=figures, findings=draft.findings,
-        curves=_curves(data, chosen), worthless=reason,
-    )  # fmt: skip
-
-
-@dataclass(kw_only=True)
-class _Draft:
-    """What is found of one axis, term by term."""
 
     data: AxisData
+    """Its trials."""
     chosen: Selection
+    """The model and its intervals."""
     file: Matrices
+    """The vehicle as its file has it."""
     estimates: dict[str, Estimate] = field(default_factory=dict)
     changes: dict[str, Any] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Estimate term by term."""
+        data, chosen = self.data, self.chosen
+        low, high = speed_range(data, chosen)
+        speeds = {"low": low, "high": high, "unit": "m/s" if data.axis < 3 else "rad/s"}
+        self.inertia()
+        self.added_mass(float(self.file.M_RB[data.axis, data.axis]))
+        self.damping(speeds)
+        if data.restoring:
+            self.add("k", K, "N m/rad", "body.center_of_buoyancy.2")
+        self.bias()
+        if 0.0 < low and high < DECADE * low:
+            self.findings.append(finding("few_speeds", self.axis, **speeds))
+        self.findings += axis_findings(self.axis, data, chosen)
+        self.quality = quality(data, chosen)
+        self.worthless = worthless(data, self.quality, chosen)
+        if self.worthless:
+            self.believe_nothing(self.worthless)
 
     @property
     def axis(self) -> str:
@@ -347,7 +336,7 @@ class _Draft:
             elif self.chosen.fit.terms[term]:
                 self.add(name, term, unit, self.path(family))
         i = self.data.axis
-        if damping_known(self.data, self.chosen, (float(self.file.D1[i, i]), float(self.file.D2[i, i]))):
+        if _damping_known(self.data, self.chosen, (float(self.file.D1[i, i]), float(self.file.D2[i, i]))):
             self.changes[self.path("linear_damping")] = max(float(theta[D1]), 0.0)
             self.changes[self.path("quadratic_damping")] = max(float(theta[D2]), 0.0)
         else:
@@ -465,7 +454,8 @@ def outside(value: float, ends: Array | tuple[float, float]) -> bool:
     return bool(np.isfinite(ends).all() and not ends[0] <= value <= ends[1])
 
 
-def _curves(data: AxisData, chosen: Selection) -> list[Curve]:
+def curves_of(data: AxisData, chosen: Selection) -> list[Curve]:
+    """Wrench, and velocity simulated from the wrench alone, over all trials of an axis."""
     axis, linear = AXES[data.axis], data.axis < 3
     lines: list[list[Array]] = [[] for _ in range(6)]
     t, y, p, tv, v, vs = lines

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.motion.signals import Motion
-from finssim.calibration.motion.smoothing import without_spikes
+from finssim.calibration.motion.smoothing import spans_of, without_spikes
 from finssim.calibration.regression.plant_terms import Matrices, known_wrench, unit_wrenches
 from finssim.calibration.uncertainty import (
     Covariance,
@@ -44,7 +44,7 @@ from finssim.calibration.uncertainty import (
 from finssim.calibration.vision.least_squares import boxed, huber_weight
 
 __all__ = [
-    "AxisData", "DAMPING", "Run", "Selection", "Signals", "TERMS", "axis_rows", "cut", "fit_axis",
+    "AKAIKE", "AxisData", "Run", "Selection", "Signals", "TERMS", "axis_rows", "cut", "fit_axis",
     "informative", "joined", "kernel", "select", "signals", "simulate_axis",
 ]  # fmt: skip
 
@@ -212,10 +212,10 @@ def axis_rows(found: Signals, axis: int, kernels: Kernel) -> Rows | None:
     if sine is not None:
         good &= np.isfinite(sine)
     outlying = np.zeros(len(nu), bool)
-    for begin, end in _spans(good) if found.rate > SLOW else ():
+    for begin, end in spans_of(good) if found.rate > SLOW else ():
         outlying[begin:end] = ~without_spikes(found.t[begin:end], nu[begin:end, None])
     nu, good = _bridge(nu, good, outlying)
-    spans = [(b, e) for b, e in _spans(good) if e - b >= len(kernels.phi) + 2]
+    spans = [(b, e) for b, e in spans_of(good) if e - b >= len(kernels.phi) + 2]
     if not spans:
         return None
     X, y, at = [], [], []
@@ -282,11 +282,6 @@ def _sine(up: Array, axis: int) -> Array | None:
     return {3: up[:, 1], 4: -up[:, 0]}.get(axis)
 
 
-def _spans(good: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
-    return [(int(b), int(e)) for b, e in edges.reshape(-1, 2)]
-
-
 def _bridge(
     x: Array, good: NDArray[np.bool_], outlying: NDArray[np.bool_]
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -295,7 +290,7 @@ def _bridge(
         return x, good
     good = good.copy()
     keep = np.flatnonzero(good & ~outlying)
-    for begin, end in _spans(outlying):
+    for begin, end in spans_of(outlying):
         inside = begin > 0 and end < len(x) and good[begin - 1] and good[end]
         if end - begin > LONGEST_REPAIR or not inside:
             good[begin:end] = False
@@ -629,8 +624,6 @@ class AxisFit:
     evidence: Evidence
     """Of the fitted terms."""
     covariance: Covariance
-    offset_ratio: float
-    """Variance of trial offsets over that of a row; 0 where trials share one bias."""
     independent: float
     """Rows' worth of independent samples."""
     fitted: tuple[Array, ...]
@@ -721,7 +714,6 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
         active=active,
         evidence=found,
         covariance=trial_covariance(found),
-        offset_ratio=ratio,
         independent=float(inside.sum()) / correlated,
         fitted=tuple(np.split(X @ (theta + known), ends)),
         used=tuple(used),

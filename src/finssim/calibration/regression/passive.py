@@ -21,7 +21,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion, attitude_samples, motion
-from finssim.calibration.motion.smoothing import without_spikes
+from finssim.calibration.motion.smoothing import spans_of, without_spikes
 from finssim.calibration.regression.axis_fit import Run, simulate_axis
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.calibration.trials.trial import NU, Trial
@@ -220,8 +220,7 @@ def _coasting(moved: Motion, axis: str, name: str) -> tuple[float, float]:
 def _rising(moved: Motion, name: str) -> tuple[float, float]:
     """The longest stretch in which the height grows faster than `RISING` [s]."""
     up = np.gradient(moved.position[:, 2], moved.t) > RISING
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], up, [False]]).astype(np.int8))).reshape(-1, 2)
-    begin, end = max(edges, key=lambda e: e[1] - e[0], default=(0, 1))
+    begin, end = max(spans_of(up), key=lambda e: e[1] - e[0], default=(0, 1))
     if moved.t[end - 1] - moved.t[begin] < SHORTEST_RISE:
         raise CalibrationError(
             f"nothing rises faster than {RISING} m/s for {SHORTEST_RISE:g} s: expected a vehicle let go under water",
@@ -336,6 +335,8 @@ class FreeMotion:
 
     def _predicted(self, points: Sequence[Array]) -> list[Array]:
         """What the samples of every release would be, (n, C) each."""
+        if self.axis not in (*SWINGING, "heave"):
+            return [self._coast(*pair) for pair in zip(self.releases, points, strict=True)]
         out = []
         for release, (nu, s) in zip(self.releases, self._lines(points), strict=True):
             parts = [
@@ -344,6 +345,17 @@ class FreeMotion:
             ]
             out.append(np.concatenate([np.stack(part, axis=1) for part in parts]))
         return out
+
+    def _coast(self, release: Release, point: Array) -> Array:
+        """The samples of a coast: nu_dot = -c1 nu - c2 |nu| nu has a closed form, (n, C)."""
+        _, _, c1, c2 = self.ratios(point)
+        c1, c2, nu = c1 + 1e-12, c2 + 1e-12, point[:, self.shared]
+        fallen = -np.expm1(-c1 * (release.t - release.begin)[:, None])
+        grown = c2 * np.abs(nu) / c1 * fallen
+        rates = len(release.rate[0])
+        place = point[:, self.shared + 1] if release.own > 1 else 0.0
+        travel = place + np.sign(nu) * np.log1p(grown[rates:]) / c2
+        return np.concatenate([nu * (1.0 - fallen[:rates]) / (1.0 + grown[:rates]), travel])
 
     def _points(self, x: Array) -> list[Array]:
         """Shared and own unknowns of every release, (1, ...) each."""

@@ -13,10 +13,11 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Correlation, Estimate, Fit
 from finssim.calibration.motion.signals import Motion, attitude_samples, motion
+from finssim.calibration.motion.smoothing import spans_of
 from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
     AxisResult,
-    axis_result,
+    curves_of,
     hydrostatics,
     late_velocity,
     quality,
@@ -79,8 +80,7 @@ def coasts(data: AxisData) -> list[tuple[str, float]]:
     for s, rows in zip(data.signals, data.rows, strict=True):
         speed, push = rows.X[:, 1], np.interp(s.t[rows.at], s.t, np.nan_to_num(s.tau[:, 2]))
         free = (np.abs(push) < HANDS_OFF * largest) & (np.abs(speed) > RISING)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], free, [False]]).astype(np.int8)))
-        for b, e in edges.reshape(-1, 2):
+        for b, e in spans_of(free):
             t = s.t[rows.at[b:e]]
             last = t > t[-1] - STEADY
             fading = abs(speed[e - 1]) < LEVEL * np.abs(speed[b:e][last]).max()
@@ -411,7 +411,7 @@ def regress(
     changes: dict[str, Any] = {}
     results: dict[str, AxisResult] = {}
     for i, (data, selection) in chosen.items():
-        results[AXES[i]] = result = axis_result(data, selection, file)
+        results[AXES[i]] = result = AxisResult(data=data, chosen=selection, file=file)
         estimates |= result.estimates
         changes |= result.changes
         findings += result.findings
@@ -433,7 +433,7 @@ def regress(
     changes |= still
     findings += notes
     figures = {axis: result.quality for axis, result in results.items()}
-    curves = [curve for result in results.values() for curve in result.curves]
+    curves = [curve for result in results.values() for curve in curves_of(result.data, result.chosen)]
     findings += late_velocity(figures, explained=[AXES[i] for i in told])
     quiet = _passive(trials, vehicle, [i for i in wanted if i not in told], known or {})
     if quiet is not None:

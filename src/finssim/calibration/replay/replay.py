@@ -270,26 +270,10 @@ STAGGER = 4
 """Predictions start this many times per horizon."""
 
 
-@dataclass(frozen=True)
-class Predictions:
-    """Predictions of one axis of several trials from many measured states, by one model."""
-
-    ahead: Array
-    """Times since each start [s], (T,)."""
-    start: Array
-    """Response in the state that each starts from, (S,)."""
-    measured: Array
-    """(T, S), NaN where not measured or outside excitation and coast."""
-    simulated: dict[str, Array]
-    """Model -> (T, S)."""
-    width: Array
-    """P95 - P5 of the trial that each belongs to, (S,)."""
-
-
 def replay_predictions(
     trials: Sequence[Trial], pairs: Sequence[Pair], vehicle: Vehicle, models: Sequence[str], horizon: float
-) -> dict[Axis, Predictions]:
-    """Short replays that start from measured states all along the trials.
+) -> dict[Axis, dict[str, Ahead]]:
+    """Errors of short replays that start from measured states all along the trials.
 
     Args:
         trials: Those of the pairs, in their order.
@@ -299,7 +283,7 @@ def replay_predictions(
         horizon: How far to look ahead [s].
 
     Returns:
-        By axis; only where a prediction can be compared.
+        By axis and model; only where a prediction can be compared.
     """
     cut: list[Segment] = []
     for i, trial in enumerate(trials):
@@ -318,7 +302,8 @@ def replay_predictions(
     steps = round(horizon / STEP)
     ahead = STEP * np.arange(steps + 1)
     responses = {model: Rollouts(vehicle, cut, hydrodynamics=model).run() for model in models}
-    out: dict[Axis, Predictions] = {}
+    seconds = _seconds(horizon)
+    out: dict[Axis, dict[str, Ahead]] = {}
     for axis in AXES:
         k = AXES.index(axis)
         chosen = [
@@ -330,13 +315,13 @@ def replay_predictions(
         ]
         if not chosen:
             continue
-        out[axis] = Predictions(
-            ahead=ahead,
-            start=np.array([cut[i].nu[k] for i in chosen]),
-            measured=np.stack([_ahead(pairs[cut[i].index], cut[i], ahead, NU[k]) for i in chosen], axis=-1),
-            simulated={m: _padded(r.nu[:, 0, chosen, k], steps + 1) for m, r in responses.items()},
-            width=np.array([response_span(pairs[cut[i].index], NU[k]).value for i in chosen]),
-        )
+        start = np.array([cut[i].nu[k] for i in chosen])
+        measured = np.stack([_ahead(pairs[cut[i].index], cut[i], ahead, NU[k]) for i in chosen], axis=-1)
+        width = np.array([response_span(pairs[cut[i].index], NU[k]).value for i in chosen])
+        out[axis] = {}
+        for model, response in responses.items():
+            simulated = _padded(response.nu[:, 0, chosen, k], steps + 1)
+            out[axis][model] = error_ahead(start, ahead, measured, simulated, width, seconds)
     return out
 
 
@@ -466,13 +451,7 @@ def replay(
     ahead: dict[Axis, dict[str, Ahead]] = {}
     if horizon is not None:
         named = {trial.name: trial for trial in trials}
-        predictions = replay_predictions([named[p.name] for p in pairs], pairs, vehicle, models, horizon)
-        seconds = _seconds(horizon)
-        for axis, p in predictions.items():
-            ahead[axis] = {
-                m: error_ahead(p.start, p.ahead, p.measured, x, p.width, seconds)
-                for m, x in p.simulated.items()
-            }
+        ahead = replay_predictions([named[p.name] for p in pairs], pairs, vehicle, models, horizon)
     result = Replay(
         vehicle=vehicle,
         models=models,

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from finssim.calibration.findings import Finding, finding, sentences
+from finssim.calibration.findings import Finding, finding, plain, sentences
 from finssim.calibration.replay.metrics import (
     RESAMPLES,
     UNITS,
@@ -394,16 +394,12 @@ def _aggregate(a: Aggregate) -> dict[str, Any] | None:
 def _ahead(a: Any) -> dict[str, Any]:
     return {
         "seconds": a.seconds.tolist(),
-        "rmse": _plain(a.rmse),
-        "nrmse": _plain(a.nrmse),
-        "persistence_rmse": _plain(a.persistence),
-        "skill": _plain(a.skill),
+        "rmse": plain(a.rmse),
+        "nrmse": plain(a.nrmse),
+        "persistence_rmse": plain(a.persistence),
+        "skill": plain(a.skill),
         "predictions": a.count.tolist(),
     }
-
-
-def _plain(x: Any) -> list[float | None]:
-    return [float(v) if math.isfinite(v) else None for v in x]
 
 
 def _trial(replay: Replay, i: int, pair: Pair) -> dict[str, Any]:

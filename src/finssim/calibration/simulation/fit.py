@@ -14,7 +14,14 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion
-from finssim.calibration.regression.axis_estimates import BIAS_NOTE, CERTAIN, USEFUL, hydrostatics, outside
+from finssim.calibration.regression.axis_estimates import (
+    BIAS_NOTE,
+    CERTAIN,
+    USEFUL,
+    drag_known,
+    hydrostatics,
+    outside,
+)
 from finssim.calibration.regression.axis_fit import AKAIKE, DAMPING
 from finssim.calibration.simulation.parameters import EXTRAS, Parameters
 from finssim.calibration.simulation.rollout import Segment, Streams, segments, streams
@@ -141,17 +148,30 @@ UNITS = {
 
 FAMILY = {"added_mass": "added_mass", "d1": "linear_damping", "d2": "quadratic_damping"}
 
+PATHS = {
+    "buoyancy_excess": "body.displaced_volume",
+    "thrust_scale": None,
+    "thrust_lag": "thrusters.*.time_constant",
+    "thrust_delay": "thrusters.*.delay",
+    "current.x": None,
+    "current.y": None,
+}
+"""Coordinates besides those of the axes that are reported, and where they stand in the vehicle file."""
+
 
 @dataclass(frozen=True)
 class Quantity:
-    """One number of the report, a function of the vector."""
+    """One number of the report: a coordinate of the vector, plus a constant."""
 
     name: str
     unit: str
     path: str | None
     kind: str
-    """m_eff, added_mass, d1, d2, bias, k, coupling, or the name of an extra."""
-    axis: int = -1
+    """m_eff, added_mass, d1, d2, bias, k, or the name of the coordinate."""
+    coordinate: str
+    """Its name; zero where it is not free."""
+    rigid: float = 0.0
+    """Rigid inertia of the axis [kg, kg m²]; in m_eff, and beside added_mass."""
 
 
 def quantities(p: Parameters, axes: Sequence[str]) -> list[Quantity]:
@@ -163,108 +183,41 @@ def quantities(p: Parameters, axes: Sequence[str]) -> list[Quantity]:
             continue
         for kind in ("m_eff", "added_mass", "d1", "d2"):
             path = f"{base}.{FAMILY[kind]}.{i}.{i}" if kind in FAMILY else None
-            out.append(Quantity(f"{axis}.{kind}", UNITS[kind][int(i > 2)], path, kind, int(i)))
+            coordinate = f"{axis}.{'added_mass' if kind == 'm_eff' else kind}"
+            rigid = float(p.M_RB[i, i]) if coordinate.endswith("added_mass") else 0.0
+            out.append(Quantity(f"{axis}.{kind}", UNITS[kind][int(i > 2)], path, kind, coordinate, rigid))
         if "k" in p.names and axis in ("roll", "pitch"):
-            out.append(Quantity(f"{axis}.k", "N m/rad", "body.center_of_buoyancy.2", "k", int(i)))
-        if f"{axis}.bias" in p.names:
-            out.append(Quantity(f"{axis}.bias", UNITS["bias"][int(i > 2)], None, "bias", int(i)))
-    paths = {
-        "buoyancy_excess": "body.displaced_volume",
-        "thrust_lag": "thrusters.*.time_constant",
-        "thrust_delay": "thrusters.*.delay",
-    }
-    for c in p.coordinates:
-        if c.name in (
-            "buoyancy_excess",
-            "thrust_scale",
-            "thrust_lag",
-            "thrust_delay",
-            "current.x",
-            "current.y",
-        ):
-            out.append(Quantity(c.name, c.unit, paths.get(c.name), c.name))
-    out += [Quantity(path, unit_of(path), f"{base}.{path}", path) for path in p.terms]
-    if p.coupled:
-        for name, matrix, i, j in p.coupled.entries():
-            out.append(Quantity(name, _coupling_unit(matrix, i, j), f"{base}.{matrix}.{i}.{j}", "coupling"))
-    return out
-
-
-def _coupling_unit(matrix: str, i: int, j: int) -> str:
-    if matrix == "added_mass":
-        return "kg m" if (i < 3) != (j < 3) else "kg" if i < 3 else "kg m²"
-    per = ("N", "N m")[int(i > 2)]
-    square = matrix == "quadratic_damping"
-    return f"{per} s{'²' if square else ''}" + (f"/m{'²' if square else ''}" if j < 3 else "")
-
-
-def values(p: Parameters, listed: Sequence[Quantity], x: Array) -> Array:
-    """Values of quantities for vectors (W, P), (W, Q)."""
-    M_A, D1, D2 = p.matrices(x)
-    matrix = {"added_mass": M_A, "d1": D1, "d2": D2, "linear_damping": D1, "quadratic_damping": D2}
-    out = np.empty((len(x), len(listed)))
-    for q, quantity in enumerate(listed):
-        i = quantity.axis
-        if quantity.kind == "m_eff":
-            out[:, q] = M_A[:, i, i] + p.M_RB[i, i]
-        elif quantity.kind in ("added_mass", "d1", "d2"):
-            out[:, q] = matrix[quantity.kind][:, i, i]
-        elif quantity.kind == "coupling":
-            family, row, column = str(quantity.path).split(".")[-3:]
-            out[:, q] = matrix[family][:, int(row), int(column)]
-        else:
-            out[:, q] = p.value(x, "k" if quantity.kind == "k" else quantity.name)
-    return out
-
-
-def jacobian(p: Parameters, listed: Sequence[Quantity], x: Array) -> Array:
-    """Derivatives of quantities by the vector, (Q, P)."""
-    size = 1e-5 * np.maximum(np.abs(x), p.scale)
-    up, down = np.minimum(x + size, p.high), np.maximum(x - size, p.low)
-    points = np.repeat(x[None], 2 * len(x), axis=0)
-    i = np.arange(len(x))
-    points[i, i], points[len(x) + i, i] = up, down
-    found = values(p, listed, points)
-    return np.asarray(((found[: len(x)] - found[len(x) :]) / (up - down)[:, None]).T)
+            out.append(Quantity(f"{axis}.k", "N m/rad", "body.center_of_buoyancy.2", "k", "k"))
+        if (bias := f"{axis}.bias") in p.names:
+            out.append(Quantity(bias, UNITS["bias"][int(i > 2)], None, "bias", bias))
+    out += [Quantity(c.name, c.unit, PATHS[c.name], c.name, c.name) for c in p.coordinates if c.name in PATHS]
+    return out + [Quantity(path, unit_of(path), f"{base}.{path}", path, path) for path in p.terms]
 
 
 def spread(
     p: Parameters, listed: Sequence[Quantity], x: Array, found: Confidence, own_error: float
 ) -> tuple[Array, Array, Array]:
     """Values (Q,), intervals (Q, 2) and p-values of being zero (Q,)."""
-    from scipy.stats import norm, t
+    from scipy.stats import norm
 
-    P = len(p.names)
-    J = jacobian(p, listed, x)
-    one = np.count_nonzero(J, axis=1) == 1
-    which = np.argmax(np.abs(J), axis=1)
-    value = values(p, listed, x[None])[0]
-    covariance = found.covariance
-    finite = np.isfinite(np.diagonal(covariance.local))[:P]
-    known = np.array([bool(finite[np.flatnonzero(row)].all()) for row in J])
-    Jk = np.where(finite, J, 0.0)
-    V = np.where(np.isfinite(covariance.trials), covariance.trials, 0.0)[:P, :P]
-    local = np.where(np.isfinite(covariance.local), covariance.local, 0.0)[:P, :P]
-    variance = np.einsum("qi,ij,qj->q", Jk, V, Jk)
-    alone = np.array([bool(covariance.alone[:P][np.flatnonzero(row)].any()) for row in J])
-    variance = np.where(alone, np.maximum(variance, np.einsum("qi,ij,qj->q", Jk, local, Jk)), variance)
-    dof = np.array([float(covariance.dof[:P][np.flatnonzero(row)].min(initial=np.inf)) for row in J])
-    quantile = np.where(np.isfinite(dof), t.ppf(0.975, np.where(np.isfinite(dof), dof, 1.0)), norm.ppf(0.975))
-    std = np.sqrt(np.maximum(variance, 0.0))
-    shift = J @ np.clip(found.free[:P] - x, -1e6, 1e6)
-    free = np.where(one, value + shift, value)
-    whole = np.array([p.M_RB[q.axis, q.axis] if q.kind == "added_mass" else 0.0 for q in listed])
-    half = np.hypot(quantile * std, own_error * np.abs(value + whole))
-    ends = np.stack([np.minimum(free - half, value), np.maximum(free + half, value)], axis=-1)
-    # A bound of the vector is one of the quantity where they are the same up to a constant.
-    offset = value - J[np.arange(len(J)), which] * x[which]
-    low = np.where(one, J[np.arange(len(J)), which] * p.low[which] + offset, -np.inf)
-    ends[:, 0] = np.maximum(ends[:, 0], np.where(np.isnan(low), -np.inf, low))
-    ends[~known] = [-np.inf, np.inf]
-    # Akaike's criterion compares likelihoods, hence independent errors: a term that is kept for nothing costs little.
-    alone_std = np.sqrt(np.einsum("qi,ij,qj->q", Jk, local, Jk))
-    tail = norm.sf(np.maximum(free, 0.0) / np.maximum(alone_std, 1e-300))
-    return value, ends, np.where(known, 2.0 * tail, 1.0)
+    local = np.diagonal(found.covariance.local)
+    half = intervals(np.zeros(len(local)), found.covariance)[:, 1]
+    value, ends, p_value = np.zeros(len(listed)), np.zeros((len(listed), 2)), np.ones(len(listed))
+    for q, quantity in enumerate(listed):
+        if quantity.coordinate not in p.names:
+            continue
+        c = p.names.index(quantity.coordinate)
+        offset = quantity.rigid if quantity.kind == "m_eff" else 0.0
+        value[q] = x[c] + offset
+        if not np.isfinite(local[c]):
+            ends[q] = -np.inf, np.inf
+            continue
+        free = value[q] + np.clip(found.free[c] - x[c], -1e6, 1e6)
+        width = np.hypot(half[c], own_error * abs(x[c] + quantity.rigid))
+        ends[q] = max(min(free - width, value[q]), p.low[c] + offset), max(free + width, value[q])
+        # Akaike's criterion compares likelihoods, hence independent errors: a term kept for nothing costs little.
+        p_value[q] = 2.0 * norm.sf(max(free, 0.0) / max(np.sqrt(local[c]), 1e-300))
+    return value, ends, p_value
 
 
 def estimates(
@@ -301,17 +254,17 @@ def estimates(
         if wider and quantity.name in wider:
             low, high = min(low, wider[quantity.name][0]), max(high, wider[quantity.name][1])
         sure, note = _verdict(quantity, float(value[q]), low, high)
-        coordinate = "k" if quantity.kind == "k" else quantity.name.replace("m_eff", "added_mass")
         if dropped and quantity.name in dropped:
             sure, note = False, dropped[quantity.name]
-        elif coordinate in at_low:
+        elif quantity.coordinate in at_low:
             sure, note = False, "held at its bound"
             if np.isfinite(low + high):
-                note += f"; free, it would be {free[coordinate]:.3g} {quantity.unit}"
-            bounds.append(finding("at_bound", quantity.name, free=free[coordinate], unit=quantity.unit))
+                note += f"; free, it would be {free[quantity.coordinate]:.3g} {quantity.unit}"
+            bounds.append(
+                finding("at_bound", quantity.name, free=free[quantity.coordinate], unit=quantity.unit)
+            )
         elif quantity.kind == "added_mass" and sure and value[q] <= 0.0:
-            rigid = p.M_RB[quantity.axis, quantity.axis]
-            sure, note = False, f"m_eff is below the file's rigid {rigid:.4g} {quantity.unit}"
+            sure, note = False, f"m_eff is below the file's rigid {quantity.rigid:.4g} {quantity.unit}"
         out[quantity.name] = Estimate(
             name=quantity.name,
             estimate=float(value[q]),
@@ -329,7 +282,7 @@ def _verdict(quantity: Quantity, value: float, low: float, high: float) -> tuple
     half = 0.5 * (high - low)
     if not np.isfinite(half):
         return False, "the trials say nothing of it"
-    if quantity.kind in ("bias", "buoyancy_excess", "coupling", "current.x", "current.y"):
+    if quantity.kind in ("bias", "buoyancy_excess", "current.x", "current.y"):
         return True, BIAS_NOTE if quantity.kind == "bias" else ""
     if quantity.kind == "thrust_delay":
         return half <= LAG_CERTAIN, "" if half <= LAG_CERTAIN else f"known to no better than ±{half:.2g} s"
@@ -611,7 +564,7 @@ class Clock:
     """Tells progress over several stages: iteration, cost, rate and what may remain."""
 
     def __init__(self, progress: Callable[[float, str], None] | None) -> None:
-        self.progress, self.begin, self.part, self.worlds = progress, time.perf_counter(), 0.0, 0
+        self.progress, self.begin, self.part = progress, time.perf_counter(), 0.0
 
     def __call__(self, words: str, toward: float = 1.0) -> None:
         # How many iterations remain nobody knows; each takes a share of the rest.
@@ -661,7 +614,7 @@ def changes(
         before = float(np.asarray(chosen.added_mass, float)[i, i])
         if added.estimate > 0.0 and (half <= USEFUL * whole.estimate or outside(before, added.ci95)):
             written["added_mass"].append(i)
-        if _force_known(p, x, evidence, axis, speed.get(axis, 0.0)):
+        if _drag_known(p, x, evidence, axis, speed.get(axis, 0.0)):
             written["linear_damping"].append(i)
             written["quadratic_damping"].append(i)
     # The numbers of axes that nobody measured, but that were simulated: the others hold with these.
@@ -672,8 +625,8 @@ def changes(
         old = np.asarray(getattr(chosen, family), float)
         for i in rows:
             for j in range(6):
-                # Couplings are written where both axes are, and where the fit did away with them.
-                if i == j or (new[family][i, j] != old[i, j] and (j in rows or new[family][i, j] == 0.0)):
+                # Couplings are written where the fit did away with them.
+                if i == j or new[family][i, j] != old[i, j]:
                     out[f"{base}.{family}.{i}.{j}"] = float(new[family][i, j])
     out |= hydrostatics(found, p.vehicle)[0]
     for name, path in (("thrust_lag", "time_constant"), ("thrust_delay", "delay")):
@@ -690,24 +643,17 @@ def changes(
     return out
 
 
-def _force_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: float) -> bool:
-    """Whether the damping force of an axis at a speed is known to `USEFUL`, or excludes that of the vehicle file."""
-    i = AXES.index(axis)
-    unit = 1e-5 * np.maximum(np.abs(x), p.scale)
-    points = np.concatenate([x[None], np.clip(x + np.diag(unit), p.low, p.high)])
-    _, D1, D2 = p.matrices(points)
-    force = D1[:, i, i] * speed + D2[:, i, i] * speed**2
-    slope = (force[1:] - force[0]) / unit
-    before = float(p.set.linear_damping[i][i] * speed + p.set.quadratic_damping[i][i] * speed**2)
-    used = np.flatnonzero(slope)
-    V = found.covariance.trials[np.ix_(used, used)]
-    if found.covariance.alone[used].any():
-        V = found.covariance.local[np.ix_(used, used)]
-    if not np.isfinite(V).all():
-        return False
-    std = float(np.sqrt(max(slope[used] @ V @ slope[used], 0.0)))
-    close, excluded = 2.0 * std < USEFUL * force[0], abs(before - force[0]) > 2.0 * std
-    return bool(force[0] > 0.0 and (close or excluded))
+def _drag_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: float) -> bool:
+    """`drag_known` at one speed."""
+    i, names = AXES.index(axis), [f"{axis}.{name}" for name in ("d1", "d2")]
+    at = [p.names.index(name) for name in names if name in p.names]
+    free = np.isin(names, p.names)
+    C = found.covariance
+    C = (C.local if C.alone[at].any() else C.trials)[np.ix_(at, at)]
+    d = np.zeros(2)
+    d[free] = x[at]
+    before = float(p.set.linear_damping[i][i]), float(p.set.quadratic_damping[i][i])
+    return drag_known(d, free, [C], 2.0, [speed], before)
 
 
 STEP = 0.02
@@ -788,7 +734,7 @@ class Stages:
         """Short segments from a rough start, then segments of the length that the answer calls for."""
         short = max(SHORT, 15.0 * sampling(self.prepared))
         self.cut(min(short, self.given or short))
-        problem = self.problem(kinds, self.vehicle, {})
+        problem = self.problem(kinds, {})
         point = self._rough(problem, problem.start())
         problem.hold_clocks(True)
         rough = solve(
@@ -804,7 +750,7 @@ class Stages:
             problem.hold_clocks(False)
             return Stage(problem, rough, confidence(problem, rough))
         self.cut(self.given or horizon(self.vehicle.replace(_matrices(p, x)), self.prepared, self.axes))
-        problem = self.problem(kinds, self.vehicle, dict(zip(p.names, x, strict=True)))
+        problem = self.problem(kinds, dict(zip(p.names, x, strict=True)))
         for _ in range(0 if self.given else HALVINGS):
             growth = problem.growth(problem.start())
             wild = {self.used[g].trial.name for g in np.unique(problem.groups[growth > GROWTH])}
@@ -813,21 +759,19 @@ class Stages:
             for name in wild:
                 self.shorter[name] = 0.5 * self.shorter.get(name, 1.0)
             self.cut(self.length)
-            problem = self.problem(kinds, self.vehicle, dict(zip(p.names, x, strict=True)))
+            problem = self.problem(kinds, dict(zip(p.names, x, strict=True)))
         return self.finish(problem, problem.start(), 0.6)
 
-    def next(self, kinds: dict[str, str], before: Stage, full: bool = False) -> Stage:
+    def next(self, kinds: dict[str, str], before: Stage) -> Stage:
         """Another set of parameters, from where a fit ended."""
         old, x = before.problem.parameters, before.x
-        base = self.vehicle.replace(_matrices(old, x)) if full else self.vehicle
-        problem = self.problem(kinds, base, dict(zip(old.names, x, strict=True)), full)
+        problem = self.problem(kinds, dict(zip(old.names, x, strict=True)))
         rest = before.solution.point.theta[len(old.names) :]
         point = Point(np.concatenate([problem.parameters.start, rest]), before.solution.point.z)
         return self.finish(problem, point, 0.95, before.solution.std)
 
     def finish(self, problem: Shooting, point: Point, toward: float, std: Array | None = None) -> Stage:
         """Fit with robust weights and clocks let go, after a first approach without."""
-        words = "couplings" if problem.parameters.coupled else "fit"
         if std is None:
             problem.hold_clocks(True)
             rough = solve(
@@ -836,13 +780,13 @@ class Stages:
                 iterations=6,
                 std=problem.size(),
                 rough=True,
-                report=self.report(words, toward),
+                report=self.report("fit", toward),
             )
             problem.hold_clocks(False)
             point = rough.point
             if rough.interrupted:
                 return Stage(problem, rough, confidence(problem, rough))
-        solution = solve(problem, point, std=std, report=self.report(words, toward))
+        solution = solve(problem, point, std=std, report=self.report("fit", toward))
         return Stage(problem, solution, confidence(problem, solution))
 
     def report(self, words: str, toward: float) -> Callable[[int, float], None]:
@@ -873,20 +817,17 @@ class Stages:
     def _part(self, one: Streams) -> float:
         return self.shorter.get(one.trial.name, 1.0)
 
-    def problem(
-        self, kinds: dict[str, str], base: Vehicle, start: dict[str, float], full: bool = False
-    ) -> Shooting:
+    def problem(self, kinds: dict[str, str], start: dict[str, float]) -> Shooting:
         """What is free, over the segments."""
         parameters = Parameters(
-            base,
+            self.vehicle,
             axes=self.axes,
             damping=kinds,
-            full=full,
             extras=tuple(self.extras),
             biases=self.biases,
             start=start,
-            imposed=() if full else self.imposed,
-            unseen=() if full else self.unseen,
+            imposed=self.imposed,
+            unseen=self.unseen,
         )
         return Shooting(
             self.segments,
@@ -943,7 +884,6 @@ class Stages:
         dropped: dict[str, str],
         remarks: list[Finding],
         *,
-        full: bool,
         damping: str,
     ) -> Fit:
         """The finished fit."""
@@ -967,7 +907,6 @@ class Stages:
         settings: dict[str, Any] = {
             "axes": list(self.axes),
             "damping": damping,
-            "full": full,
             "estimate": sorted(self.extras) + (["trial_bias"] if self.trial_biases else []),
             "horizon": round(self.length, 3),
             "step": STEP,
@@ -1010,7 +949,6 @@ def fit_by_simulation(
     vehicle: Vehicle,
     *,
     axes: Sequence[str] | None = None,
-    full: bool = False,
     estimate: Sequence[str] = (),
     damping: str = "auto",
     horizon: float | None = None,
@@ -1027,7 +965,6 @@ def fit_by_simulation(
         trials: Of any inputs, rates and measured columns.
         vehicle: Gives the rigid body, the motors and everything that is not fitted.
         axes: Axes to fit; those that the trials excite if None.
-        full: Also couplings of these axes: symmetric added mass, full damping.
         estimate: Words of `ESTIMATE`, and parameters of the vehicle's terms, such as `lift.coefficient`. Buoyancy comes
             with heave, stiffness with roll and pitch, a bias with the others.
         damping: `auto`, `linear`, `quadratic` or `both`.
@@ -1058,9 +995,7 @@ def fit_by_simulation(
         if dropped:
             wider = {name: e.ci95 for name, e in first.items()}
             stage = fit.next(kinds, stage)
-    if full and len(chosen) > 1 and not stage.solution.interrupted:
-        stage = fit.next(kinds, stage, full=True)
-    return fit.result(stage, wider, dropped, remarks, full=full, damping=damping)
+    return fit.result(stage, wider, dropped, remarks, damping=damping)
 
 
 def _check(

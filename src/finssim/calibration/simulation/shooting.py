@@ -28,7 +28,10 @@ from finssim.geometry.rotations import (
 )
 from finssim.vehicles import AXES
 
-__all__ = ["CUT", "Linear", "Point", "Shooting", "Solution", "solve", "weights_of"]
+__all__ = [
+    "CUT", "Linear", "Point", "Shooting", "Solution", "blocks_of", "costs_of", "solve", "step_of",
+    "weights_of",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -610,7 +613,7 @@ class Shooting:
         none = np.zeros(len(free))
         self.prior_mean = np.concatenate([parameters.expected, 0.0 * far, none])
         imposed = np.arange(len(parameters.low)) >= self.judged
-        wide = [VAGUE * (name != "thrust_scale" and not parameters.coupled) for name in parameters.names]
+        wide = [VAGUE * (name != "thrust_scale") for name in parameters.names]
         size = np.where(imposed, 1.0, np.array(wide, float)) * parameters.scale
         known = np.where(size > 0.0, np.maximum(size, 1e-150) ** -2.0, 0.0)
         self.prior_precision = np.concatenate([known, 0.0 * far + LATE_STD**-2.0, none])

@@ -17,19 +17,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding
 from finssim.vehicles.vehicle import Axis
 
-__all__ = [
-    "Array",
-    "COLUMNS",
-    "Conversion",
-    "Header",
-    "INPUT_PREFIXES",
-    "NU",
-    "PHASES",
-    "TAU",
-    "Trial",
-    "TrialWater",
-    "column_of",
-]
+__all__ = ["Array", "Conversion", "Header", "NU", "PHASES", "TAU", "Trial", "TrialWater", "column_of"]
 
 Point = tuple[float, float, float]
 

@@ -13,29 +13,26 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import Finding, finding, plain
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.output.report import (
     BLUE,
     GRAY,
+    HEADS,
     ORANGE,
+    ExtraTable,
+    Report,
     command_line,
     interval_text,
     new_figure,
     number_text,
+    picture_axes,
     png,
     publish,
     refuse_places,
 )
 from finssim.calibration.uncertainty import Covariance, Evidence, correlation, intervals, trial_covariance
 from finssim.calibration.vision.least_squares import Pose, arrow_evidence, block_of
-from finssim.calibration.vision.report import (
-    ExtraTable,
-    Report,
-    correlation_json,
-    picture_axes,
-    plain,
-)
 from finssim.geometry.optics import Lens
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix, skew
 from finssim.localization.camera_file import write_camera
@@ -47,7 +44,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "Board", "BoardView", "MODELS", "board_found", "calibrate_camera", "parse_size", "run", "see_board",
+    "Board", "BoardView", "MODELS", "adjust", "board_found", "calibrate_camera", "evidence",
+    "lens_names", "lens_vector", "parse_size", "run", "see_board",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -720,42 +718,45 @@ OF_A_VIDEO = 15
 
 def camera_record(fit: CameraFit) -> dict[str, Any]:
     """What a camera file remembers: estimates, intervals, residuals and where they come from, as plain values."""
-    estimates = {}
-    for name, e in fit.estimates.items():
-        ci95 = [plain(x, DIGITS) for x in e.ci95]
-        estimates[name] = {"estimate": plain(e.estimate, DIGITS), "ci95": ci95, "unit": e.unit}
-    return {
-        "estimates": estimates,
-        "rms_px": plain(fit.rms, DIGITS),
-        "held_out_rms_px": plain(fit.held_out_rms, DIGITS),
+    record = {
+        "estimates": {
+            name: {"estimate": e.estimate, "ci95": e.ci95, "unit": e.unit}
+            for name, e in fit.estimates.items()
+        },
+        "rms_px": fit.rms,
+        "held_out_rms_px": fit.held_out_rms,
         "views": len(fit.used),
         "left_out": {view.name: view.left_out for view in fit.views if view.left_out},
         "findings": [one.as_json() for one in fit.findings],
         "settings": fit.settings,
         "provenance": provenance(),
     }
+    return dict(plain(record, DIGITS))
 
 
 def camera_json(fit: CameraFit, out: Path | None = None) -> dict[str, Any]:
     """What `--json` prints: the record, the lens, every view, the correlation of the errors and the coverage."""
-    reach = fit.reach
+    views = [
+        {
+            "name": view.name,
+            "rms_px": view.rms,
+            "tilt_deg": math.degrees(view.tilt),
+            "corners": len(view.pixels),
+            "left_out": view.left_out or None,
+        }
+        for view in fit.views
+    ]
+    record = {
+        "per_view": views,
+        "error95_px": {"where_seen": fit.reach.inside, "anywhere": fit.reach.anywhere},
+        "empty_edges": fit.reach.edges,
+        "correlation": fit.correlation.as_json(),
+    }
     return {
         "kind": "camera",
         **camera_record(fit),
         "parameters": {name: estimate.as_json() for name, estimate in fit.estimates.items()},
-        "per_view": [
-            {
-                "name": view.name,
-                "rms_px": plain(view.rms, DIGITS),
-                "tilt_deg": plain(math.degrees(view.tilt), DIGITS),
-                "corners": len(view.pixels),
-                "left_out": view.left_out or None,
-            }
-            for view in fit.views
-        ],
-        "error95_px": {"where_seen": plain(reach.inside, DIGITS), "anywhere": plain(reach.anywhere, DIGITS)},
-        "empty_edges": {side: plain(share, DIGITS) for side, share in reach.edges.items()},
-        "correlation": correlation_json(fit.correlation, DIGITS),
+        **plain(record, DIGITS),
         "out": None if out is None else str(out),
     }
 
@@ -776,6 +777,7 @@ def camera_report(fit: CameraFit) -> Report:
         )
     return Report(
         title="Camera calibration",
+        heads=(*HEADS, "note"),
         headline=f"{fit.settings['model']} lens from {len(fit.used)} of {len(fit.views)} views",
         estimates=list(fit.estimates.values()),
         cells=_cells,

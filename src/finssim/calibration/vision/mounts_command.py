@@ -11,16 +11,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.output.calibrate import all_findings, calibrated, kept
+from finssim.calibration.output.calibrate import all_findings, calibrated
 from finssim.calibration.output.report import (
     command_line,
     fit_json,
-    print_fit,
+    fit_report,
     publish,
     refuse_places,
     write_report,
@@ -64,7 +63,7 @@ from finssim.localization.fusion.fuse_log import Series, imu_columns, read_strea
 from finssim.localization.pool import Pool, load_pool
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["run"]
+__all__ = ["read_mount_log", "run"]
 
 Array = NDArray[np.float64]
 
@@ -570,11 +569,6 @@ def run(
         command = command_line("mounts", [log], options)
         write_report(fit, report, after, command=command, findings=findings, out=out)
 
-    def show(console: Console) -> None:
-        print_fit(fit, after, console, findings)
-        if unchanged := kept(fit, after):
-            console.print(f"kept from the file: {', '.join(unchanged)}", highlight=False, markup=False)
-
     record = fit_json(fit, after, out=out, findings=findings) if as_json else None
-    publish(record, show, (out, report))
+    publish(record, fit_report(fit, after, findings).show, (out, report))
     return after

@@ -13,25 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import plain
 from finssim.calibration.fit import Estimate
 from finssim.calibration.output.report import (
+    AS_GIVEN,
+    BLUE,
+    GRAY,
+    HEADS,
+    ORANGE,
+    Report,
     command_line,
     draw_correlation,
     new_figure,
+    picture_axes,
     png,
     publish,
     refuse_places,
 )
 from finssim.calibration.vision.pool_fit import HeldOut, PoolFit, calibrate_pool, doubted, rms
 from finssim.calibration.vision.pool_model import Settings
-from finssim.calibration.vision.report import (
-    AS_GIVEN,
-    Report,
-    correlation_json,
-    draw_arrows,
-    picture_axes,
-    plain,
-)
 from finssim.calibration.vision.survey import Observations, observe, observe_combined, read_survey
 from finssim.geometry.optics import Layer
 from finssim.localization.camera_file import CameraFile, load_camera
@@ -39,6 +39,7 @@ from finssim.localization.pool import Pool, write_pool
 from finssim.provenance import provenance
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["pool_record", "run"]
@@ -72,22 +73,22 @@ def pool_json(
         out: Pool file that was written.
         inputs: File -> SHA-256 of what the fit was made from.
     """
-    settings = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(fit.settings).items()}
+    held_out, pinhole = (None if h is None else h.as_json() for h in (fit.held_out, fit.pinhole_held_out))
+    figures = {
+        "residual": fit.residual_json(),
+        "held_out": held_out and {**held_out, "survey_cm": _survey_share(fit)},
+        "pinhole": {"rms_px": rms(fit.pinhole_residual[fit.used]), "held_out": pinhole},
+    }
     return {
         "kind": "pool",
         "interface": "surface" if fit.surface else "wall",
         "parameters": {name: estimate.as_json() for name, estimate in fit.estimates.items()},
-        "residual": _finite(fit.residual_json()),
-        "held_out": _held_out_json(fit.held_out, survey_cm=_survey_share(fit)),
-        "pinhole": {
-            "rms_px": plain(rms(fit.pinhole_residual[fit.used])),
-            "held_out": _held_out_json(fit.pinhole_held_out),
-        },
+        **plain(figures),
         "lens_fitted": list(fit.lens_fitted),
         "outliers": fit.outliers,
-        "correlation": correlation_json(fit.correlation, 4),
+        "correlation": plain(fit.correlation.as_json(), 4),
         "findings": [one.as_json() for one in fit.findings],
-        "settings": settings,
+        "settings": plain(asdict(fit.settings)),
         "inputs": dict(inputs or {}),
         "out": None if out is None else str(out),
         "provenance": provenance(),
@@ -123,6 +124,7 @@ def pool_report(fit: PoolFit) -> Report:
     kind = "water surface" if fit.surface else "wall"
     return Report(
         title=f"Camera and {kind} from {figures['locations']} surveyed places",
+        heads=(*HEADS, "note"),
         headline=f"camera before a {kind}, from {figures['locations']} surveyed places",
         estimates=list(fit.estimates.values()),
         cells=_cells,
@@ -144,14 +146,6 @@ def _figures(held_out: HeldOut) -> str:
     if figures["rms_cm"] is not None:
         text += f", in the water {figures['rms_cm']:.2f} cm rms, 95 % within {figures['p95_cm']:.2f} cm"
     return text
-
-
-def _held_out_json(held_out: HeldOut | None, **more: float) -> dict[str, float | int | None] | None:
-    return None if held_out is None else _finite({**held_out.as_json(), **more})
-
-
-def _finite(values: Mapping[str, float | int | None]) -> dict[str, float | int | None]:
-    return {key: value if isinstance(value, int) else plain(value) for key, value in values.items()}
 
 
 def _survey_share(fit: PoolFit) -> float:
@@ -189,7 +183,7 @@ def _map(fit: PoolFit) -> Figure:
     if not fit.surface:
         across, names = fit.model.tangents, ("along the wall [m]", "along the wall, across [m]")
     axes.plot(*(across @ fit.model.camera.position), "^", color="black", markersize=8, label="camera")
-    draw_arrows(axes, fit.seen.points @ across.T, 1000.0 * fit.error @ across.T, fit.used, "mm", 1000.0)
+    _draw_arrows(axes, fit.seen.points @ across.T, 1000.0 * fit.error @ across.T, fit.used, "mm", 1000.0)
     axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
     return figure
 
@@ -198,9 +192,45 @@ def _picture(fit: PoolFit) -> Figure:
     lens = fit.model.camera.lens
     figure = new_figure(7.4, 7.4 * lens.height / lens.width + 0.6)
     axes = figure.subplots()
-    draw_arrows(axes, fit.seen.pixels, fit.residual, fit.used, "px", 1.0)
+    _draw_arrows(axes, fit.seen.pixels, fit.residual, fit.used, "px", 1.0)
     picture_axes(axes, lens)
     return figure
+
+
+ARROW = 0.06
+"""Length of the 95th percentile of arrows in a figure, in widths of what is drawn."""
+
+
+def _draw_arrows(
+    axes: Axes,
+    at: Array,
+    vectors: Array,
+    used: NDArray[np.bool_],
+    unit: str,
+    per: float,
+) -> None:
+    """Points and enlarged arrows, and crosses where there is none; `per` of the arrows' unit make one of the axes'.
+
+    Args:
+        axes: To draw into.
+        at: (N, 2).
+        vectors: (N, 2).
+        used: Which rows the calibration used, (N,).
+        unit: Of the arrows.
+        per: Arrow units in one of the axes' units.
+    """
+    good = used & np.isfinite(vectors).all(axis=1)
+    size = float(np.percentile(np.linalg.norm(vectors[good], axis=1), 95)) if good.any() else 1.0
+    scale = max(size, 1e-12) / max(float(np.ptp(at, axis=0).max()) * ARROW, 1e-12)
+    axes.plot(*at[good].T, ".", color=GRAY, markersize=3)
+    label = f"longest of 95 %: {size:.2g} {unit}, enlarged {per / scale:.2g} times"
+    arrows = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.0022}
+    axes.quiver(*at[good].T, *vectors[good].T, color=BLUE, label=label, **arrows)
+    if not good.all():
+        axes.plot(*at[~good].T, "x", color=ORANGE, markersize=6, label="left out")
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=3, frameon=False)
+    axes.grid(True, color="0.93", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def run(

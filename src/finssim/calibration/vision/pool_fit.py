@@ -15,6 +15,7 @@ from scipy.stats import t as student
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Correlation, Estimate
+from finssim.calibration.output.report import AS_GIVEN
 from finssim.calibration.uncertainty import correlation
 from finssim.calibration.vision.least_squares import huber_weight
 from finssim.calibration.vision.pool_model import (
@@ -32,12 +33,11 @@ from finssim.calibration.vision.pool_model import (
     residuals,
     solve,
 )
-from finssim.calibration.vision.report import AS_GIVEN
 from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Camera, Interface, Lens, back_project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_euler, quat_to_matrix
 
-__all__ = ["HeldOut", "PoolFit", "calibrate_pool", "doubted", "rms"]
+__all__ = ["CAMERA", "HeldOut", "PoolFit", "calibrate_pool", "doubted", "rms"]
 
 Array = NDArray[np.float64]
 

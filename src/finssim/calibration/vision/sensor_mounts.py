@@ -26,15 +26,9 @@ from finssim.geometry.rotations import (
 )
 
 __all__ = [
-    "Attitude",
-    "DepthFit",
-    "Gyro",
-    "ImuMounting",
-    "fit_depth",
-    "fit_imu_mounting",
-    "imu_clock",
-    "rotation_between",
-]
+    "Attitude", "DepthFit", "Gyro", "ImuMounting", "SALT", "UNSURE_TURN", "fit_depth",
+    "fit_imu_mounting", "imu_clock", "rotation_between", "turn_pairs",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -181,15 +175,7 @@ class ImuMounting:
     """Robust root mean square of the turns' disagreement over one window [rad]."""
     rejected: int
     """Windows without weight."""
-    windows: int
-    correlation: float
-    """Of the turns' sizes once the clocks agree."""
     findings: tuple[Finding, ...]
-
-    @property
-    def whole(self) -> bool:
-        """Whether all three angles are told."""
-        return all(self.estimates[f"imu.turn_{axis}"].identifiable for axis in "xyz")
 
 
 def rotation_between(
@@ -243,7 +229,7 @@ def fit_imu_mounting(
             f"the attitude holds {0 if pairs is None else len(pairs.start)} windows of {window:g} s, expected at least "
             f"{FEWEST}: record a minute in which the vehicle turns about all its axes"
         )
-    offset, correlation = _time_offset(pairs, gyro) if time_offset is None else (time_offset, math.nan)
+    offset = _time_offset(pairs, gyro) if time_offset is None else time_offset
     body, sensor = _both(pairs, gyro, offset)
     size, before = np.linalg.norm(body, axis=1), np.asarray(start, float)
     q = rotation_between(body, sensor, np.minimum(1.0, 0.2 / np.maximum(size, 1e-9)), before)
@@ -267,8 +253,6 @@ def fit_imu_mounting(
         estimates=estimates,
         residual=fit.rms,
         rejected=fit.rejected,
-        windows=len(fit.weight),
-        correlation=correlation,
         findings=_imu_findings(estimates, fit.rejected / len(fit.weight)),
     )
 
@@ -279,8 +263,8 @@ def _both(pairs: TurnPairs, gyro: Gyro, offset: float) -> tuple[Array, Array]:
     return pairs.body[known], sensor[known]
 
 
-def _time_offset(pairs: TurnPairs, gyro: Gyro) -> tuple[float, float]:
-    """Where the sizes of the turns go together best, which needs no orientation; and their correlation there."""
+def _time_offset(pairs: TurnPairs, gyro: Gyro) -> float:
+    """Where the sizes of the turns go together best, which needs no orientation [s]."""
     best, highest = 0.0, -1.0
     for offset in np.arange(-LONGEST_OFFSET, LONGEST_OFFSET + 1e-9, OFFSET_STEP):
         body, sensor = _both(pairs, gyro, float(offset))
@@ -297,7 +281,7 @@ def _time_offset(pairs: TurnPairs, gyro: Gyro) -> tuple[float, float]:
             f"attitude and gyro do not turn together (correlation {max(highest, 0.0):.2f} at best, within "
             f"{LONGEST_OFFSET:g} s): are they of one recording, and does the vehicle turn?"
         )
-    return best, highest
+    return best
 
 
 Mounted = tuple[Array, Array, float]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.trials.units import UNITS
+from finssim.calibration.trials.conversion import UNITS
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
 from finssim.localization import LocalizationError
 from finssim.localization.camera_file import Fields
@@ -94,13 +94,12 @@ class Row:
         """(2,)"""
         return np.array([self.numbers["u"], self.numbers["v"]])
 
-    def placed(self, name: str, points: Array, *, is_tag: bool = False) -> Placed:
+    def placed(self, name: str, points: Array) -> Placed:
         """Points with what the row says of them."""
         return Placed(
             name,
             points,
             self.numbers.get("sigma", math.nan),
-            is_tag=is_tag,
             dry=self.words.get("dry", "").lower() in ("1", "1.0", "true", "yes", "y", "dry", "x"),
             group=self.words.get("group", ""),
         )
@@ -292,7 +291,6 @@ class Placed:
     """Pool frame [m], (K, 3); a tag's corners in the order of `localization.tags.corners`."""
     sigma: float
     """Standard error of each coordinate [m]; NaN where the survey does not say."""
-    is_tag: bool = False
     dry: bool = False
     """On the camera's side of the water."""
     group: str = ""
@@ -338,7 +336,7 @@ def read_survey(
     """
     if Path(path).suffix.lower() in (".yaml", ".yml"):
         tags, sigma = grid_points(path)
-        placed = {tag: Placed(f"tag {tag}", at, sigma, is_tag=True) for tag, at in tags.items()}
+        placed = {tag: Placed(f"tag {tag}", at, sigma) for tag, at in tags.items()}
         return Survey(str(path), tags=placed)
     table = read_table(path, unit=unit)
     for name in ("x", "y"):
@@ -394,7 +392,7 @@ def _surveyed(table: Table, row: Row, edge: float | None, z: float | None) -> tu
     tag = None if word is None else int(float(word))
     name = row.words.get("image") or f"tag {tag}"
     turn = quat_from_euler(*(row.numbers.get(n, 0.0) for n in ("roll", "pitch", "yaw")))
-    return name, tag, row.placed(name, row.position(z) + quat_rotate(turn, corners(edge)), is_tag=True)
+    return name, tag, row.placed(name, row.position(z) + quat_rotate(turn, corners(edge)))
 
 
 @dataclass(frozen=True, eq=False)

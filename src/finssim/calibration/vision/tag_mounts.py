@@ -38,7 +38,10 @@ from finssim.geometry.rotations import (
 )
 from finssim.localization.pool import Pool
 
-__all__ = ["AXES", "UNSURE_LENGTH", "Moment", "MountFit", "Rig", "fit_mounts", "reference_tag", "residuals"]
+__all__ = [
+    "AXES", "Moment", "MountFit", "MountState", "Noise", "Rig", "UNSURE_LENGTH", "change", "fit_mounts",
+    "moment_blocks", "moved", "reference_tag", "residuals", "start_state",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol
 
-from finssim.learning.learners.base import own_settings
+from finssim.learning.learners.base import ActingLearner, own_settings
 from finssim.tasks import Environment, Task
+from finssim.tasks.make import own_class
 
 if TYPE_CHECKING:
     from torch import nn
@@ -63,6 +64,8 @@ class LearnerKind:
     """What of FinsSim must be installed, as pip takes it."""
     agents: str = "any"
     """How many agents of a task it can train: one, several, or any."""
+    own: type | None = None
+    """The class itself, of a learner from outside the package."""
 
     def settings(
         self,
@@ -78,9 +81,9 @@ class LearnerKind:
         Raises:
             LearningError: A change names no setting, has another type than the setting's own, or counts too few.
         """
-        learner = next(name for name, kind in LEARNERS.items() if kind == self)
-        own = own_settings(task.name, learner, randomized)
-        chosen = getattr(self._module(), self.name).settings_for(task, own, worlds, steps)
+        learner = next((name for name, kind in LEARNERS.items() if kind == self), self.name)
+        own = own_settings(task.name, learner, randomized) if learner in LEARNERS else {}
+        chosen = self._class().settings_for(task, own, worlds, steps)
         return replace(
             chosen, **{name: _fitting(chosen, name, value) for name, value in (changes or {}).items()}
         )
@@ -92,7 +95,7 @@ class LearnerKind:
             LearningError: It cannot train the task's number of agents.
         """
         self.check(environment.task)
-        learner: Learner = getattr(self._module(), self.name)(environment, settings, seed=seed, device=device)
+        learner: Learner = self._class()(environment, settings, seed=seed, device=device)
         return learner
 
     def check(self, task: Task) -> None:
@@ -113,9 +116,11 @@ class LearnerKind:
                 f"task '{task.name}' has {has}, and this learner trains {self.agents}: take {', '.join(able)}"
             )
 
-    def _module(self) -> Any:
+    def _class(self) -> Any:
+        if self.own is not None:
+            return self.own
         try:
-            return import_module(f"finssim.learning.learners.{self.module}")
+            return getattr(import_module(f"finssim.learning.learners.{self.module}"), self.name)
         except ModuleNotFoundError as error:
             if str(error.name).startswith("finssim"):
                 raise
@@ -170,13 +175,23 @@ SHARES = ("discount", "gae_lambda", "smoothing", "taught")
 
 
 def learner_named(name: str) -> LearnerKind:
-    """The kind of that name.
+    """The kind of that name; or one's own, FILE.py:CLASS or MODULE:CLASS, a class derived from `ActingLearner`.
 
     Raises:
-        LearningError: There is none.
+        LearningError: There is none, or the class is no learner.
+        EnvironmentSetupError: There is no such file or class, or its code fails.
     """
+    if ":" in name:
+        found = own_class(name, ActingLearner, "learner")
+        if not (isinstance(found, type) and issubclass(found, ActingLearner) and hasattr(found, "Settings")):
+            raise LearningError(
+                f"'{name}' is no learner: derive it from finssim.learning.learners.base.ActingLearner, with a frozen "
+                "dataclass Settings"
+            )
+        what = (found.__doc__ or found.__name__).strip().splitlines()[0]
+        return LearnerKind(found.__module__, found.__name__, what, own=found)
     if name not in LEARNERS:
-        raise LearningError(f"unknown learner '{name}'; available: {', '.join(LEARNERS)}")
+        raise LearningError(f"unknown learner '{name}'; available: {', '.join(LEARNERS)}, or FILE.py:CLASS")
     return LEARNERS[name]
 
 

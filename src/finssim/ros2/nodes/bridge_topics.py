@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from finssim.robot.bridge import Bridge
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.ros2.nodes.conversions import force_of
 from finssim.ros2.nodes.remote import Readings
 from finssim.ros2.nodes.robot_node import RobotNode, matched_callbacks

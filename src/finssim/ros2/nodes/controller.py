@@ -11,7 +11,7 @@ from finssim.control import ControlError
 from finssim.control.guidance import Guide, Station
 from finssim.geometry.rotations import quat_yaw
 from finssim.robot.goals import GoalError, check_reachable, guide_of
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.robot.runtime import Runtime
 from finssim.ros2.nodes.conversions import station_of_pose, trajectory_of
 from finssim.ros2.nodes.modes import Modes

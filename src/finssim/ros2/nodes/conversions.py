@@ -25,8 +25,8 @@ from finssim.robot.messages import (
     Telemetry,
 )
 from finssim.robot.pictures import picture_of
+from finssim.robot.reading import Reading
 from finssim.robot.record_messages import FIRST_TIME, LAST_TIME, UNKNOWN
-from finssim.robot.robot import Reading
 
 __all__ = [
     "aid_of",

@@ -17,7 +17,7 @@ from finssim.geometry.rotations import (
     quat_to_euler,
 )
 from finssim.localization.pool import Pool
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.ros2.urdf import BASE, mounts, urdf_of

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from finssim.robot.bridge import Event
 from finssim.robot.messages import Telemetry, ThrusterCommand
+from finssim.robot.reading import Reading
 from finssim.robot.record_messages import STATES
-from finssim.robot.robot import Reading
 from finssim.ros2.nodes.conversions import nanoseconds, reading_of
 from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.nodes.ros_messages import ros_type

@@ -13,7 +13,7 @@ from finssim.engine import Pool as Walls
 from finssim.engine import Simulator, Water
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.robot.pilots import make_pilot
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 from finssim.viewer.frame import Curve, Frame, Pose, Stage
 from finssim.viewer.sources.guides import goal_pose, path_of, start_of

@@ -8,7 +8,7 @@ import torch
 from tests.reference.observed import published_t1
 
 from finssim.control.guidance import Station
-from finssim.experiments.driven import collect_records
+from finssim.experiments.records import collect_records
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.learning.demonstrations import load
 from finssim.learning.learners import learner_named

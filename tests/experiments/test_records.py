@@ -9,7 +9,7 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.control.allocation import Allocator
 from finssim.control.modes import action_mode
-from finssim.experiments.driven import (
+from finssim.experiments.records import (
     DriveError,
     actions_of,
     collect_records,
@@ -23,8 +23,8 @@ from finssim.vehicles import load_vehicle
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
+from finssim.robot.reading import Reading
 from finssim.robot.recorder import Recorder
-from finssim.robot.robot import Reading
 
 FINSROV = load_vehicle("finsrov")
 STEP = 1.0 / 60.0

@@ -1,18 +1,16 @@
-"""The robot as a controller sees it: `read()` what is known, `send()` thrusts and learn how they were limited."""
+"""What a robot knows of its vehicle at one time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from finssim.control.guidance import Track
-from finssim.vehicles import Vehicle
 
-__all__ = ["Reading", "Robot"]
+__all__ = ["Reading"]
 
 Array = npt.NDArray[np.float64]
 
@@ -39,20 +37,3 @@ class Reading:
     """Standard deviations of position [m], velocity [m/s] and yaw [rad], (7,)."""
     tracks: Mapping[str, Track] = field(default_factory=dict)
     """What is known of other vehicles, by name."""
-
-
-class Robot(Protocol):
-    """A simulator, the virtual pool or the vehicle: a controller cannot tell which it holds."""
-
-    @property
-    def vehicle(self) -> Vehicle:
-        """As its file has it."""
-
-    def read(self) -> Reading:
-        """The newest state."""
-
-    def send(self, force: npt.ArrayLike) -> Array:
-        """Command thrusts along the thrusters' axes in canonical order [N], (n,).
-
-        Returns them as limited (zeros while not armed).
-        """

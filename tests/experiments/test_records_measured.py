@@ -13,7 +13,7 @@ from finssim.control.guidance import Station
 from finssim.control.trajectories import load_trajectory
 from finssim.experiments.evaluate import evaluate
 from finssim.experiments.metrics import T1_SETPOINTS, measure_trial
-from finssim.experiments.recorded import RecordedError, read_record
+from finssim.experiments.records import DriveError, read_record
 from finssim.experiments.stack import site_of
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool import draw_plant
@@ -141,18 +141,18 @@ def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):
     assert told["complete"] == 1 and told["horizontal_rmse_m"] < 0.05 and told["energy"] > 0.0
     (done,) = evaluate([record], task="t2", truth=truth, as_json=True)
     assert done.result["per_trial"][0]["p95_m"] < 0.08 and done.result["per_trial"][0]["success"]
-    with pytest.raises(RecordedError, match="its goal moves"):
+    with pytest.raises(DriveError, match="its goal moves"):
         read_record(record, "t1", FINSROV)
-    with pytest.raises(RecordedError, match="'pursuit' has 2 vehicles and .* is of one"):
+    with pytest.raises(DriveError, match="'pursuit' has 2 vehicles and .* is of one"):
         read_record(record, "pursuit", FINSROV)
-    with pytest.raises(RecordedError, match="its goal moves, and 'docking' has one"):
+    with pytest.raises(DriveError, match="its goal moves, and 'docking' has one"):
         read_record(record, "docking", FINSROV)
     short = tmp_path / "short.csv"
     short.write_text("t,x,y,z,yaw\n0,0,0,0,0\n1,0,0,0,0\n")
-    with pytest.raises(RecordedError, match="less than half of the record"):
+    with pytest.raises(DriveError, match="less than half of the record"):
         read_record(record, "t2", FINSROV, truth=short)
     short.write_text("time,x,y\n0,0,0\n")
-    with pytest.raises(RecordedError, match="columns time, x, y, expected t"):
+    with pytest.raises(DriveError, match="columns time, x, y, expected t"):
         read_record(record, "t2", FINSROV, truth=short)
 
 
