@@ -37,7 +37,7 @@ X, Y, Z, YAW = T1_SETPOINTS["P03"]
 
 
 def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5)):
-    """A recorded run of the tuned PID in a pool whose clock is the robot's, and its truth; no longer than `brief_t1`."""
+    """A recorded run of the tuned PID on the pool's clock, and its truth, as long as `brief_t1` has it."""
     true_site, known_site, settings = camera_of(FINSROV, 1, "realistic")
     truth, record = folder / "truth", folder / "run.mcap"
     camera = PoolCamera(FINSROV, true_site, mode="corners", settings=settings, seed=1)
