@@ -29,7 +29,7 @@ from finssim.tasks.agents import BASELINES
 from finssim.vehicles import load_vehicle
 from reference.policies import linear, written
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("brief_t1")]
 
 FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -37,7 +37,7 @@ X, Y, Z, YAW = T1_SETPOINTS["P03"]
 
 
 def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5)):
-    """A recorded run of the tuned PID in a pool whose clock is the robot's, and its truth."""
+    """A recorded run of the tuned PID on the pool's clock, and its truth, as long as `brief_t1` has it."""
     true_site, known_site, settings = camera_of(FINSROV, 1, "realistic")
     truth, record = folder / "truth", folder / "run.mcap"
     camera = PoolCamera(FINSROV, true_site, mode="corners", settings=settings, seed=1)
@@ -51,17 +51,18 @@ def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5)):
     )
     pilot = make_pilot("pid", FINSROV, task=task)
     about = {"command": "finssim run", "pilot": pilot.describe()}
+    guide_end = 0.0 if isinstance(guide, Station) else guide.duration
     with Recorder(record, FINSROV, about, pictures="none", epoch=1e9) as recorder:
         runtime = Runtime(FINSROV, known_site, pilot, guide, arm=True, recorder=recorder)
-        run_lockstep(runtime, pool, seconds, until=lambda r: r.t >= 60.5)
+        run_lockstep(runtime, pool, seconds, until=lambda r: r.t >= max(24.0, guide_end) + 0.5)
     pool.close()
     return record, truth, runtime.started
 
 
 @pytest.fixture(scope="module")
-def held(tmp_path_factory):
-    """P03, held for a minute."""
-    return driven(tmp_path_factory.mktemp("held"), Station((X, Y, Z), YAW, name="P03"), 70.0)
+def held(brief_t1, tmp_path_factory):
+    """P03, held for 24 s."""
+    return driven(tmp_path_factory.mktemp("held"), Station((X, Y, Z), YAW, name="P03"), 34.0)
 
 
 def captured(path, truth, late):
