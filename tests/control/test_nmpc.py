@@ -72,6 +72,18 @@ def test_a_far_goal_is_approached_with_a_thruster_at_its_limit(vehicle, nmpc):
     assert min(np.min(upper - thrusts), np.min(thrusts - lower)) < 0.1
 
 
+def test_the_sign_of_the_quaternion_makes_no_difference(nmpc):
+    """q and -q are one attitude: a filter or a motion capture may change between them at any time."""
+    goal, q = Goal(np.array([0.3, 0.0, -0.5]), quat_from_yaw(0.5)), quat_from_yaw(2.9)
+    place = np.array([0.0, 0.0, -0.5])
+    _, memory = nmpc.command(nmpc.reset(), at_rest(place, q), goal)
+    (one, after), (other, after_other) = (
+        nmpc.command(memory, at_rest(place, s * q), goal) for s in (1.0, -1.0)
+    )
+    np.testing.assert_allclose(other, one, rtol=1e-9)
+    np.testing.assert_allclose(after_other.plan, after.plan, rtol=1e-9, atol=1e-12)
+
+
 def test_commands_under_way_are_reckoned_with(pool):
     """A vehicle whose thrusters hear everything 0.3 s late: three commands under way, and it is held all the same."""
     plain = load_vehicle("finsrov")
