@@ -150,9 +150,8 @@ class Nmpc:
         a_goal: Array,
     ) -> tuple[Array, NmpcMemory]:  # fmt: skip
         """The same for one vehicle; the goal moves on with its velocity and acceleration."""
-        if (
-            memory.plan[3:7] @ q < 0.0
-        ):  # the same attitude; of the other sign no step of the last plan would fit
+        # q and -q are one attitude, but of the other sign no step of the last plan would fit.
+        if memory.plan[3:7] @ q < 0.0:
             q = -q
         observed = np.concatenate([quat_inverse_rotate(q, memory.force), memory.moment])
         if not np.isnan(memory.predicted).any():
