@@ -276,11 +276,11 @@ def test_fixes_of_another_site_are_a_file(tmp_path):
     assert env.noise == Sensing(rate=1.0, fixes=MeasurementNoise(position_std=0.2, delay=0.5))
     for text, sentence in (
         ("fixes: {}", "rate is missing: give the fixes a second"),
-        ("rate: fast", "rate: Input should be a valid number"),
-        ("rate: 1\nfix: {}", "fix: Unexpected keyword"),
-        ("rate: 1\nfixes: 3", "fixes: Input should be a dictionary"),
-        ("rate: 1\nfixes: {velocity_std: 0.1}", "velocity_std of the fixes is given, expected of"),
-        ("rate: 1\nfixes: {delay: 9}", "fixes: delay of the measurement is 9.0 s, expected at most 2 s"),
+        ("rate: fast", "rate is 'fast', expected a number"),
+        ("rate: 1\nfix: {}", "unknown key 'fix', expected rate, fixes"),
+        ("rate: 1\nfixes: 3", "fixes is 3, expected keys such as position_std"),
+        ("rate: 1\nfixes: {velocity_std: 0.1}", "unknown key 'velocity_std', expected position_std"),
+        ("rate: 1\nfixes: {delay: 9}", "delay of the measurement is 9 s, expected at most 2 s"),
         ("rate: -1", "rate of the fixes is -1.0 Hz"),
     ):
         file.write_text(text)

@@ -11,12 +11,12 @@ A measurement that comes late is compared with the estimate of its own time and 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import warp as wp
-from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from finssim.engine import Simulator
 from finssim.engine.launch import Pipeline
@@ -48,7 +48,7 @@ from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import LONGEST_DELAY, MeasurementNoise
 from finssim.vehicles import Vehicle
-from finssim.yaml_file import first_problem, read_mapping
+from finssim.yaml_file import read_mapping
 
 __all__ = ["Sensing", "SensingBatch", "load_sensing", "seen_with"]
 
@@ -76,8 +76,6 @@ class Sensing:
 
     The defaults are about those of the overhead camera of a virtual pool of severity realistic.
     """
-
-    __pydantic_config__: ClassVar = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     rate: float = 30.0
     """Fixes a second [Hz]; 0: none, from a known start on."""
@@ -109,12 +107,21 @@ def load_sensing(path: str | Path) -> Sensing:
         EnvironmentSetupError: The file is not there or wrong; names it and the key.
     """
     data = read_mapping(Path(path), EnvironmentSetupError, such_as="rate: 1.0")
+    fixes = data.get("fixes", {})
+    if not isinstance(fixes, Mapping):
+        raise EnvironmentSetupError(f"{path}: fixes is {fixes!r}, expected keys such as position_std: 0.2")
+    for given, known in ((data, ("rate", "fixes")), (fixes, PER_FIX)):
+        for key, value in given.items():
+            if key not in known:
+                raise EnvironmentSetupError(f"{path}: unknown key '{key}', expected {', '.join(known)}")
+            if key != "fixes" and (isinstance(value, bool) or not isinstance(value, int | float)):
+                raise EnvironmentSetupError(f"{path}: {key} is {value!r}, expected a number")
     if "rate" not in data:
         raise EnvironmentSetupError(f"{path}: rate is missing: give the fixes a second [Hz], 0 for none")
     try:
-        return TypeAdapter(Sensing).validate_python({"fixes": {}, **data})
-    except ValidationError as error:
-        raise EnvironmentSetupError(f"{path}: {first_problem(error)}") from None
+        return Sensing(rate=float(data["rate"]), fixes=MeasurementNoise(**fixes))
+    except ValueError as error:
+        raise EnvironmentSetupError(f"{path}: {error}") from None
 
 
 def seen_with(noise: MeasurementNoise | Sensing, vehicle: Vehicle) -> dict[str, Any]:
