@@ -22,7 +22,7 @@ from finssim.files import OutputError
 from finssim.learning import episodes
 from finssim.learning.export import onnx_bytes
 from finssim.learning.learners import LEARNERS, LearningError
-from finssim.learning.resume import ResumeError
+from finssim.learning.resume import ResumeError, read_state, write_state
 from finssim.learning.train import TrainingError, train
 from finssim.learning.training_loop import Loop
 from finssim.tasks import EnvironmentSetupError, StationKeeping, Task, TrajectoryTracking
@@ -240,6 +240,12 @@ def test_only_the_same_training_is_resumed(tmp_path, capsys):
     with pytest.raises(ResumeError, match="seed was 5 and is 6 now: give what the training began with"):
         train("t1", out=tmp_path / "p", resume=True, **{**SMALL, "seed": 6})
     side = tmp_path / "p-training"
+    for path in side.glob("checkpoint-*/resume.npz"):
+        state = read_state(path)
+        del state["best"]
+        write_state(state, path)
+    with pytest.raises(ResumeError, match="the checkpoint is of an earlier version: leave out --resume"):
+        train("t1", out=tmp_path / "p", resume=True, **SMALL)
     for state in side.glob("checkpoint-*/resume.npz"):
         state.write_bytes(state.read_bytes()[:1000])
     with pytest.raises(ResumeError, match="checkpoint-000003072/resume.npz: cannot be resumed from"):

@@ -225,7 +225,7 @@ def export_policy(
     Args:
         network: A `Network`, or a torch module that maps observations (N, n) float32 to the mean action (N, m), or, as
             a `RecurrentNetwork`, observations and memory to action and memory; the written one clips the action to
-            [-1, 1]. Or what `onnx_bytes` made of one before.
+            [-1, 1]. Or what `onnx_bytes` made of one before, which is not compared again.
         directory: Folder to write. An earlier policy directory is replaced; any other folder with files is refused.
         description: What it was trained with; `memory`, `files`, `provenance` and `created` are filled in.
         curves: Rows of `curves.csv`, with equal keys.

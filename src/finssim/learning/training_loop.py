@@ -271,6 +271,8 @@ class Loop:
                     f"cannot go on in {self.side}: {name} was {found!r} and is {value!r} now: "
                     "give what the training began with, or leave out --resume"
                 )
+        if "best" not in state:
+            raise ResumeError(f"{self.side}: the checkpoint is of an earlier version: leave out --resume")
         self.learner.load(state["learner"])
         self.curves, self.seconds = list(state["curves"]), float(state["seconds"])
         if state["best"]:

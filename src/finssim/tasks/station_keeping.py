@@ -10,7 +10,16 @@ from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.fitting import PoolTask
 from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.terms import End, ObservationPart, RewardTerm, Terms, own_velocity, tilted, uniform3
+from finssim.tasks.terms import (
+    End,
+    ObservationPart,
+    RewardTerm,
+    Terms,
+    own_velocity,
+    tilt_angle,
+    tilted,
+    uniform3,
+)
 
 DISTANCE_SCALE = 3.0
 """Distances are divided by this in the observation [m]."""
@@ -79,8 +88,7 @@ def within_tolerance(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 @wp.func
 def leaning(state: State, p: Any, w: int) -> float:
     """0 up to half of `max_tilt`, 1 at `max_tilt`, 2 from half beyond it [1]: the tilt at which a bridge stops."""
-    up = wp.quat_rotate(state.quaternion[w, 0], wp.vec3(0.0, 0.0, 1.0))[2]
-    return wp.clamp(2.0 * wp.acos(wp.clamp(up, -1.0, 1.0)) / p.max_tilt - 1.0, 0.0, 2.0)
+    return wp.clamp(2.0 * tilt_angle(state, w) / p.max_tilt - 1.0, 0.0, 2.0)
 
 
 @wp.func
@@ -139,8 +147,8 @@ class StationKeeping(PoolTask):
         delay=0.1,
         graded=True,
     )
-    """Up to twice what an estimate is off by, and as late: with exact states alone, gains are learnt that chatter; with
-    noise alone, vehicles that hardly damp their turning are held only while it shakes them."""
+    """As late as an estimate, and noisier, by worlds from none to all of it: with exact states alone gains are learnt
+    that chatter; with noise alone, vehicles that hardly damp their turning are held only while it shakes them."""
 
     def success_rule(self) -> str:
         """See `Task`."""

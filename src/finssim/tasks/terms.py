@@ -247,6 +247,13 @@ def turning(state: State, w: int) -> float:
 
 
 @wp.func
+def tilt_angle(state: State, w: int) -> float:
+    """Angle between the body z axis and the vertical [rad]."""
+    up = wp.quat_rotate(state.quaternion[w, 0], wp.vec3(0.0, 0.0, 1.0))[2]
+    return wp.acos(wp.clamp(up, -1.0, 1.0))
+
+
+@wp.func
 def out_of_pool(state: State, p: Any, w: int) -> bool:
     """Beyond `bounds`, above `ceiling` or below `depth`, in proportion to the vehicle."""
     x = state.position[w, 0] / p.fit.size

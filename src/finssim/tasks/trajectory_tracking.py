@@ -25,6 +25,7 @@ from finssim.tasks.terms import (
     Terms,
     own_velocity,
     start_upright,
+    tilt_angle,
     uniform3,
 )
 
@@ -140,9 +141,8 @@ def lead_reference(arrays: TaskArrays, w: int):
 @wp.func
 def posture(state: State, p: Any, w: int, pose: float) -> float:
     """pose · (0.5 / (1 + (tilt / tilt_scale)²) + 0.5 / (1 + (r / spin_scale)⁴))."""
-    tilt = wp.acos(wp.clamp(wp.quat_rotate(state.quaternion[w, 0], wp.vec3(0.0, 0.0, 1.0))[2], -1.0, 1.0))
     rate = state.velocity[w, 0][5]
-    lean = tilt / p.reward.tilt_scale
+    lean = tilt_angle(state, w) / p.reward.tilt_scale
     spun = rate * rate / (p.reward.spin_scale * p.reward.spin_scale)
     return pose * (0.5 / (1.0 + lean * lean) + 0.5 / (1.0 + spun * spun))
 

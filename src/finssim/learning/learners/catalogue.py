@@ -81,8 +81,11 @@ class LearnerKind:
         Raises:
             LearningError: A change names no setting, has another type than the setting's own, or counts too few.
         """
-        learner = next((name for name, kind in LEARNERS.items() if kind == self), self.name)
-        own = own_settings(task.name, learner, randomized) if learner in LEARNERS else {}
+        own = {}
+        if self.own is None:
+            own = own_settings(
+                task.name, next(name for name, kind in LEARNERS.items() if kind == self), randomized
+            )
         chosen = self._class().settings_for(task, own, worlds, steps)
         return replace(
             chosen, **{name: _fitting(chosen, name, value) for name, value in (changes or {}).items()}
