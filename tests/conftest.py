@@ -6,7 +6,6 @@ import signal
 # Before any numeric library starts: OpenMP on busy cores slows torch tens of times.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import gc
 import multiprocessing.process
 import sys
 import time
@@ -27,11 +26,6 @@ settings.load_profile("finssim")
 
 # A run in the background inherits an ignored Ctrl-C, and so would the processes that tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-# A million objects stand in memory once all tests are imported: collecting them again and again took a quarter of the
-# import and a thirtieth of the tests. What importing made stays; the collector looks at what tests make.
-gc.disable()
 
 
 # ---- processor time by test: `--durations N` shows wall-clock time, which neighbours on the machine change
@@ -92,11 +86,8 @@ def _audit(event: str, arguments: tuple) -> None:
 
 
 def pytest_collection_finish():
-    """What importing the tests took is no test's, and what it made is none's garbage."""
+    """What importing the tests took is no test's."""
     global _before
-    gc.collect()
-    gc.freeze()
-    gc.enable()
     _before = processor_time()
 
 
