@@ -23,6 +23,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.control.ardusub import motors_of
 from finssim.engine import Pool, Simulator, Water, Wave
 from finssim.geometry.frames import TO_FOSSEN, wxyz_from_xyzw
 from finssim.geometry.rotations import cross, quat_from_yaw, quat_to_euler, quat_to_matrix
@@ -123,8 +124,7 @@ class SitlWorld:
         """
         self.vehicle, self.battery = vehicle, battery or Battery(full_voltage=16.0)
         self._thrusters = list(vehicle.thrusters.values())
-        given = [t.motor_index for t in self._thrusters]
-        self._output = np.array([i if index is None else index for i, index in enumerate(given)])
+        self._output = motors_of(vehicle)
         self._start = position, quat_from_yaw(yaw)
         longest = max(t.delay for t in self._thrusters)
         self.simulator = Simulator(
