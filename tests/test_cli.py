@@ -48,6 +48,7 @@ COMMANDS = [
     "backproject",
     "run",
     "pool",
+    "ardusub-sitl",
     "tasks",
     "tasks show",
     "randomize",
