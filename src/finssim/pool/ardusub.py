@@ -50,8 +50,8 @@ BOOT_INPUTS = (NEUTRAL,) * 8 + (1100,) * 10
 SPECIFIC_WEIGHT = 9800.0
 """Of fresh water, as ArduPilot has it [Pa/m]."""
 METRES_PER_DEGREE = 111319.5
-CALIBRATION = 1.0
-"""For so long after the start the gyroscope is averaged [s]."""
+CALIBRATION, STILL = 1.0, 0.03
+"""For so long after the start the gyroscope is averaged [s], unless it turns faster than this [rad/s]."""
 DEPTH_LAG = 0.4
 """Time constant of the depth estimate [s]."""
 CLIMB_GAIN, CLIMB_INTEGRAL = 1.5, 0.4
@@ -173,7 +173,7 @@ class ArduSub:
         self._low_since, self._leak_told = math.inf, -math.inf
         self._gain, self._buttons = self._within("JS_GAIN_DEFAULT", 0.1, 1.0), 0
         self._filter = AttitudeFilter(self._spec.attitude_gain, self._spec.attitude_integral, self._gravity)
-        self._rates_sum, self._rates_count = np.zeros(3), 0
+        self._rates_sum, self._rates_count, self._fastest = np.zeros(3), 0, 0.0
         self._sample: Sample | None = None
         self._sampled, self._headed = now, False
         self._attitude, self._quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
@@ -287,8 +287,10 @@ class ArduSub:
         gyro, accel = (self._body_from_imu @ np.array(v) for v in (sample.gyro, sample.accel))
         if now - self._boot < CALIBRATION:
             self._rates_sum, self._rates_count = self._rates_sum + gyro, self._rates_count + 1
+            self._fastest = max(self._fastest, float(np.abs(gyro).max()))
             x, y, z = (self._rates_sum / self._rates_count).tolist()
-            self._filter.bias = (x, y, z)
+            # One that was moved meanwhile would take its motion for the gyroscope's offset.
+            self._filter.bias = (x, y, z) if self._fastest < STILL else (0.0, 0.0, 0.0)
         self._filter.update(tuple(gyro.tolist()), tuple(accel.tolist()), dt)
         velocities = []
         for aid in aids:

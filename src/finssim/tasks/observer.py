@@ -130,7 +130,9 @@ class Observer:
         self._remember(np.zeros(self._action_size) if previous is None else np.asarray(previous, float))
         a.time.numpy()[0] = t
         self._steps[0] = max(round(t / self.task.control_step), 0)
-        a.goal_position.numpy()[0] = now.position
+        way = np.asarray(now.position, float) - reading.position
+        far = float(np.linalg.norm(way)) / (getattr(self.task, "reach", math.inf) * self.task.fit.size)
+        a.goal_position.numpy()[0] = now.position if not far > 1.0 else reading.position + way / far
         a.goal_quaternion.numpy()[0] = quat_from_yaw(now.yaw)
         if a.target.velocity is not None:
             a.target.velocity.numpy()[0] = now.velocity
