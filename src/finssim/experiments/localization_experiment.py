@@ -35,8 +35,6 @@ from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples
 from finssim.text_table import write_csv
 from finssim.vehicles import Mount, Tags
 
-__all__ = ["RESULT_FILE", "draw_campaign", "localization_experiment", "tables_of"]
-
 Array = NDArray[np.float64]
 
 LOCATIONS = (17, 10)

@@ -18,8 +18,6 @@ from finssim.page import html_page
 from finssim.provenance import provenance
 from finssim.yaml_file import read_json
 
-__all__ = ["everything", "tables_of"]
-
 LEAD = (
     "Rows in gray are the paper's own, measured on its real vehicle in its pool. All others are measured here: "
     "localization and replay by simulation, station keeping and tracking in a virtual pool whose vehicle, water and "

@@ -27,8 +27,6 @@ from finssim.text_table import write_csv
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.terms import unit_of
 
-__all__ = ["randomize_show", "tables_of"]
-
 FAMILIES = {
     "added_mass": ("M_A", "kg", "kg m²"),
     "linear_damping": ("D1", "N s/m", "N m s"),

@@ -33,19 +33,6 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
 
-__all__ = [
-    "Pair",
-    "Process",
-    "ReliabilityError",
-    "await_flush",
-    "await_thrust",
-    "pair",
-    "soak",
-    "tables_of",
-    "timing",
-]
-
-
 # The processes of a robot and its virtual pool: started as a person starts them, watched, and killed.
 
 

@@ -13,8 +13,6 @@ from finssim.experiments import anatomy, transfer
 from finssim.experiments.tables import Table, markdown_table
 from finssim.files import atomic_write
 
-__all__ = ["ReportError", "filled", "report"]
-
 TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Table]]] = {
     **dict.fromkeys(transfer.SPECS, transfer.tables_of),
     "anatomy": anatomy.tables_of,

@@ -15,20 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "RESAMPLES",
-    "SEED",
-    "Interval",
-    "Statistic",
-    "better",
-    "bootstrap",
-    "interquartile_mean",
-    "paired_difference",
-    "probability_of_improvement",
-    "with_bootstrap",
-    "with_interval",
-]
-
 Array = NDArray[np.float64]
 Statistic = Callable[..., Any]
 """Of all values together, one number."""

@@ -30,19 +30,6 @@ from finssim.learning.train import train
 from finssim.provenance import provenance
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = [
-    "MEASURES",
-    "SPECS",
-    "T1",
-    "ROWS",
-    "T2",
-    "controllers_of",
-    "t1",
-    "t2",
-    "tables_of",
-    "transfer_experiment",
-]
-
 Results = Mapping[str, Sequence[Mapping[str, Any]]]
 """Row -> results of its trials."""
 
