@@ -106,7 +106,7 @@ def kinds() -> list[Kind]:
             "--bind 127.0.0.1:0 --duration 0",
         ), weight=3),
         Kind("ranges", "ranges.yaml", (
-            "randomize show {} --vehicle finsrov --samples 2 --out OUT/ranges",
+            "randomize show {} --vehicle finsrov",
             "collect pid --task t1 --episodes 1 --randomize {} --out OUT/set",
         )),
         Kind("observe", "site.yaml", ("collect pid --task t1 --episodes 1 --observe {} --out OUT/set",)),

@@ -38,7 +38,6 @@ COMMANDS = [
     "experiment localization",
     "experiment faults",
     "experiment soak",
-    "experiment timing",
     "calibrate camera",
     "calibrate pool",
     "calibrate mounts",

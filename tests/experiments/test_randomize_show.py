@@ -1,18 +1,15 @@
-"""`finssim randomize show`: the table in SI, the spread of step responses, and refusals."""
+"""`finssim randomize show`: the table in SI, and refusals."""
 
 from __future__ import annotations
 
-import csv
 import json
 
-import numpy as np
 import pytest
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges, available, load_ranges
-from finssim.experiments.randomize_show import STEPS, rows_of, step_responses
+from finssim.experiments.randomize_show import rows_of
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
@@ -72,53 +69,19 @@ def test_every_set_has_rows_for_every_vehicle(name, vehicle):
     )
 
 
-def test_more_thrust_and_less_drag_go_faster():
-    """Half and twice the thrust around the file's own response; nothing drawn is the file's own."""
-    _, own = step_responses(FINSROV, None, "calibrated", 1, 0)
-    for factor in (0.5, 1.0, 2.0):
-        ranges = Ranges.model_validate(
-            {"name": "t", "thrust": {"all": [factor, factor]}, "slew": [0.999, 0.9999]}
-        )
-        _, drawn = step_responses(FINSROV, Randomization(ranges), "calibrated", 2, 0)
-        for axis in STEPS:
-            ratio = drawn[axis][0, -1] / own[axis][0, -1]
-            assert (
-                (ratio > 1.2) if factor > 1.0 else (ratio < 0.8) if factor < 1.0 else abs(ratio - 1.0) < 1e-3
-            )
-            assert own[axis][0, -1] > 0.05
-
-
 def run(*words: str) -> int:
     return boundary.run(app, list(words))
 
 
-def test_the_command_writes_table_picture_and_record(tmp_path, capsys):
-    out = tmp_path / "shown"
-    assert run("randomize", "show", "pool", "--vehicle", "finsrov", "--out", str(out), "--samples", "20") == 0
-    assert (out / "spread.png").read_bytes()[:4] == b"\x89PNG"
-    record = json.loads((out / "show.json").read_text(encoding="utf-8"))
-    assert record["vehicle"]["sha256"] == FINSROV.sha256 and record["samples"] == 20
-    for axis in STEPS:
-        speeds = record["speeds"][axis]
-        assert speeds["p5"] <= speeds["p25"] <= speeds["p50"] <= speeds["p75"] <= speeds["p95"]
-    with (out / "entries.csv").open(encoding="utf-8") as file:
-        table = {row["entry"]: row for row in csv.DictReader(file)}
-    assert float(table["mass"]["low"]) == pytest.approx(0.95 * FINSROV.body.mass)
-    printed = capsys.readouterr().out
-    assert "linear_damping.surge" in printed and "heave, down" in printed
-
-
-@pytest.mark.slow
-def test_equal_seeds_print_equal_records(tmp_path, capsys):
-    records = []
-    for name in ("a", "b"):
-        assert run(
-            "randomize", "show", "equivalent_box", "--vehicle", "finsrov", "--out", str(tmp_path / name),
-            "--samples", "5", "--seed", "4", "--json",
-        ) == 0  # fmt: skip
-        records.append(json.loads(capsys.readouterr().out))
-    assert records[0] == records[1]
-    assert np.ptp([records[0]["speeds"]["heave"][p] for p in ("p5", "p95")]) > 0.01
+def test_the_command_prints_the_table_and_its_record(capsys):
+    """The same numbers as JSON, where that is asked for."""
+    assert run("randomize", "show", "pool", "--vehicle", "finsrov") == 0
+    assert "linear_damping.surge" in capsys.readouterr().out
+    assert run("randomize", "show", "pool", "--vehicle", "finsrov", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["vehicle"]["sha256"] == FINSROV.sha256
+    table = {one["entry"]: one for one in record["entries"]}
+    assert table["mass"]["low"] == pytest.approx(0.95 * FINSROV.body.mass)
 
 
 @pytest.mark.parametrize(
@@ -131,11 +94,9 @@ def test_equal_seeds_print_equal_records(tmp_path, capsys):
 def test_an_unknown_entry_is_refused_in_one_sentence(text, sentence, tmp_path, capsys):
     path = tmp_path / "ranges.yaml"
     path.write_text(text, encoding="utf-8")
-    out = tmp_path / "shown"
-    assert run("randomize", "show", str(path), "--vehicle", "finsrov", "--out", str(out)) == 2
+    assert run("randomize", "show", str(path), "--vehicle", "finsrov") == 2
     said = capsys.readouterr().err
     assert sentence in said and str(path) in said and said.count("\n") == 1
-    assert not out.exists()
 
 
 def test_ranges_from_a_fit_can_be_shown(tmp_path, capsys):
@@ -159,8 +120,4 @@ def test_ranges_from_a_fit_can_be_shown(tmp_path, capsys):
         run("randomize", "fit", str(tmp_path / "fit.json"), "--vehicle", "finsrov", "--out", str(ranges)) == 0
     )
     assert load_ranges(ranges).linear_damping.axes["surge"].normal == pytest.approx((1.0, 0.10204), rel=1e-3)
-    out = tmp_path / "shown"
-    assert (
-        run("randomize", "show", str(ranges), "--vehicle", "finsrov", "--out", str(out), "--samples", "3")
-        == 0
-    )
+    assert run("randomize", "show", str(ranges), "--vehicle", "finsrov") == 0

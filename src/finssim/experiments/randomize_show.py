@@ -1,29 +1,20 @@
-"""`finssim randomize show`: what ranges mean for a vehicle, as a table in SI and as the spread of step responses."""
+"""`finssim randomize show`: what ranges mean for a vehicle, in SI."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import warp as wp
-from numpy.typing import NDArray
 
-from finssim.control.allocation import Allocator
-from finssim.engine import Simulator, Water
 from finssim.engine.distributions import Distribution
 from finssim.engine.plant_arrays import NO_LIMIT, vehicle_parameters
-from finssim.engine.randomize import Randomization
-from finssim.engine.ranges_file import Ranges
+from finssim.engine.ranges_file import Ranges, load_ranges
 from finssim.engine.ranges_table import ENTRIES, INDEX, drawn_entries
-from finssim.experiments.campaign import write_json
-from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
 from finssim.experiments.tables import Table
-from finssim.files import atomic_directory
 from finssim.provenance import provenance
-from finssim.text_table import write_csv
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.terms import unit_of
 
@@ -139,180 +130,32 @@ def _others(drawn: dict[str, Distribution]) -> Iterator[Row]:
         yield Row(name.replace("waves.0.", "waves."), nominal, low, high, unit, drawn_as)
 
 
-Array = NDArray[np.float64]
+def randomize_show(ranges: str | Path, *, vehicle: str, hydrodynamics: str = "calibrated") -> dict[str, Any]:
+    """Show what ranges mean for a vehicle: each of its numbers that is drawn, in SI.
 
-LABELS = {
-    "surge": "surge speed [m/s]",
-    "sway": "sway speed [m/s]",
-    "heave": "heave speed, down [m/s]",
-    "yaw": "yaw rate [rad/s]",
-}
-
-
-def draw_spread(t: Array, drawn: Mapping[str, Array], nominal: Mapping[str, Array], title: str) -> Any:
-    """A panel for each axis: 5 to 95 % and the middle half of the drawn vehicles, some of them, and the file's own.
-
-    Args:
-        t: Times [s], (T,).
-        drawn: Axis -> speeds of the drawn vehicles, (n, T).
-        nominal: Axis -> speed of the vehicle of the file, (T,).
-        title: Written above.
-    """
-    figure = new_figure(8.4, 6.0, title)
-    for axes, (axis, speeds) in zip(figure.subplots(2, 2, sharex=True).flat, drawn.items(), strict=True):
-        clean(axes)
-        band = np.percentile(speeds, BAND, axis=0)
-        axes.fill_between(t, band[0], band[4], color=COLORS[0], alpha=0.18, linewidth=0.0, label="5 to 95 %")
-        axes.fill_between(t, band[1], band[3], color=COLORS[0], alpha=0.30, linewidth=0.0, label="25 to 75 %")
-        for k, line in enumerate(speeds[:12]):
-            axes.plot(t, line, color=COLORS[0], linewidth=0.5, alpha=0.6, label=None if k else "some of them")
-        axes.plot(t, nominal[axis], color="0.1", linewidth=1.8, label="as the file has it")
-        axes.set(ylabel=LABELS[axis], xlim=(0.0, float(t[-1])))
-    for axes in figure.axes[2:]:
-        axes.set_xlabel("time since the step [s]")
-    figure.align_ylabels()
-    legend_below(figure, figure.axes[0], 4)
-    return figure
-
-
-CONTROL_STEP = 0.1
-DURATION = 8.0
-"""Of a step response [s]."""
-PART = 0.5
-"""Of the wrench limit that is commanded."""
-STEPS = {"surge": 1.0, "sway": 1.0, "heave": -1.0, "yaw": 1.0}
-"""Axis -> direction of the step; heave goes down, away from the surface."""
-DEEP, SHALLOW = 10.0, 1.5
-"""Depth at the start [m]: far from the surface, or near it where there are waves to feel."""
-BAND = (5.0, 25.0, 50.0, 75.0, 95.0)
-"""Percentiles over the vehicles."""
-RECORD = "show.json"
-
-
-class ShowError(ValueError):
-    """Something that cannot be shown."""
-
-
-def randomize_show(
-    ranges: str | Path,
-    *,
-    vehicle: str,
-    out: Path,
-    hydrodynamics: str = "calibrated",
-    samples: Annotated[int, (2, 100000)] = 200,
-    seed: int = 0,
-) -> dict[str, Any]:
-    """Tell what ranges mean for a vehicle: its numbers in SI, and how far its step responses spread.
-
-    The directory takes `spread.png`, `entries.csv` and `show.json`.
-
-    Example: finssim randomize show pool --vehicle finsrov --out ranges/pool
+    Example: finssim randomize show pool --vehicle finsrov
 
     Args:
         ranges (FILE): Ranges: a file, or hold_for_position, fossen_learn_to_swim, equivalent_box, pool,
             no_thruster_dynamics.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        out: Directory for spread.png, entries.csv and show.json.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        samples: Vehicles to draw.
-        seed: Seed of every random number; equal seeds give equal results.
-
-    Returns:
-        The record.
 
     Raises:
-        ShowError: Too few samples.
-        RangesError, VehicleError, OutputError: As they say.
+        RangesError, VehicleError: As they say.
     """
-    if samples < 2:
-        raise ShowError(f"samples is {samples}, expected 2 or more")
-    randomization, chosen = Randomization(ranges), load_vehicle(vehicle)
-    with atomic_directory(out, replaces=RECORD) as place:
-        rows = rows_of(randomization.ranges, chosen, hydrodynamics)
-        t, drawn = step_responses(chosen, randomization, hydrodynamics, samples, seed)
-        _, nominal = step_responses(chosen, None, hydrodynamics, 1, seed)
-        record = {
-            "ranges": randomization.ranges.model_dump(mode="json"),
-            "vehicle": {"name": chosen.name, "sha256": chosen.sha256},
-            "hydrodynamics": hydrodynamics,
-            "seed": seed,
-            "samples": samples,
-            "entries": [asdict(row) for row in rows],
-            "speed_after_s": DURATION,
-            "speeds": {axis: _speeds(drawn[axis], nominal[axis][0]) for axis in STEPS},
-            "provenance": provenance(),
-        }
-        write_json(place / RECORD, record)
-        write_csv(
-            place / "entries.csv", list(record["entries"][0]), [one.values() for one in record["entries"]]
-        )
-        title = f"{randomization.ranges.name} on {chosen.name}: half the wrench limit on one axis, {samples} draws"
-        own = {axis: nominal[axis][0] for axis in STEPS}
-        save_figure(draw_spread(t, drawn, own, title), place / "spread.png")
-    return record
-
-
-def step_responses(
-    vehicle: Vehicle, randomization: Randomization | None, hydrodynamics: str, samples: int, seed: int
-) -> tuple[Array, dict[str, Array]]:
-    """Speed along the axis that is pushed, from rest, in deep open water.
-
-    Args:
-        vehicle: As its file has it.
-        randomization: None for that vehicle itself.
-        hydrodynamics: Key of `HYDRODYNAMICS`.
-        samples: Vehicles to draw.
-        seed: Of the draws.
-
-    Returns:
-        Times [s], (T,), and axis -> speed [m/s, rad/s], (samples, T); heave counts downwards.
-    """
-    longest = max((thruster.delay for thruster in vehicle.thrusters.values()), default=0.0)
-    extra = randomization.simulator_arguments(longest) if randomization else {}
-    simulator = Simulator(
-        vehicle,
-        worlds=samples,
-        hydrodynamics=hydrodynamics,
-        control_step=CONTROL_STEP,
-        water=Water(depth=2.0 * DEEP),
-        seed=seed,
-        **extra,
-    )
-    step = simulator.pipeline()
-    if randomization is not None:
-        draws = randomization.draws(simulator)
-        start = simulator.pipeline()
-        everywhere = wp.ones(samples, dtype=wp.int32, device=simulator.device)
-        draws.add(start, everywhere, seed)
-        simulator.add_refresh(start, everywhere)
-        start.run()
-        draws.add_step(step, seed)
-    simulator.add_step(step)
-    wavy = randomization is not None and randomization.ranges.waves is not None
-    depth, count = SHALLOW if wavy else DEEP, round(DURATION / CONTROL_STEP)
-    allocator, speeds = Allocator.from_vehicle(vehicle), {}
-    for axis, direction in STEPS.items():
-        i = AXES.index(axis)
-        tau = np.zeros(6)
-        tau[i] = direction * PART * vehicle.wrench_limits[i]
-        simulator.place(position=(0.0, 0.0, -depth))
-        simulator.set_thrust(allocator.allocate(tau))
-        speed = np.zeros((samples, count + 1))
-        for k in range(1, count + 1):
-            step.run()
-            speed[:, k] = direction * simulator.numpy("velocity")[:, 0, i]
-        speeds[axis] = speed
-    return CONTROL_STEP * np.arange(count + 1), speeds
-
-
-def _speeds(drawn: Array, nominal: Array) -> dict[str, float]:
-    """Speed at the end: of the vehicle itself, and percentiles over those that were drawn."""
-    bounds = np.percentile(drawn[:, -1], BAND).tolist()
-    return {"nominal": float(nominal[-1])} | {f"p{p:g}": x for p, x in zip(BAND, bounds, strict=True)}
+    drawn, chosen = load_ranges(ranges), load_vehicle(vehicle)
+    return {
+        "ranges": drawn.model_dump(mode="json"),
+        "vehicle": {"name": chosen.name, "sha256": chosen.sha256},
+        "hydrodynamics": hydrodynamics,
+        "entries": [asdict(row) for row in rows_of(drawn, chosen, hydrodynamics)],
+        "provenance": provenance(),
+    }
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """The entries in SI, and the speeds after the steps."""
+    """The entries in SI."""
     entries = [
         [
             one["entry"],
@@ -322,19 +165,6 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         ]
         for one in result["entries"]
     ]
-    speeds = [
-        [
-            "heave, down" if axis == "heave" else axis,
-            *(f"{of_axis[key]:.3f}" for key in ("nominal", "p5", "p50", "p95")),
-            "rad/s" if axis == "yaw" else "m/s",
-        ]
-        for axis, of_axis in result["speeds"].items()
-    ]
     title = f"{result['ranges']['name']} on {result['vehicle']['name']}"
     heads = ("entry", "file", "low", "high", "unit", "drawn as")
-    speed_heads = ("axis", "file", "5 %", "median", "95 %", "unit")
-    after = f"speed after {DURATION:g} s at half the wrench limit"
-    return [
-        Table(title=title, heads=heads, rows=entries, left=(0, 4, 5)),
-        Table(title=after, heads=speed_heads, rows=speeds, left=(0, 5)),
-    ]
+    return [Table(title=title, heads=heads, rows=entries, left=(0, 4, 5))]
