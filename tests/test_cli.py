@@ -50,7 +50,6 @@ COMMANDS = [
     "tasks",
     "tasks show",
     "randomize",
-    "randomize show",
     "randomize fit",
     "collect",
     "datasets",

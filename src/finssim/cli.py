@@ -55,7 +55,6 @@ COMMANDS: dict[str, str | Experiment] = {
     "fuse": "finssim.localization.fusion.fuse:run",
     "project": "finssim.localization.points:run_project",
     "backproject": "finssim.localization.points:run_backproject",
-    "randomize show": Experiment("finssim.experiments.randomize_show:randomize_show"),
     "randomize fit": "finssim.calibration.output.ranges:fit_ranges",
     "record info": "finssim.robot.record_reader:info",
     "record repair": "finssim.robot.record_reader:repair",
@@ -76,7 +75,7 @@ GROUPS = {
     "experiment": "Reproduce a table of the paper in simulation, beside the paper's own numbers.\n\n"
     "Example: finssim experiment replay --help",
     "randomize": "Ranges that vehicle, water and sensors are drawn from in every episode of a training.\n\n"
-    "Example: finssim randomize show --help",
+    "Example: finssim randomize fit --help",
     "record": "Look at records of runs, and mend those that were cut off.\n\nExample: finssim record info run.mcap",
     "ros2": "Be ROS 2 nodes on this machine's ROS domain; those of a sourced ROS 2 see them and are seen.\n\n"
     "Example: finssim ros2 up pool",

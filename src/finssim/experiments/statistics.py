@@ -36,11 +36,6 @@ class Interval:
     count: int
     """Trials or runs it rests on."""
 
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether the sign is supported."""
-        return self.low > 0.0 or self.high < 0.0
-
     def as_json(self) -> dict[str, Any]:
         """Plain data; a number that is infinite is None."""
         value, low, high = (x if math.isfinite(x) else None for x in (self.value, self.low, self.high))
