@@ -47,6 +47,7 @@ COMMANDS = [
     "backproject",
     "run",
     "pool",
+    "ardusub-sitl",
     "tasks",
     "tasks show",
     "randomize",

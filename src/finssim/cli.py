@@ -62,6 +62,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "teleop": "finssim.robot.teleop:run",
     "run": "finssim.robot.run:run",
     "pool": "finssim.pool.run:run",
+    "ardusub-sitl": "finssim.pool.ardusub_sitl:run",
     "view": "finssim.viewer.run:run",
     "ros2 node": "finssim.ros2.graphs:run_node",
     "ros2 up": "finssim.ros2.up:up",

@@ -41,7 +41,11 @@ def craft(layout):
     return Craft(layout.B, (layout.lower, layout.upper), layout.wrench_limits)
 
 
-@pytest.mark.parametrize("name", MODES)
+OWN = [name for name in MODES if not MODES[name].pilot]
+"""Modes of every vehicle; what needs an autopilot is tested in test_ardusub.py."""
+
+
+@pytest.mark.parametrize("name", OWN)
 def test_zero_action_is_zero_thrust(craft, name):
     mode = action_mode(name, craft)
     np.testing.assert_array_equal(
@@ -58,7 +62,7 @@ def test_thruster_actions_reach_each_limit(craft):
 
 
 def test_actions_beyond_one_saturate(craft):
-    for name in MODES:
+    for name in OWN:
         mode = action_mode(name, craft)
         np.testing.assert_array_equal(
             mode.to_thrusters(np.full(mode.size, 3.0)), mode.to_thrusters(np.ones(mode.size))
@@ -88,7 +92,7 @@ def thrusts_of_worlds(action: wp.array2d(dtype=vec8), data: ModeData, force: wp.
     force[w, v] = thrusts_of(action[w, v], v, data)
 
 
-@pytest.mark.parametrize("name", MODES)
+@pytest.mark.parametrize("name", OWN)
 def test_a_batch_of_vehicles_and_the_robot_give_the_same_bits(name):
     """Every vehicle of the catalogue that has the same number of thrusters, each with a scale of its own."""
     vehicles = [one for one in map(load_vehicle, catalogue()) if len(one.thruster_names) == 8]
@@ -119,19 +123,19 @@ def test_another_mode_is_one_entry(craft, monkeypatch):
 
 
 def test_batches_equal_single_actions(craft):
-    for name in MODES:
+    for name in OWN:
         mode = action_mode(name, craft)
         actions = np.random.default_rng(0).uniform(-1, 1, (3, 4, mode.size))
         np.testing.assert_array_equal(mode.to_thrusters(actions)[2, 1], mode.to_thrusters(actions[2, 1]))
 
 
-@pytest.mark.parametrize("name", MODES)
+@pytest.mark.parametrize("name", OWN)
 def test_definition_survives_a_file(craft, name):
     mode = action_mode(name, craft, scale=0.5)
     assert mode_from_dict(json.loads(json.dumps(mode.describe())), craft) == mode
 
 
-@pytest.mark.parametrize("name", MODES)
+@pytest.mark.parametrize("name", OWN)
 def test_another_vehicles_limits_are_refused(finsrov, name):
     craft = Craft(finsrov.B, (finsrov.lower, finsrov.upper), finsrov.wrench_limits)
     weaker = Craft(finsrov.B, (finsrov.lower, 0.9 * finsrov.upper), 0.9 * finsrov.wrench_limits)
@@ -139,7 +143,7 @@ def test_another_vehicles_limits_are_refused(finsrov, name):
         mode_from_dict(action_mode(name, craft).describe(), weaker)
 
 
-@pytest.mark.parametrize("name", MODES)
+@pytest.mark.parametrize("name", OWN)
 def test_wrong_length_and_nan_are_refused(craft, name):
     mode = action_mode(name, craft)
     with pytest.raises(ControlError, match="expected"):

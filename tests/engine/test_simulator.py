@@ -136,6 +136,21 @@ def test_placing_restarts_the_same_run():
     assert all(np.array_equal(a, b) for a, b in zip(*results, strict=True))
 
 
+def test_a_step_that_changes_on_the_way_goes_on_with_the_motion():
+    """Half a second in steps of 10 ms and half a second of 5 ms end where a second of 5 ms does; clocks go on."""
+    simulators = [Simulator("bluerov2_heavy", control_step=h, substeps=1) for h in (0.01, 0.005)]
+    for simulator, steps in zip(simulators, (50, 200), strict=True):
+        simulator.place((0.0, 0.0, -5.0), velocity=(0.8, 0.3, -0.2, 0.2, 0.1, 0.5))
+        for _ in range(steps):
+            simulator.step()
+    simulators[0].set_control_step(0.005, 1, 0.5)
+    for _ in range(100):
+        simulators[0].step()
+    assert [int(s.numpy("steps")[0]) for s in simulators] == [200, 200]
+    for name in ("position", "velocity"):
+        np.testing.assert_allclose(*(s.numpy(name) for s in simulators), atol=5e-4)
+
+
 def test_a_quaternion_is_made_of_unit_length():
     """(0, 0, 3, 4) is the turn of (0, 0, 0.6, 0.8)."""
     simulator = Simulator("finsrov")

@@ -235,7 +235,7 @@ def commanded_and_delivered(mode, plant):
     return simulator.command.thrust.numpy()[:, 0, :n], simulator.numpy("thrust")[:, 0, :n]
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", [name for name in MODES if not MODES[name].pilot])
 def test_weak_thrusters_deliver_what_is_asked_up_to_their_own_limits(mode):
     """Half the limits: the commands are those of the nominal plant bit for bit, what is delivered is cut."""
     plant = thruster_limits(0.5)
@@ -248,7 +248,7 @@ def test_weak_thrusters_deliver_what_is_asked_up_to_their_own_limits(mode):
     np.testing.assert_allclose(delivered, expected, rtol=1e-5, atol=1e-5 * upper.max())
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", [name for name in MODES if not MODES[name].pilot])
 def test_what_is_drawn_of_thrusters_does_not_change_what_is_asked(mode):
     """Ranges scale the thrust that comes of a command; nothing they draw is a limit by which actions are scaled."""
     asked, nominal = commanded_and_delivered(mode, load_plant("nominal"))

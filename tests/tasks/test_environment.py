@@ -124,10 +124,10 @@ def test_unknown_names_are_refused():
         environment(action="wrench5")
 
 
-@pytest.mark.parametrize("name", ["wrench6", "wrench4", "thruster8"])
+@pytest.mark.parametrize("name", ["wrench6", "wrench4", "thruster8", "pilot6"])
 def test_an_action_commands_what_its_mode_says(name):
     """The environment's kernels and the mode that runs on the robot give the same thrusts, beyond ±1 too."""
-    env = environment(200, action=name)
+    env = environment(200, action=name, **({"vehicle": "bluerov2_heavy"} if name == "pilot6" else {}))
     mode = action_mode(name, env.simulator.vehicles[0])
     action = np.random.default_rng(4).uniform(-1.3, 1.3, (200, mode.size))
     env.step(action)

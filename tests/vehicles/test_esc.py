@@ -59,7 +59,7 @@ def test_reversed_wiring_mirrors_the_pulse():
     """With motor_sign -1 small pulses are positive thrust, by the forward law; no signal still means off."""
     vehicle = load_vehicle("bluerov2")
     plain = vehicle.thrusters["T1"]
-    turned = vehicle.replace({"thrusters.T1.motor_sign": -1}).thrusters["T1"]
+    turned = vehicle.replace({"thrusters.T1.motor_sign": -1, "autopilot.directions": [-1]}).thrusters["T1"]
     np.testing.assert_allclose(
         turned.shaft_speed([1300.0, 1800.0, 0.0]), plain.shaft_speed([1700.0, 1200.0, 0.0])
     )

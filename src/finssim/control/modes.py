@@ -1,8 +1,8 @@
 """Action modes: what a policy's numbers in [-1, 1] mean; limits and scale are part of the definition.
 
 A mode mixes the components of an action to parts of the vehicle's wrench limits, which are allocated to the thrusters,
-or to parts of the thrusters' own limits. The batch does so for all worlds and the robot for one, with the same function
-(`thrusts_of`) and the same numbers (`mode_data`).
+to parts of the thrusters' own limits, or to the axes of an autopilot, whose mixer drives the thrusters. The batch does
+so for all worlds and the robot for one, with the same function (`thrusts_of`) and the same numbers (`mode_data`).
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
 
@@ -18,6 +18,7 @@ import warp as wp
 
 from finssim.control import ControlError
 from finssim.control.allocation import AllocationData, RowLaunch, allocate, allocation_data, axis_weights
+from finssim.control.ardusub import FROM_BODY, MixerData, mixed_thrusts, mixer_data, thrust_tables
 from finssim.control.policy import first_difference, plain_data
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
@@ -50,13 +51,21 @@ class ModeKind(NamedTuple):
     labels: Callable[[Any], tuple[str, ...]]
     """Names of the components of an action for a vehicle, m of them."""
     mix: Callable[[Any], Array]
-    """What each component asks for at 1: parts of the wrench limits (m, 6), or of the limits of n thrusters (m, n)."""
+    """What each component asks for at 1: parts of the wrench limits (m, 6), of the limits of n thrusters (m, n), or of
+    the autopilot's demands (m, 6)."""
+    pilot: bool = False
+    """Whether the components are the axes of the vehicle's autopilot."""
 
 
 def _axes(*axes: int) -> ModeKind:
     """A mode whose components drive axes of the wrench; the others are asked to be zero."""
     labels = tuple(AXES[axis] for axis in axes)
     return ModeKind(True, lambda vehicle: labels, lambda vehicle: np.eye(6)[list(axes)])
+
+
+def _gain(vehicle: Any) -> float:
+    autopilot = getattr(vehicle, "autopilot", None)
+    return 1.0 if autopilot is None else float(autopilot.gain)
 
 
 MODES: dict[str, ModeKind] = {
@@ -67,6 +76,7 @@ MODES: dict[str, ModeKind] = {
     ),
     "wrench6": _axes(0, 1, 2, 3, 4, 5),
     "wrench4": _axes(0, 1, 2, 5),
+    "pilot6": ModeKind(False, lambda vehicle: AXES, lambda vehicle: FROM_BODY.T * _gain(vehicle), pilot=True),
 }
 """Action modes by name; another is one entry."""
 
@@ -76,8 +86,8 @@ class ModeData:
     """What `thrusts_of` needs to know of each vehicle; built by `mode_data`, first index the vehicle."""
 
     columns: wp.array2d(dtype=vec8)
-    """What each component asks for at 1: a wrench [N, N m] and two zeros, or parts of the thrusters' limits,
-    (vehicles, m)."""
+    """What each component asks for at 1: a wrench [N, N m] or demands [-] and two zeros, or parts of the thrusters'
+    limits, (vehicles, m)."""
     lower: wp.array(dtype=vec8)
     """Least thrust [N], (vehicles,)."""
     upper: wp.array(dtype=vec8)
@@ -86,6 +96,10 @@ class ModeData:
     """Whether the columns are wrenches."""
     allocation: AllocationData
     """Of wrenches to the thrusters; empty where the columns are no wrenches."""
+    pilot: wp.bool
+    """Whether the columns are demands."""
+    mixer: MixerData
+    """Of demands to the thrusters; empty where the columns are no demands."""
 
 
 @wp.func
@@ -102,6 +116,8 @@ def thrusts_of(action: vec8, vehicle: int, data: ModeData) -> vec8:
         x += wp.clamp(action[k], -1.0, 1.0) * data.columns[vehicle, k]
     if data.wrench:
         return allocate(vec6(x[0], x[1], x[2], x[3], x[4], x[5]), vehicle, data.allocation)
+    if data.pilot:
+        return mixed_thrusts(vec6(x[0], x[1], x[2], x[3], x[4], x[5]), vehicle, data.mixer)
     f = vec8()
     for k in range(MAX_THRUSTERS):
         part = wp.clamp(x[k], -1.0, 1.0)
@@ -137,7 +153,9 @@ def mode_data(name: str, vehicles: Sequence[Any], scales: Sequence[Any], device:
     data.columns = wp.array(_padded(columns), dtype=vec8, device=device)
     data.lower = wp.array(_padded([lower for lower, _ in limits]), dtype=vec8, device=device)
     data.upper = wp.array(_padded([upper for _, upper in limits]), dtype=vec8, device=device)
-    data.wrench = wp.bool(kind.wrench)
+    data.wrench, data.pilot = wp.bool(kind.wrench), wp.bool(kind.pilot)
+    if kind.pilot:
+        data.mixer = mixer_data(vehicles, device)
     if kind.wrench:
         data.allocation = allocation_data(
             [vehicle.control_matrix for vehicle in vehicles],
@@ -150,7 +168,10 @@ def mode_data(name: str, vehicles: Sequence[Any], scales: Sequence[Any], device:
 
 
 def _columns(kind: ModeKind, vehicle: Any, scale: Any) -> Array:
-    """What each component asks for at 1: a wrench [N, N m], (m, 6), or parts of the thrusters' limits, (m, n)."""
+    """What each component asks for at 1: a wrench [N, N m] or demands [-], (m, 6), or parts of the thrusters' limits,
+    (m, n)."""
+    if kind.pilot:
+        return np.asarray(kind.mix(vehicle) * np.reshape(scale, (-1, 1)))
     full = np.asarray(scale, float) * (np.asarray(vehicle.wrench_limits, float) if kind.wrench else 1.0)
     return np.asarray(kind.mix(vehicle) * full)
 
@@ -174,10 +195,11 @@ class ActionMode:
     """Names of the components."""
     definition: dict[str, tuple[float, ...]]
     """Limits and scale, as `describe` has them: `scale`, with the `limits` of the wrench at action 1 and scale 1 about
-    `reference` [N, N m, m], or with `lower` and `upper` of the thrusters [N]."""
+    `reference` [N, N m, m], or with `lower` and `upper` of the thrusters [N], and of an autopilot its `factors`, row by
+    row, and `gain` [-]."""
     columns: Array = field(repr=False, compare=False)
-    """What each component asks for at 1: a wrench about `reference` [N, N m], (m, 6), or parts of the thrusters'
-    limits, (m, n)."""
+    """What each component asks for at 1: a wrench about `reference` [N, N m] or demands of the autopilot [-], (m, 6),
+    or parts of the thrusters' limits, (m, n)."""
     thrusters: int
     """Of the vehicle, n."""
     launch: RowLaunch = field(repr=False, compare=False)
@@ -199,8 +221,16 @@ class ActionMode:
         return MODES[self.name].wrench
 
     @property
+    def pilot(self) -> bool:
+        """Whether the components are the axes of the vehicle's autopilot."""
+        return MODES[self.name].pilot
+
+    @property
     def ends(self) -> tuple[Array, Array]:
-        """What each component alone asks for at -1 and at 1, (m,): of its axis [N, N m] or of its thruster [N]."""
+        """What each component alone asks for at -1 and at 1, (m,): of its axis [N, N m] or of its thruster [N], or of
+        full output [-]."""
+        if self.pilot:
+            return -np.abs(self.columns).sum(axis=1), np.abs(self.columns).sum(axis=1)
         if self.wrench:
             return -self.columns.sum(axis=1), self.columns.sum(axis=1)
         return self.columns @ self.definition["lower"], self.columns @ self.definition["upper"]
@@ -249,6 +279,15 @@ def action_mode(name: str, vehicle: Any, scale: float | Sequence[float] = 1.0) -
         raise ControlError(f"{name} scale is {tuple(parts.tolist())}, expected numbers in 0 to 1")
     if kind.wrench:
         numbers = {"limits": vehicle.wrench_limits, "scale": parts, "reference": vehicle.wrench_reference}
+    elif kind.pilot:
+        tables = thrust_tables(vehicle)
+        numbers = {
+            "lower": tables.min(axis=1),
+            "upper": tables.max(axis=1),
+            "scale": parts,
+            "factors": (vehicle.autopilot.factors * vehicle.autopilot.signs(len(tables))[:, None]).ravel(),
+            "gain": [vehicle.autopilot.gain],
+        }
     else:
         lower, upper = vehicle.force_limits
         numbers = {"lower": lower, "upper": upper, "scale": parts}

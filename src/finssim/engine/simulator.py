@@ -212,6 +212,23 @@ class Simulator:
         """Advance every world by one control step under `command`."""
         self._step.run()
 
+    def set_control_step(self, control_step: float, substeps: int, elapsed: float) -> None:
+        """Change the time between commands on the way; poses and motors go on.
+
+        Args:
+            control_step: From now on [s].
+            substeps: Physics steps in it.
+            elapsed: Since the reset [s]; clocks, and with them the waves, are set to it.
+
+        Raises:
+            SimulatorError: The delay line is too short for a step so much smaller (see `max_delay`).
+        """
+        self.control_step, self.substeps = control_step, substeps
+        self.state.steps.fill_(round(elapsed / control_step))
+        self._step = self.pipeline()
+        self.add_step(self._step)
+        self.refresh()
+
     def refresh(self) -> None:
         """Recompute what depends on `plant` (mass matrix inverses, lag coefficients) after writing to it.
 

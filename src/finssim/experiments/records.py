@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.trials.trial_files import read_table
+from finssim.control.ardusub import Mixer
 from finssim.control.guidance import Guide, Reference, Station, Track
 from finssim.control.modes import AXES, ActionMode, action_mode
 from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory
@@ -222,6 +223,9 @@ def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[
     f = np.asarray(force, float)
     if mode.wrench:
         parts = f @ vehicle.control_matrix.T
+    elif mode.pilot:
+        mixer = Mixer.of(vehicle)
+        parts = np.array([mixer.demands(thrusts) for thrusts in f])
     else:
         lower, upper = vehicle.force_limits
         full = np.where(f >= 0.0, upper, -lower)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from finssim.geometry.mesh import face_geometry
 from finssim.pool.plant_spec import (
+    HEADROOM,
     Basin,
     Circulation,
     PlantSpec,
@@ -360,8 +361,7 @@ def _thrusters(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any]:
             "delay": t.delay * (1.0 + draw.around(spread.motor)),
             "dead_rpm_plus": t.dead_rpm_plus * (1.0 + 0.5 * draw.around(spread.motor)),
             "dead_rpm_minus": -t.dead_rpm_minus * (1.0 + 0.5 * draw.around(spread.motor)),
-            # A motor reaches somewhat more than the bench drove it to.
-            "full_rpm": 1.05 * max(t.rpm_max, -t.rpm_min) * (1.0 + draw.around(0.1 * spread.motor)),
+            "full_rpm": HEADROOM * max(t.rpm_max, -t.rpm_min) * (1.0 + draw.around(0.1 * spread.motor)),
         }
     return built
 

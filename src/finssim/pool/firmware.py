@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -22,10 +23,14 @@ from finssim.robot.link.frames import (
     crc16_modbus,
     encode_command,
     encode_echo,
+    encode_navigation,
 )
 from finssim.robot.messages import HEADING, VELOCITY, CommandEcho, NavigationAid, Telemetry, ThrusterCommand
 from finssim.sensors import SensorSuite
 from finssim.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from finssim.pool.virtual_pool import Faults
 
 __all__ = ["AttitudeFilter", "Firmware", "PoolSensors", "Sample"]
 
@@ -113,14 +118,14 @@ class PoolSensors:
             float(self._pressure[0]),
         )
 
-    def aids(self) -> list[NavigationAid]:
-        """What Doppler log and compass have delivered at the newest `sample`."""
+    def aids(self, delay: float) -> list[NavigationAid]:
+        """What Doppler log and compass have delivered at the newest `sample`, as it leaves a delay [s] later."""
         found = []
         for kind, fresh, stamp, reading in self._aids:
             if not fresh[0]:
                 continue
             values = [*reading[0].tolist(), 0.0, 0.0]
-            age = max(float(self._count[0]) * self.period - float(stamp[0]), 0.0)
+            age = max(float(self._count[0]) * self.period - float(stamp[0]), 0.0) + delay
             self._sent += 1
             found.append(
                 NavigationAid(self._sent & 0xFFFF, kind, age, (values[0], values[1], values[2]), (0.0, 0.0))
@@ -152,14 +157,16 @@ def with_instruments(vehicle: Vehicle, instruments: Instruments) -> Vehicle:
     return vehicle.model_copy(update={"sensors": sensors})
 
 
-# The motor controller's attitude filter: gyroscope integrated, tilt from the accelerometer, yaw left to drift.
+# The attitude filter: gyroscope integrated, tilt from the accelerometer, yaw from a compass or left to drift.
 
 
 Three = tuple[float, float, float]
 
 
 class AttitudeFilter:
-    """Complementary filter on the rotation group (Mahony, Hamel and Pflimlin 2008, explicit form), without a compass.
+    """Complementary filter on the rotation group (Mahony, Hamel and Pflimlin 2008, explicit form).
+
+    Without a compass its yaw drifts; `turn` takes a compass's headings.
 
     With up the accelerometer's direction and R the estimate: e = up × Rᵀ z, b_dot = -ki e, q_dot = ½ q (ω - b + kp e).
     Plain floats: at this size NumPy would cost ten times as much.
@@ -215,6 +222,21 @@ class AttitudeFilter:
         norm = math.sqrt(w * w + x * x + y * y + z * z)
         self._q = (w / norm, x / norm, y / norm, z / norm)
 
+    def turn(self, heading: float, share: float) -> None:
+        """Turn the estimate about the vertical towards a heading.
+
+        Args:
+            heading: Of the filter's x axis, left positive from world x [rad].
+            share: Part of the difference that is taken away [-].
+        """
+        if self._q is None:
+            return
+        w, x, y, z = self._q
+        yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        half = 0.5 * share * math.remainder(heading - yaw, math.tau)
+        c, s = math.cos(half), math.sin(half)
+        self._q = (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
+
 
 def _level(accel: Three) -> tuple[float, float, float, float]:
     """Attitude at yaw 0 in which a specific force points upwards, wxyz."""
@@ -244,7 +266,10 @@ class Firmware:
     Attributes:
         target: Shaft speeds that it asks of the loops, canonical order [rad/s], (n,).
         commands: How many it has received.
+        ordered: Whether its frames cannot overtake each other on the wire.
     """
+
+    ordered = False
 
     def __init__(self, vehicle: Vehicle, spec: PlantSpec, *, now: float = 0.0) -> None:
         """Power on.
@@ -366,6 +391,23 @@ class Firmware:
         if self._last_command is not None and now - self._last_command > self._timeout:
             self._last_command, self._timed_out, self._enabled = None, True, False
             self._aim(np.zeros(self._outputs))
+
+    def frames(
+        self, now: float, sample: Sample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
+    ) -> list[bytes]:
+        """What leaves at a sample of the IMU: a snapshot and the navigation aids; nothing while it starts.
+
+        Args:
+            now: When it leaves [s].
+            sample: Of the instruments.
+            aids: New at this sample, with their ages now.
+            plant: Its motors.
+            faults: What is wrong.
+        """
+        telemetry = self.telemetry(now, sample, plant.measured_speed, plant.throttle)
+        if telemetry is None:
+            return []
+        return [faults.encode(telemetry), *[encode_navigation(aid) for aid in aids]]
 
     def telemetry(self, now: float, sample: Sample, speed: Array, throttle: Array) -> Telemetry | None:
         """A snapshot for the wire; None while it starts.

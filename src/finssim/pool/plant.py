@@ -16,7 +16,7 @@ from finssim.physics.kinematics import up_in_body
 from finssim.physics.motors import thrust_of_speed
 from finssim.physics.terms.composed import layout
 from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
-from finssim.pool.plant_spec import Basin, Circulation, PlantSpec, PlantSpecError, SlackTether
+from finssim.pool.plant_spec import HEADROOM, Basin, Circulation, PlantSpec, PlantSpecError, SlackTether
 from finssim.vehicles import Vehicle
 from finssim.vehicles.hydrodynamics import MeshSet
 
@@ -281,8 +281,12 @@ class MotorBank:
     motor_power: float  # at full speed [W]
     idle_current: float  # [A]
 
+    loop: int  # 0: no speed loop, the target stands for a throttle
     loop_steps: int  # motor steps between runs of the loop
     loop_period: float  # [s]
+    rated: wp.array(
+        dtype=float
+    )  # speed that a motor as described has at full throttle on a full battery [rad/s]
     scale: wp.array(dtype=float)  # speed that the firmware believes full throttle gives [rad/s]
     model_alpha: wp.array(dtype=float)  # of the response that the firmware expects, per run of the loop
     kp: float
@@ -306,6 +310,9 @@ class MotorBank:
 def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
     """One run of the speed loop of motor k: feed-forward plus PID on the deviation from the expected response.
 
+    Without a loop the throttle is the target over the speed of a motor as described at full throttle, so the true motor
+    and the battery's voltage decide how fast it turns.
+
     Args:
         motors: All motors; memory of motor k is written.
         k: Which motor.
@@ -323,6 +330,8 @@ def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
     before = motors.smooth[k]
     motors.smooth[k] = before + (motors.loop_period / wp.static(FILTER)) * (measured - before)
     target = motors.target[k]
+    if motors.loop == 0:
+        return wp.clamp(target / motors.rated[k], -1.0, 1.0)
     if target == 0.0:
         motors.integral[k] = 0.0
         motors.expected[k] = measured
@@ -380,7 +389,9 @@ def turn_motors(motors: MotorBank, tick: int, dt: float, noise: wp.uint32):
     motors.electric[1] = motors.idle_current + power / voltage
 
 
-def motor_bank(vehicle: Vehicle, spec: PlantSpec, dt: float, device: Any = "cpu") -> MotorBank:
+def motor_bank(
+    vehicle: Vehicle, spec: PlantSpec, dt: float, device: Any = "cpu", *, speed_loop: bool = True
+) -> MotorBank:
     """Motors at rest.
 
     Args:
@@ -388,12 +399,14 @@ def motor_bank(vehicle: Vehicle, spec: PlantSpec, dt: float, device: Any = "cpu"
         spec: As it is.
         dt: Motor step [s].
         device: Warp device.
+        speed_loop: Whether the firmware holds speeds; if not, a target is what it expects at full voltage.
     """
     true = [spec.thrusters[name] for name in vehicle.thruster_names]
     told = list(vehicle.thrusters.values())
     firmware = spec.firmware
     bank = MotorBank()
     n = bank.count = len(true)
+    bank.loop = int(speed_loop)
     bank.loop_steps = max(1, round(firmware.loop_period / dt))
     bank.loop_period = bank.loop_steps * dt
     delay = [round(t.delay / dt) for t in true]
@@ -403,6 +416,7 @@ def motor_bank(vehicle: Vehicle, spec: PlantSpec, dt: float, device: Any = "cpu"
         "full": [t.full_rpm * RPM for t in true],
         "dead_plus": [t.dead_rpm_plus * RPM for t in true],
         "dead_minus": [t.dead_rpm_minus * RPM for t in true],
+        "rated": [HEADROOM * max(t.rpm_max, -t.rpm_min) * RPM for t in told],
         "scale": [max(t.rpm_max, -t.rpm_min) * RPM / firmware.feed_forward for t in told],
         "model_alpha": 1.0 - np.exp(-bank.loop_period / lag),
         **{name: np.zeros(n) for name in ("target", "speed", "measured", "smooth", "expected")},
@@ -528,6 +542,7 @@ class Plant:
         period: float = 0.01,
         position: ArrayLike = (0.0, 0.0, -0.5),
         quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0),
+        speed_loop: bool = True,
     ) -> None:
         """Put the vehicle into the water, at rest.
 
@@ -538,6 +553,7 @@ class Plant:
             period: Time that the physics step must divide [s], such as the sensors' period.
             position: Start, world frame [m].
             quaternion: Start, body to world, xyzw.
+            speed_loop: Whether the firmware holds shaft speeds; if not, `target` is what it expects at full voltage.
 
         Raises:
             PlantSpecError: The plant is not of this vehicle.
@@ -553,7 +569,7 @@ class Plant:
         """Physics step [s]."""
         motor_steps = math.ceil(self.step / MOTOR_STEP - 1e-9)
         self.simulator = self._simulator(position, quaternion)
-        self.motors = motor_bank(vehicle, spec, self.step / motor_steps)
+        self.motors = motor_bank(vehicle, spec, self.step / motor_steps, speed_loop=speed_loop)
         self._views()
         s = self.simulator
         pipeline = s.pipeline()

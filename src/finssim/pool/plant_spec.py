@@ -19,6 +19,7 @@ from finssim.vehicles.defaults import POOL, room
 from finssim.yaml_file import read_mapping
 
 __all__ = [
+    "HEADROOM",
     "AddedMass",
     "Basin",
     "BuoyancyDrift",
@@ -38,6 +39,9 @@ __all__ = [
     "basin_of",
     "load_plant_spec",
 ]
+
+HEADROOM = 1.05
+"""A motor as the vehicle file describes it reaches so much more at full throttle than its bench drove it to [-]."""
 
 
 # Coefficients that hold about some point in tilted axes: how a matrix that couples all axes stays physical.

@@ -13,19 +13,22 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.pool.firmware import Firmware, PoolSensors
+from finssim.pool.firmware import Firmware, PoolSensors, Sample
 from finssim.pool.plant import RPM, Plant
-from finssim.pool.plant_spec import PlantSpec
+from finssim.pool.plant_spec import PlantSpec, PlantSpecError
 from finssim.pool.positioning import Positioning
-from finssim.robot.link.frames import TELEMETRY, crc16_modbus, encode_navigation, encode_telemetry, forms
+from finssim.robot.link.frames import TELEMETRY, crc16_modbus, encode_telemetry, forms
 from finssim.robot.messages import Delivery, Picture, Telemetry
 from finssim.vehicles import Vehicle
 from finssim.yaml_file import json_value
+
+if TYPE_CHECKING:
+    from finssim.pool.ardusub import ArduSub
 
 __all__ = [
     "Camera",
@@ -196,7 +199,20 @@ class Faults:
     """Instruments stand still; sequence numbers and clock go on."""
     nan_field: str = ""
     """Telemetry field sent as NaN, `depth` or an element of one, `gyro.2`; none if empty."""
+    freeze_depth: bool = False
+    """The pressure gauge stands still."""
+    dvl_silent: bool = False
+    """The Doppler log of an `ArduSub` sends nothing."""
+    no_heartbeat: bool = False
+    """HEARTBEAT of an `ArduSub` is lost, and nothing else."""
+    no_ground_heartbeat: bool = False
+    """HEARTBEAT of the ground station is lost on its way to an `ArduSub`."""
+    leak: bool = False
+    """Water at the leak sensor of an `ArduSub`."""
+    battery_voltage: float = 0.0
+    """What the battery monitor of an `ArduSub` reads [V]; the true voltage if 0."""
     _frozen: Telemetry | None = None
+    _frozen_depth: tuple[float, float] | None = None
 
     def __setattr__(self, name: str, value: object) -> None:
         if name in PROBABILITIES and not (isinstance(value, int | float) and 0.0 <= value <= 1.0):
@@ -216,6 +232,14 @@ class Faults:
 
     def _happens(self, probability: float) -> bool:
         return probability > 0.0 and self._random.random() < probability
+
+    def reading(self, sample: Sample) -> Sample:
+        """What the instruments read, with the pressure gauge frozen if so."""
+        if not self.freeze_depth:
+            self._frozen_depth = None
+            return sample
+        depth, pressure = self._frozen_depth = self._frozen_depth or (sample.depth, sample.pressure)
+        return sample._replace(depth=depth, pressure=pressure)
 
     def encode(self, telemetry: Telemetry) -> bytes:
         """Frame of a snapshot, with instruments frozen and fields spoiled as asked."""
@@ -289,7 +313,7 @@ class VirtualPool:
 
     Attributes:
         plant: The truth; for the truth file, the viewer's ghost and tests.
-        firmware: The motor controller's program.
+        firmware: The motor controller's program, or the autopilot's.
         faults: What is wrong with wire and instruments.
         time: Up to which everything has happened [s].
     """
@@ -305,6 +329,7 @@ class VirtualPool:
         seed: int = 0,
         truth: str | Path | None = None,
         truth_period: float = 0.01,
+        firmware: Literal["mcu", "ardusub"] = "mcu",
     ) -> None:
         """Put the vehicle into the pool, at rest, with its motor controller running.
 
@@ -317,18 +342,26 @@ class VirtualPool:
             seed: Of instruments, speed measurements and the wire.
             truth: File that is written; none if None.
             truth_period: Between its records [s], taken to whole physics steps.
+            firmware: mcu: a motor controller that takes shaft speeds; ardusub: an autopilot that takes axes over
+                MAVLink, and turns the motors by pulses alone.
 
         Raises:
             PlantSpecError: The plant is not of this vehicle.
+            ControlError: There is no autopilot for this vehicle.
         """
         imu = vehicle.sensors.imu
         period = 1.0 / imu.rate if imu is not None else 0.01
         self.vehicle, self.spec, self.camera, self.positioning = vehicle, spec, camera, positioning
-        self.plant = Plant(vehicle, spec, seed=seed, period=period, position=start[0], quaternion=start[1])
+        position, quaternion = start
+        self.firmware = self._firmware(firmware)
+        self.plant = Plant(
+            vehicle, spec, seed=seed, period=period, position=position, quaternion=quaternion,
+            speed_loop=firmware == "mcu",
+        )  # fmt: skip
         self.sensors = PoolSensors(self.plant, seed)
-        self.firmware = Firmware(vehicle, spec)
         self.faults = Faults(seed)
         self.time = 0.0
+        self._newest = 0.0
         self._imu_latency = imu.latency if imu is not None else 0.0
         # Python's own generator: a single number costs a tenth of NumPy's.
         self._random = random.Random(f"pool {seed}")
@@ -339,6 +372,17 @@ class VirtualPool:
         self._remember()
         self._truth_steps = max(1, round(truth_period / self.plant.step))
         self._truth = None if truth is None else self._open_truth(truth, seed)
+
+    def _firmware(self, name: str) -> Firmware | ArduSub:
+        if name == "mcu":
+            return Firmware(self.vehicle, self.spec)
+        try:
+            from finssim.pool.ardusub import ArduSub
+        except ImportError:
+            raise PlantSpecError(
+                "firmware ardusub needs pymavlink, which is not installed: pip install 'finssim[hardware]'"
+            ) from None
+        return ArduSub(self.vehicle, self.spec)
 
     def exchange(self, until: float, sent: Sequence[bytes] = ()) -> Delivery:
         """Let the world go on, with the frames that the robot sends now.
@@ -414,18 +458,18 @@ class VirtualPool:
         if self.camera is not None or self.positioning is not None:
             self._remember()
         if plant.steps % plant.steps_per_period == 0:
-            sample = self.sensors.sample()
+            sample = self.faults.reading(self.sensors.sample())
             leaves = plant.time + self._imu_latency
-            telemetry = firmware.telemetry(leaves, sample, plant.measured_speed, plant.throttle)
-            if telemetry is not None:
-                self._transmit(leaves, self.faults.encode(telemetry))
-                for aid in self.sensors.aids():
-                    self._transmit(leaves, encode_navigation(replace(aid, age=aid.age + self._imu_latency)))
+            aids = self.sensors.aids(self._imu_latency)
+            for frame in firmware.frames(leaves, sample, aids, plant, self.faults):
+                self._transmit(leaves, frame)
         if self._truth is not None and plant.steps % self._truth_steps == 0:
             self._write_truth(self._truth)
 
     def _transmit(self, leaves: float, frame: bytes) -> None:
         arrival = leaves + self._random.uniform(*self.spec.firmware.uplink)
+        if self.firmware.ordered:
+            arrival = self._newest = max(arrival, self._newest)
         for time, data in self.faults.arrivals(arrival, frame):
             self._send(self._up, time, data)
 

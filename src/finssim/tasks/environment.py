@@ -81,7 +81,7 @@ class Environment:
                 forces of wrenches, and the task is fitted to it; `vehicle` then only delivers. `vehicle` if None.
             worlds: How many at once.
             hydrodynamics: calibrated, mesh or simplified.
-            action: thruster8, wrench6 or wrench4; the task's own if None.
+            action: thruster8, wrench6, wrench4 or pilot6 (ArduSub's axes); the task's own if None.
             wrench_scale: Part of each wrench limit that action 1 of an agent stands for, one number or (6,).
             randomization: Drawn anew for every episode; none if None.
             noise: On what the controller sees, or the sensors that it sees with; none if None.

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from finssim.vehicles.autopilot import Autopilot, refuse_misfit
 from finssim.vehicles.body import Body, Hull, Water, moved_to_origin, skew
 from finssim.vehicles.calibration_record import CalibrationRecord
 from finssim.vehicles.defaults import DEFAULTS, default_mcu, default_safety, default_sensors, default_tags
@@ -61,6 +62,8 @@ class Vehicle(Part):
     tags: Tags | None = Field(default_factory=default_tags)
     """None only where a file takes them off: `tags: null`."""
     mcu: Mcu = Field(default_factory=default_mcu)
+    autopilot: Autopilot | None = None
+    """Of a vehicle that is steered by axes in place of shaft speeds."""
     safety: Safety = Field(default_factory=default_safety)
     calibrations: tuple[CalibrationRecord, ...] = ()
     """How its numbers were fitted to trials, oldest first; not part of `sha256`."""
@@ -98,6 +101,12 @@ class Vehicle(Part):
                 raise refuse_section(
                     f"hydrodynamics.{name}: needs a hull: give 'hull: {{parametric: true}}' or a mesh file"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _mixed_right(self) -> Vehicle:
+        if self.autopilot is not None:
+            refuse_misfit(self.autopilot, self.thrusters, self.control_matrix)
         return self
 
     @property

@@ -9,12 +9,13 @@ import pytest
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers import import_trials
 from finssim.calibration.importers.ardusub import Log, velocity_stream
-from finssim.calibration.importers.ardusub_outputs import FRAMES, outputs_of
+from finssim.calibration.importers.ardusub_outputs import outputs_of
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.trials.trial_files import load_trial
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.autopilot import FRAMES
 
 pytest.importorskip("pymavlink")
 
@@ -148,7 +149,7 @@ def test_outputs_push_as_the_autopilot_means_them(frame, name):
 def test_pulses_of_a_thruster_wired_the_other_way_are_left_to_the_vehicle_file():
     """With motor_sign -1 the file itself says that short pulses push forward: the thrust must come out the same."""
     vehicle = load_vehicle("bluerov2")
-    turned = vehicle.replace({"thrusters.T1.motor_sign": -1})
+    turned = vehicle.replace({"thrusters.T1.motor_sign": -1, "autopilot.directions": [-1]})
     given = {f"C{i + 1}": name for i, name in enumerate(vehicle.thrusters)}
     for one in (vehicle, turned):
         outputs, _ = outputs_of(one, {}, given)

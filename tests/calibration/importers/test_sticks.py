@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.importers.ardusub_outputs import STICKS, mixed_pulses
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.trials.inputs import drive
 from finssim.vehicles import load_vehicle
@@ -19,10 +18,6 @@ PUSHES = {
     "stick_yaw": (5, -1.0),
 }
 """Stick -> axis of forward-left-up and its sign: right is -y, nose up is -pitch, clockwise from above is -yaw."""
-
-
-def demand(**sticks):
-    return np.array([[sticks.get(name.removeprefix("stick_"), 0.0) for name in STICKS]])
 
 
 def trial(tmp_path, text, **columns):
@@ -56,30 +51,11 @@ def test_each_stick_pushes_its_way(tmp_path, frame, stick):
         assert np.abs(np.delete(tau[:3], axis)).max() < 0.1 * abs(tau[axis])
 
 
-def test_the_vectored_frame_gives_way_to_the_throttle():
-    """The pair that is the rear in the direction of travel has no more forward demand than 1 - |throttle|."""
-    out = (mixed_pulses("VECTORED", demand(forward=1.0, throttle=0.75)) - 1500.0)[0] / 400.0
-    np.testing.assert_allclose(out[:4], [-1.0, -1.0, 0.25, 0.25])
-    out = (mixed_pulses("VECTORED", demand(forward=-1.0, throttle=0.75)) - 1500.0)[0] / 400.0
-    np.testing.assert_allclose(out[:4], [0.25, 0.25, -1.0, -1.0])
-    np.testing.assert_allclose(
-        (mixed_pulses("VECTORED", demand(forward=1.0, yaw=1.0))[0, :4] - 1500.0) / 400.0, [0, -1, 0, 1]
-    )
-
-
-def test_the_frame_of_six_axes_keeps_directions():
-    """Horizontals and verticals are scaled down apart, so that full ahead and full right is still diagonal."""
-    out = (mixed_pulses("VECTORED_6DOF", demand(forward=1.0, lateral=1.0, throttle=0.3)) - 1500.0)[0] / 400.0
-    np.testing.assert_allclose(out, [0.0, -1.0, 1.0, 0.0, -0.3, -0.3, -0.3, -0.3])
-
-
 def test_directions_and_gain(tmp_path):
     """MOT_n_DIRECTION turns a motor's pulses; the pilot gain scales the sticks before the mixer; both from the map."""
     text = "vehicle: bluerov2\nardusub: {frame: VECTORED, gain: 0.5, motor_directions: [1, 1, 1, 1, -1, 1]}\n"
     found = trial(tmp_path, text, stick_throttle=1.0)
     assert (found.series("pwm_T5")[1][0], found.series("pwm_T6")[1][0]) == (1700.0, 1300.0)
-    turned = mixed_pulses("VECTORED", demand(throttle=0.5), directions=[1, 1, 1, 1, -1, 1])[0]
-    np.testing.assert_allclose(turned[4:], [1700.0, 1300.0])
 
 
 @pytest.mark.parametrize(

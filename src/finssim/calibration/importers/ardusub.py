@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import finding
-from finssim.calibration.importers.ardusub_outputs import NEUTRAL, outputs_of
+from finssim.calibration.importers.ardusub_outputs import outputs_of
 from finssim.calibration.importers.assemble import ArduSubMap, Frame, Stream, in_our_axes
 from finssim.calibration.trials.conversion import GRAVITY
 from finssim.calibration.trials.trial import Array
+from finssim.control.ardusub import NEUTRAL
 from finssim.geometry.rotations import wrap_angle
 from finssim.vehicles import Vehicle
 

@@ -2,112 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
+from finssim.control.ardusub import NEUTRAL
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.vehicles import Vehicle
+from finssim.vehicles.autopilot import DEMANDS, FRAMES
 from finssim.vehicles.part import did_you_mean
 
-__all__ = ["NEUTRAL", "STICKS", "mixed_pulses", "outputs_of"]
+__all__ = ["STICKS", "outputs_of"]
 
-NEUTRAL = 1500.0
-"""Pulse width of no thrust [µs]."""
-
-HALF_RANGE = 400.0
-"""Pulse width of full output, from neutral [µs]."""
-
-STICKS = ("stick_roll", "stick_pitch", "stick_yaw", "stick_throttle", "stick_forward", "stick_lateral")
+STICKS = tuple(f"stick_{name}" for name in DEMANDS)
 """Demands in the order of the mixer's factors."""
 
 MOTOR_1 = 33
 """SERVOn_FUNCTION of the first motor."""
 
-_HORIZONTAL: list[list[float]] = [
-    [0, 0, 1, 0, -1, 1],
-    [0, 0, -1, 0, -1, -1],
-    [0, 0, -1, 0, 1, 1],
-    [0, 0, 1, 0, 1, -1],
-]
-
-FRAMES: dict[int, tuple[str, list[list[float]]]] = {
-    0: (
-        "BLUEROV1",
-        [
-            [0, 0, -1, 0, 1, 0],
-            [0, 0, 1, 0, 1, 0],
-            [-0.5, 0.5, 0, 0.45, 0, 0],
-            [0.5, 0.5, 0, 0.45, 0, 0],
-            [0, -1, 0, 1, 0, 0],
-            [-0.25, 0, 0, 0, 0, 1],
-        ],
-    ),
-    1: ("VECTORED", [*_HORIZONTAL, [1, 0, 0, -1, 0, 0], [-1, 0, 0, -1, 0, 0]]),
-    2: (
-        "VECTORED_6DOF",
-        [
-            *_HORIZONTAL,
-            [1, -1, 0, -1, 0, 0],
-            [-1, -1, 0, -1, 0, 0],
-            [1, 1, 0, -1, 0, 0],
-            [-1, 1, 0, -1, 0, 0],
-        ],
-    ),
-    4: ("SIMPLEROV_3", [[0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 1, 0], [0, 0, 0, -1, 0, 0]]),
-    5: (
-        "SIMPLEROV_4",
-        [[0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 1, 0], [1, 0, 0, -1, 0, 0], [-1, 0, 0, -1, 0, 0]],
-    ),
-    6: (
-        "SIMPLEROV_5",
-        [
-            [0, 0, -1, 0, 1, 0],
-            [0, 0, 1, 0, 1, 0],
-            [1, 0, 0, -1, 0, 0],
-            [-1, 0, 0, -1, 0, 0],
-            [0, 0, 0, 0, 0, 1],
-        ],
-    ),
-}
-"""FRAME_CONFIG -> name, and of each motor its factors of roll right, pitch up, yaw right, up, forward, right
-(ArduPilot, AP_Motors6DOF::setup_motors)."""
-
 LEAST_LIKENESS = 1.4
 """Of a motor's factors to a thruster: 1 from the direction of the force and 1 from the signs of its moments at most."""
-
-
-def mixed_pulses(frame: str, demands: np.ndarray, directions: Sequence[int] = ()) -> np.ndarray:
-    """Pulse widths of ArduSub's motors 1, 2, ... for the demands of a pilot in manual mode.
-
-    VECTORED adds a motor's demands and clips them, and limits the forward demand of the rear pair (in the direction of
-    travel) to 1 - |throttle|; VECTORED_6DOF divides verticals and horizontals each by their largest sum above 1
-    (ArduPilot, AP_Motors6DOF::output_armed_stabilizing_vectored, _vectored_6dof).
-
-    Args:
-        frame: VECTORED or VECTORED_6DOF.
-        demands: Roll right, pitch up, yaw clockwise, throttle up, forward, lateral right in [-1, 1], (n, 6).
-        directions: MOT_n_DIRECTION of each motor; 1 where not given.
-
-    Returns:
-        [µs], (n, motors).
-    """
-    factors = np.array(next(rows for name, rows in FRAMES.values() if name == frame), dtype=float)
-    demands = np.clip(demands, -1.0, 1.0)
-    output = demands @ factors.T
-    if frame == "VECTORED":
-        forward = demands[:, 4]
-        limit = np.maximum(1.0 - np.abs(demands[:, 3]), 0.0)
-        rear = np.sign(factors[:, 4]) * np.sign(forward)[:, None] > 0.0
-        output += np.where(rear, (np.clip(forward, -limit, limit) - forward)[:, None] * factors[:, 4], 0.0)
-    else:
-        for group in (factors[:, 3] == 0.0, factors[:, 3] != 0.0):
-            output[:, group] /= np.maximum(np.abs(output[:, group]).max(axis=-1, keepdims=True), 1.0)
-    sign = np.ones(len(factors))
-    sign[: len(directions)] = directions
-    return np.asarray(NEUTRAL + HALF_RANGE * np.clip(sign * output, -1.0, 1.0))
 
 
 def outputs_of(

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.importers.ardusub_outputs import FRAMES, NEUTRAL, STICKS, mixed_pulses, outputs_of
+from finssim.calibration.importers.ardusub_outputs import STICKS, outputs_of
 from finssim.calibration.trials.conversion import (
     EXTRA_COLUMNS,
     GRAVITY,
@@ -36,9 +36,11 @@ from finssim.calibration.trials.trial import (
     Trial,
     column_of,
 )
+from finssim.control.ardusub import NEUTRAL, Mixer
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.autopilot import FRAMES
 from finssim.vehicles.part import Part, did_you_mean, refuse_section, refuse_value
 from finssim.yaml_file import read_mapping
 
@@ -711,7 +713,7 @@ def _pulses(
     config = next(number for number, (frame, _) in FRAMES.items() if frame == asked.frame)
     directions = {f"MOT_{motor + 1}_DIRECTION": 1.0 for motor in range(len(FRAMES[config][1]))}
     outputs, mapped = outputs_of(vehicle, {"FRAME_CONFIG": config, **directions}, asked.outputs)
-    mixed = mixed_pulses(asked.frame, asked.gain * demands, asked.motor_directions)
+    mixed = Mixer.of_frame(asked.frame, asked.motor_directions).pulses(asked.gain * demands)
     found = {}
     for output, (thruster, sign) in outputs.items():
         pulse = NEUTRAL + sign * (mixed[:, output - 1] - NEUTRAL)

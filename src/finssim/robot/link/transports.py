@@ -57,12 +57,12 @@ class UdpTransport:
         Raises:
             LinkError: An address cannot be found, bound, or reached from `bind`.
         """
-        self.peer = _resolved(peer)
+        self.peer = resolved(peer)
         if self.peer[0] == "0.0.0.0" or not self.peer[1]:
             raise LinkError(
                 f"peer {peer[0]}:{peer[1]} is not one address and port: give those of the vehicle"
             )
-        here = _resolved(bind)
+        here = resolved(bind)
         if here[0].startswith("127.") and not self.peer[0].startswith("127."):
             raise LinkError(
                 f"{peer[0]}:{peer[1]} is on another machine and this end is bound to {here[0]}, which only this "
@@ -140,7 +140,7 @@ class UdpTransport:
         return text + (f", {sum(self.refused.values())} datagrams of others refused" if self.refused else "")
 
 
-def _resolved(address: Address) -> Address:
+def resolved(address: Address) -> Address:
     """IPv4 address of a host name."""
     try:
         (*_, found), *_ = socket.getaddrinfo(*address, family=socket.AF_INET, type=socket.SOCK_DGRAM)

@@ -1,0 +1,262 @@
+"""ArduSub's mixer: a pilot's six axes to pulses and thrusts of the motors, and back.
+
+out = rpy + linear, limited as the frame does it,   pulse = 1500 + 400 direction out,   T = c± ω|ω|, ω = ESC(pulse)
+
+The batch mixes for all worlds, the robot and the virtual firmware for one, by the same function and the same numbers.
+"""
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from finssim.control import ControlError
+from finssim.control.allocation import RowLaunch
+from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
+from finssim.vehicles.autopilot import DEMANDS, Autopilot
+
+__all__ = ["FULL", "NEUTRAL", "Mixer", "MixerData", "mix", "mixed_thrusts", "mixer_data"]
+
+Array = npt.NDArray[np.float64]
+
+NEUTRAL, FULL = 1500.0, 400.0
+"""Pulse width of no thrust, and of full output from there [µs]."""
+PULSES = np.arange(NEUTRAL - FULL, NEUTRAL + FULL + 1.0)
+"""Pulse widths of the tables of thrust [µs], (801,)."""
+RULES = {"VECTORED": 1, "VECTORED_6DOF": 2}
+"""How a frame limits the outputs of its motors: those of others, rule 0, are clipped one by one."""
+CORRECTIONS, NEAR = 20, 1e-4
+"""Most rounds of `Mixer.demands`, and how near the outputs have to come [-]."""
+
+FROM_BODY = np.zeros((6, 6))
+"""Surge, sway, heave, roll, pitch, yaw (forward, left, up) -> `DEMANDS` (forward, right, down), (6, 6)."""
+for _row, (_axis, _sign) in enumerate([(3, 1.0), (4, -1.0), (5, -1.0), (2, 1.0), (0, 1.0), (1, -1.0)]):
+    FROM_BODY[_row, _axis] = _sign
+
+
+@wp.struct
+class MixerData:
+    """What `mix` and `mixed_thrusts` need to know of each vehicle; built by `mixer_data`, first index the vehicle."""
+
+    factors: wp.array2d(dtype=vec8)
+    """Of the demands, by motor, (vehicles, motors)."""
+    rule: wp.array(dtype=int)
+    """Of `RULES`, (vehicles,)."""
+    motor: wp.array2d(dtype=int)
+    """Of each thruster, canonical order, (vehicles, motors)."""
+    direction: wp.array2d(dtype=float)
+    """MOT_n_DIRECTION, by motor, (vehicles, motors)."""
+    thrust: wp.array3d(dtype=float)
+    """Steady thrust of each thruster, canonical order, at the pulses of `PULSES` [N], (vehicles, motors, 801)."""
+
+
+@wp.func
+def mix(demand: vec6, vehicle: int, data: MixerData) -> vec8:
+    """Outputs of the motors before directions [-1, 1]      (ArduPilot, AP_Motors6DOF::output_armed_stabilizing_*).
+
+    VECTORED clips each sum, and limits the forward demand of the rear pair (in the direction of travel) to
+    1 - |throttle|; VECTORED_6DOF divides verticals and horizontals each by their largest sum above 1.
+
+    Args:
+        demand: Of `DEMANDS`; those beyond +-1 saturate.
+        vehicle: First index into `data`.
+        data: From `mixer_data`.
+    """
+    d = vec6()
+    for k in range(6):
+        d[k] = wp.clamp(demand[k], -1.0, 1.0)
+    free = wp.max(1.0 - wp.abs(d[3]), 0.0)
+    out = vec8()
+    vertical, horizontal = float(1.0), float(1.0)
+    for m in range(data.factors.shape[1]):
+        factor = data.factors[vehicle, m]
+        total = float(0.0)
+        for k in range(6):
+            part = d[k]
+            if k == 4 and data.rule[vehicle] == 1 and factor[4] * d[4] > 0.0:
+                part = wp.clamp(part, -free, free)
+            total += factor[k] * part
+        out[m] = total
+        if factor[3] == 0.0:
+            horizontal = wp.max(horizontal, wp.abs(total))
+        else:
+            vertical = wp.max(vertical, wp.abs(total))
+    for m in range(data.factors.shape[1]):
+        if data.rule[vehicle] == 2:
+            out[m] /= wp.where(data.factors[vehicle, m][3] == 0.0, horizontal, vertical)
+        out[m] = wp.clamp(out[m], -1.0, 1.0)
+    return out
+
+
+@wp.func
+def mixed_thrusts(demand: vec6, vehicle: int, data: MixerData) -> vec8:
+    """Steady thrusts that demands give, canonical order [N].
+
+    Args:
+        demand: Of `DEMANDS`; those beyond +-1 saturate.
+        vehicle: First index into `data`.
+        data: From `mixer_data`.
+    """
+    out, f = mix(demand, vehicle, data), vec8()
+    for k in range(data.factors.shape[1]):
+        m = data.motor[vehicle, k]
+        at = wp.static(FULL) * (1.0 + data.direction[vehicle, m] * out[m])
+        i = wp.min(int(at), wp.static(len(PULSES) - 2))
+        part = at - float(i)
+        f[k] = (1.0 - part) * data.thrust[vehicle, k, i] + part * data.thrust[vehicle, k, i + 1]
+    return f
+
+
+@wp.kernel(enable_backward=False)
+def mix_row(demand: wp.array(dtype=vec6), data: MixerData, out: wp.array(dtype=vec8)):
+    """`mix` for the first vehicle.
+
+    Args:
+        demand: Of `DEMANDS`, (N,).
+        data: From `mixer_data`.
+        out: Outputs before directions, by motor, out, (N,).
+    """
+    i = wp.tid()
+    out[i] = mix(demand[i], 0, data)
+
+
+def autopilot_of(vehicle: Any) -> Autopilot:
+    """The autopilot section of a vehicle.
+
+    Raises:
+        ControlError: The file has none, or a thruster no `esc`.
+    """
+    autopilot: Autopilot | None = getattr(vehicle, "autopilot", None)
+    if autopilot is None:
+        raise ControlError(
+            f"{vehicle.name} has no 'autopilot' section, so axes cannot become pulses: give its file one, "
+            "'autopilot: {frame: VECTORED_6DOF}'"
+        )
+    bare = [name for name, thruster in vehicle.thrusters.items() if thruster.esc is None]
+    if bare:
+        raise ControlError(
+            f"{vehicle.name}: thruster '{bare[0]}' has no 'esc' section, so pulses cannot become thrusts: fit one with "
+            "'finssim calibrate thruster'"
+        )
+    return autopilot
+
+
+def thrust_tables(vehicle: Any) -> Array:
+    """Steady thrust of each thruster at the pulses of `PULSES` and the autopilot's voltage [N], (n, 801)."""
+    autopilot = autopilot_of(vehicle)
+    return np.stack(
+        [
+            np.clip(t.thrust(t.shaft_speed(PULSES, autopilot.voltage)), t.force_min, t.force_max)
+            for t in vehicle.thrusters.values()
+        ]
+    )
+
+
+def motors_of(vehicle: Any) -> npt.NDArray[np.int64]:
+    """Motor of each thruster, canonical order, from 0, (n,)."""
+    thrusters = vehicle.thrusters.values()
+    return np.array([k if t.motor_index is None else t.motor_index for k, t in enumerate(thrusters)])
+
+
+def mixer_data(vehicles: Sequence[Any], device: Any = "cpu") -> MixerData:
+    """The numbers of `mix` and `mixed_thrusts` for vehicles alike in their number of thrusters.
+
+    Raises:
+        ControlError: One has no `autopilot`, or thrusters without `esc`.
+    """
+    autopilots = [autopilot_of(vehicle) for vehicle in vehicles]
+    data = _frames(autopilots, device)
+    data.motor = wp.array(np.stack([motors_of(v) for v in vehicles]), dtype=int, device=device)
+    data.thrust = wp.array(np.stack([thrust_tables(v) for v in vehicles]), dtype=float, device=device)
+    return data
+
+
+def _frames(autopilots: Sequence[Autopilot], device: Any = "cpu") -> MixerData:
+    data = MixerData()
+    factors = [np.pad(a.factors, [(0, 0), (0, MAX_THRUSTERS - len(DEMANDS))]) for a in autopilots]
+    data.factors = wp.array(np.stack(factors), dtype=vec8, device=device)
+    data.rule = wp.array([RULES.get(a.name, 0) for a in autopilots], dtype=int, device=device)
+    signs = np.stack([a.signs(len(a.factors)) for a in autopilots])
+    data.direction = wp.array(signs, dtype=float, device=device)
+    return data
+
+
+class Mixer:
+    """The mixer of one vehicle, from NumPy.
+
+    Note:
+        Runs on the CPU and reuses its launch buffers, so one instance belongs to one thread.
+    """
+
+    def __init__(self, autopilot: Autopilot) -> None:
+        """Args:
+        autopilot: Its frame and directions.
+        """
+        self.autopilot = autopilot
+        self.directions = autopilot.signs(len(autopilot.factors))
+        """MOT_n_DIRECTION, by motor, (motors,)."""
+        self._launch = RowLaunch(mix_row, vec6, _frames([autopilot]))
+        self._inverse = np.linalg.pinv(autopilot.factors)
+        self._motor: npt.NDArray[np.int64] | None = None
+        self._tables: Array | None = None
+
+    @classmethod
+    def of(cls, vehicle: Any) -> Mixer:
+        """The mixer of a vehicle's `autopilot`.
+
+        Raises:
+            ControlError: It has none, or thrusters without `esc`.
+        """
+        mixer = cls(autopilot_of(vehicle))
+        mixer._motor, mixer._tables = motors_of(vehicle), thrust_tables(vehicle)
+        return mixer
+
+    @classmethod
+    def of_frame(cls, frame: str, directions: Sequence[Any] = ()) -> Mixer:
+        """The mixer of a frame by name; MOT_n_DIRECTION of each motor is 1 where not given."""
+        return cls(Autopilot(frame=frame, directions=tuple(directions)))
+
+    def outputs(self, demands: npt.ArrayLike) -> Array:
+        """Outputs of the motors before directions [-1, 1], (..., motors).
+
+        Args:
+            demands: Of `DEMANDS` in [-1, 1], (..., 6).
+        """
+        return self._launch(demands)[..., : len(self.directions)]
+
+    def pulses(self, demands: npt.ArrayLike) -> Array:
+        """Pulse widths of motors 1, 2, ... [µs], (..., motors), for demands (..., 6)."""
+        return NEUTRAL + FULL * self.directions * self.outputs(demands)
+
+    def demands(self, force: npt.ArrayLike) -> Array:
+        """The demands whose thrusts come nearest to these, within [-1, 1], (6,).
+
+        Outputs that lie in the dead band are free within it; each round steps by the pseudo-inverse of the factors
+        towards the outputs that are wanted.
+
+        Args:
+            force: Along the thrusters' axes, canonical order [N], (n,); 0 is a motor that stands.
+        """
+        assert self._motor is not None and self._tables is not None  # made by `of`
+        low, high = np.zeros((2, len(self._motor)))
+        for motor, table, thrust in zip(self._motor, self._tables, np.asarray(force, float), strict=True):
+            rising = 1.0 if table[-1] > table[0] else -1.0
+            if thrust == 0.0:  # anywhere in the dead band
+                pulses = PULSES[table == 0.0][[0, -1]]
+            else:
+                pulses = np.interp(np.full(2, rising * thrust), rising * table, PULSES)
+            ends = self.directions[motor] * (pulses - NEUTRAL) / FULL
+            low[motor], high[motor] = ends.min(), ends.max()
+        demand: Any = self._inverse @ np.where(low < high, 0.0, low)
+        for _ in range(CORRECTIONS):
+            out = self.outputs(demand)
+            missing = np.clip(out, low, high) - out
+            if np.abs(missing).max() < NEAR:
+                break
+            demand = np.clip(demand + self._inverse @ missing, -1.0, 1.0)
+        return np.asarray(demand)

@@ -1,0 +1,1002 @@
+"""An autopilot to try against: what ArduSub 4.5 does on a BlueROV2, with MAVLink 2 in and out.
+
+The messages, their units and the rules of pilot input, arming and failsafes follow ArduSub; the loops that hold
+attitude and depth are simpler than its own. It has one link, which a router shares among ground stations, as on the
+vehicle itself. Its axes are forward, right, down in north, east, down; north is our world x.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from finssim.control.ardusub import Mixer
+from finssim.geometry.frames import TO_FOSSEN
+from finssim.geometry.rotations import quat_rotate, quat_to_euler, quat_to_matrix, wrap_angle
+from finssim.pool.firmware import AttitudeFilter, Sample
+from finssim.pool.plant_spec import PlantSpec
+from finssim.robot.link.water_linked import encode_velocity
+from finssim.robot.messages import HEADING, VELOCITY, NavigationAid
+from finssim.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from finssim.pool.plant import Plant
+    from finssim.pool.virtual_pool import Faults
+
+__all__ = ["ALT_HOLD", "MANUAL", "STABILIZE", "SURFACE", "ArduSub"]
+
+Array = NDArray[np.float64]
+
+STABILIZE, ALT_HOLD, SURFACE, MANUAL = 0, 2, 9, 19
+"""Modes, by their numbers in HEARTBEAT.custom_mode."""
+VERSION = (4, 5, 0)
+
+SYSTEM = 1
+NEUTRAL, HALF_RANGE = 1500, 400
+"""Pulse width of no demand and how far a full one is from it [µs]."""
+FORCE = 21196.0
+"""Second parameter of an arming command that passes over the checks."""
+PITCH, ROLL, THROTTLE, YAW, FORWARD, LATERAL = range(6)
+"""Input channels, from 0."""
+BOOT_INPUTS = (NEUTRAL,) * 8 + (1100,) * 10
+"""Pulse widths of the 18 inputs that nobody overrides: lights off, all else in the middle [µs]."""
+SPECIFIC_WEIGHT = 9800.0
+"""Of fresh water, as ArduPilot has it [Pa/m]."""
+METRES_PER_DEGREE = 111319.5
+CALIBRATION = 1.0
+"""For so long after the start the gyroscope is averaged [s]."""
+DEPTH_LAG = 0.4
+"""Time constant of the depth estimate [s]."""
+CLIMB_GAIN, CLIMB_INTEGRAL = 1.5, 0.4
+"""Throttle per error of climb rate [s/m] and per error of height [1/m/s] in depth hold."""
+COMPASS_SHARE = 0.05
+"""Part of the difference to a heading that one reading of the compass takes away [-]."""
+POSITION_LASTS = 5.0
+"""A position is given so long after the last velocity [s]."""
+
+GROUPS = {
+    "RAW_SENS": (1, "raw_imu scaled_imu2 scaled_pressure scaled_pressure2"),
+    "EXT_STAT": (2, "sys_status power_status named_value_float"),
+    "RC_CHAN": (3, "servo_output_raw rc_channels"),
+    "POSITION": (6, "global_position_int local_position_ned"),
+    "EXTRA1": (10, "attitude"),
+    "EXTRA2": (11, "vfr_hud"),
+    "EXTRA3": (12, "system_time battery_status ekf_status_report"),
+}
+"""Stream groups: name in the parameter SR0_NAME, number in REQUEST_DATA_STREAM, messages."""
+
+INT8, INT16, INT32, REAL32 = 2, 4, 6, 9
+BUTTONS = (0, 5, 7, 6, 4, 1, 3, 21, 48, 23, 22, 42, 43, 33, 32, 0)
+"""BTNn_FUNCTION of a BlueROV2: 1 shift, 3 arm, 4 disarm, 5 to 7 modes, 42 and 43 gain."""
+BUTTON_MODES = {5: MANUAL, 6: STABILIZE, 7: ALT_HOLD}
+
+REALS = {
+    "ACRO_YAW_P": 3.375, "ATC_ANG_PIT_P": 6.0, "ATC_ANG_RLL_P": 6.0, "ATC_ANG_YAW_P": 6.0, "ATC_RAT_PIT_P": 0.135,
+    "ATC_RAT_RLL_P": 0.135, "ATC_RAT_YAW_P": 0.18, "BARO1_GND_PRESS": 101325.0, "BARO_SPEC_GRAV": 1.0,
+    "BATT_ARM_VOLT": 0.0, "BATT_LOW_VOLT": 12.8, "FS_GCS_TIMEOUT": 5.0, "FS_PILOT_TIMEOUT": 3.0,
+    "JS_GAIN_DEFAULT": 0.5, "JS_GAIN_MAX": 1.0, "JS_GAIN_MIN": 0.25, "JS_THR_GAIN": 1.0, "MOT_FV_CPLNG_K": 1.0,
+    "PSC_POSZ_P": 1.0, "RC_OVERRIDE_TIME": 3.0, "SURFACE_DEPTH": -10.0, "SURFACE_MAX_THR": 0.1,
+}  # fmt: skip
+WHOLE = {
+    "ANGLE_MAX": (INT16, 4500), "ARMING_CHECK": (INT32, 1), "BATT_FS_LOW_ACT": (INT8, 2), "BATT_LOW_TIMER": (INT8, 10),
+    "BATT_MONITOR": (INT8, 4), "COMPASS_USE": (INT8, 1), "EK3_ENABLE": (INT8, 1), "EK3_SRC1_POSXY": (INT8, 6),
+    "EK3_SRC1_VELXY": (INT8, 6), "FS_GCS_ENABLE": (INT8, 2), "FS_LEAK_ENABLE": (INT8, 1), "FS_PILOT_INPUT": (INT8, 2),
+    "JS_GAIN_STEPS": (INT8, 4), "PILOT_SPEED_UP": (INT16, 500), "SYSID_MYGCS": (INT16, 255),
+    "SYSID_THISMAV": (INT16, SYSTEM), "THR_DZ": (INT16, 100), "VISO_TYPE": (INT8, 1),
+}  # fmt: skip
+LIMITS = {INT8: 2**7 - 1, INT16: 2**15 - 1, INT32: 2**31 - 1}
+
+
+class ArduSub:
+    """One autopilot, from power-on; like `Firmware` it is told the time, and its motors turn in the plant.
+
+    Attributes:
+        parameters: By name; they outlive a reboot.
+        target: Shaft speeds that its pulses stand for on a full battery, canonical order [rad/s], (n,).
+        pulses: Of motors 1, 2, ... [µs], (n,).
+        mode: `MANUAL`, `STABILIZE`, `ALT_HOLD` or `SURFACE`.
+        armed: Whether its motors turn.
+        ordered: Whether its frames cannot overtake each other on the wire.
+    """
+
+    ordered = True
+
+    def __init__(self, vehicle: Vehicle, spec: PlantSpec, *, now: float = 0.0) -> None:
+        """Power on.
+
+        Args:
+            vehicle: Its file: mixer, speed controllers, mounts.
+            spec: Clock, attitude filter and battery.
+            now: Time of power-on [s].
+
+        Raises:
+            ControlError: The vehicle has no `autopilot`, or thrusters without `esc`.
+        """
+        self._mixer, self._spec, self._gravity = Mixer.of(vehicle), spec.firmware, vehicle.water.gravity
+        thrusters = list(vehicle.thrusters.values())
+        self._motor = np.array(
+            [k if t.motor_index is None else t.motor_index for k, t in enumerate(thrusters)]
+        )
+        widths = np.arange(NEUTRAL - HALF_RANGE, NEUTRAL + HALF_RANGE + 1)
+        self._speeds = np.array([t.shaft_speed(widths, spec.battery.full_voltage) for t in thrusters])
+        imu, self._dvl = vehicle.sensors.imu, vehicle.sensors.dvl
+        assert imu is not None  # the pool refuses a vehicle without one
+        self._body_from_imu = quat_to_matrix(imu.orientation)
+        self._has_compass, self._key = vehicle.sensors.compass is not None, b""
+        self._table = self._default_parameters(vehicle)
+        self.parameters = {name: value for name, (_, value) in self._table.items()}
+        self._faults: Faults | None = None
+        self._clock_start = spec.firmware.clock_start
+        self._start(now)
+
+    def _default_parameters(self, vehicle: Vehicle) -> dict[str, tuple[int, float]]:
+        """Types and values, by name, sorted."""
+        frame = {"VECTORED": 1, "VECTORED_6DOF": 2}.get(self._mixer.autopilot.name, 7)
+        table = {name: (REAL32, value) for name, value in REALS.items()}
+        table |= {name: (kind, float(value)) for name, (kind, value) in WHOLE.items()}
+        table |= {"FRAME_CONFIG": (INT8, frame), "VISO_TYPE": (INT8, float(self._dvl is not None))}
+        for i, function in enumerate(BUTTONS):
+            table |= {f"BTN{i}_FUNCTION": (INT8, function), f"BTN{i}_SFUNCTION": (INT8, 0)}
+        for i in range(1, 9):
+            table |= {
+                f"RC{i}_{end}": (INT16, width)
+                for end, width in (("MIN", 1100), ("MAX", 1900), ("TRIM", NEUTRAL))
+            }
+        for i, direction in enumerate(self._mixer.directions, 1):
+            table |= {f"MOT_{i}_DIRECTION": (INT8, float(direction)), f"SERVO{i}_FUNCTION": (INT16, 32.0 + i)}
+        table |= {f"SR0_{name}": (INT16, 0) for name in GROUPS}
+        return dict(sorted(table.items()))
+
+    def _start(self, now: float) -> None:
+        """State after power-on: parameters are remembered and nothing else."""
+        self._boot = self._now = now
+        self._out: list[bytes] = []
+        self._mav = mavlink.MAVLink(SimpleNamespace(write=self._out.append), self._id, 1)
+        self._mav.robust_parsing = True
+        if self._key:
+            self.sign(self._key)
+        self.mode, self.armed = MANUAL, False
+        self._held: tuple[float, float, float, float] | None = None
+        self._driven: tuple[float, ...] | None = None
+        self.pulses = np.full(len(self._motor), float(NEUTRAL))
+        self.target: Array = np.zeros(len(self._motor))
+        self._inputs, self._input_times = list(BOOT_INPUTS), [-math.inf] * 18
+        self._pilot_seen, self._ground_seen = -math.inf, -math.inf
+        self._pilot_lost, self._ground_lost, self._battery_low, self._leaking = True, False, False, False
+        self._low_since, self._leak_told = math.inf, -math.inf
+        self._gain, self._buttons = self._within("JS_GAIN_DEFAULT", 0.1, 1.0), 0
+        self._filter = AttitudeFilter(self._spec.attitude_gain, self._spec.attitude_integral, self._gravity)
+        self._rates_sum, self._rates_count = np.zeros(3), 0
+        self._sample: Sample | None = None
+        self._sampled, self._headed = now, False
+        self._attitude, self._quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+        self._rates, self._force = np.zeros(3), np.zeros(3)
+        self._altitude = self._climb = self._climb_integral = 0.0
+        self._held_altitude: float | None = None
+        self._held_yaw: float | None = None
+        self._position, self._velocity, self._velocity_time = np.zeros(2), np.zeros(2), -math.inf
+        self._origin: tuple[int, int] | None = None
+        self._battery = (self._boot, 0.0)
+        self._dvl_time = now
+        self._asked_parameters: deque[int] = deque()
+        self._servos = [0] * 16
+        self._rebooting = False
+        self._interval: dict[int, float] = {}
+        self._due: dict[int, float] = {}
+        self._every(mavlink.MAVLINK_MSG_ID_HEARTBEAT, 1.0)
+        for name in GROUPS:
+            self._stream(name, self.parameters[f"SR0_{name}"])
+        self._greet()
+
+    # What the pool calls.
+
+    def reboot(self, now: float) -> None:
+        """Motors off, silence for the plant's `reboot_time`, then everything but the parameters anew."""
+        self._clock_start = 0
+        self._start(now + self._spec.reboot_time)
+
+    def running(self, now: float) -> bool:
+        """Whether it has finished starting."""
+        return now >= self._boot
+
+    @property
+    def driving(self) -> bool:
+        """Whether it is armed."""
+        return self.armed
+
+    def receive(self, now: float, data: bytes) -> list[bytes]:
+        """Take a datagram of whole MAVLink frames; returns the answers. Whatever it holds, nothing is raised."""
+        if not self.running(now):
+            return []
+        self._now = max(self._now, now)
+        for message in self._mav.parse_buffer(data) or ():
+            handler = getattr(self, f"_on_{message.get_type().lower()}", None)
+            for_us = getattr(message, "target_system", self._id) in (0, self._id)
+            if handler is not None and for_us and getattr(message, "target_component", 1) in (0, 1):
+                handler(message)
+        # What is left is no whole frame: it must not swallow the next one.
+        self._mav.buf, self._mav.buf_index, self._mav.expected_length = (
+            bytearray(),
+            0,
+            mavlink.HEADER_LEN_V1 + 2,
+        )
+        out = self._drain()
+        if self._rebooting:
+            self.reboot(now)
+        return out
+
+    def watch(self, now: float) -> None:
+        """Let overrides lapse, look at the pilot and the ground station, and set the motors."""
+        if not self.running(now):
+            return
+        self._now = now = max(self._now, now)
+        lasts = self.parameters["RC_OVERRIDE_TIME"]
+        for i, since in enumerate(self._input_times):
+            if since > -math.inf and 0.0 <= lasts < now - since:
+                self._release(i)
+        self._look_after_pilot(now)
+        self._look_after_ground(now)
+        self._drive()
+
+    def frames(
+        self, now: float, sample: Sample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
+    ) -> list[bytes]:
+        """What leaves at a sample of the IMU: telemetry that is due, and the lines of the Doppler log.
+
+        Args:
+            now: When it leaves [s].
+            sample: Of the instruments.
+            aids: Of compass and Doppler log, new at this sample.
+            plant: Battery, and distance to the floor.
+            faults: What is wrong.
+        """
+        lines = [] if faults.dvl_silent or self._dvl is None else self._dvl_lines(now, aids, plant)
+        if not self.running(now):
+            return lines
+        self._now, self._faults = max(self._now, now), faults
+        self._battery = (faults.battery_voltage or float(plant.electric[0]), float(plant.electric[1]))
+        if not faults.freeze_sensors or self._sample is None:
+            self._sense(now, sample, aids)
+        self._look_after_battery(now)
+        self._look_after_leak(now, faults.leak)
+        self._hold()
+        for number, due in self._due.items():
+            if now >= due - 1e-9:
+                self._due[number] = max(due + self._interval[number], now - self._interval[number])
+                self._report(number)
+        for _ in range(min(4, len(self._asked_parameters))):
+            self._send_parameter(self._asked_parameters.popleft())
+        return self._drain() + lines
+
+    def _drain(self) -> list[bytes]:
+        out = list(self._out)
+        self._out.clear()
+        return out
+
+    # Instruments, and what it makes of them.
+
+    def _sense(self, now: float, sample: Sample, aids: Sequence[NavigationAid]) -> None:
+        dt, self._sampled, self._sample = now - self._sampled, now, sample
+        gyro, accel = (self._body_from_imu @ np.array(v) for v in (sample.gyro, sample.accel))
+        if now - self._boot < CALIBRATION:
+            self._rates_sum, self._rates_count = self._rates_sum + gyro, self._rates_count + 1
+            x, y, z = (self._rates_sum / self._rates_count).tolist()
+            self._filter.bias = (x, y, z)
+        self._filter.update(tuple(gyro.tolist()), tuple(accel.tolist()), dt)
+        velocities = []
+        for aid in aids:
+            if aid.kind == HEADING and self.parameters["COMPASS_USE"]:
+                self._filter.turn(aid.values[0], COMPASS_SHARE if self._headed else 1.0)
+                self._headed = True
+            elif aid.kind == VELOCITY:
+                velocities.append(aid)
+        q = np.array(self._filter.quaternion)
+        self._quaternion = TO_FOSSEN.quaternion(q)
+        self._attitude = np.array(quat_to_euler(self._quaternion)).ravel()
+        self._rates = TO_FOSSEN.axial(gyro - np.array(self._filter.bias))
+        self._force = TO_FOSSEN.vector(accel)
+        self._climb_by(float(quat_rotate(q, accel)[2]) - self._gravity, dt)
+        if self.parameters["VISO_TYPE"] and self._dvl is not None:
+            self._position += dt * self._velocity * (now - self._velocity_time < POSITION_LASTS)
+            for aid in velocities:
+                self._move(TO_FOSSEN.vector(quat_to_matrix(self._dvl.orientation) @ np.array(aid.values)))
+
+    def _climb_by(self, acceleration: float, dt: float) -> None:
+        """Height and climb rate from pressure and vertical acceleration [m/s^2]: an observer of two poles."""
+        assert self._sample is not None
+        weight = SPECIFIC_WEIGHT * self._within("BARO_SPEC_GRAV", 0.5, 2.0)
+        measured = (self._within("BARO1_GND_PRESS", 5e4, 2e5) - self._sample.pressure) / weight
+        if self._rates_count <= 1:
+            self._altitude = measured
+        error = measured - self._altitude
+        self._altitude += dt * (self._climb + 2.0 / DEPTH_LAG * error)
+        self._climb += dt * (acceleration + error / DEPTH_LAG**2)
+
+    def _move(self, velocity: Array) -> None:
+        """Take a velocity over the floor, forward, right, down [m/s]."""
+        self._velocity, self._velocity_time = quat_rotate(self._quaternion, velocity)[:2], self._now
+
+    def _dvl_lines(self, now: float, aids: Sequence[NavigationAid], plant: Plant) -> list[bytes]:
+        """Reports of the Doppler log: its velocities, and that it has none where it misses more than one."""
+        assert self._dvl is not None
+        interval = now - self._dvl_time
+        velocities = [aid for aid in aids if aid.kind == VELOCITY]
+        if not velocities and interval * self._dvl.rate < 1.5:
+            return []
+        self._dvl_time = now
+        if not velocities:
+            return [encode_velocity(None, measured=now, sent=now, interval=interval)]
+        height = plant.spec.basin.depth + float(plant.position[2])
+        upright = float(quat_rotate(plant.quaternion, (0.0, 0.0, 1.0))[2])
+        return [
+            encode_velocity(
+                velocities[-1].values,
+                altitude=height / max(upright, 0.1),
+                measured=now - velocities[-1].age,
+                sent=now,
+                interval=interval,
+                std=(self._dvl.noise_std,) * 3,
+            )
+        ]
+
+    # Motors.
+
+    def _hold(self) -> None:
+        """Demands of roll, pitch, yaw and throttle that hold attitude and depth, in the modes that do."""
+        p = self.parameters
+        pitch, roll, throttle, yaw, *_ = self._sticks()
+        if self.mode == MANUAL or not self.armed:
+            self._held, self._held_yaw, self._held_altitude, self._climb_integral = None, None, None, 0.0
+            return
+        lean = math.radians(0.01 * p["ANGLE_MAX"])
+        rate = np.zeros(3)
+        for axis, stick in enumerate((roll, pitch)):
+            gain = p["ATC_ANG_RLL_P"] if axis == 0 else p["ATC_ANG_PIT_P"]
+            rate[axis] = gain * (_dead(stick, 0.075) * lean - self._attitude[axis])
+        turn = _dead(yaw, 0.1)
+        if turn or self._held_yaw is None:
+            self._held_yaw = float(self._attitude[2])
+        rate[2] = p["ATC_ANG_YAW_P"] * float(wrap_angle(self._held_yaw - self._attitude[2]))
+        rate[2] += turn * math.radians(45.0 * p["ACRO_YAW_P"])
+        gains = np.array([p["ATC_RAT_RLL_P"], p["ATC_RAT_PIT_P"], p["ATC_RAT_YAW_P"]])
+        turning = np.clip(gains * (rate - self._rates), -1.0, 1.0).tolist()
+        self._held = (*turning, throttle if self.mode == STABILIZE else self._climbing(throttle))
+
+    def _climbing(self, stick: float) -> float:
+        """Throttle that climbs as the stick says or holds the depth, less near the surface."""
+        p = self.parameters
+        climb = 0.01 * p["PILOT_SPEED_UP"] * _dead(stick, 0.001 * p["THR_DZ"])
+        if self.mode == SURFACE:
+            climb = 0.2
+        if climb or self._held_altitude is None:
+            self._held_altitude, error = self._altitude, 0.0
+        else:
+            error = p["PSC_POSZ_P"] * (self._held_altitude - self._altitude)
+            self._climb_integral = max(-1.0, min(1.0, self._climb_integral + CLIMB_INTEGRAL * 0.01 * error))
+        up = CLIMB_GAIN * (climb + error - self._climb) + self._climb_integral
+        least, surface = self._within("SURFACE_MAX_THR", 0.0, 1.0), 0.01 * p["SURFACE_DEPTH"]
+        limit = least + (1.0 - least) * max(0.0, min(1.0, surface - self._altitude))
+        return max(-1.0, min(limit, up))
+
+    def _drive(self) -> None:
+        """Pulses of the mixer while armed, else 1500."""
+        demands = self._demands() if self.armed else None
+        if demands == self._driven:
+            return
+        self._driven = demands
+        pulses = np.full(len(self._motor), float(NEUTRAL))
+        if demands is not None:
+            pulses += np.round(self._signs() * (self._mixer.pulses(np.array(demands)) - NEUTRAL))
+        self.pulses = pulses
+        column = (pulses[self._motor] - (NEUTRAL - HALF_RANGE)).astype(int)
+        self.target = self._speeds[np.arange(len(column)), column]
+
+    def _demands(self) -> tuple[float, ...]:
+        """Of the mixer: roll, pitch, yaw, throttle, forward, lateral."""
+        pitch, roll, throttle, yaw, forward, lateral = self._sticks()
+        yaw *= self.parameters["ACRO_YAW_P"] / REALS["ACRO_YAW_P"]
+        return (*(self._held or (roll, pitch, yaw, throttle)), forward, lateral)
+
+    def _signs(self) -> Array:
+        """Of the motors that parameters turn against the vehicle file, (n,)."""
+        n = len(self.pulses)
+        now = np.array([self.parameters[f"MOT_{i + 1}_DIRECTION"] for i in range(n)])
+        return np.asarray(np.where(now < 0.0, -1.0, 1.0) * self._mixer.directions)
+
+    # Pilot.
+
+    def _sticks(self) -> list[float]:
+        """The first six inputs in [-1, 1]: pitch, roll, throttle, yaw, forward, lateral."""
+        return [max(-1.0, min(1.0, (width - NEUTRAL) / HALF_RANGE)) for width in self._inputs[:6]]
+
+    def _override(self, channel: int, width: float) -> None:
+        self._inputs[channel], self._input_times[channel] = int(width), self._now
+
+    def _release(self, channel: int) -> None:
+        self._inputs[channel], self._input_times[channel] = BOOT_INPUTS[channel], -math.inf
+
+    def _neutral_sticks(self) -> None:
+        for channel in range(6):
+            self._release(channel)
+
+    def _from_ground(self, message: Any) -> bool:
+        """Whether it came from the ground station that may steer."""
+        return bool(message.get_srcSystem() == self.parameters["SYSID_MYGCS"])
+
+    def _on_heartbeat(self, message: Any) -> None:
+        if self._from_ground(message) and not (self._faults and self._faults.no_ground_heartbeat):
+            self._ground_seen = self._now
+
+    def _on_manual_control(self, message: Any) -> None:
+        if not self._from_ground(message) or message.target != self._id:
+            return
+        self._pilot_seen = self._ground_seen = self._now
+        pressed, self._buttons = message.buttons & ~self._buttons, message.buttons
+        shifted = any(
+            message.buttons >> i & 1 and self.parameters[f"BTN{i}_FUNCTION"] == 1 for i in range(len(BUTTONS))
+        )
+        for i in range(len(BUTTONS)):
+            if pressed >> i & 1:
+                self._press(int(self.parameters[f"BTN{i}_{'S' * shifted}FUNCTION"]))
+        gain = 0.001 * HALF_RANGE * self._gain
+        for channel, offset in (
+            (PITCH, message.s),
+            (ROLL, message.t),
+            (THROTTLE, 2.0 * gain * self.parameters["JS_THR_GAIN"] * (message.z - 500)),
+            (YAW, gain * message.r),
+            (FORWARD, gain * message.x),
+            (LATERAL, gain * message.y),
+        ):
+            self._override(channel, NEUTRAL + max(-HALF_RANGE, min(HALF_RANGE, offset)))
+
+    def _press(self, function: int) -> None:
+        """What a button does; those of lights, camera and trim do nothing."""
+        if function in (2, 3, 4):
+            arm = function == 3 or (function == 2 and not self.armed)
+            self._arm() if arm else self._disarm()
+        elif function in BUTTON_MODES:
+            self._set_mode(BUTTON_MODES[function])
+        elif function in (41, 42, 43):
+            low, high = self._within("JS_GAIN_MIN", 0.1, 1.0), self._within("JS_GAIN_MAX", 0.1, 1.0)
+            step = (high - low) / max(self.parameters["JS_GAIN_STEPS"] - 1.0, 1.0)
+            toggled = high if self._gain < high else low
+            self._gain = toggled if function == 41 else self._gain + (step if function == 42 else -step)
+            self._gain = max(low, min(high, self._gain))
+            self._say(mavlink.MAV_SEVERITY_INFO, f"#Gain is at {100.0 * self._gain:.0f}%")
+
+    def _on_rc_channels_override(self, message: Any) -> None:
+        if not self._from_ground(message):
+            return
+        self._pilot_seen = self._ground_seen = self._now
+        for i in range(18):
+            width = getattr(message, f"chan{i + 1}_raw")
+            if width == (0 if i < 8 else 65534):
+                self._release(i)
+            elif width not in (0, 65535):
+                self._override(i, width)
+
+    # Arming, modes, failsafes.
+
+    def _unfit(self) -> list[str]:
+        """Why it must not be armed."""
+        p = self.parameters
+        reasons = []
+        if self._sample is None or self._now - self._boot < CALIBRATION:
+            reasons.append("Gyros still settling")
+        if self._sample is not None and not math.isfinite(self._sample.pressure):
+            reasons.append("Depth sensor not healthy")
+        if not any(p[f"BTN{i}_FUNCTION"] in (2, 4) or p[f"BTN{i}_SFUNCTION"] in (2, 4) for i in range(16)):
+            reasons.append("Disarm button not assigned")
+        if self._battery[0] < max(p["BATT_ARM_VOLT"], p["BATT_LOW_VOLT"]):
+            reasons.append(f"Battery 1 low voltage {self._battery[0]:.1f}")
+        for i in range(1, 9):
+            if p[f"RC{i}_MIN"] > 1300 or p[f"RC{i}_MAX"] < 1700:
+                reasons.append(f"RC{i} limits too narrow")
+        return reasons
+
+    def _arm(self, forced: bool = False) -> bool:
+        reasons = [] if forced or not self.parameters["ARMING_CHECK"] else self._unfit()
+        for reason in reasons:
+            self._say(mavlink.MAV_SEVERITY_CRITICAL, f"Arm: {reason}")
+        if reasons:
+            return False
+        if not self.armed:
+            self.armed = True
+            self._say(mavlink.MAV_SEVERITY_INFO, "Arming motors")
+            self._beat_soon()
+        return True
+
+    def _disarm(self) -> bool:
+        if self.armed:
+            self.armed = False
+            self._say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
+            self._beat_soon()
+        self._drive()
+        return True
+
+    def _set_mode(self, mode: int) -> bool:
+        depth = self._sample is not None and math.isfinite(self._sample.pressure)
+        if mode not in (MANUAL, STABILIZE) and not (mode in (ALT_HOLD, SURFACE) and depth):
+            self._say(mavlink.MAV_SEVERITY_WARNING, "Flight mode change failed")
+            return False
+        if mode != self.mode:
+            if mode == MANUAL:
+                self._neutral_sticks()
+            self.mode, self._held, self._held_yaw, self._held_altitude = mode, None, None, None
+            self._hold()
+            self._beat_soon()
+        return True
+
+    def _beat_soon(self) -> None:
+        if mavlink.MAVLINK_MSG_ID_HEARTBEAT in self._interval:
+            self._due[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = self._now
+
+    def _look_after_pilot(self, now: float) -> None:
+        """No input for FS_PILOT_TIMEOUT: sticks to neutral, and disarmed where FS_PILOT_INPUT says so; once a loss."""
+        action = self.parameters["FS_PILOT_INPUT"]
+        lost = action > 0 and now - self._pilot_seen > self.parameters["FS_PILOT_TIMEOUT"]
+        if lost and not self._pilot_lost:
+            self._say(mavlink.MAV_SEVERITY_CRITICAL, "Lost manual control")
+            self._neutral_sticks()
+            if action == 2:
+                self._disarm()
+        self._pilot_lost = lost
+
+    def _look_after_ground(self, now: float) -> None:
+        """No heartbeat of the ground station for FS_GCS_TIMEOUT, once there was one: what FS_GCS_ENABLE says."""
+        action, since = self.parameters["FS_GCS_ENABLE"], self._ground_seen
+        lost = action > 0 and since > -math.inf and now - since > self.parameters["FS_GCS_TIMEOUT"]
+        if lost and not self._ground_lost:
+            self._say(
+                mavlink.MAV_SEVERITY_WARNING, f"MYGCS: {self.parameters['SYSID_MYGCS']:.0f}, heartbeat lost"
+            )
+            if action == 2:
+                self._disarm()
+            elif action in (3, 4) and self.armed and not self._set_mode(ALT_HOLD if action == 3 else SURFACE):
+                self._disarm()
+        self._ground_lost = lost
+
+    def _look_after_battery(self, now: float) -> None:
+        """BATT_FS_LOW_ACT (2 disarm, 3 surface) after BATT_LOW_TIMER below BATT_LOW_VOLT; once a start."""
+        p = self.parameters
+        if self._battery[0] >= p["BATT_LOW_VOLT"]:
+            self._low_since = math.inf
+        self._low_since = min(self._low_since, now if self._battery[0] < p["BATT_LOW_VOLT"] else math.inf)
+        if not self._battery_low and now - self._low_since >= p["BATT_LOW_TIMER"]:
+            self._battery_low = True
+            self._say(mavlink.MAV_SEVERITY_WARNING, f"Battery 1 is low {self._battery[0]:.2f}V used 0 mAh")
+            if p["BATT_FS_LOW_ACT"] == 2:
+                self._disarm()
+            elif p["BATT_FS_LOW_ACT"] == 3 and self.armed:
+                self._set_mode(SURFACE)
+
+    def _look_after_leak(self, now: float, leaking: bool) -> None:
+        """FS_LEAK_ENABLE: 1 tells, every 20 s; 2 surfaces too."""
+        action = self.parameters["FS_LEAK_ENABLE"]
+        self._leaking = leaking and action > 0
+        if not self._leaking:
+            self._leak_told = -math.inf
+        elif now - self._leak_told > 20.0:
+            self._say(mavlink.MAV_SEVERITY_CRITICAL, "Leak Detected")
+            if action == 2 and self.armed and self._leak_told == -math.inf:
+                self._set_mode(SURFACE)
+            self._leak_told = now
+
+    # Commands.
+
+    def _on_command_long(self, message: Any) -> None:
+        self._command(message, [getattr(message, f"param{i}") for i in range(1, 8)])
+
+    def _on_command_int(self, message: Any) -> None:
+        first = [getattr(message, f"param{i}") for i in range(1, 5)]
+        self._command(message, [*first, float(message.x), float(message.y), message.z])
+
+    def _command(self, message: Any, values: list[float]) -> None:
+        """Do it or refuse it; one that is not known is unsupported, never met with silence."""
+        values = [value if abs(value) < 1e9 else -1.0 for value in values]  # NaN as well: no command takes it
+        do = COMMANDS.get(message.command)
+        result = mavlink.MAV_RESULT_UNSUPPORTED if do is None else do(self, values)
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        self._send(mavlink.MAVLink_command_ack_message(message.command, int(result), 0, 0, *sender))
+
+    def _do_arm(self, values: list[float]) -> int:
+        if values[0] not in (0.0, 1.0):
+            return int(mavlink.MAV_RESULT_UNSUPPORTED)
+        return _result(self._arm(values[1] == FORCE) if values[0] else self._disarm())
+
+    def _do_set_mode(self, values: list[float]) -> int:
+        if not int(values[0]) & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+            return int(mavlink.MAV_RESULT_DENIED)
+        return _result(self._set_mode(int(values[1])))
+
+    def _do_set_interval(self, values: list[float]) -> int:
+        number, interval = int(values[0]), 1e-6 * values[1]
+        if self._reporter(number) is None:
+            return int(mavlink.MAV_RESULT_FAILED)
+        if values[1] == 0.0:
+            default = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
+            for name, (_, messages) in GROUPS.items():
+                rate = self.parameters[f"SR0_{name}"]
+                default |= {_number(m): 1.0 / rate for m in messages.split() if rate > 0.0}
+            interval = default.get(number, -1.0)
+        self._every(number, interval)
+        return int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def _do_get_interval(self, values: list[float]) -> int:
+        number = int(values[0])
+        known = self._reporter(number) is not None
+        interval = round(1e6 * self._interval[number]) if number in self._interval else -1
+        if known:
+            self._send(mavlink.MAVLink_message_interval_message(number, interval))
+        return _result(known)
+
+    def _do_request(self, values: list[float]) -> int:
+        return _result(self._report(int(values[0])))
+
+    def _do_request_version(self, values: list[float]) -> int:
+        return _result(values[0] == 1.0 and self._report(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION))
+
+    def _do_calibrate(self, values: list[float]) -> int:
+        """Gyroscope (first) and ground pressure (third); nothing while armed."""
+        if self.armed or self._sample is None:
+            return int(mavlink.MAV_RESULT_FAILED)
+        if values[2] == 1.0:
+            self._store("BARO1_GND_PRESS", self._sample.pressure)
+        return int(
+            mavlink.MAV_RESULT_ACCEPTED if 1.0 in (values[0], values[2]) else mavlink.MAV_RESULT_UNSUPPORTED
+        )
+
+    def _do_test_motor(self, values: list[float]) -> int:
+        self._say(mavlink.MAV_SEVERITY_CRITICAL, "Motor test refused: not emulated")
+        return int(mavlink.MAV_RESULT_FAILED)
+
+    def _do_set_servo(self, values: list[float]) -> int:
+        output = int(values[0])
+        if not len(self.pulses) < output <= 16 or not 0.0 <= values[1] <= 65535.0:
+            self._say(mavlink.MAV_SEVERITY_WARNING, f"ServoRelayEvent: Channel {output} is already in use")
+            return int(mavlink.MAV_RESULT_FAILED)
+        self._servos[output - 1] = int(values[1])
+        return int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def _do_reboot(self, values: list[float]) -> int:
+        if self.armed or values[0] not in (1.0, 3.0):
+            return int(mavlink.MAV_RESULT_FAILED)
+        self._rebooting = True
+        return int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def _on_set_mode(self, message: Any) -> None:
+        result = self._do_set_mode([float(message.base_mode), float(message.custom_mode)])
+        self._send(mavlink.MAVLink_command_ack_message(mavlink.MAVLINK_MSG_ID_SET_MODE, result))
+
+    # Parameters, streams and what else a ground station asks.
+
+    @property
+    def _id(self) -> int:
+        return int(self._within("SYSID_THISMAV", 1, 255))
+
+    def _within(self, name: str, low: float, high: float) -> float:
+        """A parameter, which anybody may have set, within what makes sense."""
+        return max(low, min(high, self.parameters[name]))
+
+    def _on_param_request_list(self, message: Any) -> None:
+        self._greet()
+        self._asked_parameters = deque(range(len(self._table)))
+
+    def _on_param_request_read(self, message: Any) -> None:
+        names = list(self._table)
+        index = names.index(message.param_id) if message.param_id in self._table else -1
+        index = index if message.param_index == -1 else message.param_index
+        if 0 <= index < len(names):
+            self._send_parameter(index)
+
+    def _on_param_set(self, message: Any) -> None:
+        if message.param_id in self._table and math.isfinite(message.param_value):
+            self._store(message.param_id, message.param_value)
+            self._send_parameter(list(self._table).index(message.param_id))
+
+    def _store(self, name: str, value: float) -> None:
+        kind = self._table[name][0]
+        if kind != REAL32:
+            value = float(round(max(-LIMITS[kind], min(LIMITS[kind], value))))
+        self.parameters[name], self._driven = value, ()
+        self._mav.srcSystem = self._id
+        if name.startswith("SR0_"):
+            self._stream(name.removeprefix("SR0_"), value)
+
+    def _send_parameter(self, index: int) -> None:
+        name, (kind, _) = list(self._table.items())[index]
+        value = self.parameters[name]
+        self._send(mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(self._table), index))
+
+    def _on_request_data_stream(self, message: Any) -> None:
+        for name, (number, _) in GROUPS.items():
+            if message.req_stream_id in (0, number):
+                self._stream(name, message.req_message_rate * message.start_stop)
+
+    def _stream(self, group: str, rate: float) -> None:
+        for message in GROUPS[group][1].split():
+            self._every(_number(message), 1.0 / rate if rate > 0.0 else -1.0)
+
+    def _every(self, number: int, interval: float) -> None:
+        """Send a message at an interval [s]; none or a negative one ends it."""
+        if interval > 0.0:
+            self._interval[number] = max(interval, 0.0025)
+            self._due.setdefault(number, self._now)
+        else:
+            self._interval.pop(number, None)
+            self._due.pop(number, None)
+
+    def _on_mission_request_list(self, message: Any) -> None:
+        sender, kind = (message.get_srcSystem(), message.get_srcComponent()), message.mission_type
+        if kind in (0, 1, 2):
+            self._send(mavlink.MAVLink_mission_count_message(*sender, 0, kind))
+        else:
+            self._send(mavlink.MAVLink_mission_ack_message(*sender, mavlink.MAV_MISSION_UNSUPPORTED, kind))
+
+    def _on_mission_clear_all(self, message: Any) -> None:
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        accepted = mavlink.MAV_MISSION_ACCEPTED
+        self._send(mavlink.MAVLink_mission_ack_message(*sender, accepted, message.mission_type))
+
+    def _on_mission_count(self, message: Any) -> None:
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        unsupported = mavlink.MAV_MISSION_UNSUPPORTED
+        self._send(mavlink.MAVLink_mission_ack_message(*sender, unsupported, message.mission_type))
+
+    def _on_log_request_list(self, message: Any) -> None:
+        self._send(mavlink.MAVLink_log_entry_message(0, 0, 0, 0, 0))
+
+    def _on_timesync(self, message: Any) -> None:
+        if message.tc1 == 0:
+            self._send(mavlink.MAVLink_timesync_message(round(1e9 * (self._now - self._boot)), message.ts1))
+
+    def _on_ping(self, message: Any) -> None:
+        if message.target_system == 0 and message.target_component == 0:
+            sender = message.get_srcSystem(), message.get_srcComponent()
+            self._send(mavlink.MAVLink_ping_message(message.time_usec, message.seq, *sender))
+
+    def _on_setup_signing(self, message: Any) -> None:
+        if not self.armed:
+            self.sign(bytes(message.secret_key) if any(message.secret_key) else b"")
+
+    def sign(self, key: bytes) -> None:
+        """Sign with a key of 32 bytes from now on, and take nothing that is not; empty: neither."""
+        signing, self._key = self._mav.signing, key
+        signing.secret_key, signing.sign_outgoing, signing.link_id = key or None, bool(key), 1
+
+    def _on_set_gps_global_origin(self, message: Any) -> None:
+        self._origin = (message.latitude, message.longitude)
+
+    def _on_vision_position_delta(self, message: Any) -> None:
+        time = 1e-6 * message.time_delta_usec
+        usable = self.parameters["VISO_TYPE"] and self._dvl is None and 0.0025 <= time <= 1.0
+        if usable and message.confidence > 0.0 and all(abs(d) < 10.0 * time for d in message.position_delta):
+            self._move(np.array(message.position_delta) / time)
+
+    # Telemetry.
+
+    def _send(self, message: Any) -> None:
+        self._mav.send(message)
+
+    def _say(self, severity: int, text: str) -> None:
+        self._send(mavlink.MAVLink_statustext_message(severity, text.encode()[:50]))
+
+    def _greet(self) -> None:
+        self._say(mavlink.MAV_SEVERITY_INFO, "ArduSub V{}.{}.{} (FinsSim)".format(*VERSION))
+        self._say(mavlink.MAV_SEVERITY_INFO, f"Frame: {self._mixer.autopilot.name}")
+
+    def _reporter(self, number: int) -> Callable[[], Any] | None:
+        """What makes a message, by its number."""
+        kind = mavlink.mavlink_map.get(number)
+        return None if kind is None else getattr(self, f"_report_{kind.msgname.lower()}", None)
+
+    def _report(self, number: int) -> bool:
+        """Send a message with what is known now; False where there is none of this number."""
+        reporter = self._reporter(number)
+        if reporter is None:
+            return False
+        messages = reporter() if self._sample is not None or number in WITHOUT_SAMPLE else ()
+        for message in messages if isinstance(messages, tuple) else (messages,):
+            self._send(message)
+        return True
+
+    @property
+    def _milliseconds(self) -> int:
+        """Its own clock, modulo 2^32."""
+        rate = 1000.0 * (1.0 + 1e-6 * self._spec.crystal_ppm)
+        return (self._clock_start + int(rate * (self._now - self._boot))) & 0xFFFFFFFF
+
+    def _spoiled(self, value: float, *fields: str) -> float:
+        """A number, or NaN where a fault names one of these fields."""
+        field = self._faults.nan_field.partition(".")[0] if self._faults else ""
+        return math.nan if field in fields else value
+
+    def _report_heartbeat(self) -> Any:
+        if self._faults and self._faults.no_heartbeat:
+            return ()
+        lost = self._pilot_lost or self._ground_lost or self._battery_low or self._leaking
+        base = 81 | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0)
+        state = mavlink.MAV_STATE_ACTIVE if self.armed else mavlink.MAV_STATE_STANDBY
+        return mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_SUBMARINE,
+            mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+            base,
+            self.mode,
+            mavlink.MAV_STATE_CRITICAL if lost else state,
+            3,
+        )
+
+    def _report_autopilot_version(self) -> Any:
+        able = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+        able |= mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+        major, minor, patch = VERSION
+        version = major << 24 | minor << 16 | patch << 8 | 255
+        return mavlink.MAVLink_autopilot_version_message(
+            able, version, 0, 0, 0, list(b"FinsSim\0"), [0] * 8, [0] * 8, 0, 0, 0
+        )
+
+    def _report_attitude(self) -> Any:
+        angles = [self._spoiled(angle, "quaternion") for angle in self._attitude.tolist()]
+        rates = [self._spoiled(rate, "gyro") for rate in self._rates.tolist()]
+        return mavlink.MAVLink_attitude_message(self._milliseconds, *angles, *rates)
+
+    def _report_attitude_quaternion(self) -> Any:
+        x, y, z, w = (self._spoiled(part, "quaternion") for part in self._quaternion.tolist())
+        rates = [self._spoiled(rate, "gyro") for rate in self._rates.tolist()]
+        return mavlink.MAVLink_attitude_quaternion_message(self._milliseconds, w, x, y, z, *rates)
+
+    def _imu(self) -> list[int]:
+        """Specific force [mg], rates [mrad/s], and no magnetic field; of these rates the bias is not taken off."""
+        assert self._sample is not None
+        rates = TO_FOSSEN.axial(self._body_from_imu @ np.array(self._sample.gyro))
+        values = [
+            *(self._force * 1000.0 / STANDARD_GRAVITY).tolist(),
+            *(1000.0 * rates).tolist(),
+            0.0,
+            0.0,
+            0.0,
+        ]
+        return [_int16(value) for value in values]
+
+    def _report_raw_imu(self) -> Any:
+        return mavlink.MAVLink_raw_imu_message(1000 * self._milliseconds, *self._imu())
+
+    def _report_scaled_imu2(self) -> Any:
+        return mavlink.MAVLink_scaled_imu2_message(self._milliseconds, *self._imu())
+
+    def _report_scaled_pressure(self) -> Any:
+        return mavlink.MAVLink_scaled_pressure_message(self._milliseconds, 1013.25, 0.0, 3000)
+
+    def _report_scaled_pressure2(self) -> Any:
+        assert self._sample is not None
+        pressure = self._spoiled(0.01 * self._sample.pressure, "depth", "pressure")
+        return mavlink.MAVLink_scaled_pressure2_message(self._milliseconds, pressure, 0.0, 2000)
+
+    def _report_vfr_hud(self) -> Any:
+        heading = int(math.degrees(self._attitude[2])) % 360
+        throttle = round(50.0 + 50.0 * max(-1.0, min(1.0, self._demands()[3]))) if self.armed else 50
+        speed = float(np.hypot(*self._velocity)) if self._has_position else 0.0
+        altitude = self._spoiled(self._altitude, "depth", "pressure")
+        return mavlink.MAVLink_vfr_hud_message(0.0, speed, heading, throttle, altitude, self._climb)
+
+    @property
+    def _has_position(self) -> bool:
+        return self._origin is not None and self._now - self._velocity_time < POSITION_LASTS
+
+    def _report_local_position_ned(self) -> Any:
+        if not self._has_position:
+            return ()
+        place, speed = [*self._position.tolist(), -self._altitude], [*self._velocity.tolist(), -self._climb]
+        return mavlink.MAVLink_local_position_ned_message(self._milliseconds, *place, *speed)
+
+    def _report_global_position_int(self) -> Any:
+        latitude, longitude = self._origin or (0, 0)
+        north, east = self._position / METRES_PER_DEGREE * 1e7
+        east /= max(math.cos(math.radians(1e-7 * latitude)), 0.01)
+        height, heading = (
+            round(1000.0 * self._altitude),
+            round(100.0 * math.degrees(self._attitude[2])) % 36000,
+        )
+        speed = [_int16(100.0 * v) for v in (*self._velocity.tolist(), -self._climb)]
+        place = [max(-(2**31), min(2**31 - 1, round(v))) for v in (latitude + north, longitude + east)]
+        return mavlink.MAVLink_global_position_int_message(
+            self._milliseconds, *place, height, height, *speed, heading
+        )
+
+    def _report_ekf_status_report(self) -> Any:
+        flags = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
+        horizontal = mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
+        flags |= horizontal if self._has_position else mavlink.EKF_CONST_POS_MODE
+        return mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.0)
+
+    def _report_sys_status(self) -> Any:
+        present = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+        present |= mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+        present |= mavlink.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS | mavlink.MAV_SYS_STATUS_AHRS
+        present |= mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG if self._has_compass else 0
+        present |= mavlink.MAV_SYS_STATUS_PREARM_CHECK
+        enabled = present if self.armed else present & ~mavlink.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
+        healthy = present & ~mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if self._battery_low else present
+        healthy = healthy & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK if self._unfit() else healthy
+        voltage, current = self._battery
+        return mavlink.MAVLink_sys_status_message(
+            present, enabled, healthy, 100, round(1000.0 * voltage), _int16(100.0 * current), -1, *[0] * 6
+        )
+
+    def _report_battery_status(self) -> Any:
+        voltage, current = self._battery
+        voltages = [round(1000.0 * voltage), *[65535] * 9]
+        return mavlink.MAVLink_battery_status_message(
+            0, 0, 0, 32767, voltages, _int16(100.0 * current), 0, -1, -1
+        )
+
+    def _report_power_status(self) -> Any:
+        return mavlink.MAVLink_power_status_message(5000, 0, 0)
+
+    def _report_system_time(self) -> Any:
+        return mavlink.MAVLink_system_time_message(0, self._milliseconds)
+
+    def _report_named_value_float(self) -> Any:
+        values = {"CamTilt": 0.5, "TetherTrn": 0.0, "Lights1": 0.0, "Lights2": 0.0, "PilotGain": self._gain}
+        values |= {"InputHold": 0.0, "RollPitch": 0.0}
+        ms = self._milliseconds
+        return tuple(mavlink.MAVLink_named_value_float_message(ms, n.encode(), v) for n, v in values.items())
+
+    def _report_servo_output_raw(self) -> Any:
+        pulses = self._servos.copy()
+        pulses[: len(self.pulses)] = [round(pulse) for pulse in self.pulses.tolist()]
+        return mavlink.MAVLink_servo_output_raw_message(1000 * self._milliseconds & 0xFFFFFFFF, 0, *pulses)
+
+    def _report_rc_channels(self) -> Any:
+        return mavlink.MAVLink_rc_channels_message(self._milliseconds, 18, *self._inputs, 0)
+
+
+WITHOUT_SAMPLE = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT,
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
+    mavlink.MAVLINK_MSG_ID_RC_CHANNELS,
+    mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+}
+"""Messages that need no instrument."""
+STANDARD_GRAVITY = 9.80665
+"""[m/s^2]"""
+
+COMMANDS: dict[int, Callable[[ArduSub, list[float]], int]] = {
+    mavlink.MAV_CMD_COMPONENT_ARM_DISARM: ArduSub._do_arm,
+    mavlink.MAV_CMD_DO_SET_MODE: ArduSub._do_set_mode,
+    mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: ArduSub._do_set_interval,
+    mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: ArduSub._do_get_interval,
+    mavlink.MAV_CMD_REQUEST_MESSAGE: ArduSub._do_request,
+    mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: ArduSub._do_request_version,
+    mavlink.MAV_CMD_PREFLIGHT_CALIBRATION: ArduSub._do_calibrate,
+    mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: ArduSub._do_reboot,
+    mavlink.MAV_CMD_DO_MOTOR_TEST: ArduSub._do_test_motor,
+    mavlink.MAV_CMD_DO_SET_SERVO: ArduSub._do_set_servo,
+}
+"""Those that are carried out or refused; every other is unsupported."""
+
+
+def _result(done: bool) -> int:
+    return int(mavlink.MAV_RESULT_ACCEPTED if done else mavlink.MAV_RESULT_FAILED)
+
+
+def _number(message: str) -> int:
+    """Of a message by its name in lower case."""
+    return int(getattr(mavlink, f"MAVLINK_MSG_ID_{message.upper()}"))
+
+
+def _dead(stick: float, zone: float) -> float:
+    """A stick in [-1, 1] with a dead zone in its middle."""
+    return math.copysign(max(abs(stick) - zone, 0.0) / (1.0 - min(zone, 0.99)), stick)
+
+
+def _int16(value: float) -> int:
+    return max(-32768, min(32767, round(value)))

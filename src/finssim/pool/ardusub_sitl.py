@@ -1,0 +1,470 @@
+"""`finssim ardusub-sitl`: the physics behind ArduPilot's own ArduSub in SITL, over its JSON interface (UDP).
+
+SITL sends pulse widths and waits; each new frame moves the world on by 1 / frame_rate, and the answer tells where the
+vehicle is, in ArduPilot's frames (body forward-right-down, world north-east-down; north is world x).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import select
+import socket
+import struct
+import sys
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from functools import lru_cache
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.control.ardusub import motors_of
+from finssim.engine import Pool, Simulator, Water, Wave
+from finssim.geometry.frames import TO_FOSSEN, wxyz_from_xyzw
+from finssim.geometry.rotations import cross, quat_from_yaw, quat_to_euler, quat_to_matrix
+from finssim.pool.plant_spec import Battery, PlantSpecError
+from finssim.robot.goals import station_of
+from finssim.robot.link.frames import LinkError
+from finssim.robot.link.transports import host_port
+from finssim.robot.link.water_linked import DvlServer, encode_velocity
+from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import POOL, SITES, with_navigation
+
+__all__ = ["Pulses", "SitlServer", "SitlWorld", "decode_pulses", "run"]
+
+Array = NDArray[np.float64]
+
+_LOG = logging.getLogger("finssim.ardusub_sitl")
+
+
+class Pulses(NamedTuple):
+    """What SITL sends."""
+
+    frame_rate: int
+    """Frames in a second of its clock [Hz]."""
+    frame_count: int
+    """Counts answers that SITL has taken."""
+    pulses: tuple[int, ...]
+    """By output channel from 1, 16 or 32 [µs]; 0 where there is no signal."""
+
+
+_LAYOUTS = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
+"""Magic number -> packet."""
+SLOWEST, FASTEST = 20, 2000
+"""Frame rates that can be served [Hz]."""
+
+
+def decode_pulses(data: bytes) -> Pulses | str:
+    """The content of a packet of SITL, or in a word why it is none.
+
+    Args:
+        data: A datagram.
+    """
+    layout = _LAYOUTS.get(int.from_bytes(data[:2], "little"))
+    if layout is None:
+        return "wrong magic"
+    if len(data) != layout.size:
+        return "wrong length"
+    _, rate, count, *pulses = layout.unpack(data)
+    return Pulses(rate, count, tuple(pulses)) if SLOWEST <= rate <= FASTEST else "wrong rate"
+
+
+GRAVITY = 9.80665
+"""What ArduPilot takes off a specific force [m/s²]: with it, accelerations and velocities of an answer agree."""
+_FLIP = TO_FOSSEN.A
+_LONGEST_STEP = 0.005
+"""Longest physics step [s]."""
+_LONGEST_PULSE = 2500
+_RANGE = 100.0
+"""Reach of the rangefinder, and of its tilt the cosine [m, -]."""
+_LEAST_COSINE = 0.5
+
+
+class SitlWorld:
+    """One vehicle in its water: pulse widths and a time step in, the state as SITL reads it out.
+
+    Attributes:
+        time: Since the start [s].
+        simulator: The one world.
+        voltage: Of the battery under load [V].
+        current: Out of the battery [A].
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        pool: Pool | None = None,
+        water: Water | None = None,
+        position: tuple[float, float, float] = (0.0, 0.0, -1.0),
+        yaw: float = 0.0,
+        battery: Battery | None = None,
+        dvl: DvlServer | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Put the vehicle into the water, at rest and level.
+
+        Args:
+            vehicle: Its thrusters have an `esc`; those without a `motor_index` are on the outputs in their order.
+            pool: Walls and floor; open water without a floor if None.
+            water: Current and waves; still water if None.
+            position: Of the body origin, world frame [m].
+            yaw: From world x, which is north, left positive [rad].
+            battery: Of its motors; 16 V whatever the load if None.
+            dvl: Server of its Doppler log; none if None.
+            seed: Of everything random.
+
+        Raises:
+            VehicleError, SimulatorError: The vehicle cannot be driven by pulse widths, or not simulated.
+        """
+        self.vehicle, self.battery = vehicle, battery or Battery(full_voltage=16.0)
+        self._thrusters = list(vehicle.thrusters.values())
+        self._output = motors_of(vehicle)
+        self._start = position, quat_from_yaw(yaw)
+        longest = max(t.delay for t in self._thrusters)
+        self.simulator = Simulator(
+            vehicle, control_step=1.0 / FASTEST, substeps=1, pool=pool, water=water, threads=1, seed=seed,
+            max_delay=longest,
+        )  # fmt: skip
+        s, n = self.simulator, len(self._thrusters)
+        self._thrust = s.command.fields["thrust"].numpy()[0, 0]
+        names = ("position", "quaternion", "velocity", "acceleration")
+        self._position, self._quaternion, self._nu, self._nu_dot = (s.numpy(name)[0, 0] for name in names)
+        self._frozen, self._count = s.numpy("frozen"), n
+        self._floor = pool.depth if pool is not None else math.inf
+        self._forces = lru_cache(maxsize=512)(self._forces_at)
+        self._fastest = np.array([max(t.rpm_max, -t.rpm_min) for t in self._thrusters]) * (math.tau / 60.0)
+        self.log = None if dvl is None else _DopplerLog(with_navigation(vehicle), dvl, self._floor, seed)
+        self._rate = FASTEST
+        self.restart()
+        self.step((0,) * 32, self._rate)  # kernels are compiled before anybody waits
+        self.restart()
+
+    def restart(self) -> None:
+        """Back to the start, at time 0."""
+        self.time, self.voltage, self.current = 0.0, self.battery.full_voltage, self.battery.idle_current
+        self._thrust[:] = 0.0
+        self.simulator.restart_episodes()
+        position, quaternion = self._start
+        self.simulator.place(position, quaternion)
+        if self.log is not None:
+            self.log.restart()
+
+    def step(self, pulses: tuple[int, ...], rate: int) -> None:
+        """Move on by 1 / rate.
+
+        Args:
+            pulses: By output channel [µs].
+            rate: Frames in a second [Hz].
+        """
+        if rate != self._rate:
+            self._rate = rate
+            substeps = math.ceil(1.0 / rate / _LONGEST_STEP - 1e-9)
+            self.simulator.set_control_step(1.0 / rate, substeps, self.time)
+        width = np.minimum([pulses[k] if k < len(pulses) else 0 for k in self._output], _LONGEST_PULSE)
+        force, power = self._forces(round(20.0 * self.voltage))
+        each = np.arange(self._count)
+        self._thrust[: self._count] = force[each, width]
+        self.current = self.battery.idle_current + float(power[each, width].sum()) / self.voltage
+        self.simulator.step()
+        self.time += 1.0 / rate
+        faded = 1.0 - self.battery.fade * min(self.time / self.battery.fade_time, 1.0)
+        self.voltage = max(self.battery.full_voltage * faded - self.battery.resistance * self.current, 1.0)
+        if self.log is not None:
+            self.log.look(self.time, self._position, quat_to_matrix(self._quaternion), self._nu)
+
+    def _forces_at(self, twentieths: int) -> tuple[Array, Array]:
+        """Steady thrust [N] and electric power [W] at every pulse width, (n, 2501), at a voltage of so many 0.05 V."""
+        width = np.arange(_LONGEST_PULSE + 1)
+        omega = np.array([t.shaft_speed(width, 0.05 * twentieths) for t in self._thrusters])
+        force = np.array([t.thrust(speed) for t, speed in zip(self._thrusters, omega, strict=True)])
+        return force, self.battery.motor_power * np.abs(omega / self._fastest[:, None]) ** 3
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the vehicle stands still since its motion stopped being finite."""
+        return bool(self._frozen[0])
+
+    def answer(self) -> bytes:
+        """The state as SITL's parser takes it: no JSON reader, but a search for names with what follows them."""
+        R = quat_to_matrix(self._quaternion)
+        nu, nu_dot = self._nu.astype(float), self._nu_dot.astype(float)
+        v, omega = nu[:3], nu[3:]
+        force = nu_dot[:3] + cross(omega, v) + GRAVITY * R[2]
+        gyro, accel, velocity, position = (np.array([omega, force, R @ v, self._position]) @ _FLIP.T).tolist()
+        q = TO_FOSSEN.quaternion(self._quaternion)
+        state: dict[str, Any] = {
+            "timestamp": round(self.time, 9),
+            "imu": {"gyro": gyro, "accel_body": accel},
+            "position": position,
+            "attitude": [float(angle) + 0.0 for angle in quat_to_euler(q)],
+            "quaternion": wxyz_from_xyzw(q).tolist(),
+            "velocity": velocity,
+            "battery": {"voltage": round(self.voltage, 3), "current": round(self.current, 3)},
+        }
+        distance = (self._floor + float(self._position[2])) / max(float(R[2, 2]), 1e-9)
+        if R[2, 2] > _LEAST_COSINE and 0.0 <= distance <= _RANGE:
+            state["rng_1"] = round(distance, 4)
+        return b"\n" + json.dumps(state, separators=(",", ":")).encode() + b"\n"
+
+
+class _DopplerLog:
+    """The vehicle's Doppler log, looked at once per frame; its reports leave when their latency is over."""
+
+    def __init__(self, vehicle: Vehicle, server: DvlServer, floor: float, seed: int) -> None:
+        log = vehicle.sensors.dvl
+        assert log is not None  # with_navigation gives one
+        self.entry, self.server, self._floor = log, server, floor
+        self._R_bs, self._random = quat_to_matrix(log.orientation), np.random.default_rng([seed, 73])
+        self.restart()
+
+    def restart(self) -> None:
+        """Back to time 0, which is now."""
+        self._next, self._sent = 0.0, 0.0
+        self._waiting: deque[tuple[float, Array | None, float]] = deque()
+        self._epoch = time.time()
+
+    def look(self, now: float, position: Array, R: Array, nu: Array) -> None:
+        """Measure if it is time, and send what has waited long enough.
+
+        Args:
+            now: Since the start [s].
+            position: Of the body origin, world frame [m], (3,).
+            R: Attitude, body to world, (3, 3).
+            nu: Body frame [m/s, rad/s], (6,).
+        """
+        log = self.entry
+        if now >= self._next - 1e-9:
+            self._next += 1.0 / log.rate
+            up, r = R[2], np.asarray(log.position)
+            v = self._R_bs.T @ (nu[:3] + cross(nu[3:], r)) + log.noise_std * self._random.standard_normal(3)
+            altitude = (self._floor + float(position[2]) + float(up @ r)) / max(float(up[2]), 1e-9)
+            lock = (
+                up[2] > math.cos(min(log.max_tilt, 0.5 * math.pi)) and np.abs(v).max() <= log.velocity_range
+            )
+            lock = lock and log.altitude_min <= altitude <= log.altitude_max
+            self._waiting.append((now, v if lock else None, altitude))
+        while self._waiting and now >= self._waiting[0][0] + log.latency - 1e-9:
+            at, velocity, altitude = self._waiting.popleft()
+            self.server.send(
+                encode_velocity(
+                    velocity,
+                    altitude=altitude,
+                    measured=self._epoch + at,
+                    sent=self._epoch + now,
+                    interval=now - self._sent,
+                    std=(log.noise_std,) * 3,
+                )
+            )
+            self._sent = now
+
+
+Address = tuple[str, int]
+
+_POLL = 0.1
+"""Longest wait for a packet between looks at everything else [s]."""
+_PACKETS_AT_ONCE = 1024
+_AWAY = 1.5
+"""A SITL that is silent for so long may be followed by another one [s]."""
+
+
+class SitlServer:
+    """Answers SITL packet by packet, by its lock-step rules; what is no packet of SITL is counted and not answered.
+
+    Attributes:
+        counts: Of `frames`, `repeats`, `restarts`, `gaps`, and of what was refused: `wrong magic`, `wrong length`,
+            `wrong rate`, `stranger`.
+    """
+
+    def __init__(
+        self,
+        world: SitlWorld,
+        address: Address = ("127.0.0.1", 9002),
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Listen.
+
+        Args:
+            world: The physics.
+            address: Host and port of this end; port 0 takes a free one (see `address`).
+            clock: Tells for how long SITL is silent [s].
+
+        Raises:
+            LinkError: It cannot be bound.
+        """
+        self.world, self.counts = world, Counter[str]()
+        self._clock, self._heard = clock, -math.inf
+        self._peer: Address | None = None
+        self._last, self._answer = -1, b""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind(address)
+        except OSError as problem:
+            self._socket.close()
+            raise LinkError(
+                f"cannot bind {address[0]}:{address[1]} for SITL ({problem.strerror}): end the program that has it, or "
+                "give another port to both (SITL adds 10 per instance)"
+            ) from None
+        self._socket.setblocking(False)
+        self.address: Address = self._socket.getsockname()
+
+    def serve(self, duration: float = math.inf) -> None:
+        """Answer until the world's clock has come so far [s]."""
+        while self.world.time < duration - 1e-9:
+            self.serve_once()
+
+    def serve_once(self) -> None:
+        """Wait a moment for packets, and answer the newest one: SITL takes one answer per frame, more would lag."""
+        newest = None
+        select.select([self._socket], [], [], _POLL)
+        with suppress(BlockingIOError, ConnectionError):
+            for _ in range(_PACKETS_AT_ONCE):
+                packet = self._accepted(*self._socket.recvfrom(256))
+                if packet is not None and newest is not None:
+                    self.counts["repeats"] += 1
+                newest = packet or newest
+        if newest is not None and self._peer is not None:
+            with suppress(OSError):  # SITL has gone: its system says so
+                self._socket.sendto(self.answer(newest), self._peer)
+        elif self.world.log is not None:
+            self.world.log.server.poll()
+
+    def _accepted(self, data: bytes, sender: Address) -> Pulses | None:
+        packet = decode_pulses(data)
+        now = self._clock()
+        if not isinstance(packet, str) and sender != self._peer:
+            if now - self._heard > _AWAY:
+                _LOG.info("SITL at %s:%d", *sender)
+                self._peer = sender
+            else:
+                packet = "stranger"
+        if isinstance(packet, str):
+            self._note(packet, "refused a packet from %s:%d: %s", *sender, packet)
+            return None
+        self._heard = now
+        return packet
+
+    def answer(self, packet: Pulses) -> bytes:
+        """What SITL gets for a packet; the world moves on if its frame is new, and starts again if it counts back."""
+        count = packet.frame_count
+        if count == self._last:
+            self.counts["repeats"] += 1
+            return self._answer
+        if count < self._last:
+            self._note("restarts", "SITL has started again: the world starts again too")
+            self.world.restart()
+        elif self._last >= 0 and count > self._last + 1:
+            self._note("gaps", "SITL counts from frame %d to %d: answers were lost", self._last, count)
+        self._last = count
+        self.counts["frames"] += 1
+        self.world.step(packet.pulses, packet.frame_rate)
+        if self.world.frozen:
+            self._note("frozen", "the motion stopped being finite at %.3f s: restart SITL", self.world.time)
+        self._answer = self.world.answer()
+        return self._answer
+
+    def _note(self, what: str, sentence: str, *values: Any) -> None:
+        """Count, and log the first of its kind; the end tells how many there were."""
+        self.counts[what] += 1
+        if self.counts[what] == 1 or what == "restarts":
+            _LOG.warning(sentence, *values)
+
+    def close(self) -> None:
+        """Let go of the port."""
+        self._socket.close()
+
+
+MOTOR_POWER = 385.0
+"""Of a T200 at full speed on 16 V, from its table [W]."""
+
+
+def run(
+    *,
+    vehicle: str = "bluerov2_heavy",
+    bind: str = "127.0.0.1:9002",
+    site: str = "tank",
+    start: str | None = None,
+    current: str = "0,0,0",
+    wave: str | None = None,
+    voltage: Annotated[float, (5.0, 30.0)] = 16.0,
+    resistance: Annotated[float, (0.0, 1.0)] = 0.02,
+    dvl: str | None = None,
+    duration: Annotated[float | None, (0.0, None)] = None,
+    seed: int = 0,
+) -> None:
+    """Be the physics behind ArduPilot's own ArduSub in SITL, started with `--model JSON:127.0.0.1`, until Ctrl-C.
+
+    Example: finssim ardusub-sitl --vehicle bluerov2_heavy --site tank --dvl 127.0.0.1:16171
+
+    Args:
+        vehicle (NAME|FILE): Vehicle whose thrusters have an `esc`, of the catalogue or a file; of a calibrated one, its
+            file.
+        bind (HOST:PORT): Where SITL sends its packets: this machine alone unless given.
+        site (NAME): Walls and floor: pool, tank or open-water (no walls near, floor at 20 m).
+        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x (north), y, z [m], yaw left positive [deg]; half way
+            down if not given.
+        current (X,Y,Z): Of the water, world frame [m/s].
+        wave (A,LENGTH,HEADING): One wave: amplitude [m], length [m], direction of travel [deg]; none if not given.
+        voltage: Of the battery without load [V].
+        resistance: Of battery and wiring [ohm].
+        dvl (HOST:PORT): Also serve a Water Linked DVL there, for BlueOS' driver or a robot; its own port is 16171.
+        duration: When to end, simulated [s]; never if not given.
+        seed: Seed of every random number; equal seeds give equal results.
+
+    Raises:
+        PlantSpecError, LinkError, GoalError, VehicleError: What cannot be used.
+    """
+    logging.basicConfig(level=logging.INFO, format="finssim: %(message)s", stream=sys.stderr)
+    if site not in SITES:
+        raise PlantSpecError(f"unknown site '{site}'; available: {', '.join(SITES)}")
+    length, width, depth = SITES[site] or POOL
+    begin = station_of(start or f"0,0,{-0.5 * depth:g},0")
+    waves = []
+    if wave is not None:
+        amplitude, wavelength, heading = _three(wave, "wave")
+        waves = [Wave(amplitude=amplitude, wavelength=wavelength, heading=math.radians(heading))]
+    with ExitStack() as stack:
+        log = None
+        if dvl is not None:
+            log = DvlServer(host_port(dvl, "--dvl"))
+            stack.callback(log.close)
+        world = SitlWorld(
+            load_vehicle(vehicle),
+            pool=Pool(length=length, width=width, depth=depth),
+            water=Water(current=_three(current, "current"), waves=waves, depth=depth),
+            position=tuple(begin.position),
+            yaw=begin.yaw,
+            battery=Battery(full_voltage=voltage, resistance=resistance, motor_power=MOTOR_POWER),
+            dvl=log,
+            seed=seed,
+        )
+        server = SitlServer(world, host_port(bind, "--bind"))
+        stack.callback(server.close)
+        print(
+            f"{world.vehicle.title}: waiting for SITL on {server.address[0]}:{server.address[1]}", flush=True
+        )
+        if log is not None:
+            print(f"DVL: {log.address[0]}:{log.address[1]}", flush=True)
+        try:
+            server.serve(math.inf if duration is None else duration)
+        except KeyboardInterrupt:
+            pass
+        told = ", ".join(f"{count} {what}" for what, count in sorted(server.counts.items()) if count)
+        print(f"ended after {world.time:.1f} s: {told or 'SITL sent nothing'}")
+
+
+def _three(text: str, option: str) -> tuple[float, float, float]:
+    """Three numbers with commas between."""
+    try:
+        a, b, c = map(float, text.split(","))
+    except ValueError:
+        a = b = c = math.nan
+    if not all(map(math.isfinite, (a, b, c))):
+        raise PlantSpecError(f"--{option}: {text!r}: expected three finite numbers with commas between")
+    return a, b, c

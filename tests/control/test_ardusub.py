@@ -1,0 +1,147 @@
+"""ArduSub's mixer: the published tables, its limits, the catalogue's thrusters, and the way back from thrusts."""
+
+import numpy as np
+import pytest
+
+from finssim.control import ControlError
+from finssim.control.ardusub import PULSES, Mixer, thrust_tables
+from finssim.control.modes import action_mode
+from finssim.vehicles import VehicleError, load_vehicle
+from finssim.vehicles.autopilot import DEMANDS
+
+HEAVY, ROV = load_vehicle("bluerov2_heavy"), load_vehicle("bluerov2")
+PUSHES = {
+    "forward": (0, 1),
+    "lateral": (1, -1),
+    "throttle": (2, 1),
+    "roll": (3, 1),
+    "pitch": (4, -1),
+    "yaw": (5, -1),
+}
+"""Demand -> axis of forward-left-up and its sign: right is -y, nose up is -pitch, clockwise from above is -yaw."""
+
+
+def demand(**parts):
+    return np.array([parts.get(name, 0.0) for name in DEMANDS])
+
+
+def test_the_vectored_frame_gives_way_to_the_throttle():
+    """The pair that is the rear in the direction of travel has no more forward demand than 1 - |throttle|."""
+    mixer = Mixer.of_frame("VECTORED")
+    out = mixer.outputs(demand(forward=1.0, throttle=0.75))
+    np.testing.assert_allclose(out[:4], [-1.0, -1.0, 0.25, 0.25])
+    out = mixer.outputs(demand(forward=-1.0, throttle=0.75))
+    np.testing.assert_allclose(out[:4], [0.25, 0.25, -1.0, -1.0])
+    np.testing.assert_allclose(mixer.outputs(demand(forward=1.0, yaw=1.0))[:4], [0, -1, 0, 1])
+
+
+def test_the_frame_of_six_axes_keeps_directions():
+    """Horizontals and verticals are scaled down apart, so that full ahead and full right is still diagonal."""
+    out = Mixer.of_frame("VECTORED_6DOF").outputs(demand(forward=1.0, lateral=1.0, throttle=0.3))
+    np.testing.assert_allclose(out, [0.0, -1.0, 1.0, 0.0, -0.3, -0.3, -0.3, -0.3], rtol=1e-6)
+
+
+def test_full_ahead_and_full_up_are_the_published_pulses():
+    """1100 µs on motors 1, 2 and 1900 on 3, 4 ahead, 1100 on the verticals up; directions turn a motor's pulses."""
+    mixer = Mixer.of_frame("VECTORED_6DOF")
+    np.testing.assert_allclose(
+        mixer.pulses(demand(forward=1.0)), [1100, 1100, 1900, 1900, 1500, 1500, 1500, 1500]
+    )
+    np.testing.assert_allclose(mixer.pulses(demand(throttle=1.0)), [1500] * 4 + [1100] * 4)
+    turned = Mixer.of_frame("VECTORED", [1, 1, 1, 1, -1, 1]).pulses(demand(throttle=0.5))
+    np.testing.assert_allclose(turned[4:], [1700.0, 1300.0])
+
+
+@pytest.mark.parametrize("vehicle", [HEAVY, ROV], ids=lambda v: v.name)
+@pytest.mark.parametrize("name", PUSHES)
+def test_each_demand_pushes_its_way(vehicle, name):
+    """Through the mode, the mixer, the ESC and the thrusters of the catalogue: the axis named, and no other force."""
+    if (vehicle, name) == (ROV, "pitch"):
+        pytest.skip("six thrusters do not pitch")
+    axis, sign = PUSHES[name]
+    action = np.zeros(6)
+    action[axis] = sign * 0.5
+    tau = vehicle.control_matrix @ action_mode("pilot6", vehicle).to_thrusters(action)
+    assert sign * tau[axis] > (5.0 if axis < 3 else 0.5)
+    if axis < 3:
+        assert np.abs(np.delete(tau[:3], axis)).max() < 0.1 * abs(tau[axis])
+
+
+def test_thrusts_are_those_of_the_speed_controller():
+    """An action's thrusts are c ω² at the pulses that the mixer gives, by the ESC's own law; at another voltage too."""
+    for voltage in (None, 12.0):
+        vehicle = HEAVY if voltage is None else HEAVY.replace({"autopilot.voltage": voltage})
+        action = np.array([0.7, -0.2, 0.4, 0.05, -0.1, 0.3])
+        f = action_mode("pilot6", vehicle).to_thrusters(action)
+        pulses = Mixer.of(vehicle).pulses(
+            demand(forward=0.7, lateral=0.2, throttle=0.4, roll=0.05, pitch=0.1, yaw=-0.3)
+        )
+        expected = [
+            np.clip(t.thrust(t.shaft_speed(pulse, voltage)), t.force_min, t.force_max)
+            for t, pulse in zip(vehicle.thrusters.values(), pulses, strict=True)
+        ]
+        np.testing.assert_allclose(
+            f, expected, atol=0.02
+        )  # a table every µs between which thrust is taken as straight
+
+
+@pytest.mark.parametrize("vehicle", [HEAVY, ROV], ids=lambda v: v.name)
+def test_demands_of_thrusts_give_these_thrusts_again(vehicle):
+    """What the mixer gave comes back from it, with motors in the dead band and groups that saturate."""
+    mode, mixer = action_mode("pilot6", vehicle), Mixer.of(vehicle)
+    random, off = np.random.default_rng(0), []
+    for _ in range(200):
+        f = mode.to_thrusters(random.uniform(-1.0, 1.0, 6) * random.uniform(0.0, 1.0))
+        again = mixer.demands(f)
+        body = np.array([again[4], -again[5], again[3], again[0], -again[1], -again[2]])
+        off.append(np.abs(mode.to_thrusters(body) - f).max())
+    # Where the vectored frame clips single motors with all axes near full, the demand is not always reached.
+    assert np.percentile(off, 90.0) < 0.1
+    np.testing.assert_array_equal(mixer.demands(np.zeros(len(f))), 0.0)
+
+
+def test_a_motor_wired_and_declared_the_other_way_gives_the_same_push():
+    """MOT_3_DIRECTION -1 beside a propeller that pushes the other way: pulses differ, thrust direction does not."""
+    turned = HEAVY.replace(
+        {"thrusters.T3.axis": (-HEAVY.thrusters["T3"].axis).tolist(), "autopilot.directions": [1, 1, -1]}
+    )
+    ahead = np.array([0.5, 0, 0, 0, 0, 0])
+    for vehicle in (HEAVY, turned):
+        tau = vehicle.control_matrix @ action_mode("pilot6", vehicle).to_thrusters(ahead)
+        assert tau[0] > 20.0
+    assert Mixer.of(turned).pulses(demand(forward=0.5))[2] == pytest.approx(1300.0)
+
+
+def test_a_frame_may_be_a_table():
+    """The factors written out are the frame of that name, but clipped one by one."""
+    rows = HEAVY.autopilot.factors.tolist()
+    own = HEAVY.replace({"autopilot.frame": rows})
+    small = demand(forward=0.2, yaw=0.1, throttle=-0.3)
+    np.testing.assert_allclose(Mixer.of(own).outputs(small), Mixer.of(HEAVY).outputs(small), atol=1e-6)
+
+
+def test_tables_rise_with_the_pulse_and_stand_still_about_neutral():
+    for table, thruster in zip(thrust_tables(HEAVY), HEAVY.thrusters.values(), strict=True):
+        assert (np.diff(table) >= 0.0).all()
+        dead = (PULSES > thruster.esc.dead_minus) & (PULSES < thruster.esc.dead_plus)
+        assert (table[dead] == 0.0).all()
+
+
+@pytest.mark.parametrize(
+    "changes, sentence",
+    [
+        ({"autopilot.frame": "VECTORED_6DOFF"}, "VECTORED_6DOF"),
+        ({"autopilot.frame": "VECTORED"}, "6 motors"),
+        ({"autopilot.directions": [-1]}, "motor 1 pushes thruster 'T1' against"),
+        ({"autopilot.gain": 1.5}, "gain"),
+        ({"autopilot.frame": [[0, 0, 1]]}, "6 long"),
+    ],
+)
+def test_an_autopilot_that_cannot_be_is_refused(changes, sentence):
+    with pytest.raises(VehicleError, match=sentence):
+        HEAVY.replace(changes)
+
+
+def test_a_vehicle_without_an_autopilot_has_no_axes():
+    with pytest.raises(ControlError, match="no 'autopilot' section"):
+        action_mode("pilot6", load_vehicle("finsrov"))

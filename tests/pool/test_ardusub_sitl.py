@@ -1,0 +1,506 @@
+"""The physics behind ArduSub's SITL: golden packets, its lock-step rules, a stand-in as strict as SITL, and motion."""
+
+import json
+import math
+import runpy
+import socket
+import struct
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from finssim import boundary
+from finssim.cli import app
+from finssim.engine import Pool, Simulator, Water
+from finssim.pool.ardusub_sitl import GRAVITY, Pulses, SitlServer, SitlWorld, decode_pulses
+from finssim.pool.plant_spec import Battery
+from finssim.robot.link.frames import LinkError
+from finssim.robot.link.water_linked import DvlClient, DvlServer, decode_line, encode_velocity
+from finssim.vehicles import load_vehicle
+
+HEAVY = load_vehicle("bluerov2_heavy")
+NEUTRAL = HEAVY.model_copy(
+    update={"body": HEAVY.body.model_copy(update={"displaced_volume": HEAVY.body.mass / HEAVY.water.density})}
+)
+STILL = (1500,) * 16
+PACKET = bytes.fromhex("1a48 9001 2a000000" + "dc05" * 15 + "6c07")
+"""Magic 18458, 400 Hz, frame 42, fifteen channels at 1500 and the last at 1900, by hand."""
+
+
+def mixed(**demands):
+    """Pulses of ArduSub's mixer for VECTORED_6DOF, all motors turning as wired, from its published table."""
+    table = {
+        "roll": (0, 0, 0, 0, 1, -1, 1, -1),
+        "pitch": (0, 0, 0, 0, -1, -1, 1, 1),
+        "yaw": (1, -1, -1, 1, 0, 0, 0, 0),
+        "throttle": (0, 0, 0, 0, -1, -1, -1, -1),
+        "forward": (-1, -1, 1, 1, 0, 0, 0, 0),
+        "lateral": (1, -1, 1, -1, 0, 0, 0, 0),
+    }
+    out = sum(demand * np.array(table[axis]) for axis, demand in demands.items())
+    return (*(int(1500 + 400 * x) for x in out), *STILL[8:])
+
+
+class StandIn:
+    """SITL's side of the wire, as strict as the reference has it: `sitl_time` goes on as SITL's clock would."""
+
+    KEYS = (
+        ("", "timestamp"), ("imu", "gyro"), ("imu", "accel_body"), ("", "position"), ("", "attitude"),
+        ("", "quaternion"), ("", "velocity"), ("", "rng_1"), ("battery", "voltage"), ("battery", "current"),
+    )  # fmt: skip
+    """Section and name of what is looked for."""
+
+    def __init__(self, address, rate=400, silence=1.0):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.settimeout(0.1)
+        self.address, self.rate, self.silence = address, rate, silence
+        self.frame, self.sitl_time, self.timestamp = 0, 0.0, None
+        self.buffer, self.sent, self.resets = b"", 0, 0
+
+    def send(self, pulses):
+        magic = {16: 18458, 32: 29569}[len(pulses)]
+        packet = struct.pack(f"<HHI{len(pulses)}H", magic, self.rate, self.frame, *pulses)
+        self.socket.sendto(packet, self.address)
+        self.sent += 1
+
+    def step(self, pulses=STILL):
+        """One frame: send, wait in polls of 100 ms, send again after a second of silence; what the answer says."""
+        self.send(pulses)
+        polls = 0
+        while True:
+            try:
+                self.buffer += self.socket.recv(65536)
+            except TimeoutError:
+                polls += 1
+                if polls >= 10 * self.silence:
+                    self.send(pulses)
+                    polls = 0
+                continue
+            found = self.parse()
+            if found is not None:
+                return self.advance(found)
+
+    def parse(self):
+        """Only what lies between the last two newlines is read; what follows the last one is left."""
+        end = self.buffer.rfind(b"\n")
+        begin = self.buffer.rfind(b"\n", 0, max(end, 0))
+        if end < 0 or begin < 0:
+            return None
+        text, self.buffer = self.buffer[begin + 1 : end].decode("ascii"), self.buffer[end:]
+        return {name: self.value(text, section, name) for section, name in self.KEYS if name in text}
+
+    @staticmethod
+    def value(text, section, name):
+        """Plain searches: the section, the name after it, then right after quote and colon a number or an array."""
+        at = text.index(section) + len(section)
+        at = text.index(name, at) + len(name) + 2
+        if text[at] != "[":
+            assert text[at] in "-0123456789", f"{name}: {text[at : at + 8]!r} is read as 0"
+            end = at
+            while text[end] in "+-.e0123456789":
+                end += 1
+            return float(text[at:end])
+        return [float(x) for x in text[at + 1 : text.index("]", at)].split(",")]
+
+    def advance(self, found):
+        dt = found["timestamp"] - (self.timestamp or 0.0)
+        self.resets += dt < 0.0
+        if 0.0 < dt < 0.1:
+            self.sitl_time += dt
+        self.timestamp = found["timestamp"]
+        self.frame += 1
+        return found
+
+
+@pytest.fixture
+def serving():
+    """Makes servers that answer in a thread until the test ends; gives the server."""
+    running, threads = [True], []
+
+    def start(world, **settings):
+        server = SitlServer(world, ("127.0.0.1", 0), **settings)
+
+        def loop():
+            while running[0]:
+                server.serve_once()
+            server.close()
+
+        threads.append(threading.Thread(target=loop))
+        threads[-1].start()
+        return server
+
+    yield start
+    running[0] = False
+    for thread in threads:
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def shared():
+    """A neutral vehicle in open water, which tests put where they want."""
+    return SitlWorld(NEUTRAL, position=(0.0, 0.0, -50.0))
+
+
+@pytest.fixture
+def world(shared):
+    shared.restart()
+    return shared
+
+
+def state_of(world):
+    return json.loads(world.answer())
+
+
+# The wire.
+
+
+def test_the_golden_packets_of_both_sizes_are_read():
+    """As the reference has them, byte by byte."""
+    assert decode_pulses(PACKET) == Pulses(400, 42, (*[1500] * 15, 1900))
+    big = bytes.fromhex("8173 b004 00000100" + "4c04" * 32)
+    assert decode_pulses(big) == Pulses(1200, 65536, (1100,) * 32)
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "wrong magic"),
+        (b"\x1a", "wrong magic"),
+        (b"\x1b" + PACKET[1:], "wrong magic"),
+        (PACKET[:-1], "wrong length"),
+        (PACKET + b"\0", "wrong length"),
+        (b"\x81\x73" + PACKET[2:], "wrong length"),
+        (PACKET[:2] + b"\0\0" + PACKET[4:], "wrong rate"),
+    ],
+)
+def test_other_packets_are_refused_with_a_word(data, reason):
+    """Nothing is raised."""
+    assert decode_pulses(data) == reason
+
+
+def test_the_answer_of_a_vehicle_at_rest_is_this_line():
+    """Every byte: newline, compact, the order of the names, specific force (0, 0, -9.80665), depth down, newline."""
+    world = SitlWorld(NEUTRAL, pool=Pool(length=10.0, width=6.0, depth=5.0), position=(1.0, 0.5, -2.0))
+    assert world.answer() == (
+        b'\n{"timestamp":0.0,"imu":{"gyro":[0.0,0.0,0.0],"accel_body":[0.0,0.0,-9.80665]},"position":[1.0,-0.5,2.0],'
+        b'"attitude":[0.0,0.0,0.0],"quaternion":[1.0,0.0,0.0,0.0],"velocity":[0.0,0.0,0.0],'
+        b'"battery":{"voltage":16.0,"current":0.6},"rng_1":3.0}\n'
+    )
+
+
+def test_the_strict_parser_reads_what_a_json_reader_reads(world):
+    """In every field, of a vehicle that moves and turns."""
+    for _ in range(50):
+        world.step(mixed(forward=0.7, yaw=0.4, roll=0.5, throttle=-0.6), 100)
+    line, client = world.answer(), StandIn(("127.0.0.1", 9))
+    client.buffer = line
+    found, state = client.parse(), json.loads(line)
+    assert found.pop("voltage") == state["battery"]["voltage"]
+    assert found.pop("current") == state["battery"]["current"] > 1.0
+    assert found == {k: v for k, v in (state | state.pop("imu")).items() if k not in ("battery", "imu")}
+    client.buffer = line[1:]
+    assert client.parse() is None, "without the first newline nothing is read"
+    client.socket.close()
+
+
+# Lock-step.
+
+
+def test_equal_counts_are_answered_without_stepping_lower_ones_start_again_gaps_go_on(world):
+    """The rules of the reference; the first frame may have any count."""
+    server = SitlServer(world, ("127.0.0.1", 0))
+    full = mixed(throttle=-1.0)
+    first = server.answer(Pulses(400, 7, full))
+    assert server.answer(Pulses(400, 7, STILL)) == first and world.time == pytest.approx(1 / 400)
+    server.answer(Pulses(400, 8, full))
+    server.answer(Pulses(400, 11, full))
+    assert world.time == pytest.approx(3 / 400)
+    assert server.answer(Pulses(400, 0, full)) == first
+    assert server.counts == {"frames": 4, "repeats": 1, "gaps": 1, "restarts": 1}
+    server.close()
+
+
+def test_a_restarted_world_repeats_itself(world):
+    """The same pulses give the same bytes."""
+    runs = []
+    for _ in range(2):
+        for _ in range(100):
+            world.step(mixed(forward=0.5, yaw=0.3), 400)
+        runs.append(world.answer())
+        world.restart()
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.slow
+def test_sitl_goes_through_four_hundred_frames_in_a_second_of_its_clock(world, serving):
+    """Each answered once; its own clock and ours agree, and the vehicle of SITL's channels moves."""
+    server = serving(world)
+    client = StandIn(server.address)
+    for _ in range(400):
+        state = client.step(mixed(throttle=-1.0))
+    assert client.sitl_time == pytest.approx(1.0, abs=1e-9) and client.resets == 0
+    assert state["position"][2] > 50.3 and state["velocity"][2] > 0.5
+    assert server.counts == {"frames": 400} and client.sent == 400
+    client.socket.close()
+
+
+def test_sitl_with_32_channels_is_answered(world, serving):
+    """Those beyond 16 drive nothing here."""
+    client = StandIn(serving(world).address)
+    assert client.step((1500,) * 32)["timestamp"] == pytest.approx(1 / 400)
+    client.socket.close()
+
+
+def test_packets_that_wait_get_one_answer(world):
+    """SITL takes one answer per frame: one that was sent again while we were slow is not answered twice."""
+    server = SitlServer(world, ("127.0.0.1", 0))
+    client = StandIn(server.address)
+    for _ in range(3):
+        client.send(STILL)
+    time.sleep(0.02)
+    server.serve_once()
+    assert client.socket.recv(65536).startswith(b'\n{"timestamp":0.0025')
+    with pytest.raises(TimeoutError):
+        client.socket.recv(65536)
+    assert server.counts == {"frames": 1, "repeats": 2}
+    client.socket.close()
+    server.close()
+
+
+def test_bad_packets_and_strangers_are_counted_and_not_answered(world):
+    """Until SITL has been silent for a while: then another may come, as after its restart."""
+    now = [0.0]
+    server = SitlServer(world, ("127.0.0.1", 0), clock=lambda: now[0])
+    client, other = StandIn(server.address), StandIn(server.address)
+    client.send(STILL)
+    time.sleep(0.02)
+    server.serve_once()
+    other.send(STILL)
+    for data in (b"", b"hello", PACKET[:10], bytes(3000)):
+        other.socket.sendto(data, server.address)
+    time.sleep(0.02)
+    server.serve_once()
+    assert server.counts == {"frames": 1, "stranger": 1, "wrong magic": 3, "wrong length": 1}
+    now[0] = 2.0
+    other.send(STILL)
+    time.sleep(0.02)
+    server.serve_once()
+    assert other.socket.recv(65536)
+    for end in (client.socket, other.socket, server):
+        end.close()
+
+
+def test_a_taken_port_is_refused(world):
+    """With what to do."""
+    server = SitlServer(world, ("127.0.0.1", 0))
+    with pytest.raises(LinkError, match="for SITL"):
+        SitlServer(world, server.address)
+    server.close()
+
+
+# Motion.
+
+
+def test_free_decay_is_the_simulators(world):
+    """With the motors off the state is that of a `Simulator` stepped directly, to the last bit."""
+    other = Simulator(NEUTRAL, control_step=1 / 400, substeps=1, threads=1)
+    for simulator in (world.simulator, other):
+        simulator.place((0.0, 0.0, -50.0), (0.0, 0.1, 0.0, 0.995), (0.8, -0.3, 0.2, 0.3, -0.2, 0.5))
+    for _ in range(200):
+        world.step(STILL, 400)
+        other.step()
+    for name in ("position", "quaternion", "velocity"):
+        np.testing.assert_array_equal(world.simulator.numpy(name), other.numpy(name))
+
+
+def test_a_buoyant_vehicle_rises_at_its_terminal_speed():
+    """d1 w + d2 w² equals its net buoyancy; up is negative down, and at constant speed the force is that of rest."""
+    body = HEAVY.body.model_copy(update={"displaced_volume": 0.0142})
+    world = SitlWorld(HEAVY.model_copy(update={"body": body}), position=(0.0, 0.0, -50.0))
+    for _ in range(1000):
+        world.step((0,) * 16, 100)
+    net = 9.82 * (1000.0 * 0.0142 - 13.5)
+    w = (-33.0 + math.sqrt(33.0**2 + 4.0 * 190.0 * net)) / (2.0 * 190.0)
+    state = state_of(world)
+    assert state["velocity"] == pytest.approx([0.0, 0.0, -w], abs=1e-4)
+    assert state["imu"]["accel_body"] == pytest.approx([0.0, 0.0, -GRAVITY], abs=1e-3)
+
+
+def test_forward_moves_it_along_its_heading():
+    """Turned 30° to the left, which is -30° in NED, it goes north and west."""
+    world = SitlWorld(NEUTRAL, position=(0.0, 0.0, -50.0), yaw=math.radians(30.0))
+    assert state_of(world)["attitude"][2] == pytest.approx(math.radians(-30.0), abs=1e-6)
+    for _ in range(100):
+        world.step(mixed(forward=0.4), 100)
+    north, east, _ = state_of(world)["velocity"]
+    assert math.degrees(math.atan2(east, north)) == pytest.approx(-30.0, abs=0.5)
+    assert math.hypot(north, east) > 0.2
+
+
+def test_a_quarter_turn_to_the_right_points_east(world):
+    """Yaw demand is clockwise from above: gyro z and yaw grow; then forward goes east."""
+    while (yaw := state_of(world)["attitude"][2]) < math.pi / 2:
+        assert yaw > -0.01 and world.time < 10.0
+        world.step(mixed(yaw=0.3), 100)
+    state = state_of(world)
+    assert state["imu"]["gyro"][2] > 0.1
+    half = 0.5 * state["attitude"][2]
+    assert state["quaternion"] == pytest.approx([math.cos(half), 0.0, 0.0, math.sin(half)], abs=0.01)
+    for _ in range(50):
+        world.step(mixed(forward=0.5), 100)
+    north, east, _ = state_of(world)["velocity"]
+    assert east > 0.2 and abs(north) < east
+
+
+@pytest.mark.parametrize(("axis", "index"), [("roll", 0), ("pitch", 1)])
+def test_roll_and_pitch_turn_as_ardusub_means_them(world, axis, index):
+    """Right side down and nose up are positive."""
+    for _ in range(20):
+        world.step(mixed(**{axis: 0.5}), 100)
+    state = state_of(world)
+    assert state["imu"]["gyro"][index] > 0.05 and state["attitude"][index] > 0.01
+
+
+def test_velocity_is_the_integral_of_the_specific_force(world):
+    """ArduPilot's navigation equation, v_dot = R f + g with its g, holds through a turning, pitching dive."""
+    rate, v = 400, np.zeros(3)
+    for _ in range(400):
+        world.step(mixed(forward=0.6, throttle=-0.5, yaw=0.3, pitch=0.2), rate)
+        state = state_of(world)
+        w, x, y, z = state["quaternion"]
+        R = np.array([
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ])  # fmt: skip
+        v += (R @ state["imu"]["accel_body"] + [0.0, 0.0, GRAVITY]) / rate
+    assert v == pytest.approx(state["velocity"], abs=0.02)
+    assert np.linalg.norm(v) > 0.3
+
+
+def test_pulses_make_the_published_thrusts_at_the_batterys_voltage():
+    """1900 µs at 16 V pulls what the T200's table says; an empty battery gives less, a loaded one sags."""
+    stiff = SitlWorld(NEUTRAL, position=(0.0, 0.0, -50.0))
+    weak = SitlWorld(NEUTRAL, position=(0.0, 0.0, -50.0), battery=Battery(full_voltage=13.0, resistance=0.02))
+    pulses = (1900, 1100, 1500, 1520, 0, 1500, 1500, 1500)
+    for world in (stiff, weak):
+        for _ in range(50):
+            world.step(pulses, 100)
+    strong, faint = (w.simulator.numpy("thrust")[0, 0] for w in (stiff, weak))
+    assert strong[:5] == pytest.approx([50.8, -39.0, 0.0, 0.0, 0.0], abs=0.6)
+    assert 0.0 < faint[0] < 0.8 * strong[0]
+    assert weak.voltage == pytest.approx(13.0 - 0.02 * weak.current) and weak.current > 3.0
+
+
+def test_a_frame_rate_that_glides_keeps_time_and_motion(world):
+    """SITL changes its rate by 1 Hz per frame; the motion is that of a fixed rate."""
+    elapsed = 0.0
+    for rate in range(1200, 399, -1):
+        world.step(mixed(forward=0.3), rate)
+        elapsed += 1.0 / rate
+    assert world.time == pytest.approx(elapsed)
+    assert int(world.simulator.numpy("steps")[0]) == pytest.approx(400 * elapsed, abs=2)
+    glided = state_of(world)
+    world.restart()
+    while world.time < elapsed:
+        world.step(mixed(forward=0.3), 400)
+    assert state_of(world)["velocity"] == pytest.approx(glided["velocity"], abs=0.005)
+
+
+def test_current_carries_it_away():
+    """A drifting vehicle ends with the water's velocity, in NED."""
+    world = SitlWorld(NEUTRAL, position=(0.0, 0.0, -50.0), water=Water(current=(0.2, 0.1, 0.0), depth=60.0))
+    for _ in range(600):
+        world.step(STILL, 20)
+    assert state_of(world)["velocity"] == pytest.approx([0.2, -0.1, 0.0], abs=0.02)
+
+
+def test_the_doppler_log_beside_it_measures_the_same_world():
+    """Velocities in our axes of the log, altitude, and its latency as age, at 8 Hz of the world's clock."""
+    log = DvlServer(("127.0.0.1", 0))
+    client = DvlClient(*log.address)
+    pool, water = Pool(length=50.0, width=50.0, depth=5.0), Water(current=(0.2, 0.4, 0.0), depth=5.0)
+    world = SitlWorld(NEUTRAL, pool=pool, water=water, position=(0.0, 0.0, -3.5), dvl=log)
+    while not client.connected:
+        client.receive()
+    log.poll()
+    for _ in range(200):
+        world.step(mixed(throttle=0.2), 100)
+    time.sleep(0.05)
+    aids = [decode_line(line) for line in client.receive()]
+    assert len(aids) == 16
+    assert aids[-1].age == pytest.approx(0.06, abs=0.011)
+    nu = world.simulator.numpy("velocity")[0, 0, :3]
+    assert nu.min() > 0.1
+    assert aids[-1].values == pytest.approx(nu.tolist(), abs=0.05)
+    assert aids[-1].altitude == pytest.approx(5.0 + world.simulator.numpy("position")[0, 0, 2], abs=0.1)
+    client.close()
+    log.close()
+
+
+@pytest.mark.slow
+def test_velocities_reach_ardusub_as_vision_position_deltas(monkeypatch):
+    """The example passes reports on: velocity times the time since the last, forward-right-down, with confidence."""
+    monkeypatch.setenv("MAVLINK20", "1")
+    example = runpy.run_path(str(Path(__file__).parents[2] / "examples/bluerov2/dvl_to_ardusub.py"))
+    ardusub = example["mavutil"].mavlink_connection("udpin:127.0.0.1:0", dialect="ardupilotmega")
+    port = ardusub.port.getsockname()[1]
+    out = example["mavutil"].mavlink_connection(f"udpout:127.0.0.1:{port}", dialect="ardupilotmega")
+    log, clock = DvlServer(("127.0.0.1", 0)), [time.monotonic()]
+    client = DvlClient(*log.address)
+
+    def enough(sent):
+        """Reports at 10 Hz until two were sent."""
+        if time.monotonic() >= clock[0]:
+            clock[0] += 0.1
+            now = time.time()
+            log.send(
+                encode_velocity(
+                    [0.5, -0.2, 0.1], measured=now - 0.06, sent=now, interval=0.1, std=(0.1, 0, 0)
+                )
+            )
+        return sent == 2
+
+    example["forward"](client, out, enough)
+    message = ardusub.recv_match(type="VISION_POSITION_DELTA", blocking=True, timeout=5.0)
+    dt = 1e-6 * message.time_delta_usec
+    assert 0.05 < dt < 0.3
+    assert message.position_delta == pytest.approx([0.5 * dt, 0.2 * dt, -0.1 * dt], rel=1e-4)
+    assert message.confidence == pytest.approx(75.0, abs=0.1)
+    for end in (ardusub, out, client, log):
+        end.close()
+    monkeypatch.undo()
+    example["mavutil"].set_dialect("ardupilotmega")
+
+
+@pytest.mark.slow
+def test_the_command_serves_until_its_time_is_over(capsys):
+    """Its options reach the world; the end tells what came."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        address = free.getsockname()
+    client, states = StandIn(address, silence=0.3), []
+    thread = threading.Thread(target=lambda: states.extend(client.step() for _ in range(20)))
+    thread.start()
+    words = "ardusub-sitl --site open-water --start 1,2,-3,90 --duration 0.05 --voltage 15 --dvl 127.0.0.1:0"
+    assert boundary.run(app, [*words.split(), "--bind", f"127.0.0.1:{address[1]}"]) == 0
+    thread.join(5.0)
+    assert states[0]["position"] == pytest.approx([1.0, -2.0, 3.0], abs=0.01)
+    assert states[0]["attitude"][2] == pytest.approx(-math.pi / 2, abs=0.01)
+    assert states[0]["rng_1"] == pytest.approx(17.0, abs=0.01)
+    assert "20 frames" in capsys.readouterr().out
+    client.socket.close()
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["--site moon", "--current 1,2", "--wave 1,nan,2", "--bind here", "--vehicle finsrov", "--start up"],
+)
+def test_the_command_refuses_what_cannot_be(words, capsys):
+    """With one sentence."""
+    assert boundary.run(app, ["ardusub-sitl", *words.split()]) == 2
+    assert "Traceback" not in capsys.readouterr().err
