@@ -105,10 +105,7 @@ def kinds() -> list[Kind]:
             "run --policy pid --goal 0,0,-0.5,0 --vehicle {} --pool-file none --robot udp://127.0.0.1:9 "
             "--bind 127.0.0.1:0 --duration 0",
         ), weight=3),
-        Kind("ranges", "ranges.yaml", (
-            "randomize show {} --vehicle finsrov --samples 2 --out OUT/ranges",
-            "collect pid --task t1 --episodes 1 --randomize {} --out OUT/set",
-        )),
+        Kind("ranges", "ranges.yaml", ("collect pid --task t1 --episodes 1 --randomize {} --out OUT/set",)),
         Kind("observe", "site.yaml", ("collect pid --task t1 --episodes 1 --observe {} --out OUT/set",)),
         Kind("evaluation plant", "plant.yaml", ("evaluate pid --trials 1 --plant {}",)),
         Kind("pool plant", "pool-plant.yaml", ("pool --plant {} --camera none --port 50321 --duration 0",)),

@@ -47,17 +47,14 @@ COMMANDS: dict[str, str | Experiment] = {
     "experiment t2": Experiment("finssim.experiments.transfer:t2"),
     "experiment anatomy": Experiment("finssim.experiments.anatomy:anatomy"),
     "experiment open-water": Experiment("finssim.experiments.open_water:open_water"),
-    "experiment all": Experiment("finssim.experiments.paper_report:everything"),
     "experiment faults": Experiment("finssim.experiments.faults:faults_experiment"),
-    "experiment soak": Experiment("finssim.experiments.reliability:soak"),
-    "experiment timing": Experiment("finssim.experiments.reliability:timing"),
+    "experiment soak": Experiment("finssim.experiments.soak:soak"),
     "experiment stack": Experiment("finssim.experiments.stack:play"),
     "report": "finssim.experiments.report:report",
     "localize": "finssim.localization.localize:run",
     "fuse": "finssim.localization.fusion.fuse:run",
     "project": "finssim.localization.points:run_project",
     "backproject": "finssim.localization.points:run_backproject",
-    "randomize show": Experiment("finssim.experiments.randomize_show:randomize_show"),
     "randomize fit": "finssim.calibration.output.ranges:fit_ranges",
     "record info": "finssim.robot.record_reader:info",
     "record repair": "finssim.robot.record_reader:repair",
@@ -79,7 +76,7 @@ GROUPS = {
     "experiment": "Reproduce a table of the paper in simulation, beside the paper's own numbers.\n\n"
     "Example: finssim experiment replay --help",
     "randomize": "Ranges that vehicle, water and sensors are drawn from in every episode of a training.\n\n"
-    "Example: finssim randomize show --help",
+    "Example: finssim randomize fit --help",
     "record": "Look at records of runs, and mend those that were cut off.\n\nExample: finssim record info run.mcap",
     "ros2": "Be ROS 2 nodes on this machine's ROS domain; those of a sourced ROS 2 see them and are seen.\n\n"
     "Example: finssim ros2 up pool",

@@ -69,10 +69,10 @@ WIDTHS = {
 @pytest.mark.parametrize("case", WIDTHS)
 def test_half_the_width_lies_half_way_from_the_nominal_number(case):
     distribution, nominal, ends, probability = WIDTHS[case]
-    found, p = widened(distribution, nominal, 0.5, 0.5)
+    found, p = widened(distribution, nominal, 0.5)
     np.testing.assert_allclose(found, ends, rtol=1e-12)
     assert p == probability
-    full, whole = widened(distribution, nominal, 1.0, 1.0)
+    full, whole = widened(distribution, nominal, 1.0)
     np.testing.assert_allclose(full[:2], distribution.bounds(), rtol=1e-12)
     assert whole == distribution.probability
 
@@ -100,10 +100,9 @@ REFUSED = {
     "center": ("center_of_gravity: {X: [0, 1]}", "center_of_gravity: unknown entry 'X'; available: x, y, z"),
     "too late": ("added_delay: [0, 3]", "added_delay: reaches 3 s, expected at most 2 s"),
     "nothing alike": ("qqqq: [0, 1]", "unknown entry 'qqqq'; available: name, source, mass"),
-    "two schedules": ("curriculum: {}\nautomatic: {}", "curriculum and automatic both say how ranges grow"),
     "schedule": ("curriculum: {over: [0.6, 0.2]}", "curriculum: over is [0.6, 0.2], expected [low, high]"),
-    "judge": ("automatic: {narrow_at: 0.9}", "automatic: narrow_at is 0.9, expected at most widen_at, 0.8"),
-    "success": ("automatic: {success: {}}", "automatic.success: expected either held [s] or episode_return"),
+    "judge": ("curriculum: {narrow_at: 0.9}", "curriculum: narrow_at is 0.9, expected at most widen_at, 0.8"),
+    "success": ("curriculum: {success: {}}", "curriculum.success: expected either held [s] or episode_return"),
 }  # fmt: skip
 
 
@@ -129,7 +128,7 @@ def test_ranges_are_read_back_from_what_they_are_saved_as():
             "thrust": {"failure": {"uniform": [0.0, 0.3], "probability": 0.1}},
             "waves": {"count": [0, 2], "amplitude": {"log_uniform": [0.01, 0.03]}, "wavelength": [3.0, 8.0]},
             "correlated": [{"entries": ["mass", "center_of_gravity.z"], "correlation": [[1, 0.5], [0.5, 1]]}],
-            "automatic": {"success": {"held": 3.0}},
+            "curriculum": {"success": {"held": 3.0}},
         }
     )
     assert Ranges.model_validate(ranges.model_dump(mode="json")) == ranges

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 TINY = {"locations": (4, 3), "images": 12}
 FILES = {
-    *("localization.json", "localization.md", "error_map.png", "sensitivity.png", "camera.yaml", "pool.yaml"),
+    *("localization.json", "localization.md", "error_map.png", "camera.yaml", "pool.yaml"),
     *("pool_pinhole.yaml", "detections.csv", "survey.csv"),
 }
 
@@ -56,8 +56,7 @@ def test_the_folder_holds_what_is_returned(done):
     assert json.loads((out / "localization.json").read_text()) == json.loads(json.dumps(result))
     assert {path.name for path in out.iterdir()} == FILES
     assert [path.name for path in out.parent.iterdir()] == [out.name]
-    for name in ("error_map.png", "sensitivity.png"):
-        assert (out / name).read_bytes().startswith(b"\x89PNG")
+    assert (out / "error_map.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_result_has_its_documented_parts(done):
@@ -74,7 +73,6 @@ def test_the_result_has_its_documented_parts(done):
             low, high = figures["rmse_ci95_cm"]
             assert low <= figures["rmse_cm"] <= high
     assert {m: list(p.values()) for m, p in result["paper"].items()} == PAPER_TABLE_2
-    assert set(result["sensitivity"]) == {"depth_cm", "tilt_deg", "index", "ripples"}
     assert result["provenance"]["finssim"]
 
 
@@ -176,7 +174,6 @@ def interrupting(words):
 INTERRUPTED = {
     "seed 2, published conditions": [1],
     "seed 1, flat conditions": [1],
-    "sensitivity": [1],
 }
 
 

@@ -13,7 +13,6 @@ from finssim.experiments.localization_experiment import CONDITIONS, Scores, draw
 
 PIXEL_STD = 0.2
 locate = partial(localization_experiment.locate, pixel_std=PIXEL_STD)
-sensitivity = partial(localization_experiment.sensitivity, pixel_std=PIXEL_STD)
 SMALL = {"locations": (6, 4), "images": 48}
 
 
@@ -165,24 +164,12 @@ def test_where_nothing_was_located_there_is_no_figure(empty):
         assert figures["rmse_cm"] == pytest.approx(5.0)
 
 
-def test_sensitivity_starts_at_the_plain_error_and_grows(exact):
-    """Nothing wrong gives what `locate` gives; more wrong gives more, on either side."""
-    campaign, seen = exact
-    swept = sensitivity(campaign, seen, campaign.truth)
-    plain = 100.0 * locate(campaign, seen, campaign.truth, "refractive").rmse
-    assert set(swept) == {"depth_cm", "tilt_deg", "index"}
-    for name, pairs in swept.items():
-        wrong, rmse = np.array(pairs).T
-        (zero,) = np.flatnonzero(wrong == 0.0)
-        assert rmse[zero] == pytest.approx(plain, abs=1e-9), name
-        assert (np.diff(rmse[zero:]) > 0.0).all() and (np.diff(rmse[: zero + 1]) < 0.0).all(), name
-
-
 @pytest.mark.parametrize(("offset", "sign"), [(0.05, 1.0), (-0.05, -1.0)])
 def test_a_depth_read_too_deep_puts_the_tag_too_far_out(exact, offset, sign):
     """Along the ray in the water: by tan of its angle there, outwards from the point below the camera."""
     campaign, seen = exact
-    scores = locate(campaign, seen, campaign.truth, "refractive", depth_offset=offset)
+    visits = tuple(replace(visit, depth_read=visit.depth_read + offset) for visit in campaign.visits)
+    scores = locate(replace(campaign, visits=visits), seen, campaign.truth, "refractive")
     outwards = np.array(
         [campaign.visits[k].position[:2] - campaign.truth.camera.position[:2] for k in scores.visits]
     )

@@ -10,7 +10,7 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.experiments.reliability import FLAT, memory_mib, verdict
+from finssim.experiments.soak import FLAT, memory_mib, verdict
 
 
 def test_a_leak_is_told_from_a_cache_that_fills():

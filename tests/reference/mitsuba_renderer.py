@@ -1,9 +1,9 @@
 """The overhead camera's scene rendered by Mitsuba 3: an independent referee of our ray caster.
 
 Geometry and Fresnel losses are Mitsuba's: a smooth dielectric surface (a mesh with interpolated normals where it
-ripples), window layers, tags, boxes and the plain basin as surfaces that glow with the radiance the scene gives them.
+ripples), window layers, tags and the plain basin as surfaces that glow with the radiance the scene gives them.
 Light therefore needs no way in through the surface, which a path tracer would hardly find. Water is clear: attenuation
-and veil, tiles, lanes, lamps, caustics and motion are ours alone.
+and veil, tiles and motion are ours alone.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FAR = 50.0
 def render_with_mitsuba(
     scene: Scene, *, time: float = 0.0, seed: int = 0, region: Any = None, rays: int = 16
 ) -> NDArray[np.uint8]:
-    """One picture of a scene, as `finssim.sensors.overhead_camera.render` gives it; zero outside the region.
+    """One picture of a scene, as `OverheadCamera.render` gives it; zero outside the region.
 
     Args:
         scene: Its sensor turns Mitsuba's radiance into numbers.
@@ -80,7 +80,7 @@ def radiance_by_mitsuba(
     import mitsuba as mi
 
     mi.set_variant("scalar_rgb")
-    if any(x.end for x in scene.tags) or any(x.end for x in scene.bodies):
+    if any(x.end for x in scene.tags):
         raise SensorError(
             "the Mitsuba renderer shows things at rest: leave out `end`, or use our own renderer"
         )
@@ -92,13 +92,8 @@ def radiance_by_mitsuba(
     parts |= _surface(mi, scene, frame, film.footprint(scene, frame), time) | _basin(mi, scene)
     for i, tag in enumerate(scene.tags):
         parts |= _tag(mi, tag, f"tag{i}", _gain(scene, tag.pose))
-    for i, body in enumerate(scene.bodies):
-        pose, half = body.pose, 0.5 * np.asarray(body.size)
-        place = _matrix(mi, quat_to_matrix(pose.orientation), pose.position, half)
-        glow = _glowing(mi, body.colour, _gain(scene, pose))
-        parts[f"body{i}"] = {"type": "cube", "to_world": place, **glow}
-    if scene.light.sky > 0.0:
-        parts["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": scene.light.sky}}
+    if scene.sky > 0.0:
+        parts["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": scene.sky}}
     picture = np.array(mi.render(mi.load_dict(parts), seed=seed))
     return film.resampled(picture[..., :3], scene)
 
@@ -193,7 +188,7 @@ def _gain(scene: Scene, pose: Pose) -> float:
 def _tag(mi: Any, tag: TagInScene, name: str, gain: float) -> dict[str, Any]:
     """The bitmap 0.1 mm above the tag's plane, half-way to it the white board whose rim is the margin.
 
-    So both are seen where the tag lies on a wall or a body.
+    So both are seen where the tag lies on a wall.
     """
     R = quat_to_matrix(tag.pose.orientation)
     print_half, board = 0.5 * tag.cell * len(tag.bitmap), tag.half_size

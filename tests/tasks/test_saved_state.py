@@ -6,8 +6,7 @@ import pytest
 import finssim
 from finssim.engine import Water
 from finssim.engine.randomize import Randomization
-from finssim.engine.ranges_file import Ranges, load_ranges
-from finssim.engine.ranges_schedule import Curriculum
+from finssim.engine.ranges_file import Curriculum, Ranges, load_ranges
 from finssim.tasks import TASKS, EnvironmentSetupError, MeasurementNoise
 from finssim.tasks.sensing import Sensing
 from finssim.vehicles import load_vehicle

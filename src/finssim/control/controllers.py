@@ -11,8 +11,6 @@ from finssim.control.lqr import Lqr
 from finssim.control.pid import TRAJECTORY_PROFILE, PaperPid, Pid
 from finssim.vehicles import Vehicle
 
-__all__ = ["CONTROLLERS", "COSTLY", "controller", "controller_for"]
-
 
 def _nmpc(vehicle: Vehicle, **options: Any) -> Controller:
     from finssim.control.nmpc import Nmpc  # takes CasADi, an extra

@@ -14,8 +14,6 @@ from finssim.control.pid import CRUISE, INTEGRAL_SHARE, Pid
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.vehicles import Vehicle
 
-__all__ = ["Lqr", "LqrMemory"]
-
 Array = npt.NDArray[np.float64]
 
 POSITION_SCALE, ANGLE_SCALE = 0.25, math.radians(25.0)

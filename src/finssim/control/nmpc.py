@@ -20,8 +20,6 @@ from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.body import moved_to_origin, skew
 
-__all__ = ["Nmpc", "NmpcMemory"]
-
 Array = npt.NDArray[np.float64]
 
 HORIZON = 20

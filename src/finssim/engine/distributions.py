@@ -145,14 +145,6 @@ class Distribution(Part):
         weights = self.weights or (1.0,) * len(self.choice or ())
         return [sum(weights[: i + 1]) / sum(weights) for i in range(len(weights))]
 
-    def text(self) -> str:
-        """In a few words, as in a table."""
-        kind = self.kind
-        words = f"{kind.replace('_', '-')} {', '.join(f'{x:.4g}' for x in getattr(self, kind))}"
-        if self.normal is not None:
-            words += f" in {', '.join(f'{x:.4g}' for x in self.bounds())}"
-        return words if self.probability == 1.0 else f"{words} with probability {self.probability:.4g}"
-
 
 Drawn: TypeAlias = Pair | Distribution
 """Two numbers, between which every number is as likely, or a distribution."""

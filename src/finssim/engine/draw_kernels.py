@@ -31,7 +31,6 @@ class DrawnArrays:
     """What was drawn, and where it goes."""
 
     values: wp.array3d(dtype=float)  # (worlds, vehicles, entries)
-    probe: wp.array(dtype=int)  # by world: 2 i + side where the end of probed entry i is tried, -1 elsewhere
     volume_with_mass: int
     water: int  # 1: write the water's numbers
     drift: int
@@ -54,23 +53,13 @@ def stream(seed: int, w: int) -> int:
 
 @wp.func
 def draw_values(t: DrawTable, d: DrawnArrays, w: int, v: int, own: int, shared: int):
-    """Every entry that varies; then one of them at an end of its range, in the episodes that try one."""
+    """Every entry that varies."""
     for i in range(t.count):
         k = t.drawn[i]
         key = own
         if k >= WORLD and k < WORLD_END:
             key = shared
         d.values[w, v, k] = draw_entry(t, k, key)
-    probe = int(-1)
-    if t.probes > 0:
-        rng = wp.rand_init(shared, -1)
-        if wp.randf(rng) < t.probe_share[0]:
-            i = wp.min(int(wp.randf(rng) * float(t.probes)), t.probes - 1)
-            probe = 2 * i + wp.where(wp.randf(rng) < 0.5, 0, 1)
-            ends = t.ends[t.probe[i]]
-            d.values[w, v, t.probe[i]] = wp.where(probe % 2 == 0, ends[0], ends[1])
-    if v == 0:
-        d.probe[w] = probe
 
 
 @wp.func

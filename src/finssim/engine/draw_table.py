@@ -34,9 +34,6 @@ class DrawTable:
     ties: wp.array(dtype=int)  # how many normal numbers its own is a sum of; 0: it stands alone
     tied: wp.array(dtype=int)  # entries of these
     tie_weight: wp.array(dtype=float)
-    probes: int  # entries whose ends are tried by themselves
-    probe: wp.array(dtype=int)
-    probe_share: wp.array(dtype=float)  # of the episodes that try one, of one element
 
 
 @wp.func
@@ -87,9 +84,7 @@ def draw_entry(t: DrawTable, k: int, key: int) -> float:
     return x
 
 
-def widened(
-    distribution: Distribution, nominal: float, low_part: float, high_part: float
-) -> tuple[list[float], float]:
+def widened(distribution: Distribution, nominal: float, part: float) -> tuple[list[float], float]:
     """Ends [low, high, mean, standard deviation] and probability of a distribution at a part of its width.
 
     Widths grow from the number of the range that lies nearest to the nominal one. What is drawn from with a
@@ -98,21 +93,20 @@ def widened(
     Args:
         distribution: At its full width.
         nominal: Where nothing is drawn.
-        low_part: Part of the way to the low end, in [0, 1].
-        high_part: The same of the high end; also of the standard deviation and of probabilities.
+        part: Of the way to both ends, of the standard deviation and of probabilities, in [0, 1].
     """
     low, high = distribution.bounds()
     mean, std = distribution.normal or (0.0, 0.0)
     if distribution.choice is not None or distribution.probability < 1.0:
-        return [low, high, mean, std], distribution.probability * high_part
+        return [low, high, mean, std], distribution.probability * part
     anchor = min(max(nominal, low), high)
     if distribution.log_uniform is not None:
         down, up = (math.log(end / anchor) for end in (low, high))
-        return [anchor * math.exp(low_part * down), anchor * math.exp(high_part * up), 0.0, 0.0], 1.0
-    ends = [anchor + low_part * (low - anchor), anchor + high_part * (high - anchor)]
+        return [anchor * math.exp(part * down), anchor * math.exp(part * up), 0.0, 0.0], 1.0
+    ends = [anchor + part * (low - anchor), anchor + part * (high - anchor)]
     if distribution.normal is None:
         return [*ends, 0.0, 0.0], 1.0
-    return [*ends, anchor + high_part * (mean - anchor), high_part * std], 1.0
+    return [*ends, anchor + part * (mean - anchor), part * std], 1.0
 
 
 def ties_of(ranges: Ranges) -> dict[int, list[tuple[int, float]]]:
@@ -145,18 +139,18 @@ def draw_table(
     for name, distribution in drawn.items():
         k = INDEX[name]
         kind[k] = KINDS.index(distribution.kind)
-        ends[k], probability[k] = widened(distribution, float(nominal[k]), 1.0, 1.0)
+        ends[k], probability[k] = widened(distribution, float(nominal[k]), 1.0)
         first[k], choices[k] = len(choice), len(distribution.choice or ())
         choice += distribution.choice or ()
         cumulative += distribution.cumulative()
     first_tie, ties, tied, weights = _flat(ties_of(ranges), n)
     t = DrawTable()
-    t.count, t.probes = len(drawn), 0
+    t.count = len(drawn)
     whole = {"drawn": [INDEX[name] for name in drawn], "kind": kind, "first_choice": first, "choices": choices,
              "stream": [e.stream for e in ENTRIES],
-             "first_tie": first_tie, "ties": ties, "tied": tied, "probe": []}  # fmt: skip
+             "first_tie": first_tie, "ties": ties, "tied": tied}  # fmt: skip
     real = {"probability": probability, "nominal": nominal, "choice": choice, "cumulative": cumulative,
-            "tie_weight": weights, "probe_share": [0.0]}  # fmt: skip
+            "tie_weight": weights}  # fmt: skip
     for fields, dtype, plain in ((whole, wp.int32, np.int32), (real, wp.float32, np.float32)):
         for name, values in fields.items():
             # No kernel reads beyond the counts: one element keeps empty columns valid.

@@ -37,7 +37,7 @@ class Randomization:
 
     def at_full_width(self) -> "Randomization":
         """The same ranges without a schedule, for an evaluation: from the whole width at once."""
-        return Randomization(self.ranges.model_copy(update={"curriculum": None, "automatic": None}))
+        return Randomization(self.ranges.model_copy(update={"curriculum": None}))
 
     def _draws(self, *beginnings: str) -> bool:
         return any(name.startswith(beginnings) for name in self.drawn)
@@ -139,7 +139,6 @@ class Draws:
         randomization, device = self.randomization, self.simulator.device
         d = DrawnArrays()
         d.values = self.values
-        d.probe = wp.full(self.simulator.worlds, value=-1, dtype=wp.int32, device=device)
         d.volume_with_mass = int(randomization.ranges.volume == "with_mass")
         d.water, d.sensors = int(randomization.moves_water), int(randomization.changes_sensors)
         d.drift, d.tether = (int(randomization._draws(f"{name}.")) for name in ("current_drift", "tether"))
@@ -167,29 +166,12 @@ class Draws:
         nominal = float(self.nominal[INDEX[name]])
         return 1.0 / (max(abs(end - nominal) for end in own.bounds()) or 1.0)
 
-    @property
-    def probe(self) -> wp.array:
-        """By world: 2 i + side where the low (0) or high (1) end of probed entry i is tried, -1 elsewhere."""
-        return self._arrays.probe
-
-    def probe_ends(self, names: Sequence[str], share: float) -> None:
-        """Let a share of the episodes have one of these entries at one end of its range; call it before `add`."""
-        device = self.simulator.device
-        self.table.probes = len(names)
-        columns = np.array([INDEX[name] for name in names] or [0], np.int32)
-        self.table.probe = wp.array(columns, dtype=wp.int32, device=device)
-        self.table.probe_share = wp.array(np.array([share], np.float32), dtype=wp.float32, device=device)
-
-    def set_width(self, parts: dict[str, tuple[float, float]]) -> None:
-        """Draw from parts of the full ranges from now on.
-
-        Args:
-            parts: Entry -> part of the way from the nominal number to the low and to the high end, in [0, 1].
-        """
+    def set_width(self, part: float, names: Sequence[str]) -> None:
+        """Draw entries from a part of their full ranges from now on, in [0, 1]."""
         ends, probability = self.table.ends.numpy().copy(), self.table.probability.numpy().copy()
-        for name, (low, high) in parts.items():
+        for name in names:
             k = INDEX[name]
-            ends[k], probability[k] = widened(self.distributions[name], float(self.nominal[k]), low, high)
+            ends[k], probability[k] = widened(self.distributions[name], float(self.nominal[k]), part)
         self.table.ends.assign(ends)
         self.table.probability.assign(probability)
 

@@ -28,7 +28,6 @@ from finssim.engine.distributions import (
     sentence,
     unknown,
 )
-from finssim.engine.ranges_schedule import Automatic, Curriculum
 from finssim.engine.surroundings import SurroundingsError, Wave
 from finssim.vehicles.terms import Term, find_term
 from finssim.yaml_file import read_mapping
@@ -214,6 +213,58 @@ class Correlated(Part):
         return self
 
 
+class Success(Part):
+    """When an episode counts as a success: exactly one of the two."""
+
+    held: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    """The task's tolerance was kept for so long when the episode ended [s]."""
+    episode_return: float | None = Field(default=None, allow_inf_nan=False)
+    """The return was at least this."""
+
+    @model_validator(mode="after")
+    def _one(self) -> "Success":
+        if (self.held is None) == (self.episode_return is None):
+            raise ValueError("expected either held [s] or episode_return")
+        return self
+
+
+class Curriculum(Part):
+    """All ranges grow together from a part of their width to the whole."""
+
+    by: Literal["progress", "steps", "success"] = "progress"
+    """The share of the training done, the environment's own control steps, or the share of successes."""
+    start: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Part of the width at the start; 0 is the vehicle of the file."""
+    over: tuple[float, float] = (0.0, 1.0)
+    """From where to where they grow: shares of the training, or control steps of all worlds together."""
+    success: Success | None = None
+    """The task's own hold time if None."""
+    episodes: int = Field(default=400, ge=1)
+    """After so many the share of successes is looked at."""
+    widen_at: float = Field(default=0.8, ge=0.0, le=1.0)
+    """A share of at least this widens."""
+    narrow_at: float = Field(default=0.4, ge=0.0, le=1.0)
+    """A share below this narrows."""
+    step: float = Field(default=0.1, gt=0.0, le=1.0)
+    """By this part of the full width."""
+
+    @model_validator(mode="after")
+    def _possible(self) -> "Curriculum":
+        if self.narrow_at > self.widen_at:
+            raise ValueError(f"narrow_at is {self.narrow_at}, expected at most widen_at, {self.widen_at}")
+        low, high = self.over
+        if not 0.0 <= low < high < float("inf") or (self.by == "progress" and high > 1.0):
+            most = "1" if self.by == "progress" else "any number of steps"
+            raise ValueError(f"over is {[low, high]}, expected [low, high] with 0 <= low < high up to {most}")
+        return self
+
+    def width(self, done: float) -> float:
+        """Part of the full width when so much is done, in [0, 1]."""
+        low, high = self.over
+        part = min(max((done - low) / (high - low), 0.0), 1.0)
+        return self.start + part * (1.0 - self.start)
+
+
 class Ranges(Part):
     """What is drawn for every episode: factors on the vehicle file's numbers unless a unit is given."""
 
@@ -259,7 +310,6 @@ class Ranges(Part):
     sensors: SensorRanges | None = None
     correlated: tuple[Correlated, ...] = ()
     curriculum: Curriculum | None = None
-    automatic: Automatic | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -281,8 +331,6 @@ class Ranges(Part):
         from finssim.engine.ranges_table import check_correlated  # the table is made of this file's parts
 
         check_correlated(self)
-        if self.curriculum is not None and self.automatic is not None:
-            raise ValueError("curriculum and automatic both say how ranges grow: give one of them")
         return self
 
 

@@ -20,8 +20,6 @@ from finssim.experiments.transfer import T1, controllers_of
 from finssim.provenance import provenance
 from finssim.vehicles import load_vehicle
 
-__all__ = ["CAUSES", "anatomy", "tables_of"]
-
 TRAINING_SHARE = 0.3
 """Of the progress bar."""
 HELD = 0.9

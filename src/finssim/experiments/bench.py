@@ -22,8 +22,6 @@ from finssim.experiments.tables import Table
 from finssim.provenance import provenance
 from finssim.tasks import Environment, StationKeeping
 
-__all__ = ["bench", "tables_of"]
-
 SECONDS = 1.0
 """Time each figure is measured for; the best of its rounds counts, since other load only ever slows one down."""
 ROUNDS = 10

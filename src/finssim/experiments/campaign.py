@@ -31,18 +31,6 @@ from finssim.quiet import start_warp
 from finssim.vehicles import load_vehicle
 from finssim.yaml_file import json_value, read_json
 
-__all__ = [
-    "Job",
-    "Progress",
-    "Show",
-    "check_choices",
-    "progress_bar",
-    "run_experiment",
-    "run_jobs",
-    "spread",
-    "write_json",
-]
-
 Progress = Callable[..., None]
 """Told the share that is done, and what comes next as text."""
 

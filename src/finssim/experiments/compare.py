@@ -244,82 +244,20 @@ CURVES = {
     "held": "share that held at the end",
     "mean_return": "return in training",
 }
-"""Columns of a training's curves and what they are; the first two that every run has are drawn."""
-TITLES = {
-    "e_p_m": "position error [m]",
-    "e_psi_deg": "heading error [°]",
-    "t_s_s": "settling time [s]",
-    "horizontal_rmse_m": "horizontal error, rms [m]",
-    "vertical_rmse_m": "vertical error, rms [m]",
-    "p95_m": "95th percentile of the error [m]",
-}
-"""What measures are; others are called by their names."""
+"""Columns of a training's curves and what they are."""
 POINTS = 60
 """Of a curve."""
 CURVE_RESAMPLES = 200
 
 
-def draw_comparison(groups: Sequence[Group], result: Mapping[str, Any], path: Path) -> Path:
-    """Write the figure."""
-    curves, measures = _curves_of(groups), list(result["measures"])
-    height = 0.42 * len(groups) + 0.9
-    columns = max(len(measures), len(curves))
-    figure = new_figure(2.4 + 2.6 * columns, height + 3.4)
-    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(height, 3.4))[:, 0]
-    above.suptitle("interquartile means, with 95 % intervals over the seeds", fontsize=9)
-    for k, axes in enumerate(above.subplots(1, len(measures), squeeze=False)[0]):
-        _intervals(axes, groups, result, measures[k], labels=k == 0)
-    panels = below.subplots(1, len(curves), squeeze=False)[0] if curves else ()
-    for axes, name in zip(panels, curves, strict=True):
-        _draw_curves(axes, groups, name, legend=name == curves[0])
-    return save_figure(figure, path)
-
-
-def _intervals(
-    axes: Any, groups: Sequence[Group], result: Mapping[str, Any], name: str, *, labels: bool
-) -> None:
-    for i, group in enumerate(groups):
-        found = result["groups"][group.name]["measures"][name]
-        y, color = len(groups) - 1 - i, COLORS[i % len(COLORS)]
-        low, high = found["ci95"]
-        if found["value"] is None:
-            axes.annotate(
-                "not reached",
-                (0.04, y),
-                xycoords=("axes fraction", "data"),
-                fontsize=8,
-                color=color,
-                va="center",
-            )
-            continue
-        if low is not None and high is not None:
-            axes.barh(y, high - low, left=low, height=0.5, color=color, alpha=0.35)
-        axes.plot([found["value"]] * 2, [y - 0.25, y + 0.25], color=color, linewidth=2.5)
-    axes.set_yticks(range(len(groups)), [g.name for g in reversed(groups)] if labels else [""] * len(groups))
-    axes.set_ylim(-0.6, len(groups) - 0.4)
-    axes.use_sticky_edges = False  # an interval that ends at the least value is not to lie on the axis
-    axes.margins(x=0.08)
-    if name == "success":
-        axes.set_xlim(-0.04, 1.04)
-    axes.set_title(TITLES.get(name, name), fontsize=10)
-    axes.set_xlabel("less is better" if result["measures"][name] else "more is better", fontsize=8)
-    clean(axes)
-
-
-def draw_training(words: Sequence[str], path: Path) -> Path:
-    """Write a figure of learning curves alone; runs as of `groups_of`."""
-    groups = groups_of(words)
-    curves = _curves_of(groups)
+def draw_training(groups: Sequence[Group], path: Path) -> Path:
+    """Write a figure of the first two of `CURVES` that every run has."""
+    runs = [run for group in groups for run in group.runs]
+    curves = [name for name in CURVES if all(_drawable(run, name) for run in runs)][:2]
     figure = new_figure(3.6 * max(len(curves), 1), 3.0)
     for axes, name in zip(figure.subplots(1, max(len(curves), 1), squeeze=False)[0], curves, strict=False):
         _draw_curves(axes, groups, name, legend=len(groups) > 1)
     return save_figure(figure, path)
-
-
-def _curves_of(groups: Sequence[Group]) -> list[str]:
-    """The first two of `CURVES` that every run has."""
-    runs = [run for group in groups for run in group.runs]
-    return [name for name in CURVES if all(_drawable(run, name) for run in runs)][:2]
 
 
 def _drawable(run: Run, name: str) -> bool:
@@ -411,7 +349,7 @@ def compare(
         "seed": seed,
         "provenance": provenance(),
     }
-    draw_comparison(groups, result, out / "compare.png")
+    draw_training(groups, out / "compare.png")
     write_json(out / RESULT_FILE, result, tables_of(result))
     return result
 

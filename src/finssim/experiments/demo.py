@@ -28,7 +28,7 @@ from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Pool
 from finssim.experiments.campaign import Progress, run_jobs, write_json
-from finssim.experiments.compare import draw_training
+from finssim.experiments.compare import draw_training, groups_of
 from finssim.experiments.evaluate import CAPTION, Evaluation, by_target, cells, comparison_table
 from finssim.experiments.excitation import pool_trials, trials_on_robot
 from finssim.experiments.figures import (
@@ -609,7 +609,7 @@ class _Demonstration:
         envelopes = {e.label: error_envelope(e.trials) for e in compared}
         save_figure(draw_envelopes(envelopes), folder / "envelopes.png")
         save_figure(_paths(policy.trials), folder / "paths.png")
-        draw_training([str(folder / "policy")], folder / "training.png")
+        draw_training(groups_of([str(folder / "policy")]), folder / "training.png")
         title = f"Station keeping of {policy.result['vehicle']['name']}"
         origin = {
             "vehicle": policy.result["vehicle"],

@@ -48,9 +48,6 @@ from finssim.robot.runtime import Runtime
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = ["ProgrammePilot", "excite", "excite_on_robot", "pool_trials", "trials_on_robot"]
-
-
 Array = NDArray[np.float64]
 
 HELD = ("surge", "sway", "heave", "yaw")

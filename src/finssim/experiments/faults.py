@@ -9,12 +9,16 @@ import json
 import math
 import os
 import resource
+import signal
 import socket
+import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -24,9 +28,8 @@ from numpy.typing import NDArray
 
 from finssim.experiments.campaign import Job, Progress, check_choices, run_jobs, write_json
 from finssim.experiments.pool_trial import noise_seed
-from finssim.experiments.reliability import Pair, ReliabilityError, await_flush, await_thrust, pair
 from finssim.experiments.tables import Table
-from finssim.pool import VirtualPool, read_truth
+from finssim.pool import TruthError, VirtualPool, read_truth
 from finssim.pool.run import make_plan
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
@@ -551,6 +554,197 @@ def _first_stop(path: Path, since: float) -> float | None:
             if entry.time >= since and kind in ("hold", "fault", "disarmed"):
                 return entry.time
     return None
+
+
+# Processes of a robot and its virtual pool: started as a person starts them, watched, and killed.
+
+
+STARTING = 120.0
+"""Longest time that a process takes to start, or to do what is waited for [s]."""
+POLL = 0.005
+"""Between looks [s]."""
+
+
+class ReliabilityError(ValueError):
+    """A trial could not be made: what it needs did not come about."""
+
+
+class Process:
+    """A `finssim` command in a process of its own, its words kept in files."""
+
+    def __init__(self, words: Sequence[str], folder: Path, name: str) -> None:
+        """
+        Args:
+            words: Of the command line, after `finssim`.
+            folder: Takes NAME.out and NAME.err.
+            name: Of its files.
+        """
+        self.name = name
+        self._out, self._err = folder / f"{name}.out", folder / f"{name}.err"
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "finssim", *words], stdout=out, stderr=err, env=environment
+            )
+
+    @property
+    def said(self) -> str:
+        """Standard output so far."""
+        return self._out.read_text(encoding="utf-8", errors="replace")
+
+    @property
+    def complained(self) -> str:
+        """Standard error so far."""
+        return self._err.read_text(encoding="utf-8", errors="replace")
+
+    @property
+    def running(self) -> bool:
+        """Whether it is there."""
+        return self._process.poll() is None
+
+    def kill(self) -> None:
+        """As `kill -9`."""
+        self._process.kill()
+        self._process.wait()
+
+    def end(self) -> int:
+        """As Ctrl-C, and not as gently where that is not heard; returns the exit status."""
+        if self.running:
+            self._process.send_signal(signal.SIGINT)
+        try:
+            return self._process.wait(20.0)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return self._process.returncode
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """A process does not outlive its block."""
+        if self.running:
+            self.kill()
+
+    def broke(self) -> str:
+        """What broke through to the person who started it; nothing if it ended as it should."""
+        lines = self.complained.splitlines()
+        if any(line.startswith("Traceback") for line in lines) or self._process.returncode == 1:
+            return f"{self.name}: {lines[-1] if lines else 'exit status 1'}"
+        return ""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A robot in a pool, each in a process of its own."""
+
+    pool: Process
+    robot: Process
+    port: int
+    """Of the motor controller."""
+
+
+@contextmanager
+def pair(
+    folder: Path, vehicle: str, goal: str, *, pool: Sequence[str], robot: Sequence[str]
+) -> Iterator[Pair]:
+    """Both at work on free ports, the robot armed.
+
+    Args:
+        folder: Takes what they say, and the pool's file.
+        vehicle: Name or file.
+        goal: As `finssim run` takes it.
+        pool: Further words of `finssim pool`.
+        robot: Further words of `finssim run`.
+
+    Raises:
+        ReliabilityError: The pool never stood.
+    """
+    port, peer = free_ports()
+    end, both = f"127.0.0.1:{peer}", ["--vehicle", vehicle, "--pool-file", str(folder / "pool.yaml")]
+    world = ["pool", *both, "--port", str(port), "--robot", end, *pool]
+    ours = ["run", *both, "--goal", goal, "--arm", "--json", "--bind", end, *robot]
+    wires = ["--robot", f"udp://127.0.0.1:{port}", "--pictures", f"udp://127.0.0.1:{port + 1}"]
+    with Process(world, folder, "pool") as first:
+        silent = "the pool never said 'pictures: '"
+        _await(
+            lambda: "pictures: " in first.said,
+            10.0 * POLL,
+            lambda: first.running,
+            lambda: f"{silent}: {first.complained.strip()[-300:] or 'no error'}",
+        )
+        with Process([*ours, *wires], folder, "robot") as second:
+            yield Pair(first, second, port)
+
+
+def _await(
+    ready: Callable[[], bool], poll: float, running: Callable[[], bool], failure: Callable[[], str]
+) -> None:
+    """Wait for something.
+
+    Args:
+        ready: Whether it has come about.
+        poll: Between looks [s].
+        running: Whether it still can.
+        failure: What is raised if it does not, or takes too long.
+
+    Raises:
+        ReliabilityError: It did not come about.
+    """
+    deadline = time.monotonic() + STARTING
+    while not ready():
+        if not running() or time.monotonic() > deadline:
+            raise ReliabilityError(failure())
+        time.sleep(poll)
+
+
+def await_thrust(truth: Path, bound: float, process: Process) -> None:
+    """Wait until the thrusters of a pool turn, as its truth file tells.
+
+    Raises:
+        ReliabilityError: They never do, or the process that should turn them has ended.
+    """
+
+    def turning() -> bool:
+        try:
+            return bool(abs(read_truth(truth).thrust[-50:]).max(initial=0.0) > bound)
+        except TruthError:
+            return False  # not begun yet
+
+    def failure() -> str:
+        why = (process.complained + process.said).strip()[-300:] or "it said nothing"
+        return f"no thruster ever turned: {process.name}: {why}"
+
+    _await(turning, 20.0 * POLL, lambda: process.running, failure)
+
+
+def await_flush(truth: Path) -> float:
+    """Wait for the next piece of a truth file that grows; returns the pool's clock then [s].
+
+    The pool writes half a second at a time, so that the last record is as old as one look takes.
+    """
+    size = truth.stat().st_size
+    still = f"{truth} does not grow: the pool stands still"
+    _await(lambda: truth.stat().st_size > size, POLL, lambda: True, lambda: still)
+    return float(read_truth(truth).time[-1])
+
+
+def free_ports() -> tuple[int, int]:
+    """Ports of the pool's and of the robot's end; the two after the first and the one after the second are free too."""
+    for _ in range(100):
+        with ExitStack() as stack:
+            probes = [
+                stack.enter_context(socket.socket(socket.AF_INET, kind))
+                for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM) * 6
+            ]
+            try:
+                probes[0].bind(("127.0.0.1", 0))
+                first: int = probes[0].getsockname()[1]
+                for k, probe in enumerate(probes[1:], start=1):
+                    probe.bind(("127.0.0.1", first + k // 2))
+            except (OSError, OverflowError):
+                continue
+            return first, first + 4
+    raise ReliabilityError("no six free ports in a row on this machine: end some programs")
 
 
 def play_kill(job: FaultJob, path: Path) -> dict[str, Any]:

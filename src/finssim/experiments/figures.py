@@ -22,19 +22,6 @@ from finssim.experiments.metrics import (
 from finssim.experiments.trials import LABELS, Trial
 from finssim.files import atomic_write
 
-__all__ = [
-    "COLORS",
-    "clean",
-    "draw_envelopes",
-    "draw_episodes",
-    "draw_tracking",
-    "error_envelope",
-    "legend_below",
-    "new_figure",
-    "png",
-    "save_figure",
-]
-
 Array = NDArray[np.float64]
 
 QUARTILES = (0.25, 0.5, 0.75)

@@ -25,8 +25,6 @@ from finssim.quiet import start_warp
 from finssim.vehicles import Provenance, Vehicle, load_vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = ["HELD_OUT", "TRIALS", "Identification", "commands", "identify", "vehicle_files"]
-
 TRIALS = "trials"
 SET = "hydrodynamics.calibrated"
 

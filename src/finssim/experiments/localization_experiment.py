@@ -35,8 +35,6 @@ from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples
 from finssim.text_table import write_csv
 from finssim.vehicles import Mount, Tags
 
-__all__ = ["RESULT_FILE", "draw_campaign", "localization_experiment", "tables_of"]
-
 Array = NDArray[np.float64]
 
 LOCATIONS = (17, 10)
@@ -390,12 +388,6 @@ refractive calibration."""
 
 LIFT = 0.4
 """How much higher than the places of the calibration the tag is shown once more [m]."""
-RIPPLES = (0.0, 0.005, 0.01, 0.02, 0.04)
-RIPPLE_VISITS = 40
-RIPPLE_IMAGES = 4
-DEPTHS = (-0.05, -0.02, -0.01, 0.0, 0.01, 0.02, 0.05)
-TILTS = tuple(np.radians([0.0, 0.1, 0.2, 0.5, 1.0]).tolist())
-INDICES = (-0.02, -0.01, -0.005, 0.0, 0.005, 0.01, 0.02)
 Z_STD = 0.01
 TILT_STD = float(np.radians(0.5))
 TAGS_B = tag_corners_b(TAG)
@@ -427,12 +419,6 @@ CALIBRATION = {
     "index": ("index", "+.4f"),
 }
 """What a calibration got wrong: key -> heading and format."""
-SENSITIVITIES = {
-    "depth_cm": "error of depth [cm]",
-    "tilt_deg": "tilt of the water that is not known [°]",
-    "index": "error of the water's index",
-    "ripples": "rms slope of ripples",
-}
 
 
 @dataclass(frozen=True)
@@ -463,7 +449,6 @@ def locate(
     method: str,
     *,
     pixel_std: float,
-    depth_offset: float = 0.0,
 ) -> Scores:
     """Locate the tag in every picture of the held-out visits and average over each visit.
 
@@ -473,7 +458,6 @@ def locate(
         pool: As calibrated.
         method: Key of `finssim.localization.poses.methods.METHODS`.
         pixel_std: Standard deviation of a corner, as the calibration found it [px].
-        depth_offset: Added to the depth reading [m].
     """
     places: dict[int, list[tuple[float, float]]] = {}
     reasons, water = Counter[str](), pool.interface  # depth is measured along its normal, which is up
@@ -484,7 +468,7 @@ def locate(
             continue
         visit = campaign.visits[picture.visit]
         prior = Constraints(
-            z_b=-water.offset - visit.depth_read - depth_offset,
+            z_b=-water.offset - visit.depth_read,
             z_std=Z_STD,
             roll=visit.roll_read,
             pitch=visit.pitch_read,
@@ -549,43 +533,6 @@ def _figures(errors: Sequence[Array]) -> tuple[float, float]:
     return float(np.sqrt(np.mean(x**2))), float(np.percentile(x, 95))
 
 
-def rmse_cm(scores: Scores) -> float | None:
-    """Horizontal error against the surveyed places [cm]; None where nothing was located."""
-    return 100.0 * scores.rmse if len(scores.visits) else None
-
-
-def sensitivity(
-    campaign: Campaign, seen: Sequence[Picture], pool: Pool, pixel_std: float
-) -> dict[str, list[list[float | None]]]:
-    """RMSE of the refractive method with one thing wrong on purpose.
-
-    Returns:
-        `depth_cm`, `tilt_deg` and `index` -> pairs of the error put in and the RMSE [cm] that comes out, None where
-        nothing was located.
-    """
-
-    def rmse(changed: Pool, depth_offset: float = 0.0) -> float | None:
-        given = {"pixel_std": pixel_std, "depth_offset": depth_offset}
-        return rmse_cm(locate(campaign, seen, changed, "refractive", **given))
-
-    water = pool.interface
-    return {
-        "depth_cm": [[100.0 * d, rmse(pool, d)] for d in DEPTHS],
-        "tilt_deg": [[float(np.degrees(t)), rmse(replace(pool, interface=_leaning(pool, t)))] for t in TILTS],
-        "index": [
-            [i, rmse(replace(pool, interface=replace(water, index_far=water.index_far + i)))] for i in INDICES
-        ],
-    }
-
-
-def _leaning(pool: Pool, angle: float) -> Any:
-    """The water tilted about the point below the camera, which keeps its height."""
-    x, y = pool.camera.position[:2]
-    height = float(pool.interface.height(x, y))
-    leaning = pool.interface.tilted(angle, 0.0)
-    return replace(leaning, offset=-float(leaning.normal @ [x, y, height]))
-
-
 def _draw_error_map(campaign: Campaign, pinhole: Scores, refractive: Scores, path: Path) -> None:
     """Arrows from every held-out place to where each method puts it, longer than true as the titles say."""
     places = np.array([visit.nominal[:2] for visit in campaign.visits])
@@ -601,19 +548,6 @@ def _draw_error_map(campaign: Campaign, pinhole: Scores, refractive: Scores, pat
         axes.set(aspect="equal", xlabel="x [m]", xlim=(-REACH[0] - 0.3, REACH[0] + 0.3))
     figure.axes[0].set_ylabel("y [m]")
     legend_below(figure, figure.axes[0], 2)
-    save_figure(figure, path)
-
-
-def _draw_sensitivity(swept: Mapping[str, Any], path: Path) -> None:
-    """RMSE [cm] against an error put in on purpose."""
-    names = [name for name in SENSITIVITIES if name in swept]
-    figure = new_figure(3.1 * len(names), 3.0)
-    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
-    for axes, name in zip(panels, names, strict=True):
-        axes.plot(*np.array(swept[name], float).T, "o-", color=COLORS[0], markersize=4)
-        axes.set(xlabel=SENSITIVITIES[name], ylim=(0.0, None))
-        clean(axes)
-    panels[0].set_ylabel("RMSE [cm]")
     save_figure(figure, path)
 
 
@@ -636,16 +570,13 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         [f"paper, {WORDS[m]}", f"{p['rmse_cm']:.2f}", "", f"{p['p95_cm']:.2f}", "", ""]
         for m, p in result["paper"].items()
     ]
-    pictures = {"error_map.png": "Error map"}
-    if result["sensitivity"]:  # an interruption may come before it
-        pictures["sensitivity.png"] = "Sensitivity"
     paper = "the paper: its camera over its pool"
     rows_wrong = [
         [format(c[key], form) for key, (_, form) in CALIBRATION.items()] for c in result["calibration"]
     ]
     return [
         *tables,
-        Table(title=paper, heads=HEADS, rows=rows, note=NOTE, pictures=pictures),
+        Table(title=paper, heads=HEADS, rows=rows, note=NOTE, pictures={"error_map.png": "Error map"}),
         Table(
             title="what the calibrations got wrong",
             heads=[heading for heading, _ in CALIBRATION.values()],
@@ -692,7 +623,6 @@ class SeedResult:
     """One drawing of the test under one set of conditions."""
 
     campaign: Campaign
-    seen: list[Picture]
     found: Calibrated
     scores: Mapping[str, Scores]
     """By method."""
@@ -734,7 +664,6 @@ def localization_experiment(
     refuse_unwritable(atomic_directory(out, replaces=RESULT_FILE))
     drawn: dict[str, list[SeedResult]] = {name: [] for name in CONDITIONS}
     higher: list[Mapping[str, Scores]] = []
-    swept: dict[str, Any] = {}
     runs, interrupted = drawn["published"], False
     try:
         for k in range(seeds):
@@ -744,9 +673,6 @@ def localization_experiment(
             progress((k + 0.8) / seeds, f"seed {seed + k}, another depth")
             campaign = lifted(runs[k].campaign, LIFT)  # the same calibration, the tag at another depth
             higher.append(_scored(campaign, list(pictures(campaign, renderer)), runs[k].found))
-            if not swept:
-                progress((k + 0.9) / seeds, "sensitivity")
-                swept.update(_swept(runs[0], renderer))
     except KeyboardInterrupt:
         if not runs:
             raise
@@ -772,7 +698,6 @@ def localization_experiment(
         "lift_m": LIFT,
         "pixel_std_px": [one.found.pixel_std for one in runs],
         "calibration": [_errors(one) for one in runs],
-        "sensitivity": swept,
         "paper": {m: {"rmse_cm": r, "p95_cm": p} for m, (r, p) in PAPER_TABLE_2.items()},
         "provenance": provenance(),
     }
@@ -785,8 +710,6 @@ def _write(result: Mapping[str, Any], out: Path, first: SeedResult) -> None:
     with atomic_directory(out, replaces=RESULT_FILE) as folder:
         scores, found = first.scores, first.found
         _draw_error_map(first.campaign, scores["pinhole"], scores["refractive"], folder / "error_map.png")
-        if result["sensitivity"]:
-            _draw_sensitivity(result["sensitivity"], folder / "sensitivity.png")
         write_camera(folder / "camera.yaml", first.campaign.lens, {})
         write_pool(found.refractive, folder / "pool.yaml")
         write_pool(found.pinhole, folder / "pool_pinhole.yaml")
@@ -799,7 +722,7 @@ def _one(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedRe
     campaign = draw_campaign(CONDITIONS[name], seed, **size)
     seen = list(pictures(campaign, renderer))
     found = calibrate(campaign, seen)
-    return SeedResult(campaign, seen, found, _scored(campaign, seen, found))
+    return SeedResult(campaign, found, _scored(campaign, seen, found))
 
 
 def _scored(campaign: Campaign, seen: Sequence[Picture], found: Calibrated) -> dict[str, Scores]:
@@ -808,26 +731,6 @@ def _scored(campaign: Campaign, seen: Sequence[Picture], found: Calibrated) -> d
         row: locate(campaign, seen, pools[kind], method, pixel_std=found.pixel_std)
         for row, (method, kind) in METHODS_SHOWN.items()
     }
-
-
-def _swept(one: SeedResult, renderer: str) -> dict[str, Any]:
-    """Sensitivities: to depth, tilt and index on the same pictures, to ripples on new ones."""
-    swept: dict[str, Any] = dict(
-        sensitivity(one.campaign, one.seen, one.found.refractive, one.found.pixel_std)
-    )
-    if renderer == "geometry":  # it has no ripples
-        return swept
-    held_out = np.flatnonzero(~one.campaign.calibrates)
-    some = held_out[:: max(1, len(held_out) // RIPPLE_VISITS)]
-    visits = tuple(replace(one.campaign.visits[k], images=RIPPLE_IMAGES) for k in some)
-    still = replace(one.campaign, visits=visits, calibrates=np.zeros(len(visits), bool))
-    swept["ripples"] = []
-    for slope in RIPPLES:
-        campaign = replace(still, conditions=replace(still.conditions, ripples=slope))
-        seen, std = list(pictures(campaign, renderer)), one.found.pixel_std
-        scores = locate(campaign, seen, one.found.refractive, "refractive", pixel_std=std)
-        swept["ripples"].append([slope, rmse_cm(scores)])
-    return swept
 
 
 def _errors(one: SeedResult) -> dict[str, Any]:

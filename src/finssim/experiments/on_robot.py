@@ -33,19 +33,6 @@ from finssim.robot.wiring import Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 
-__all__ = [
-    "Attendant",
-    "OnRobot",
-    "Outcome",
-    "RobotError",
-    "RobotTrial",
-    "Session",
-    "check_starts",
-    "kept_folder",
-    "robot_or_none",
-    "session",
-]
-
 GETTING_READY = 10.0
 """Longest time until the estimator knows where the vehicle is, and it is armed [s]."""
 NEAR, TURNED = 0.10, math.radians(10.0)

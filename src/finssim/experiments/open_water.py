@@ -30,8 +30,6 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["open_water", "tables_of"]
-
 Array = npt.NDArray[np.float64]
 
 DEPTH = -5.0

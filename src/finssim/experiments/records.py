@@ -39,21 +39,6 @@ from finssim.viewer.sources.alignment import offset_between
 from finssim.viewer.sources.series import PoseSeries
 from finssim.yaml_file import json_value
 
-__all__ = [
-    "SAME_GOAL",
-    "Drive",
-    "DriveError",
-    "RecordedTrial",
-    "collect",
-    "collect_records",
-    "datasets",
-    "read_drive",
-    "read_record",
-    "station_at",
-    "tables_of",
-    "trajectory_of",
-]
-
 Array = NDArray[np.float64]
 
 TOPICS = ("thruster_cmd", "odom", "policy_info", "goal", "estimator_status", "thruster_state")

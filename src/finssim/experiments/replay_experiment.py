@@ -36,8 +36,6 @@ from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import Axis
 from finssim.yaml_file import first_problem, read_mapping
 
-__all__ = ["RESULT_FILE", "load_replay_plant", "replay_experiment", "tables_of"]
-
 Array = NDArray[np.float64]
 
 PLANT_FILE = Path(__file__).with_name("replay_plant.yaml")

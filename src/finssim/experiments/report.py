@@ -13,8 +13,6 @@ from finssim.experiments import anatomy, transfer
 from finssim.experiments.tables import Table, markdown_table
 from finssim.files import atomic_write
 
-__all__ = ["ReportError", "filled", "report"]
-
 TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Table]]] = {
     **dict.fromkeys(transfer.SPECS, transfer.tables_of),
     "anatomy": anatomy.tables_of,
@@ -37,7 +35,7 @@ def report(
     """Fill the tables of Markdown pages with what experiments have measured.
 
     A page has a table where it says <!-- finssim report: t1 --> and <!-- end -->; after the name may stand table=2 (the
-    second of the result), columns=0,1,3, rows=calibrated;paper: calibrated (names as the table has them) and sentences.
+    second of the result), columns=0,1,3, and rows=calibrated;paper: calibrated (names as the table has them).
 
     Example: finssim report results/t1.json results/anatomy.json --into docs/experiments.md --into README.md
 
@@ -103,7 +101,7 @@ def filled(page: str, results: Mapping[str, Mapping[str, Any]], name: str) -> st
 
 
 def _table(tables: Sequence[Table], options: str) -> str:
-    chosen = dict(re.findall(r"(table|columns|rows)=((?:[^=]*?)(?=\s+\w+=|\s+sentences|$))", options))
+    chosen = dict(re.findall(r"(table|columns|rows)=((?:[^=]*?)(?=\s+\w+=|$))", options))
     number = int(chosen.get("table", "1"))
     if not 1 <= number <= len(tables):
         raise ReportError(f"table {number}: the result has {len(tables)}")
@@ -125,5 +123,4 @@ def _table(tables: Sequence[Table], options: str) -> str:
             rows=[[row[k] for k in columns] for row in shown.rows if row],
         )
     rows = [[row[0].strip(), *row[1:]] for row in shown.rows if row]
-    sentences = "".join(f"\n- {line}" for line in shown.sentences) if options.endswith("sentences") else ""
-    return markdown_table(shown.heads, rows) + (f"\n{sentences}" if sentences else "")
+    return markdown_table(shown.heads, rows)

@@ -21,8 +21,6 @@ from finssim.provenance import provenance
 from finssim.text_table import write_csv
 from finssim.vehicles import AXES, load_vehicle
 
-__all__ = ["CommandError", "simulate"]
-
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
 
 

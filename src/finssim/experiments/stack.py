@@ -27,8 +27,6 @@ from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["BATCH", "play", "site_of", "tables_of"]
-
 BATCH = 256
 """Episodes in the batch, beside those through the stack."""
 ROWS = "episodes.json"

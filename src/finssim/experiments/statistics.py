@@ -15,20 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "RESAMPLES",
-    "SEED",
-    "Interval",
-    "Statistic",
-    "better",
-    "bootstrap",
-    "interquartile_mean",
-    "paired_difference",
-    "probability_of_improvement",
-    "with_bootstrap",
-    "with_interval",
-]
-
 Array = NDArray[np.float64]
 Statistic = Callable[..., Any]
 """Of all values together, one number."""
@@ -49,11 +35,6 @@ class Interval:
     """2.5 and 97.5 %."""
     count: int
     """Trials or runs it rests on."""
-
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether the sign is supported."""
-        return self.low > 0.0 or self.high < 0.0
 
     def as_json(self) -> dict[str, Any]:
         """Plain data; a number that is infinite is None."""

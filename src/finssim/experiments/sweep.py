@@ -34,8 +34,6 @@ from finssim.provenance import provenance
 from finssim.tasks import TASKS
 from finssim.yaml_file import first_problem, read_mapping
 
-__all__ = ["SweepError", "sweep", "tables_of"]
-
 RESULT_FILE = "sweep.json"
 ROW_FILE = "sweep-row.json"
 PATIENCE = 10.0

@@ -16,17 +16,6 @@ from rich.text import Text
 
 from finssim.page import html_picture, html_table
 
-__all__ = [
-    "Table",
-    "console_table",
-    "figure_text",
-    "html_of",
-    "html_row",
-    "markdown_of",
-    "markdown_table",
-    "print_tables",
-]
-
 Rows = Sequence[Sequence[str] | None]
 """Cells of each row; None: a line between two rows."""
 

@@ -21,8 +21,6 @@ from finssim.tasks.sensing import Sensing, seen_with
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["attribute_docs", "describe_task", "tables_of", "tasks_list", "tasks_show"]
-
 
 def attribute_docs(kind: type) -> dict[str, str]:
     """Field -> the string that follows it, of a class and those it is derived from; where the source can be had.

@@ -30,19 +30,6 @@ from finssim.learning.train import train
 from finssim.provenance import provenance
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = [
-    "MEASURES",
-    "SPECS",
-    "T1",
-    "ROWS",
-    "T2",
-    "controllers_of",
-    "t1",
-    "t2",
-    "tables_of",
-    "transfer_experiment",
-]
-
 Results = Mapping[str, Sequence[Mapping[str, Any]]]
 """Row -> results of its trials."""
 
@@ -51,8 +38,6 @@ TRAINING_SHARE = 0.4
 INTERVALS = "intervals"
 """Stands for the ranges that the calibration's intervals give."""
 RANGES_FILE = "ranges.yaml"
-FEWEST_UNITS = 3
-"""Plants and seeds on which a sentence about a difference rests at least; below it there are numbers alone."""
 DIFFERENCES_NOTE = (
     "Each figure is the mean of row less reference, over pairs of trials with the same pool, seed and target; in "
     "brackets 95 % from a bootstrap of plants and seeds. paper: the difference of its rows, on hardware, single runs."
@@ -61,14 +46,14 @@ FORGETFUL = {"integral": False, "history": 0, "last_action": False}
 """Settings of the learner, for policies as the paper's."""
 
 MEASURES = {
-    "success_rate": ("the share of setpoints held", "held [points]", 100.0, "percentage points", ".0f"),
-    "e_p_m": ("the position error", "e_p [cm]", 100.0, "cm", ".1f"),
-    "e_psi_deg": ("the heading error", "e_psi [°]", 1.0, "°", ".1f"),
-    "horizontal_rmse_m": ("the horizontal error", "horizontal [cm]", 100.0, "cm", ".1f"),
-    "vertical_rmse_m": ("the vertical error", "vertical [cm]", 100.0, "cm", ".1f"),
-    "p95_m": ("the 95th percentile of the distance", "P95 [cm]", 100.0, "cm", ".1f"),
+    "success_rate": ("held [points]", 100.0, ".0f"),
+    "e_p_m": ("e_p [cm]", 100.0, ".1f"),
+    "e_psi_deg": ("e_psi [°]", 1.0, ".1f"),
+    "horizontal_rmse_m": ("horizontal [cm]", 100.0, ".1f"),
+    "vertical_rmse_m": ("vertical [cm]", 100.0, ".1f"),
+    "p95_m": ("P95 [cm]", 100.0, ".1f"),
 }
-"""Key in which rows are compared -> words, heading, factor, unit and format of a difference."""
+"""Key in which rows are compared -> heading, factor and format of a difference."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +80,6 @@ class Row:
     """Name of the PID."""
     paper: str | None = None
     """Row of the paper's table; None where it has none."""
-    module: str = ""
-    """What the row takes away or puts in place of the reference, as a sentence begins."""
     changes: dict[str, Any] = field(default_factory=dict)
     """Fields of its jobs."""
 
@@ -152,13 +135,15 @@ class Spec:
         rows = []
         for name, differences in result["differences"].items():
             row, theirs = self.rows[name], self.paper_differences(self.rows[name])
-            texts = (figure_text(differences[key], f"+{u[4]}", u[2]) for key, u in units.items())
+            texts = (figure_text(differences[key], f"+{form}", by) for key, (_, by, form) in units.items())
             rows.append([row.title, *texts])
             if theirs is not None:
-                rows.append(["  paper", *(f"{u[2] * theirs[key]:+{u[4]}}" for key, u in units.items())])
+                rows.append(
+                    ["  paper", *(f"{by * theirs[key]:+{form}}" for key, (_, by, form) in units.items())]
+                )
         differences = Table(
             title=f"{self.name.upper()}: differences from {self.rows[self.base].title}",
-            heads=["", *(heading for _, heading, *_ in units.values())],
+            heads=["", *(heading for heading, *_ in units.values())],
             rows=rows,
             note=DIFFERENCES_NOTE,
         )
@@ -190,7 +175,6 @@ class Spec:
             heads=["", *first, *(heading for heading, _ in self.columns.values())],
             rows=rows,
             note=f"ours: {source}; mean, in brackets 95 % from a bootstrap of {units}{self.note}",
-            sentences=result["sentences"],
             pictures=dict([self.picture]),
         )
 
@@ -369,7 +353,7 @@ def finished(place: Path, vehicle: Vehicle | None = None) -> bool:
 
 
 def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
-    """Figures of every row, all targets together and each alone; differences from the reference; sentences."""
+    """Figures of every row, all targets together and each alone; differences from the reference."""
     rows = {}
     for name, results in by_row.items():
         by_target: dict[str, list[Mapping[str, Any]]] = {}
@@ -389,11 +373,6 @@ def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
             name: {key: d and d.as_json() for key, d in of_row.items()}
             for name, of_row in differences.items()
         },
-        "sentences": [
-            sentence(spec.rows[name].module, of_row)
-            for name, of_row in differences.items()
-            if len({_cluster(r) for r in by_row[name]}) >= FEWEST_UNITS
-        ],
     }
 
 
@@ -448,39 +427,6 @@ def _difference(
 def _figure(result: Mapping[str, Any], key: str) -> float | None:
     value = result["success"] if key == "success_rate" else result[key]
     return None if value is None else float(value)
-
-
-def sentence(module: str, differences: Mapping[str, Interval | None]) -> str:
-    """What a module changes, with what the intervals leave open said as such.
-
-    Args:
-        module: How the sentence begins, such as "Domain randomisation".
-        differences: Key of `MEASURES` -> other less reference; None where no pair of trials has both.
-    """
-    clear = [_clause(key, d) for key, d in differences.items() if d is not None and d.excludes_zero]
-    unclear = [MEASURES[key][0] for key, d in differences.items() if d is not None and not d.excludes_zero]
-    unpaired = [MEASURES[key][0] for key, d in differences.items() if d is None]
-    parts = []
-    if clear:
-        parts.append(f"{module} {_listed(clear)}")
-    if unclear:
-        start = "it" if clear else module
-        parts.append(f"{start} makes no difference to {_listed(unclear)} that the intervals support")
-    if unpaired:
-        parts.append(f"{_listed(unpaired)} cannot be compared: no pair of trials has both")
-    return "; ".join(parts) + "."
-
-
-def _clause(key: str, d: Interval) -> str:
-    words, _, factor, unit, form = MEASURES[key]
-    verb = "raises" if d.value > 0.0 else "lowers"
-    low, high = sorted(abs(factor * x) for x in (d.low, d.high))
-    space = "" if unit == "°" else " "
-    return f"{verb} {words} by {abs(factor * d.value):{form}}{space}{unit} [{low:{form}}, {high:{form}}]"
-
-
-def _listed(items: list[str]) -> str:
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
 ROWS: Mapping[str, Mapping[str, Row]] = {

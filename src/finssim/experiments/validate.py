@@ -17,8 +17,6 @@ from finssim.experiments.tables import Table
 from finssim.provenance import provenance
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["ValidationError", "tables_of", "validate"]
-
 PUBLISHED = Path(__file__).parent / "published"
 DURATION = 6.0
 """Of each run [s]: eight of the slowest time constants, but too short for added mass to turn a straight run."""

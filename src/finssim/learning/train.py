@@ -155,12 +155,13 @@ def train(
     if plan is not None:
         climb(environment, plan)
     began = time.perf_counter()
+    full = randomization and randomization.at_full_width()  # as it is measured, whatever it grew from
     with one_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a last small batch does no harm
         warnings.filterwarnings("ignore", message=".*on the GPU.*")
         loop = Loop(
             kind(environment, values, seed=seed, device=device), description, side,
-            evaluate=HeldEvaluation(worlds_of(HELD_WORLDS, _whole(randomization), held_seed(seed)), device),
+            evaluate=HeldEvaluation(worlds_of(HELD_WORLDS, full, held_seed(seed)), device),
             show=view.update, progress=environment.set_progress, also=lambda: _level(environment),
             identity=_identity(description), until=until,
         )  # fmt: skip
@@ -244,13 +245,6 @@ def _finish(loop: Any, place: Path, stopped: bool, console: Console, where: Path
 def _place_beside(out: Path, side: Path) -> Path:
     """Where an unfinished policy goes: a finished one that is there already must not be lost to it."""
     return side / "interrupted" if (out / DESCRIPTION_FILE).is_file() else out
-
-
-def _whole(randomization: Randomization | None) -> Randomization | None:
-    """The ranges as they are when grown: what a policy is trained for is what it is measured in."""
-    if randomization is None:
-        return None
-    return Randomization(randomization.ranges.model_copy(update={"curriculum": None, "automatic": None}))
 
 
 def _identity(description: PolicyDescription) -> dict[str, Any]:

@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["PARENT", "follow_parent", "interruptible"]
-
 PARENT = "FINSSIM_PARENT"
 """Environment of a process: the one without which it ends too."""
 ORPHANED = 0.5

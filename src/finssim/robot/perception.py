@@ -51,9 +51,6 @@ from finssim.robot.messages import (
 from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 
-__all__ = ["Aboard", "Perception", "Stuck", "Unfused", "Unlocated"]
-
-
 # Telemetry as samples for the estimator: body axes, times of measurement, no sample twice, nothing that has frozen.
 
 

@@ -33,20 +33,6 @@ from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import with_navigation
 
-__all__ = [
-    "METADATA",
-    "QUALITIES",
-    "TOPICS",
-    "Messages",
-    "RecordError",
-    "Topic",
-    "definition",
-    "floats",
-    "offered_qos",
-    "types",
-]
-
-
 # Names, types, frames and policies of all that FinsSim says of a robot: one table, for topics, records and page.
 
 

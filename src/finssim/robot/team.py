@@ -18,8 +18,6 @@ from finssim.control.guidance import Track
 from finssim.robot.reading import Reading
 from finssim.robot.runtime import Ticks
 
-__all__ = ["LONGEST_NAME", "Team", "decode_track", "encode_track"]
-
 MAGIC = b"FST1"
 LAYOUT = struct.Struct("<4s32s14d")
 """Magic, name in UTF-8 filled up with zeros, age [s], position [m], quaternion xyzw, nu [m/s, rad/s]; then CRC-32."""

@@ -232,7 +232,6 @@ class Environment:
         where = np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
         self._mask.assign(where)
         self._start.run()
-        self.drawing.after_reset()
         return self._by_agent(self.arrays.observation.numpy())
 
     def _by_agent(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -18,8 +18,6 @@ from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.capability import terminal_speeds
 from finssim.vehicles.defaults import POOL, room
 
-__all__ = ["Fit", "FittedTask", "PoolTask", "authority", "coefficients_of", "driven_axes", "fit"]
-
 Array = NDArray[np.float64]
 
 SLOWEST_SPEED = 0.22

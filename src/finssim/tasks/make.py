@@ -25,9 +25,6 @@ from finssim.tasks.team_pursuit import TeamPursuit
 from finssim.tasks.trajectory_tracking import TrajectoryTracking
 from finssim.vehicles import Vehicle
 
-__all__ = ["OBSERVED", "TASKS", "make", "observed", "own_class", "own_task", "task_named"]
-
-
 # Every task by name.
 
 

@@ -26,8 +26,6 @@ from finssim.tasks.reference import fill_table
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["Observer", "fitted_task", "one_world", "unscored"]
-
 Array = NDArray[np.float64]
 
 

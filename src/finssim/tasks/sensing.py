@@ -50,8 +50,6 @@ from finssim.tasks.measurement import LONGEST_DELAY, MeasurementNoise
 from finssim.vehicles import Vehicle
 from finssim.yaml_file import read_mapping
 
-__all__ = ["Sensing", "SensingBatch", "load_sensing", "seen_with"]
-
 FIX = 100
 """Number of the fixes in the random key, apart from those of the kinds of sensor."""
 STANDING = 400

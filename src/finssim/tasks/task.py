@@ -26,8 +26,6 @@ from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.terms import ObservationPart, Terms
 from finssim.vehicles import Vehicle
 
-__all__ = ["Kernels", "kernels_of", "settings_of"]
-
 
 class Batch(NamedTuple):
     """What the parts of a task work on in one environment."""

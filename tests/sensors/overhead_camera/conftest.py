@@ -10,11 +10,10 @@ from scipy.ndimage import map_coordinates
 
 from finssim.geometry.optics import Camera, Interface, Lens, project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_euler, quat_rotate
-from finssim.sensors.overhead_camera import Basin, Light, Pose, Scene, Sensor, TagInScene, Water
+from finssim.sensors.overhead_camera import Basin, Pose, Scene, Sensor, TagInScene, Water
 
 LENS = Lens(320, 240, 200.0, 201.0, 161.3, 118.2)
 CLEAR = Water(attenuation=(0.0, 0.0, 0.0))
-DARK = Light(sky=0.0)
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 """Optical axes of a camera that looks straight down, pool frame."""
 
@@ -47,7 +46,7 @@ def pool(**changes: Any) -> Scene:
         "interface": Interface.water(1.0),
         "basin": Basin(lower=(-4.0, -4.0, 0.0), upper=(4.0, 4.0, 3.0), tile=0.0),
         "water": CLEAR,
-        "light": DARK,
+        "sky": 0.0,
         "sensor": Sensor(noise=False),
     }
     return Scene(**{**parts, **changes})

@@ -1,24 +1,10 @@
-"""What a fixed camera above a pool sees: tags, tiles and bodies through a flat or rippling surface."""
+"""What a fixed camera above a pool sees: tags and tiles through a flat or rippling surface."""
 
-from finssim.sensors.overhead_camera.render import OverheadCamera, Rectangle, render
-from finssim.sensors.overhead_camera.scene import (
-    Basin,
-    Body,
-    Lamp,
-    Light,
-    Pose,
-    Ripples,
-    Scene,
-    Sensor,
-    TagInScene,
-    Water,
-)
+from finssim.sensors.overhead_camera.render import OverheadCamera, Rectangle
+from finssim.sensors.overhead_camera.scene import Basin, Pose, Ripples, Scene, Sensor, TagInScene, Water
 
 __all__ = [
     "Basin",
-    "Body",
-    "Lamp",
-    "Light",
     "OverheadCamera",
     "Pose",
     "Rectangle",
@@ -27,5 +13,4 @@ __all__ = [
     "Sensor",
     "TagInScene",
     "Water",
-    "render",
 ]

@@ -13,11 +13,10 @@ from finssim.sensors.overhead_camera.surface import (
     Wave,
     distance_to,
     normal_of,
-    surface_at,
     surface_hit,
 )
 
-# What light meets in and around the pool: printed tags, matt boxes, and the tiled basin, each for one ray.
+# What light meets in and around the pool: printed tags and the tiled basin, each for one ray.
 #
 # Texture is averaged over the ray's share of the pixel, a square of a given width, in closed form.
 
@@ -55,19 +54,6 @@ class TagData:
 
 
 @wp.struct
-class BodyData:
-    """A box, surface frame, at the start and the end of the exposure."""
-
-    start: wp.vec3  # middle [m]
-    end: wp.vec3
-    q_start: wp.quat  # body to surface frame, xyzw
-    q_end: wp.quat
-    moving: int
-    half: wp.vec3  # half edge lengths [m]
-    colour: wp.vec3
-
-
-@wp.struct
 class BasinData:
     """The tiled box. Basin axes are the pool's, its origin the lower corner."""
 
@@ -75,16 +61,11 @@ class BasinData:
     origin: wp.vec3  # surface frame [m]
     size: wp.vec3  # [m]
     up: int  # axis closest to the interface's normal
-    up_sign: float  # 1 if that axis points to the camera's side, else -1
     tile: float  # [m], 0 for none
     joint: float  # [m]
     colour: wp.vec3
     joint_colour: wp.vec3
     variation: float
-    lanes: wp.array(dtype=float)  # middles of the lane lines along `lane_axis`, from the lower corner [m]
-    lane_axis: int
-    lane_width: float  # [m]
-    lane_colour: wp.vec3
     deck_colour: wp.vec3
 
 
@@ -96,12 +77,6 @@ def share(x: float, period: float, width: float, spread: float) -> float:
     w = width / period
     integral = wp.floor(b) * w + wp.min(b - wp.floor(b), w) - wp.floor(a) * w - wp.min(a - wp.floor(a), w)
     return integral / (b - a)
-
-
-@wp.func
-def overlap(x: float, low: float, high: float, spread: float) -> float:
-    """Share of [x - spread/2, x + spread/2] within [low, high]."""
-    return wp.max(wp.min(x + 0.5 * spread, high) - wp.max(x - 0.5 * spread, low), 0.0) / spread
 
 
 @wp.func
@@ -199,43 +174,6 @@ def meet_tag(
 
 
 @wp.func
-def meet_body(body: BodyData, origin: wp.vec3, ray: wp.vec3, t: float) -> Surfel:
-    """Where a ray enters a box; its upper faces are lighter than its sides. Arguments as of `meet_tag`."""
-    hit = Surfel()
-    hit.distance = NOTHING
-    centre = body.start
-    q = body.q_start
-    if body.moving != 0:
-        centre = (1.0 - t) * body.start + t * body.end
-        q = wp.normalize((1.0 - t) * body.q_start + t * body.q_end)
-    if not near_ray(origin, ray, centre, wp.length(body.half)):
-        return hit
-    o = wp.quat_rotate_inv(q, origin - centre)
-    d = wp.quat_rotate_inv(q, ray)
-    enter = float(0.0)
-    leave = NOTHING
-    normal = wp.vec3(0.0)
-    for a in range(3):
-        if wp.abs(d[a]) < 1.0e-9:
-            if wp.abs(o[a]) > body.half[a]:
-                return hit
-        else:
-            side = -wp.sign(d[a])
-            near = (side * body.half[a] - o[a]) / d[a]
-            leave = wp.min(leave, (-side * body.half[a] - o[a]) / d[a])
-            if near > enter:
-                enter = near
-                normal = wp.vec3(0.0)
-                normal[a] = side
-    if enter <= 0.0 or enter > leave:
-        return hit
-    hit.distance = enter
-    up = wp.quat_rotate(q, normal)
-    hit.radiance = (0.65 + 0.35 * up[2]) * body.colour
-    return hit
-
-
-@wp.func
 def tiles(basin: BasinData, x: float, y: float, face: int, spread: float) -> wp.vec3:
     """Reflectance of tiles around a point of a face, coordinates and spread in metres."""
     if basin.tile <= 0.0:
@@ -289,25 +227,11 @@ def meet_basin(basin: BasinData, p: wp.vec3, d: wp.vec3, angle: float, travelled
     if face == basin.up:
         shade = 1.0
     colour = tiles(basin, at[(face + 1) % 3], at[(face + 2) % 3], face, spread)
-    if face == basin.up and d[face] * basin.up_sign < 0.0:
-        for i in range(basin.lanes.shape[0]):
-            low = basin.lanes[i] - 0.5 * basin.lane_width
-            dark = overlap(at[basin.lane_axis], low, low + basin.lane_width, spread)
-            colour = (1.0 - dark) * colour + dark * basin.lane_colour
     hit.radiance = shade * colour
     return hit
 
 
 # A scene as the ray caster reads it.
-
-
-@wp.struct
-class LampData:
-    """A bright rectangle parallel to the surface."""
-
-    centre: wp.vec3  # [m]
-    half: wp.vec2  # half lengths [m]
-    radiance: float
 
 
 @wp.struct
@@ -320,21 +244,18 @@ class SceneData:
     layer_thickness: wp.array(dtype=float)  # of the window, from the camera [m]
     layer_index: wp.array(dtype=float)
     waves: wp.array(dtype=Wave)
-    caustics: float
     attenuation: wp.vec3  # [1/m]
     veil: wp.vec3
     sky: float
-    lamps: wp.array(dtype=LampData)
     basin: BasinData
     tags: wp.array(dtype=TagData)
     cells: wp.array(dtype=wp.uint8)
-    bodies: wp.array(dtype=BodyData)
     shutter: float  # [s]
     spot: float  # [px]
 
 
 ON_TOP = wp.constant(1.0e-3)
-"""A tag this little behind a wall or a body's face lies on it: stuck-on tags are given the same height [m]."""
+"""A tag this little behind a wall lies on it: stuck-on tags are given the same height [m]."""
 
 HORIZON = wp.constant(-1.0e-3)
 """Rays that go down no steeper than this are left dark, as is what the lens does not see (zero)."""
@@ -350,13 +271,13 @@ class Refraction:
 
 
 @wp.func
-def meet_things(
+def meet_tags(
     scene: SceneData, origin: wp.vec3, ray: wp.vec3, t: float, angle: float, travelled: float
 ) -> Surfel:
-    """The first tag or body on a ray.
+    """The first tag on a ray.
 
     Args:
-        scene: Holds tags and bodies.
+        scene: Holds the tags.
         origin: Of the ray, surface frame [m].
         ray: Its unit direction.
         t: Time as a fraction of the exposure, 0 to 1.
@@ -368,10 +289,6 @@ def meet_things(
     for i in range(scene.tags.shape[0]):
         hit = meet_tag(scene.cells, scene.tags[i], origin, ray, t, angle, travelled)
         if hit.distance < first.distance:
-            first = hit
-    for i in range(scene.bodies.shape[0]):
-        hit = meet_body(scene.bodies[i], origin, ray, t)
-        if hit.distance + ON_TOP < first.distance:
             first = hit
     return first
 
@@ -411,40 +328,8 @@ def enter_water(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3
 
 
 @wp.func
-def mirrored(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3) -> float:
-    """Radiance of sky or lamp in the direction in which the surface reflects a ray.
-
-    Args:
-        scene: Holds sky and lamps.
-        origin: Where the ray meets the surface, surface frame [m].
-        ray: Its unit direction.
-        normal: Unit normal towards the camera, surface frame [-].
-    """
-    up = ray - 2.0 * wp.dot(ray, normal) * normal
-    for i in range(scene.lamps.shape[0]):
-        lamp = scene.lamps[i]
-        s = (lamp.centre[2] - origin[2]) / wp.max(up[2], 1.0e-6)
-        x = origin[0] + s * up[0] - lamp.centre[0]
-        y = origin[1] + s * up[1] - lamp.centre[1]
-        if s > 0.0 and wp.abs(x) < lamp.half[0] and wp.abs(y) < lamp.half[1]:
-            return lamp.radiance
-    return scene.sky
-
-
-@wp.func
-def focused(scene: SceneData, at: wp.vec3) -> float:
-    """Light that ripples gather on a point in the water, relative to a flat surface.
-
-    To first order in the slope, light from straight above falls with 1 - (1 - n1/n2) depth ∇²h; its mean is 1.
-    """
-    above = surface_at(scene.waves, at[0], at[1])
-    bend = 1.0 - scene.index_near / scene.index_far
-    return wp.max(1.0 + scene.caustics * bend * at[2] * (above.hxx + above.hyy), 0.0)
-
-
-@wp.func
 def under_water(
-    scene: SceneData, origin: wp.vec3, ray: wp.vec3, t: float, angle: float, travelled: float, things: bool
+    scene: SceneData, origin: wp.vec3, ray: wp.vec3, t: float, angle: float, travelled: float, tagged: bool
 ) -> wp.vec3:
     """Radiance that reaches the surface from below.
 
@@ -455,23 +340,20 @@ def under_water(
         t: Time as a fraction of the exposure.
         angle: Width of the ray's share of the pixel per distance, in the water [rad].
         travelled: Distance before that counts for that width [m].
-        things: Whether tags and bodies may be near.
+        tagged: Whether tags may be near.
     """
     p = scene.basin.R_bs * (origin - scene.basin.origin)
     hit = meet_basin(scene.basin, p, scene.basin.R_bs * ray, angle, travelled)
-    if things:
-        thing = meet_things(scene, origin, ray, t, angle, travelled)
-        if thing.distance < hit.distance + ON_TOP:
-            hit = thing
-    radiance = hit.radiance
-    if scene.caustics > 0.0:
-        radiance *= focused(scene, origin + hit.distance * ray)
-    return through_water(radiance, scene.attenuation, scene.veil, hit.distance)
+    if tagged:
+        tag = meet_tags(scene, origin, ray, t, angle, travelled)
+        if tag.distance < hit.distance + ON_TOP:
+            hit = tag
+    return through_water(hit.radiance, scene.attenuation, scene.veil, hit.distance)
 
 
 @wp.func
 def radiance_along(
-    scene: SceneData, patch: Patch, ray: wp.vec3, t: float, angle: float, things: bool
+    scene: SceneData, patch: Patch, ray: wp.vec3, t: float, angle: float, tagged: bool
 ) -> wp.vec3:
     """Radiance that the camera receives from one direction at one moment.
 
@@ -481,7 +363,7 @@ def radiance_along(
         ray: Unit direction from the camera.
         t: Time as a fraction of the exposure.
         angle: Width of the ray's share of the pixel [rad].
-        things: Whether tags and bodies may be near.
+        tagged: Whether tags may be near.
     """
     eye = wp.vec3(0.0, 0.0, scene.camera_height)
     after = (t - 0.5) * scene.shutter
@@ -490,19 +372,19 @@ def radiance_along(
     basin_point = scene.basin.R_bs * (surface - scene.basin.origin)
     in_air = Surfel()
     in_air.distance = NOTHING
-    if things:
-        in_air = meet_things(scene, eye, ray, t, angle, 0.0)
+    if tagged:
+        in_air = meet_tags(scene, eye, ray, t, angle, 0.0)
     if in_air.distance < reach:
         return in_air.radiance
     if on_deck(scene.basin, basin_point):
         return scene.basin.deck_colour
     normal = normal_of(patch, surface[0], surface[1], after)
     bent = enter_water(scene, surface, ray, normal)
-    glare = (1.0 - bent.transmitted) * mirrored(scene, surface, ray, normal)
+    glare = (1.0 - bent.transmitted) * scene.sky
     below = wp.vec3(0.0)
     if bent.transmitted > 0.0:
         ratio = scene.index_near / scene.index_far
-        below = under_water(scene, bent.origin, bent.ray, t, ratio * angle, reach / ratio, things)
+        below = under_water(scene, bent.origin, bent.ray, t, ratio * angle, reach / ratio, tagged)
     return bent.transmitted * below + wp.vec3(glare, glare, glare)
 
 
@@ -567,7 +449,7 @@ def cast(
     Args:
         scene: What is there.
         corner_rays: Directions through the pixels' corners, zero where the lens sees nothing.
-        samples: Rays along each axis of each pixel; 0 for one ray that passes by all tags and bodies.
+        samples: Rays along each axis of each pixel; 0 for one ray that passes by all tags.
         first_row: Of the rectangle.
         first_column: Of the rectangle.
         radiance: Result over the rectangle.

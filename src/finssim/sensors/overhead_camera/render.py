@@ -1,4 +1,4 @@
-"""The overhead camera: pictures of a scene, whole or around the tags alone."""
+"""The overhead camera: pictures of a scene, complete or around the tags alone."""
 # mypy: disable-error-code="attr-defined,call-overload,no-untyped-call,index"
 
 from __future__ import annotations
@@ -11,25 +11,22 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.geometry.optics import Camera, Interface, Status, project
+from finssim.geometry.optics import Status, project
 from finssim.geometry.rotations import quat_rotate, quat_to_matrix
 from finssim.sensors.batch import SensorError
 from finssim.sensors.overhead_camera.photometry import digitise, noise_key
-from finssim.sensors.overhead_camera.raycast import BasinData, BodyData, LampData, SceneData, TagData, cast
+from finssim.sensors.overhead_camera.raycast import BasinData, SceneData, TagData, cast
 from finssim.sensors.overhead_camera.scene import (
     Basin,
-    Body,
-    Light,
-    Pose,
     Scene,
     SurfaceFrame,
     TagInScene,
     corner_rays_s,
     surface_frame,
 )
-from finssim.sensors.overhead_camera.surface import Wave, Waves, layout_of, pack_waves, waves_of
+from finssim.sensors.overhead_camera.surface import Wave, layout_of, pack_waves, waves_of
 
-# Which pixels tags and bodies may touch: rectangles of the image, with room for ripples and motion.
+# Which pixels tags may touch: rectangles of the image, with room for ripples and motion.
 
 
 Array = NDArray[np.float64]
@@ -54,40 +51,32 @@ class Rectangle(NamedTuple):
         return (self.right - self.left) * (self.bottom - self.top)
 
 
-_CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+_SQUARE = np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)])
+BORDER = 2
+"""Pixels around a tag that its picture may touch, besides those of the lens' spot."""
 
 
-def rectangles(
-    camera: Camera,
-    interface: Interface,
-    things: Sequence[TagInScene | Body],
-    steepest: float,
-    border: int = 2,
-) -> list[Rectangle]:
-    """A rectangle around the image of each thing; the whole image where that cannot be told.
+def rectangles(scene: Scene, tags: Sequence[TagInScene], steepest: float) -> list[Rectangle]:
+    """A rectangle around the image of each tag; the complete image where that cannot be said.
 
     Args:
-        camera: The camera.
-        interface: Still surface.
-        things: Tags and bodies.
-        steepest: Bound on the slope of ripples.
-        border: Pixels added on every side.
+        scene: Camera and still surface.
+        tags: Whose.
+        steepest: Bound on the slope of ripples [-].
     """
-    if not things:
+    if not tags:
         return []
-    corners = np.stack([_corners(thing) for thing in things])
-    pixels, seen = _seen(camera, interface, corners)
-    depth = np.max(np.abs(interface.distance(corners)), axis=1)
-    margin = border + _ripple_shift(camera, interface, corners, depth, steepest)
-    lens = camera.lens
-    whole = Rectangle(0, 0, lens.width, lens.height)
+    lens = scene.camera.lens
+    corners = np.stack([_corners(tag) for tag in tags])
+    pixels, visible = _seen(scene, corners)
+    depth = np.max(np.abs(scene.interface.distance(corners)), axis=1)
+    margin = BORDER + math.ceil(scene.sensor.spot) + _ripple_shift(scene, corners, depth, steepest)
     found = []
-    for i in range(len(things)):
-        if not seen[i].all():
-            found.append(whole)
-            continue
-        low, high = np.floor(pixels[i].min(0) - margin[i]), np.ceil(pixels[i].max(0) + margin[i]) + 1
-        box = Rectangle(*(int(x) for x in np.clip([*low, *high], -(2**30), 2**30)))
+    for i in range(len(tags)):
+        box = Rectangle(0, 0, lens.width, lens.height)
+        if visible[i].all():
+            low, high = np.floor(pixels[i].min(0) - margin[i]), np.ceil(pixels[i].max(0) + margin[i]) + 1
+            box = Rectangle(*(int(x) for x in np.clip([*low, *high], -(2**30), 2**30)))
         found.append(box.clipped(lens.width, lens.height))
     return found
 
@@ -109,20 +98,18 @@ def merged(found: Iterable[Rectangle]) -> list[Rectangle]:
     return done
 
 
-def _corners(thing: TagInScene | Body) -> Array:
-    """Corners of the thing at the start and the end of the exposure, pool frame, (16, 3)."""
-    half = np.array([thing.half_size, thing.half_size, 0.0]) if isinstance(thing, TagInScene) else None
-    half = 0.5 * np.asarray(thing.size, float) if half is None else half  # type: ignore[union-attr]
-    return np.concatenate([_placed(pose, half) for pose in (thing.pose, thing.end or thing.pose)])
+def _corners(tag: TagInScene) -> Array:
+    """Corners of a tag at the start and the end of the exposure, pool frame, (8, 3)."""
+    poses, half = (tag.pose, tag.end or tag.pose), tag.half_size
+    return np.concatenate(
+        [quat_rotate(x.orientation, half * _SQUARE) + np.asarray(x.position) for x in poses]
+    )
 
 
-def _placed(pose: Pose, half: Array) -> Array:
-    return np.asarray(quat_rotate(pose.orientation, _CUBE * half) + np.asarray(pose.position))
-
-
-def _seen(camera: Camera, interface: Interface, corners: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _seen(scene: Scene, corners: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Where corners appear, on whichever side of the surface they are, and whether they do."""
-    view = project(camera, interface, corners)
+    camera = scene.camera
+    view = project(camera, scene.interface, corners)
     dry = view.status == Status.WRONG_SIDE
     direct, ok = camera.lens.project((corners - camera.position) @ camera.R_pc)
     pixels = np.where(dry[..., None], direct, view.pixels)
@@ -130,10 +117,9 @@ def _seen(camera: Camera, interface: Interface, corners: Array) -> tuple[Array, 
     return pixels, ok & np.isfinite(pixels).all(-1)
 
 
-def _ripple_shift(
-    camera: Camera, interface: Interface, corners: Array, depth: Array, steepest: float
-) -> Array:
-    """Bound on how far ripples move the image of each thing [px]."""
+def _ripple_shift(scene: Scene, corners: Array, depth: Array, steepest: float) -> Array:
+    """Bound on how far ripples move the image of each tag [px]."""
+    camera, interface = scene.camera, scene.interface
     if steepest == 0.0:
         return np.zeros(len(depth))
     distance = np.linalg.norm(corners - camera.position, axis=-1)
@@ -148,47 +134,18 @@ def _ripple_shift(
 
 
 def pack_scene(scene: Scene, frame: SurfaceFrame, device: Any) -> SceneData:
-    """Everything but tags, bodies and waves, which change from picture to picture."""
+    """Everything but tags and waves, which change from picture to picture."""
     data = SceneData()
     data.camera_height = frame.camera_height
     data.index_near, data.index_far = scene.interface.index_near, scene.interface.index_far
     layers = scene.interface.window
     data.layer_thickness = wp.array([x.thickness for x in layers], dtype=float, device=device)
     data.layer_index = wp.array([x.index for x in layers], dtype=float, device=device)
-    data.caustics = 0.0 if scene.ripples is None else scene.ripples.caustics
     data.attenuation, data.veil = wp.vec3(*scene.water.attenuation), wp.vec3(*scene.water.veil)
-    data.sky = scene.light.sky
-    data.lamps = on_device(_lamps(scene.light, frame), LampData, device)
-    data.basin = _basin(scene.basin, frame, device)
+    data.sky = scene.sky
+    data.basin = _basin(scene.basin, frame)
     data.shutter, data.spot = scene.sensor.shutter, scene.sensor.spot
     return data
-
-
-def put_things(
-    data: SceneData,
-    frame: SurfaceFrame,
-    tags: Sequence[TagInScene],
-    bodies: Sequence[Body],
-    waves: Waves | None,
-    time: float,
-    device: Any,
-) -> None:
-    """Put tags, bodies and the waves of a moment into a packed scene.
-
-    Args:
-        data: From `pack_scene`.
-        frame: The surface frame.
-        tags: In the scene.
-        bodies: In the scene.
-        waves: The surface; None for a flat one.
-        time: Middle of the exposure [s].
-        device: Warp device.
-    """
-    data.tags = on_device(_tags(tags, frame), TagData, device)
-    cells = [np.asarray(tag.bitmap, np.uint8).ravel() for tag in tags]
-    data.cells = on_device(np.concatenate([*cells, np.zeros(0, np.uint8)]), wp.uint8, device)
-    data.bodies = on_device(_bodies(bodies, frame), BodyData, device)
-    data.waves = on_device(pack_waves(waves, frame.offset, time), Wave, device)
 
 
 def on_device(table: NDArray[Any], dtype: Any, device: Any) -> wp.array[Any]:
@@ -202,70 +159,44 @@ def on_device(table: NDArray[Any], dtype: Any, device: Any) -> wp.array[Any]:
     return array
 
 
-def _poses(table: NDArray[Any], i: int, pose: Pose, end: Pose | None, frame: SurfaceFrame) -> None:
-    for pose_then, place, axes in ((pose, "start", "q_start"), (end or pose, "end", "q_end")):
-        table[place][i] = frame.point(pose_then.position)
-        table[axes][i] = frame.quaternion(quat_to_matrix(pose_then.orientation))
-    if np.dot(table["q_start"][i], table["q_end"][i]) < 0.0:
-        table["q_end"][i] *= -1.0  # the same axes, on the short way from the start
-    table["moving"][i] = end is not None
-
-
 def _tags(tags: Sequence[TagInScene], frame: SurfaceFrame) -> NDArray[Any]:
     table = np.zeros(len(tags), dtype=layout_of(TagData))
     offset = 0
-    for i, tag in enumerate(tags):
-        _poses(table, i, tag.pose, tag.end, frame)
-        table["cell"][i], table["half"][i] = tag.cell, tag.half_size
-        table["cells"][i], table["offset"][i] = len(tag.bitmap), offset
-        table["white"][i], table["black"][i] = tag.white, tag.black
+    for row, tag in zip(table, tags, strict=True):
+        for pose, place, axes in ((tag.pose, "start", "q_start"), (tag.end or tag.pose, "end", "q_end")):
+            row[place] = frame.point(pose.position)
+            row[axes] = frame.quaternion(quat_to_matrix(pose.orientation))
+        if np.dot(row["q_start"], row["q_end"]) < 0.0:
+            row["q_end"] *= -1.0  # the same axes, on the short way from the start
+        row["moving"] = tag.end is not None
+        row["cell"], row["half"] = tag.cell, tag.half_size
+        row["cells"], row["offset"] = len(tag.bitmap), offset
+        row["white"], row["black"] = tag.white, tag.black
         offset += tag.bitmap.size
     return table
 
 
-def _bodies(bodies: Sequence[Body], frame: SurfaceFrame) -> NDArray[Any]:
-    table = np.zeros(len(bodies), dtype=layout_of(BodyData))
-    for i, body in enumerate(bodies):
-        _poses(table, i, body.pose, body.end, frame)
-        table["half"][i], table["colour"][i] = 0.5 * np.asarray(body.size), body.colour
-    return table
-
-
-def _lamps(light: Light, frame: SurfaceFrame) -> NDArray[Any]:
-    table = np.zeros(len(light.lamps), dtype=layout_of(LampData))
-    for i, lamp in enumerate(light.lamps):
-        table["centre"][i], table["half"][i] = frame.point(lamp.centre), 0.5 * np.asarray(lamp.size)
-        table["radiance"][i] = lamp.radiance
-    return table
-
-
-def _basin(basin: Basin, frame: SurfaceFrame, device: Any) -> BasinData:
+def _basin(basin: Basin, frame: SurfaceFrame) -> BasinData:
     data = BasinData()
-    normal_p = frame.R_sp[2]
     data.R_bs = wp.mat33(*frame.R_sp.T.ravel())
     data.origin = wp.vec3(*frame.point(basin.lower))
     data.size = wp.vec3(*np.subtract(basin.upper, basin.lower))
-    data.up = int(np.argmax(np.abs(normal_p)))
-    data.up_sign = float(np.sign(normal_p[data.up]))
+    data.up = int(np.argmax(np.abs(frame.R_sp[2])))
     data.tile, data.joint, data.variation = basin.tile, basin.joint, basin.variation
     data.colour, data.joint_colour = wp.vec3(*basin.colour), wp.vec3(*basin.joint_colour)
-    middles = np.asarray(basin.lanes, np.float32) - np.float32(basin.lower[basin.lane_axis])
-    data.lanes = wp.array(middles.reshape(-1), dtype=float, device=device)
-    data.lane_axis, data.lane_width = basin.lane_axis, basin.lane_width
-    data.lane_colour, data.deck_colour = wp.vec3(*basin.lane_colour), wp.vec3(*basin.deck_colour)
+    data.deck_colour = wp.vec3(*basin.deck_colour)
     return data
 
 
 Image = NDArray[np.uint8]
-Thing = TagInScene | Body
 Region = Rectangle | tuple[int, int, int, int]
 
 
 class OverheadCamera:
     """A fixed camera above a pool.
 
-    Its pictures are a function of the scene, the time and the seed: the same on every call, and in every region the
-    same as in the whole picture.
+    Its pictures are a function of the scene, the tags, the time and the seed: the same on every call, and in every
+    region the same as in the complete picture.
     """
 
     def __init__(self, scene: Scene, *, device: Any = "cpu") -> None:
@@ -285,53 +216,47 @@ class OverheadCamera:
         self._rays: wp.array[Any] = wp.array(rays, dtype=wp.vec3, device=self.device)
         self._data = pack_scene(scene, self._frame, self.device)
         self._waves = None if scene.ripples is None else waves_of(scene.ripples)
+        lens = scene.camera.lens
+        self._full = Rectangle(0, 0, lens.width, lens.height)
         self._background: Image | None = None
 
     def render(
         self,
         *,
-        tags: Sequence[TagInScene] | None = None,
-        bodies: Sequence[Body] | None = None,
+        tags: Sequence[TagInScene] = (),
         time: float = 0.0,
         seed: int = 0,
-        region: Literal["tags"] | Region | Sequence[Region] | None = None,
+        region: Literal["tags"] | Region | None = None,
     ) -> Image:
         """One picture.
 
         Args:
-            tags: Those to draw; the scene's if not given.
-            bodies: Those to draw; the scene's if not given.
+            tags: Those that move, besides the scene's.
             time: Middle of the exposure [s], for ripples and noise.
             seed: Of the noise.
-            region: What to draw anew, as (left, top, right, bottom) in pixels with right and bottom excluded, or a list
-                of these, or "tags" for the neighbourhood of all tags and bodies that are not fixed. The rest is the
-                background: the scene without them, at the time and with the seed of the first such call. None draws
-                everything.
+            region: What to draw anew, as (left, top, right, bottom) in pixels with right and bottom excluded, or "tags"
+                for the neighbourhood of `tags`. The remainder is the background: the scene without them, at the time
+                and with the seed of the first such call. None draws everything.
 
         Returns:
             (height, width) grey or (height, width, 3) red, green, blue.
         """
-        tags = self.scene.tags if tags is None else tuple(tags)
-        bodies = self.scene.bodies if bodies is None else tuple(bodies)
-        lens = self.scene.camera.lens
-        boxes = self._rectangles((*bodies, *tags))
-        if region is None:
-            whole = [Rectangle(0, 0, lens.width, lens.height)]
-            return self._picture(tags, bodies, time, seed, whole, boxes, None)
-        if self._background is None:
-            self._background = self.render(
-                tags=[x for x in self.scene.tags if x.fixed],
-                bodies=[x for x in self.scene.bodies if x.fixed],
-                time=time,
-                seed=seed,
-            )
-        if isinstance(region, str):
-            moving = zip((*bodies, *tags), boxes, strict=True)
-            chosen = [box for thing, box in moving if not thing.fixed]
-        else:
-            chosen = _listed(region)
-        chosen = merged(r.clipped(lens.width, lens.height) for r in chosen)
-        return self._picture(tags, bodies, time, seed, chosen, boxes, self._background)
+        sensor = self.scene.sensor
+        shape = (self._full.bottom, self._full.right, 3 if sensor.colour else 1)
+        start, chosen = np.zeros(shape, np.uint8), [self._full]
+        if region is not None:
+            chosen = self.neighbourhood(tags) if isinstance(region, str) else [self._clipped(region)]
+            if self._background is None:
+                self._background = self.render(time=time, seed=seed)
+            start = self._background.reshape(shape).copy()
+        image = on_device(start, wp.uint8, self.device)
+        samples = self._prepare((*self.scene.tags, *tags), time)
+        levels = [sensor.gain, sensor.full_well, sensor.read_noise, sensor.gamma, sensor.noise]
+        for r in chosen:
+            radiance = self._cast(r, samples)
+            inputs = [radiance, r.top, r.left, *levels, noise_key(seed, time), image]
+            wp.launch(digitise, dim=radiance.shape, inputs=inputs, device=self.device)
+        return np.asarray(image.numpy()).reshape(shape if sensor.colour else shape[:2])
 
     def radiance(self, *, time: float = 0.0, region: Region | None = None) -> NDArray[np.float32]:
         """Mean radiance of every pixel of the scene before it becomes a number, (height, width, 3); white paper has 1.
@@ -340,38 +265,30 @@ class OverheadCamera:
             time: Middle of the exposure [s].
             region: (left, top, right, bottom) in pixels; None for all.
         """
-        lens = self.scene.camera.lens
-        r = Rectangle(*(region or (0, 0, lens.width, lens.height))).clipped(lens.width, lens.height)
-        tags, bodies = self.scene.tags, self.scene.bodies
-        samples = self._prepare(tags, bodies, time, self._rectangles((*bodies, *tags)))
-        return np.asarray(self._cast(r, samples).numpy())
+        r = self._full if region is None else self._clipped(region)
+        return np.asarray(self._cast(r, self._prepare(self.scene.tags, time)).numpy())
 
-    def neighbourhood(
-        self, tags: Sequence[TagInScene] | None = None, bodies: Sequence[Body] | None = None
-    ) -> list[Rectangle]:
+    def neighbourhood(self, tags: Sequence[TagInScene]) -> list[Rectangle]:
         """The rectangles that `region="tags"` draws."""
-        tags = self.scene.tags if tags is None else tags
-        bodies = self.scene.bodies if bodies is None else bodies
-        return merged(self._rectangles(_moving(tags, bodies)))
+        return merged(self._rectangles(tags))
 
-    def _rectangles(self, things: Sequence[Thing]) -> list[Rectangle]:
-        steepest = 0.0 if self._waves is None else self._waves.steepest
-        border = 2 + math.ceil(self.scene.sensor.spot)
-        return rectangles(self.scene.camera, self.scene.interface, things, steepest, border)
+    def _clipped(self, region: Region) -> Rectangle:
+        if len(region) != 4:
+            raise SensorError(f"region {region}: expected (left, top, right, bottom) in pixels")
+        return Rectangle(*(int(x) for x in region)).clipped(self._full.right, self._full.bottom)
 
-    def _prepare(
-        self,
-        tags: Sequence[TagInScene],
-        bodies: Sequence[Body],
-        time: float,
-        boxes: Sequence[Rectangle],
-    ) -> wp.array[Any]:
-        """Pack what changes; rays per pixel, (height, width). `boxes`: of the bodies, then of the tags."""
-        put_things(self._data, self._frame, tags, bodies, self._waves, time, self.device)
-        lens = self.scene.camera.lens
-        samples = np.zeros((lens.height, lens.width), np.uint8)
-        for i, r in enumerate(boxes):
-            samples[r.top : r.bottom, r.left : r.right] = 1 if i < len(bodies) else self.scene.samples
+    def _rectangles(self, tags: Sequence[TagInScene]) -> list[Rectangle]:
+        return rectangles(self.scene, tags, 0.0 if self._waves is None else self._waves.steepest)
+
+    def _prepare(self, tags: Sequence[TagInScene], time: float) -> wp.array[Any]:
+        """Pack what changes; returns the rays per pixel, (height, width)."""
+        self._data.tags = on_device(_tags(tags, self._frame), TagData, self.device)
+        cells = [np.asarray(tag.bitmap, np.uint8).ravel() for tag in tags]
+        self._data.cells = on_device(np.concatenate([*cells, np.zeros(0, np.uint8)]), wp.uint8, self.device)
+        self._data.waves = on_device(pack_waves(self._waves, self._frame.offset, time), Wave, self.device)
+        samples = np.zeros((self._full.bottom, self._full.right), np.uint8)
+        for r in self._rectangles(tags):
+            samples[r.top : r.bottom, r.left : r.right] = self.scene.samples
         return on_device(samples, wp.uint8, self.device)
 
     def _cast(self, r: Rectangle, samples: wp.array[Any]) -> wp.array[Any]:
@@ -381,59 +298,3 @@ class OverheadCamera:
         blocks = ((r.bottom + 1) // 2 - r.top // 2, (r.right + 1) // 2 - r.left // 2)
         wp.launch(cast, dim=blocks, inputs=inputs, device=self.device)
         return radiance
-
-    def _picture(
-        self,
-        tags: Sequence[TagInScene],
-        bodies: Sequence[Body],
-        time: float,
-        seed: int,
-        region: Sequence[Rectangle],
-        boxes: Sequence[Rectangle],
-        background: Image | None,
-    ) -> Image:
-        sensor, lens = self.scene.sensor, self.scene.camera.lens
-        shape = (lens.height, lens.width, 3 if sensor.colour else 1)
-        start = np.zeros(shape, np.uint8) if background is None else background.reshape(shape).copy()
-        image = on_device(start, wp.uint8, self.device)
-        samples = self._prepare(tags, bodies, time, boxes)
-        levels = [sensor.gain, sensor.full_well, sensor.read_noise, sensor.gamma, sensor.noise]
-        for r in region:
-            radiance = self._cast(r, samples)
-            inputs = [radiance, r.top, r.left, *levels, noise_key(seed, time), image]
-            wp.launch(digitise, dim=radiance.shape, inputs=inputs, device=self.device)
-        return np.asarray(image.numpy()).reshape(shape if sensor.colour else shape[:2])
-
-
-def render(
-    scene: Scene, *, time: float = 0.0, seed: int = 0, region: Any = None, device: Any = "cpu"
-) -> Image:
-    """One picture of a scene; many pictures of one scene are faster from one `OverheadCamera`.
-
-    Args:
-        scene: What stands before the camera.
-        time: Middle of the exposure [s].
-        seed: Of the noise.
-        region: As of `OverheadCamera.render`.
-        device: Warp device.
-    """
-    return OverheadCamera(scene, device=device).render(time=time, seed=seed, region=region)
-
-
-def _moving(tags: Sequence[TagInScene], bodies: Sequence[Body]) -> list[Thing]:
-    things: tuple[Thing, ...] = (*tags, *bodies)
-    return [thing for thing in things if not thing.fixed]
-
-
-def _listed(region: Any) -> list[Rectangle]:
-    """One rectangle or several as a list.
-
-    Raises:
-        SensorError: They are not rectangles of four numbers.
-    """
-    several = region if len(region) == 0 or np.ndim(region[0]) == 1 else [region]
-    if any(len(r) != 4 for r in several):
-        raise SensorError(
-            f"region {region}: expected (left, top, right, bottom) in pixels, or a list of these"
-        )
-    return [Rectangle(*(int(x) for x in r)) for r in several]

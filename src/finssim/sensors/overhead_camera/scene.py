@@ -1,4 +1,4 @@
-"""What stands before a fixed camera above a pool: basin, water, light, tags and bodies, as plain data.
+"""What stands before a fixed camera above a pool: basin, water, light and tags, as plain data.
 
 Everything is in the pool frame unless a line says otherwise. Radiance is relative: white paper in the pool's light
 has 1. Colours and water constants are triples (red, green, blue).
@@ -56,8 +56,6 @@ class TagInScene:
     """Reflectance of paper; laminated white paper has 0.85 to 0.92."""
     black: float = 0.05
     """Reflectance of print; toner has 0.03 to 0.06."""
-    fixed: bool = False
-    """Whether it belongs to the background that region renders keep: surveyed tags on the floor."""
 
     def __post_init__(self) -> None:
         if self.bitmap.ndim != 2 or self.bitmap.shape[0] != self.bitmap.shape[1]:
@@ -81,21 +79,6 @@ class TagInScene:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Body:
-    """A matt box, such as a vehicle's hull under its tags; origin at its middle, axes along its edges."""
-
-    size: Triple
-    """Full edge lengths [m]."""
-    pose: Pose
-    """At the start of the exposure."""
-    end: Pose | None = None
-    """At its end; None for a body at rest."""
-    colour: Triple = (0.95, 0.60, 0.06)
-    fixed: bool = False
-    """Whether it belongs to the background that region renders keep."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Basin:
     """The pool's tiled inside, an upright box between two corners; around it lies the deck."""
 
@@ -112,13 +95,6 @@ class Basin:
     joint_colour: Triple = (0.80, 0.84, 0.84)
     variation: float = 0.05
     """Relative standard deviation of the reflectance from tile to tile."""
-    lanes: tuple[float, ...] = ()
-    """Where the dark lane lines run on the floor: their middles along `lane_axis` [m]."""
-    lane_axis: int = 1
-    """Pool axis across the lanes, 0, 1 or 2."""
-    lane_width: float = 0.25
-    """[m]"""
-    lane_colour: Triple = (0.06, 0.10, 0.28)
     deck_colour: Triple = (0.62, 0.60, 0.56)
     """Reflectance of what lies around the pool."""
 
@@ -152,8 +128,6 @@ class Ripples:
     """How many sines; their wavelengths are spread evenly on a logarithmic scale and share the mean square slope."""
     seed: int = 0
     """Of wavelengths, headings and phases."""
-    caustics: float = 0.0
-    """How much of the light comes straight down and is focused by the ripples, 0 to 1. Lamps and sky: 0; noon: 0.8."""
 
     def __post_init__(self) -> None:
         shortest, longest = self.wavelengths
@@ -162,27 +136,6 @@ class Ripples:
                 f"ripples: slope {self.rms_slope}, {self.waves} waves of {shortest} to {longest} m:"
                 " expected slope >= 0, waves >= 1 and 0 < shortest <= longest"
             )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lamp:
-    """A bright rectangle parallel to the water, seen in the surface as glare."""
-
-    centre: Triple
-    """[m]"""
-    size: tuple[float, float]
-    """Full lengths along the interface's two tangents [m]."""
-    radiance: float = 30.0
-    """White paper in the pool's light has 1; a lamp panel has 10 to 100."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Light:
-    """Light on the scene is even from above and gives white paper radiance 1; the rest is mirrored in the surface."""
-
-    sky: float = 0.3
-    """Radiance of ceiling or sky. At normal incidence water mirrors 2 % of it."""
-    lamps: tuple[Lamp, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,13 +175,15 @@ class Scene:
     """Between camera and water; its layers are flat, so ripples need an interface without window."""
     basin: Basin
     water: Water = field(default_factory=Water)
-    light: Light = field(default_factory=Light)
+    sky: float = 0.3
+    """Radiance of ceiling or sky, of which the surface shows 2 % at normal incidence. Light on the scene is even, from
+    above."""
     ripples: Ripples | None = None
     tags: tuple[TagInScene, ...] = ()
-    bodies: tuple[Body, ...] = ()
+    """Those that stay where they are: surveyed tags on the floor."""
     sensor: Sensor = field(default_factory=Sensor)
     samples: int = 2
-    """Rays per pixel along each image axis near tags and bodies (elsewhere one ray). Texture and tiles are filtered
+    """Rays per pixel along each image axis near tags (elsewhere one ray). Texture and tiles are filtered
     over each ray's share of the pixel, so 2 places a straight edge to about 0.01 px."""
 
     def __post_init__(self) -> None:
