@@ -66,16 +66,13 @@ class Dive:
         self.messages.append((time, system, component, kind, fields))
 
     def channels(self, time, ms):
-        raw = {f"chan{n}_raw": 1500 for n in range(1, 19)} | {
-            "chan5_raw": 1700,
-            "chan3_raw": 1400,
-            "chan4_raw": 1460,
-        }
+        raw = {f"chan{n}_raw": 1500 for n in range(1, 19)}
+        raw |= {"chan1_raw": 1520, "chan2_raw": 1460, "chan3_raw": 1400, "chan4_raw": 1460, "chan5_raw": 1700}
         self.add(time, 1, 1, "RC_CHANNELS", {"time_boot_ms": ms, "chancount": 8, "rssi": 255, **raw})
 
     def joystick(self, time, ms):
         self.add(time, 1, 1, "NAMED_VALUE_FLOAT", {"time_boot_ms": ms, "name": "PilotGain", "value": 0.5})
-        axes = {"x": 1000, "y": 0, "z": 250, "r": -200, "s": 0, "t": 0}
+        axes = {"x": 1000, "y": 0, "z": 250, "r": -200, "s": 20, "t": -40}
         self.add(time, 255, 190, "MANUAL_CONTROL", {"target": 1, "buttons": 0, **axes})
 
     def tlog(self, path):
@@ -122,10 +119,10 @@ class Dive:
 @pytest.mark.parametrize("form", ["tlog", "mcap"])
 @pytest.mark.parametrize("sticks", ["channels", "joystick"])
 def test_axes_in_manual_become_pulses(tmp_path, form, sticks):
-    """Half ahead, a quarter down, a tenth to the left: neutral while disarmed, left out in another mode."""
+    """Half ahead, a quarter down, a little of the others: neutral while disarmed, left out in another mode."""
     path = getattr(Dive(sticks), form)(tmp_path / f"dive.{form}")
     (trial,) = read_trials([path], vehicle="bluerov2_heavy")
-    expected = Mixer.of_frame("VECTORED_6DOF").pulses([0.0, 0.0, -0.1, -0.25, 0.5, 0.0])
+    expected = Mixer.of_frame("VECTORED_6DOF").pulses([-0.1, 0.05, -0.1, -0.25, 0.5, 0.0])
     pulses = pulses_of(trial)
     assert len(pulses) == 50
     np.testing.assert_array_equal(pulses[:10], 1500.0)
