@@ -487,7 +487,9 @@ def test_the_command_serves_until_its_time_is_over(capsys):
     client, states = StandIn(address, silence=0.3), []
     thread = threading.Thread(target=lambda: states.extend(client.step() for _ in range(20)))
     thread.start()
-    words = "ardusub-sitl --site open-water --start 1,2,-3,90 --duration 0.05 --wave 0.5,20,90 --dvl 127.0.0.1:0"
+    words = (
+        "ardusub-sitl --site open-water --start 1,2,-3,90 --duration 0.05 --wave 0.5,20,90 --dvl 127.0.0.1:0"
+    )
     assert boundary.run(app, [*words.split(), "--bind", f"127.0.0.1:{address[1]}"]) == 0
     thread.join(5.0)
     assert states[0]["position"] == pytest.approx([1.0, -2.0, 3.0], abs=0.01)
