@@ -331,8 +331,8 @@ def test_a_low_battery_disarms_after_its_timer():
     assert not ground.firmware.armed
 
 
-def test_a_leak_is_told_and_with_two_it_surfaces():
-    """FS_LEAK_ENABLE 1 tells and drives on, 2 goes up."""
+def test_a_leak_is_reported_and_with_two_it_surfaces():
+    """FS_LEAK_ENABLE 1 warns and drives on, 2 goes up."""
     ground = Ground().armed()
     ground.pool.faults.leak = True
     assert ground.texts(ground.run(0.5)) == ["Leak Detected"] and ground.firmware.mode == MANUAL
