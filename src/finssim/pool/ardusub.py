@@ -53,6 +53,8 @@ SENSORS = sum(
 """Bits of SYS_STATUS of what every vehicle has."""
 WITHOUT_SAMPLE = {"heartbeat", "autopilot_version", "rc_channels", "servo_output_raw", "system_time"}
 """Messages that need no instrument."""
+FRD = TO_FOSSEN.A
+"""Forward, left, up to forward, right, down, (3, 3): half a turn, so that rates and quaternions turn by it too."""
 STANDARD_GRAVITY = 9.80665
 """[m/s^2]"""
 
@@ -315,16 +317,16 @@ class ArduSub:
             elif aid.kind == VELOCITY:
                 velocities.append(aid)
         q = np.array(self._filter.quaternion)
-        self._quaternion = TO_FOSSEN.quaternion(q)
+        self._quaternion = np.append(FRD @ q[:3], q[3])
         self._attitude = np.array(quat_to_euler(self._quaternion)).ravel()
-        self._gyro = TO_FOSSEN.axial(gyro)
-        self._rates = TO_FOSSEN.axial(gyro - np.array(self._filter.bias))
-        self._force = TO_FOSSEN.vector(accel)
+        self._gyro = FRD @ gyro
+        self._rates = FRD @ (gyro - self._filter.bias)
+        self._force = FRD @ accel
         self._climb_by(float(quat_rotate(q, accel)[2]) - self._gravity, dt)
         if self.parameters["VISO_TYPE"] and self._dvl is not None:
             self._position += dt * self._velocity * (now - self._velocity_time < POSITION_LASTS)
             for aid in velocities:
-                over_floor = TO_FOSSEN.vector(quat_to_matrix(self._dvl.orientation) @ np.array(aid.values))
+                over_floor = FRD @ quat_to_matrix(self._dvl.orientation) @ aid.values
                 self._velocity, self._velocity_time = quat_rotate(self._quaternion, over_floor)[:2], now
 
     def _climb_by(self, acceleration: float, dt: float) -> None:
