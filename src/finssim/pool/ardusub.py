@@ -43,23 +43,18 @@ ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
 """Results of commands."""
 CRITICAL, WARNING, INFO = 2, 4, 6
 """Severities of texts."""
-CAPABILITIES = (
-    mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
-    | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-    | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-)
-SENSORS = (
-    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
-    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-    | mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
-    | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
-    | mavlink.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
-    | mavlink.MAV_SYS_STATUS_AHRS
-    | mavlink.MAV_SYS_STATUS_PREARM_CHECK
-)
+CAPABILITIES = 2 | 8 | 8192
+"""Parameters as floats, COMMAND_INT, MAVLink 2."""
+SENSORS = sum(
+    getattr(mavlink, f"MAV_SYS_STATUS_{name}")
+    for name in ("SENSOR_3D_GYRO", "SENSOR_3D_ACCEL", "SENSOR_ABSOLUTE_PRESSURE", "SENSOR_BATTERY",
+                 "SENSOR_MOTOR_OUTPUTS", "AHRS", "PREARM_CHECK")
+)  # fmt: skip
 """Bits of SYS_STATUS of what every vehicle has."""
 WITHOUT_SAMPLE = {"heartbeat", "autopilot_version", "rc_channels", "servo_output_raw", "system_time"}
 """Messages that need no instrument."""
+FRD = TO_FOSSEN.A
+"""Forward, left, up to forward, right, down, (3, 3): half a turn, so that rates and quaternions turn by it too."""
 STANDARD_GRAVITY = 9.80665
 """[m/s^2]"""
 
@@ -173,11 +168,7 @@ class ArduSub:
         table |= {"FRAME_CONFIG": (INT8, frame), "VISO_TYPE": (INT8, float(self._dvl is not None))}
         for i, function in enumerate(BUTTONS):
             table |= {f"BTN{i}_FUNCTION": (INT8, function), f"BTN{i}_SFUNCTION": (INT8, 0)}
-        for i in range(1, 9):
-            table |= {
-                f"RC{i}_{end}": (INT16, width)
-                for end, width in (("MIN", 1100), ("MAX", 1900), ("TRIM", NEUTRAL))
-            }
+        table |= {f"RC{i}_TRIM": (INT16, NEUTRAL) for i in range(1, 9)}
         for i, direction in enumerate(self._mixer.directions, 1):
             table |= {f"MOT_{i}_DIRECTION": (INT8, float(direction)), f"SERVO{i}_FUNCTION": (INT16, 32.0 + i)}
         table |= {f"SR0_{name}": (INT16, 0) for name in GROUPS}
@@ -199,7 +190,7 @@ class ArduSub:
         self._inputs, self._input_times = list(BOOT_INPUTS), [-math.inf] * 18
         self._pilot_seen, self._ground_seen = -math.inf, -math.inf
         self._pilot_lost, self._ground_lost, self._battery_low, self._leaking = True, False, False, False
-        self._low_since, self._leak_told = math.inf, -math.inf
+        self._low_since, self._leak_reported = math.inf, -math.inf
         self._gain, self._buttons = self._within("JS_GAIN_DEFAULT", 0.1, 1.0), 0
         self._filter = AttitudeFilter(self._spec.attitude_gain, self._spec.attitude_integral, self._gravity)
         self._rates_sum, self._rates_count, self._fastest = np.zeros(3), 0, 0.0
@@ -214,7 +205,7 @@ class ArduSub:
         self._origin: tuple[int, int] | None = None
         self._battery, self._used = (0.0, 0.0), 0.0
         self._dvl_time = now
-        self._asked_parameters: deque[str] = deque()
+        self._requested_parameters: deque[str] = deque()
         self._sender = (0, 0)
         self._rebooting = False
         self._interval: dict[str, float] = {}
@@ -252,11 +243,8 @@ class ArduSub:
             if handler is not None and for_us and getattr(message, "target_component", 1) in (0, 1):
                 handler(message)
         # What is left is no whole frame: it must not swallow the next one.
-        self._mav.buf, self._mav.buf_index, self._mav.expected_length = (
-            bytearray(),
-            0,
-            mavlink.HEADER_LEN_V1 + 2,
-        )
+        self._mav.buf, self._mav.buf_index = bytearray(), 0
+        self._mav.expected_length = mavlink.HEADER_LEN_V1 + 2
         out = self._drain()
         if self._rebooting:
             self.reboot(now)
@@ -271,8 +259,8 @@ class ArduSub:
         for i, since in enumerate(self._input_times):
             if since > -math.inf and 0.0 <= lasts < now - since:
                 self._release(i)
-        self._look_after_pilot(now)
-        self._look_after_ground(now)
+        self._check_pilot(now)
+        self._check_ground(now)
         self._drive()
 
     def frames(
@@ -295,15 +283,15 @@ class ArduSub:
         self._used += self._battery[1] * max(now - self._sampled, 0.0) / 3.6
         if not faults.freeze_sensors or self._sample is None:
             self._sense(now, sample, aids)
-        self._look_after_battery(now)
-        self._look_after_leak(now, faults.leak)
+        self._check_battery(now)
+        self._check_leak(now, faults.leak)
         self._hold()
         for name, due in self._due.items():
             if now >= due - 1e-9:
                 self._due[name] = max(due + self._interval[name], now - self._interval[name])
                 self._report(name)
-        for _ in range(min(4, len(self._asked_parameters))):
-            self._send_parameter(self._asked_parameters.popleft())
+        for _ in range(min(4, len(self._requested_parameters))):
+            self._send_parameter(self._requested_parameters.popleft())
         return self._drain() + lines
 
     def _drain(self) -> list[bytes]:
@@ -331,16 +319,16 @@ class ArduSub:
             elif aid.kind == VELOCITY:
                 velocities.append(aid)
         q = np.array(self._filter.quaternion)
-        self._quaternion = TO_FOSSEN.quaternion(q)
+        self._quaternion = np.append(FRD @ q[:3], q[3])
         self._attitude = np.array(quat_to_euler(self._quaternion)).ravel()
-        self._gyro = TO_FOSSEN.axial(gyro)
-        self._rates = TO_FOSSEN.axial(gyro - np.array(self._filter.bias))
-        self._force = TO_FOSSEN.vector(accel)
+        self._gyro = FRD @ gyro
+        self._rates = FRD @ (gyro - self._filter.bias)
+        self._force = FRD @ accel
         self._climb_by(float(quat_rotate(q, accel)[2]) - self._gravity, dt)
         if self.parameters["VISO_TYPE"] and self._dvl is not None:
             self._position += dt * self._velocity * (now - self._velocity_time < POSITION_LASTS)
             for aid in velocities:
-                over_floor = TO_FOSSEN.vector(quat_to_matrix(self._dvl.orientation) @ np.array(aid.values))
+                over_floor = FRD @ quat_to_matrix(self._dvl.orientation) @ aid.values
                 self._velocity, self._velocity_time = quat_rotate(self._quaternion, over_floor)[:2], now
 
     def _climb_by(self, acceleration: float, dt: float) -> None:
@@ -500,7 +488,7 @@ class ArduSub:
             toggled = high if self._gain < high else low
             self._gain = toggled if function == 41 else self._gain + (step if function == 42 else -step)
             self._gain = max(low, min(high, self._gain))
-            self._say(INFO, f"#Gain is at {100.0 * self._gain:.0f}%")
+            self._statustext(INFO, f"#Gain is at {100.0 * self._gain:.0f}%")
 
     def _on_rc_channels_override(self, message: Any) -> None:
         if not self._from_ground():
@@ -532,64 +520,64 @@ class ArduSub:
     def _arm(self, forced: bool = False) -> bool:
         reasons = [] if forced or not self.parameters["ARMING_CHECK"] else self._unfit()
         for reason in reasons:
-            self._say(CRITICAL, f"Arm: {reason}")
+            self._statustext(CRITICAL, f"Arm: {reason}")
         if reasons:
             return False
         if not self.armed:
             self.armed = True
-            self._say(INFO, "Arming motors")
-            self._beat_soon()
+            self._statustext(INFO, "Arming motors")
+            self._heartbeat_now()
         return True
 
     def _disarm(self) -> bool:
         if self.armed:
             self.armed = False
-            self._say(INFO, "Disarming motors")
-            self._beat_soon()
+            self._statustext(INFO, "Disarming motors")
+            self._heartbeat_now()
         self._drive()
         return True
 
     def _set_mode(self, mode: int) -> bool:
         depth = self._sample is not None and math.isfinite(self._sample.pressure)
         if mode not in (MANUAL, STABILIZE) and not (mode in (ALT_HOLD, SURFACE) and depth):
-            self._say(WARNING, "Flight mode change failed")
+            self._statustext(WARNING, "Flight mode change failed")
             return False
         if mode != self.mode:
             if mode == MANUAL:
                 self._neutral_sticks()
             self.mode, self._held, self._held_yaw, self._held_altitude = mode, None, None, None
             self._hold()
-            self._beat_soon()
+            self._heartbeat_now()
         return True
 
-    def _beat_soon(self) -> None:
+    def _heartbeat_now(self) -> None:
         if "heartbeat" in self._due:
             self._due["heartbeat"] = self._now
 
-    def _look_after_pilot(self, now: float) -> None:
+    def _check_pilot(self, now: float) -> None:
         """No input for FS_PILOT_TIMEOUT: sticks to neutral, and disarmed where FS_PILOT_INPUT says so; once a loss."""
         action = self.parameters["FS_PILOT_INPUT"]
         lost = action > 0 and now - self._pilot_seen > self.parameters["FS_PILOT_TIMEOUT"]
         if lost and not self._pilot_lost:
-            self._say(CRITICAL, "Lost manual control")
+            self._statustext(CRITICAL, "Lost manual control")
             self._neutral_sticks()
             if action == 2:
                 self._disarm()
         self._pilot_lost = lost
 
-    def _look_after_ground(self, now: float) -> None:
+    def _check_ground(self, now: float) -> None:
         """No heartbeat of the ground station for FS_GCS_TIMEOUT, once there was one: what FS_GCS_ENABLE says."""
         action, since = self.parameters["FS_GCS_ENABLE"], self._ground_seen
         lost = action > 0 and since > -math.inf and now - since > self.parameters["FS_GCS_TIMEOUT"]
         if lost and not self._ground_lost:
-            self._say(WARNING, f"MYGCS: {self.parameters['SYSID_MYGCS']:.0f}, heartbeat lost")
+            self._statustext(WARNING, f"MYGCS: {self.parameters['SYSID_MYGCS']:.0f}, heartbeat lost")
             if action == 2:
                 self._disarm()
             elif action in (3, 4) and self.armed and not self._set_mode(ALT_HOLD if action == 3 else SURFACE):
                 self._disarm()
         self._ground_lost = lost
 
-    def _look_after_battery(self, now: float) -> None:
+    def _check_battery(self, now: float) -> None:
         """BATT_FS_LOW_ACT (2 disarm, 3 surface) after BATT_LOW_TIMER below BATT_LOW_VOLT; once a start."""
         p = self.parameters
         if self._battery[0] >= p["BATT_LOW_VOLT"]:
@@ -597,7 +585,7 @@ class ArduSub:
         self._low_since = min(self._low_since, now if self._battery[0] < p["BATT_LOW_VOLT"] else math.inf)
         if not self._battery_low and now - self._low_since >= p["BATT_LOW_TIMER"]:
             self._battery_low = True
-            self._say(
+            self._statustext(
                 WARNING,
                 f"Battery 1 is low {self._battery[0]:.2f}V used {self._used:.0f} mAh",
             )
@@ -606,17 +594,17 @@ class ArduSub:
             elif p["BATT_FS_LOW_ACT"] == 3 and self.armed:
                 self._set_mode(SURFACE)
 
-    def _look_after_leak(self, now: float, leaking: bool) -> None:
-        """FS_LEAK_ENABLE: 1 tells, every 20 s; 2 surfaces too."""
+    def _check_leak(self, now: float, leaking: bool) -> None:
+        """FS_LEAK_ENABLE: 1 warns, every 20 s; 2 surfaces too."""
         action = self.parameters["FS_LEAK_ENABLE"]
         self._leaking = leaking and action > 0
         if not self._leaking:
-            self._leak_told = -math.inf
-        elif now - self._leak_told > 20.0:
-            self._say(CRITICAL, "Leak Detected")
-            if action == 2 and self.armed and self._leak_told == -math.inf:
+            self._leak_reported = -math.inf
+        elif now - self._leak_reported > 20.0:
+            self._statustext(CRITICAL, "Leak Detected")
+            if action == 2 and self.armed and self._leak_reported == -math.inf:
                 self._set_mode(SURFACE)
-            self._leak_told = now
+            self._leak_reported = now
 
     # Commands.
 
@@ -676,7 +664,7 @@ class ArduSub:
         return ACCEPTED if 1.0 in (values[0], values[2]) else UNSUPPORTED
 
     def _do_refuse(self, values: list[float]) -> int:
-        self._say(WARNING, "Motor outputs are the mixer's alone")
+        self._statustext(WARNING, "Motor outputs are the mixer's alone")
         return FAILED
 
     def _do_reboot(self, values: list[float]) -> int:
@@ -695,7 +683,7 @@ class ArduSub:
 
     def _on_param_request_list(self, message: Any) -> None:
         self._greet()
-        self._asked_parameters = deque(self._table)
+        self._requested_parameters = deque(self._table)
 
     def _on_param_request_read(self, message: Any) -> None:
         names = dict(enumerate(self._table))
@@ -778,12 +766,12 @@ class ArduSub:
         """Put a message on the link, by its name in lower case and its fields in MAVLink's order."""
         self._mav.send(getattr(mavlink, f"MAVLink_{name}_message")(*fields))
 
-    def _say(self, severity: int, text: str) -> None:
+    def _statustext(self, severity: int, text: str) -> None:
         self._send("statustext", severity, text.encode()[:50])
 
     def _greet(self) -> None:
-        self._say(INFO, "ArduSub V{}.{}.{} (FinsSim)".format(*VERSION))
-        self._say(INFO, f"Frame: {self._mixer.autopilot.name}")
+        self._statustext(INFO, "ArduSub V{}.{}.{} (FinsSim)".format(*VERSION))
+        self._statustext(INFO, f"Frame: {self._mixer.autopilot.name}")
 
     def _reporter(self, name: str) -> Callable[[], tuple[Any, ...]] | None:
         """What gives the fields of a message, or of several, by its name."""

@@ -7,14 +7,14 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 from finssim.pool.fleet import Fleet, Medium, one_picture
-from finssim.pool.pictures import UdpSender, bound_socket
+from finssim.pool.pictures import UdpSender
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
-from finssim.robot.link.transports import Address, Transport, resolved
+from finssim.robot.link.transports import Address, TcpServer, Transport, bound_socket, resolved
 from finssim.robot.link.water_linked import DvlServer
 from finssim.robot.lockstep import (
     LockstepError,
@@ -118,12 +118,12 @@ class LockstepServer:
         self._listener.close()
 
 
-MOST_STATIONS = 8
-"""Ground stations that have a link of a kind at a time."""
+MOST_CALLERS = 8
+"""Ground stations that are answered over UDP: those that called last."""
+LARGEST = 2048
+"""Bytes taken of a datagram."""
 MOST_FRAMES = 1024
 """Taken of UDP by one call, so that a flood cannot hold the loop up."""
-STREAM = 1 << 16
-"""Bytes taken of a stream at once."""
 
 
 def whole_frames(data: bytearray) -> list[bytes]:
@@ -166,19 +166,15 @@ class GroundLinks:
             LinkError: One cannot be bound or found.
         """
         self._fixed = [resolved(station) for station in stations]
-        self._callers: deque[Address] = deque(maxlen=MOST_STATIONS)
-        self._streams: dict[socket.socket, bytearray] = {}
+        self._callers: deque[Address] = deque(maxlen=MOST_CALLERS)
         with ExitStack() as stack:
             self._socket = stack.enter_context(bound_socket(socket.SOCK_DGRAM, bind))
-            self._listener = stack.enter_context(bound_socket(socket.SOCK_STREAM, tcp))
-            self._listener.listen(MOST_STATIONS)
-            for end in (self._socket, self._listener):
-                end.setblocking(False)
-            self.dvl = DvlServer(dvl)
+            self._socket.setblocking(False)
+            self._streams = stack.enter_context(closing(TcpServer(tcp, bytearray)))
+            self.dvl = stack.enter_context(closing(DvlServer(dvl)))
             self._stack = stack.pop_all()
-        self._stack.callback(self.dvl.close)
         self.address: Address = self._socket.getsockname()
-        self.tcp: Address = self._listener.getsockname()
+        self.tcp = self._streams.address
 
     def receive(self) -> list[bytes]:
         """Whole frames of all stations, which the other stations get too."""
@@ -186,31 +182,13 @@ class GroundLinks:
         frames: list[bytes] = []
         with suppress(BlockingIOError, ConnectionError):
             while len(frames) < MOST_FRAMES:
-                data, sender = self._socket.recvfrom(STREAM)
+                data, sender = self._socket.recvfrom(LARGEST)
                 if sender not in (*self._fixed, *self._callers):
                     self._callers.append(sender)  # and forget the one that came first, if they are too many
                 frames += self._pass_on(bytearray(data), sender)
-        with suppress(OSError):
-            while True:
-                station, _ = self._listener.accept()
-                station.setblocking(False)
-                station.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                if len(self._streams) < MOST_STATIONS:
-                    self._streams[station] = bytearray()
-                else:
-                    station.close()
-        for station, stream in list(self._streams.items()):
-            try:
-                data = station.recv(STREAM)
-            except BlockingIOError:
-                continue
-            except OSError:
-                data = b""
-            if data:
-                stream += data
-                frames += self._pass_on(stream, station)
-            else:
-                self._leave(station)
+        for station, stream, data in self._streams.receive():
+            stream += data
+            frames += self._pass_on(stream, station)
         return frames
 
     def send(self, data: bytes) -> None:
@@ -218,46 +196,35 @@ class GroundLinks:
         if data[:1] == b"{":
             self.dvl.send(data)
         else:
-            self._tell(data)
+            self._broadcast(data)
 
     def close(self) -> None:
         """Let everyone go."""
-        for station in list(self._streams):
-            self._leave(station)
         self._stack.close()
 
     def describe(self) -> str:
         """Who is there."""
-        return f"{len(self._callers)} stations over UDP, {len(self._streams)} over TCP"
+        return f"{len(self._callers)} stations over UDP, {len(self._streams.clients)} over TCP"
 
     def _pass_on(self, stream: bytearray, source: object) -> list[bytes]:
         frames = whole_frames(stream)
         for frame in frames:
-            self._tell(frame, but=source)
+            self._broadcast(frame, source)
         return frames
 
-    def _tell(self, frame: bytes, but: object = None) -> None:
+    def _broadcast(self, frame: bytes, source: object = None) -> None:
+        """To all stations but the source."""
         for address in [*self._fixed, *self._callers]:
-            if address != but:
+            if address != source:
                 with suppress(OSError):  # nobody listens there yet
                     self._socket.sendto(frame, address)
-        for station in list(self._streams):
-            if station is not but:
-                try:
-                    if station.send(frame) < len(frame):
-                        self._leave(station)  # it does not read
-                except OSError:
-                    self._leave(station)
-
-    def _leave(self, station: socket.socket) -> None:
-        self._streams.pop(station, None)
-        station.close()
+        for station in list(self._streams.clients):
+            if station is not source:
+                self._streams.send(frame, station)
 
 
 RATE = 60.0
 """Steps a second of the software of vehicles that the task commands [Hz]."""
-LARGEST = 2048
-"""Bytes taken of a datagram."""
 
 
 class MediumServer:
