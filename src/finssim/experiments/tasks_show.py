@@ -90,7 +90,6 @@ def describe_task(
         "period_s": the_task.control_step,
         "substeps": the_task.substeps,
         "time_limit_s": the_task.time_limit,
-        "levels": the_task.levels,
         "reward": _reward(the_task),
         "ends": [
             {"name": one.name, "reward": one.reward, "told": _text(the_task, one.term)} for one in terms.ends
@@ -231,9 +230,6 @@ def _head(result: Mapping[str, Any]) -> list[str]:
         "baselines": ", ".join(result["baselines"]) or "none",
         "noise in training": _value(result["training_noise"]) or "none",
         **{f"seen with sensors, {name}": _value(one) for name, one in result["sensors"].items()},
-        "levels": f"0 to {result['levels'] - 1}; training may climb them with --set level_at=0.8"
-        if result["levels"]
-        else "",
     }
     return [f"{name}: {text}" for name, text in lines.items() if text]
 
