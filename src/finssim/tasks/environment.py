@@ -9,10 +9,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.control.modes import MODES
+from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
 from finssim.engine import Pool, Simulator, TetherLine, Water
 from finssim.engine.randomize import Randomization
-from finssim.tasks.actions import add_action
+from finssim.physics.plant import VehicleCommand
+from finssim.physics.types import vec8
+from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.drawing import Drawing
 from finssim.tasks.given import (
     GREATEST_SEED,
@@ -35,6 +37,27 @@ GPU_FROZEN_CHECK = 100
 """Steps between looks for frozen worlds on a GPU."""
 
 
+@wp.kernel(enable_backward=False)
+def act(
+    arrays: TaskArrays,
+    command: wp.array2d(dtype=VehicleCommand),
+    data: ModeData,
+    agents: int,
+    world_offset: int,
+):
+    """Thrusts of every vehicle: of an agent's own action, or of what the task says for one of the others."""
+    i, v = wp.tid()
+    w = world_offset + i
+    size = data.columns.shape[1]
+    a = vec8()
+    for k in range(size):
+        if v < agents:
+            a[k] = arrays.action[w, v * size + k]
+        else:
+            a[k] = arrays.scripted[w, (v - agents) * size + k]
+    command[w, v].thrust = thrusts_of(a, v, data)
+
+
 class Environment:
     """The task's agents, which are the first vehicles of every world, act; the task commands the others.
 
@@ -44,7 +67,7 @@ class Environment:
         nominal: The vehicles as their controllers know them.
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
-        drawing: What randomisation draws, how its ranges grow, and a log of it.
+        drawing: What randomisation draws, and how its ranges grow.
     """
 
     def __init__(
@@ -170,14 +193,13 @@ class Environment:
         self._batch = batch = Batch(self.simulator.state, self.arrays, self.seed)
         if self.task.others:
             self.task.add_command(self._step, batch)
-        add_action(
-            self.action_mode,
-            self.nominal,
-            self.simulator.command,
-            self.arrays,
-            self.agents,
-            self.wrench_scale,
-        )(self._step)
+        # Controllers know the nominal limits and allocation; what the simulated thrusters deliver may differ. What the
+        # task commands is in parts of all of the limits, however gently the agents are to act.
+        own = self.wrench_scale if MODES[self.action_mode].wrench else 1.0
+        scales = [own if v < self.agents else 1.0 for v in range(len(self.nominal))]
+        modes = mode_data(self.action_mode, self.nominal, scales, self.device)
+        command = self.simulator.command.array
+        self._step.add(act, [self.arrays, command, modes, self.agents], vehicles=len(self.nominal))
         self.drawing.add_step(self._step, self.seed)
         self.simulator.add_step(self._step)
         self._add_measure(self._step)
