@@ -46,11 +46,13 @@ clean:  ## remove what was built, the environment included
 	rm -rf $(VENV) build dist site .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find src tests examples -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# torch goes first and alone: where a CPU wheel is at hand pip takes it, and no later step may exchange it.
+# torch goes first and alone: where a CPU wheel is at hand pip takes it, and no later step may exchange it. MAVProxy (GPLv3,
+# which a test runs as a process) goes last and alone: what it needs is there, and what it asks for exchanges OpenCV.
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python >= 3.10 is needed; name one with: make PYTHON=python3.12")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet "$$(grep '^torch==' constraints.txt)"
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
+	$(BIN)/python -m pip install --quiet --no-deps "$$(grep '^MAVProxy==' constraints.txt)"
 	@rm -f $(VENV)/.installed-*
 	@touch $@

@@ -128,6 +128,7 @@ HOMES = {
     "pupil_apriltags": {"localization/detection/families.py"},
     "serial": {"robot/link/transports.py"},
     "mcap": {
+        "calibration/importers/ardusub.py",
         "robot/recorder.py",
         "robot/record_reader.py",
     },

@@ -80,8 +80,14 @@ EXTRAS = {
         {"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "be ROS 2 nodes without an installed ROS 2"
     ),
     "hardware": Extra(
-        {"mcap": "mcap", "pygame": "pygame", "pyserial": "serial", "rosbags": "rosbags"},
-        "reach a vehicle over a serial line, steer it with a gamepad, record its runs",
+        {
+            "mcap": "mcap",
+            "pygame": "pygame",
+            "pymavlink": "pymavlink",
+            "pyserial": "serial",
+            "rosbags": "rosbags",
+        },
+        "reach a vehicle over a serial line or MAVLink, steer it with a gamepad, record its runs",
     ),
 }
 

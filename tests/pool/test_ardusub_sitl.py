@@ -259,10 +259,11 @@ def test_packets_that_wait_get_one_answer(world):
     """SITL takes one answer per frame: one that was sent again while we were slow is not answered twice."""
     server = SitlServer(world, ("127.0.0.1", 0))
     client = StandIn(server.address)
-    for _ in range(3):
-        client.send(STILL)
+    for pulses in (STILL, STILL, mixed(throttle=-1.0)):
+        client.send(pulses)
     time.sleep(0.02)
     server.serve_once()
+    assert world.simulator.numpy("thrust")[0, 0, 4] > 0.0, "the newest one counts"
     assert client.socket.recv(65536).startswith(b'\n{"timestamp":0.0025')
     with pytest.raises(TimeoutError):
         client.socket.recv(65536)
@@ -486,11 +487,15 @@ def test_the_command_serves_until_its_time_is_over(capsys):
     client, states = StandIn(address, silence=0.3), []
     thread = threading.Thread(target=lambda: states.extend(client.step() for _ in range(20)))
     thread.start()
-    words = "ardusub-sitl --site open-water --start 1,2,-3,90 --duration 0.05 --voltage 15 --dvl 127.0.0.1:0"
+    words = (
+        "ardusub-sitl --site open-water --start 1,2,-3,90 --duration 0.05 --wave 0.5,20,90 --dvl 127.0.0.1:0"
+    )
     assert boundary.run(app, [*words.split(), "--bind", f"127.0.0.1:{address[1]}"]) == 0
     thread.join(5.0)
     assert states[0]["position"] == pytest.approx([1.0, -2.0, 3.0], abs=0.01)
     assert states[0]["attitude"][2] == pytest.approx(-math.pi / 2, abs=0.01)
+    north, east, _ = states[-1]["velocity"]
+    assert east < -0.01 and abs(north) < 0.1 * abs(east), "carried by a wave that travels to the left, west"
     assert states[0]["rng_1"] == pytest.approx(17.0, abs=0.01)
     assert "20 frames" in capsys.readouterr().out
     client.socket.close()

@@ -8,6 +8,7 @@ vehicle itself. Its axes are forward, right, down in north, east, down; north is
 from __future__ import annotations
 
 import math
+import struct
 from collections import deque
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
@@ -38,6 +39,25 @@ STABILIZE, ALT_HOLD, SURFACE, MANUAL = 0, 2, 9, 19
 """Modes, by their numbers in HEARTBEAT.custom_mode."""
 VERSION = (4, 5, 0)
 
+ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
+"""Results of commands."""
+CRITICAL, WARNING, INFO = 2, 4, 6
+"""Severities of texts."""
+CAPABILITIES = 2 | 8 | 8192
+"""Parameters as floats, COMMAND_INT, MAVLink 2."""
+SENSORS = sum(
+    getattr(mavlink, f"MAV_SYS_STATUS_{name}")
+    for name in ("SENSOR_3D_GYRO", "SENSOR_3D_ACCEL", "SENSOR_ABSOLUTE_PRESSURE", "SENSOR_BATTERY",
+                 "SENSOR_MOTOR_OUTPUTS", "AHRS", "PREARM_CHECK")
+)  # fmt: skip
+"""Bits of SYS_STATUS of what every vehicle has."""
+WITHOUT_SAMPLE = {"heartbeat", "autopilot_version", "rc_channels", "servo_output_raw", "system_time"}
+"""Messages that need no instrument."""
+FRD = TO_FOSSEN.A
+"""Forward, left, up to forward, right, down, (3, 3): half a turn, so that rates and quaternions turn by it too."""
+STANDARD_GRAVITY = 9.80665
+"""[m/s^2]"""
+
 SYSTEM = 1
 NEUTRAL, HALF_RANGE = 1500, 400
 """Pulse width of no demand and how far a full one is from it [µs]."""
@@ -61,9 +81,12 @@ COMPASS_SHARE = 0.05
 POSITION_LASTS = 5.0
 """A position is given so long after the last velocity [s]."""
 
+FTP_NAK, FTP_UNKNOWN = 129, 7
+"""Answer to an operation of file transfer, and its reason."""
+
 GROUPS = {
-    "RAW_SENS": (1, "raw_imu scaled_imu2 scaled_pressure scaled_pressure2"),
-    "EXT_STAT": (2, "sys_status power_status named_value_float"),
+    "RAW_SENS": (1, "raw_imu scaled_imu2 scaled_pressure2"),
+    "EXT_STAT": (2, "sys_status named_value_float"),
     "RC_CHAN": (3, "servo_output_raw rc_channels"),
     "POSITION": (6, "global_position_int local_position_ned"),
     "EXTRA1": (10, "attitude"),
@@ -86,6 +109,7 @@ REALS = {
 }  # fmt: skip
 WHOLE = {
     "ANGLE_MAX": (INT16, 4500), "ARMING_CHECK": (INT32, 1), "BATT_FS_LOW_ACT": (INT8, 2), "BATT_LOW_TIMER": (INT8, 10),
+    "BATT_CAPACITY": (INT32, 18000),
     "BATT_MONITOR": (INT8, 4), "COMPASS_USE": (INT8, 1), "EK3_ENABLE": (INT8, 1), "EK3_SRC1_POSXY": (INT8, 6),
     "EK3_SRC1_VELXY": (INT8, 6), "FS_GCS_ENABLE": (INT8, 2), "FS_LEAK_ENABLE": (INT8, 1), "FS_PILOT_INPUT": (INT8, 2),
     "JS_GAIN_STEPS": (INT8, 4), "PILOT_SPEED_UP": (INT16, 500), "SYSID_MYGCS": (INT16, 255),
@@ -144,11 +168,7 @@ class ArduSub:
         table |= {"FRAME_CONFIG": (INT8, frame), "VISO_TYPE": (INT8, float(self._dvl is not None))}
         for i, function in enumerate(BUTTONS):
             table |= {f"BTN{i}_FUNCTION": (INT8, function), f"BTN{i}_SFUNCTION": (INT8, 0)}
-        for i in range(1, 9):
-            table |= {
-                f"RC{i}_{end}": (INT16, width)
-                for end, width in (("MIN", 1100), ("MAX", 1900), ("TRIM", NEUTRAL))
-            }
+        table |= {f"RC{i}_TRIM": (INT16, NEUTRAL) for i in range(1, 9)}
         for i, direction in enumerate(self._mixer.directions, 1):
             table |= {f"MOT_{i}_DIRECTION": (INT8, float(direction)), f"SERVO{i}_FUNCTION": (INT16, 32.0 + i)}
         table |= {f"SR0_{name}": (INT16, 0) for name in GROUPS}
@@ -170,27 +190,27 @@ class ArduSub:
         self._inputs, self._input_times = list(BOOT_INPUTS), [-math.inf] * 18
         self._pilot_seen, self._ground_seen = -math.inf, -math.inf
         self._pilot_lost, self._ground_lost, self._battery_low, self._leaking = True, False, False, False
-        self._low_since, self._leak_told = math.inf, -math.inf
+        self._low_since, self._leak_reported = math.inf, -math.inf
         self._gain, self._buttons = self._within("JS_GAIN_DEFAULT", 0.1, 1.0), 0
         self._filter = AttitudeFilter(self._spec.attitude_gain, self._spec.attitude_integral, self._gravity)
         self._rates_sum, self._rates_count = np.zeros(3), 0
         self._sample: Sample | None = None
         self._sampled, self._headed = now, False
         self._attitude, self._quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
-        self._rates, self._force = np.zeros(3), np.zeros(3)
+        self._rates, self._gyro, self._force = np.zeros(3), np.zeros(3), np.zeros(3)
         self._altitude = self._climb = self._climb_integral = 0.0
         self._held_altitude: float | None = None
         self._held_yaw: float | None = None
         self._position, self._velocity, self._velocity_time = np.zeros(2), np.zeros(2), -math.inf
         self._origin: tuple[int, int] | None = None
-        self._battery = (self._boot, 0.0)
+        self._battery, self._used = (0.0, 0.0), 0.0
         self._dvl_time = now
-        self._asked_parameters: deque[int] = deque()
-        self._servos = [0] * 16
+        self._requested_parameters: deque[str] = deque()
+        self._sender = (0, 0)
         self._rebooting = False
-        self._interval: dict[int, float] = {}
-        self._due: dict[int, float] = {}
-        self._every(mavlink.MAVLINK_MSG_ID_HEARTBEAT, 1.0)
+        self._interval: dict[str, float] = {}
+        self._due: dict[str, float] = {}
+        self._every("heartbeat", 1.0)
         for name in GROUPS:
             self._stream(name, self.parameters[f"SR0_{name}"])
         self._greet()
@@ -218,15 +238,13 @@ class ArduSub:
         self._now = max(self._now, now)
         for message in self._mav.parse_buffer(data) or ():
             handler = getattr(self, f"_on_{message.get_type().lower()}", None)
+            self._sender = message.get_srcSystem(), message.get_srcComponent()
             for_us = getattr(message, "target_system", self._id) in (0, self._id)
             if handler is not None and for_us and getattr(message, "target_component", 1) in (0, 1):
                 handler(message)
         # What is left is no whole frame: it must not swallow the next one.
-        self._mav.buf, self._mav.buf_index, self._mav.expected_length = (
-            bytearray(),
-            0,
-            mavlink.HEADER_LEN_V1 + 2,
-        )
+        self._mav.buf, self._mav.buf_index = bytearray(), 0
+        self._mav.expected_length = mavlink.HEADER_LEN_V1 + 2
         out = self._drain()
         if self._rebooting:
             self.reboot(now)
@@ -241,8 +259,8 @@ class ArduSub:
         for i, since in enumerate(self._input_times):
             if since > -math.inf and 0.0 <= lasts < now - since:
                 self._release(i)
-        self._look_after_pilot(now)
-        self._look_after_ground(now)
+        self._check_pilot(now)
+        self._check_ground(now)
         self._drive()
 
     def frames(
@@ -262,17 +280,18 @@ class ArduSub:
             return lines
         self._now, self._faults = max(self._now, now), faults
         self._battery = (faults.battery_voltage or float(plant.electric[0]), float(plant.electric[1]))
+        self._used += self._battery[1] * max(now - self._sampled, 0.0) / 3.6
         if not faults.freeze_sensors or self._sample is None:
             self._sense(now, sample, aids)
-        self._look_after_battery(now)
-        self._look_after_leak(now, faults.leak)
+        self._check_battery(now)
+        self._check_leak(now, faults.leak)
         self._hold()
-        for number, due in self._due.items():
+        for name, due in self._due.items():
             if now >= due - 1e-9:
-                self._due[number] = max(due + self._interval[number], now - self._interval[number])
-                self._report(number)
-        for _ in range(min(4, len(self._asked_parameters))):
-            self._send_parameter(self._asked_parameters.popleft())
+                self._due[name] = max(due + self._interval[name], now - self._interval[name])
+                self._report(name)
+        for _ in range(min(4, len(self._requested_parameters))):
+            self._send_parameter(self._requested_parameters.popleft())
         return self._drain() + lines
 
     def _drain(self) -> list[bytes]:
@@ -298,15 +317,17 @@ class ArduSub:
             elif aid.kind == VELOCITY:
                 velocities.append(aid)
         q = np.array(self._filter.quaternion)
-        self._quaternion = TO_FOSSEN.quaternion(q)
+        self._quaternion = np.append(FRD @ q[:3], q[3])
         self._attitude = np.array(quat_to_euler(self._quaternion)).ravel()
-        self._rates = TO_FOSSEN.axial(gyro - np.array(self._filter.bias))
-        self._force = TO_FOSSEN.vector(accel)
+        self._gyro = FRD @ gyro
+        self._rates = FRD @ (gyro - self._filter.bias)
+        self._force = FRD @ accel
         self._climb_by(float(quat_rotate(q, accel)[2]) - self._gravity, dt)
         if self.parameters["VISO_TYPE"] and self._dvl is not None:
             self._position += dt * self._velocity * (now - self._velocity_time < POSITION_LASTS)
             for aid in velocities:
-                self._move(TO_FOSSEN.vector(quat_to_matrix(self._dvl.orientation) @ np.array(aid.values)))
+                over_floor = FRD @ quat_to_matrix(self._dvl.orientation) @ aid.values
+                self._velocity, self._velocity_time = quat_rotate(self._quaternion, over_floor)[:2], now
 
     def _climb_by(self, acceleration: float, dt: float) -> None:
         """Height and climb rate from pressure and vertical acceleration [m/s^2]: an observer of two poles."""
@@ -318,10 +339,6 @@ class ArduSub:
         error = measured - self._altitude
         self._altitude += dt * (self._climb + 2.0 / DEPTH_LAG * error)
         self._climb += dt * (acceleration + error / DEPTH_LAG**2)
-
-    def _move(self, velocity: Array) -> None:
-        """Take a velocity over the floor, forward, right, down [m/s]."""
-        self._velocity, self._velocity_time = quat_rotate(self._quaternion, velocity)[:2], self._now
 
     def _dvl_lines(self, now: float, aids: Sequence[NavigationAid], plant: Plant) -> list[bytes]:
         """Reports of the Doppler log: its velocities, and that it has none where it misses more than one."""
@@ -426,16 +443,16 @@ class ArduSub:
         for channel in range(6):
             self._release(channel)
 
-    def _from_ground(self, message: Any) -> bool:
-        """Whether it came from the ground station that may steer."""
-        return bool(message.get_srcSystem() == self.parameters["SYSID_MYGCS"])
+    def _from_ground(self) -> bool:
+        """Whether the newest message came from the ground station that may steer."""
+        return bool(self._sender[0] == self.parameters["SYSID_MYGCS"])
 
     def _on_heartbeat(self, message: Any) -> None:
-        if self._from_ground(message) and not (self._faults and self._faults.no_ground_heartbeat):
+        if self._from_ground() and not (self._faults and self._faults.no_ground_heartbeat):
             self._ground_seen = self._now
 
     def _on_manual_control(self, message: Any) -> None:
-        if not self._from_ground(message) or message.target != self._id:
+        if not self._from_ground() or message.target != self._id:
             return
         self._pilot_seen = self._ground_seen = self._now
         pressed, self._buttons = message.buttons & ~self._buttons, message.buttons
@@ -469,10 +486,10 @@ class ArduSub:
             toggled = high if self._gain < high else low
             self._gain = toggled if function == 41 else self._gain + (step if function == 42 else -step)
             self._gain = max(low, min(high, self._gain))
-            self._say(mavlink.MAV_SEVERITY_INFO, f"#Gain is at {100.0 * self._gain:.0f}%")
+            self._statustext(INFO, f"#Gain is at {100.0 * self._gain:.0f}%")
 
     def _on_rc_channels_override(self, message: Any) -> None:
-        if not self._from_ground(message):
+        if not self._from_ground():
             return
         self._pilot_seen = self._ground_seen = self._now
         for i in range(18):
@@ -496,74 +513,69 @@ class ArduSub:
             reasons.append("Disarm button not assigned")
         if self._battery[0] < max(p["BATT_ARM_VOLT"], p["BATT_LOW_VOLT"]):
             reasons.append(f"Battery 1 low voltage {self._battery[0]:.1f}")
-        for i in range(1, 9):
-            if p[f"RC{i}_MIN"] > 1300 or p[f"RC{i}_MAX"] < 1700:
-                reasons.append(f"RC{i} limits too narrow")
         return reasons
 
     def _arm(self, forced: bool = False) -> bool:
         reasons = [] if forced or not self.parameters["ARMING_CHECK"] else self._unfit()
         for reason in reasons:
-            self._say(mavlink.MAV_SEVERITY_CRITICAL, f"Arm: {reason}")
+            self._statustext(CRITICAL, f"Arm: {reason}")
         if reasons:
             return False
         if not self.armed:
             self.armed = True
-            self._say(mavlink.MAV_SEVERITY_INFO, "Arming motors")
-            self._beat_soon()
+            self._statustext(INFO, "Arming motors")
+            self._heartbeat_now()
         return True
 
     def _disarm(self) -> bool:
         if self.armed:
             self.armed = False
-            self._say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
-            self._beat_soon()
+            self._statustext(INFO, "Disarming motors")
+            self._heartbeat_now()
         self._drive()
         return True
 
     def _set_mode(self, mode: int) -> bool:
         depth = self._sample is not None and math.isfinite(self._sample.pressure)
         if mode not in (MANUAL, STABILIZE) and not (mode in (ALT_HOLD, SURFACE) and depth):
-            self._say(mavlink.MAV_SEVERITY_WARNING, "Flight mode change failed")
+            self._statustext(WARNING, "Flight mode change failed")
             return False
         if mode != self.mode:
             if mode == MANUAL:
                 self._neutral_sticks()
             self.mode, self._held, self._held_yaw, self._held_altitude = mode, None, None, None
             self._hold()
-            self._beat_soon()
+            self._heartbeat_now()
         return True
 
-    def _beat_soon(self) -> None:
-        if mavlink.MAVLINK_MSG_ID_HEARTBEAT in self._interval:
-            self._due[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = self._now
+    def _heartbeat_now(self) -> None:
+        if "heartbeat" in self._due:
+            self._due["heartbeat"] = self._now
 
-    def _look_after_pilot(self, now: float) -> None:
+    def _check_pilot(self, now: float) -> None:
         """No input for FS_PILOT_TIMEOUT: sticks to neutral, and disarmed where FS_PILOT_INPUT says so; once a loss."""
         action = self.parameters["FS_PILOT_INPUT"]
         lost = action > 0 and now - self._pilot_seen > self.parameters["FS_PILOT_TIMEOUT"]
         if lost and not self._pilot_lost:
-            self._say(mavlink.MAV_SEVERITY_CRITICAL, "Lost manual control")
+            self._statustext(CRITICAL, "Lost manual control")
             self._neutral_sticks()
             if action == 2:
                 self._disarm()
         self._pilot_lost = lost
 
-    def _look_after_ground(self, now: float) -> None:
+    def _check_ground(self, now: float) -> None:
         """No heartbeat of the ground station for FS_GCS_TIMEOUT, once there was one: what FS_GCS_ENABLE says."""
         action, since = self.parameters["FS_GCS_ENABLE"], self._ground_seen
         lost = action > 0 and since > -math.inf and now - since > self.parameters["FS_GCS_TIMEOUT"]
         if lost and not self._ground_lost:
-            self._say(
-                mavlink.MAV_SEVERITY_WARNING, f"MYGCS: {self.parameters['SYSID_MYGCS']:.0f}, heartbeat lost"
-            )
+            self._statustext(WARNING, f"MYGCS: {self.parameters['SYSID_MYGCS']:.0f}, heartbeat lost")
             if action == 2:
                 self._disarm()
             elif action in (3, 4) and self.armed and not self._set_mode(ALT_HOLD if action == 3 else SURFACE):
                 self._disarm()
         self._ground_lost = lost
 
-    def _look_after_battery(self, now: float) -> None:
+    def _check_battery(self, now: float) -> None:
         """BATT_FS_LOW_ACT (2 disarm, 3 surface) after BATT_LOW_TIMER below BATT_LOW_VOLT; once a start."""
         p = self.parameters
         if self._battery[0] >= p["BATT_LOW_VOLT"]:
@@ -571,109 +583,91 @@ class ArduSub:
         self._low_since = min(self._low_since, now if self._battery[0] < p["BATT_LOW_VOLT"] else math.inf)
         if not self._battery_low and now - self._low_since >= p["BATT_LOW_TIMER"]:
             self._battery_low = True
-            self._say(mavlink.MAV_SEVERITY_WARNING, f"Battery 1 is low {self._battery[0]:.2f}V used 0 mAh")
+            self._statustext(
+                WARNING,
+                f"Battery 1 is low {self._battery[0]:.2f}V used {self._used:.0f} mAh",
+            )
             if p["BATT_FS_LOW_ACT"] == 2:
                 self._disarm()
             elif p["BATT_FS_LOW_ACT"] == 3 and self.armed:
                 self._set_mode(SURFACE)
 
-    def _look_after_leak(self, now: float, leaking: bool) -> None:
-        """FS_LEAK_ENABLE: 1 tells, every 20 s; 2 surfaces too."""
+    def _check_leak(self, now: float, leaking: bool) -> None:
+        """FS_LEAK_ENABLE: 1 warns, every 20 s; 2 surfaces too."""
         action = self.parameters["FS_LEAK_ENABLE"]
         self._leaking = leaking and action > 0
         if not self._leaking:
-            self._leak_told = -math.inf
-        elif now - self._leak_told > 20.0:
-            self._say(mavlink.MAV_SEVERITY_CRITICAL, "Leak Detected")
-            if action == 2 and self.armed and self._leak_told == -math.inf:
+            self._leak_reported = -math.inf
+        elif now - self._leak_reported > 20.0:
+            self._statustext(CRITICAL, "Leak Detected")
+            if action == 2 and self.armed and self._leak_reported == -math.inf:
                 self._set_mode(SURFACE)
-            self._leak_told = now
+            self._leak_reported = now
 
     # Commands.
 
     def _on_command_long(self, message: Any) -> None:
-        self._command(message, [getattr(message, f"param{i}") for i in range(1, 8)])
+        self._command(message.command, [getattr(message, f"param{i}") for i in range(1, 8)])
 
     def _on_command_int(self, message: Any) -> None:
-        first = [getattr(message, f"param{i}") for i in range(1, 5)]
-        self._command(message, [*first, float(message.x), float(message.y), message.z])
+        self._command(message.command, [getattr(message, f"param{i}") for i in range(1, 5)])
 
-    def _command(self, message: Any, values: list[float]) -> None:
+    def _on_set_mode(self, message: Any) -> None:
+        result = self._do_set_mode([float(message.base_mode), float(message.custom_mode)])
+        self._send("command_ack", mavlink.MAVLINK_MSG_ID_SET_MODE, result)
+
+    def _command(self, command: int, values: list[float]) -> None:
         """Do it or refuse it; one that is not known is unsupported, never met with silence."""
         values = [value if abs(value) < 1e9 else -1.0 for value in values]  # NaN as well: no command takes it
-        do = COMMANDS.get(message.command)
-        result = mavlink.MAV_RESULT_UNSUPPORTED if do is None else do(self, values)
-        sender = message.get_srcSystem(), message.get_srcComponent()
-        self._send(mavlink.MAVLink_command_ack_message(message.command, int(result), 0, 0, *sender))
+        do = COMMANDS.get(command)
+        result = UNSUPPORTED if do is None else do(self, values)
+        self._send("command_ack", command, result, 0, 0, *self._sender)
 
     def _do_arm(self, values: list[float]) -> int:
         if values[0] not in (0.0, 1.0):
-            return int(mavlink.MAV_RESULT_UNSUPPORTED)
+            return UNSUPPORTED
         return _result(self._arm(values[1] == FORCE) if values[0] else self._disarm())
 
     def _do_set_mode(self, values: list[float]) -> int:
         if not int(values[0]) & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
-            return int(mavlink.MAV_RESULT_DENIED)
+            return DENIED
         return _result(self._set_mode(int(values[1])))
 
     def _do_set_interval(self, values: list[float]) -> int:
-        number, interval = int(values[0]), 1e-6 * values[1]
-        if self._reporter(number) is None:
-            return int(mavlink.MAV_RESULT_FAILED)
-        if values[1] == 0.0:
-            default = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
-            for name, (_, messages) in GROUPS.items():
-                rate = self.parameters[f"SR0_{name}"]
-                default |= {_number(m): 1.0 / rate for m in messages.split() if rate > 0.0}
-            interval = default.get(number, -1.0)
-        self._every(number, interval)
-        return int(mavlink.MAV_RESULT_ACCEPTED)
-
-    def _do_get_interval(self, values: list[float]) -> int:
-        number = int(values[0])
-        known = self._reporter(number) is not None
-        interval = round(1e6 * self._interval[number]) if number in self._interval else -1
-        if known:
-            self._send(mavlink.MAVLink_message_interval_message(number, interval))
-        return _result(known)
+        name, interval = _name(values[0]), 1e-6 * values[1]
+        if self._reporter(name) is None:
+            return FAILED
+        if interval == 0.0:
+            rates = [
+                self.parameters[f"SR0_{group}"]
+                for group, (_, names) in GROUPS.items()
+                if name in names.split()
+            ]
+            interval = 1.0 / rates[0] if rates and rates[0] > 0.0 else float(name == "heartbeat")
+        self._every(name, interval)
+        return ACCEPTED
 
     def _do_request(self, values: list[float]) -> int:
-        return _result(self._report(int(values[0])))
+        return _result(self._report(_name(values[0])))
 
     def _do_request_version(self, values: list[float]) -> int:
-        return _result(values[0] == 1.0 and self._report(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION))
+        return _result(values[0] == 1.0 and self._report("autopilot_version"))
 
     def _do_calibrate(self, values: list[float]) -> int:
-        """Gyroscope (first) and ground pressure (third); nothing while armed."""
+        """Gyroscope (first, which the start has done) and ground pressure (third); nothing while armed."""
         if self.armed or self._sample is None:
-            return int(mavlink.MAV_RESULT_FAILED)
+            return FAILED
         if values[2] == 1.0:
             self._store("BARO1_GND_PRESS", self._sample.pressure)
-        return int(
-            mavlink.MAV_RESULT_ACCEPTED if 1.0 in (values[0], values[2]) else mavlink.MAV_RESULT_UNSUPPORTED
-        )
+        return ACCEPTED if 1.0 in (values[0], values[2]) else UNSUPPORTED
 
-    def _do_test_motor(self, values: list[float]) -> int:
-        self._say(mavlink.MAV_SEVERITY_CRITICAL, "Motor test refused: not emulated")
-        return int(mavlink.MAV_RESULT_FAILED)
-
-    def _do_set_servo(self, values: list[float]) -> int:
-        output = int(values[0])
-        if not len(self.pulses) < output <= 16 or not 0.0 <= values[1] <= 65535.0:
-            self._say(mavlink.MAV_SEVERITY_WARNING, f"ServoRelayEvent: Channel {output} is already in use")
-            return int(mavlink.MAV_RESULT_FAILED)
-        self._servos[output - 1] = int(values[1])
-        return int(mavlink.MAV_RESULT_ACCEPTED)
+    def _do_refuse(self, values: list[float]) -> int:
+        self._statustext(WARNING, "Motor outputs are the mixer's alone")
+        return FAILED
 
     def _do_reboot(self, values: list[float]) -> int:
-        if self.armed or values[0] not in (1.0, 3.0):
-            return int(mavlink.MAV_RESULT_FAILED)
-        self._rebooting = True
-        return int(mavlink.MAV_RESULT_ACCEPTED)
-
-    def _on_set_mode(self, message: Any) -> None:
-        result = self._do_set_mode([float(message.base_mode), float(message.custom_mode)])
-        self._send(mavlink.MAVLink_command_ack_message(mavlink.MAVLINK_MSG_ID_SET_MODE, result))
+        self._rebooting = not self.armed and values[0] in (1.0, 3.0)
+        return _result(self._rebooting)
 
     # Parameters, streams and what else a ground station asks.
 
@@ -687,19 +681,18 @@ class ArduSub:
 
     def _on_param_request_list(self, message: Any) -> None:
         self._greet()
-        self._asked_parameters = deque(range(len(self._table)))
+        self._requested_parameters = deque(self._table)
 
     def _on_param_request_read(self, message: Any) -> None:
-        names = list(self._table)
-        index = names.index(message.param_id) if message.param_id in self._table else -1
-        index = index if message.param_index == -1 else message.param_index
-        if 0 <= index < len(names):
-            self._send_parameter(index)
+        names = dict(enumerate(self._table))
+        name = message.param_id if message.param_index == -1 else names.get(message.param_index)
+        if name in self._table:
+            self._send_parameter(name)
 
     def _on_param_set(self, message: Any) -> None:
         if message.param_id in self._table and math.isfinite(message.param_value):
             self._store(message.param_id, message.param_value)
-            self._send_parameter(list(self._table).index(message.param_id))
+            self._send_parameter(message.param_id)
 
     def _store(self, name: str, value: float) -> None:
         kind = self._table[name][0]
@@ -710,57 +703,48 @@ class ArduSub:
         if name.startswith("SR0_"):
             self._stream(name.removeprefix("SR0_"), value)
 
-    def _send_parameter(self, index: int) -> None:
-        name, (kind, _) = list(self._table.items())[index]
-        value = self.parameters[name]
-        self._send(mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(self._table), index))
+    def _send_parameter(self, name: str) -> None:
+        index, kind = list(self._table).index(name), self._table[name][0]
+        self._send("param_value", name.encode(), self.parameters[name], kind, len(self._table), index)
 
     def _on_request_data_stream(self, message: Any) -> None:
-        for name, (number, _) in GROUPS.items():
+        for group, (number, _) in GROUPS.items():
             if message.req_stream_id in (0, number):
-                self._stream(name, message.req_message_rate * message.start_stop)
+                self._stream(group, message.req_message_rate * message.start_stop)
 
     def _stream(self, group: str, rate: float) -> None:
-        for message in GROUPS[group][1].split():
-            self._every(_number(message), 1.0 / rate if rate > 0.0 else -1.0)
+        for name in GROUPS[group][1].split():
+            self._every(name, 1.0 / rate if rate > 0.0 else 0.0)
 
-    def _every(self, number: int, interval: float) -> None:
-        """Send a message at an interval [s]; none or a negative one ends it."""
+    def _every(self, name: str, interval: float) -> None:
+        """Send a message at an interval [s]; 0 or a negative one ends it."""
         if interval > 0.0:
-            self._interval[number] = max(interval, 0.0025)
-            self._due.setdefault(number, self._now)
+            self._interval[name] = max(interval, 0.0025)
+            self._due.setdefault(name, self._now)
         else:
-            self._interval.pop(number, None)
-            self._due.pop(number, None)
+            self._interval.pop(name, None)
+            self._due.pop(name, None)
 
     def _on_mission_request_list(self, message: Any) -> None:
-        sender, kind = (message.get_srcSystem(), message.get_srcComponent()), message.mission_type
-        if kind in (0, 1, 2):
-            self._send(mavlink.MAVLink_mission_count_message(*sender, 0, kind))
-        else:
-            self._send(mavlink.MAVLink_mission_ack_message(*sender, mavlink.MAV_MISSION_UNSUPPORTED, kind))
+        self._send("mission_count", *self._sender, 0, message.mission_type)
 
     def _on_mission_clear_all(self, message: Any) -> None:
-        sender = message.get_srcSystem(), message.get_srcComponent()
-        accepted = mavlink.MAV_MISSION_ACCEPTED
-        self._send(mavlink.MAVLink_mission_ack_message(*sender, accepted, message.mission_type))
+        self._send("mission_ack", *self._sender, mavlink.MAV_MISSION_ACCEPTED, message.mission_type)
 
-    def _on_mission_count(self, message: Any) -> None:
-        sender = message.get_srcSystem(), message.get_srcComponent()
-        unsupported = mavlink.MAV_MISSION_UNSUPPORTED
-        self._send(mavlink.MAVLink_mission_ack_message(*sender, unsupported, message.mission_type))
-
-    def _on_log_request_list(self, message: Any) -> None:
-        self._send(mavlink.MAVLink_log_entry_message(0, 0, 0, 0, 0))
+    def _on_file_transfer_protocol(self, message: Any) -> None:
+        """Refuse, so that nobody waits: parameters go by PARAM_REQUEST_LIST."""
+        sequence, session, opcode = struct.unpack_from("<HBB", bytes(message.payload))
+        fields = (sequence + 1) & 0xFFFF, session, FTP_NAK, 1, opcode, 0, 0, FTP_UNKNOWN
+        payload = struct.pack("<HBBBBHIB", *fields).ljust(251, b"\0")
+        self._send("file_transfer_protocol", 0, *self._sender, list(payload))
 
     def _on_timesync(self, message: Any) -> None:
         if message.tc1 == 0:
-            self._send(mavlink.MAVLink_timesync_message(round(1e9 * (self._now - self._boot)), message.ts1))
+            self._send("timesync", round(1e9 * (self._now - self._boot)), message.ts1)
 
     def _on_ping(self, message: Any) -> None:
         if message.target_system == 0 and message.target_component == 0:
-            sender = message.get_srcSystem(), message.get_srcComponent()
-            self._send(mavlink.MAVLink_ping_message(message.time_usec, message.seq, *sender))
+            self._send("ping", message.time_usec, message.seq, *self._sender)
 
     def _on_setup_signing(self, message: Any) -> None:
         if not self.armed:
@@ -774,37 +758,32 @@ class ArduSub:
     def _on_set_gps_global_origin(self, message: Any) -> None:
         self._origin = (message.latitude, message.longitude)
 
-    def _on_vision_position_delta(self, message: Any) -> None:
-        time = 1e-6 * message.time_delta_usec
-        usable = self.parameters["VISO_TYPE"] and self._dvl is None and 0.0025 <= time <= 1.0
-        if usable and message.confidence > 0.0 and all(abs(d) < 10.0 * time for d in message.position_delta):
-            self._move(np.array(message.position_delta) / time)
-
     # Telemetry.
 
-    def _send(self, message: Any) -> None:
-        self._mav.send(message)
+    def _send(self, name: str, *fields: Any) -> None:
+        """Put a message on the link, by its name in lower case and its fields in MAVLink's order."""
+        self._mav.send(getattr(mavlink, f"MAVLink_{name}_message")(*fields))
 
-    def _say(self, severity: int, text: str) -> None:
-        self._send(mavlink.MAVLink_statustext_message(severity, text.encode()[:50]))
+    def _statustext(self, severity: int, text: str) -> None:
+        self._send("statustext", severity, text.encode()[:50])
 
     def _greet(self) -> None:
-        self._say(mavlink.MAV_SEVERITY_INFO, "ArduSub V{}.{}.{} (FinsSim)".format(*VERSION))
-        self._say(mavlink.MAV_SEVERITY_INFO, f"Frame: {self._mixer.autopilot.name}")
+        self._statustext(INFO, "ArduSub V{}.{}.{} (FinsSim)".format(*VERSION))
+        self._statustext(INFO, f"Frame: {self._mixer.autopilot.name}")
 
-    def _reporter(self, number: int) -> Callable[[], Any] | None:
-        """What makes a message, by its number."""
-        kind = mavlink.mavlink_map.get(number)
-        return None if kind is None else getattr(self, f"_report_{kind.msgname.lower()}", None)
+    def _reporter(self, name: str) -> Callable[[], tuple[Any, ...]] | None:
+        """What gives the fields of a message, or of several, by its name."""
+        return getattr(self, f"_report_{name}", None)
 
-    def _report(self, number: int) -> bool:
-        """Send a message with what is known now; False where there is none of this number."""
-        reporter = self._reporter(number)
+    def _report(self, name: str) -> bool:
+        """Send a message with what is known now, if anything is; False where there is none of this name."""
+        reporter = self._reporter(name)
         if reporter is None:
             return False
-        messages = reporter() if self._sample is not None or number in WITHOUT_SAMPLE else ()
-        for message in messages if isinstance(messages, tuple) else (messages,):
-            self._send(message)
+        fields = reporter() if self._sample is not None or name in WITHOUT_SAMPLE else ()
+        for message in fields if fields and isinstance(fields[0], tuple) else [fields]:
+            if message:
+                self._send(name, *message)
         return True
 
     @property
@@ -813,184 +792,146 @@ class ArduSub:
         rate = 1000.0 * (1.0 + 1e-6 * self._spec.crystal_ppm)
         return (self._clock_start + int(rate * (self._now - self._boot))) & 0xFFFFFFFF
 
-    def _spoiled(self, value: float, *fields: str) -> float:
-        """A number, or NaN where a fault names one of these fields."""
+    def _spoiled(self, values: Any, *fields: str) -> list[float]:
+        """Numbers, or NaN where a fault names one of these fields."""
         field = self._faults.nan_field.partition(".")[0] if self._faults else ""
-        return math.nan if field in fields else value
+        return [math.nan if field in fields else float(value) for value in values]
 
-    def _report_heartbeat(self) -> Any:
+    def _report_heartbeat(self) -> tuple[Any, ...]:
         if self._faults and self._faults.no_heartbeat:
             return ()
         lost = self._pilot_lost or self._ground_lost or self._battery_low or self._leaking
-        base = 81 | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0)
         state = mavlink.MAV_STATE_ACTIVE if self.armed else mavlink.MAV_STATE_STANDBY
-        return mavlink.MAVLink_heartbeat_message(
-            mavlink.MAV_TYPE_SUBMARINE,
-            mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
-            base,
-            self.mode,
-            mavlink.MAV_STATE_CRITICAL if lost else state,
-            3,
-        )
+        kind = mavlink.MAV_TYPE_SUBMARINE, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+        return (*kind, 209 if self.armed else 81, self.mode, mavlink.MAV_STATE_CRITICAL if lost else state, 3)
 
-    def _report_autopilot_version(self) -> Any:
-        able = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-        able |= mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    def _report_autopilot_version(self) -> tuple[Any, ...]:
         major, minor, patch = VERSION
         version = major << 24 | minor << 16 | patch << 8 | 255
-        return mavlink.MAVLink_autopilot_version_message(
-            able, version, 0, 0, 0, list(b"FinsSim\0"), [0] * 8, [0] * 8, 0, 0, 0
-        )
+        return CAPABILITIES, version, 0, 0, 0, list(b"FinsSim\0"), [0] * 8, [0] * 8, 0, 0, 0
 
-    def _report_attitude(self) -> Any:
-        angles = [self._spoiled(angle, "quaternion") for angle in self._attitude.tolist()]
-        rates = [self._spoiled(rate, "gyro") for rate in self._rates.tolist()]
-        return mavlink.MAVLink_attitude_message(self._milliseconds, *angles, *rates)
+    def _report_attitude(self) -> tuple[Any, ...]:
+        rates = self._spoiled(self._rates, "gyro")
+        return (self._milliseconds, *self._spoiled(self._attitude, "quaternion"), *rates)
 
-    def _report_attitude_quaternion(self) -> Any:
-        x, y, z, w = (self._spoiled(part, "quaternion") for part in self._quaternion.tolist())
-        rates = [self._spoiled(rate, "gyro") for rate in self._rates.tolist()]
-        return mavlink.MAVLink_attitude_quaternion_message(self._milliseconds, w, x, y, z, *rates)
+    def _report_attitude_quaternion(self) -> tuple[Any, ...]:
+        x, y, z, w = self._spoiled(self._quaternion, "quaternion")
+        return (self._milliseconds, w, x, y, z, *self._spoiled(self._rates, "gyro"))
 
     def _imu(self) -> list[int]:
-        """Specific force [mg], rates [mrad/s], and no magnetic field; of these rates the bias is not taken off."""
-        assert self._sample is not None
-        rates = TO_FOSSEN.axial(self._body_from_imu @ np.array(self._sample.gyro))
-        values = [
-            *(self._force * 1000.0 / STANDARD_GRAVITY).tolist(),
-            *(1000.0 * rates).tolist(),
-            0.0,
-            0.0,
-            0.0,
-        ]
+        """Specific force [mg], rates with their bias [mrad/s], and no magnetic field."""
+        values = [*(1000.0 / STANDARD_GRAVITY * self._force), *(1000.0 * self._gyro), 0.0, 0.0, 0.0]
         return [_int16(value) for value in values]
 
-    def _report_raw_imu(self) -> Any:
-        return mavlink.MAVLink_raw_imu_message(1000 * self._milliseconds, *self._imu())
+    def _report_raw_imu(self) -> tuple[Any, ...]:
+        return (1000 * self._milliseconds, *self._imu())
 
-    def _report_scaled_imu2(self) -> Any:
-        return mavlink.MAVLink_scaled_imu2_message(self._milliseconds, *self._imu())
+    def _report_scaled_imu2(self) -> tuple[Any, ...]:
+        return (self._milliseconds, *self._imu())
 
-    def _report_scaled_pressure(self) -> Any:
-        return mavlink.MAVLink_scaled_pressure_message(self._milliseconds, 1013.25, 0.0, 3000)
-
-    def _report_scaled_pressure2(self) -> Any:
+    def _report_scaled_pressure2(self) -> tuple[Any, ...]:
         assert self._sample is not None
-        pressure = self._spoiled(0.01 * self._sample.pressure, "depth", "pressure")
-        return mavlink.MAVLink_scaled_pressure2_message(self._milliseconds, pressure, 0.0, 2000)
+        return (
+            self._milliseconds,
+            *self._spoiled([0.01 * self._sample.pressure], "depth", "pressure"),
+            0.0,
+            2000,
+        )
 
-    def _report_vfr_hud(self) -> Any:
-        heading = int(math.degrees(self._attitude[2])) % 360
+    def _report_vfr_hud(self) -> tuple[Any, ...]:
         throttle = round(50.0 + 50.0 * max(-1.0, min(1.0, self._demands()[3]))) if self.armed else 50
         speed = float(np.hypot(*self._velocity)) if self._has_position else 0.0
-        altitude = self._spoiled(self._altitude, "depth", "pressure")
-        return mavlink.MAVLink_vfr_hud_message(0.0, speed, heading, throttle, altitude, self._climb)
+        altitude = self._spoiled([self._altitude], "depth", "pressure")
+        return (0.0, speed, int(math.degrees(self._attitude[2])) % 360, throttle, *altitude, self._climb)
 
     @property
     def _has_position(self) -> bool:
         return self._origin is not None and self._now - self._velocity_time < POSITION_LASTS
 
-    def _report_local_position_ned(self) -> Any:
+    def _report_local_position_ned(self) -> tuple[Any, ...]:
         if not self._has_position:
             return ()
-        place, speed = [*self._position.tolist(), -self._altitude], [*self._velocity.tolist(), -self._climb]
-        return mavlink.MAVLink_local_position_ned_message(self._milliseconds, *place, *speed)
+        return (self._milliseconds, *self._position, -self._altitude, *self._velocity, -self._climb)
 
-    def _report_global_position_int(self) -> Any:
+    def _report_global_position_int(self) -> tuple[Any, ...]:
         latitude, longitude = self._origin or (0, 0)
-        north, east = self._position / METRES_PER_DEGREE * 1e7
-        east /= max(math.cos(math.radians(1e-7 * latitude)), 0.01)
+        narrow = max(math.cos(math.radians(1e-7 * latitude)), 0.01)
+        north, east = 1e7 / METRES_PER_DEGREE * self._position / (1.0, narrow)
         height, heading = (
             round(1000.0 * self._altitude),
             round(100.0 * math.degrees(self._attitude[2])) % 36000,
         )
-        speed = [_int16(100.0 * v) for v in (*self._velocity.tolist(), -self._climb)]
-        place = [max(-(2**31), min(2**31 - 1, round(v))) for v in (latitude + north, longitude + east)]
-        return mavlink.MAVLink_global_position_int_message(
-            self._milliseconds, *place, height, height, *speed, heading
-        )
+        place = _int32(latitude + north), _int32(longitude + east), height, height
+        speed = [_int16(100.0 * v) for v in (*self._velocity, -self._climb)]
+        return (self._milliseconds, *place, *speed, heading)
 
-    def _report_ekf_status_report(self) -> Any:
+    def _report_ekf_status_report(self) -> tuple[Any, ...]:
         flags = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
         horizontal = mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
-        flags |= horizontal if self._has_position else mavlink.EKF_CONST_POS_MODE
-        return mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.0)
+        return (
+            flags | (horizontal if self._has_position else mavlink.EKF_CONST_POS_MODE),
+            0.1,
+            0.1,
+            0.1,
+            0.1,
+            0.0,
+        )
 
-    def _report_sys_status(self) -> Any:
-        present = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-        present |= mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
-        present |= mavlink.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS | mavlink.MAV_SYS_STATUS_AHRS
-        present |= mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG if self._has_compass else 0
-        present |= mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    def _power(self) -> tuple[int, int, int]:
+        """Voltage [mV], current [cA] and what is left of the charge [%]."""
+        voltage, current = self._battery
+        left = max(0.0, 1.0 - self._used / max(self.parameters["BATT_CAPACITY"], 1.0))
+        return round(1000.0 * voltage), _int16(100.0 * current), round(100.0 * left)
+
+    def _report_sys_status(self) -> tuple[Any, ...]:
+        present = SENSORS | (mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG if self._has_compass else 0)
         enabled = present if self.armed else present & ~mavlink.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
-        healthy = present & ~mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if self._battery_low else present
-        healthy = healthy & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK if self._unfit() else healthy
-        voltage, current = self._battery
-        return mavlink.MAVLink_sys_status_message(
-            present, enabled, healthy, 100, round(1000.0 * voltage), _int16(100.0 * current), -1, *[0] * 6
-        )
+        healthy = present | mavlink.MAV_SYS_STATUS_GEOFENCE
+        healthy &= ~mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if self._battery_low else -1
+        healthy &= ~mavlink.MAV_SYS_STATUS_PREARM_CHECK if self._unfit() else -1
+        return (present, enabled, healthy, 100, *self._power(), *[0] * 6)
 
-    def _report_battery_status(self) -> Any:
-        voltage, current = self._battery
-        voltages = [round(1000.0 * voltage), *[65535] * 9]
-        return mavlink.MAVLink_battery_status_message(
-            0, 0, 0, 32767, voltages, _int16(100.0 * current), 0, -1, -1
-        )
+    def _report_battery_status(self) -> tuple[Any, ...]:
+        voltage, current, left = self._power()
+        return 0, 0, 0, 32767, [voltage, *[65535] * 9], current, round(self._used), -1, left
 
-    def _report_power_status(self) -> Any:
-        return mavlink.MAVLink_power_status_message(5000, 0, 0)
+    def _report_system_time(self) -> tuple[Any, ...]:
+        return 0, self._milliseconds
 
-    def _report_system_time(self) -> Any:
-        return mavlink.MAVLink_system_time_message(0, self._milliseconds)
+    def _report_named_value_float(self) -> tuple[Any, ...]:
+        values = {"PilotGain": self._gain, "InputHold": 0.0, "RollPitch": 0.0, "Lights1": 0.0, "CamTilt": 0.5}
+        return tuple((self._milliseconds, name.encode(), value) for name, value in values.items())
 
-    def _report_named_value_float(self) -> Any:
-        values = {"CamTilt": 0.5, "TetherTrn": 0.0, "Lights1": 0.0, "Lights2": 0.0, "PilotGain": self._gain}
-        values |= {"InputHold": 0.0, "RollPitch": 0.0}
-        ms = self._milliseconds
-        return tuple(mavlink.MAVLink_named_value_float_message(ms, n.encode(), v) for n, v in values.items())
+    def _report_servo_output_raw(self) -> tuple[Any, ...]:
+        pulses = [round(pulse) for pulse in self.pulses.tolist()]
+        return (1000 * self._milliseconds & 0xFFFFFFFF, 0, *pulses, *[0] * (16 - len(pulses)))
 
-    def _report_servo_output_raw(self) -> Any:
-        pulses = self._servos.copy()
-        pulses[: len(self.pulses)] = [round(pulse) for pulse in self.pulses.tolist()]
-        return mavlink.MAVLink_servo_output_raw_message(1000 * self._milliseconds & 0xFFFFFFFF, 0, *pulses)
+    def _report_rc_channels(self) -> tuple[Any, ...]:
+        return (self._milliseconds, 18, *self._inputs, 0)
 
-    def _report_rc_channels(self) -> Any:
-        return mavlink.MAVLink_rc_channels_message(self._milliseconds, 18, *self._inputs, 0)
-
-
-WITHOUT_SAMPLE = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT,
-    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-    mavlink.MAVLINK_MSG_ID_RC_CHANNELS,
-    mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
-}
-"""Messages that need no instrument."""
-STANDARD_GRAVITY = 9.80665
-"""[m/s^2]"""
 
 COMMANDS: dict[int, Callable[[ArduSub, list[float]], int]] = {
     mavlink.MAV_CMD_COMPONENT_ARM_DISARM: ArduSub._do_arm,
     mavlink.MAV_CMD_DO_SET_MODE: ArduSub._do_set_mode,
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: ArduSub._do_set_interval,
-    mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: ArduSub._do_get_interval,
     mavlink.MAV_CMD_REQUEST_MESSAGE: ArduSub._do_request,
     mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: ArduSub._do_request_version,
     mavlink.MAV_CMD_PREFLIGHT_CALIBRATION: ArduSub._do_calibrate,
     mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: ArduSub._do_reboot,
-    mavlink.MAV_CMD_DO_MOTOR_TEST: ArduSub._do_test_motor,
-    mavlink.MAV_CMD_DO_SET_SERVO: ArduSub._do_set_servo,
+    mavlink.MAV_CMD_DO_MOTOR_TEST: ArduSub._do_refuse,
+    mavlink.MAV_CMD_DO_SET_SERVO: ArduSub._do_refuse,
 }
 """Those that are carried out or refused; every other is unsupported."""
 
 
 def _result(done: bool) -> int:
-    return int(mavlink.MAV_RESULT_ACCEPTED if done else mavlink.MAV_RESULT_FAILED)
+    return ACCEPTED if done else FAILED
 
 
-def _number(message: str) -> int:
-    """Of a message by its name in lower case."""
-    return int(getattr(mavlink, f"MAVLINK_MSG_ID_{message.upper()}"))
+def _name(number: float) -> str:
+    """Of a message by its number, in lower case; empty if there is none."""
+    kind = mavlink.mavlink_map.get(int(number))
+    return "" if kind is None else kind.msgname.lower()
 
 
 def _dead(stick: float, zone: float) -> float:
@@ -999,4 +940,8 @@ def _dead(stick: float, zone: float) -> float:
 
 
 def _int16(value: float) -> int:
-    return max(-32768, min(32767, round(value)))
+    return max(-(2**15), min(2**15 - 1, round(value)))
+
+
+def _int32(value: float) -> int:
+    return max(-(2**31), min(2**31 - 1, round(value)))

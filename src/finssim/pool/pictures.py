@@ -22,6 +22,7 @@ from finssim.pool.plant_spec import Basin
 from finssim.pool.positioning import Exposure, PoseAt
 from finssim.quiet import start_warp
 from finssim.robot.link.frames import LinkError
+from finssim.robot.link.transports import bound_socket
 from finssim.robot.messages import Picture
 from finssim.robot.pictures import (
     LONGEST_FRAGMENT,
@@ -36,27 +37,7 @@ __all__ = [
     "CameraPlan",
     "PictureProcess",
     "UdpSender",
-    "bound_socket",
 ]
-
-
-def bound_socket(kind: int, address: tuple[str, int]) -> socket.socket:
-    """A socket of a kind (`socket.SOCK_...`) with an address, host and port; port 0 takes a free one.
-
-    Raises:
-        LinkError: The address cannot be bound.
-    """
-    out = socket.socket(socket.AF_INET, kind)
-    out.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(kind == socket.SOCK_STREAM))
-    try:
-        out.bind(address)
-    except OSError as problem:
-        out.close()
-        raise LinkError(
-            f"cannot bind {address[0]}:{address[1]} ({problem.strerror or problem}): "
-            "end the program that has it, or give another port"
-        ) from None
-    return out
 
 
 class UdpSender:

@@ -23,7 +23,7 @@ from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
 from finssim.pool.fleet import Fleet
 from finssim.pool.pictures import CameraPlan, PictureProcess, UdpSender
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
-from finssim.pool.server import LockstepServer, MediumServer, serve_realtime
+from finssim.pool.server import GroundLinks, LockstepServer, MediumServer, serve_realtime
 from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.goals import station_of
@@ -31,7 +31,7 @@ from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import UdpTransport, host_port
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
-from finssim.vehicles.defaults import numbered, vehicle_at
+from finssim.vehicles.defaults import numbered, vehicle_at, with_navigation
 
 __all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run", "swimming"]
 
@@ -54,6 +54,8 @@ class PoolPlan:
     """What a robot may know of the camera."""
     positioning: str = "none"
     """Name of the positioning system."""
+    firmware: Literal["mcu", "ardusub"] = "mcu"
+    """Of the vehicle."""
 
     def world(self, camera: Any, *, start: Station, seed: int, truth: Path | None) -> VirtualPool:
         """The living pool.
@@ -73,6 +75,7 @@ class PoolPlan:
             start=pose,
             seed=seed,
             truth=truth,
+            firmware=self.firmware,
         )
 
     def standing(self, start: Station, *, seed: int, truth: Path | None = None) -> VirtualPool:
@@ -89,6 +92,7 @@ def make_plan(
     camera: Literal["pictures", "corners", "none"] = "pictures",
     seed: int = 0,
     site: str = "pool",
+    firmware: Literal["mcu", "ardusub"] = "mcu",
 ) -> PoolPlan:
     """Draw a plant and its camera, or read the plant from its file.
 
@@ -99,6 +103,7 @@ def make_plan(
         camera: What it sends.
         seed: Of ripples, noise, jitter and losses.
         site: pool, tank or open-water; a camera hangs over the pool and the tank alone.
+        firmware: mcu, or ardusub, with which the vehicle has a compass and a Doppler log.
 
     Raises:
         PlantSpecError: The plant cannot be made, or there is no such severity or camera.
@@ -106,17 +111,21 @@ def make_plan(
     ours = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
     spec, ours = site_of(site, spec), vehicle_at(site, ours)
+    if firmware == "ardusub":
+        ours = with_navigation(ours)
     if site == "open-water" and camera != "none":
         raise PlantSpecError(
             "no camera hangs over open water: give --camera none, and a positioning if there is one"
         )
+    if firmware not in ("mcu", "ardusub"):
+        raise PlantSpecError(f"unknown firmware '{firmware}'; available: mcu, ardusub")
     if camera not in ("pictures", "corners", "none"):
         raise PlantSpecError(f"unknown camera '{camera}'; available: pictures, corners, none")
     if camera == "none":
-        return PoolPlan(vehicle=ours, spec=spec, camera=None, calibrated=None)
+        return PoolPlan(vehicle=ours, spec=spec, camera=None, calibrated=None, firmware=firmware)
     site, calibrated, settings = camera_of(ours, spec.seed, spec.severity, basin=spec.basin)
     plan = CameraPlan(vehicle=ours, site=site, settings=settings, basin=spec.basin, mode=camera, seed=seed)
-    return PoolPlan(vehicle=ours, spec=spec, camera=plan, calibrated=calibrated)
+    return PoolPlan(vehicle=ours, spec=spec, camera=plan, calibrated=calibrated, firmware=firmware)
 
 
 def run(
@@ -136,6 +145,10 @@ def run(
     team: str | None = None,
     site: str = "pool",
     positioning: str = "none",
+    firmware: Literal["mcu", "ardusub"] = "mcu",
+    ground: str = "127.0.0.1:14550",
+    tcp: str = "127.0.0.1:5760",
+    dvl: str = "127.0.0.1:16171",
     duration: Annotated[float | None, (0.0, None)] = None,
     seed: int = 0,
 ) -> None:
@@ -149,8 +162,9 @@ def run(
         severity (NAME): How far a drawn plant and its camera are from what is known: nominal, realistic or hard.
         lockstep: Time goes as fast as one robot asks, instead of in real time.
         camera (KIND): What the camera sends: pictures, corners (of the tags) or none. If not given: pictures, over a
-            team or a tank corners, in open water and of a task none.
-        port: UDP port of the motor controller; pictures leave from the next, lock-step (TCP) is the one after.
+            team or a tank corners, in open water, of a task and with ardusub none.
+        port: UDP port of the motor controller; pictures leave from the next, lock-step (TCP) is the one after. With
+            ardusub 0 takes a free one.
         bind (ADDRESS): Address of this end: this machine alone unless given.
         robot (HOST:PORT): The only robot that may command in real time; its pictures go to the port after this.
         pool_file (FILE): Pool file to write: the camera as its calibration has it (.yaml).
@@ -164,6 +178,11 @@ def run(
             robot at --robot, ten ports on, and so on. A camera sees them all; each has tags of its own ids.
         site (NAME): Where: pool, tank or open-water (current, waves, 20 m of water).
         positioning (NAME): Fixes on the robot's wire: none, motion-capture or usbl.
+        firmware (NAME): What steers the motors: mcu, the motor controller of `finssim run`, or ardusub, an autopilot
+            that answers as ArduSub 4.5 does, over MAVLink, with a compass and a Doppler log.
+        ground (HOST:PORT,...): UDP, with ardusub: ground stations that are sent to; it answers whoever sends to --port.
+        tcp (HOST:PORT): With ardusub: where ground stations connect; port 0 takes a free one.
+        dvl (HOST:PORT): With ardusub: TCP server of the Water Linked Doppler log; port 0 takes a free one.
         duration: When to end, pool's clock [s]; never if not given.
         seed: Seed of every random number; equal seeds give equal results.
 
@@ -172,7 +191,10 @@ def run(
     """
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
     positioning_of(positioning, seed)  # refuses what is none
+    ardusub = firmware == "ardusub"
     if task is not None or team is not None:
+        if ardusub:
+            raise PlantSpecError("--firmware ardusub is for one vehicle: leave --team and --task out")
         files = task is not None and (pool_file is not None or truth is not None)
         if not plant.isdecimal() or lockstep or start is not None or files:
             raise PlantSpecError(
@@ -190,13 +212,14 @@ def run(
             made = _playing(task, bodies, int(plant), severity, positioning, seed)
         _serve_team(made, calibrated, (bind, port), host_port(robot, "--robot"), pool_file, duration)
         return
-    camera = camera or {"pool": "pictures", "tank": "corners"}.get(site, "none")  # type: ignore[assignment]
-    plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed, site=site)
+    usual: Any = {"pool": "pictures", "tank": "corners"}.get(site, "none")
+    camera = camera or ("none" if ardusub else usual)
+    plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed, site=site, firmware=firmware)
     plan = replace(plan, positioning=positioning)
     start = start or f"0,0,{-0.5 * plan.spec.basin.depth:g},0"
     begin = station_of(start)
     _check_start(begin, plan.spec.basin, start)
-    if not 0 < port <= 65533:
+    if not (0 < port or (ardusub and not lockstep and camera == "none")) or port > 65533:
         raise LinkError(f"port {port}: expected 1 to 65533, as the two after it are taken too")
     if pool_file is not None and plan.calibrated is None:
         raise PlantSpecError("--pool-file tells of the camera, and --camera none has none: leave one out")
@@ -213,7 +236,17 @@ def run(
     if lockstep:
         _lockstep(plan, make_world, (bind, port + 2), longest)
     else:
-        _realtime(plan, make_world, (bind, port), host_port(robot, "--robot"), longest)
+        links = None
+        if ardusub:
+            stations = (
+                []
+                if ground == "none"
+                else [host_port(text.strip(), "--ground") for text in ground.split(",")]
+            )
+            links = partial(
+                GroundLinks, (bind, port), stations, host_port(tcp, "--tcp"), host_port(dvl, "--dvl")
+            )
+        _realtime(plan, make_world, (bind, port), host_port(robot, "--robot"), longest, links)
 
 
 def _serve_team(
@@ -399,9 +432,10 @@ def _realtime(
     bind: tuple[str, int],
     robot: tuple[str, int],
     duration: float,
+    links: Callable[[], GroundLinks] | None,
 ) -> None:
     with _stoppable() as asked, ExitStack() as stack:
-        transport = UdpTransport(bind, robot)
+        transport = UdpTransport(bind, robot) if links is None else links()
         stack.callback(transport.close)
         drawn, sink, eye = _camera(plan, _next(bind), _next(robot))
         for end in (drawn, sink):
@@ -409,7 +443,11 @@ def _realtime(
                 stack.callback(end.close)
         world = make_world(eye)
         stack.callback(world.close)
-        _say(f"motor controller: {_name(transport.address)}, for {_name(transport.peer)} alone")
+        if isinstance(transport, GroundLinks):
+            _say(f"autopilot: {_name(transport.address)} (UDP), {_name(transport.tcp)} (TCP)")
+            _say(f"Doppler log: {_name(transport.dvl.address)}")
+        else:
+            _say(f"motor controller: {_name(transport.address)}, for {_name(transport.peer)} alone")
         if eye is not None:
             _say(f"pictures: {_name(_next(bind))}, for {_name(_next(robot))}")
         site, sinks = Fleet({plan.vehicle.name: world}), [] if sink is None else [sink]

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import socket
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 from finssim.pool.fleet import Fleet, Medium, one_picture
-from finssim.pool.pictures import UdpSender, bound_socket
+from finssim.pool.pictures import UdpSender
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
-from finssim.robot.link.transports import Transport
+from finssim.robot.link.transports import Address, TcpServer, Transport, bound_socket, resolved
+from finssim.robot.link.water_linked import DvlServer
 from finssim.robot.lockstep import (
     LockstepError,
     decode_request,
@@ -24,7 +26,7 @@ from finssim.robot.lockstep import (
 from finssim.robot.messages import Picture
 from finssim.robot.team import decode_track
 
-__all__ = ["LockstepServer", "MediumServer", "Pace", "serve_realtime"]
+__all__ = ["GroundLinks", "LockstepServer", "MediumServer", "Pace", "serve_realtime"]
 
 
 TICK = 0.003
@@ -116,10 +118,113 @@ class LockstepServer:
         self._listener.close()
 
 
-RATE = 60.0
-"""Steps a second of the software of vehicles that the task commands [Hz]."""
+MOST_CALLERS = 8
+"""Ground stations that are answered over UDP: those that called last."""
 LARGEST = 2048
 """Bytes taken of a datagram."""
+MOST_FRAMES = 1024
+"""Taken of UDP by one call, so that a flood cannot hold the loop up."""
+
+
+def whole_frames(data: bytearray) -> list[bytes]:
+    """Cut the MAVLink frames that are complete off a stream, and what is before the first one."""
+    frames: list[bytes] = []
+    while True:
+        starts = [i for i in (data.find(b"\xfd"), data.find(b"\xfe")) if i >= 0]
+        del data[: min(starts, default=len(data))]
+        if len(data) < 3:
+            return frames
+        length = 12 + data[1] + 13 * (data[2] & 1) if data[0] == 0xFD else 8 + data[1]
+        if len(data) < length:
+            return frames
+        frames.append(bytes(data[:length]))
+        del data[:length]
+
+
+class GroundLinks:
+    """The router of an autopilot: its frames go to all ground stations, theirs to it and to each other.
+
+    Over UDP stations are those told of and whoever sends, over TCP whoever connects; lines of the Doppler log go to its
+    own clients. A `Transport`: no call waits.
+
+    Attributes:
+        address: UDP, of this end.
+        tcp: Where stations connect.
+        dvl: The log's server.
+    """
+
+    def __init__(self, bind: Address, stations: Sequence[Address], tcp: Address, dvl: Address) -> None:
+        """Open all; port 0 takes a free one.
+
+        Args:
+            bind: UDP, of this end.
+            stations: UDP, that frames go to before they have sent anything.
+            tcp: To listen at.
+            dvl: For the Doppler log.
+
+        Raises:
+            LinkError: One cannot be bound or found.
+        """
+        self._fixed = [resolved(station) for station in stations]
+        self._callers: deque[Address] = deque(maxlen=MOST_CALLERS)
+        with ExitStack() as stack:
+            self._socket = stack.enter_context(bound_socket(socket.SOCK_DGRAM, bind))
+            self._socket.setblocking(False)
+            self._streams = stack.enter_context(closing(TcpServer(tcp, bytearray)))
+            self.dvl = stack.enter_context(closing(DvlServer(dvl)))
+            self._stack = stack.pop_all()
+        self.address: Address = self._socket.getsockname()
+        self.tcp = self._streams.address
+
+    def receive(self) -> list[bytes]:
+        """Whole frames of all stations, which the other stations get too."""
+        self.dvl.poll()
+        frames: list[bytes] = []
+        with suppress(BlockingIOError, ConnectionError):
+            while len(frames) < MOST_FRAMES:
+                data, sender = self._socket.recvfrom(LARGEST)
+                if sender not in (*self._fixed, *self._callers):
+                    self._callers.append(sender)  # and forget the one that came first, if they are too many
+                frames += self._pass_on(bytearray(data), sender)
+        for station, stream, data in self._streams.receive():
+            stream += data
+            frames += self._pass_on(stream, station)
+        return frames
+
+    def send(self, data: bytes) -> None:
+        """Send a frame to every station, or a line to the log's clients."""
+        if data[:1] == b"{":
+            self.dvl.send(data)
+        else:
+            self._broadcast(data)
+
+    def close(self) -> None:
+        """Let everyone go."""
+        self._stack.close()
+
+    def describe(self) -> str:
+        """Who is there."""
+        return f"{len(self._callers)} stations over UDP, {len(self._streams.clients)} over TCP"
+
+    def _pass_on(self, stream: bytearray, source: object) -> list[bytes]:
+        frames = whole_frames(stream)
+        for frame in frames:
+            self._broadcast(frame, source)
+        return frames
+
+    def _broadcast(self, frame: bytes, source: object = None) -> None:
+        """To all stations but the source."""
+        for address in [*self._fixed, *self._callers]:
+            if address != source:
+                with suppress(OSError):  # nobody listens there yet
+                    self._socket.sendto(frame, address)
+        for station in list(self._streams.clients):
+            if station is not source:
+                self._streams.send(frame, station)
+
+
+RATE = 60.0
+"""Steps a second of the software of vehicles that the task commands [Hz]."""
 
 
 class MediumServer:

@@ -296,7 +296,7 @@ def test_a_client_that_does_not_read_is_let_go(server):
     for _ in range(200):
         server.send(data)
         client.receive()
-    assert len(server._clients) == 1
+    assert len(server._server.clients) == 1
     lazy.close()
     client.close()
 

@@ -1,10 +1,12 @@
-"""ArduSub logs as streams: pulses, attitude, inertial measurements, depth, velocity, battery, arming."""
+"""ArduSub logs as streams: pulses or axes, attitude, inertial measurements, depth, velocity, battery, arming."""
 
 from __future__ import annotations
 
 import contextlib
 import io
+import json
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,17 +17,19 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import finding
-from finssim.calibration.importers.ardusub_outputs import outputs_of
+from finssim.calibration.importers.ardusub_outputs import mixed_pulses, outputs_of
 from finssim.calibration.importers.assemble import ArduSubMap, Frame, Stream, in_our_axes
 from finssim.calibration.trials.conversion import GRAVITY
 from finssim.calibration.trials.trial import Array
-from finssim.control.ardusub import NEUTRAL
+from finssim.control.ardusub import FULL, NEUTRAL
 from finssim.geometry.rotations import wrap_angle
+from finssim.mcap_repair import whole_mcap
 from finssim.vehicles import Vehicle
+from finssim.vehicles.autopilot import DEMANDS, FRAMES
 
 __all__ = ["Log", "read_ardusub", "velocity_stream"]
 
-# Messages of ArduPilot logs: DataFlash `.BIN` and telemetry `.tlog`, through pymavlink.
+# Messages of ArduPilot logs: DataFlash `.BIN` and telemetry `.tlog`, through pymavlink, and recordings of BlueOS.
 
 DATAFLASH = b"\xa3\x95"
 """First bytes of a DataFlash log."""
@@ -46,7 +50,7 @@ class Log:
 
     shown: str
     telemetry: bool
-    """Whether it is a `.tlog`."""
+    """Whether it is a `.tlog` or a recording of BlueOS, not written by the autopilot."""
     times: dict[str, Array] = field(default_factory=dict)
     """Kind -> times [s], (n,)."""
     messages: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
@@ -62,7 +66,7 @@ class Log:
         """A field of every message of a kind, NaN where it has none, (n,)."""
         return np.array([_number(message.get(name)) for message in self.messages[kind]], dtype=float)
 
-    def some(self, kind: str, name: str, value: int) -> Log:
+    def some(self, kind: str, name: str, value: int | str) -> Log:
         """The log with only those messages of a kind whose field has that value; all where none has the field."""
         if not any(name in message for message in self.messages.get(kind, ())):
             return self
@@ -80,7 +84,7 @@ def read_log(path: Path, kinds: frozenset[str], *, received: bool = False) -> Lo
     """The messages of some kinds; a log that was cut short is read up to the cut.
 
     Args:
-        path: `.BIN` or `.tlog`.
+        path: `.BIN`, `.tlog`, or `.mcap` of BlueOS.
         kinds: Names of messages.
         received: Whether telemetry is timed by its receipt, not by the stamps of the autopilot.
 
@@ -106,7 +110,8 @@ def read_log(path: Path, kinds: frozenset[str], *, received: bool = False) -> Lo
     log.times.update(clock.times() if log.telemetry else clock.boot_times())
     if not log.messages:
         raise CalibrationError(
-            f"{path}: holds no messages that a trial could use: expected an ArduSub log, .BIN or .tlog"
+            f"{path}: holds no messages that a trial could use: expected an ArduSub log, .BIN or .tlog, or a .mcap of "
+            "BlueOS' recorder or of ROS 2"
         )
     return log
 
@@ -160,6 +165,9 @@ def _messages(
     path: Path, dataflash: bool, kinds: frozenset[str]
 ) -> Iterator[tuple[str, dict[str, Any], float]]:
     """Kind, fields and time of receipt [s] of each message of the autopilot."""
+    if path.suffix.lower() == ".mcap":
+        yield from _recorded(path, kinds)
+        return
     from pymavlink import DFReader, mavutil
 
     complaints = io.StringIO()  # pymavlink prints what it skips at a cut
@@ -181,25 +189,77 @@ def _messages(
                     break
                 if message is None:
                     break
-                kind = message.get_type()
-                if not dataflash and not _of_autopilot(message, kind, systems):
-                    continue
-                yield kind, message.to_dict(), float(message._timestamp)
+                kind, fields = message.get_type(), message.to_dict()
+                if not dataflash:
+                    sender = message.get_srcSystem(), message.get_srcComponent()
+                    if not _of_autopilot(sender, kind, fields, systems):
+                        continue
+                yield kind, fields, float(message._timestamp)
         finally:
             close = getattr(log, "close", None)
             if close is not None:
                 close()
 
 
-def _of_autopilot(message: Any, kind: str, systems: set[int]) -> bool:
-    """Whether the vehicle's autopilot sent it; position sensors speak for themselves."""
+MAVLINK_TOPIC = re.compile(r"mavlink/(\d+)/(\d+)/([A-Z0-9_]+)")
+"""Of a recording of BlueOS: system, component and kind of a message."""
+
+
+def _recorded(path: Path, kinds: frozenset[str]) -> Iterator[tuple[str, dict[str, Any], float]]:
+    """The same of an MCAP of BlueOS' recorder, which keeps messages of its MAVLink server as JSON."""
+    from mcap.reader import NonSeekingReader
+
+    systems: set[int] = set()
+    with whole_mcap(path, []) as whole, whole.open("rb") as file:
+        messages = NonSeekingReader(file).iter_messages(log_time_order=False)
+        while True:
+            try:
+                _, channel, message = next(messages)
+            except StopIteration:
+                return
+            except Exception:  # at the cut of a log, in whatever layer reads it
+                return
+            topic = MAVLINK_TOPIC.fullmatch(channel.topic)
+            if topic is None or topic[3] not in kinds:
+                continue
+            try:
+                fields = {name: _plain(value) for name, value in json.loads(message.data)["message"].items()}
+            except (ValueError, KeyError, TypeError, AttributeError):
+                continue
+            if _of_autopilot((int(topic[1]), int(topic[2])), topic[3], fields, systems):
+                yield topic[3], fields, 1e-9 * message.log_time
+
+
+def _plain(value: Any) -> Any:
+    """A field as pymavlink has it: numbers for names and sets of flags, text for lists of letters."""
+    from pymavlink.dialects.v20 import ardupilotmega
+
+    if isinstance(value, dict):
+        return value["bits"] if "bits" in value else _plain(value.get("type"))
+    if isinstance(value, list) and value and all(isinstance(letter, str) for letter in value):
+        return "".join(value).split("\0")[0]
+    if isinstance(value, str):
+        flags = [getattr(ardupilotmega, name.strip(), None) for name in value.split("|")]
+        return sum(flags) if all(isinstance(flag, int) for flag in flags) else value.split("\0")[0]
+    return value
+
+
+def _of_autopilot(sender: tuple[int, int], kind: str, fields: dict[str, Any], systems: set[int]) -> bool:
+    """Whether the vehicle's autopilot sent it; position sensors and pilots speak for themselves.
+
+    Args:
+        sender: System and component.
+        kind: Of the message.
+        fields: Of the message.
+        systems: Those that an autopilot speaks for; a heartbeat of one is added.
+    """
     if kind == "HEARTBEAT":
-        if message.autopilot == NO_AUTOPILOT:
+        if fields.get("autopilot") == NO_AUTOPILOT:
             return False
-        systems.add(message.get_srcSystem())
-    if kind.startswith("VISION"):
+        systems.add(sender[0])
+    if kind.startswith("VISION") or kind == "MANUAL_CONTROL":
         return True
-    return message.get_srcComponent() == AUTOPILOT and (not systems or message.get_srcSystem() in systems)
+    return sender[1] == AUTOPILOT and (not systems or sender[0] in systems)
 
 
 def _number(value: Any) -> float:
@@ -279,7 +339,8 @@ def _estimate(log: Log) -> Stream | None:
         return None
     status, flag_name, names = ESTIMATES[kind]
     first_core = log.some(kind, "C", 0).some(status, "C", 0)
-    flags = _held(first_core, status, flag_name, first_core.times[kind])
+    usable = HORIZONTAL_VELOCITY | RELATIVE_POSITION
+    flags = _held(first_core, status, flag_name, first_core.times[kind], usable).astype(np.int64)
     moving = (flags & HORIZONTAL_VELOCITY > 0) & (flags & STANDING_STILL == 0)
     source = f"{log.shown} {kind}"
     if moving.mean() < LEAST_USABLE:
@@ -296,12 +357,12 @@ def _estimate(log: Log) -> Stream | None:
     )
 
 
-def _held(log: Log, kind: str, name: str, t: NDArray[np.float64]) -> NDArray[np.int64]:
-    """A field of flags at other times, each held until the next; all usable where the log has none."""
-    if not log.has(kind):
-        return np.full(len(t), HORIZONTAL_VELOCITY | RELATIVE_POSITION)
+def _held(log: Log, kind: str, name: str, t: Array, otherwise: float) -> Array:
+    """A field at other times, each value held until the next; the same everywhere where the log has none."""
+    if not log.messages.get(kind):
+        return np.full(len(t), otherwise)
     held = np.searchsorted(log.times[kind], t, side="right") - 1
-    return log.numbers(kind, name).astype(np.int64)[np.maximum(held, 0)]
+    return log.numbers(kind, name)[np.maximum(held, 0)]
 
 
 FRD = Frame(body="FRD", world="NED")
@@ -315,6 +376,7 @@ KINDS = (
     | frozenset(
         ("SERVO_OUTPUT_RAW", "ATTITUDE", "SYS_STATUS", "BATTERY_STATUS", "HEARTBEAT", *INERTIAL, *PRESSURES)
     )
+    | frozenset(("MODE", "RCIN", "RC_CHANNELS", "MANUAL_CONTROL", "NAMED_VALUE_FLOAT"))
     | VELOCITY_KINDS
 )
 
@@ -329,7 +391,7 @@ def read_ardusub(
     """What an ArduSub log says, one stream for each kind of message.
 
     Args:
-        path: `.BIN` or `.tlog`.
+        path: `.BIN`, `.tlog`, or `.mcap` of BlueOS.
         asked: What is taken.
         vehicle: Whose thrusters the outputs drive; without it the pulses keep the numbers of the outputs.
         pulses: Whether the outputs are wanted; they are not of a passive trial.
@@ -349,6 +411,8 @@ def read_ardusub(
         *(_pulses(log, asked, vehicle) if pulses else ()),
     ]
     found = [stream for stream in streams if stream is not None and len(stream.t) >= 2]
+    if pulses and vehicle is not None and not any("pwm_" in name for s in found for name in s.channels):
+        found = _driven_by_sticks(log, asked, vehicle, found)
     if not any(stream.channels for stream in found):
         raise CalibrationError(f"{path.name}: holds no attitude, rates, depth, velocity or outputs")
     return found
@@ -488,3 +552,92 @@ def _pulses(log: Log, asked: ArduSubMap, vehicle: Vehicle | None) -> list[Stream
         pulse = one.numbers(kind, field.format(output))
         channels[f"pwm_{name}"] = np.where(pulse > 0.0, NEUTRAL + sign * (pulse - NEUTRAL), np.nan)
     return [Stream(source=f"{log.shown} {kind}", t=one.times[kind], channels=channels, findings=(of,))]
+
+
+MANUAL = 19
+"""The mode in which the pilot's axes pass the mixer as they are."""
+STICK_CHANNELS = ("pitch", "roll", "throttle", "yaw", "forward", "lateral")
+"""What channels 1 to 6 of an ArduSub ask for."""
+USUAL_YAW = 3.375
+"""ACRO_YAW_P at which the yaw axis is passed on as it is."""
+
+
+def _driven_by_sticks(log: Log, asked: ArduSubMap, vehicle: Vehicle, streams: list[Stream]) -> list[Stream]:
+    """The streams with pwm_NAME from the pilot's axes, where the log has no outputs, and without what other modes did.
+
+    Raises:
+        CalibrationError: The frame's motors do not fit the vehicle's thrusters.
+    """
+    axes = _axes(log, asked)
+    named = [number for number, (name, _) in FRAMES.items() if name == _frame_name(asked, vehicle)]
+    config = int(log.parameters.get("FRAME_CONFIG", named[0] if named else -1))
+    if axes is None or config not in FRAMES:
+        return streams
+    kind, t, demands = axes
+    motors = range(1, len(FRAMES[config][1]) + 1)
+    directions = {f"MOT_{n}_DIRECTION": log.parameters.get(f"MOT_{n}_DIRECTION", 1.0) for n in motors}
+    parameters = {**log.parameters, "FRAME_CONFIG": float(config), **directions}
+    signs = tuple(int(sign) for sign in directions.values())
+    standing = np.where(_armed(log, t)[:, None], demands, 0.0)
+    try:
+        channels, mapped = mixed_pulses(vehicle, standing, parameters, signs, asked.outputs)
+    except CalibrationError as error:
+        raise CalibrationError(f"{log.shown}: {error}") from None
+    note = finding("sticks_mixed", frame=FRAMES[config][0], gain=1.0)
+    pulses = Stream(source=f"{log.shown} {kind}", t=t, channels=channels, findings=(note, mapped))
+    # A held command knows no gap but one of the whole recording.
+    kept, other = [], 0
+    for stream in (*streams, pulses):
+        manual = (_mode(log, stream.t) == MANUAL) | ~_armed(log, stream.t)
+        other += int((~manual).sum())
+        kept.append(stream.taken(manual))
+    if other:
+        share = other / sum(len(stream.t) for stream in (*streams, pulses))
+        kept[-1] = kept[-1].noting(finding("other_modes_left_out", share=share))
+    return [stream for stream in kept if len(stream.t) >= 2]
+
+
+def _frame_name(asked: ArduSubMap, vehicle: Vehicle) -> Any:
+    return asked.frame or (vehicle.autopilot.frame if vehicle.autopilot is not None else None)
+
+
+def _axes(log: Log, asked: ArduSubMap) -> tuple[str, Array, Array] | None:
+    """Kind of message, times and demands in the order of `DEMANDS`, (n, 6), from channels or from the joystick."""
+    kind, name = ("RC_CHANNELS", "chan{}_raw") if log.telemetry else ("RCIN", "C{}")
+    if log.has(kind):
+        pulses = np.stack([log.numbers(kind, name.format(n)) for n in range(1, 7)])
+        axes = np.where((pulses > 800.0) & (pulses < 2200.0), (pulses - NEUTRAL) / FULL, np.nan)
+    elif log.has("MANUAL_CONTROL"):
+        kind = "MANUAL_CONTROL"
+        x, y, z, r, s, t = (np.nan_to_num(log.numbers(kind, name)) for name in "xyzrst")
+        gain = _held(_gains(log), "NAMED_VALUE_FLOAT", "value", log.times[kind], asked.gain)
+        scaled = gain * np.stack([(z - 500.0) / 500.0, r / 1000.0, x / 1000.0, y / 1000.0])
+        axes = np.concatenate([np.stack([s, t]) / FULL, scaled])
+    else:
+        return None
+    given = dict(zip(STICK_CHANNELS, axes.clip(-1.0, 1.0), strict=True))
+    given["yaw"] = given["yaw"] * log.parameters.get("ACRO_YAW_P", USUAL_YAW) / USUAL_YAW
+    return kind, log.times[kind], np.stack([given[demand] for demand in DEMANDS], axis=-1)
+
+
+def _gains(log: Log) -> Log:
+    """The log with PilotGain alone of the values that go by names."""
+    kind = "NAMED_VALUE_FLOAT"
+    if all(message.get("name") != "PilotGain" for message in log.messages.get(kind, ())):
+        return replace(log, messages={**log.messages, kind: []})
+    return log.some(kind, "name", "PilotGain")
+
+
+def _mode(log: Log, t: Array) -> Array:
+    """Number of the autopilot's mode at times; MANUAL where the log tells none."""
+    kind, name = ("HEARTBEAT", "custom_mode") if log.telemetry else ("MODE", "ModeNum")
+    return _held(log, kind, name, t, MANUAL)
+
+
+def _armed(log: Log, t: Array) -> NDArray[np.bool_]:
+    """Whether it was armed at times; always where the log does not tell."""
+    arming = _arming(log)
+    if arming is None:
+        return np.ones(len(t), dtype=bool)
+    held = np.searchsorted(arming.t, t, side="right") - 1
+    return np.asarray(arming.words["arming"][np.maximum(held, 0)] == "armed")

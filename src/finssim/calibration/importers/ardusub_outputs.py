@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.control.ardusub import NEUTRAL
+from finssim.calibration.trials.trial import Array
+from finssim.control.ardusub import NEUTRAL, Mixer
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.vehicles import Vehicle
 from finssim.vehicles.autopilot import DEMANDS, FRAMES
 from finssim.vehicles.part import did_you_mean
 
-__all__ = ["STICKS", "outputs_of"]
+__all__ = ["STICKS", "mixed_pulses", "outputs_of"]
 
 STICKS = tuple(f"stick_{name}" for name in DEMANDS)
 """Demands in the order of the mixer's factors."""
@@ -62,6 +63,38 @@ def outputs_of(
     return found, finding("outputs_mapped", how=how, pairs=pairs, neutral=NEUTRAL)
 
 
+def mixed_pulses(
+    vehicle: Vehicle,
+    demands: Array,
+    parameters: Mapping[str, float],
+    directions: Sequence[int],
+    given: Mapping[str, str],
+) -> tuple[dict[str, Array], Finding]:
+    """pwm_NAME of each thruster [µs] from demands, by ArduSub's mixer, and which output drives which thruster.
+
+    Args:
+        vehicle: Whose thrusters the motors are.
+        demands: In the order of `STICKS` [-1, 1], (n, 6); rows that are not all known give NaN.
+        parameters: FRAME_CONFIG, one of `FRAMES`, and MOT_n_DIRECTION as `outputs_of` takes it.
+        directions: MOT_n_DIRECTION as the mixer takes it; 1 where not given.
+        given: As of `outputs_of`.
+
+    Raises:
+        CalibrationError: The motors do not fit the thrusters.
+    """
+    outputs, mapped = outputs_of(vehicle, parameters, given)
+    known = np.isfinite(demands).all(axis=-1)
+    frame, _ = FRAMES[int(parameters["FRAME_CONFIG"])]
+    mixed = Mixer.of_frame(frame, directions).pulses(np.where(known[:, None], demands, 0.0))
+    pulses = {
+        f"pwm_{thruster}": np.where(
+            known, NEUTRAL + sign * (mixed[:, _motor(output, parameters)] - NEUTRAL), np.nan
+        )
+        for output, (thruster, sign) in outputs.items()
+    }
+    return pulses, mapped
+
+
 def _given(vehicle: Vehicle, given: Mapping[str, str]) -> dict[int, tuple[str, int]]:
     found = {}
     for output, target in given.items():
@@ -84,6 +117,11 @@ def _output_of(motor: int, parameters: Mapping[str, float]) -> int:
         if parameters.get(f"SERVO{output}_FUNCTION") == MOTOR_1 + motor - 1:
             return output
     return motor
+
+
+def _motor(output: int, parameters: Mapping[str, float]) -> int:
+    """The motor, from 0, that an output, from 1, carries."""
+    return int(parameters.get(f"SERVO{output}_FUNCTION", MOTOR_1 + output - 1)) - MOTOR_1
 
 
 def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[int, tuple[str, int]], str]:

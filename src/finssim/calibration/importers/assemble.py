@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.importers.ardusub_outputs import STICKS, outputs_of
+from finssim.calibration.importers.ardusub_outputs import STICKS, mixed_pulses
 from finssim.calibration.trials.conversion import (
     EXTRA_COLUMNS,
     GRAVITY,
@@ -36,7 +36,6 @@ from finssim.calibration.trials.trial import (
     Trial,
     column_of,
 )
-from finssim.control.ardusub import NEUTRAL, Mixer
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.vehicles import load_vehicle
@@ -711,13 +710,11 @@ def _pulses(
         )
     vehicle = load_vehicle(header.vehicle)
     config = next(number for number, (frame, _) in FRAMES.items() if frame == asked.frame)
-    directions = {f"MOT_{motor + 1}_DIRECTION": 1.0 for motor in range(len(FRAMES[config][1]))}
-    outputs, mapped = outputs_of(vehicle, {"FRAME_CONFIG": config, **directions}, asked.outputs)
-    mixed = Mixer.of_frame(asked.frame, asked.motor_directions).pulses(asked.gain * demands)
-    found = {}
-    for output, (thruster, sign) in outputs.items():
-        pulse = NEUTRAL + sign * (mixed[:, output - 1] - NEUTRAL)
-        found[f"pwm_{thruster}"] = np.where(known, pulse, np.nan)
+    parameters = {"FRAME_CONFIG": float(config)}
+    parameters |= {f"MOT_{motor + 1}_DIRECTION": 1.0 for motor in range(len(FRAMES[config][1]))}
+    found, mapped = mixed_pulses(
+        vehicle, asked.gain * demands, parameters, asked.motor_directions, asked.outputs
+    )
     return found, [finding("sticks_mixed", frame=asked.frame, gain=asked.gain), mapped]
 
 

@@ -36,7 +36,7 @@ from finssim.calibration.trials.trial import Array, Trial, column_of
 from finssim.calibration.trials.trial_files import Table, read_table
 from finssim.files import plain_name
 from finssim.mcap_metadata import mcap_metadata
-from finssim.mcap_repair import whole_mcap
+from finssim.mcap_repair import MAGIC, whole_mcap
 from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import json_value
@@ -616,7 +616,8 @@ def import_logs(
     Example: finssim trials import dive.BIN --vehicle bluerov2 --split arming --out trials
 
     Args:
-        logs (LOG): Tables (.csv, .parquet), ArduSub logs (.BIN, .tlog), ROS 2 bags (.mcap, .db3, folder).
+        logs (LOG): Tables (.csv, .parquet), ArduSub logs (.BIN, .tlog, .mcap of BlueOS), ROS 2 bags (.mcap, .db3,
+            folder).
         out (DIR): Folder in which the trial folders are made.
         column_map (FILE): Map of the log's columns or topics, with units and frames (.yaml).
         format (FORMAT): auto (by suffix), csv, ardupilot or rosbag.
@@ -744,7 +745,7 @@ def _groups(
 
 def _kind(path: Path) -> Format:
     suffix = path.suffix.lower()
-    if suffix in ARDUPILOT:
+    if suffix in ARDUPILOT or (suffix == ".mcap" and _without_profile(path)):
         return "ardupilot"
     if bag_files(path):
         return "rosbag"
@@ -754,6 +755,15 @@ def _kind(path: Path) -> Format:
         f"{path}: unknown kind of log: expected {', '.join((*TABLES, *ARDUPILOT, *BAGS))} or the folder of a ROS 2 "
         "bag, or give --format"
     )
+
+
+def _without_profile(path: Path) -> bool:
+    """Whether an MCAP's header names no profile, unlike one of ROS 2: BlueOS' recorder writes such files."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(len(MAGIC) + 13)
+    return head.startswith(MAGIC + b"\x01") and len(head) == len(MAGIC) + 13 and head[-4:] == bytes(4)
 
 
 def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[Group]:

@@ -9,7 +9,8 @@ import socket
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Any, Protocol
+from contextlib import suppress
+from typing import Any, Generic, Protocol, TypeVar
 from urllib.parse import parse_qs, urlsplit
 
 from finssim.robot.link.frames import LinkError
@@ -19,8 +20,10 @@ __all__ = [
     "DryRun",
     "MemoryTransport",
     "SerialTransport",
+    "TcpServer",
     "Transport",
     "UdpTransport",
+    "bound_socket",
     "memory_pair",
     "open_transport",
 ]
@@ -153,6 +156,102 @@ def resolved(address: Address) -> Address:
 
 def _name(address: Address) -> str:
     return f"{address[0]}:{address[1]}"
+
+
+# A port for several clients.
+
+
+State = TypeVar("State")
+"""What a server remembers of a client."""
+
+
+def bound_socket(kind: int, address: tuple[str, int]) -> socket.socket:
+    """A socket of a kind (`socket.SOCK_...`) with an address, host and port; port 0 takes a free one.
+
+    Raises:
+        LinkError: The address cannot be bound.
+    """
+    out = socket.socket(socket.AF_INET, kind)
+    out.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(kind == socket.SOCK_STREAM))
+    try:
+        out.bind(address)
+    except OSError as problem:
+        out.close()
+        raise LinkError(
+            f"cannot bind {address[0]}:{address[1]} ({problem.strerror or problem}): "
+            "end the program that has it, or give another port"
+        ) from None
+    return out
+
+
+class TcpServer(Generic[State]):
+    """A port at which several clients listen and talk. No call waits, and a client that does not read is let go.
+
+    Attributes:
+        clients: Who is connected, with what is remembered of each.
+        address: Where they connect.
+    """
+
+    def __init__(self, address: Address, state: Callable[[], State], *, most: int = 8) -> None:
+        """Listen.
+
+        Args:
+            address: Host and port; port 0 takes a free one.
+            state: Makes what is remembered of a client.
+            most: Clients at a time; others are turned away.
+
+        Raises:
+            LinkError: It cannot be bound.
+        """
+        self.clients: dict[socket.socket, State] = {}
+        self._state, self._most = state, most
+        self._listener = bound_socket(socket.SOCK_STREAM, address)
+        self._listener.listen(most)
+        self._listener.setblocking(False)
+        self.address: Address = self._listener.getsockname()
+
+    def receive(self) -> list[tuple[socket.socket, State, bytes]]:
+        """Let new clients in and dead ones go; what has come, by client."""
+        with suppress(OSError):
+            while True:
+                client, _ = self._listener.accept()
+                client.setblocking(False)
+                client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                if len(self.clients) < self._most:
+                    self.clients[client] = self._state()
+                else:
+                    client.close()
+        received = []
+        for client, state in list(self.clients.items()):
+            try:
+                data = client.recv(_BYTES_AT_ONCE)
+            except BlockingIOError:
+                continue
+            except OSError:
+                data = b""
+            if data:
+                received.append((client, state, data))
+            else:
+                self._leave(client)
+        return received
+
+    def send(self, data: bytes, client: socket.socket) -> None:
+        """Send to one client, if it is still there."""
+        try:
+            if client in self.clients and client.send(data) < len(data):
+                self._leave(client)
+        except OSError:
+            self._leave(client)
+
+    def close(self) -> None:
+        """Let everyone go and stop listening."""
+        for client in list(self.clients):
+            self._leave(client)
+        self._listener.close()
+
+    def _leave(self, client: socket.socket) -> None:
+        self.clients.pop(client, None)
+        client.close()
 
 
 # The wire as a serial line, which may be unplugged and plugged in again.

@@ -15,7 +15,6 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,8 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.frames import FROM_FOSSEN, TO_FOSSEN
-from finssim.robot.link.frames import LinkError
-from finssim.robot.link.transports import Address, resolved
+from finssim.robot.link.transports import Address, TcpServer, resolved
 from finssim.robot.messages import VELOCITY, NavigationAid
 
 __all__ = ["PORT", "DvlClient", "DvlServer", "DvlVelocity", "decode_line", "encode_velocity"]
@@ -279,7 +277,7 @@ class DvlClient:
             gone.close()
 
 
-_MOST_CLIENTS, _MOST_PINGS = 8, 15
+_MOST_PINGS = 15
 _CONFIG: dict[str, Any] = {
     "speed_of_sound": 1475.0,
     "acoustic_enabled": True,
@@ -310,45 +308,15 @@ class DvlServer:
             LinkError: It cannot be bound.
         """
         self.config, self.resets = dict(_CONFIG), 0
-        self._clients: dict[socket.socket, _Lines] = {}
         self._pings = 0
-        self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            self._listener.bind(address)
-        except OSError as problem:
-            self._listener.close()
-            host, port = address
-            raise LinkError(
-                f"cannot bind {host}:{port} for the DVL ({problem.strerror}): end the program that has it, or give "
-                "another port"
-            ) from None
-        self._listener.listen(_MOST_CLIENTS)
-        self._listener.setblocking(False)
-        self.address: Address = self._listener.getsockname()
+        self._server = TcpServer(address, _Lines)
+        self.address: Address = self._server.address
 
     def poll(self) -> None:
         """Let new clients in and answer their commands; call it often."""
-        with suppress(OSError):
-            while True:
-                client, _ = self._listener.accept()
-                client.setblocking(False)
-                client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                if len(self._clients) < _MOST_CLIENTS:
-                    self._clients[client] = _Lines()
-                else:
-                    client.close()
-        for client, lines in list(self._clients.items()):
-            try:
-                data = client.recv(_LONGEST_LINE)
-            except BlockingIOError:
-                continue
-            except OSError:
-                data = b""
-            if not data:
-                self._leave(client)
+        for client, lines, data in self._server.receive():
             for line in lines.feed(data):
-                self._tell(client, _line(self._answer(_object(line))))
+                self._server.send(_line(self._answer(_object(line))), client)
 
     def send(self, line: bytes) -> None:
         """Send a report to every client, if the log pings: always, or once per `trigger_ping` where it is told not to.
@@ -361,25 +329,12 @@ class DvlServer:
             if not self._pings:
                 return
             self._pings -= 1
-        for client in list(self._clients):
-            self._tell(client, line)
+        for client in list(self._server.clients):
+            self._server.send(line, client)
 
     def close(self) -> None:
         """Let everyone go and stop listening."""
-        for client in list(self._clients):
-            self._leave(client)
-        self._listener.close()
-
-    def _tell(self, client: socket.socket, data: bytes) -> None:
-        try:
-            if client in self._clients and client.send(data) < len(data):
-                self._leave(client)
-        except OSError:
-            self._leave(client)
-
-    def _leave(self, client: socket.socket) -> None:
-        self._clients.pop(client, None)
-        client.close()
+        self._server.close()
 
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
         command, error, result = request.get("command"), "", None
