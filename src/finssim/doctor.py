@@ -56,6 +56,7 @@ EXTRAS = {
     "logs": Extra(
         {
             "matplotlib": "matplotlib",
+            "mcap": "mcap",
             "pandas": "pandas",
             "pyarrow": "pyarrow",
             "pymavlink": "pymavlink",

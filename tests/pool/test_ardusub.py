@@ -25,9 +25,11 @@ NEUTRAL = (0, 0, 500, 0)
 class Ground:
     """A ground station in lock-step with a pool, that beats and may steer."""
 
-    def __init__(self, *, system=255, start=(0.0, 0.0, -2.0), yaw=0.0, attitude=None, spec=DEEP, **options):
+    def __init__(
+        self, *, system=255, start=(0.0, 0.0, -2.0), yaw=0.0, attitude=None, vehicle=HEAVY, spec=DEEP
+    ):
         q = quat_from_euler(*(attitude or (0.0, 0.0, yaw)))
-        self.pool = VirtualPool(HEAVY, spec, firmware="ardusub", start=(start, q), **options)
+        self.pool = VirtualPool(vehicle, spec, firmware="ardusub", start=(start, q))
         self.mav = mavlink.MAVLink(None, system, 190)
         self.mav.robust_parsing = True
         self.beats, self.axes, self.buttons, self.tilt = True, None, 0, (0, 0)
@@ -223,6 +225,18 @@ def test_each_axis_moves_the_vehicle_its_way(axis, way):
     assert nu[index] * sign * way > 0.2
     others = np.delete(nu[:3], index) if index < 3 else nu[:3]
     assert np.abs(others).max() < 0.3 * abs(nu[index])
+
+
+def test_six_thrusters_have_their_own_frame_and_directions():
+    """A BlueROV2 without compass and log: frame 1, no pitch, the mixer's limits; MOT_n_DIRECTION turns a motor."""
+    rov = load_vehicle("bluerov2")
+    ground = Ground(vehicle=rov, spec=draw_plant(rov, 1, "nominal"), start=(0.0, 0.0, -0.5)).armed()
+    assert ground.firmware.parameters["FRAME_CONFIG"] == 1.0 and not ground.lines
+    ground.axes, ground.tilt = (500, 0, 1000, 0), (200, 0)
+    ground.run(0.2)
+    assert ground.firmware.pulses.tolist() == [1300, 1300, 1500, 1500, 1100, 1100]
+    ground.set(MOT_5_DIRECTION=-1)
+    assert ground.firmware.pulses.tolist() == [1300, 1300, 1500, 1500, 1900, 1100]
 
 
 @pytest.mark.parametrize("name, tilt", [("pitch", (150, 0)), ("roll", (0, 150))])

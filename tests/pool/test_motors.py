@@ -11,9 +11,9 @@ FINSROV = load_vehicle("finsrov")
 NOMINAL = draw_plant(FINSROV, 0, "nominal")
 
 
-def speeds(spec, target_rpm, duration=2.0, motor=4, seed=0):
+def speeds(spec, target_rpm, duration=2.0, motor=4, seed=0, **options):
     """True shaft speed of one motor after a step of its target [rpm], by physics step."""
-    plant = Plant(FINSROV, spec, seed=seed)
+    plant = Plant(FINSROV, spec, seed=seed, **options)
     plant.target[motor] = target_rpm * RPM
     out = []
     for _ in range(round(duration / plant.step)):
@@ -53,6 +53,19 @@ def test_without_the_loop_the_feed_forward_alone_is_wrong():
     assert speeds(NOMINAL.model_copy(update={"firmware": wrong}), 1000.0)[-1] == pytest.approx(
         0.8 * speeds(spec, 1000.0)[-1], rel=1e-3
     )
+
+
+@pytest.mark.parametrize("target", [1500.0, -900.0])
+def test_pulses_alone_turn_a_motor_as_fast_as_it_and_its_battery_can(target):
+    """Without a speed loop: the target at full voltage and for a motor as described, else in proportion to both."""
+    assert speeds(NOMINAL, target, speed_loop=False)[-1] == pytest.approx(target, rel=2e-3)
+    built = NOMINAL.thrusters
+    weak = {name: t.model_copy(update={"full_rpm": 0.9 * t.full_rpm}) for name, t in built.items()}
+    spec = NOMINAL.model_copy(update={"thrusters": weak})
+    assert speeds(spec, target, speed_loop=False)[-1] == pytest.approx(0.9 * target, rel=2e-3)
+    tired = NOMINAL.battery.model_copy(update={"fade": 0.2, "fade_time": 0.1, "resistance": 0.0})
+    spec = NOMINAL.model_copy(update={"battery": tired})
+    assert speeds(spec, target, speed_loop=False)[-1] == pytest.approx(0.8 * target, rel=2e-3)
 
 
 def test_the_derivative_gain_holds_the_rise_back():

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from finssim.calibration.check import check_trials
+from finssim.calibration.hydrodynamics import fit_hydrodynamics
 from finssim.calibration.importers import ardusub
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.control.ardusub import Mixer
+from finssim.geometry.frames import TO_FOSSEN
+from finssim.pool.ardusub_sitl import SitlWorld
 from finssim.vehicles import load_vehicle
 
 pytest.importorskip("pymavlink")
@@ -166,3 +169,47 @@ def test_check_judges_such_a_dive(tmp_path):
     (report,) = check_trials(read_trials([path], vehicle="bluerov2_heavy"))
     assert report.verdict != "refused" and report.inputs == "pwm"
     assert "yaw" in {axis.axis for axis in report.axes}
+
+
+@pytest.mark.slow
+def test_a_dive_of_sticks_alone_identifies_the_vehicle(tmp_path):
+    """Steps ahead, astern and of yaw in the water of `ardusub-sitl`, with sticks, attitude and a DVL's deltas on the
+    ground station's log: the fit finds the damping and the added mass of the vehicle file."""
+    world, mixer, dive = SitlWorld(HEAVY, position=(0.0, 0.0, -20.0)), Mixer.of_frame("VECTORED_6DOF"), Dive()
+    noise, travelled = np.random.default_rng(0), np.zeros(3)
+    for i in range(4400):
+        time, step = 0.02 * i, int(0.02 * i) // 4 - 1
+        demands, level = np.zeros(6), (0.13, 0.17, 0.21)[step // 2 % 3] * (1.0 if step // 6 % 2 else -1.0)
+        demands[4 if step < 12 else 2] = level if step >= 0 and step % 2 == 0 else 0.0
+        pulses = (*np.round(mixer.pulses(demands)).astype(int).tolist(), *[1500] * 8)
+        if i % 5 == 0:
+            state = json.loads(world.answer())
+            angles = dict(zip(("roll", "pitch", "yaw"), state["attitude"], strict=True))
+            rates = np.array(state["imu"]["gyro"]) + 1e-3 * noise.standard_normal(3)
+            rates = dict(zip(("rollspeed", "pitchspeed", "yawspeed"), rates.tolist(), strict=True))
+            raw = {f"chan{n}_raw": 1500 for n in range(1, 19)}
+            raw |= {"chan4_raw": round(1500 + 400 * demands[2]), "chan5_raw": round(1500 + 400 * demands[4])}
+            ms = {"time_boot_ms": round(1000 * time)}
+            dive.add(time, 1, 1, "ATTITUDE", {**ms, **angles, **rates})
+            dive.add(time, 1, 1, "RC_CHANNELS", {**ms, "chancount": 8, "rssi": 255, **raw})
+            told = travelled + 5e-4 * noise.standard_normal(3)
+            delta = {"time_usec": 0, "time_delta_usec": 100_000, "angle_delta": [0.0] * 3, "confidence": 90.0}
+            dive.add(time, 255, 0, "VISION_POSITION_DELTA", {**delta, "position_delta": told.tolist()})
+            travelled[:] = 0.0
+        if i % 50 == 0:
+            mode = {"type": 12, "autopilot": 3, "base_mode": 209, "custom_mode": MANUAL, "system_status": 4}
+            dive.add(time, 1, 1, "HEARTBEAT", mode)
+        world.step(pulses, 50)
+        travelled += 0.02 * TO_FOSSEN.vector(world.simulator.numpy("velocity")[0, 0, :3])
+    trials = read_trials([dive.tlog(tmp_path / "dive.tlog")], vehicle="bluerov2_heavy")
+    (report,) = check_trials(trials)
+    told = {axis.axis: {name for name, one in axis.tells.items() if one.can} for axis in report.axes}
+    assert {"m_eff", "d1", "d2"} <= told["surge"] & told["yaw"] and "d1" not in told["sway"]
+    found = fit_hydrodynamics(trials, HEAVY, axes=["surge", "yaw"], method="regression", known={}).estimates
+    for name, true in (
+        ("surge.d2", 141.0),
+        ("surge.m_eff", 19.86),
+        ("yaw.d2", 1.5),
+        ("yaw.added_mass", 0.2215),
+    ):
+        assert found[name].estimate == pytest.approx(true, rel=0.15)
