@@ -45,21 +45,17 @@ from finssim.experiments.on_robot import Attendant, OnRobot, kept_folder
 from finssim.experiments.pool_trial import HARDWARE, Job, play, pool_evaluation, run_on_robot
 from finssim.experiments.tables import Table, html_of, print_tables
 from finssim.experiments.transfer import finished
-from finssim.experiments.trials import Motion
 from finssim.experiments.trials import Trial as PlayedTrial
 from finssim.files import atomic_directory
 from finssim.learning.train import train
-from finssim.localization.detection.detector import detector
 from finssim.page import html_page
 from finssim.pool import draw_plant
-from finssim.pool.camera import PoolCamera, camera_of
-from finssim.pool.positioning import Exposure
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed
 from finssim.vehicles.defaults import room
 
-__all__ = ["camera_view", "demo"]
+__all__ = ["demo"]
 
 SHARE = 0.9
 """Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""
@@ -175,8 +171,6 @@ def _shuttle(axis: str, level: float, period: float) -> Programme:
     )
 
 
-ZOOM = 110
-"""Half the width of the part of a picture that is shown larger [px]."""
 BLUE, ORANGE = COLORS[:2]
 ARROW = 0.18
 """Length of an arrow that shows a heading [m]."""
@@ -191,9 +185,6 @@ POOL_VEHICLE = (
     "pool alone. Its propellers push up to 15 % more or less than the bench said, so what is found are effective "
     "masses and dampings: those of the thrust that the vehicle file promises."
 )
-VIEW = (
-    "Drawn again from the true pose of a trial of the policy with pictures, by that trial's camera and water."
-)
 PAPER = (
     "e_y is the vertical error. Gray rows are the paper's own, on hardware: its real vehicle in its pool. The others "
     "are of "
@@ -203,42 +194,6 @@ POOL = (
     "against a plant that no training has seen. Errors are those of the true pose."
 )
 ROBOT = "hardware, too. Errors are those of the robot's own estimate, whose error is not in them."
-
-
-def camera_view(job: Job, series: Path, at: float, seed: int, path: Path) -> None:
-    """Draw what the camera of a pool saw at one moment, anew from the pose that the vehicle truly had.
-
-    On the left is the whole picture, on the right the vehicle in it with the outlines of the tags that were detected.
-
-    Args:
-        job: The trial.
-        series: As `run_jobs` left it, without its suffix.
-        at: Time since its start [s].
-        seed: Of ripples and noise.
-        path: Picture to write.
-    """
-    standing = load_vehicle(job.pool_vehicle)
-    site, _, settings = camera_of(standing, job.plant, job.severity)  # type: ignore[arg-type]
-    camera = PoolCamera(standing, site, mode="pictures", settings=settings, seed=seed)
-    motion = Motion.read(series)
-    k = int(np.argmin(np.abs(motion.t - at)))
-    pose = motion.position[k], motion.quaternion[k]
-    image = camera.develop(Exposure(0, at, at + settings.latency, pose, pose)).image
-    assert image is not None and standing.tags is not None
-    tags = [d for d in detector(standing.tags.family).detect(image) if d.tag in standing.tags.mounts]
-    figure = new_figure(9.0, 3.4, layout="compressed")
-    whole, close = figure.subplots(1, 2, width_ratios=(16, 9))
-    for axes in (whole, close):
-        axes.imshow(image, cmap="gray", vmin=0, vmax=255)
-        axes.set_axis_off()
-        for tag in tags:
-            axes.plot(*np.vstack([tag.corners, tag.corners[:1]]).T, color=ORANGE, linewidth=1.4)
-    whole.set_title("the overhead camera's picture", fontsize=9)
-    close.set_title(f"tags found: {', '.join(str(d.tag) for d in tags) or 'none'}", fontsize=9)
-    if tags:
-        x, y = np.concatenate([tag.corners for tag in tags]).mean(axis=0)
-        close.set(xlim=(x - ZOOM, x + ZOOM), ylim=(y + ZOOM, y - ZOOM))
-    save_figure(figure, path)
 
 
 def _paths(trials: Sequence[PlayedTrial]) -> Any:
@@ -313,7 +268,7 @@ def _lead(evaluations: Sequence[Evaluation], seconds: float) -> str:
 
 
 def _results(evaluations: Sequence[Evaluation]) -> list[Table]:
-    """All controllers beside the paper's, the policy's paths, what the camera saw, the training, and every setpoint."""
+    """All controllers beside the paper's, the policy's paths, the training, and every setpoint."""
     results = comparison_table([e.result for e in evaluations], "controller")
     heads = [head.replace("\n", " ") for head in results.heads]
     rows = [[e.label, *cells(e.result)] for e in evaluations]
@@ -330,9 +285,6 @@ def _results(evaluations: Sequence[Evaluation]) -> list[Table]:
             pictures={"paths.png": "Paths of the trials from above and from the side"},
         ),
     ]  # fmt: skip
-    if any(e.result["camera"] == "pictures" for e in evaluations):
-        seen = {"camera.png": "A picture of the overhead camera with the tags found in it"}
-        tables.append(Table(title="What the camera sees", note=VIEW, pictures=seen))
     learnt = {"training.png": "Mean return and share of episodes held while training"}
     tables.append(Table(title="Training", pictures=learnt))
     for e in evaluations:
@@ -352,8 +304,6 @@ SEED = 1
 PLANT, SEVERITY, RANGES = 1, "realistic", "pool"
 CONTROLLERS = ("policy", "pid", "pid-paper")
 WITH_PICTURES = "policy-with-pictures"
-VIEW_AT = 12.0
-"""Time of a trial from which the report shows a picture [s]."""
 COAST = 4.0
 """Longest, after a dive [s]: the pool is shallow, and this vehicle hardly rises."""
 
@@ -560,7 +510,7 @@ class _Demonstration:
         return result
 
     def _deployed(self, policy: Path) -> list[Evaluation]:
-        """All controllers in the pool, the policy with pictures too, and one of those pictures; or all on the robot."""
+        """All controllers in the pool, the policy with pictures too; or all on the robot."""
         vehicle = str(self.folder / vehicle_files(self.standing.name)[1])
         pool_vehicle, plant, severity, camera = self.name, PLANT, SEVERITY, "corners"
         if self.robot is not None:
@@ -584,9 +534,6 @@ class _Demonstration:
                 results = run_jobs(
                     jobs, place, play, processes=self.processes, progress=progress, show=self._show
                 )
-            if pictures:
-                series = place / pictures[0].key()
-                camera_view(pictures[0], series, VIEW_AT, self.seed, self.folder / "camera.png")
         evaluations = []
         for row in (*CONTROLLERS, WITH_PICTURES):
             of_row = [result for result in results if result["job"]["row"] == row]
