@@ -40,7 +40,6 @@ def made(tmp_path_factory):
     """The command, with a policy that had no time to learn: its folder, what was identified, and what it told."""
     out, found, told = tmp_path_factory.mktemp("demo") / "demo", [], io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(told):
-        patch.setattr(demo_module, "VIEW_AT", 1.0)
         patch.setattr(demo_module, "identify", lambda *a, **k: found.append(identify(*a, **k)) or found[0])
         patch.setattr(demo_module, "FULL", SMALL)
         assert boundary.run(app, ["demo", "--steps", "8192", "--seed", "1", "--out", str(out)]) == 0
@@ -71,7 +70,6 @@ def test_policy_results_and_report_are_there(folder):
         "policy-with-pictures.json",
         "pid.json",
         "pid-paper.json",
-        "camera.png",
         "envelopes.png",
         "paths.png",
         "training.png",
@@ -127,7 +125,7 @@ def test_the_report_loads_nothing(folder):
     """Pictures are inside; no script, no style sheet, no address."""
     html = (folder / "report.html").read_text(encoding="utf-8")
     sources = re.findall(r'(?:src|href)="([^"]{0,30})', html)
-    assert len(sources) == 5 and all(source.startswith("data:image/png;base64,") for source in sources)
+    assert len(sources) == 4 and all(source.startswith("data:image/png;base64,") for source in sources)
     assert "http" not in re.sub(r'"data:[^"]*"', "", html) and "<script" not in html
 
 
@@ -143,7 +141,6 @@ def test_the_report_has_every_controller_the_paper_and_the_provenance(folder):
         "P01",
         "Provenance",
         "surge.d1",
-        "What the camera sees",
     ):
         assert f">{word}<" in html
     vehicle = f"--vehicle {folder / 'finsrov_identified.yaml'}"

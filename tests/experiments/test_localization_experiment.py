@@ -63,7 +63,7 @@ def test_the_result_has_its_documented_parts(done):
     """Every method under every condition, with intervals around figures; the paper's figures are the paper's."""
     _, result, _ = done
     assert result["experiment"] == "localization" and result["renderer"] == "own"
-    assert result["seeds"] == [1] and not result["interrupted"]
+    assert result["seeds"] == [1]
     assert (result["places"], result["pictures_per_seed"]) == (20, 40)
     assert set(result["results"]) == {*CONDITIONS, "lifted"}
     for methods in result["results"].values():
@@ -171,28 +171,7 @@ def interrupting(words):
     return progress
 
 
-INTERRUPTED = {
-    "seed 2, published conditions": [1],
-    "seed 1, flat conditions": [1],
-}
-
-
-@pytest.mark.parametrize("words", INTERRUPTED)
-def test_an_interruption_keeps_what_is_finished(tmp_path, words):
-    """Whole seeds, the first as far as it came; the page says that it was interrupted, and links what is there."""
-    out = tmp_path / "out"
-    given = {"renderer": "geometry", "seeds": 3, "seed": 1, **TINY}
-    result = localization_experiment(out=out, progress=interrupting(words), **given)
-    assert result["interrupted"] and result["seeds"] == INTERRUPTED[words] and result["seeds_asked_for"] == 3
-    visits = {m["refractive"]["visits"] for m in result["results"].values()}
-    assert visits <= {5, 6}  # of one seed each; a lifted tag may leave the picture
-    page = (out / "localization.md").read_text(encoding="utf-8")
-    assert "interrupted, 3 asked for" in page
-    assert all((out / name).is_file() for name in re.findall(r"\]\((\w+\.png)\)", page))
-    assert json.loads((out / "localization.json").read_text())["interrupted"] is True
-
-
-def test_an_interruption_before_anything_is_finished_leaves_nothing(tmp_path):
+def test_an_interruption_leaves_nothing(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         localization_experiment(
             out=tmp_path / "out", progress=interrupting("seed 1, published conditions"), seeds=1, **TINY

@@ -43,7 +43,6 @@ def result():
     return {
         "seeds": [1, 2],
         "seeds_asked_for": 2,
-        "interrupted": False,
         "places": 170,
         "pictures_per_seed": 720,
         "renderer": "own",
@@ -112,13 +111,6 @@ def test_where_nothing_was_located_the_table_says_so(result):
     for text in (printed(result), markdown_of(tables_of(result))):
         assert "none" in text and "0/12" in text
         assert "calibrated on the same half" not in " ".join(text.split())
-
-
-def test_an_interruption_is_said(result):
-    """With the seeds that were asked for."""
-    result |= {"interrupted": True, "seeds_asked_for": 5}
-    assert "(interrupted, 5 asked for)" in markdown_of(tables_of(result))
-    assert "(interrupted, 5 asked for)" in " ".join(printed(result).split())
 
 
 def test_errors_of_the_calibrations_are_on_the_page(result):

@@ -1,9 +1,8 @@
-"""Results of the virtual pool in the form of an evaluation, and what its camera saw."""
+"""Results of the virtual pool in the form of an evaluation."""
 
 import numpy as np
 import pytest
 
-from finssim.experiments.demo import camera_view
 from finssim.experiments.metrics import T1_SETPOINTS, measure_trial
 from finssim.experiments.pool_trial import Job, pool_evaluation
 from finssim.experiments.trials import Motion
@@ -49,27 +48,3 @@ def test_a_trial_that_ended_early_has_no_motion_afterwards(tmp_path, jobs):
     evaluation = pool_evaluation(jobs[0], results, tmp_path)
     assert evaluation.trials[1].motion.t[-1] < 20.0
     assert evaluation.result["valid"] == 1  # errors of the last twenty seconds
-
-
-@pytest.mark.slow
-def test_the_camera_view_shows_the_tags_of_the_vehicle(tmp_path, jobs, monkeypatch):
-    """FinsROV's two tags are found where it is, and the answer is a PNG."""
-    held(tmp_path, jobs[0])
-    from finssim.experiments import demo as module
-
-    tags, find = [], module.detector
-
-    def detecting(family):
-        detector = find(family)
-
-        class Spy:
-            def detect(self, image):
-                tags.extend(detector.detect(image))
-                return tags
-
-        return Spy()
-
-    monkeypatch.setattr(module, "detector", detecting)
-    camera_view(jobs[0], tmp_path / jobs[0].key(), 12.0, seed=1, path=tmp_path / "camera.png")
-    assert (tmp_path / "camera.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(d.tag for d in tags) == [15, 16]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.experiments import replay_experiment as module
 from finssim.experiments.replay_experiment import (
     MODELS,
     PAPER_TABLE_3,
@@ -18,7 +17,7 @@ from finssim.experiments.replay_experiment import (
     replay_experiment,
     tables_of,
 )
-from finssim.experiments.tables import markdown_of, print_tables
+from finssim.experiments.tables import print_tables
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow
@@ -112,23 +111,6 @@ def test_seeds_that_disagree_widen_the_interval():
     mixed = width(np.r_[low[:2], high[:2]], np.r_[low[2:], high[2:]])
     apart = width(low, high)
     assert apart >= mixed and math.isclose(apart, 0.2, abs_tol=0.06)
-
-
-def test_an_interruption_keeps_the_finished_seeds(small, tmp_path, monkeypatch):
-    first = module.experiment_seed
-
-    def interrupted(vehicle, plant, seed, *rest):
-        if seed == 8:
-            raise KeyboardInterrupt
-        return first(vehicle, plant, seed, *rest)
-
-    monkeypatch.setattr(module, "experiment_seed", interrupted)
-    result = replay_experiment(seeds=3, seed=7, out=tmp_path / "out", repeats=2, axes=("yaw",))
-    assert result["interrupted"] and result["seeds"] == [7] and result["seeds_asked_for"] == 3
-    assert "interrupted" in markdown_of(tables_of(result))
-    with pytest.raises(KeyboardInterrupt):
-        replay_experiment(seeds=1, seed=8, out=tmp_path / "none", repeats=2)
-    assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize("options", [{"seeds": 0}, {"seeds": 1, "repeats": 3}])

@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from finssim.calibration.excitation.programmes import programmes
 from finssim.engine import Simulator
-from finssim.experiments.plants import PlantError
-from finssim.experiments.replay_experiment import load_replay_plant
+from finssim.experiments.replay_experiment import ReplayPlant
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
-PLANT = load_replay_plant()
+PLANT = ReplayPlant()
 
 
 def test_the_plant_couples_axes_that_every_model_of_the_file_keeps_apart():
@@ -79,10 +78,3 @@ def test_telemetry_hides_what_the_propellers_lose():
         c = np.where(omega > 0.0, thruster.c_plus, thruster.c_minus)
         logged += thruster.axis[0] * float(np.mean(c * omega * np.abs(omega)))
     assert logged == pytest.approx(12.0, rel=0.02)
-
-
-def test_a_wrong_plant_file_names_the_key(tmp_path):
-    file = tmp_path / "plant.yaml"
-    file.write_text("title: x\nmass: -1\n")
-    with pytest.raises(PlantError, match="mass"):
-        load_replay_plant(file)

@@ -73,7 +73,7 @@ def test_play_prints_the_messages_of_the_topics_asked_for(run, capsys):
 
 
 def test_play_starts_where_it_is_told_and_writes_json(run, capsys):
-    text = finssim(capsys, "play", run, "--fast", "--topics", "telemetry", "--start", 1.9, "--json")
+    text = finssim(capsys, "play", run, "--fast", "--topics", "telemetry", "--start", 1.9)
     lines = [json.loads(line) for line in text.splitlines()]
     assert [line["time"] for line in lines] == pytest.approx([101.9, 101.92, 101.94, 101.96, 101.98, 102.0])
     assert lines[0]["message"]["depth"] == 0.5 and lines[0]["message"]["pressure"] is None

@@ -147,14 +147,6 @@ def test_progress_adds_up_to_the_way():
     np.testing.assert_allclose(total, before - env.arrays.totals.numpy()[:, gap], atol=1e-4)
 
 
-def test_a_level_that_rises_is_no_way_lost():
-    """The step after it costs what the steps before it do: nobody has moved."""
-    env = Environment(TeamPursuit(level=0), worlds=8, seed=1)
-    usual = [env.step(np.zeros((8, 3, 4))).reward.copy() for _ in range(5)][-1]
-    env.change(replace(env.task, level=1))
-    np.testing.assert_allclose(env.step(np.zeros((8, 3, 4))).reward, usual, atol=0.1)
-
-
 def test_a_herder_that_strays_loses_by_its_distance_to_the_prey():
     """By d / 8 m up to one, and nobody else does."""
     reward = TeamPursuit().reward

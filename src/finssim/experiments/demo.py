@@ -46,22 +46,18 @@ from finssim.experiments.on_robot import Attendant, OnRobot, kept_folder
 from finssim.experiments.pool_trial import HARDWARE, Job, play, pool_evaluation, run_on_robot
 from finssim.experiments.tables import Table, html_of, print_tables
 from finssim.experiments.transfer import finished
-from finssim.experiments.trials import Motion
 from finssim.experiments.trials import Trial as PlayedTrial
 from finssim.files import atomic_directory
 from finssim.learning.train import train
-from finssim.localization.detection.detector import detector
 from finssim.page import html_page
 from finssim.pool import draw_plant
-from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import site_of
-from finssim.pool.positioning import Exposure
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed
 from finssim.vehicles.defaults import SITES, room
 
-__all__ = ["camera_view", "demo"]
+__all__ = ["demo"]
 
 SHARE = 0.9
 """Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""
@@ -177,8 +173,6 @@ def _shuttle(axis: str, level: float, period: float) -> Programme:
     )
 
 
-ZOOM = 110
-"""Half the width of the part of a picture that is shown larger [px]."""
 BLUE, ORANGE = COLORS[:2]
 ARROW = 0.18
 """Length of an arrow that shows a heading [m]."""
@@ -193,54 +187,16 @@ POOL_VEHICLE = (
     "pool alone. Its propellers push up to 15 % more or less than the bench said, so what is found are effective "
     "masses and dampings: those of the thrust that the vehicle file promises."
 )
-VIEW = (
-    "Drawn again from the true pose of a trial of the policy with pictures, by that trial's camera and water."
-)
 PAPER = (
     "e_y is the vertical error. Gray rows are the paper's own, on hardware: its real vehicle in its pool. The others "
     "are of "
 )
 POOL = (
-    "the virtual pool: the robot's whole software, from the camera's tags to the motor controller's frames, "
+    "the virtual pool or tank: the robot's whole software, from what locates it to the frames of the motor controller "
+    "or autopilot, "
     "against a plant that no training has seen. Errors are those of the true pose."
 )
 ROBOT = "hardware, too. Errors are those of the robot's own estimate, whose error is not in them."
-
-
-def camera_view(job: Job, series: Path, at: float, seed: int, path: Path) -> None:
-    """Draw what the camera of a pool saw at one moment, anew from the pose that the vehicle truly had.
-
-    On the left is the whole picture, on the right the vehicle in it with the outlines of the tags that were detected.
-
-    Args:
-        job: The trial.
-        series: As `run_jobs` left it, without its suffix.
-        at: Time since its start [s].
-        seed: Of ripples and noise.
-        path: Picture to write.
-    """
-    standing = load_vehicle(job.pool_vehicle)
-    site, _, settings = camera_of(standing, job.plant, job.severity)  # type: ignore[arg-type]
-    camera = PoolCamera(standing, site, mode="pictures", settings=settings, seed=seed)
-    motion = Motion.read(series)
-    k = int(np.argmin(np.abs(motion.t - at)))
-    pose = motion.position[k], motion.quaternion[k]
-    image = camera.develop(Exposure(0, at, at + settings.latency, pose, pose)).image
-    assert image is not None and standing.tags is not None
-    tags = [d for d in detector(standing.tags.family).detect(image) if d.tag in standing.tags.mounts]
-    figure = new_figure(9.0, 3.4, layout="compressed")
-    whole, close = figure.subplots(1, 2, width_ratios=(16, 9))
-    for axes in (whole, close):
-        axes.imshow(image, cmap="gray", vmin=0, vmax=255)
-        axes.set_axis_off()
-        for tag in tags:
-            axes.plot(*np.vstack([tag.corners, tag.corners[:1]]).T, color=ORANGE, linewidth=1.4)
-    whole.set_title("the overhead camera's picture", fontsize=9)
-    close.set_title(f"tags found: {', '.join(str(d.tag) for d in tags) or 'none'}", fontsize=9)
-    if tags:
-        x, y = np.concatenate([tag.corners for tag in tags]).mean(axis=0)
-        close.set(xlim=(x - ZOOM, x + ZOOM), ylim=(y + ZOOM, y - ZOOM))
-    save_figure(figure, path)
 
 
 def _paths(trials: Sequence[PlayedTrial], site: str) -> Any:
@@ -316,7 +272,7 @@ def _lead(evaluations: Sequence[Evaluation], seconds: float) -> str:
 
 
 def _results(evaluations: Sequence[Evaluation]) -> list[Table]:
-    """All controllers beside the paper's, the policy's paths, what the camera saw, the training, and every setpoint."""
+    """All controllers beside the paper's, the policy's paths, the training, and every setpoint."""
     results = comparison_table([e.result for e in evaluations], "controller")
     heads = [head.replace("\n", " ") for head in results.heads]
     rows = [[e.label, *cells(e.result)] for e in evaluations]
@@ -333,9 +289,6 @@ def _results(evaluations: Sequence[Evaluation]) -> list[Table]:
             pictures={"paths.png": "Paths of the trials from above and from the side"},
         ),
     ]  # fmt: skip
-    if any(e.result["camera"] == "pictures" for e in evaluations):
-        seen = {"camera.png": "A picture of the overhead camera with the tags found in it"}
-        tables.append(Table(title="What the camera sees", note=VIEW, pictures=seen))
     learnt = {"training.png": "Mean return and share of episodes held while training"}
     tables.append(Table(title="Training", pictures=learnt))
     for e in evaluations:
@@ -367,8 +320,6 @@ class Firmware(NamedTuple):
 
 FIRMWARES = {"mcu": Firmware(None, "pool", "corners"), "ardusub": Firmware("pilot6", "tank", "none")}
 WITH_PICTURES = "policy-with-pictures"
-VIEW_AT = 12.0
-"""Time of a trial from which the report shows a picture [s]."""
 COAST = 4.0
 """Longest, after a dive [s]: the pool is shallow, and this vehicle hardly rises."""
 
@@ -530,6 +481,11 @@ class _Demonstration:
             raise
         return evaluations
 
+    @property
+    def site(self) -> str:
+        """Where trials are made."""
+        return FIRMWARES[self.firmware].site if self.robot is None else self.robot.site
+
     def tell(self, text: str) -> None:
         """Show a line of progress."""
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
@@ -562,8 +518,7 @@ class _Demonstration:
 
             result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=record)
         else:
-            site = FIRMWARES[self.firmware].site
-            spec = site_of(site, draw_plant(standing, PLANT, SEVERITY))
+            spec = site_of(self.site, draw_plant(standing, PLANT, SEVERITY))
             spec.write(self.folder / PLANT_FILE)
             with self._working("recording trials in the virtual pool") as progress:
 
@@ -576,7 +531,7 @@ class _Demonstration:
                 def simulated(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
                     return pool_trials(
                         plans, folder, vehicle=str(rough), pool_vehicle=self.name, plant=PLANT, severity=SEVERITY,
-                        seed=seed, site=site, firmware=self.firmware, leave_out=True, processes=self.processes,
+                        seed=seed, site=self.site, firmware=self.firmware, leave_out=True, processes=self.processes,
                         progress=progress, show=show,
                     )  # fmt: skip
 
@@ -590,18 +545,17 @@ class _Demonstration:
         return result
 
     def _deployed(self, policy: Path) -> list[Evaluation]:
-        """All controllers in the pool, the policy with pictures too, and one of those pictures; or all on the robot."""
+        """All controllers in the pool, the policy with pictures too; or all on the robot."""
         vehicle = str(self.folder / vehicle_files(self.standing.name)[1])
         pool_vehicle, plant, severity, camera = self.name, PLANT, SEVERITY, FIRMWARES[self.firmware].camera
-        site = FIRMWARES[self.firmware].site
         if self.robot is not None:
-            pool_vehicle, plant, severity, camera, site = vehicle, 0, HARDWARE, HARDWARE, self.robot.site
+            pool_vehicle, plant, severity, camera = vehicle, 0, HARDWARE, HARDWARE
 
         def job(row: str, target: str, camera: str) -> Job:
             controller = str(policy) if row.startswith("policy") else row
             return Job(
                 row=row, controller=controller, target=target, camera=camera, vehicle=vehicle, seed=self.seed,
-                pool_vehicle=pool_vehicle, plant=plant, severity=severity, duration=self.scope.duration, site=site,
+                pool_vehicle=pool_vehicle, plant=plant, severity=severity, duration=self.scope.duration, site=self.site,
                 firmware=self.firmware,
             )  # fmt: skip
 
@@ -620,9 +574,6 @@ class _Demonstration:
                 results = run_jobs(
                     jobs, place, play, processes=self.processes, progress=progress, show=self._show
                 )
-            if pictures:
-                series = place / pictures[0].key()
-                camera_view(pictures[0], series, VIEW_AT, self.seed, self.folder / "camera.png")
         evaluations = []
         for row in (*CONTROLLERS, WITH_PICTURES):
             of_row = [result for result in results if result["job"]["row"] == row]
@@ -644,7 +595,7 @@ class _Demonstration:
         compared = [e for e in evaluations if e.result["trials"] == policy.result["trials"]]
         envelopes = {e.label: error_envelope(e.trials) for e in compared}
         save_figure(draw_envelopes(envelopes), folder / "envelopes.png")
-        save_figure(_paths(policy.trials, FIRMWARES[self.firmware].site), folder / "paths.png")
+        save_figure(_paths(policy.trials, self.site), folder / "paths.png")
         draw_training(groups_of([str(folder / "policy")]), folder / "training.png")
         title = f"Station keeping of {policy.result['vehicle']['name']}"
         origin = {
@@ -671,6 +622,8 @@ class _Demonstration:
         rough, identified = (out / file for file in vehicle_files(name))
         steps = Policy.load(self.folder / "policy").description.training["steps"]
         options = f"--randomize {RANGES} --seed {seed} --steps {steps}"
+        action = FIRMWARES[self.firmware].action
+        options += f" --action {action}" if action else ""
         learn = f"finssim train t1 --vehicle {identified} {options} --out policy"
         drive = f"finssim run --policy policy --vehicle {identified} --goal 1,0.3,-0.5,90"
         excite = f"finssim excite all --vehicle {rough} --coast {COAST:g} --out more-trials"
@@ -679,6 +632,11 @@ class _Demonstration:
             robot = f"{self.robot.options} --arm"
             evaluated = f"finssim evaluate run.mcap --task t1 --vehicle {identified}"
             return [f"{excite} {robot}", *middle, f"{drive} {robot} --record run.mcap", evaluated]
+        if self.firmware == "ardusub":
+            tank = f"finssim pool --vehicle {self.name} --plant {out / PLANT_FILE} --firmware ardusub"
+            robot = f"--robot mavlink --site {self.site} --pool-file none --let-in 0,0 --arm"
+            tank += f" --site {self.site} --truth truth.fst"
+            return [tank, f"{excite} {robot}", *middle, f"{drive} {robot}"]
         return [
             f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
             f"{excite} --pool {PLANT} --severity {SEVERITY} --pool-vehicle {self.name}",

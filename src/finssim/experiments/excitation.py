@@ -35,7 +35,7 @@ from finssim.experiments.on_robot import (
     check_starts,
     session,
 )
-from finssim.experiments.pool_trial import equipped, noise_seed, play_in_pool
+from finssim.experiments.pool_trial import noise_seed, play_in_pool
 from finssim.files import atomic_directory, atomic_write
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import draw_plant
@@ -47,7 +47,7 @@ from finssim.robot.perception import Perception
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import AXES, Vehicle, load_vehicle
-from finssim.vehicles.defaults import room
+from finssim.vehicles.defaults import room, vehicle_at
 
 Array = NDArray[np.float64]
 
@@ -363,7 +363,7 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
         outcome = play_in_pool(
             trial,
             Station(place.position, place.yaw),
-            equipped(vehicle, run.site, run.firmware),
+            vehicle_at(run.site, vehicle, navigation=run.firmware == "ardusub"),
             pool,
             seed=seed,
             recorder=recorder,

@@ -18,7 +18,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -633,8 +633,7 @@ class Process:
         return ""
 
 
-@dataclass(frozen=True)
-class Pair:
+class Pair(NamedTuple):
     """A robot in a pool, each in a process of its own."""
 
     pool: Process
@@ -659,7 +658,12 @@ def pair(
     Raises:
         ReliabilityError: The pool never stood.
     """
-    port, peer = free_ports()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port: int = free.getsockname()[
+            1
+        ]  # and the five after it: another attempt is made where they are taken
+    peer = port + 4
     end, both = f"127.0.0.1:{peer}", ["--vehicle", vehicle, "--pool-file", str(folder / "pool.yaml")]
     world = ["pool", *both, "--port", str(port), "--robot", end, *pool]
     ours = ["run", *both, "--goal", goal, "--arm", "--json", "--bind", end, *robot]
@@ -726,25 +730,6 @@ def await_flush(truth: Path) -> float:
     still = f"{truth} does not grow: the pool stands still"
     _await(lambda: truth.stat().st_size > size, POLL, lambda: True, lambda: still)
     return float(read_truth(truth).time[-1])
-
-
-def free_ports() -> tuple[int, int]:
-    """Ports of the pool's and of the robot's end; the two after the first and the one after the second are free too."""
-    for _ in range(100):
-        with ExitStack() as stack:
-            probes = [
-                stack.enter_context(socket.socket(socket.AF_INET, kind))
-                for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM) * 6
-            ]
-            try:
-                probes[0].bind(("127.0.0.1", 0))
-                first: int = probes[0].getsockname()[1]
-                for k, probe in enumerate(probes[1:], start=1):
-                    probe.bind(("127.0.0.1", first + k // 2))
-            except (OSError, OverflowError):
-                continue
-            return first, first + 4
-    raise ReliabilityError("no six free ports in a row on this machine: end some programs")
 
 
 def play_kill(job: FaultJob, path: Path) -> dict[str, Any]:

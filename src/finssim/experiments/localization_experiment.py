@@ -595,9 +595,8 @@ def _texts(value: float | None, interval: Sequence[float | None]) -> tuple[str, 
 
 
 def _headline(result: Mapping[str, Any]) -> str:
-    short = f" (interrupted, {result['seeds_asked_for']} asked for)" if result["interrupted"] else ""
     return (
-        f"{len(result['seeds'])} seeds{short}, each {result['pictures_per_seed']} pictures at"
+        f"{len(result['seeds'])} seeds, each {result['pictures_per_seed']} pictures at"
         f" {result['places']} places,"
         f" renderer {result['renderer']}"
     )
@@ -639,8 +638,7 @@ def localization_experiment(
 ) -> dict[str, Any]:
     """Locate a tag at places that the calibration has not seen, by refractive and pinhole methods: RMSE, P95 [cm].
 
-    Every seed draws the places' survey errors, readings, camera file, plumb line, ripples and noise anew. Ctrl-C keeps
-    the seeds that are finished, or of the first what there is.
+    Every seed draws the places' survey errors, readings, camera file, plumb line, ripples and noise anew.
 
     Example: finssim experiment localization --seeds 3 --out localization
 
@@ -664,36 +662,26 @@ def localization_experiment(
     refuse_unwritable(atomic_directory(out, replaces=RESULT_FILE))
     drawn: dict[str, list[SeedResult]] = {name: [] for name in CONDITIONS}
     higher: list[Mapping[str, Scores]] = []
-    runs, interrupted = drawn["published"], False
-    try:
-        for k in range(seeds):
-            for j, name in enumerate(CONDITIONS):
-                progress((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
-                drawn[name].append(_one(name, seed + k, renderer, size))
-            progress((k + 0.8) / seeds, f"seed {seed + k}, another depth")
-            campaign = lifted(runs[k].campaign, LIFT)  # the same calibration, the tag at another depth
-            higher.append(_scored(campaign, list(pictures(campaign, renderer)), runs[k].found))
-    except KeyboardInterrupt:
-        if not runs:
-            raise
-        interrupted = True
-        for each in drawn.values():
-            del each[max(len(higher), 1) :]
+    runs = drawn["published"]
+    for k in range(seeds):
+        for j, name in enumerate(CONDITIONS):
+            progress((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
+            drawn[name].append(_one(name, seed + k, renderer, size))
+        progress((k + 0.8) / seeds, f"seed {seed + k}, another depth")
+        campaign = lifted(runs[k].campaign, LIFT)  # the same calibration, the tag at another depth
+        higher.append(_scored(campaign, list(pictures(campaign, renderer)), runs[k].found))
     scores = {**{name: [one.scores for one in each] for name, each in drawn.items()}, "lifted": higher}
     visits = runs[0].campaign.visits
     result = {
         "experiment": "localization",
         "renderer": renderer,
         "seeds": [one.campaign.seed for one in runs],
-        "seeds_asked_for": seeds,
-        "interrupted": interrupted,
         "places": len(visits),
         "pictures_per_seed": sum(visit.images for visit in visits),
         "conditions": {name: vars(CONDITIONS[name]) for name in CONDITIONS},
         "results": {
             name: {method: pooled([one[method] for one in each]) for method in METHODS_SHOWN}
             for name, each in scores.items()
-            if each
         },
         "lift_m": LIFT,
         "pixel_std_px": [one.found.pixel_std for one in runs],

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import difflib
-import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from finssim.engine import Water, Wave
+from finssim.engine import Water
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges, load_ranges
 from finssim.tasks import Environment, MeasurementNoise, Task
@@ -43,10 +41,10 @@ class Plant(BaseModel):
     """calibrated, mesh or simplified."""
     ranges: Ranges | None = None
     """Drawn anew for every trial: a mapping, or the name or file of ranges."""
-    water: dict[str, Any] = Field(default_factory=dict)
-    """Arguments of `finssim.engine.Water`: current, shear, drift_std, drift_time, depth, waves."""
-    noise: dict[str, float] = Field(default_factory=dict)
-    """Arguments of `finssim.tasks.MeasurementNoise` [m, rad, m/s, rad/s]."""
+    water: Water | None = None
+    """Current, shear, drift_std, drift_time, depth, waves; still if None."""
+    noise: MeasurementNoise | None = None
+    """On what the controller sees [m, rad, m/s, rad/s]."""
     observe: str | None = None
     """In place of `noise`: truth, estimator, or sensors, those of the vehicle file with position fixes; or a file of
     fixes."""
@@ -61,18 +59,6 @@ class Plant(BaseModel):
     @classmethod
     def _named_ranges(cls, value: Any) -> Any:
         return load_ranges(value) if isinstance(value, str) else value
-
-    @field_validator("water")
-    @classmethod
-    def _possible_water(cls, value: dict[str, Any]) -> dict[str, Any]:
-        _water(value)
-        return value
-
-    @field_validator("noise")
-    @classmethod
-    def _possible_noise(cls, value: dict[str, float]) -> dict[str, float]:
-        _made(MeasurementNoise, value)
-        return value
 
     @model_validator(mode="after")
     def _sees_one_way(self) -> Plant:
@@ -90,7 +76,7 @@ class Plant(BaseModel):
         """
         title = f"{self.title}; seen: {observe}".removeprefix("; ")
         try:
-            return Plant.model_validate({**dict(self), "noise": {}, "observe": observe, "title": title})
+            return Plant.model_validate({**dict(self), "noise": None, "observe": observe, "title": title})
         except ValidationError as error:
             raise PlantError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
 
@@ -116,12 +102,9 @@ class Plant(BaseModel):
 
     def environment_arguments(self) -> dict[str, Any]:
         """Arguments of `finssim.tasks.Environment`: water, noise, randomization."""
-        noise = observed(self.observe) if self.observe else None
-        if self.noise:
-            noise = MeasurementNoise(**self.noise)
         return {
-            "water": _water(self.water) if self.water else None,
-            "noise": noise,
+            "water": self.water,
+            "noise": observed(self.observe) if self.observe else self.noise,
             "randomization": Randomization(self.ranges).at_full_width() if self.ranges else None,
         }
 
@@ -173,31 +156,3 @@ def load_plant(name_or_path: str | Path) -> Plant:
         return Plant.model_validate({"name": path.stem, **data})
     except ValidationError as error:
         raise PlantError(f"{path}: {first_problem(error)}") from None
-
-
-def _water(value: Mapping[str, Any]) -> Water:
-    waves = value.get("waves", ())
-    if not isinstance(waves, list | tuple) or not all(isinstance(wave, Mapping) for wave in waves):
-        raise ValueError("waves: expected a list of mappings such as {amplitude: 0.03, wavelength: 8}")
-    water: Water = _made(Water, {**value, "waves": tuple(_made(Wave, wave) for wave in waves)})
-    return water
-
-
-def _made(kind: type, arguments: Mapping[str, Any]) -> Any:
-    """`kind(**arguments)`, with unknown names and wrong types told in one sentence."""
-    known = kind.__dataclass_fields__  # type: ignore[attr-defined]
-    for key, value in arguments.items():
-        if key not in known:
-            raise ValueError(f"unknown key '{key}'; available: {', '.join(known)}")
-        if key != "waves" and not _finite(value):
-            raise ValueError(f"{key} is {value!r}, expected finite numbers")
-    try:
-        return kind(**arguments)
-    except TypeError as error:
-        raise ValueError(str(error).replace(f"{kind.__name__}.__init__() ", "")) from None
-
-
-def _finite(value: Any) -> bool:
-    if isinstance(value, list | tuple):
-        return len(value) == 3 and all(_finite(x) for x in value)
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -47,7 +47,7 @@ from finssim.robot.wiring import link_of
 from finssim.tasks import task_named
 from finssim.tasks.agents import agent_for
 from finssim.vehicles import Vehicle, load_vehicle
-from finssim.vehicles.defaults import room, vehicle_at, with_navigation
+from finssim.vehicles.defaults import room, vehicle_at
 
 __all__ = [
     "HARDWARE",
@@ -143,12 +143,6 @@ def play_in_pool(
     return Outcome(trial=trial, runtime=runtime, fault=fault_of(trial, runtime))
 
 
-def equipped(vehicle: Vehicle, site: str, firmware: str) -> Vehicle:
-    """The vehicle as the robot has it at a site: with a Doppler log and a compass where an autopilot steers it."""
-    there = vehicle_at(site, vehicle)
-    return with_navigation(there) if firmware == "ardusub" else there
-
-
 def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial, Station]:
     """The trial of a job, which ends when its time is over, and where it starts.
 
@@ -227,7 +221,7 @@ def play(job: Job, path: Path) -> dict[str, Any]:
     trial, start = job_trial(job, vehicle, seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "truth"
-        ours = equipped(vehicle, job.site, job.firmware)
+        ours = vehicle_at(job.site, vehicle, navigation=job.firmware == "ardusub")
         outcome = play_in_pool(trial, start, ours, plan, seed=seed, truth=file, fusion=job.fusion)
         truth = read_truth(file)
     t = truth.time - outcome.runtime.started

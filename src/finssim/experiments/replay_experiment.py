@@ -6,11 +6,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
 
 from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.excitation.synthetic import Recording, record, trials_of
@@ -25,16 +26,14 @@ from finssim.engine import Simulator, TetherLine
 from finssim.experiments.campaign import Progress, write_json
 from finssim.experiments.figures import save_figure
 from finssim.experiments.metrics import PAPER
-from finssim.experiments.plants import PlantError
 from finssim.experiments.statistics import RESAMPLES, SEED, bootstrap
 from finssim.experiments.tables import Table
 from finssim.files import atomic_directory, refuse_unwritable
-from finssim.pool.plant_spec import CoupledMatrix, Section, Three
+from finssim.pool.plant_spec import CoupledMatrix
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import Axis
-from finssim.yaml_file import first_problem, read_mapping
 
 Array = NDArray[np.float64]
 
@@ -44,52 +43,21 @@ SLOWEST = 3.0
 """Below this propeller speed the loss of thrust is taken as at it [1/s]: there is hardly any thrust to lose."""
 
 
-class _Hull(Section):
-    form_drag: float = Field(ge=0.0)
-    skin_drag: float = Field(ge=0.0)
+class ReplayPlant:
+    """The hidden plant of `replay_plant.yaml`; inertia, buoyancy, thrusters and allocation are the vehicle file's."""
 
-
-class _Motors(Section):
-    time_constant: float = Field(gt=0.0)
-    delay: float = Field(ge=0.0)
-
-
-class _Propellers(Section):
-    diameter: float = Field(gt=0.0)
-    advance_at_zero_thrust: float = Field(gt=0.0)
-    induced_share: float = Field(ge=0.0, le=1.0)
-    induced_reach: float = Field(gt=0.0)
-
-
-class _Tether(Section):
-    diameter: float = Field(gt=0.0)
-    drag_coefficient: float = Field(ge=0.0)
-    attachment: Three
-
-
-class ReplayPlant(Section):
-    """What `replay_plant.yaml` says; the vehicle file gives inertia, buoyancy, thruster places and allocation."""
-
-    title: str
-    mass: float = Field(gt=0.0)
-    depth: float = Field(gt=0.0)
-    rpm_noise: float = Field(ge=0.0)
-    hull: _Hull
-    added_mass: CoupledMatrix
-    linear_damping: CoupledMatrix
-    motors: _Motors
-    propellers: _Propellers
-    tether: _Tether
+    def __init__(self) -> None:
+        self.spec: Mapping[str, Any] = yaml.safe_load(PLANT_FILE.read_text(encoding="utf-8"))
+        self.added_mass = CoupledMatrix(**self.spec["added_mass"])
+        self.linear_damping = CoupledMatrix(**self.spec["linear_damping"])
 
     def record(self, programmes: Sequence[Programme], vehicle: Vehicle, seed: int) -> Recording:
         """The true motion under some programmes, commanded as the vehicle file has it; see `record`."""
         fields: dict[str, Any] = {
-            "mass": self.mass,
+            "mass": self.spec["mass"],
             "M_A": self.added_mass.matrix(),
-            "form_drag": self.hull.form_drag,
-            "skin_drag": self.hull.skin_drag,
-            "time_constant": self.motors.time_constant,
-            "delay": self.motors.delay,
+            **self.spec["hull"],
+            **self.spec["motors"],
         }
         return record(
             programmes,
@@ -97,8 +65,8 @@ class ReplayPlant(Section):
             seed=seed,
             hydrodynamics="mesh",
             plant=fields,
-            tether=TetherLine(**self.tether.model_dump()),
-            depth=self.depth,
+            tether=TetherLine(**self.spec["tether"]),
+            depth=self.spec["depth"],
             each_step=self.forces(vehicle),
         )
 
@@ -114,14 +82,14 @@ class ReplayPlant(Section):
             if not name.startswith("rpm_"):
                 return values
             turning = np.where(values != 0.0, 1.0, 0.0)
-            return np.asarray(values + self.rpm_noise * turning * random.standard_normal(len(values)))
+            return np.asarray(values + self.spec["rpm_noise"] * turning * random.standard_normal(len(values)))
 
         return [replace(t, channels={k: noisy(k, v) for k, v in t.channels.items()}) for t in logged]
 
     def forces(self, vehicle: Vehicle) -> Callable[[Simulator], None]:
         """What acts besides the engine's own forces: coupled damping and the loss of thrust, from the present state."""
         D = self.linear_damping.matrix()
-        p = self.propellers
+        p = SimpleNamespace(**self.spec["propellers"])
         thrusters = list(vehicle.thrusters.values())
         axis = np.array([t.axis for t in thrusters])
         place = np.array([t.position for t in thrusters])
@@ -144,19 +112,6 @@ class ReplayPlant(Section):
             simulator.plant.gain.numpy()[:, 0, :n] = 1.0 - loss
 
         return act
-
-
-def load_replay_plant(path: Path = PLANT_FILE) -> ReplayPlant:
-    """The plant in a file.
-
-    Raises:
-        PlantError: The file cannot be used; names file, key and expectation.
-    """
-    data = read_mapping(path, PlantError, such_as="mass: 12.13")
-    try:
-        return ReplayPlant.model_validate(data)
-    except ValidationError as error:
-        raise PlantError(f"{path}: {first_problem(error)}") from None
 
 
 RESULT_FILE = "replay_experiment.json"
@@ -205,8 +160,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 def _headline(result: Mapping[str, Any]) -> str:
     counts = result["trials_per_seed"]
     seeds = len(result["seeds"])
-    note = f" (interrupted: {result['seeds_asked_for']} were asked for)" if result["interrupted"] else ""
-    who = f"{result['vehicle']['name']}, {seeds} seed{'s' if seeds != 1 else ''}{note}"
+    who = f"{result['vehicle']['name']}, {seeds} seed{'s' if seeds != 1 else ''}"
     return (
         f"{who}: fitted on {counts['fitted']} trials each, replayed on {counts['same_levels']} others of the same "
         f"levels and {counts['other_levels']} of other levels"
@@ -246,15 +200,13 @@ def replay_experiment(
     seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
     vehicle: Annotated[str, "python"] = "finsrov",
-    plant: ReplayPlant | None = None,
     repeats: Annotated[int, "python"] = REPEATS,
     axes: Annotated[Sequence[str], "python"] = AXES,
     progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Identify on half of the trials of a plant outside the model class, replay three models on the other half.
 
-    The calibrated model is what the fit found; mesh and simplified have the vehicle file's published numbers. Ctrl-C
-    keeps the seeds that are finished.
+    The calibrated model is what the fit found; mesh and simplified have the vehicle file's published numbers.
 
     Example: finssim experiment replay --seeds 3 --out experiment
 
@@ -263,7 +215,6 @@ def replay_experiment(
         seeds: Repetitions with other noise and starts.
         seed: Seed of every random number; equal seeds give equal results.
         vehicle: Name or file of the vehicle whose file the operator starts from.
-        plant: The hidden plant; the shipped one if None.
         repeats: Of every level and direction, an even number.
         axes: Which are excited, fitted and replayed.
         progress: Told the share that is done and what comes next.
@@ -280,28 +231,19 @@ def replay_experiment(
         )
     refuse_unwritable(atomic_directory(out, replaces=RESULT_FILE))
     start_warp()
-    body, water = load_vehicle(vehicle), plant or load_replay_plant()
-    done: list[SeedResult] = []
-    interrupted = False
-    try:
-        for k in range(seeds):
-            done.append(
-                experiment_seed(
-                    body, water, seed + k, repeats, axes,
-                    lambda part, what, k=k: progress((k + part) / seeds, f"seed {k + 1} of {seeds}: {what}"),
-                )
-            )  # fmt: skip
-    except KeyboardInterrupt:
-        if not done:
-            raise
-        interrupted = True
+    body, water = load_vehicle(vehicle), ReplayPlant()
+    done = [
+        experiment_seed(
+            body, water, seed + k, repeats, axes,
+            lambda part, what, k=k: progress((k + part) / seeds, f"seed {k + 1} of {seeds}: {what}"),
+        )
+        for k in range(seeds)
+    ]  # fmt: skip
     result = {
         "experiment": "replay",
         "vehicle": {"name": body.name, "sha256": body.sha256},
-        "plant": water.model_dump(mode="json"),
+        "plant": dict(water.spec),
         "seeds": [one.seed for one in done],
-        "seeds_asked_for": seeds,
-        "interrupted": interrupted,
         "trials_per_seed": {
             "fitted": len(done[0].fit.trials),
             "same_levels": len(done[0].same_levels.pairs),

@@ -90,7 +90,6 @@ def describe_task(
         "period_s": the_task.control_step,
         "substeps": the_task.substeps,
         "time_limit_s": the_task.time_limit,
-        "levels": the_task.levels,
         "reward": _reward(the_task),
         "ends": [
             {"name": one.name, "reward": one.reward, "told": _text(the_task, one.term)} for one in terms.ends
@@ -193,78 +192,53 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         ]  # fmt: skip
         heads = ("task", "agents", "sees", "does", "every [s]", "for [s]", "baseline", "what is to be done")
         return [Table(title="", heads=heads, rows=rows, left=(0, 6, 7), whole=(0, 6))]
-    parts = [
-        [
-            f"{one['first']}–{one['first'] + one['size'] - 1}" if one["size"] > 1 else str(one["first"]),
-            one["name"],
-            "" if one["unit"] == "1" else f"[{one['unit']}]",
-            "" if one["scale"] == 1.0 else f"{one['scale']:g}",
-            "" if one["clip"] is None else f"±{one['clip']:g}",
-        ]
-        for one in result["observation"]["parts"]
-    ]
-    action = [
-        [one["name"], f"{one['low']:.4g}", f"{one['high']:.4g}", f"[{one['unit']}]"]
-        for one in result["action"]["components"]
-    ]
-    rewards = [[one["name"], f"{one['weight']:g}", one["told"]] for one in result["reward"]["terms"]]
-    ends = [[one["name"], f"{one['reward']:g}", one["told"]] for one in result["ends"]]
-    totals = [[one["name"], one["told"]] for one in result["totals"]]
-    settings = [[one["name"], _value(one["value"]), one["told"]] for one in result["settings"]]
-    observation = ("index", "quantity", "unit", "divided by", "limited to")
-    reward, about = result["reward"]["told"], result["name"]
-    tables = (
-        Table(title="Observation, of one agent", heads=observation, rows=parts, left=(0, 1, 2)),
+    parts = {
+        "Observation, of one agent: each over its scale, within ± clip": result["observation"]["parts"],
+        "Action: what -1 and 1 stand for": result["action"]["components"],
+        "Reward, in every step": result["reward"]["terms"],
+        "Ends": result["ends"],
+        "Counted": result["totals"],
+        "Settings": result["settings"],
+    }
+    notes = {"Reward, in every step": result["reward"]["told"]}
+    tables = [
         Table(
-            title="Action, from -1 to 1",
-            heads=("component", "at -1", "at 1", "unit"),
-            rows=action,
-            left=(0, 3),
-        ),
-        Table(
-            title="Reward, in every step",
-            heads=("name", "weight", "term"),
-            rows=rewards,
-            left=(0, 2),
-            note=reward,
-        ),
-        Table(title="Ends", heads=("name", "reward", "term"), rows=ends, left=(0, 2)),
-        Table(title="Counted", heads=("name", "term"), rows=totals, left=(0, 1)),
-        Table(title="Settings", heads=("name", "value", "meaning"), rows=settings, left=(0, 1, 2)),
-    )
-    first = Table(title=about, headline="\n".join(_head(result)))
+            title=title,
+            heads=[head.replace("told", "meaning") for head in rows[0]] if rows else (),
+            rows=[[_value(value) for value in row.values()] for row in rows],
+            left=range(9),
+            note=notes.get(title, ""),
+        )
+        for title, rows in parts.items()
+    ]
+    first = Table(title=result["name"], headline="\n".join(_head(result)))
     return [first, *(table for table in tables if table.rows or table.note)]
 
 
 def _head(result: Mapping[str, Any]) -> list[str]:
-    vehicles = result["vehicles"]
-    lines = [
-        f"{result['name']}: {result['title']}",
-        "agents: " + ", ".join(f"{name} ({vehicles[name]['name']})" for name in result["agents"]),
-        f"success: {result['success']}",
-        f"acts every {result['period_s']:g} s, in {result['substeps']} physics steps; an episode takes up to "
+    crew = {
+        place: ", ".join(f"{name} ({result['vehicles'][name]['name']})" for name in result[place])
+        for place in ("agents", "others")
+    }
+    lines = {
+        result["name"]: result["title"],
+        "agents": crew["agents"],
+        "commanded by the task": crew["others"],
+        "success": result["success"],
+        "acts every": f"{result['period_s']:g} s, in {result['substeps']} physics steps; an episode takes up to "
         f"{result['time_limit_s']:g} s",
-        f"baselines: {', '.join(result['baselines']) or 'none'}",
-        "noise in training: " + (_pairs(result["training_noise"]) or "none"),
-        *(f"seen with sensors, {name}: {_pairs(one)}" for name, one in result["sensors"].items()),
-    ]
-    if result["others"]:
-        others = ", ".join(f"{name} ({vehicles[name]['name']})" for name in result["others"])
-        lines.insert(2, f"commanded by the task: {others}")
-    if result["levels"]:
-        lines.append(f"levels: 0 to {result['levels'] - 1}; training may climb them with --set level_at=0.8")
-    return lines
+        "baselines": ", ".join(result["baselines"]) or "none",
+        "noise in training": _value(result["training_noise"]) or "none",
+        **{f"seen with sensors, {name}": _value(one) for name, one in result["sensors"].items()},
+    }
+    return [f"{name}: {text}" for name, text in lines.items() if text]
 
 
 def _value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Mapping):
-        return _pairs(value)
+        return ", ".join(f"{name} {_value(one)}" for name, one in value.items())
     if isinstance(value, list | tuple):
-        return ", ".join(_value(one) for one in value)
+        return ", ".join(map(_value, value))
     return "none" if value is None else str(value)
-
-
-def _pairs(values: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {_value(value)}" for name, value in values.items())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +17,6 @@ from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.learners import learner_named
 from finssim.quiet import start_warp
 from finssim.tasks import Environment, Task, make, task_named
-from finssim.tasks.environment import LevelPlan, climb
 from finssim.tasks.fitting import authority
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -125,7 +124,7 @@ def train(
 
     checkpoint = last_checkpoint(side) if resume else None
     randomized = randomization is not None
-    plan, changes = _level_plan(settings if isinstance(settings, Mapping) else settings_of_words(settings))
+    changes = dict(settings) if isinstance(settings, Mapping) else settings_of_words(settings)
     values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=changes)
     values = _taught(values, init, learner, mode_name == the_task.action)
 
@@ -149,11 +148,8 @@ def train(
         **asdict(values),
         device=device,
         observe={"name": observe},
-        levels=asdict(plan) if plan else None,
         until=until,
     )
-    if plan is not None:
-        climb(environment, plan)
     began = time.perf_counter()
     full = randomization and randomization.at_full_width()  # as it is measured, whatever it grew from
     with one_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
@@ -162,7 +158,7 @@ def train(
         loop = Loop(
             kind(environment, values, seed=seed, device=device), description, side,
             evaluate=HeldEvaluation(worlds_of(HELD_WORLDS, full, held_seed(seed)), device),
-            show=view.update, progress=environment.set_progress, also=lambda: _level(environment),
+            show=view.update, progress=environment.set_progress,
             identity=_identity(description), until=until,
         )  # fmt: skip
         if checkpoint is not None:
@@ -189,21 +185,6 @@ def _taught(values: Any, init: str | Path | None, learner: str, own_action: bool
     if init is not None:
         return replace(values, teacher="" if str(init) == "none" else str(init))
     return values if own_action else replace(values, teacher="")
-
-
-def _level_plan(settings: Mapping[str, Any]) -> tuple[LevelPlan | None, dict[str, Any]]:
-    """How the task's level rises, if a setting of it is given; and the settings of the learner."""
-    kinds = {field.name: type(field.default) for field in fields(LevelPlan)}
-    try:
-        own = {name: kinds[name](value) for name, value in settings.items() if name in kinds}
-    except (TypeError, ValueError) as error:
-        raise TrainingError(f"settings of levels: {error}; expected such as level_at=0.8") from error
-    rest = {name: value for name, value in settings.items() if name not in kinds}
-    return (LevelPlan(**own) if own else None), rest
-
-
-def _level(environment: Environment) -> dict[str, float]:
-    return {"level": environment.levels.level} if environment.levels else {}
 
 
 def settings_of_words(words: Sequence[str]) -> dict[str, Any]:

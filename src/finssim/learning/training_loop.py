@@ -143,8 +143,6 @@ class Loop:
     """Called with every row of the curves."""
     progress: Callable[[float], None]
     """Told the share of the training that is done, before each update: ranges may grow with it."""
-    also: Callable[[], Mapping[str, float]]
-    """What else a row says, after each update: at which level it was."""
     identity: Mapping[str, Any]
     """What must be equal for a training to go on from a checkpoint."""
     until: float | None = None
@@ -220,7 +218,7 @@ class Loop:
             "seconds": round(self.seconds, 3),
             "steps_per_s": round(steps / self.seconds),
         }
-        return {**counted, **learned, **self.also(), **held}
+        return {**counted, **learned, **held}
 
     def _passed(self, every: int) -> bool:
         """Whether the last update went past a multiple of so many steps."""

@@ -308,10 +308,6 @@ def events_of(record: Record) -> list[dict[str, Any]]:
 # Records played: their messages one after the other, in the time in which they were recorded.
 
 
-SHOWN = 16
-"""Elements of a longer array are counted, not shown, in lines; JSON has all but pictures."""
-
-
 def play(
     record: Record,
     *,
@@ -367,30 +363,6 @@ def json_line(entry: Entry) -> str:
     return json.dumps(line)
 
 
-def as_line(entry: Entry) -> str:
-    """One line to read: time, topic and the numbers and words in it, without the header."""
-    return f"{entry.time:10.3f}  {entry.topic}  " + " ".join(_line_words(plain(entry.message)))
-
-
-def _line_words(value: Any, name: str = "") -> Iterator[str]:
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            if key not in ("header", "covariance") and not key.endswith("_covariance"):
-                yield from _line_words(inner, f"{name}.{key}" if name else key)
-    elif isinstance(value, list) and value and isinstance(value[0], dict):
-        for inner in value:
-            yield from _line_words(inner, name)
-    elif isinstance(value, list):
-        numbers = " ".join(_word(x) for x in value[:SHOWN])
-        yield f"{name}=[{numbers}{' ...' if len(value) > SHOWN else ''}]"
-    else:
-        yield f"{name}={_word(value)}"
-
-
-def _word(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else "nan" if value is None else str(value)
-
-
 EVENTS_SHOWN = 20
 
 
@@ -426,9 +398,8 @@ def play_record(
     fast: bool = False,
     topics: Annotated[Sequence[str] | None, ","] = None,
     start: Annotated[float, (0.0, None)] = 0.0,
-    as_json: bool = False,
 ) -> None:
-    """Print the messages of a record as they came, a line each [s, SI units]; pictures by their size.
+    """Print the messages of a record as they came, a JSON object a line [s, SI units]; pictures by their size.
 
     Example: finssim play run.mcap --topics odom,events --speed 4
 
@@ -438,7 +409,6 @@ def play_record(
         fast: Without waiting.
         topics (NAMES): Only these, with commas between: odom,thruster_cmd.
         start: Begin so long after the start of the record [s].
-        as_json: Print one JSON object a line instead of text.
 
     Raises:
         RecordError: Not a record, no such topic, or a speed that is not above zero.
@@ -448,9 +418,10 @@ def play_record(
             print(note, file=sys.stderr)
         first = next((at for at, _, _ in record.sizes()), 0.0) + start if start else None
         pace = math.inf if fast else speed
-        played = play(record, speed=pace, clock=time.monotonic, wait=time.sleep, topics=topics, start=first)
-        for entry in played:
-            print(json_line(entry) if as_json else as_line(entry), flush=True)
+        for entry in play(
+            record, speed=pace, clock=time.monotonic, wait=time.sleep, topics=topics, start=first
+        ):
+            print(json_line(entry), flush=True)
 
 
 def _lines(found: dict[str, Any]) -> list[str]:

@@ -1,9 +1,7 @@
 """The batched environment: any task, any vehicle, thousands of worlds, with automatic reset."""
 
-import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +9,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.control.modes import MODES
+from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
 from finssim.engine import Pool, Simulator, TetherLine, Water
 from finssim.engine.randomize import Randomization
-from finssim.tasks.actions import add_action
+from finssim.physics.plant import VehicleCommand
+from finssim.physics.types import vec8
+from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.drawing import Drawing
 from finssim.tasks.given import (
     GREATEST_SEED,
@@ -30,11 +30,32 @@ from finssim.tasks.sensing import Sensing, SensingBatch
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["GREATEST_SEED", "Environment", "EnvironmentSetupError", "LevelPlan", "Levels", "Step", "climb"]
+__all__ = ["GREATEST_SEED", "Environment", "EnvironmentSetupError", "Step"]
 
 
 GPU_FROZEN_CHECK = 100
 """Steps between looks for frozen worlds on a GPU."""
+
+
+@wp.kernel(enable_backward=False)
+def act(
+    arrays: TaskArrays,
+    command: wp.array2d(dtype=VehicleCommand),
+    data: ModeData,
+    agents: int,
+    world_offset: int,
+):
+    """Thrusts of every vehicle: of an agent's own action, or of what the task says for one of the others."""
+    i, v = wp.tid()
+    w = world_offset + i
+    size = data.columns.shape[1]
+    a = vec8()
+    for k in range(size):
+        if v < agents:
+            a[k] = arrays.action[w, v * size + k]
+        else:
+            a[k] = arrays.scripted[w, (v - agents) * size + k]
+    command[w, v].thrust = thrusts_of(a, v, data)
 
 
 class Environment:
@@ -46,7 +67,7 @@ class Environment:
         nominal: The vehicles as their controllers know them.
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
-        drawing: What randomisation draws, how its ranges grow, and a log of it.
+        drawing: What randomisation draws, and how its ranges grow.
     """
 
     def __init__(
@@ -154,8 +175,6 @@ class Environment:
                 drawn,
             )
         self.drawing = Drawing(randomization, self.simulator, self.arrays, self._seen, task, privileged)
-        self.levels: Levels | None = None
-        """How the task's level rises, after `climb` of `finssim.tasks.environment`."""
         self._build()
         self.reset(seed=self.seed)
 
@@ -174,14 +193,13 @@ class Environment:
         self._batch = batch = Batch(self.simulator.state, self.arrays, self.seed)
         if self.task.others:
             self.task.add_command(self._step, batch)
-        add_action(
-            self.action_mode,
-            self.nominal,
-            self.simulator.command,
-            self.arrays,
-            self.agents,
-            self.wrench_scale,
-        )(self._step)
+        # Controllers know the nominal limits and allocation; what the simulated thrusters deliver may differ. What the
+        # task commands is in parts of all of the limits, however gently the agents are to act.
+        own = self.wrench_scale if MODES[self.action_mode].wrench else 1.0
+        scales = [own if v < self.agents else 1.0 for v in range(len(self.nominal))]
+        modes = mode_data(self.action_mode, self.nominal, scales, self.device)
+        command = self.simulator.command.array
+        self._step.add(act, [self.arrays, command, modes, self.agents], vehicles=len(self.nominal))
         self.drawing.add_step(self._step, self.seed)
         self.simulator.add_step(self._step)
         self._add_measure(self._step)
@@ -227,8 +245,6 @@ class Environment:
             self.simulator.restart_episodes(mask)
             if mask is None:
                 self.drawing.restart()
-                if self.levels is not None:
-                    self.levels.restart()
         where = np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
         self._mask.assign(where)
         self._start.run()
@@ -286,24 +302,15 @@ class Environment:
         self._step.run()
         self._steps += 1
         self.drawing.after_step()
-        if self.levels is not None:
-            self.levels.after_step()
         # On a GPU the look costs a copy, so frozen worlds wait there for a while, reported as terminated meanwhile.
         look = self.device.is_cpu or self._steps % GPU_FROZEN_CHECK == 0
         if look and self.simulator.state.frozen.numpy().any():
             self._revive()
 
     def set_progress(self, done: float) -> None:
-        """Tell how much of the training is done, in [0, 1]: ranges may grow with it, and the level may rise now."""
+        """Take how much of the training is done, in [0, 1]: ranges may grow with it."""
         if self.drawing.schedule is not None:
             self.drawing.schedule.progress(done)
-        if self.levels is not None:
-            self.levels.rise()
-
-    def change(self, task: Task) -> None:
-        """Go on with other settings of the same task: the episodes that run end by them."""
-        self.task = task.fitted(self.nominal)
-        self._build()
 
     def _revive(self) -> None:
         """Report the worlds that froze, then start new episodes there; their step counts as terminated."""
@@ -337,8 +344,6 @@ class Environment:
         saved["counters.seed"], saved["counters.steps"] = np.array(self.seed), np.array(self._steps)
         if self.drawing.schedule is not None:
             saved["counters.schedule"] = np.array(self.drawing.schedule._steps)
-        if self.levels is not None:
-            saved.update(self.levels.state())
         reported = np.array(sorted(self.simulator._reported), dtype=np.int64)
         return {**saved, "counters.reported": reported.reshape(-1, 2)}
 
@@ -349,13 +354,8 @@ class Environment:
             EnvironmentSetupError: It was made with other arguments: a name or shape does not fit.
         """
         refused, remedy = "saved state does not fit: ", "make the environment with the same arguments"
-        if (self.levels is None) == ("counters.level" in state):
-            reason = "has levels and the saved state has none" if self.levels else "has no levels"
-            raise EnvironmentSetupError(f"{refused}the environment {reason}: make it with the same arguments")
         if int(state["counters.seed"]) != self.seed:
             self.reset(seed=int(state["counters.seed"]))
-        if self.levels is not None:
-            self.levels.load(state)
         arrays = dict(self._members())
         for name in sorted(arrays.keys() ^ {name for name in state if not name.startswith("counters.")}):
             reason = "is not in the saved state" if name in arrays else "is in the saved state alone"
@@ -394,124 +394,3 @@ def _members(prefix: str, struct: Any) -> Iterator[tuple[str, wp.array]]:
                 yield f"{prefix}.{name}", value
         elif hasattr(value, "_cls"):
             yield from _members(f"{prefix}.{name}", value)
-
-
-# Levels of a task, taken one after the other: the next one when enough of the recent episodes succeeded.
-
-
-@dataclass(frozen=True, kw_only=True)
-class LevelPlan:
-    """When a level rises; the last one is the task's own."""
-
-    level_from: int = 0
-    """Level at the start."""
-    level_at: float = 0.8
-    """Share of successes at which it rises."""
-    level_episodes: int = 200
-    """Episodes that the share is taken over, or a few more: as many of each world. All begun at that level."""
-
-    def __post_init__(self) -> None:
-        if self.level_from < 0 or not 0.0 < self.level_at <= 1.0 or self.level_episodes < 1:
-            raise EnvironmentSetupError(
-                f"level_from is {self.level_from}, level_at {self.level_at}, level_episodes {self.level_episodes}: "
-                "expected 0 or more, above 0 to 1, and 1 or more"
-            )
-
-
-class Levels:
-    """Watches the episodes of an environment, and takes it to the next level when `rise` is called and it is time.
-
-    Attributes:
-        plan: When.
-        last: The level at which it ends.
-    """
-
-    def __init__(self, environment: Environment, plan: LevelPlan) -> None:
-        """Begin at the first level; running episodes, which began elsewhere, are not counted.
-
-        Raises:
-            EnvironmentSetupError: The task has no levels, or its own is below the first.
-        """
-        task: Any = environment.task
-        if not task.levels:
-            raise EnvironmentSetupError(f"task '{task.name}' has no levels: leave level_... out")
-        self.plan, self.last, self._environment = plan, int(task.level), environment
-        if "success" not in task.metrics(environment.arrays):
-            raise EnvironmentSetupError(
-                f"task '{task.name}' has no metric 'success', by which its levels rise"
-            )
-        if plan.level_from > self.last:
-            raise EnvironmentSetupError(
-                f"level_from is {plan.level_from}, expected at most the task's own level, {self.last}"
-            )
-        # As many of each world: of the first to end, most are successes, where these end an episode early.
-        each = math.ceil(plan.level_episodes / environment.worlds)
-        self._recent = np.full((environment.worlds, each), np.nan)
-        self._go(plan.level_from)
-
-    @property
-    def level(self) -> int:
-        """Where it is now."""
-        task: Any = self._environment.task
-        return int(task.level)
-
-    @property
-    def share(self) -> float:
-        """Of successes among the episodes counted so far; 0 before the first."""
-        counted = self._recent[~np.isnan(self._recent)]
-        return float(counted.mean()) if len(counted) else 0.0
-
-    def after_step(self) -> None:
-        """Count the episodes that ended in the step just done."""
-        e = self._environment
-        ended = (e.arrays.terminated.numpy() | e.arrays.truncated.numpy()) != 0
-        counted = ended & self._whole
-        if counted.any():
-            success = e.task.metrics(e.arrays)["success"]
-            self._recent[counted] = np.column_stack([self._recent[counted, 1:], success[counted]])
-        self._whole |= ended
-
-    def rise(self) -> None:
-        """Take the next level if enough episodes succeeded; those that run end by its rules, and are not counted."""
-        full = not np.isnan(self._recent).any()
-        if full and self.share >= self.plan.level_at and self.level < self.last:
-            self._go(self.level + 1)
-
-    def restart(self) -> None:
-        """Begin at the first level again."""
-        self._go(self.plan.level_from)
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """What decides how it goes on."""
-        return {
-            "counters.level": np.array(self.level),
-            "counters.level_recent": self._recent.copy(),
-            "counters.level_whole": self._whole.copy(),
-        }
-
-    def load(self, saved: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from what `state` gave."""
-        if int(saved["counters.level"]) != self.level:
-            self._go(int(saved["counters.level"]))
-        self._recent = saved["counters.level_recent"].copy()
-        self._whole = saved["counters.level_whole"].copy()
-
-    def _go(self, level: int) -> None:
-        task: Any = self._environment.task
-        self._environment.change(replace(task, level=level))
-        self._recent[:] = np.nan
-        self._whole = np.zeros(self._environment.worlds, dtype=np.bool_)
-
-
-def climb(environment: Environment, plan: LevelPlan | None = None) -> Levels:
-    """Let an environment begin at a lower level and rise: at `set_progress`, which a training calls before each update.
-
-    Args:
-        environment: Its task is at the last level.
-        plan: When to rise.
-
-    Raises:
-        EnvironmentSetupError: See `Levels`.
-    """
-    environment.levels = Levels(environment, plan or LevelPlan())
-    return environment.levels

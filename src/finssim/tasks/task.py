@@ -51,8 +51,6 @@ class Task:
     """Action mode, unless another is asked for."""
     pool: ClassVar[Pool | None] = Pool()
     """Walls and floor, unless others are asked for; None is open water."""
-    levels: ClassVar[int] = 0
-    """How many there are, of a task whose setting `level` says how hard it is; 0: it has none."""
     moving: ClassVar[bool] = False
     """Whether what it goes to moves: a robot is then given a trajectory, otherwise a pose."""
     succeeds: ClassVar[str] = ""

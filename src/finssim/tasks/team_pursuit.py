@@ -194,15 +194,6 @@ def missing(p: Any, net: float, near: float) -> float:
 
 
 @wp.func
-def gained(p: Any, gap_now: float, to_net: float, to_agent: float) -> float:
-    """Way gained towards a capture in this step [m].
-
-    What was missing by the rules of now: a level that rises under a running episode is no way gained or lost.
-    """
-    return missing(p, to_net, to_agent) - gap_now
-
-
-@wp.func
 def driving(state: State, w: int, a: int) -> float:
     """Herder: cosine of the angle between the way to the prey and the way on to the net's middle."""
     prey = state.position[w, PREY]
@@ -260,7 +251,6 @@ class TeamPursuit(Team, Chase):
     """3-v-1 pursuit. What counts as a capture, the prey's speed and the stake are the level's, unless given here."""
 
     agents: ClassVar[tuple[str, ...]] = ("herder", "left_netter", "right_netter")
-    levels: ClassVar[int] = len(LEVELS)
     title: ClassVar[str] = "drive a prey into a net, three against one"
     name: str = "team-pursuit"
     observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
@@ -330,7 +320,7 @@ class TeamPursuit(Team, Chase):
             seen={"gap": prey_gap},
             shared={"net": net_gap, "near": nearest_pursuer, "gap_now": missing},
             rewards=(
-                RewardTerm("progress", gained, r.progress),
+                RewardTerm("progress", "gap - gap_now", r.progress),
                 RewardTerm("distance", "wp.min(gap_now / 8.0, 1.0)", -r.distance),
                 RewardTerm("step", "1.0", -r.step),
                 RewardTerm("drive", driving, r.drive),
@@ -346,7 +336,5 @@ class TeamPursuit(Team, Chase):
                 Total("closest", "wp.min(was, near)", first="near"),
                 Total("closest_to_net", "wp.min(was, net)", first="net"),
                 Total("gap", "gap_now", first="gap_now"),
-                Total("to_net", "net", first="net"),
-                Total("to_agent", "near", first="near"),
             ),
         )

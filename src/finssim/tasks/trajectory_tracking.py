@@ -197,7 +197,6 @@ class TrajectoryTracking(FittedTask):
     their speeds and the pool `fit.size` times as large; the tolerance stays.
     """
 
-    levels: ClassVar[int] = len(LEVELS)
     succeeds: ClassVar[str] = "held"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "follow a moving reference, whatever the heading"
