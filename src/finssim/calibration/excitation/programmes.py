@@ -290,9 +290,9 @@ def programmes(
     FinsROV was validated. `multisine` drives all axes at once, for coupled fits; see `multisine`.
 
     Levels are FinsROV's, times the ratio of this vehicle's wrench limit to FinsROV's on that axis (two digits), and
-    never above the limit; steps on surge and sway of a vehicle that hovers stay below what tilts it. Where `room` is given, the
-    levels of a linear axis are brought down together until the strongest step, with its coast, stays within it by the
-    damping of the vehicle's file.
+    never above the limit; steps on surge and sway of a vehicle that hovers stay below what tilts it. Where `room` is
+    given, the levels of a linear axis are brought down together until the strongest step, with its coast, stays within
+    it by the damping of the vehicle's file.
 
     Args:
         axes: As for `which_axes`.
