@@ -17,21 +17,6 @@ from finssim.geometry.rotations import cross, quat_inverse_rotate, quat_rotate, 
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.body import moved_to_origin
 
-__all__ = [
-    "PAPER_PROFILE",
-    "TRAJECTORY_PROFILE",
-    "AxisModel",
-    "Gains",
-    "PaperMemory",
-    "PaperPid",
-    "PaperProfile",
-    "Pid",
-    "PidMemory",
-    "axis_model",
-    "place_poles",
-]
-
-
 # PID gains that put the poles of an identified axis where they are wanted, the actuators' lag included.
 
 
