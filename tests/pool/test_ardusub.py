@@ -496,3 +496,15 @@ def test_a_compass_turns_the_filter_and_nothing_else():
     filter.turn(2.0, 1.0)
     after = [float(a) for a in quat_to_euler(np.array(filter.quaternion))]
     np.testing.assert_allclose(after, [before[0], before[1], 2.0], atol=1e-9)
+
+
+def test_equal_seeds_send_equal_bytes():
+    """Nothing of the computer's clock is in them."""
+
+    def sent():
+        ground = Ground()
+        ground.pool.exchange(1.0, [ground.pack(mavlink.MAVLink_request_data_stream_message(1, 1, 0, 10, 1))])
+        return ground.pool.exchange(3.0).frames
+
+    frames = sent()
+    assert len(frames) > 200 and frames == sent()

@@ -174,3 +174,14 @@ def test_a_task_in_torch_sees_its_last_actions_on_a_robot(tmp_path, action):
     observer.restart()
     assert observer.observe(me, goal, 0.0)[1] == 0.0
     assert env.reset()[0, 1] == 0.0
+
+
+def test_a_goal_out_of_reach_is_seen_on_the_way_to_it():
+    """Three metres ahead and at the reach look alike; a goal within reach is seen where it is."""
+    me, observer = Track(np.array([0.1, 0.0, -0.5]), quat_from_yaw(0.0), np.zeros(6)), Observer("t1", FINSROV)
+    far, edge, near = (
+        observer.observe(me, Station((0.1 + ahead, 0.0, -0.5), 0.0), 0.0, reach=1.2)
+        for ahead in (3.0, 1.2, 1.1)
+    )
+    np.testing.assert_allclose(far, edge, atol=1e-6)
+    assert near[0] < 0.99 * edge[0]

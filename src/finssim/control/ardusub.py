@@ -157,6 +157,13 @@ def thrust_tables(vehicle: Any) -> Array:
     )
 
 
+def dead_band(vehicle: Any) -> float:
+    """Output up to which no motor of a vehicle turns, either way, at the autopilot's voltage [-]."""
+    voltage = autopilot_of(vehicle).voltage
+    edges = [t.esc.dead_band(voltage) for t in vehicle.thrusters.values()]
+    return float(np.abs(np.array(edges) - NEUTRAL).max() / FULL)
+
+
 def motors_of(vehicle: Any) -> npt.NDArray[np.int64]:
     """Motor of each thruster, canonical order, from 0, (n,)."""
     thrusters = vehicle.thrusters.values()

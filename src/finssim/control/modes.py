@@ -18,7 +18,7 @@ import warp as wp
 
 from finssim.control import ControlError
 from finssim.control.allocation import AllocationData, RowLaunch, allocate, allocation_data, axis_weights
-from finssim.control.ardusub import FROM_BODY, MixerData, mixed_thrusts, mixer_data, thrust_tables
+from finssim.control.ardusub import FROM_BODY, MixerData, dead_band, mixed_thrusts, mixer_data, thrust_tables
 from finssim.control.policy import first_difference, plain_data
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
@@ -39,6 +39,8 @@ Array = npt.NDArray[np.float64]
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 
+QUIET = 0.01
+"""Axes of `pilot6` up to this turn no motor [-]."""
 TOLERANCE = 1e-6
 """Relative difference between limits that are computed anew and those that a policy's directory holds."""
 
@@ -98,8 +100,25 @@ class ModeData:
     """Of wrenches to the thrusters; empty where the columns are no wrenches."""
     pilot: wp.bool
     """Whether the columns are demands."""
+    dead_band: wp.array(dtype=float)
+    """Outputs up to this turn no motor [-], (vehicles,); of demands."""
     mixer: MixerData
     """Of demands to the thrusters; empty where the columns are no demands."""
+
+
+@wp.func
+def past_dead_band(part: float, dead_band: float) -> float:
+    """An axis of an action, moved past the outputs at which no motor turns; within +-`QUIET` it stays in them.
+
+    Args:
+        part: In [-1, 1].
+        dead_band: Outputs up to this turn no motor [-].
+    """
+    size = wp.abs(part)
+    if size <= wp.static(QUIET):
+        return part * dead_band / wp.static(QUIET)
+    rest = (size - wp.static(QUIET)) / wp.static(1.0 - QUIET)
+    return wp.sign(part) * (dead_band + (1.0 - dead_band) * rest)
 
 
 @wp.func
@@ -113,15 +132,18 @@ def thrusts_of(action: vec8, vehicle: int, data: ModeData) -> vec8:
     """
     x = vec8()
     for k in range(data.columns.shape[1]):
-        x += wp.clamp(action[k], -1.0, 1.0) * data.columns[vehicle, k]
+        part = wp.clamp(action[k], -1.0, 1.0)
+        if data.pilot:
+            part = past_dead_band(part, data.dead_band[vehicle])
+        x += part * data.columns[vehicle, k]
     if data.wrench:
         return allocate(vec6(x[0], x[1], x[2], x[3], x[4], x[5]), vehicle, data.allocation)
     if data.pilot:
         return mixed_thrusts(vec6(x[0], x[1], x[2], x[3], x[4], x[5]), vehicle, data.mixer)
     f = vec8()
     for k in range(MAX_THRUSTERS):
-        part = wp.clamp(x[k], -1.0, 1.0)
-        f[k] = wp.where(part >= 0.0, part * data.upper[vehicle][k], -part * data.lower[vehicle][k])
+        share = wp.clamp(x[k], -1.0, 1.0)
+        f[k] = wp.where(share >= 0.0, share * data.upper[vehicle][k], -share * data.lower[vehicle][k])
     return f
 
 
@@ -156,6 +178,7 @@ def mode_data(name: str, vehicles: Sequence[Any], scales: Sequence[Any], device:
     data.wrench, data.pilot = wp.bool(kind.wrench), wp.bool(kind.pilot)
     if kind.pilot:
         data.mixer = mixer_data(vehicles, device)
+        data.dead_band = wp.array([dead_band(vehicle) for vehicle in vehicles], dtype=float, device=device)
     if kind.wrench:
         data.allocation = allocation_data(
             [vehicle.control_matrix for vehicle in vehicles],
@@ -287,6 +310,7 @@ def action_mode(name: str, vehicle: Any, scale: float | Sequence[float] = 1.0) -
             "scale": parts,
             "factors": (vehicle.autopilot.factors * vehicle.autopilot.signs(len(tables))[:, None]).ravel(),
             "gain": [vehicle.autopilot.gain],
+            "dead_band": [dead_band(vehicle)],
         }
     else:
         lower, upper = vehicle.force_limits

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from html import escape
 from os import environ
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -29,6 +29,7 @@ from finssim.calibration.regression.regress import regress
 from finssim.calibration.replay.replay import Replay, replay
 from finssim.calibration.replay.report import draw_response_envelopes
 from finssim.calibration.trials.trial import Trial
+from finssim.control.modes import action_mode
 from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Pool
@@ -54,10 +55,11 @@ from finssim.files import atomic_directory
 from finssim.learning.train import train
 from finssim.page import html_page
 from finssim.pool import draw_plant
+from finssim.pool.draw_plant import site_of
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Provenance, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed
-from finssim.vehicles.defaults import room
+from finssim.vehicles.defaults import SITES, room
 
 __all__ = ["demo"]
 
@@ -315,15 +317,17 @@ PAPER = (
     "are of "
 )
 POOL = (
-    "the virtual pool: the robot's whole software, from the camera's tags to the motor controller's frames, "
+    "the virtual pool or tank: the robot's whole software, from what locates it to the frames of the motor controller "
+    "or autopilot, "
     "against a plant that no training has seen. Errors are those of the true pose."
 )
 ROBOT = "hardware, too. Errors are those of the robot's own estimate, whose error is not in them."
 
 
-def _paths(trials: Sequence[PlayedTrial]) -> Any:
-    """The paths of all trials from above and from the side, in the pool; start and goals with their headings."""
-    pool = Pool()
+def _paths(trials: Sequence[PlayedTrial], site: str) -> Any:
+    """The paths of all trials from above and from the side, in the water; start and goals with their headings."""
+    size = SITES[site]
+    pool = Pool() if size is None else Pool(length=size[0], width=size[1], depth=size[2])
     figure = new_figure(7.2, 6.0, layout="compressed")
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(pool.width, pool.depth))
     spans = ((1, -pool.width / 2, pool.width), (2, -pool.depth, pool.depth))
@@ -428,6 +432,18 @@ REPORT_FILE = "report.html"
 SEED = 1
 PLANT, SEVERITY, RANGES = 1, "realistic", "pool"
 CONTROLLERS = ("policy", "pid", "pid-paper")
+
+
+class Firmware(NamedTuple):
+    """How a vehicle of one kind is demonstrated."""
+
+    action: str | None
+    """Of the policy; the task's own if None."""
+    site: str
+    camera: str
+
+
+FIRMWARES = {"mcu": Firmware(None, "pool", "corners"), "ardusub": Firmware("pilot6", "tank", "none")}
 WITH_PICTURES = "policy-with-pictures"
 COAST = 4.0
 """Longest, after a dive [s]: the pool is shallow, and this vehicle hardly rises."""
@@ -487,6 +503,7 @@ def demo(
     console: Console | None = None,
     scope: Scope | None = None,
     processes: Annotated[int | None, "python"] = None,
+    firmware: str = "mcu",
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
 ) -> Path:
@@ -498,6 +515,8 @@ def demo(
 
     Example: finssim demo --vehicle bluerov2_heavy --out demo
 
+    Example: finssim demo --vehicle bluerov2_heavy --firmware ardusub --out demo
+
     Example: finssim demo --robot udp://10.0.0.2:58766 --pool-file pool.yaml --arm --out demo
 
     Args:
@@ -508,6 +527,9 @@ def demo(
         console: Where progress is shown; standard error if None.
         scope: How much of it; `FULL` if None.
         processes: As many as there are processors if None.
+        firmware (NAME): What steers the motors: mcu, FinsROV's motor controller, or ardusub, an autopilot: commands
+            then go by MAVLink, the policy acts by its axes (`pilot6`), and in place of the pool and its camera there is
+            a tank, a Doppler log, a compass, and setpoints three times as far.
         robot: Where trials are made and setpoints held, in place of the virtual pool. What is done stays in `out`, and
             the next call goes on.
         attendant: The person beside that robot, instead of the terminal's keyboard.
@@ -519,13 +541,18 @@ def demo(
         KeyboardInterrupt: After Ctrl-C. A policy so far is then in `OUT-training/interrupted`, and, but for a robot's,
             `out` as it was.
     """
+    if firmware not in FIRMWARES:
+        raise ValueError(f"unknown firmware '{firmware}'; available: {', '.join(FIRMWARES)}")
     console, standing = console or Console(stderr=True), load_vehicle(vehicle)
+    if firmware == "ardusub" or (robot is not None and robot.wiring.robot.startswith("mavlink")):
+        firmware = "ardusub"
+        action_mode(FIRMWARES[firmware].action, standing)  # refuses a vehicle without an autopilot
     start_warp()
     place = atomic_directory(out, replaces=REPORT_FILE) if robot is None else kept_folder(out)
     with place as folder:
         demonstration = _Demonstration(
             folder=folder, out=out, name=vehicle, standing=standing, seed=seed, scope=(scope or FULL).of(standing),
-            console=console, processes=processes, robot=robot, attendant=attendant,
+            console=console, processes=processes, robot=robot, attendant=attendant, firmware=firmware,
         )  # fmt: skip
         evaluations = demonstration.run(steps)
     simulated = [e.result for e in evaluations if e.result["camera"] != "pictures"]
@@ -555,6 +582,7 @@ class _Demonstration:
     processes: int | None
     robot: OnRobot | None
     attendant: Attendant | None
+    firmware: str
 
     def run(self, steps: int | None) -> list[Evaluation]:
         """Identify, train, deploy and report; returns an evaluation of each controller, the policy's first."""
@@ -563,7 +591,8 @@ class _Demonstration:
         rescue = self.out.with_name(f"{self.out.name}-training") / "interrupted"
         if self.robot is None or not finished(policy, result.vehicle):
             train(
-                "t1", out=policy, vehicle=result.vehicle, randomize=RANGES, seed=self.seed, steps=steps,
+                "t1", out=policy, vehicle=result.vehicle, action=FIRMWARES[self.firmware].action, randomize=RANGES,
+                seed=self.seed, steps=steps,
                 console=self.console, shown=self.out / "policy", interrupted=rescue,
             )  # fmt: skip
         seconds = time.perf_counter() - began
@@ -576,6 +605,11 @@ class _Demonstration:
             self.tell(f"policy kept: {rescue}")
             raise
         return evaluations
+
+    @property
+    def site(self) -> str:
+        """Where trials are made."""
+        return FIRMWARES[self.firmware].site if self.robot is None else self.robot.site
 
     def tell(self, text: str) -> None:
         """Show a line of progress."""
@@ -609,7 +643,7 @@ class _Demonstration:
 
             result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=record)
         else:
-            spec = draw_plant(standing, PLANT, SEVERITY)
+            spec = site_of(self.site, draw_plant(standing, PLANT, SEVERITY))
             spec.write(self.folder / PLANT_FILE)
             with self._working("recording trials in the virtual pool") as progress:
 
@@ -622,7 +656,8 @@ class _Demonstration:
                 def simulated(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
                     return pool_trials(
                         plans, folder, vehicle=str(rough), pool_vehicle=self.name, plant=PLANT, severity=SEVERITY,
-                        seed=seed, leave_out=True, processes=self.processes, progress=progress, show=show,
+                        seed=seed, site=self.site, firmware=self.firmware, leave_out=True, processes=self.processes,
+                        progress=progress, show=show,
                     )  # fmt: skip
 
                 result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=simulated)
@@ -637,7 +672,7 @@ class _Demonstration:
     def _deployed(self, policy: Path) -> list[Evaluation]:
         """All controllers in the pool, the policy with pictures too; or all on the robot."""
         vehicle = str(self.folder / vehicle_files(self.standing.name)[1])
-        pool_vehicle, plant, severity, camera = self.name, PLANT, SEVERITY, "corners"
+        pool_vehicle, plant, severity, camera = self.name, PLANT, SEVERITY, FIRMWARES[self.firmware].camera
         if self.robot is not None:
             pool_vehicle, plant, severity, camera = vehicle, 0, HARDWARE, HARDWARE
 
@@ -645,11 +680,16 @@ class _Demonstration:
             controller = str(policy) if row.startswith("policy") else row
             return Job(
                 row=row, controller=controller, target=target, camera=camera, vehicle=vehicle, seed=self.seed,
-                pool_vehicle=pool_vehicle, plant=plant, severity=severity, duration=self.scope.duration,
+                pool_vehicle=pool_vehicle, plant=plant, severity=severity, duration=self.scope.duration, site=self.site,
+                firmware=self.firmware,
             )  # fmt: skip
 
         # Pictures first: they take longest, and the other processor has time for the rest.
-        pictures = [] if self.robot else [job(WITH_PICTURES, t, "pictures") for t in self.scope.pictures]
+        pictures = (
+            []
+            if self.robot or camera == "none"
+            else [job(WITH_PICTURES, t, "pictures") for t in self.scope.pictures]
+        )
         jobs = pictures + [job(row, target, camera) for row in CONTROLLERS for target in self.scope.setpoints]
         place = self.folder / TRIALS_FOLDER
         if self.robot is not None:
@@ -680,7 +720,7 @@ class _Demonstration:
         compared = [e for e in evaluations if e.result["trials"] == policy.result["trials"]]
         envelopes = {e.label: error_envelope(e.trials) for e in compared}
         save_figure(draw_envelopes(envelopes), folder / "envelopes.png")
-        save_figure(_paths(policy.trials), folder / "paths.png")
+        save_figure(_paths(policy.trials, self.site), folder / "paths.png")
         draw_training(groups_of([str(folder / "policy")]), folder / "training.png")
         title = f"Station keeping of {policy.result['vehicle']['name']}"
         origin = {
@@ -707,6 +747,8 @@ class _Demonstration:
         rough, identified = (out / file for file in vehicle_files(name))
         steps = Policy.load(self.folder / "policy").description.training["steps"]
         options = f"--randomize {RANGES} --seed {seed} --steps {steps}"
+        action = FIRMWARES[self.firmware].action
+        options += f" --action {action}" if action else ""
         learn = f"finssim train t1 --vehicle {identified} {options} --out policy"
         drive = f"finssim run --policy policy --vehicle {identified} --goal 1,0.3,-0.5,90"
         excite = f"finssim excite all --vehicle {rough} --coast {COAST:g} --out more-trials"
@@ -715,6 +757,11 @@ class _Demonstration:
             robot = f"{self.robot.options} --arm"
             evaluated = f"finssim evaluate run.mcap --task t1 --vehicle {identified}"
             return [f"{excite} {robot}", *middle, f"{drive} {robot} --record run.mcap", evaluated]
+        if self.firmware == "ardusub":
+            tank = f"finssim pool --vehicle {self.name} --plant {out / PLANT_FILE} --firmware ardusub"
+            robot = f"--robot mavlink --site {self.site} --pool-file none --let-in 0,0 --arm"
+            tank += f" --site {self.site} --truth truth.fst"
+            return [tank, f"{excite} {robot}", *middle, f"{drive} {robot}"]
         return [
             f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
             f"{excite} --pool {PLANT} --severity {SEVERITY} --pool-vehicle {self.name}",

@@ -39,6 +39,7 @@ from finssim.experiments.pool_trial import noise_seed, play_in_pool
 from finssim.files import atomic_directory, atomic_write
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import draw_plant
+from finssim.pool.draw_plant import site_of
 from finssim.pool.plant_spec import Basin
 from finssim.pool.run import make_plan
 from finssim.quiet import start_warp
@@ -46,7 +47,7 @@ from finssim.robot.perception import Perception
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import AXES, Vehicle, load_vehicle
-from finssim.vehicles.defaults import room
+from finssim.vehicles.defaults import room, vehicle_at
 
 Array = NDArray[np.float64]
 
@@ -324,12 +325,16 @@ class PoolRun(Job):
     """nominal, realistic or hard."""
     hold: str | None = "pid"
     """PID that keeps the other axes."""
+    site: str = "pool"
+    """pool, tank or open-water."""
+    firmware: str = "mcu"
+    """mcu or ardusub, as of `pool_trial.Job`."""
 
     @property
     def water(self) -> Box:
         """Of the pool."""
         standing = load_vehicle(self.pool_vehicle)
-        return box_of(draw_plant(standing, self.plant, self.severity).basin)  # type: ignore[arg-type]
+        return box_of(site_of(self.site, draw_plant(standing, self.plant, self.severity)).basin)  # type: ignore[arg-type]
 
 
 def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
@@ -348,7 +353,9 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     record.parent.mkdir(parents=True, exist_ok=True)
     record.unlink(missing_ok=True)
     vehicle, seed = load_vehicle(run.vehicle), noise_seed(run.seed, run.row, run.target)
-    pool = make_plan(run.pool_vehicle, str(run.plant), run.severity, camera="corners", seed=seed)  # type: ignore[arg-type]
+    camera: Any = "none" if run.firmware == "ardusub" else "corners"
+    where: Any = {"site": run.site, "firmware": run.firmware}
+    pool = make_plan(run.pool_vehicle, str(run.plant), run.severity, camera=camera, seed=seed, **where)  # type: ignore[arg-type]
     place = place_of(run.programme, vehicle, run.water)
     trial = programme_trial(run.programme, vehicle, place, hold=run.hold)
     about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
@@ -356,11 +363,11 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
         outcome = play_in_pool(
             trial,
             Station(place.position, place.yaw),
-            vehicle,
+            vehicle_at(run.site, vehicle, navigation=run.firmware == "ardusub"),
             pool,
             seed=seed,
             recorder=recorder,
-            mode=ESTIMATOR,
+            mode=ESTIMATOR if run.firmware == "mcu" else "error-state",
         )
     t, pilot = outcome.runtime.t, outcome.trial.pilot
     assert isinstance(pilot, ProgrammePilot)

@@ -61,9 +61,13 @@ T1_START = from_published((0.0, -0.5, 0.0, 0.0))
 """Pose at the start of every trial [x, y, z [m], yaw [rad]], world frame, at rest and level."""
 
 
-def in_room(pose: NDArray[np.float64], vehicle: Vehicle) -> NDArray[np.float64]:
-    """A published pose [x, y, z [m], yaw [rad]] in the pool that this vehicle needs: places grow with it, yaw stays."""
-    size = room(vehicle.body.size)
+SITE_SIZES = {"pool": 1.0, "tank": 3.0, "open-water": 3.0}
+"""Factor on the setpoints and the start of T1 by site: a metre away in the pool, three in the others."""
+
+
+def in_room(pose: NDArray[np.float64], vehicle: Vehicle, site: str = "pool") -> NDArray[np.float64]:
+    """A published pose [x, y, z [m], yaw [rad]] in the room that this vehicle has: places grow with it, yaw stays."""
+    size = room(vehicle.body.size) * SITE_SIZES[site]
     return pose * np.array([size, size, size, 1.0])
 
 

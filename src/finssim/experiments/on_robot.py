@@ -294,6 +294,10 @@ class OnRobot:
         """The robot's address."""
         return f"{self.wiring.robot}{', lock-step' if self.wiring.lockstep else ''}"
 
+    def equipped(self, vehicle: Vehicle) -> Vehicle:
+        """The vehicle as it is there, where its file does not say more."""
+        return vehicle_at(self.site, vehicle, navigation=self.wiring.robot.startswith("mavlink"))
+
     @property
     def options(self) -> str:
         """Words of a command line that name it."""
@@ -322,8 +326,9 @@ def robot_or_none(
     """The robot that options name; none where they name none, and nothing tells of one.
 
     Args:
-        robot (ADDRESS): Robot on which it is done: its motor controller's udp://HOST:PORT or serial:DEVICE, or pool for
-            the virtual pool on this machine. With --lockstep: pool, or HOST:PORT.
+        robot (ADDRESS): Robot on which it is done: its motor controller's udp://HOST:PORT or serial:DEVICE, its
+            autopilot's mavlink://KIND:WHERE, or pool or mavlink for the virtual pool on this machine. With --lockstep:
+            pool, mavlink, or HOST:PORT.
         pool_file (FILE|none): Of that robot: camera, water plane and frames (.yaml); none where no camera looks and
             position fixes come by wire.
         site (NAME): Where that robot is: pool, tank or open-water, by which it is equipped. If not given: pool.
@@ -396,7 +401,7 @@ class Session:
     @property
     def equipped(self) -> Vehicle:
         """The vehicle as it is equipped where it is."""
-        return vehicle_at(self.robot.site, self.vehicle)
+        return self.robot.equipped(self.vehicle)
 
     @cached_property
     def _reckoning(self) -> Perception:
@@ -521,7 +526,7 @@ def session(
     console = console or Console(stderr=True)
     site = None if robot.pool_file is None else load_pool(robot.pool_file)
     with ExitStack() as stack:
-        drive = stack.enter_context(connected(robot.wiring, vehicle_at(robot.site, vehicle), site))
+        drive = stack.enter_context(connected(robot.wiring, robot.equipped(vehicle), site))
         if attendant is None and not robot.unattended:
             if not sys.stdin.isatty():
                 raise RobotError(

@@ -102,7 +102,6 @@ def swim(
     """
     start_warp()
     plan = make_plan(vehicle, str(plant), severity, camera="none", seed=seed, site="open-water")
-    let_in = np.random.default_rng([seed, 0x57A]).normal(0.0, LET_IN_STD, 2).tolist()
     rows: list[tuple[float, ...]] = []
 
     def watch(runtime: Runtime) -> None:
@@ -114,6 +113,8 @@ def swim(
         P = estimate.P[:2, :2].ravel().tolist()
         rows.append((reading.time, *estimate.x[:2].tolist(), estimate.yaw, *P))
 
+    let_in = np.random.default_rng([seed, 0x57A]).normal(0.0, LET_IN_STD, 2).tolist()
+    start = Station((0.0, 0.0, DEPTH), 0.0)
     trial = RobotTrial(
         name=way.name,
         pilot=make_pilot(controller, plan.vehicle, task="t2"),
@@ -124,7 +125,7 @@ def swim(
     )
     with tempfile.TemporaryDirectory() as folder:
         runtime = play_in_pool(
-            trial, Station((0.0, 0.0, DEPTH), 0.0), plan.vehicle, replace(plan, positioning=positioning), seed=seed,
+            trial, start, plan.vehicle, replace(plan, positioning=positioning), seed=seed,
             truth=Path(folder) / "truth", mode="error-state", let_in=let_in,
         ).runtime  # fmt: skip
         truth = read_truth(Path(folder) / "truth")

@@ -18,7 +18,7 @@ from rich.console import Console
 from finssim.control.guidance import Station
 from finssim.experiments import campaign
 from finssim.experiments.evaluate import Evaluation, summary_of
-from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room
+from finssim.experiments.metrics import SITE_SIZES, T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.on_robot import (
     GETTING_READY,
     Attendant,
@@ -43,10 +43,11 @@ from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
+from finssim.robot.wiring import link_of
 from finssim.tasks import task_named
 from finssim.tasks.agents import agent_for
 from finssim.vehicles import Vehicle, load_vehicle
-from finssim.vehicles.defaults import room
+from finssim.vehicles.defaults import room, vehicle_at
 
 HARDWARE = "hardware"
 """In place of the severity of a pool, and of what its camera sends."""
@@ -74,6 +75,10 @@ class Job(campaign.Job):
     """Added to what the controller sees [rad]."""
     duration: float = 60.0
     """[s]; of T2 the trajectory's own."""
+    site: str = "pool"
+    """pool, tank or open-water."""
+    firmware: str = "mcu"
+    """mcu or ardusub: an autopilot, on whose vehicle a Doppler log and a compass take the camera's place."""
 
     @property
     def task(self) -> str:
@@ -110,10 +115,14 @@ def play_in_pool(
         estimator: Options of `Perception`.
     """
     world = plan.standing(start, seed=seed, truth=truth)
+    if plan.firmware == "ardusub":
+        # Dead reckoning counts from where the vehicle is let in, so nobody can be wrong about that place.
+        estimator = {"mode": "error-state", "let_in": start.position[:2], **estimator}
     perception = Perception(vehicle, plan.calibrated, **estimator)
     runtime = Runtime(
         vehicle, plan.calibrated, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
     )
+    runtime.attach(link_of("mavlink" if plan.firmware == "ardusub" else "pool", vehicle))
     longest = GETTING_READY + trial.duration
     with closing(world):
         run_lockstep(
@@ -134,9 +143,11 @@ def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial,
         PolicyError, ControlError: The controller does not fit the vehicle or the task.
     """
     standing = load_vehicle(job.pool_vehicle)
-    guide = guide_of(job.target, standing)
+    guide = guide_of(job.target, standing, site=job.site)
     first = guide.at(0.0)
-    *place, yaw = in_room(T1_START, standing) if job.task == "t1" else (*first.position, float(first.yaw))
+    *place, yaw = (
+        in_room(T1_START, standing, job.site) if job.task == "t1" else (*first.position, float(first.yaw))
+    )
     duration = guide.duration if math.isfinite(guide.duration) else job.duration
     pilot = make_pilot(job.controller, vehicle, task=job.task)
     if job.position_noise or job.yaw_noise:
@@ -189,14 +200,17 @@ def play(job: Job, path: Path) -> dict[str, Any]:
         job.pool_vehicle,
         str(job.plant),
         job.severity,
-        camera=job.camera,
+        camera="none" if job.firmware == "ardusub" else job.camera,
         seed=noise_seed(job.seed, job.target),
+        site=job.site,
+        firmware=job.firmware,
     )  # type: ignore[arg-type]
     seed = noise_seed(job.seed, job.target)
     trial, start = job_trial(job, vehicle, seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "truth"
-        outcome = play_in_pool(trial, start, vehicle, plan, seed=seed, truth=file, fusion=job.fusion)
+        ours = vehicle_at(job.site, vehicle, navigation=job.firmware == "ardusub")
+        outcome = play_in_pool(trial, start, ours, plan, seed=seed, truth=file, fusion=job.fusion)
         truth = read_truth(file)
     t = truth.time - outcome.runtime.started
     rows = np.flatnonzero((t >= 0.0) & (t <= trial.duration + 1e-6))
@@ -216,7 +230,7 @@ def _result(job: Job, path: Path, motion: Motion, outcome: Outcome, began: float
     return {
         **trial.measures(job.task, limits, stopped=bool(outcome.fault)),
         "fault": outcome.fault,
-        "room": room(load_vehicle(job.pool_vehicle).body.size),
+        "room": room(load_vehicle(job.pool_vehicle).body.size) * SITE_SIZES[job.site],
         "localization": None,
         "missed_decisions": outcome.runtime.counters.missed,
         "seconds": time.perf_counter() - began,

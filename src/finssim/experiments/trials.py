@@ -19,6 +19,7 @@ from finssim.control.guidance import Goal, Guide, Station, Track, acceleration_a
 from finssim.control.trajectories import load_trajectory
 from finssim.experiments.metrics import (
     ERRORS,
+    SITE_SIZES,
     T1_SETPOINTS,
     T1_START,
     in_room,
@@ -190,16 +191,19 @@ def follows(task: Task) -> bool:
     return hasattr(task, "knot_spacing")
 
 
-def guide_of(target: str | Path, vehicle: Vehicle | None = None, *, size: float = 1.0) -> Guide:
+def guide_of(
+    target: str | Path, vehicle: Vehicle | None = None, *, size: float = 1.0, site: str = "pool"
+) -> Guide:
     """A published setpoint by its name, or a trajectory by name or file.
 
     Args:
         target: What is to be done.
         vehicle: In whose room; one that cannot follow the trajectory is refused.
         size: Of the room, where no vehicle is named: 1 for FinsROV.
+        site: By which setpoints grow, where a vehicle is named.
     """
     if str(target) in T1_SETPOINTS:
-        size = size if vehicle is None else room(vehicle.body.size)
+        size = size if vehicle is None else room(vehicle.body.size) * SITE_SIZES[site]
         x, y, z, yaw = (T1_SETPOINTS[str(target)] * (size, size, size, 1.0)).tolist()
         return Station((x, y, z), yaw, name=str(target))
     if vehicle is None:

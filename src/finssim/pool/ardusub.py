@@ -70,8 +70,8 @@ BOOT_INPUTS = (NEUTRAL,) * 8 + (1100,) * 10
 SPECIFIC_WEIGHT = 9800.0
 """Of fresh water, as ArduPilot has it [Pa/m]."""
 METRES_PER_DEGREE = 111319.5
-CALIBRATION = 1.0
-"""For so long after the start the gyroscope is averaged [s]."""
+CALIBRATION, STILL = 1.0, 0.03
+"""For so long after the start the gyroscope is averaged [s], unless it turns faster than this [rad/s]."""
 DEPTH_LAG = 0.4
 """Time constant of the depth estimate [s]."""
 CLIMB_GAIN, CLIMB_INTEGRAL = 1.5, 0.4
@@ -189,11 +189,10 @@ class ArduSub:
         self.target: Array = np.zeros(len(self._motor))
         self._inputs, self._input_times = list(BOOT_INPUTS), [-math.inf] * 18
         self._pilot_seen, self._ground_seen = -math.inf, -math.inf
-        self._pilot_lost, self._ground_lost, self._battery_low, self._leaking = True, False, False, False
-        self._low_since, self._leak_reported = math.inf, -math.inf
+        self._failsafes, self._low_since = {"pilot"}, math.inf
         self._gain, self._buttons = self._within("JS_GAIN_DEFAULT", 0.1, 1.0), 0
         self._filter = AttitudeFilter(self._spec.attitude_gain, self._spec.attitude_integral, self._gravity)
-        self._rates_sum, self._rates_count = np.zeros(3), 0
+        self._rates_sum, self._rates_count, self._fastest = np.zeros(3), 0, 0.0
         self._sample: Sample | None = None
         self._sampled, self._headed = now, False
         self._attitude, self._quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
@@ -284,7 +283,7 @@ class ArduSub:
         if not faults.freeze_sensors or self._sample is None:
             self._sense(now, sample, aids)
         self._check_battery(now)
-        self._check_leak(now, faults.leak)
+        self._check_leak(faults.leak)
         self._hold()
         for name, due in self._due.items():
             if now >= due - 1e-9:
@@ -306,8 +305,10 @@ class ArduSub:
         gyro, accel = (self._body_from_imu @ np.array(v) for v in (sample.gyro, sample.accel))
         if now - self._boot < CALIBRATION:
             self._rates_sum, self._rates_count = self._rates_sum + gyro, self._rates_count + 1
+            self._fastest = max(self._fastest, float(np.abs(gyro).max()))
             x, y, z = (self._rates_sum / self._rates_count).tolist()
-            self._filter.bias = (x, y, z)
+            # One that was moved meanwhile would take its motion for the gyroscope's offset.
+            self._filter.bias = (x, y, z) if self._fastest < STILL else (0.0, 0.0, 0.0)
         self._filter.update(tuple(gyro.tolist()), tuple(accel.tolist()), dt)
         velocities = []
         for aid in aids:
@@ -372,17 +373,15 @@ class ArduSub:
         if self.mode == MANUAL or not self.armed:
             self._held, self._held_yaw, self._held_altitude, self._climb_integral = None, None, None, 0.0
             return
-        lean = math.radians(0.01 * p["ANGLE_MAX"])
-        rate = np.zeros(3)
-        for axis, stick in enumerate((roll, pitch)):
-            gain = p["ATC_ANG_RLL_P"] if axis == 0 else p["ATC_ANG_PIT_P"]
-            rate[axis] = gain * (_dead(stick, 0.075) * lean - self._attitude[axis])
-        turn = _dead(yaw, 0.1)
+        turn, lean = _dead(yaw, 0.1), math.radians(0.01 * p["ANGLE_MAX"])
         if turn or self._held_yaw is None:
             self._held_yaw = float(self._attitude[2])
-        rate[2] = p["ATC_ANG_YAW_P"] * float(wrap_angle(self._held_yaw - self._attitude[2]))
+        target = [lean * _dead(roll, 0.075), lean * _dead(pitch, 0.075), self._held_yaw]
+        angles, gains = (
+            np.array([p[f"ATC_{kind}_{axis}_P"] for axis in ("RLL", "PIT", "YAW")]) for kind in ("ANG", "RAT")
+        )
+        rate = angles * wrap_angle(target - self._attitude)
         rate[2] += turn * math.radians(45.0 * p["ACRO_YAW_P"])
-        gains = np.array([p["ATC_RAT_RLL_P"], p["ATC_RAT_PIT_P"], p["ATC_RAT_YAW_P"]])
         turning = np.clip(gains * (rate - self._rates), -1.0, 1.0).tolist()
         self._held = (*turning, throttle if self.mode == STABILIZE else self._climbing(throttle))
 
@@ -552,57 +551,51 @@ class ArduSub:
         if "heartbeat" in self._due:
             self._due["heartbeat"] = self._now
 
+    def _failsafe(self, name: str, active: bool, severity: int, text: str) -> bool:
+        """Keep the state of a failsafe; True, and a text, where it sets in."""
+        sets_in = active and name not in self._failsafes
+        self._failsafes = self._failsafes | {name} if active else self._failsafes - {name}
+        if sets_in:
+            self._statustext(severity, text)
+        return sets_in
+
     def _check_pilot(self, now: float) -> None:
         """No input for FS_PILOT_TIMEOUT: sticks to neutral, and disarmed where FS_PILOT_INPUT says so; once a loss."""
         action = self.parameters["FS_PILOT_INPUT"]
         lost = action > 0 and now - self._pilot_seen > self.parameters["FS_PILOT_TIMEOUT"]
-        if lost and not self._pilot_lost:
-            self._statustext(CRITICAL, "Lost manual control")
+        if self._failsafe("pilot", lost, CRITICAL, "Lost manual control"):
             self._neutral_sticks()
-            if action == 2:
-                self._disarm()
-        self._pilot_lost = lost
+            self._act({2: None}.get(int(action), self.mode))
 
     def _check_ground(self, now: float) -> None:
         """No heartbeat of the ground station for FS_GCS_TIMEOUT, once there was one: what FS_GCS_ENABLE says."""
         action, since = self.parameters["FS_GCS_ENABLE"], self._ground_seen
         lost = action > 0 and since > -math.inf and now - since > self.parameters["FS_GCS_TIMEOUT"]
-        if lost and not self._ground_lost:
-            self._statustext(WARNING, f"MYGCS: {self.parameters['SYSID_MYGCS']:.0f}, heartbeat lost")
-            if action == 2:
-                self._disarm()
-            elif action in (3, 4) and self.armed and not self._set_mode(ALT_HOLD if action == 3 else SURFACE):
-                self._disarm()
-        self._ground_lost = lost
+        if self._failsafe(
+            "ground", lost, WARNING, f"MYGCS: {self.parameters['SYSID_MYGCS']:.0f}, heartbeat lost"
+        ):
+            self._act({2: None, 3: ALT_HOLD, 4: SURFACE}.get(int(action), self.mode))
 
     def _check_battery(self, now: float) -> None:
         """BATT_FS_LOW_ACT (2 disarm, 3 surface) after BATT_LOW_TIMER below BATT_LOW_VOLT; once a start."""
-        p = self.parameters
-        if self._battery[0] >= p["BATT_LOW_VOLT"]:
-            self._low_since = math.inf
-        self._low_since = min(self._low_since, now if self._battery[0] < p["BATT_LOW_VOLT"] else math.inf)
-        if not self._battery_low and now - self._low_since >= p["BATT_LOW_TIMER"]:
-            self._battery_low = True
-            self._statustext(
-                WARNING,
-                f"Battery 1 is low {self._battery[0]:.2f}V used {self._used:.0f} mAh",
-            )
-            if p["BATT_FS_LOW_ACT"] == 2:
-                self._disarm()
-            elif p["BATT_FS_LOW_ACT"] == 3 and self.armed:
-                self._set_mode(SURFACE)
+        p, voltage = self.parameters, self._battery[0]
+        self._low_since = min(self._low_since, now) if voltage < p["BATT_LOW_VOLT"] else math.inf
+        low = "battery" in self._failsafes or now - self._low_since >= p["BATT_LOW_TIMER"]
+        if self._failsafe(
+            "battery", low, WARNING, f"Battery 1 is low {voltage:.2f}V used {self._used:.0f} mAh"
+        ):
+            self._act({2: None, 3: SURFACE}.get(int(p["BATT_FS_LOW_ACT"]), self.mode))
 
-    def _check_leak(self, now: float, leaking: bool) -> None:
-        """FS_LEAK_ENABLE: 1 warns, every 20 s; 2 surfaces too."""
+    def _check_leak(self, leaking: bool) -> None:
+        """FS_LEAK_ENABLE: 1 warns, 2 surfaces too."""
         action = self.parameters["FS_LEAK_ENABLE"]
-        self._leaking = leaking and action > 0
-        if not self._leaking:
-            self._leak_reported = -math.inf
-        elif now - self._leak_reported > 20.0:
-            self._statustext(CRITICAL, "Leak Detected")
-            if action == 2 and self.armed and self._leak_reported == -math.inf:
-                self._set_mode(SURFACE)
-            self._leak_reported = now
+        if self._failsafe("leak", leaking and action > 0, CRITICAL, "Leak Detected"):
+            self._act({2: SURFACE}.get(int(action), self.mode))
+
+    def _act(self, mode: int | None) -> None:
+        """Go into a mode; None, or a mode that is refused, disarms."""
+        if self.armed and (mode is None or not self._set_mode(mode)):
+            self._disarm()
 
     # Commands.
 
@@ -800,10 +793,15 @@ class ArduSub:
     def _report_heartbeat(self) -> tuple[Any, ...]:
         if self._faults and self._faults.no_heartbeat:
             return ()
-        lost = self._pilot_lost or self._ground_lost or self._battery_low or self._leaking
         state = mavlink.MAV_STATE_ACTIVE if self.armed else mavlink.MAV_STATE_STANDBY
         kind = mavlink.MAV_TYPE_SUBMARINE, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-        return (*kind, 209 if self.armed else 81, self.mode, mavlink.MAV_STATE_CRITICAL if lost else state, 3)
+        return (
+            *kind,
+            209 if self.armed else 81,
+            self.mode,
+            mavlink.MAV_STATE_CRITICAL if self._failsafes else state,
+            3,
+        )
 
     def _report_autopilot_version(self) -> tuple[Any, ...]:
         major, minor, patch = VERSION
@@ -887,7 +885,7 @@ class ArduSub:
         present = SENSORS | (mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG if self._has_compass else 0)
         enabled = present if self.armed else present & ~mavlink.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
         healthy = present | mavlink.MAV_SYS_STATUS_GEOFENCE
-        healthy &= ~mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if self._battery_low else -1
+        healthy &= ~mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if "battery" in self._failsafes else -1
         healthy &= ~mavlink.MAV_SYS_STATUS_PREARM_CHECK if self._unfit() else -1
         return (present, enabled, healthy, 100, *self._power(), *[0] * 6)
 

@@ -31,7 +31,7 @@ from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import UdpTransport, host_port
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
-from finssim.vehicles.defaults import numbered, vehicle_at, with_navigation
+from finssim.vehicles.defaults import numbered, vehicle_at
 
 __all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run", "swimming"]
 
@@ -110,9 +110,7 @@ def make_plan(
     """
     ours = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
-    spec, ours = site_of(site, spec), vehicle_at(site, ours)
-    if firmware == "ardusub":
-        ours = with_navigation(ours)
+    spec, ours = site_of(site, spec), vehicle_at(site, ours, navigation=firmware == "ardusub")
     if site == "open-water" and camera != "none":
         raise PlantSpecError(
             "no camera hangs over open water: give --camera none, and a positioning if there is one"

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -713,6 +713,16 @@ RUNNING = ("armed", "hold")
 """States in which the watchdogs bite."""
 
 
+class Autopilot(Protocol):
+    """What stands between a bridge and the motors and has a will of its own (`robot.runtime.Link`)."""
+
+    def prepare(self, now: float) -> str:
+        """Called by `Bridge.arm` where nothing else stands against it: "" once commands count, else why not yet."""
+
+    def alarm(self, now: float) -> str:
+        """Asked at every tick of an armed bridge: why the vehicle is no longer ours; "" while it is."""
+
+
 class Bridge:
     """State machine of one vehicle. Every method takes the robot's clock `now` [s]; it reads no clock itself."""
 
@@ -722,6 +732,8 @@ class Bridge:
         self.motors = MotorMap.from_vehicle(vehicle)
         if len(self.settings.slew) != self.motors.thrusters:
             raise BridgeError(f"slew has {len(self.settings.slew)} rates, expected {self.motors.thrusters}")
+        self.autopilot: Autopilot | None = None
+        """Has to be ready before the bridge arms, and may end it; None: there is none."""
         self.state = "disarmed"
         self.reason = ""
         """Why it is in hold or fault."""
@@ -742,7 +754,7 @@ class Bridge:
 
     def arm(self, now: float, source: str) -> str:
         """Let commands through from now on. Returns "" or, in one sentence, why it is refused."""
-        why = self._refusal(now)
+        why = self._refusal(now) or (self.autopilot.prepare(now) if self.autopilot is not None else "")
         if why:
             self.log.repeat(self._clock.now, "refused", f"{source} may not arm: {why}")
             return why
@@ -884,7 +896,8 @@ class Bridge:
 
     def _watch(self, now: float) -> None:
         """Let the watchdogs look: fault, hold, or on with it."""
-        danger = self._watchdogs.danger(now)
+        lost = self.autopilot.alarm(now) if self.autopilot is not None else ""
+        danger = lost or self._watchdogs.danger(now)
         if danger:
             return self._fault(danger)
         want = "the operator holds" if self._operator else self._watchdogs.want(now, self._armed_at)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 __all__ = ["AgentPilot", "ModeSwitch", "Pilot", "WrenchPilot", "make_pilot"]
 
 Array = npt.NDArray[np.float64]
+
+BY_AXES = 2.0 / 3.0
+"""Part of a task's reach for a vehicle that is steered by axes: a Doppler log locates it, and loses the floor when the
+vehicle leans on its way."""
 
 
 class Pilot(Protocol):
@@ -81,6 +86,10 @@ class AgentPilot:
         """
         self.agent, self.observer, self.period, self.name = agent, observer, agent.period, agent.name
         self.mode = action_mode(agent.action, vehicle, agent.wrench_scale)
+        task = None if observer is None else observer.task
+        reach = task.reach * task.fit.size if hasattr(task, "reach") else math.inf
+        self.reach = reach * (BY_AXES if self.mode.pilot else 1.0)
+        """Goals farther away than this are shown so far ahead on the way to them [m]."""
         self._input_noise: dict[str, float] = {}
         self.reset()
 
@@ -126,7 +135,7 @@ class AgentPilot:
             reading = Track(moved, quat_multiply(turn, reading.quaternion), np.asarray(reading.nu, float))
         if self.observer is not None:
             previous = self.action if self.action.size else None
-            self.observation = self.observer.observe(reading, guide, t, previous)
+            self.observation = self.observer.observe(reading, guide, t, previous, self.reach)
         known = Known(self.observation[None], *(np.asarray(x, float)[None] for x in _state(reading)))
         goal = goal_at(guide, t)
         rows = (goal.position, goal.quaternion, goal.velocity, goal.acceleration)

@@ -310,7 +310,9 @@ def run(
             heading [deg], or a file with goal: [x, y, z, yaw_deg].
         trajectory (NAME|FILE): Trajectory to follow in place of a goal: straight, broken, ellipse, lemniscate, circle,
             helix, or a file.
-        robot (ADDRESS): Motor controller: udp://HOST:PORT, serial:DEVICE, or pool for the virtual pool on this machine.
+        robot (ADDRESS): Motor controller: udp://HOST:PORT, serial:DEVICE, or pool for the virtual pool on this machine;
+            or autopilot: mavlink://udpin:HOST:PORT, udpout:, tcp: or serial:, with ?dvl=HOST for a Water Linked log, or
+            mavlink for that of the virtual pool.
             With --lockstep: pool, or HOST:PORT.
         bind (ADDRESS:PORT): Address and port of this end, for udp; pictures come to the port after it. Loopback unless
             given.
@@ -368,7 +370,7 @@ def run(
     console, site = Console(stderr=True), site or "pool"
     file = None if pool_file == "none" else Path(pool_file or "pool.yaml")
     filed = load_vehicle(vehicle)
-    ours = numbered(vehicle_at(site, filed), number)
+    ours = numbered(vehicle_at(site, filed, navigation=robot.startswith("mavlink")), number)
     guide = _GO if wiring.team and goal is None and trajectory is None else guide_of(goal, trajectory)
     if guide is not _GO:
         check_reachable(guide, ours)

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from finssim.control.guidance import Guide
 from finssim.localization.pool import Pool
 from finssim.robot.bridge import Bridge
 from finssim.robot.link.clock import ClockMap
-from finssim.robot.link.frames import Decoder, encode_command
+from finssim.robot.link.frames import McuLink, Message
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry, ThrusterCommand
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from finssim.robot.recorder import Recorder
     from finssim.robot.team import Team
 
-__all__ = ["Counters", "Intake", "Runtime", "Ticks"]
+__all__ = ["Counters", "Intake", "Link", "Runtime", "Ticks"]
 
 
 # What a run counts: steps, decisions that came late, and the time from camera to command.
@@ -118,11 +118,32 @@ class Counters:
 USED = ("accepted", "initialized", "reacquired")
 
 
+class Link(Protocol):
+    """Who turns the bridge's commands into motion at the other end of the wire: a motor controller or an autopilot."""
+
+    def feed(self, now: float, data: bytes) -> list[Message]:
+        """Messages that bytes complete, which came at a time [s]; never raises, whatever they are."""
+
+    def prepare(self, now: float) -> str:
+        """Called while the bridge is about to be armed: "" once commands will count, else what is waited for."""
+
+    def alarm(self, now: float) -> str:
+        """Asked while the bridge is armed: why the vehicle is no longer ours, in a sentence; "" while it is."""
+
+    def encode(self, now: float, command: ThrusterCommand, state: str) -> list[bytes]:
+        """Frames to send at a time [s] for the bridge's command and state."""
+
+
 class Intake:
     """Feeds one perception and one bridge. Nothing that arrives can raise."""
 
     def __init__(
-        self, perception: Perception, bridge: Bridge, counters: Counters, recorder: Recorder | None = None
+        self,
+        perception: Perception,
+        bridge: Bridge,
+        counters: Counters,
+        recorder: Recorder | None = None,
+        link: Link | None = None,
     ) -> None:
         """
         Args:
@@ -130,8 +151,9 @@ class Intake:
             bridge: Watches whether they still speak.
             counters: Counts it.
             recorder: Takes it down.
+            link: Reads what comes; the vehicle's motor controller if None.
         """
-        self.decoder = Decoder(outputs=perception.vehicle.mcu.outputs)
+        self.link: Link = link or McuLink(perception.vehicle.mcu.outputs)
         self.clock = ClockMap()
         self._perception, self._bridge = perception, bridge
         self._counters, self.recorder = counters, recorder
@@ -147,7 +169,7 @@ class Intake:
             pictures: From the camera.
         """
         for arrival, data in frames:
-            for message in self.decoder.feed(data):
+            for message in self.link.feed(arrival, data):
                 if isinstance(message, Telemetry):
                     self._telemetry(arrival, message)
                 elif isinstance(message, CommandEcho):
@@ -231,6 +253,11 @@ class Runtime:
         self._arm = arm
         self._ticks = Ticks()
         self.intake = Intake(self.perception, self.bridge, self.counters, recorder)
+        self.attach(self.intake.link)
+
+    def attach(self, link: Link) -> None:
+        """Speak with what is at the other end of the wire: the vehicle's motor controller if nothing else is told."""
+        self.link = self.intake.link = self.bridge.autopilot = link
 
     def step(
         self,
@@ -263,7 +290,7 @@ class Runtime:
         self._decide(now, reading)
         command = self.bridge.tick(now)
         self._record(now, reading, command)
-        return [encode_command(command)]
+        return self.link.encode(now, command, self.bridge.state)
 
     def sent(self, now: float) -> None:
         """Tell when the datagrams of the last step went out [s], for the latency of a decision."""
@@ -299,9 +326,9 @@ class Runtime:
         """Disarm; returns frames without thrust to send."""
         self._arm = False
         self.bridge.disarm(now)
-        last = [encode_command(self.bridge.tick(now)) for _ in range(frames)]
+        last = [self.link.encode(now, self.bridge.tick(now), self.bridge.state) for _ in range(frames)]
         self._record_events()
-        return last
+        return [frame for made in last for frame in made]
 
     @property
     def t(self) -> float:

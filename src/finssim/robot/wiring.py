@@ -13,14 +13,21 @@ from typing import Any, Protocol
 
 from finssim.localization.pool import Pool
 from finssim.robot.interrupt import interruptible
-from finssim.robot.link.frames import LinkError
-from finssim.robot.link.transports import DEFAULT_BIND, Transport, UdpTransport, host_port, open_transport
+from finssim.robot.link.frames import LinkError, McuLink
+from finssim.robot.link.transports import (
+    DEFAULT_BIND,
+    MavlinkAddress,
+    Transport,
+    UdpTransport,
+    host_port,
+    open_transport,
+)
 from finssim.robot.lockstep import DEFAULT_PORT, LockstepClient, run_lockstep
 from finssim.robot.pictures import DEFAULT_CAMERA, NoPictures, PictureSource, TagFinder, open_pictures
-from finssim.robot.runtime import Runtime
+from finssim.robot.runtime import Link, Runtime
 from finssim.vehicles import Vehicle
 
-__all__ = ["POOL_ADDRESS", "Drive", "Wiring", "connected", "open_camera", "run_realtime"]
+__all__ = ["POOL_ADDRESS", "Drive", "Wiring", "connected", "link_of", "open_camera", "run_realtime"]
 
 
 # The outermost loop of a robot in real time: the only place that reads a clock and waits.
@@ -131,7 +138,7 @@ class Wiring:
     """How the robot is connected."""
 
     robot: str = "pool"
-    """Address of the motor controller, or `pool`."""
+    """Address of the motor controller or autopilot, or `pool`."""
     bind: str = DEFAULT_BIND
     """Own end, for UDP; pictures come to the port after it."""
     pictures: str | None = None
@@ -140,6 +147,23 @@ class Wiring:
     """Take turns with a virtual pool."""
     team: str = ""
     """HOST:PORT of what carries messages between vehicles; empty: this one is alone."""
+
+
+def link_of(robot: str, vehicle: Vehicle) -> Link:
+    """Who is at the other end of an address: an autopilot at `mavlink`, else the vehicle's motor controller.
+
+    Raises:
+        LinkError, ControlError: pymavlink is missing, or the vehicle has no autopilot.
+    """
+    if not robot.startswith("mavlink"):
+        return McuLink(vehicle.mcu.outputs)
+    try:
+        from finssim.robot.link.mavlink import MavlinkLink
+    except ModuleNotFoundError:
+        raise LinkError(
+            "mavlink needs pymavlink, which is not installed: pip install 'finssim[hardware]'"
+        ) from None
+    return MavlinkLink(vehicle, key=MavlinkAddress.of(robot).key)
 
 
 class Drive(Protocol):
@@ -175,12 +199,14 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[D
             raise LinkError(
                 "a team takes turns within one process: finssim experiment stack; or leave --lockstep out"
             )
+        link = link_of(wiring.robot, vehicle)
         if wiring.lockstep:
             world = stack.enter_context(LockstepClient(_lockstep_address(wiring)))
             clock = 0.0
 
             def take_turns(runtime: Runtime, **how: Any) -> float:
                 nonlocal clock
+                runtime.attach(link)
                 began, clock = clock, run_lockstep(runtime, world, start=clock, gentle=True, **how)
                 return clock - began
 
@@ -199,6 +225,7 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[D
             while transport.receive():
                 pass
             camera.receive(time.monotonic())
+            runtime.attach(link)
             return run_realtime(runtime, transport, camera, mates=mates, **how)
 
         yield run
@@ -223,9 +250,9 @@ def _lockstep_address(wiring: Wiring) -> str:
     """HOST:PORT of the pool."""
     if wiring.bind != DEFAULT_BIND or wiring.pictures is not None:
         raise LinkError("in lock-step all comes over one connection: leave --bind and --pictures out")
-    if wiring.robot == "pool":
+    if wiring.robot in ("pool", "mavlink"):
         return f"127.0.0.1:{DEFAULT_PORT}"
-    address = wiring.robot.removeprefix("tcp://")
+    address = wiring.robot.removeprefix("mavlink://").removeprefix("tcp://")
     if "/" in address or address.startswith("serial:"):
         raise LinkError(
             f"--robot {wiring.robot} is no world in lock-step: give HOST:PORT of finssim pool --lockstep, "

@@ -107,7 +107,12 @@ class Observer:
         self._guide = None
 
     def observe(
-        self, reading: Measured, guide: Guide, t: float, previous: ArrayLike | None = None
+        self,
+        reading: Measured,
+        guide: Guide,
+        t: float,
+        previous: ArrayLike | None = None,
+        reach: float = math.inf,
     ) -> NDArray[np.float32]:
         """The observation, (schema.size,).
 
@@ -116,6 +121,7 @@ class Observer:
             guide: Where to go.
             t: Time since the guide's start [s].
             previous: The action before, in [-1, 1], (size,), for tasks that look at it; zeros if None.
+            reach: A goal farther away than this is seen as one so far ahead on the straight way to it [m].
 
         Raises:
             ControlError: The place of a vehicle that the task needs is not known.
@@ -128,7 +134,9 @@ class Observer:
         self._remember(np.zeros(self._action_size) if previous is None else np.asarray(previous, float))
         a.time.numpy()[0] = t
         self._steps[0] = max(round(t / self.task.control_step), 0)
-        a.goal_position.numpy()[0] = now.position
+        way = np.asarray(now.position, float) - reading.position
+        far = float(np.linalg.norm(way)) / reach
+        a.goal_position.numpy()[0] = now.position if not far > 1.0 else reading.position + way / far
         a.goal_quaternion.numpy()[0] = quat_from_yaw(now.yaw)
         if a.target.velocity is not None:
             a.target.velocity.numpy()[0] = now.velocity

@@ -115,8 +115,13 @@ def with_navigation(vehicle: Vehicle) -> Vehicle:
     return vehicle.model_copy(update={"sensors": fitted})
 
 
-def vehicle_at(site: str, vehicle: Vehicle) -> Vehicle:
+def vehicle_at(site: str, vehicle: Vehicle, *, navigation: bool = False) -> Vehicle:
     """The vehicle as it is equipped for a site: a workspace as large, and in open water Doppler log and compass.
+
+    Args:
+        site: A name of `SITES`.
+        vehicle: As its file has it.
+        navigation: It has Doppler log and compass at every site, as one that an autopilot steers.
 
     Raises:
         VehicleError: There is no such site.
@@ -124,6 +129,8 @@ def vehicle_at(site: str, vehicle: Vehicle) -> Vehicle:
     if site not in SITES:
         raise VehicleError(f"unknown site '{site}'; available: {', '.join(SITES)}")
     size = SITES[site]
+    if navigation or site == "open-water":
+        vehicle = with_navigation(vehicle)
     if size is None:
         return vehicle
     length, width, depth = size
@@ -131,8 +138,7 @@ def vehicle_at(site: str, vehicle: Vehicle) -> Vehicle:
         "workspace_lower": np.array([-0.5 * length, -0.5 * width, -depth]),
         "workspace_upper": np.array([0.5 * length, 0.5 * width, 0.0]),
     }
-    fitted = with_navigation(vehicle) if site == "open-water" else vehicle
-    return fitted.model_copy(update={"safety": vehicle.safety.model_copy(update=box)})
+    return vehicle.model_copy(update={"safety": vehicle.safety.model_copy(update=box)})
 
 
 def numbered(vehicle: Vehicle, number: int) -> Vehicle:

@@ -141,7 +141,7 @@ def test_a_second_robot_on_the_same_port_is_refused(ends):
     [
         (
             "tcp://127.0.0.1:1",
-            "unknown wire 'tcp://127.0.0.1:1': give udp://HOST:PORT, serial:DEVICE or dry-run",
+            "unknown wire 'tcp://127.0.0.1:1': give udp://HOST:PORT, serial:DEVICE, mavlink://KIND:WHERE or dry-run",
         ),
         ("udp://127.0.0.1", "no HOST:PORT"),
         ("udp://127.0.0.1:70000", "no HOST:PORT"),

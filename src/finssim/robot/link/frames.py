@@ -37,6 +37,7 @@ __all__ = [
     "Form",
     "Layout",
     "LinkError",
+    "McuLink",
     "Message",
     "RejectFlag",
     "StatusFlag",
@@ -503,3 +504,29 @@ def _search(magics: Iterable[bytes]) -> re.Pattern[bytes]:
         for m in magics
     }
     return re.compile(b"|".join(sorted(parts)))
+
+
+class McuLink:
+    """The motor controller at the other end of a wire, as `Runtime` sees it: frames of thrusts out, telemetry in."""
+
+    def __init__(self, outputs: int) -> None:
+        """Args:
+        outputs: Motor outputs of the vehicle (`vehicle.mcu.outputs`).
+        """
+        self._decoder = Decoder(outputs=outputs)
+
+    def feed(self, now: float, data: bytes) -> list[Message]:
+        """Messages that bytes complete, which came at a time [s]."""
+        return self._decoder.feed(data)
+
+    def prepare(self, now: float) -> str:
+        """Nothing stands between the bridge and the motors."""
+        return ""
+
+    def alarm(self, now: float) -> str:
+        """Nobody else can take the vehicle; what its telemetry says is for the bridge."""
+        return ""
+
+    def encode(self, now: float, command: ThrusterCommand, state: str) -> list[bytes]:
+        """Frames to send at a time [s]: the bridge's command, whatever its state."""
+        return [encode_command(command)]

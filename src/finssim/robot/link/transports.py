@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import math
 import os
 import select
 import socket
@@ -10,6 +12,8 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 from urllib.parse import parse_qs, urlsplit
 
@@ -18,9 +22,11 @@ from finssim.robot.link.frames import LinkError
 __all__ = [
     "DEFAULT_BIND",
     "DryRun",
+    "MavlinkAddress",
     "MemoryTransport",
     "SerialTransport",
     "TcpServer",
+    "TcpTransport",
     "Transport",
     "UdpTransport",
     "bound_socket",
@@ -39,6 +45,8 @@ _DATAGRAM = 2048
 """Bytes of the longest datagram of a motor controller."""
 _DATAGRAMS_AT_ONCE = 1024
 """Datagrams taken by one call, so that a flood cannot hold the loop up."""
+_SILENT = 5.0
+"""A peer that was not named has gone when it said nothing for so long [s]."""
 _NAMED = 64
 """Refused senders that are told apart; those beyond are counted together."""
 
@@ -46,27 +54,41 @@ _NAMED = 64
 class UdpTransport:
     """Datagrams with one peer; those of any other address or port are refused, counted and named once in the log.
 
+    The peer may be the first who sends a datagram that begins as it has to; after a silence another takes its place.
+
     Note:
         `refused` counts by sender, `send_errors` the frames that could not leave (nobody listens, network down).
     """
 
-    def __init__(self, bind: Address, peer: Address, *, longest: int = _DATAGRAM, buffer: int = 0) -> None:
+    def __init__(
+        self,
+        bind: Address,
+        peer: Address | None,
+        *,
+        longest: int = _DATAGRAM,
+        buffer: int = 0,
+        greeting: bytes = b"",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Args:
             bind: Address and port of this end; port 0 takes a free one (see `address`).
-            peer: Host and port of the other end; the name is looked up once.
+            peer: Host and port of the other end; the name is looked up once. None: who sends first.
             longest: Bytes taken of a datagram; a longer one is cut, and its checksum no longer fits.
             buffer: Asked of the system for what has not been read yet [bytes]; its own choice if 0.
+            greeting: First bytes of which a datagram must have one, for its sender to become the peer.
+            clock: Tells how long the peer was silent [s].
 
         Raises:
             LinkError: An address cannot be found, bound, or reached from `bind`.
         """
-        self.peer = resolved(peer)
-        if self.peer[0] == "0.0.0.0" or not self.peer[1]:
+        self.peer = None if peer is None else resolved(peer)
+        self._greeting, self._clock, self._heard = greeting if peer is None else b"", clock, -math.inf
+        if peer is not None and self.peer is not None and (self.peer[0] == "0.0.0.0" or not self.peer[1]):
             raise LinkError(
                 f"peer {peer[0]}:{peer[1]} is not one address and port: give those of the vehicle"
             )
         here = resolved(bind)
-        if here[0].startswith("127.") and not self.peer[0].startswith("127."):
+        if self.peer is not None and here[0].startswith("127.") and not self.peer[0].startswith("127."):
             raise LinkError(
                 f"{peer[0]}:{peer[1]} is on another machine and this end is bound to {here[0]}, which only this "
                 "machine reaches: bind the address that this machine has on the vehicle's network"
@@ -89,6 +111,9 @@ class UdpTransport:
 
     def send(self, data: bytes) -> None:
         """Send one datagram to the peer; one that cannot leave is counted."""
+        if self.peer is None:
+            self.send_errors += 1
+            return
         try:
             self._socket.sendto(data, self.peer)
             self._send_problem = ""
@@ -116,7 +141,17 @@ class UdpTransport:
                 continue
             except OSError:  # closed
                 break
+            now = self._clock() if self._greeting else 0.0
+            if (
+                sender != self.peer
+                and data[:1]
+                and data[:1] in self._greeting
+                and now - self._heard > _SILENT
+            ):
+                _LOG.info("hear %s", _name(sender))
+                self.peer = sender
             if sender == self.peer:
+                self._heard = now
                 found.append(data)
             else:
                 self._refuse(sender)
@@ -128,7 +163,7 @@ class UdpTransport:
             _LOG.warning(
                 "refused a datagram from %s: this end listens to %s alone",
                 _name(key) if key else "yet another sender, the last one named",
-                _name(self.peer),
+                _name(self.peer) if self.peer is not None else "who begins as an autopilot does",
             )
         self.refused[key] += 1
 
@@ -138,7 +173,7 @@ class UdpTransport:
 
     def describe(self) -> str:
         """Both ends, and what went wrong so far."""
-        text = f"udp {_name(self.address)} to {_name(self.peer)}"
+        text = f"udp {_name(self.address)} to {_name(self.peer) if self.peer is not None else 'nobody yet'}"
         text += f", {self.send_errors} frames could not leave" if self.send_errors else ""
         return text + (f", {sum(self.refused.values())} datagrams of others refused" if self.refused else "")
 
@@ -393,6 +428,208 @@ def _written(port: Any, data: bytes) -> int:
     return os.write(port.fileno(), data) if os.name == "posix" else int(port.write(data))
 
 
+# The wire as a TCP connection to a server, which may go and come back.
+
+
+_SILENCE, _RETRY, _PATIENCE = 5.0, 1.0, 3.0
+"""A server that says nothing for so long has gone (an unplugged cable ends no connection); between attempts to reach
+it; longest wait for an attempt [s]."""
+_MOST_AT_ONCE = 1 << 18
+"""Bytes taken by one call, so that a flood cannot hold the loop up."""
+
+
+class TcpTransport:
+    """The connection to a server; a lost one is tried again every second, without waiting.
+
+    Attributes:
+        connected: Whether it is there now.
+        connections: How often it was reached.
+    """
+
+    title = "tcp"
+    """What is at the other end, for messages."""
+
+    def __init__(self, peer: Address, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """
+        Args:
+            peer: Host and port; a name is looked up once, now.
+            clock: Tells the time between attempts [s].
+
+        Raises:
+            LinkError: There is no such host.
+        """
+        self.peer: Address = resolved(peer)
+        self.connected, self.connections, self.send_errors = False, 0, 0
+        self._clock, self._next_try, self._since, self._closed = clock, -math.inf, 0.0, False
+        self._socket: socket.socket | None = None
+
+    def pieces(self, data: bytes | None) -> list[bytes]:
+        """What to give for bytes that came; None: a new connection begins."""
+        return [data] if data else []
+
+    def receive(self) -> list[bytes]:
+        """What has come since the last call, oldest first."""
+        if not self._ready():
+            return []
+        assert self._socket is not None  # it is ready
+        found: list[bytes] = []
+        taken = 0
+        try:
+            while taken < _MOST_AT_ONCE:
+                data = self._socket.recv(_BYTES_AT_ONCE)
+                if not data:
+                    raise ConnectionResetError("closed by the other end")
+                taken, self._since = taken + len(data), self._clock()
+                found += self.pieces(data)
+        except BlockingIOError:
+            if self._clock() - self._since > _SILENCE:
+                self._lose(f"silent for {_SILENCE:g} s")
+        except OSError as problem:
+            self._lose(str(problem))
+        return found
+
+    def send(self, data: bytes) -> None:
+        """Send bytes; what cannot leave whole is counted."""
+        try:
+            if not self._ready() or self._socket is None or self._socket.send(data) < len(data):
+                self.send_errors += 1
+        except OSError:
+            self.send_errors += 1
+
+    def close(self) -> None:
+        """Leave for good."""
+        self._closed = True
+        self._drop()
+
+    def describe(self) -> str:
+        """Where the other end is and whether it is there."""
+        state = "closed" if self._closed else "connected" if self.connected else "not connected"
+        return f"{self.title} at {_name(self.peer)}, {state}"
+
+    def _ready(self) -> bool:
+        """Whether there is a connection, after the next step of making one."""
+        now = self._clock()
+        if self._socket is None and not self._closed and now >= self._next_try:
+            self._next_try, self._since = now + _RETRY, now
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            self._socket.setblocking(False)
+            problem = self._socket.connect_ex(self.peer)
+            if problem not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):
+                self._drop()
+        if self._socket is not None and not self.connected:
+            if select.select([], [self._socket], [], 0.0)[1]:
+                if self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+                    self._drop()
+                else:
+                    self.connected, self._since = True, now
+                    self.connections += 1
+                    self.pieces(None)
+                    _LOG.info("%s %s: connected", self.title, _name(self.peer))
+            elif now - self._since > _PATIENCE:
+                self._drop()
+        return self.connected
+
+    def _lose(self, why: str) -> None:
+        _LOG.warning("%s %s: lost (%s); trying again every %g s", self.title, _name(self.peer), why, _RETRY)
+        self._next_try = self._clock() + _RETRY
+        self._drop()
+
+    def _drop(self) -> None:
+        gone, self._socket, self.connected = self._socket, None, False
+        if gone is not None:
+            gone.close()
+
+
+class _Beside:
+    """A wire, and another that only listens: an autopilot's and its Doppler log's."""
+
+    def __init__(self, wire: Transport, listening: Transport) -> None:
+        self._wires = (wire, listening)
+        self.send = wire.send
+
+    def receive(self) -> list[bytes]:
+        """What came over both."""
+        return [data for wire in self._wires for data in wire.receive()]
+
+    def close(self) -> None:
+        """Let go of both."""
+        for wire in self._wires:
+            wire.close()
+
+    def describe(self) -> str:
+        """Both."""
+        return "; ".join(wire.describe() for wire in self._wires)
+
+
+@dataclass(frozen=True)
+class MavlinkAddress:
+    """Where an autopilot is: `mavlink://KIND:...?dvl=HOST:PORT&key=FILE`, KIND udpin, udpout, tcp or serial."""
+
+    kind: str
+    where: str
+    dvl: str = ""
+    """HOST or HOST:PORT of a Water Linked log; empty: none."""
+    key: bytes = b""
+    """Of signing; empty: none."""
+
+    DEFAULT = "udpin:127.0.0.1:14550"
+    """Where the autopilot of a virtual pool on this machine sends to, and its log."""
+
+    @classmethod
+    def of(cls, address: str) -> MavlinkAddress:
+        """The address in its parts.
+
+        Raises:
+            LinkError: It is none, or the key cannot be read.
+        """
+        rest, _, query = address.removeprefix("mavlink").removeprefix("://").partition("?")
+        kind, _, where = (rest or cls.DEFAULT).partition(":")
+        options = {name: values[-1] for name, values in parse_qs(query).items()}
+        if kind not in ("udpin", "udpout", "tcp", "serial") or not where or options.keys() - {"dvl", "key"}:
+            raise LinkError(
+                f"{address}: give mavlink://udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE,BAUD, "
+                "with ?dvl=HOST for a Water Linked log and &key=FILE for a signing key"
+            )
+        key = b""
+        if "key" in options:
+            try:
+                key = Path(options["key"]).read_bytes()
+            except OSError as problem:
+                raise LinkError(
+                    f"{options['key']}: the signing key cannot be read: {problem.strerror}"
+                ) from None
+        return cls(kind, where, options.get("dvl", "" if rest else "127.0.0.1"), key)
+
+    def open(self) -> Transport:
+        """The wire, with the log's beside it.
+
+        Raises:
+            LinkError: It cannot be opened.
+        """
+        wire: Transport
+        if self.kind == "serial":
+            device, _, baud = self.where.partition(",")
+            if baud and not baud.isdecimal():
+                raise LinkError(
+                    f"serial:{self.where}: baud is {baud!r}, expected a whole number such as 115200"
+                )
+            wire = SerialTransport(device, int(baud or 115200))
+        else:
+            end = host_port(self.where, f"mavlink://{self.kind}")
+            if self.kind == "udpin":
+                wire = UdpTransport(end, None, greeting=b"\xfd\xfe")
+            elif self.kind == "udpout":
+                wire = UdpTransport(("127.0.0.1" if end[0].startswith("127.") else "0.0.0.0", 0), end)
+            else:
+                wire = TcpTransport(end)
+        if not self.dvl:
+            return wire
+        from finssim.robot.link.water_linked import PORT, DvlClient
+
+        host, port = host_port(self.dvl, "dvl") if ":" in self.dvl else (self.dvl, PORT)
+        return _Beside(wire, DvlClient(host, port))
+
+
 DEFAULT_BIND = "127.0.0.1:54321"
 """Address of the robot's own end."""
 
@@ -474,7 +711,8 @@ def open_transport(address: str, bind: str = DEFAULT_BIND) -> Transport:
     """The wire that an address names.
 
     Args:
-        address: "udp://HOST:PORT" of the motor controller, "serial:DEVICE" or "serial:DEVICE?baud=57600", "dry-run".
+        address: "udp://HOST:PORT" of the motor controller, "serial:DEVICE" or "serial:DEVICE?baud=57600", "dry-run", or
+            of an autopilot, as `MavlinkAddress` has it.
         bind: "ADDRESS:PORT" of this end, for UDP.
 
     Raises:
@@ -489,9 +727,13 @@ def open_transport(address: str, bind: str = DEFAULT_BIND) -> Transport:
         if not baud.isdecimal():
             raise LinkError(f"{address}: baud is {baud!r}, expected a whole number such as 115200")
         return SerialTransport(parts.path, int(baud))
+    if address.startswith("mavlink"):
+        return MavlinkAddress.of(address).open()
     if address == "dry-run":
         return DryRun()
-    raise LinkError(f"unknown wire {address!r}: give udp://HOST:PORT, serial:DEVICE or dry-run")
+    raise LinkError(
+        f"unknown wire {address!r}: give udp://HOST:PORT, serial:DEVICE, mavlink://KIND:WHERE or dry-run"
+    )
 
 
 def host_port(text: str, where: str) -> tuple[str, int]:

@@ -6,12 +6,8 @@ sends it, for a log that is simulated. The log's axes on the wire are x forward,
 
 from __future__ import annotations
 
-import errno
 import json
-import logging
 import math
-import select
-import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.frames import FROM_FOSSEN, TO_FOSSEN
-from finssim.robot.link.transports import Address, TcpServer, resolved
+from finssim.robot.link.transports import Address, TcpServer, TcpTransport
 from finssim.robot.messages import VELOCITY, NavigationAid
 
 __all__ = ["PORT", "DvlClient", "DvlServer", "DvlVelocity", "decode_line", "encode_velocity"]
@@ -30,7 +26,6 @@ __all__ = ["PORT", "DvlClient", "DvlServer", "DvlVelocity", "decode_line", "enco
 PORT = 16171
 """TCP port of a log."""
 
-_LOG = logging.getLogger("finssim.robot.link")
 _FORMAT = "json_v3.1"
 _FASTEST, _OLDEST, _HIGHEST = 10.0, 5.0, 300.0
 """Speed [m/s], age [s] and altitude [m] beyond what either log can report."""
@@ -38,11 +33,6 @@ _MICROSECONDS = 1e17
 """Times beyond are no Unix times [us]."""
 _LONGEST_LINE = 1 << 16
 """A report has about 1 kB [bytes]."""
-_BYTES_AT_ONCE = 1 << 18
-"""Bytes taken by one call, so that a flood cannot hold the loop up."""
-_SILENCE, _RETRY, _PATIENCE = 5.0, 1.0, 3.0
-"""A log that says nothing for so long has gone (an unplugged cable ends no connection); between attempts to reach it;
-longest wait for an attempt [s]."""
 
 
 @dataclass(frozen=True)
@@ -181,13 +171,10 @@ class _Lines:
         return [line.strip() for line in lines if line.strip() and len(line) <= _LONGEST_LINE]
 
 
-class DvlClient:
-    """The connection to a log, a `Transport` of whole lines; a lost log is tried again every second, without waiting.
+class DvlClient(TcpTransport):
+    """The connection to a log, a `Transport` of whole lines."""
 
-    Attributes:
-        connected: Whether the log is there now.
-        connections: How often it was reached.
-    """
+    title = "Water Linked DVL"
 
     def __init__(self, host: str, port: int = PORT, *, clock: Callable[[], float] = time.monotonic) -> None:
         """
@@ -199,82 +186,14 @@ class DvlClient:
         Raises:
             LinkError: There is no such host.
         """
-        self.peer: Address = resolved((host, port))
-        self.connected, self.connections, self.send_errors = False, 0, 0
-        self._clock, self._next_try, self._since, self._closed = clock, -math.inf, 0.0, False
-        self._socket: socket.socket | None = None
+        super().__init__((host, port), clock=clock)
         self._lines = _Lines()
 
-    def receive(self) -> list[bytes]:
-        """The whole lines that have come since the last call, oldest first."""
-        if not self._ready():
-            return []
-        assert self._socket is not None  # it is ready
-        found: list[bytes] = []
-        taken = 0
-        try:
-            while taken < _BYTES_AT_ONCE:
-                data = self._socket.recv(_LONGEST_LINE)
-                if not data:
-                    raise ConnectionResetError("closed by the log")
-                taken, self._since = taken + len(data), self._clock()
-                found += self._lines.feed(data)
-        except BlockingIOError:
-            if self._clock() - self._since > _SILENCE:
-                self._lose(f"silent for {_SILENCE:g} s")
-        except OSError as problem:
-            self._lose(str(problem))
-        return found
-
-    def send(self, data: bytes) -> None:
-        """Send a command such as `{"command": "reset_dead_reckoning"}`; one that cannot leave whole is counted."""
-        try:
-            if not self._ready() or self._socket is None or self._socket.send(data) < len(data):
-                self.send_errors += 1
-        except OSError:
-            self.send_errors += 1
-
-    def close(self) -> None:
-        """Leave the log for good."""
-        self._closed = True
-        self._drop()
-
-    def describe(self) -> str:
-        """Where the log is and whether it is there."""
-        state = "closed" if self._closed else "connected" if self.connected else "not connected"
-        return f"Water Linked DVL at {self.peer[0]}:{self.peer[1]}, {state}"
-
-    def _ready(self) -> bool:
-        """Whether there is a connection, after the next step of making one."""
-        now = self._clock()
-        if self._socket is None and not self._closed and now >= self._next_try:
-            self._next_try, self._since = now + _RETRY, now
-            self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-            self._socket.setblocking(False)
-            problem = self._socket.connect_ex(self.peer)
-            if problem not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):
-                self._drop()
-        if self._socket is not None and not self.connected:
-            if select.select([], [self._socket], [], 0.0)[1]:
-                if self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-                    self._drop()
-                else:
-                    self.connected, self._since, self._lines = True, now, _Lines()
-                    self.connections += 1
-                    _LOG.info("DVL %s:%d: connected", *self.peer)
-            elif now - self._since > _PATIENCE:
-                self._drop()
-        return self.connected
-
-    def _lose(self, why: str) -> None:
-        _LOG.warning("DVL %s:%d: lost (%s); trying again every %g s", *self.peer, why, _RETRY)
-        self._next_try = self._clock() + _RETRY
-        self._drop()
-
-    def _drop(self) -> None:
-        gone, self._socket, self.connected = self._socket, None, False
-        if gone is not None:
-            gone.close()
+    def pieces(self, data: bytes | None) -> list[bytes]:
+        """The lines that these bytes end; None begins anew."""
+        if data is None:
+            self._lines = _Lines()
+        return [] if data is None else self._lines.feed(data)
 
 
 _MOST_PINGS = 15

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from finssim.robot.bridge import Bridge, BridgeSettings
-from finssim.robot.link.frames import encode_command
 from finssim.robot.link.transports import DEFAULT_BIND, open_transport
 from finssim.robot.messages import CommandEcho, NavigationAid, Telemetry
 from finssim.robot.perception import Unlocated
 from finssim.robot.runtime import Counters, Intake
-from finssim.robot.wiring import POOL_ADDRESS
+from finssim.robot.wiring import POOL_ADDRESS, link_of
 from finssim.ros2.nodes.bridge_topics import BridgeTopics
 from finssim.ros2.nodes.robot_node import RobotNode
 
@@ -32,10 +31,12 @@ class HardwareBridge(RobotNode):
         super().__init__("hardware_bridge")
         address, bind = self.parameter("robot", "pool"), self.parameter("bind", DEFAULT_BIND)
         located = self.parameter("need_reading", True)
-        self.transport = open_transport(POOL_ADDRESS if address == "pool" else address, bind)
+        address = POOL_ADDRESS if address == "pool" else address
+        self.transport, link = open_transport(address, bind), link_of(address, self.vehicle)
         self.bridge = Bridge(self.vehicle, BridgeSettings.of(self.vehicle, need_reading=located))
+        self.bridge.autopilot = link
         self.counters, self.shafts = Counters(), np.zeros(0)
-        self.intake = Intake(Unlocated(self.vehicle), self.bridge, self.counters, self)
+        self.intake = Intake(Unlocated(self.vehicle), self.bridge, self.counters, self, link)
         self.sends("imu", "pressure", "telemetry", "shafts", "echo", "positioning", "dvl", "compass")
         self.topics = BridgeTopics(self, self.bridge)
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
@@ -79,7 +80,8 @@ class HardwareBridge(RobotNode):
         self.intake.take(now, [(now, data) for data in self.transport.receive()])
         command = self.bridge.tick(now)
         if self.now() - now < self.bridge.settings.command_timeout:  # else the process stood still meanwhile
-            self.transport.send(encode_command(command))
+            for data in self.intake.link.encode(now, command, self.bridge.state):
+                self.transport.send(data)
         self.topics.tell(now, normalised=command.normalised, shaft_speed=self.shafts)
 
     def _tell(self) -> None:
@@ -92,5 +94,6 @@ class HardwareBridge(RobotNode):
         """Disarm, tell the motor controller so, and let go of the wire."""
         self.bridge.disarm(self.now())
         for _ in range(LAST_FRAMES):
-            self.transport.send(encode_command(self.bridge.tick(self.now())))
+            for data in self.intake.link.encode(self.now(), self.bridge.tick(self.now()), self.bridge.state):
+                self.transport.send(data)
         self.transport.close()
