@@ -19,20 +19,6 @@ from finssim.tasks import Environment, make
 from finssim.tasks.agents import NOWHERE, Agent, Known, expert_for, restarted
 from finssim.yaml_file import json_value
 
-__all__ = [
-    "DATASET_FILE",
-    "DatasetError",
-    "Demonstrations",
-    "Episode",
-    "about",
-    "collect",
-    "found_in",
-    "load",
-    "record_episodes",
-    "save",
-]
-
-
 DATASET_FILE = "metadata.json"
 """Which marks a data set of Minari."""
 OURS = "finssim"

@@ -20,8 +20,6 @@ from finssim.tasks import Environment, Task, make, task_named
 from finssim.tasks.fitting import authority
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["TrainingError", "settings_of_words", "train"]
-
 
 class TrainingError(ValueError):
     """A training that cannot be started."""

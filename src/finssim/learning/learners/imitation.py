@@ -18,8 +18,6 @@ from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment
 from finssim.tasks.agents import NOWHERE, Known, memory_from, memory_leaves, restarted
 
-__all__ = ["Bc", "Dagger", "demonstrations_for"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class BcSettings:

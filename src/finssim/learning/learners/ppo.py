@@ -28,8 +28,6 @@ from finssim.learning.served import age_episodes
 from finssim.tasks import Environment
 from finssim.tasks.agents import NOWHERE, Known, memory_from, memory_leaves, restarted
 
-__all__ = ["Ppo", "PpoSettings"]
-
 ROLLOUT_SAMPLES = 4096
 """Fewest samples between two updates: with few worlds, rollouts are longer."""
 

@@ -56,8 +56,6 @@ from finssim.localization.fusion.streams import (
 )
 from finssim.localization.poses import axes_of_up
 
-__all__ = ["ErrorState"]
-
 Array = npt.NDArray[np.float64]
 
 P, V, A, G, B = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)

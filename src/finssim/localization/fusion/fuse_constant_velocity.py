@@ -36,10 +36,6 @@ from finssim.localization.fusion.streams import (
     changed,
 )
 
-__all__ = [
-    "GYRO_HOLD", "ConstantVelocity", "GateMemory", "Track", "judge", "judge_carried", "motion_of", "vision_covariance",
-]  # fmt: skip
-
 Array = npt.NDArray[np.float64]
 
 # Gates: which measurements are believed, and when a run of disbelieved ones has been right all along.

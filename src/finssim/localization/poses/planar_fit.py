@@ -23,8 +23,6 @@ from finssim.localization.poses import (
     tilt_matrix,
 )
 
-__all__ = ["WORST", "planar_fit"]
-
 # A rigid motion in the plane that lays one set of points on another, measured in pixels.
 
 _MOST_STEPS = 30
