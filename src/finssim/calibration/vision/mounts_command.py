@@ -25,17 +25,8 @@ from finssim.calibration.output.report import (
     write_report,
 )
 from finssim.calibration.output.vehicle_file import write_vehicle
-from finssim.calibration.vision.least_squares import Pose
-from finssim.calibration.vision.sensor_mounts import (
-    UNSURE_TURN,
-    Attitude,
-    DepthFit,
-    Gyro,
-    ImuMounting,
-    fit_depth,
-    fit_imu_mounting,
-    imu_clock,
-)
+from finssim.calibration.uncertainty import Evidence, intervals, trial_covariance
+from finssim.calibration.vision.least_squares import Pose, huber_weight
 from finssim.calibration.vision.tag_mounts import (
     AXES,
     UNSURE_LENGTH,
@@ -49,8 +40,6 @@ from finssim.calibration.vision.tag_mounts import (
 from finssim.geometry.rotations import (
     matrix_to_quat,
     quat_conjugate,
-    quat_from_rotvec,
-    quat_inverse_rotate,
     quat_multiply,
     quat_to_matrix,
     quat_to_rotvec,
@@ -63,7 +52,7 @@ from finssim.localization.fusion.fuse_log import Series, imu_columns, read_strea
 from finssim.localization.pool import Pool, load_pool
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["read_mount_log", "run"]
+__all__ = ["imu_clock", "read_mount_log", "run"]
 
 Array = NDArray[np.float64]
 
@@ -85,8 +74,6 @@ class MountLog:
     """Time of the exposure [s] and tag -> pixels of its corners (4, 2), in order of time."""
     up: Series | None
     """Direction of up in body axes."""
-    gyro: Gyro | None
-    """In the sensor's own axes."""
     turning: Series | None
     """Angular rate about the vertical, by gyro and `up` [rad/s]."""
     depth: Series | None
@@ -144,7 +131,7 @@ def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog
     time = np.array([frame.time for frame in frames]) - pool.latency
     if not np.isfinite(time).all():
         raise CalibrationError(f"{folder / DETECTIONS}: pictures without a time: add a column 'time' [s]")
-    up, gyro, turning = _read_imu(folder / IMU, vehicle, findings)
+    up, turning = _read_imu(folder / IMU, vehicle, findings)
     pictures = tuple(
         (float(time[i]), {d.tag: np.asarray(d.corners, float) for d in most_certain(frames[i].detections)})
         for i in np.argsort(time, kind="stable")
@@ -155,7 +142,6 @@ def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog
     return MountLog(
         pictures=pictures,
         up=up,
-        gyro=gyro,
         turning=turning,
         depth=depth,
         sha256=sha256,
@@ -163,38 +149,31 @@ def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog
     )
 
 
-def _read_imu(
-    path: Path, vehicle: Vehicle, findings: list[Finding]
-) -> tuple[Series | None, Gyro | None, Series | None]:
-    """Up in body axes, the gyro in its own, and the angular rate about the vertical."""
+def _read_imu(path: Path, vehicle: Vehicle, findings: list[Finding]) -> tuple[Series | None, Series | None]:
+    """Up in body axes, and the angular rate about the vertical."""
     if not path.is_file():
         findings.append(finding("imu_missing", file=IMU))
-        return None, None, None
+        return None, None
     table = read_stream_table(path)
     findings += [finding("as_read", remark=note) for note in table.notes]
-    sensor = vehicle.sensors.imu
-    mount = np.array([0.0, 0.0, 0.0, 1.0] if sensor is None else sensor.orientation)
-    omega, force, up, _ = imu_columns(table, sensor)
+    omega, force, up, _ = imu_columns(table, vehicle.sensors.imu)
     rated = bool(np.isfinite(omega).all(axis=1).any())
-    rate = series("rate", table.t, omega, math.inf, where=str(path)) if rated else None
-    gyro = None
-    if rate is not None and len(rate.t) > 2:
-        gyro = Gyro(t=rate.t, rate=quat_inverse_rotate(mount, rate.values))
     if up is None and rated and np.isfinite(force).any():
         up = _tilt(table.t, omega, force, vehicle.water.gravity)
         findings.append(finding("attitude_made", file=IMU))
     if up is None or not np.isfinite(up).any():
         findings.append(finding("tilt_unknown", file=IMU))
-        return None, gyro, None
+        return None, None
     tilt = series("attitude", table.t, up, LONGEST_AGE, where=str(path))
-    if gyro is None or rate is None or len(tilt.t) < 2:
-        return tilt, gyro, None
+    if not rated or len(tilt.t) < 2:
+        return tilt, None
+    rate = series("rate", table.t, omega, math.inf, where=str(path))
     within = (rate.t >= tilt.t[0]) & (rate.t <= tilt.t[-1])
     t, about = rate.t[within], np.zeros(int(within.sum()))
     for i in range(3):
         about += rate.values[within, i] * np.interp(t, tilt.t, tilt.values[:, i])
     turning = series("turning", t, about[:, None], math.inf, where=str(path)) if len(t) > 2 else None
-    return tilt, gyro, turning
+    return tilt, turning
 
 
 def _tilt(t: Array, omega: Array, force: Array, gravity: float) -> Array:
@@ -233,11 +212,6 @@ def _read_depth(path: Path, findings: list[Finding]) -> Series | None:
 
 
 # The mounts, as estimates and as numbers of the vehicle file.
-
-ESTIMATES = ("tags", "sensors")
-
-STUDENT = 2.2
-"""95 % point of Student's distribution with the degrees of freedom of a dozen blocks."""
 
 EDGE_STD = 0.25e-3
 """Standard deviation of a tag's edge measured with a ruler [m]: it makes every distance wrong by the same share."""
@@ -298,33 +272,6 @@ def _half_widths(found: MountFit, tag: int) -> Array:
     return np.sqrt(np.concatenate([turn, position]))
 
 
-def imu_orientation(
-    found: MountFit, imu: ImuMounting | CalibrationError | None, vehicle: Vehicle
-) -> tuple[list[Estimate], dict[str, Any]]:
-    """The IMU's orientation from its tilt and from its gyro, each by what it tells."""
-    if vehicle.sensors.imu is None:
-        return [], {}
-    start = np.asarray(vehicle.sensors.imu.orientation)
-    std = np.array([found.std(f"imu.turn_{axis}") for axis in "xyz"])
-    q, information = quat_multiply(matrix_to_quat(found.state.imu_turn), start), np.diag(1.0 / std**2)
-    if isinstance(imu, ImuMounting) and np.isfinite(imu.covariance).all():
-        second = np.linalg.inv(imu.covariance)
-        between = quat_to_rotvec(quat_multiply(imu.orientation, quat_conjugate(q)))
-        q = quat_multiply(quat_from_rotvec(np.linalg.pinv(information + second) @ second @ between), q)
-        information = information + second
-    known = np.diagonal(information) > 1e-6
-    half = np.where(known, STUDENT * np.sqrt(np.diagonal(np.linalg.pinv(information))), np.inf)
-    turn = np.degrees(quat_to_rotvec(quat_multiply(q, quat_conjugate(start))))
-    estimates = [
-        Estimate.within(
-            f"imu.turn_{axis}", turn[i], math.degrees(half[i]), "deg", half[i] < UNSURE_TURN, KEPT
-        )
-        for i, axis in enumerate("xyz")
-    ]
-    orientation = {"sensors.imu.orientation": (q / np.linalg.norm(q)).tolist()}
-    return estimates, orientation if (half < UNSURE_TURN).any() else {}
-
-
 def of_frozen(found: MountFit) -> list[Finding]:
     """What the motion does not tell of the tags."""
     findings, tag = [], found.rig.reference
@@ -341,49 +288,20 @@ def of_frozen(found: MountFit) -> list[Finding]:
     return findings
 
 
-def of_imu(imu: ImuMounting | CalibrationError | None, estimate: str) -> list[Finding]:
-    """What is to be said of the gyro."""
-    if isinstance(imu, CalibrationError):
-        return [finding("gyro_unused", reason=str(imu))]
-    if imu is None:
-        return []
-    turns = {axis: imu.estimates[f"imu.turn_{axis}"] for axis in "xyz"}
-    return [
-        *imu.findings,
-        *(
-            finding("imu_turned", angle=turn.estimate, axis=axis)
-            for axis, turn in turns.items()
-            if estimate == "tags" and turn.identifiable and not turn.ci95[0] - 2.0 < 0.0 < turn.ci95[1] + 2.0
-        ),
-    ]
-
-
-def calibrate_mounts(
-    log: MountLog,
-    pool: Pool,
-    vehicle: Vehicle,
-    *,
-    name: str,
-    estimate: str = "tags",
-    seed: int = 0,
-) -> Fit:
-    """Where tags sit in the body, or how IMU and pressure port do, with everything that the motion tells.
+def calibrate_mounts(log: MountLog, pool: Pool, vehicle: Vehicle, *, name: str, seed: int = 0) -> Fit:
+    """Where tags sit in the body, with everything that the motion shows; IMU and pressure port are right in the file.
 
     Args:
         log: The recording.
         pool: Camera and water.
         vehicle: Gives the tags' edge and the mounts so far.
         name: Of the recording.
-        estimate: `tags`: IMU and pressure port are right in the file, tags are written. `sensors`: the tag that is seen
-            most is right in the file; the IMU's orientation, the port's height and the other tags are written.
         seed: Recorded; nothing here is random.
 
     Raises:
-        CalibrationError: Unknown `estimate`, a vehicle without tags, a pool whose plane is no water surface, or a
-            recording with too little in it.
+        CalibrationError: A vehicle without tags, a pool whose plane is no water surface, or a recording with too little
+            in it.
     """
-    if estimate not in ESTIMATES:
-        raise CalibrationError(f"unknown estimate '{estimate}'; available: {', '.join(ESTIMATES)}")
     tags = vehicle.file_tags
     if tags is None:
         raise CalibrationError(
@@ -405,96 +323,114 @@ def calibrate_mounts(
         reference=reference_tag(log.moments(), mounts),
     )
     clock = _clock(rig, mounts, log)
-    sure = clock is not None and clock.identifiable and not clock.ci95[0] <= 0.0 <= clock.ci95[1]
-    offset = clock.estimate if clock is not None and sure else 0.0
-    found = fit_mounts(rig, mounts, log.moments(offset), estimate=estimate)
-    imu = _imu(found, log, vehicle, offset)
+    late = clock is not None and clock.identifiable and not clock.ci95[0] <= 0.0 <= clock.ci95[1]
+    found = fit_mounts(rig, mounts, log.moments(clock.estimate if clock is not None and late else 0.0))
     rows, changes = tag_estimates(found, mounts, vehicle)
-    findings = [*log.findings, *of_frozen(found), *of_imu(imu, estimate)]
-    quality = {"corners [px]": _figures(found.rms, found.left_out, len(found.moments), found.held_out_rms)}
-    if estimate == "sensors":
-        of_tilt, written = imu_orientation(found, imu, vehicle)
-        rows, changes = rows + of_tilt, changes | written
-    if isinstance(imu, ImuMounting):
-        rows += [row for row in imu.estimates.values() if "turn" not in row.name]
-        quality["turns of the gyro [deg]"] = _figures(math.degrees(imu.residual), imu.rejected)
     rows += [clock] if clock is not None else []
-    pressure = _pressure(rig, found, mounts) if estimate == "sensors" else None
-    if pressure is not None:
-        rows += pressure.estimates.values()
-        findings += pressure.findings
-        if pressure.estimates["depth.offset"].identifiable and depth is not None:
-            changes["sensors.depth.position.2"] = float(depth.position[2]) - pressure.offset
-        quality["depth [m]"] = _figures(pressure.rms, pressure.rejected)
+    figures = {
+        "rmse": found.rms,
+        "rmse_held_out": found.held_out_rms,
+        "samples": float(len(found.moments)),
+        "rejected": float(found.left_out),
+    }
     return Fit(
         kind="mounts",
         method="vision",
         vehicle=vehicle,
         estimates={row.name: row for row in rows},
         changes=changes,
-        quality=quality,
-        findings=tuple(findings),
+        quality={"corners [px]": figures},
+        findings=(*log.findings, *of_frozen(found)),
         curves=_curves(found),
         trials={name: log.sha256},
-        settings={"estimate": estimate, "seed": seed, "reference_tag": found.rig.reference},
+        settings={"seed": seed, "reference_tag": found.rig.reference},
     )
 
 
-def _figures(
-    rmse: float, rejected: int, samples: int | None = None, held_out: float = math.nan
-) -> dict[str, float]:
-    """Figures of a part of the fit; without samples nothing was held out."""
-    if samples is None:
-        return {"rmse": rmse, "rejected": float(rejected)}
-    figures = {"rmse": rmse, "rmse_held_out": held_out, "samples": float(samples)}
-    return {**figures, "rejected": float(rejected)}
+LONGEST_OFFSET, OFFSET_STEP = 1.0, 0.02
+"""Offsets of the clock that are tried: up to [s], every [s]."""
 
+NUDGE = 0.005
+"""Step of the derivative with respect to the offset [s]."""
 
-def _attitude(found: MountFit) -> Attitude:
-    times = np.array([moment.time for moment in found.moments])
-    return Attitude(t=times, quaternion=matrix_to_quat(np.array([pose.R for pose in found.state.poses])))
+FEWEST = 20
+"""Turns without which no offset is fitted."""
 
+CLOCK_BLOCKS = 12
 
-def _window(attitude: Attitude) -> float:
-    return max(0.5, float(np.median(np.diff(attitude.t))))
+UNSURE_CLOCK = 0.05
+"""Half width of the 95 % interval of the offset beyond which it does not count as identified [s]."""
 
 
 def _clock(rig: Rig, mounts: Mapping[int, Pose], log: MountLog) -> Estimate | None:
-    """What is to be added to the IMU's times, by turns that the pixels alone tell: tilts by the IMU agree with its gyro
+    """What is to be added to the IMU's times, by turns that the pixels alone show: tilts by the IMU agree with its gyro
     whatever its clock does."""
     if log.turning is None:
         return None
-    blind = [replace(moment, up=None, depth=None) for moment in log.moments()]
-    alone = fit_mounts(rig, mounts, blind, estimate="sensors", held_out=False)
-    return imu_clock(_attitude(alone), rig.pool.interface.normal, log.turning.t, log.turning.values[:, 0])
+    alone = fit_mounts(rig, mounts, [replace(m, up=None, depth=None) for m in log.moments()], held_out=False)
+    q = matrix_to_quat(np.array([pose.R for pose in alone.state.poses]))
+    t = np.array([moment.time for moment in alone.moments])
+    return imu_clock(t, q, rig.pool.interface.normal, log.turning.t, log.turning.values[:, 0])
 
 
-def _imu(
-    found: MountFit, log: MountLog, vehicle: Vehicle, offset: float
-) -> ImuMounting | CalibrationError | None:
-    """The IMU from the attitudes that the pixels and the tilt give; the refusal itself where they say too little."""
-    if log.gyro is None or vehicle.sensors.imu is None:
+def imu_clock(
+    t_picture: Array, attitude: Array, up_p: Array, t_imu: Array, vertical_rate: Array
+) -> Estimate | None:
+    """What is to be added to the IMU's times, from turns about the vertical between neighbouring pictures.
+
+    n · log(R_2 R_1ᵀ) = ∫ ω · up dt over the same time, less a bias; ω and up in any one frame of the vehicle, so that
+    neither the IMU's mounting nor the tilt is needed.
+
+    Args:
+        t_picture: Times of the pictures, increasing [s], (n,).
+        attitude: From the pixels, body to pool, xyzw, (n, 4); its tilt may be poor.
+        up_p: n, upwards in the pool, (3,).
+        t_imu: Times of the IMU, increasing [s], (m,).
+        vertical_rate: ω · up [rad/s], (m,).
+
+    Returns:
+        `imu.time_offset` [s], or None if there are too few pictures.
+    """
+    from scipy.optimize import least_squares
+
+    turn = quat_to_rotvec(quat_multiply(attitude[1:], quat_conjugate(attitude[:-1]))) @ up_p
+    start, end = t_picture[:-1], t_picture[1:]
+    inside = (start > t_imu[0] + LONGEST_OFFSET) & (end < t_imu[-1] - LONGEST_OFFSET) & (end - start < 3.0)
+    turn, start, end = turn[inside], start[inside], end[inside]
+    if len(turn) < FEWEST:
         return None
-    attitude, start = _attitude(found), vehicle.sensors.imu.orientation
-    try:
-        return fit_imu_mounting(attitude, log.gyro, start=start, window=_window(attitude), time_offset=offset)
-    except CalibrationError as error:
-        return error
+    steps = 0.5 * (vertical_rate[1:] + vertical_rate[:-1]) * np.diff(t_imu)
+    heading = np.concatenate([[0.0], np.cumsum(steps)])
 
+    def error(x: Array) -> Array:
+        """Of the turns, with bias [rad/s] and offset [s]."""
+        later, earlier = (np.interp(t - x[1], t_imu, heading) for t in (end, start))
+        return np.asarray(turn - later + earlier + x[0] * (end - start))
 
-def _pressure(rig: Rig, found: MountFit, mounts: Mapping[int, Pose]) -> DepthFit | None:
-    """Depths by the pixels alone, with the mounts found, against what the sensor said."""
-    reading = {moment.time: moment.depth for moment in found.moments if moment.depth is not None}
-    if not reading:
-        return None
-    turned = [
-        replace(moment, depth=None, up=None if moment.up is None else found.state.imu_turn @ moment.up)
-        for moment in found.moments
-    ]
-    known = {tag: found.state.mount(tag, rig.reference) for tag in (rig.reference, *found.state.others)}
-    alone = fit_mounts(rig, {**mounts, **known}, turned, estimate="sensors", held_out=False)
-    readings = [reading.get(moment.time, math.nan) for moment in alone.moments]
-    return fit_depth(alone.port_depths, readings, known_std=distance_std(found))
+    def slopes(x: Array) -> Array:
+        return np.stack([end - start, (error(x + [0.0, NUDGE]) - error(x - [0.0, NUDGE])) / (2.0 * NUDGE)], 1)
+
+    def spread(offset: float) -> float:
+        off = error(np.array([0.0, offset]))
+        return float(np.median(np.abs(off - np.median(off))))
+
+    first = min(np.arange(-LONGEST_OFFSET, LONGEST_OFFSET + 1e-9, OFFSET_STEP), key=spread)
+    bias = -float(np.median(error(np.array([0.0, first])) / (end - start)))
+    sigma = 1.4826 * max(spread(first), 1e-9)
+    x = least_squares(error, [bias, first], slopes, loss="huber", f_scale=1.345 * sigma, x_scale="jac").x
+    J, r = slopes(x), error(x)
+    w = huber_weight(np.abs(r), 1.345 * sigma) / sigma**2
+    parts = np.array_split(np.arange(len(r)), max(2, min(CLOCK_BLOCKS, len(r) // 4)))
+    evidence = Evidence(
+        names=("bias", "offset"),
+        normal=np.array([(w[p, None] * J[p]).T @ J[p] for p in parts]),
+        score=np.array([-(w[p] * r[p]) @ J[p] for p in parts]),
+        unit="blocks",
+    )
+    half = float(intervals(x, trial_covariance(evidence))[1, 1] - x[1])
+    note = "the vehicle turns too evenly to tell the clocks apart: taken as 0"
+    sure = half < UNSURE_CLOCK and abs(x[1]) <= LONGEST_OFFSET
+    return Estimate.within("imu.time_offset", x[1], half, "s", sure, note)
 
 
 def _curves(found: MountFit) -> tuple[Curve, ...]:
@@ -517,12 +453,12 @@ def _curves(found: MountFit) -> tuple[Curve, ...]:
             measured = seen[of, 0, i]
             fitted = measured - pixels[of, 0, i]
             add(f"tag {tag}, top-left corner", f"{axis} [px]", t[owner[of]], measured, fitted)
-    felt = np.array([np.full(3, math.nan) if m.up is None else state.imu_turn @ m.up for m in moments])
+    felt = np.array([np.full(3, math.nan) if m.up is None else m.up for m in moments])
     up = np.array([pose.R.T @ rig.pool.interface.normal for pose in state.poses])
     for i, axis in enumerate("xy"):
         add("tilt by the IMU", f"up along body {axis} [-]", t, felt[:, i], up[:, i])
     depth = np.array([math.nan if m.depth is None else m.depth for m in moments])
-    add("pressure port", "depth [m]", t, depth, found.port_depths + state.depth_offset)
+    add("pressure port", "depth [m]", t, depth, found.port_depths)
     return tuple(curves)
 
 
@@ -532,12 +468,11 @@ def run(
     pool: Path,
     vehicle: str,
     out: Path,
-    estimate: str = "tags",
     report: Path | None = None,
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Find where tags, IMU and pressure port sit on the vehicle, from its motion: poses [m, deg], depth offset [m].
+    """Find where tags sit on the vehicle, from its motion, its IMU and its pressure port: poses [m, deg].
 
     Example: finssim calibrate mounts log --pool pool.yaml --vehicle mine.yaml --out mine.yaml
 
@@ -546,7 +481,6 @@ def run(
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
-        estimate (WHAT): tags: the sensors are right in the vehicle file; sensors: the tag seen most is.
         report (DIR): Directory for the report and its pictures.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
@@ -560,12 +494,12 @@ def run(
     refuse_places(out, report, "vehicle")
     where, body = load_pool(pool), load_vehicle(vehicle)
     recording = read_mount_log(log, where, body)
-    fit = calibrate_mounts(recording, where, body, name=Path(log).name, estimate=estimate, seed=seed)
+    fit = calibrate_mounts(recording, where, body, name=Path(log).name, seed=seed)
     after = calibrated(fit)
     findings = all_findings(fit, after)
     write_vehicle(after, out)
     if report is not None:
-        options = {"pool": pool, "vehicle": vehicle, "out": out, "estimate": estimate, "seed": seed}
+        options = {"pool": pool, "vehicle": vehicle, "out": out, "seed": seed}
         command = command_line("mounts", [log], options)
         write_report(fit, report, after, command=command, findings=findings, out=out)
 

@@ -1,8 +1,8 @@
 """Where tags sit on a vehicle, from what a camera above the water, an IMU and a pressure sensor measure while it moves.
 
 A vehicle carries tags; one is the reference tag r, the others are placed relative to it. Unknown are the pose of every
-moment, and shared by all moments: the mount of the reference tag, the other tags relative to it, a turn of the IMU, and
-an offset of the depth. The pixels of a corner follow from refraction (`finssim.geometry.optics.project`).
+moment, and shared by all moments: the mount of the reference tag and the other tags relative to it. The pixels of a
+corner follow from refraction (`finssim.geometry.optics.project`).
 """
 
 from __future__ import annotations
@@ -26,11 +26,9 @@ from finssim.calibration.vision.least_squares import (
     huber_cost,
     huber_weight,
 )
-from finssim.calibration.vision.sensor_mounts import rotation_between
 from finssim.geometry.optics import back_project, project, projection_jacobians
 from finssim.geometry.rotations import (
     matrix_to_quat,
-    quat_from_rotvec,
     quat_rotate,
     quat_to_matrix,
     quat_to_rotvec,
@@ -40,16 +38,13 @@ from finssim.localization.pool import Pool
 
 __all__ = [
     "AXES", "Moment", "MountFit", "MountState", "Noise", "Rig", "UNSURE_LENGTH", "change", "fit_mounts",
-    "moment_blocks", "moved", "reference_tag", "residuals", "start_state",
+    "moment_blocks", "moved", "reference_tag", "residuals", "rotation_between", "start_state",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
 
 AXES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 """Of a small motion of a tag: about the outer axes [rad], and along them [m]."""
-
-SENSORS = ("imu.turn_x", "imu.turn_y", "imu.turn_z", "depth.offset")
-"""Shared unknowns that are not of tags."""
 
 HUBER = 3.0
 """Corners further off than this many standard deviations count linearly."""
@@ -110,15 +105,11 @@ class MountState:
     """Other tags in the frame of the reference tag."""
     poses: Sequence[Pose]
     """Body in the pool at every moment."""
-    imu_turn: Array = field(default_factory=lambda: np.eye(3))
-    """Turn of the IMU's body axes into the body, (3, 3)."""
-    depth_offset: float = 0.0
-    """Reading less true depth [m]."""
 
     @property
     def names(self) -> tuple[str, ...]:
         """Of the shared unknowns, in the order of a step."""
-        return (*(f"{tag}.{axis}" for tag in ("reference", *self.others) for axis in AXES), *SENSORS)
+        return tuple(f"{tag}.{axis}" for tag in ("reference", *self.others) for axis in AXES)
 
     def mount(self, tag: int, reference: int) -> Pose:
         """A tag in the body."""
@@ -127,7 +118,6 @@ class MountState:
 
 def moved(state: MountState, shared: Array, own: Sequence[Array]) -> MountState:
     """After a step of the shared unknowns, in the order of `names`, and of each moment's pose."""
-    tail = 6 + 6 * len(state.others)
     return replace(
         state,
         reference=state.reference.stepped(shared[:6]),
@@ -136,8 +126,6 @@ def moved(state: MountState, shared: Array, own: Sequence[Array]) -> MountState:
             for i, (tag, pose) in enumerate(state.others.items())
         },
         poses=[pose.stepped(step) for pose, step in zip(state.poses, own, strict=True)],
-        imu_turn=quat_to_matrix(quat_from_rotvec(shared[tail : tail + 3])) @ state.imu_turn,
-        depth_offset=state.depth_offset + float(shared[tail + 3]),
     )
 
 
@@ -202,22 +190,18 @@ def _corner_rows(rig: Rig, state: MountState, pose: Pose, tag: int, J: Array) ->
 
 def _others(rig: Rig, state: MountState, pose: Pose, moment: Moment) -> list[tuple[Array, Array, Array]]:
     """Whitened rows of IMU and depth: shared, own, residual."""
-    n, noise, tail = rig.pool.interface.normal, rig.noise, len(state.names) - len(SENSORS)
-    rows = []
+    n, noise, rows = rig.pool.interface.normal, rig.noise, []
 
-    def add(std: float, first: int, shared: Array, turn: Array, shift: Array, residual: Array) -> None:
+    def add(std: float, turn: Array, shift: Array, residual: Array) -> None:
         A = np.zeros((len(residual), len(state.names)))
-        A[:, first : first + shared.shape[1]] = shared
-        rows.append((A / std, np.hstack([turn, shift]) / std, residual / std))
+        rows.append((A, np.hstack([turn, shift]) / std, residual / std))
 
     if moment.up is not None:
-        felt, up_b = state.imu_turn @ moment.up, pose.R.T @ n
-        add(noise.up, tail, skew(felt), pose.R.T @ skew(n), np.zeros((3, 3)), felt - up_b)
+        add(noise.up, pose.R.T @ skew(n), np.zeros((3, 3)), moment.up - pose.R.T @ n)
     if moment.depth is not None:
         arm = pose.R @ rig.port
-        predicted = -(n @ (pose.t + arm) + rig.pool.interface.offset) + state.depth_offset
-        off = np.array([moment.depth - predicted])
-        add(noise.depth, tail + 3, np.ones((1, 1)), (n @ skew(arm))[None], -n[None], off)
+        off = moment.depth + (n @ (pose.t + arm) + rig.pool.interface.offset)
+        add(noise.depth, (n @ skew(arm))[None], -n[None], np.array([off]))
     return rows
 
 
@@ -226,6 +210,21 @@ def _others(rig: Rig, state: MountState, pose: Pose, moment: Moment) -> list[tup
 HALVINGS = 40
 DEEPEST = 20.0
 """Distance below the surface up to which a tag is looked for [m]."""
+
+
+def rotation_between(a: Array, b: Array) -> Array:
+    """Rotation q_ab with a = R_ab b in least squares; where the vectors leave it open, the smallest  (Kabsch 1976).
+
+    Args:
+        a: (n, 3).
+        b: The same vectors in other axes, (n, 3).
+
+    Returns:
+        xyzw, (4,).
+    """
+    B = a.T @ b
+    left, _, right = np.linalg.svd(B + 1e-6 * np.linalg.norm(B) * np.eye(3))
+    return matrix_to_quat(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)
 
 
 def start_state(
@@ -338,7 +337,7 @@ def minimise(
 
 
 def as_before(state: MountState, origin: MountState, frozen: Sequence[str]) -> MountState:
-    """With unknowns of the start put back, those of the reference tag, the IMU and the depth."""
+    """With unknowns of the start put back."""
     back = np.zeros(len(state.names))
     for name, total in zip(frozen, change(origin, state, frozen), strict=True):
         back[state.names.index(name)] = -total
@@ -354,7 +353,6 @@ def change(before: MountState, after: MountState, free: Sequence[str]) -> Array:
     total = [turn(before.reference.R, after.reference.R), after.reference.t - before.reference.t]
     for tag, pose in before.others.items():
         total += [turn(pose.R, after.others[tag].R), after.others[tag].t - pose.t]
-    total += [turn(before.imu_turn, after.imu_turn), np.array([after.depth_offset - before.depth_offset])]
     every = np.concatenate(total)
     return every[[before.names.index(name) for name in free]]
 
@@ -407,10 +405,6 @@ class MountFit:
             return math.inf
         return float(intervals(np.zeros(len(self.free)), self.covariance)[self.free.index(name), 1])
 
-    def std(self, name: str) -> float:
-        """Standard deviation of a shared unknown; infinite if it is not free."""
-        return float(self.covariance.std[self.free.index(name)]) if name in self.free else math.inf
-
     @property
     def port_depths(self) -> Array:
         """Depth of the pressure port at every moment by the poses [m], (n,)."""
@@ -439,10 +433,9 @@ def fit_mounts(
     mounts: Mapping[int, Pose],
     moments: Sequence[Moment],
     *,
-    estimate: str = "tags",
     held_out: bool = True,
 ) -> MountFit:
-    """Mounts of all tags, or of the sensors, from moments of a moving vehicle.
+    """Mounts of all tags, from moments of a moving vehicle whose IMU and pressure port are mounted as its file says.
 
     Tags relative to one another follow from pictures that show two. How the reference tag sits in the body follows from
     the IMU's tilt (its whole orientation, once the vehicle tilts two ways) and from the depth (its height over the
@@ -452,8 +445,6 @@ def fit_mounts(
         rig: Camera, water, tags, port.
         mounts: Tags in the body as the vehicle file has them; one of them may be all.
         moments: In order of time.
-        estimate: `tags`: IMU and pressure port in the file are right. `sensors`: the reference tag in the file is
-            right, and the IMU's turn and the depth's offset are estimated.
         held_out: Fit parts of the recording too, for the error at the others.
 
     Raises:
@@ -470,9 +461,9 @@ def fit_mounts(
     unknown = sorted({tag for m in used for tag in m.corners} - {rig.reference} - state.others.keys())
     used = [replace(m, corners={t: c for t, c in m.corners.items() if t not in unknown}) for m in used]
     origin = state
-    state = _by_vision(rig, state, used, estimate)
+    state = _by_vision(rig, state, used)
     state, used, left_out = _without_far(rig, state, used)
-    wanted = _wanted(rig, state, used, estimate)
+    wanted = _wanted(state, used)
     free = _hopeful(rig, state, used, wanted)
     state = as_before(state, origin, [name for name in wanted if name not in free])
     while True:
@@ -521,15 +512,12 @@ def _spread(moments: Sequence[Moment]) -> list[Moment]:
     return [moments[i] for i in np.unique(np.linspace(0, len(moments) - 1, MOST_MOMENTS).astype(int))]
 
 
-def _wanted(rig: Rig, state: MountState, moments: Sequence[Moment], estimate: str) -> tuple[str, ...]:
+def _wanted(state: MountState, moments: Sequence[Moment]) -> tuple[str, ...]:
     """Shared unknowns that the sensors at hand could tell."""
     up, depth = any(m.up is not None for m in moments), any(m.depth is not None for m in moments)
-    others = _of_others(state)
-    if estimate == "sensors":
-        return (*others, *SENSORS[: 3 if up else 0], *SENSORS[3 : 4 if depth else 3])
     told = {"turn_x": up, "turn_y": up, "turn_z": up, "z": depth, "x": depth and up, "y": depth and up}
     wanted = [f"reference.{axis}" for axis, is_told in told.items() if is_told]
-    return (*wanted, *others)
+    return (*wanted, *_of_others(state))
 
 
 def _of_others(state: MountState) -> tuple[str, ...]:
@@ -572,11 +560,11 @@ def _hopeful(
         free = tuple(name for name in free if name != worst)
 
 
-def _by_vision(rig: Rig, state: MountState, moments: Sequence[Moment], estimate: str) -> MountState:
-    """Poses from the pixels, and a reference tag or an IMU turned so that up by the IMU is up by the pixels.
+def _by_vision(rig: Rig, state: MountState, moments: Sequence[Moment]) -> MountState:
+    """Poses from the pixels, and a reference tag turned so that up by the IMU is up by the pixels.
 
-    A tag or an IMU that is mounted a quarter turn away from what the file says would otherwise start with tilts of the
-    wrong sign. Where the vehicle never tilts, the smallest turn is taken.
+    A tag that is mounted a quarter turn away from what the file says would otherwise start with tilts of the wrong
+    sign. Where the vehicle never tilts, the smallest turn is taken.
     """
     blind = [replace(moment, up=None) for moment in moments]
     state = minimise(rig, state, blind, _of_others(state), steps=15)
@@ -587,13 +575,9 @@ def _by_vision(rig: Rig, state: MountState, moments: Sequence[Moment], estimate:
     felt = np.array([moments[i].up for i in known])
     q = rotation_between(felt, seen)
     better = np.sum((felt - quat_rotate(q, seen)) ** 2) < BETTER * np.sum((felt - seen) ** 2)
-    if 2.0 * math.acos(min(1.0, abs(float(q[3])))) < TURNED or not better:
-        return minimise(rig, state, moments, ())
-    turn = Pose(quat_to_matrix(q), np.zeros(3))
-    if estimate == "sensors":
-        state = replace(state, imu_turn=turn.R.T.copy())
-    else:  # the body turns about the reference tag, so that every tag stays where it is seen
-        mount = Pose(turn.R @ state.reference.R, state.reference.t)
+    if 2.0 * math.acos(min(1.0, abs(float(q[3])))) >= TURNED and better:
+        # The body turns about the reference tag, so that every tag stays where it is seen.
+        mount = Pose(quat_to_matrix(q) @ state.reference.R, state.reference.t)
         back = state.reference.then(mount.inverse)
         state = replace(state, reference=mount, poses=[pose.then(back) for pose in state.poses])
     return minimise(rig, state, moments, ())
