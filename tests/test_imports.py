@@ -117,7 +117,6 @@ HOMES = {
         "calibration/importers/dispatch.py",
         "robot/record_messages.py",
         "ros2/codec.py",
-        "ros2/definitions.py",
     },
     "cv2": {
         "calibration/vision/camera.py",
@@ -134,17 +133,13 @@ HOMES = {
     },
     "pygame": {"robot/teleop.py"},
     "cyclonedds": {
-        "ros2/wire/dds_types.py",
-        "ros2/wire/endpoints.py",
-        "ros2/wire/participant.py",
-        "ros2/wire/quality.py",
-        "ros2/wire/waiting.py",
+        "ros2/wire.py",
     },
     "rclpy": {
+        "ros2/nodes/remote.py",
         "ros2/nodes/robot_node.py",
         "ros2/topics.py",
         "ros2/up.py",
-        "ros2/watcher.py",
         "ros2_worlds/sim.py",
     },
     "viser": {"viewer/app.py"},

@@ -383,7 +383,7 @@ def imu_clock(
 
     Args:
         t_picture: Times of the pictures, increasing [s], (n,).
-        attitude: From the pixels, body to pool, xyzw, (n, 4); its tilt may be poor.
+        attitude: From the pixels, body to pool, unit xyzw [-], (n, 4); its tilt may be poor.
         up_p: n, upwards in the pool, (3,).
         t_imu: Times of the IMU, increasing [s], (m,).
         vertical_rate: ω · up [rad/s], (m,).

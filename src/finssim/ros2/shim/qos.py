@@ -5,8 +5,8 @@ from __future__ import annotations
 from enum import Enum, IntEnum
 from typing import Any
 
-from finssim.ros2.shim.duration import Duration
-from finssim.ros2.wire.quality import Quality
+from finssim.ros2.shim.time import Duration
+from finssim.ros2.wire import Quality
 
 __all__ = [
     "DurabilityPolicy",
