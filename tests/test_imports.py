@@ -108,7 +108,7 @@ HOMES = {
         "calibration/output/report.py",
         "calibration/replay/report.py",
         "calibration/vision/camera.py",
-        "calibration/vision/pool_command.py",
+        "calibration/vision/pool_fit.py",
         "experiments/figures.py",
         "vehicles/picture.py",
     },

@@ -18,14 +18,16 @@ from finssim.calibration.findings import SEVERITIES, Finding, finding, plain
 from finssim.calibration.motion.signals import (
     AttitudeSignal,
     Motion,
+    Offset,
     attitude_samples,
     attitude_signal,
     holds_gravity,
     motion,
+    on_grid,
+    stream_offsets,
     up_in_body,
 )
 from finssim.calibration.motion.smoothing import longest_step
-from finssim.calibration.motion.synchronisation import Offset, on_grid, stream_offsets
 from finssim.calibration.trials.inputs import Drive, drive, implausible
 from finssim.calibration.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
 from finssim.calibration.trials.trial_files import load_trial, trials_at

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.vision.moving_vehicle import motion
-from finssim.calibration.vision.mounts_command import imu_clock
+from finssim.calibration.vision.mounts import imu_clock
 from finssim.geometry.rotations import quat_conjugate, quat_from_rotvec, quat_multiply, quat_to_rotvec
 
 UP = np.array([0.0, 0.0, 1.0])

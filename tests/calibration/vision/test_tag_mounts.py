@@ -8,7 +8,7 @@ import pytest
 from calibration.vision.moving_vehicle import EDGE, MOUNTS, POOL, PORT, moments, motion
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.vision.least_squares import Pose
-from finssim.calibration.vision.tag_mounts import (
+from finssim.calibration.vision.mounts import (
     Moment,
     MountState,
     Noise,

@@ -78,7 +78,7 @@ def calibrate_motor(
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Fit the motors' response to steps: delay and lag [s], dead zone, and tune the speed loop.
+    """Fit the motors' response to steps: delay and lag [s], dead zone.
 
     Example: finssim calibrate motor steps --vehicle mine.yaml --out mine.yaml
 

@@ -15,12 +15,13 @@ from rich.table import Table
 from rich.text import Text
 
 from finssim.calibration.findings import Finding, finding, plain, sentences
-from finssim.calibration.replay.metrics import (
+from finssim.calibration.replay.replay import (
     RESAMPLES,
     UNITS,
     Aggregate,
     Ahead,
     Pair,
+    Replay,
     aggregate,
     models_of,
     onset,
@@ -28,7 +29,6 @@ from finssim.calibration.replay.metrics import (
     response_span,
     score,
 )
-from finssim.calibration.replay.replay import Replay
 from finssim.calibration.trials.trial import Array
 from finssim.files import atomic_directory
 from finssim.provenance import provenance
