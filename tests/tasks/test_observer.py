@@ -185,3 +185,13 @@ def test_a_goal_out_of_reach_is_seen_on_the_way_to_it():
     )
     np.testing.assert_allclose(far, edge, atol=1e-6)
     assert near[0] < 0.99 * edge[0]
+
+
+def test_a_heading_out_of_reach_is_seen_on_the_way_to_it():
+    """Half a turn and the most that is shown at once look alike, on the shorter way round."""
+    me, observer = Track(np.array([0.1, 0.0, -0.5]), quat_from_yaw(3.0), np.zeros(6)), Observer("t1", FINSROV)
+    half, edge, near = (
+        observer.observe(me, Station((0.1, 0.0, -0.5), yaw), 0.0, turn=1.0) for yaw in (-0.3, 4.0, 3.9)
+    )
+    np.testing.assert_allclose(half, edge, atol=1e-6)
+    assert not np.allclose(near, edge, atol=1e-3)

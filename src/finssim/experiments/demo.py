@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from html import escape
 from os import environ
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from rich.console import Console
@@ -24,7 +24,6 @@ from finssim.calibration.findings import sentences
 from finssim.calibration.output.calibrate import number_in
 from finssim.calibration.output.report import interval_text, number_text, state_text
 from finssim.calibration.trials.trial import Trial
-from finssim.control.modes import action_mode
 from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Pool
@@ -43,7 +42,15 @@ from finssim.experiments.figures import (
 from finssim.experiments.identify import HELD_OUT, TRIALS, Identification, commands, identify, vehicle_files
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row
 from finssim.experiments.on_robot import Attendant, OnRobot, kept_folder
-from finssim.experiments.pool_trial import HARDWARE, Job, play, pool_evaluation, run_on_robot
+from finssim.experiments.pool_trial import (
+    FIRMWARES,
+    HARDWARE,
+    Job,
+    firmware_of,
+    play,
+    pool_evaluation,
+    run_on_robot,
+)
 from finssim.experiments.tables import Table, html_of, print_tables
 from finssim.experiments.transfer import finished
 from finssim.experiments.trials import Trial as PlayedTrial
@@ -308,17 +315,6 @@ SEED = 1
 PLANT, SEVERITY, RANGES = 1, "realistic", "pool"
 CONTROLLERS = ("policy", "pid", "pid-paper")
 
-
-class Firmware(NamedTuple):
-    """How a vehicle of one kind is demonstrated."""
-
-    action: str | None
-    """Of the policy; the task's own if None."""
-    site: str
-    camera: str
-
-
-FIRMWARES = {"mcu": Firmware(None, "pool", "corners"), "ardusub": Firmware("pilot6", "tank", "none")}
 WITH_PICTURES = "policy-with-pictures"
 COAST = 4.0
 """Longest, after a dive [s]: the pool is shallow, and this vehicle hardly rises."""
@@ -416,12 +412,8 @@ def demo(
         KeyboardInterrupt: After Ctrl-C. A policy so far is then in `OUT-training/interrupted`, and, but for a robot's,
             `out` as it was.
     """
-    if firmware not in FIRMWARES:
-        raise ValueError(f"unknown firmware '{firmware}'; available: {', '.join(FIRMWARES)}")
     console, standing = console or Console(stderr=True), load_vehicle(vehicle)
-    if firmware == "ardusub" or (robot is not None and robot.wiring.robot.startswith("mavlink")):
-        firmware = "ardusub"
-        action_mode(FIRMWARES[firmware].action, standing)  # refuses a vehicle without an autopilot
+    firmware = firmware_of(firmware, standing, robot)
     start_warp()
     place = atomic_directory(out, replaces=REPORT_FILE) if robot is None else kept_folder(out)
     with place as folder:

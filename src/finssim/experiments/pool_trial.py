@@ -10,12 +10,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
 
 from finssim.control.guidance import Station
+from finssim.control.modes import action_mode
 from finssim.experiments import campaign
 from finssim.experiments.evaluate import Evaluation, summary_of
 from finssim.experiments.metrics import SITE_SIZES, T1_SETPOINTS, T1_START, in_room
@@ -63,6 +64,35 @@ __all__ = [
 
 HARDWARE = "hardware"
 """In place of the severity of a pool, and of what its camera sends."""
+
+
+class Firmware(NamedTuple):
+    """How a vehicle is tried that it steers."""
+
+    action: str | None
+    """Of policies; the task's own if None."""
+    site: str
+    camera: str
+
+
+FIRMWARES = {"mcu": Firmware(None, "pool", "corners"), "ardusub": Firmware("pilot6", "tank", "none")}
+"""What steers the motors: a controller that takes shaft speeds, in the pool under a camera, or an autopilot that takes
+axes, in a tank by Doppler log, depth and compass."""
+
+
+def firmware_of(name: str, vehicle: Vehicle, robot: OnRobot | None = None) -> str:
+    """The name of what steers, or that of what a robot's address says.
+
+    Raises:
+        ValueError: There is no such firmware.
+        ControlError: The vehicle has no autopilot.
+    """
+    campaign.check_choices([name], FIRMWARES, "firmware", ValueError)
+    name = "ardusub" if robot is not None and robot.wiring.robot.startswith("mavlink") else name
+    action = FIRMWARES[name].action
+    if action is not None:
+        action_mode(action, vehicle)
+    return name
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,15 @@ from finssim.experiments.figures import draw_envelopes, draw_tracking, error_env
 from finssim.experiments.identify import identify
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row, paper_t2_row
 from finssim.experiments.on_robot import Attendant, OnRobot
-from finssim.experiments.pool_trial import HARDWARE, Job, play, played_trial, run_on_robot
+from finssim.experiments.pool_trial import (
+    FIRMWARES,
+    HARDWARE,
+    Job,
+    firmware_of,
+    play,
+    played_trial,
+    run_on_robot,
+)
 from finssim.experiments.statistics import Interval, Statistic, paired_difference, with_interval
 from finssim.experiments.tables import Table, figure_text
 from finssim.experiments.trials import T2_TRAJECTORIES
@@ -188,6 +196,7 @@ def transfer_experiment(
     seed: int = 1,
     severity: str = "realistic",
     camera: str = "corners",
+    firmware: str = "mcu",
     rows: Annotated[Sequence[str] | None, ","] = None,
     targets: Annotated[Sequence[str] | None, "python"] = None,
     vehicle: str = "finsrov",
@@ -211,6 +220,9 @@ def transfer_experiment(
         severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
         camera (MODE): corners (projected through the rippling water, with noise), or pictures (drawn, and searched for
             tags: several times slower).
+        firmware (NAME): What steers the motors: mcu, or ardusub, an autopilot: commands then go by MAVLink, policies
+            act by its axes, and a tank, a Doppler log, a compass and setpoints three times as far take the place of
+            the pool and its camera.
         rows (NAMES): Rows of the table, separated by commas; all but nmpc, which takes an extra, if not given.
         targets: What is played; the published ones if None.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
@@ -238,15 +250,26 @@ def transfer_experiment(
         raise ValueError(f"plants is {plants}, seeds {seeds}: expected at least 1 of each")
     chosen = {name: spec.rows[name] for name in rows}
     pools, run_seeds, folder = range(seed, seed + plants), range(seed, seed + seeds), Path(out)
+    firmware = firmware_of(firmware, load_vehicle(vehicle), robot)
+    action, site, sees = FIRMWARES[firmware]
     controllers = controllers_of(
-        chosen, run_seeds, folder, vehicle, steps, lambda part, what: progress(TRAINING_SHARE * part, what)
+        chosen,
+        run_seeds,
+        folder,
+        vehicle,
+        steps,
+        lambda part, what: progress(TRAINING_SHARE * part, what),
+        action,
     )
     if robot is not None:  # there is one plant, and nobody chose its severity
         pools, severity, camera = range(1), HARDWARE, HARDWARE
+        site = robot.site if firmware == "ardusub" else site
+    elif firmware == "ardusub":
+        camera = sees
     jobs = [
         Job(
             row=name, controller=controllers[name, s], target=target, vehicle=vehicle, pool_vehicle=vehicle,
-            plant=plant, severity=severity, seed=s, camera=camera, **row.changes,
+            plant=plant, severity=severity, seed=s, camera=camera, site=site, firmware=firmware, **row.changes,
         )
         for name, row in chosen.items() for plant in pools for s in run_seeds for target in targets
     ]  # fmt: skip
@@ -278,12 +301,13 @@ def controllers_of(
     vehicle: str,
     steps: int | None,
     progress: Progress,
+    action: str | None = None,
 ) -> dict[tuple[str, int], str]:
     """Who steers, by row and seed: a policy's directory in `policies` of the folder, or the name of a PID.
 
     Args:
         rows: Of a table.
-        seeds, vehicle, steps, say: As of `trained`.
+        seeds, vehicle, steps, progress, action: As of `trained`.
         folder: Of the experiment.
     """
     trainings = list(dict.fromkeys(row.training for row in rows.values() if row.training))
@@ -295,7 +319,9 @@ def controllers_of(
                 found = identify(place, vehicle, seed=seeds[0], shown=ranges.parent)
                 write_ranges(found.fit, place / RANGES_FILE, found.vehicle)
         trainings = [replace(t, randomize=str(ranges)) if t.randomize == INTERVALS else t for t in trainings]
-    policies = trained(trainings, seeds, folder / "policies", vehicle=vehicle, steps=steps, progress=progress)
+    policies = trained(
+        trainings, seeds, folder / "policies", vehicle=vehicle, steps=steps, action=action, progress=progress
+    )
     return {
         (name, seed): str(policies[row.training.name, seed]) if row.training else row.controller
         for name, row in rows.items()
@@ -310,6 +336,7 @@ def trained(
     *,
     vehicle: str,
     steps: int | None = None,
+    action: str | None = None,
     progress: Progress = lambda part, what: None,
 ) -> dict[tuple[str, int], Path]:
     """Policy directories of every training and seed; what is finished in the folder is not trained again.
@@ -320,6 +347,7 @@ def trained(
         folder: Where the directories are and come.
         vehicle: Name or file.
         steps: Control steps of each; the task's own if None.
+        action: Mode; the task's own if None.
         progress: Told the share that is done and what comes next.
 
     Returns:
@@ -332,7 +360,7 @@ def trained(
         progress(done / len(plan), f"training {training.name}, seed {seed}")
         if not finished(place):
             train(
-                training.task, out=place, vehicle=vehicle, hydrodynamics=training.hydrodynamics,
+                training.task, out=place, vehicle=vehicle, action=action, hydrodynamics=training.hydrodynamics,
                 randomize=training.randomize, seed=seed, steps=steps, settings={} if training.remembers else FORGETFUL,
                 console=Console(stderr=True, quiet=True),
             )  # fmt: skip

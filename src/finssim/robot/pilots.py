@@ -27,9 +27,9 @@ __all__ = ["AgentPilot", "ModeSwitch", "Pilot", "WrenchPilot", "make_pilot"]
 
 Array = npt.NDArray[np.float64]
 
-BY_AXES = 2.0 / 3.0
-"""Part of a task's reach for a vehicle that is steered by axes: a Doppler log locates it, and loses the floor when the
-vehicle leans on its way."""
+BY_AXES, TURN = 2.0 / 3.0, 1.0
+"""Part of a task's reach, and most of a turn that is shown at once [rad], for a vehicle that is steered by axes: a
+Doppler log locates it, and loses the floor when the vehicle leans on its way."""
 
 
 class Pilot(Protocol):
@@ -90,6 +90,8 @@ class AgentPilot:
         reach = task.reach * task.fit.size if hasattr(task, "reach") else math.inf
         self.reach = reach * (BY_AXES if self.mode.pilot else 1.0)
         """Goals farther away than this are shown so far ahead on the way to them [m]."""
+        self.turn = TURN if self.mode.pilot and math.isfinite(reach) else math.inf
+        """Headings farther away than this are shown so far round on the way to them [rad]."""
         self._input_noise: dict[str, float] = {}
         self.reset()
 
@@ -135,7 +137,7 @@ class AgentPilot:
             reading = Track(moved, quat_multiply(turn, reading.quaternion), np.asarray(reading.nu, float))
         if self.observer is not None:
             previous = self.action if self.action.size else None
-            self.observation = self.observer.observe(reading, guide, t, previous, self.reach)
+            self.observation = self.observer.observe(reading, guide, t, previous, self.reach, self.turn)
         known = Known(self.observation[None], *(np.asarray(x, float)[None] for x in _state(reading)))
         goal = goal_at(guide, t)
         rows = (goal.position, goal.quaternion, goal.velocity, goal.acceleration)

@@ -17,7 +17,7 @@ from finssim.control.modes import MODES
 from finssim.control.policy import ObservationSchema
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
-from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate
+from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate, quat_yaw
 from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError, crew
@@ -113,6 +113,7 @@ class Observer:
         t: float,
         previous: ArrayLike | None = None,
         reach: float = math.inf,
+        turn: float = math.inf,
     ) -> NDArray[np.float32]:
         """The observation, (schema.size,).
 
@@ -122,6 +123,7 @@ class Observer:
             t: Time since the guide's start [s].
             previous: The action before, in [-1, 1], (size,), for tasks that look at it; zeros if None.
             reach: A goal farther away than this is seen as one so far ahead on the straight way to it [m].
+            turn: A heading farther away than this is seen as one so far round on the way to it [rad].
 
         Raises:
             ControlError: The place of a vehicle that the task needs is not known.
@@ -137,7 +139,11 @@ class Observer:
         way = np.asarray(now.position, float) - reading.position
         far = float(np.linalg.norm(way)) / reach
         a.goal_position.numpy()[0] = now.position if not far > 1.0 else reading.position + way / far
-        a.goal_quaternion.numpy()[0] = quat_from_yaw(now.yaw)
+        yaw = now.yaw
+        if math.isfinite(turn):
+            here = float(quat_yaw(np.asarray(reading.quaternion, float)))
+            yaw = here + np.clip(math.remainder(float(now.yaw) - here, math.tau), -turn, turn)
+        a.goal_quaternion.numpy()[0] = quat_from_yaw(yaw)
         if a.target.velocity is not None:
             a.target.velocity.numpy()[0] = now.velocity
         self._put(self._place, reading.position, reading.quaternion, reading.nu)

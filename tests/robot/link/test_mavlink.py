@@ -159,6 +159,18 @@ def test_a_ground_station_that_only_looks_disturbs_nothing():
 
 
 @pytest.mark.slow
+def test_rates_that_another_station_lowers_are_asked_for_again():
+    """Attitude at 2 Hz for everybody, as a ground station might want it: within 3 s there are 50 a second again."""
+    slow = mavlink.MAVLink_command_long_message(1, 1, 511, 0, 30, 5e5, 0, 0, 0, 0, 0)
+    runtime, world, link, fault = drive(4.0, arm=False, somebody=Somebody().does(2.0, slow, until=2.01))
+    assert link.counts["ATTITUDE"] < 200
+    before = link.counts["ATTITUDE"]
+    runtime.attach(link)
+    run_lockstep(runtime, world, 6.0, start=world.pool.time)
+    assert link.counts["ATTITUDE"] - before > 150
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault, sentence, limit",
     [

@@ -49,6 +49,8 @@ PARAMETERS = ("JS_GAIN_DEFAULT", "JS_THR_GAIN", "BARO1_GND_PRESS", "BARO2_GND_PR
 
 MANUAL_PERIOD, HEARTBEAT_PERIOD, ASK_AGAIN = 0.03, 1.0, 0.5
 """Between two frames of axes, two heartbeats, and two attempts at the same request [s]."""
+SELDOM, SMOOTH = 2.0, 0.2
+"""Mean time between two messages, part of that asked for, at which they come too seldom; how much the newest counts."""
 HEARTBEAT_LOST = 3.0
 """Longest silence of the autopilot's heartbeat [s]."""
 REMEMBERED = 1.0
@@ -137,6 +139,7 @@ class MavlinkLink:
         self._gain = math.nan
         self._asked: dict[Any, float] = {}
         self._seen: dict[int, float] = {}
+        self._gap: dict[int, float] = {}
         self._refused = ""
         self._ours = self._others = False
         self._wanted = -math.inf
@@ -172,7 +175,11 @@ class MavlinkLink:
                 continue
             self.counts[kind] += 1
             if (message.get_srcSystem(), message.get_srcComponent()) == VEHICLE and kind in self._handlers:
-                self._seen[message.get_msgId()] = now
+                number = message.get_msgId()
+                gap = now - self._seen.get(number, -math.inf)
+                before = self._gap.get(number, gap)
+                self._gap[number] = gap if not math.isfinite(before) else before + SMOOTH * (gap - before)
+                self._seen[number] = now
                 made += self._handlers[kind](now, message)
         return made
 
@@ -194,6 +201,7 @@ class MavlinkLink:
         if m.time_boot_ms < self._boot_ms - 1000:  # it restarted: what was agreed with it is forgotten
             self._asked.clear()
             self._seen.clear()
+            self._gap.clear()
             self._boot_ms = -math.inf
         self._boot_ms = max(self._boot_ms, m.time_boot_ms)
         q = self._q = quat_from_euler(m.roll, -m.pitch, -m.yaw)
@@ -395,18 +403,11 @@ class MavlinkLink:
         """Requests whose answers have not come, each now and then."""
         frames: list[bytes] = []
         for message, interval in INTERVALS.items():
-            if now - self._seen.get(message, -math.inf) > max(2.0, 3.0 * interval):
+            # Another ground station may ask for its own rates: what comes too seldom is asked for again.
+            gap = max(self._gap.get(message, math.inf), now - self._seen.get(message, -math.inf))
+            if gap > SELDOM * interval:
                 ask = self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message), 1e6 * interval)
                 frames += self._ask(now, ("interval", message), 1.0, ask)
-        if now - self._first(now, "rates") > 1.0 and ("rates", 1) not in self._asked:
-            # Messages may come by an autopilot's defaults at other rates: ask once for ours.
-            self._asked[("rates", 1)] = now
-            for message, interval in INTERVALS.items():
-                frames.append(
-                    self._pack(
-                        self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message), 1e6 * interval)
-                    )
-                )
         if self._version is None:
             version = float(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             frames += self._ask(now, "version", 1.0, self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, version))
