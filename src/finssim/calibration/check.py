@@ -37,8 +37,6 @@ from finssim.vehicles import AXES, Vehicle, VehicleError, load_vehicle
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["as_object", "check", "check_trials", "print_reports", "together"]
-
 # What holds between the trials of a set: vehicles, roles, names, what all of them tell together.
 
 AGREE = 0.7

@@ -22,10 +22,6 @@ from rosbags.typesys.store import Typestore
 
 from finssim.ros2.errors import MessageError, Ros2Error
 
-__all__ = [
-    "Codec", "Definitions", "Distro", "HEADER", "INTERFACES", "Message", "Nodetype", "codec_of", "distro_of",
-]  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Distro:

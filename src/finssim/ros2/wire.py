@@ -37,11 +37,6 @@ from cyclonedds.topic import Topic
 from finssim.ros2.codec import Codec, Distro, Message, Nodetype, codec_of, distro_of
 from finssim.ros2.errors import Ros2Error
 
-__all__ = [
-    "ClientEnd", "LOOPBACK", "NodeRecord", "Participant", "Quality", "ServerEnd", "Waiter", "wire_settings",
-]  # fmt: skip
-
-
 MAX_DOMAIN = 232
 """A higher domain has no room for its UDP ports (7400 + 250 d + 2·index)."""
 

@@ -24,8 +24,6 @@ from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = []
-
 ONLY_SIMULATION = "needs --method simulation"
 
 

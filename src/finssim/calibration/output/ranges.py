@@ -15,8 +15,6 @@ from finssim.engine.ranges_file import load_ranges
 from finssim.files import atomic_write
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle
 
-__all__ = ["range_factors", "write_ranges"]
-
 NARROWEST = 0.02
 """A told parameter varies by at least this part to either side: intervals know of noise, not of a wrong model."""
 WIDEST = (0.0, 5.0)

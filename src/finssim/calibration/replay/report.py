@@ -37,19 +37,6 @@ from finssim.vehicles.vehicle import AXES, Axis
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "DEFINITION",
-    "MODEL_LABELS",
-    "REPLAY_FILE",
-    "draw_ahead",
-    "draw_overlay",
-    "draw_response_envelopes",
-    "normalised",
-    "print_replay",
-    "replay_json",
-    "write_replay",
-]
-
 MODEL_LABELS = {"calibrated": "Calibrated Fossen", "mesh": "Physics-mesh", "simplified": "Simplified Fossen"}
 COLORS = {"calibrated": "#0072B2", "mesh": "#009E73", "simplified": "#D55E00"}
 OTHERS = ("#CC79A7", "#56B4E9", "#E69F00")

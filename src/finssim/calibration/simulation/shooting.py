@@ -32,12 +32,6 @@ from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.terms import TERMS, unit_of
 
-__all__ = [
-    "CUT", "EXTRAS", "Linear", "Parameters", "Point", "Shooting", "Solution", "blocks_of", "costs_of",
-    "solve", "step_of", "weights_of",
-]  # fmt: skip
-
-
 Array = NDArray[np.float64]
 
 

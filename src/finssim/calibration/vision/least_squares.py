@@ -15,11 +15,6 @@ from numpy.typing import NDArray
 from finssim.calibration.uncertainty import Evidence
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix
 
-__all__ = [
-    "Block", "Pose", "arrow_evidence", "arrow_reduced", "arrow_step", "block_of", "boxed", "descent", "huber_cost",
-    "huber_weight",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 State = TypeVar("State")
 

@@ -59,12 +59,6 @@ from finssim.localization.fusion.fuse_log import Series, imu_columns, read_strea
 from finssim.localization.pool import Pool, load_pool
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = [
-    "Moment", "MountState", "Noise", "Rig", "change", "fit_mounts", "imu_clock", "moment_blocks", "moved",
-    "read_mount_log", "reference_tag", "residuals", "run", "start_state",
-]  # fmt: skip
-
-
 Array = NDArray[np.float64]
 
 AXES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")

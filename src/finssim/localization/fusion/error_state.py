@@ -57,9 +57,6 @@ from finssim.localization.fusion.streams import (
 )
 from finssim.localization.poses import axes_of_up
 
-__all__ = ["ConstantVelocity", "ErrorState", "GateMemory", "judge", "vision_covariance"]
-
-
 Array = npt.NDArray[np.float64]
 
 # Gates: which measurements are believed, and when a run of disbelieved ones has been right all along.

@@ -22,9 +22,6 @@ from finssim.ros2.nodes.conversions import station_of_pose, trajectory_of, wrenc
 from finssim.ros2.nodes.remote import RemoteBridge, RemoteState
 from finssim.ros2.nodes.robot_node import RobotNode
 
-__all__ = ["Controller"]
-
-
 Array = npt.NDArray[np.float64]
 
 STALE = 0.5

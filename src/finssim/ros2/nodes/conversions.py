@@ -32,12 +32,6 @@ from finssim.robot.reading import Reading
 from finssim.robot.record_messages import FIRST_TIME, LAST_TIME, MAP, UNKNOWN, Messages, floats
 from finssim.vehicles import Vehicle
 
-__all__ = [
-    "RosMessages", "aid_of", "compressed_of", "force_of", "image_of", "nanoseconds", "reading_of", "ros_type",
-    "station_of_pose", "tags_of", "telemetry_of", "trajectory_of", "wrench_of",
-]  # fmt: skip
-
-
 Array = npt.NDArray[np.float64]
 
 LEVEL = math.radians(20.0)

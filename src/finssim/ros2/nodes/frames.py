@@ -27,9 +27,6 @@ from finssim.ros2.nodes.conversions import ros_type, xyz, xyzw
 from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.vehicles import Vehicle
 
-__all__ = ["FixFrame", "Frames", "Odometer", "Pose", "mounts", "urdf_of"]
-
-
 Array = npt.NDArray[np.float64]
 
 BASE = "base_link"

@@ -20,9 +20,6 @@ from finssim.ros2.nodes.remote import Readings
 from finssim.ros2.nodes.robot_node import RobotNode, matched_callbacks
 from finssim.ros2.topics import SERVICES
 
-__all__ = ["BridgeTopics", "HardwareBridge"]
-
-
 LOOK = 0.5
 """Between two counts of those who publish commands [s]."""
 

@@ -19,8 +19,6 @@ from finssim.ros2.nodes.conversions import compressed_of, image_of, nanoseconds,
 from finssim.ros2.nodes.frames import FixFrame
 from finssim.ros2.nodes.robot_node import RobotNode
 
-__all__ = ["Localizer"]
-
 FORMS = {"raw": ("image", image_of), "compressed": ("picture", compressed_of)}
 
 

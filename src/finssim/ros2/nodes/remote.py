@@ -20,9 +20,6 @@ from finssim.robot.record_messages import STATES
 from finssim.ros2.nodes.conversions import nanoseconds, reading_of, ros_type
 from finssim.ros2.nodes.robot_node import LISTENING, RobotNode
 
-__all__ = ["Readings", "RemoteBridge", "RemoteState", "Watcher"]
-
-
 Array = npt.NDArray[np.float64]
 
 SILENT = 0.5

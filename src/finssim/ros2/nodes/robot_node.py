@@ -21,8 +21,6 @@ from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
-__all__ = ["LISTENING", "RobotNode", "TwinError", "matched_callbacks"]
-
 URGENCY = -10
 """Niceness of a node that others wait for; only a privileged user may have it, others do without."""
 LISTENING = 1.0

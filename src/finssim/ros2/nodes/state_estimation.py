@@ -18,8 +18,6 @@ from finssim.ros2.nodes.frames import FixFrame, Frames
 from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.topics import TOPICS
 
-__all__ = ["StateEstimation", "health_values"]
-
 
 class StateEstimation(RobotNode):
     """Publishes Odometry, tf and EstimatorStatus of one stamp; no Odometry while the place is not known."""

@@ -18,12 +18,6 @@ from finssim.ros2.shim.exceptions import (
 )
 from finssim.ros2.shim.logging import LoggingSeverity
 
-__all__ = [
-    "Overrides", "Remap", "RosArguments", "TOKEN", "check_node", "expanded", "full_node_name", "override",
-    "overrides_for", "parse_arguments", "parsed_value", "read_parameters", "remapped",
-]  # fmt: skip
-
-
 TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"
 _TOPIC = re.compile(rf"^(~|(~/|/)?{TOKEN}(/{TOKEN})*)$")
 LONGEST_NODE, LONGEST_NAMESPACE, LONGEST_TOPIC = 255, 245, 247

@@ -14,8 +14,6 @@ from finssim.ros2.shim.exceptions import NotInitializedException
 from finssim.ros2.shim.logging import set_logger_level
 from finssim.ros2.wire import Participant, wire_settings
 
-__all__ = ["Context", "get_default_context", "ok", "remove_ros_args", "shutdown", "try_shutdown"]
-
 
 class Context:
     """One presence on the wire. Nodes of one process share it."""

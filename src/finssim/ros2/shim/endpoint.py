@@ -15,12 +15,6 @@ from finssim.ros2.shim.exceptions import InvalidHandle
 from finssim.ros2.shim.qos import quality_of
 from finssim.ros2.wire import ClientEnd, Quality, ServerEnd
 
-__all__ = [
-    "CallbackGroup", "Client", "Endpoint", "Future", "MutuallyExclusiveCallbackGroup", "Publisher",
-    "QoSSubscriptionMatchedInfo", "ReentrantCallbackGroup", "Service", "Subscription",
-    "SubscriptionEventCallbacks", "check_callback", "deserialize_message", "serialize_message",
-]  # fmt: skip
-
 
 class QoSSubscriptionMatchedInfo(NamedTuple):
     """Publishers that a subscription was matched with, and how that changed since it was told last."""

@@ -12,10 +12,6 @@ from finssim.ros2.shim.endpoint import Future, check_callback
 from finssim.ros2.shim.time import Clock
 from finssim.ros2.wire import Waiter
 
-__all__ = [
-    "ExternalShutdownException", "ShutdownException", "SingleThreadedExecutor", "TimeoutException", "Timer",
-]  # fmt: skip
-
 
 class Timer:
     """Calls back at a fixed period of a clock. Made by `Node.create_timer`.

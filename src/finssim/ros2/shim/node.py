@@ -36,8 +36,6 @@ from finssim.ros2.shim.qos import (
 from finssim.ros2.shim.time import Clock, ROSClock, Time
 from finssim.ros2.wire import NodeRecord
 
-__all__ = ["Node", "NodeGraph", "TimeSource"]
-
 
 class NodeGraph:
     """The part of `Node` that looks at the graph."""

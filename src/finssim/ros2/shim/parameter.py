@@ -20,12 +20,6 @@ from finssim.ros2.shim.exceptions import (
 )
 from finssim.ros2.shim.qos import qos_profile_parameters
 
-__all__ = [
-    "NodeParameters", "PARAMETER_SEPARATOR_STRING", "Parameter", "ParameterService",
-    "parameter_value_to_python",
-]  # fmt: skip
-
-
 PARAMETER_SEPARATOR_STRING = DOT = "."
 
 

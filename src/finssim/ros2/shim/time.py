@@ -9,8 +9,6 @@ from typing import Any
 
 from finssim.ros2.codec import codec_of
 
-__all__ = ["Clock", "ClockType", "Duration", "Infinite", "ROSClock", "Time"]
-
 
 class ClockType(IntEnum):
     """What a clock counts."""
