@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 from rich.console import Console
 
-from finssim.calibration.excitation.programmes import RATE, Programme, programmes, which_axes
+from finssim.calibration.excitation.programmes import RATE, STEADY, Programme, programmes, which_axes
 from finssim.calibration.findings import Finding, sentences
 from finssim.calibration.fit import Fit
 from finssim.calibration.output.calibrate import all_findings, calibrated, number_in
@@ -74,8 +74,6 @@ SHARE = 0.9
 """Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""
 BALLASTED = 0.25
 """Weight less buoyancy of a vehicle that floats well enough by itself [N]."""
-STEADY = 0.8
-"""Fastest surge and sway, part of `level_speed` [-]."""
 
 
 def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str, list[float]]:

@@ -428,7 +428,7 @@ def collect(
         episodes: How many; each agent's is one of its own. Not of records.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        action: What is commanded: wrench6, wrench4 or thruster8; the task's own if not given.
+        action: What is commanded: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
         randomize (FILE): Ranges that vehicle and water are drawn from, by name or file.
         observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
             through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
