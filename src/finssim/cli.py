@@ -11,8 +11,6 @@ import typer
 from finssim import __version__, boundary
 from finssim.command_line import Experiment, command_app
 
-__all__ = ["app", "main"]
-
 COMMANDS: dict[str, str | Experiment] = {
     "demo": "finssim.experiments.demo:demo",
     "simulate": "finssim.experiments.simulate:simulate",

@@ -145,7 +145,7 @@ class Options:
     """Arm once, as soon as the state is known; otherwise the topic arm does."""
     robot: str = "pool"
     """(ADDRESS) Motor controller of a robot: udp://HOST:PORT, serial:DEVICE, dry-run, or pool for a finssim pool on
-    this machine."""
+    this machine; or its autopilot: mavlink or mavlink://KIND:WHERE, as of finssim run."""
     bind: str = "127.0.0.1:54321"
     """(ADDRESS:PORT) Own end for udp; pictures are taken at the port after it."""
     pictures: str | None = None
@@ -234,7 +234,8 @@ def _wire(plan: Plan, o: Options) -> None:
     pool = plan.graph == "pool" or o.robot == "pool"
     address = f"udp://127.0.0.1:{o.port}" if pool else o.robot
     camera = o.pictures or (f"udp://127.0.0.1:{o.port + 1}" if pool else "none")
-    plan.set("hardware_bridge", robot=address, bind=o.bind, need_reading=False if o.teleop else None)
+    plan.set("/**", robot=address)
+    plan.set("hardware_bridge", bind=o.bind, need_reading=False if o.teleop else None)
     plan.set("camera", pictures=camera, pictures_bind=f"{host}:{int(port) + 1}")
 
 

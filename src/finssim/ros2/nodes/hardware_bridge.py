@@ -1,4 +1,4 @@
-"""Hardware bridge node: the one process that talks to the motor controller, with arming and every watchdog."""
+"""Hardware bridge node: the one process that talks to motor controller or autopilot, with arming and every watchdog."""
 
 from __future__ import annotations
 
@@ -131,9 +131,8 @@ class HardwareBridge(RobotNode):
 
     def __init__(self) -> None:
         super().__init__("hardware_bridge")
-        address, bind = self.parameter("robot", "pool"), self.parameter("bind", DEFAULT_BIND)
-        located = self.parameter("need_reading", True)
-        address = POOL_ADDRESS if address == "pool" else address
+        located, bind = self.parameter("need_reading", True), self.parameter("bind", DEFAULT_BIND)
+        address = POOL_ADDRESS if self.robot == "pool" else self.robot
         self.transport, link = open_transport(address, bind), link_of(address, self.vehicle)
         self.bridge = Bridge(self.vehicle, BridgeSettings.of(self.vehicle, need_reading=located))
         self.bridge.autopilot = link

@@ -60,9 +60,12 @@ class RobotNode(Node):
         super().__init__(name)
         self.filed = load_vehicle(self.parameter("vehicle", "finsrov"))
         """The vehicle as its file has it, which policies are trained for."""
-        self.vehicle = numbered(
-            vehicle_at(self.parameter("site", "pool"), self.filed), self.parameter("number", 0)
+        self.robot = self.parameter("robot", "pool")
+        """Address of the motor controller, or of an autopilot, whose vehicle has a Doppler log and a compass."""
+        equipped = vehicle_at(
+            self.parameter("site", "pool"), self.filed, navigation=self.robot.startswith("mavlink")
         )
+        self.vehicle = numbered(equipped, self.parameter("number", 0))
         """The same as it is equipped for the site, with the tags of its number among several."""
         self.make = RosMessages(self.vehicle, self.parameter("frame_prefix", ""))
         self._below = "" if self.get_namespace() != "/" else f"{self.vehicle.name.replace('-', '_')}/"
