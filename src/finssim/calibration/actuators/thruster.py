@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -923,7 +923,6 @@ def fit_thruster(
     vehicle: Vehicle,
     *,
     group: str | None = None,
-    columns: Mapping[str, str] | None = None,
     voltage: float | None = None,
     pool_voltages: bool = False,
     seed: int = 0,
@@ -934,7 +933,6 @@ def fit_thruster(
         tables: CSV files (see `read_table`), folders of bench trials, or what was read from them.
         vehicle: Whose thrusters they are.
         group: Propeller group that all tables speak about.
-        columns: What the headers do not tell; see `read_table`.
         voltage: At which the numbers shall hold [V], and for tables without a voltage column the voltage they were
             taken at; where not given, the tables' only one, else that of the vehicle file's ESC, else the middle one.
         pool_voltages: Fit all voltages together; otherwise the others only check the prediction.
@@ -946,7 +944,7 @@ def fit_thruster(
     Raises:
         CalibrationError: A table that cannot be read, names that the vehicle does not have, too few rows.
     """
-    read = _named_apart([(item, table) for item in tables for table in _read(item, vehicle, columns)])
+    read = _named_apart([(item, table) for item in tables for table in _read(item, vehicle)])
     if not read:
         raise CalibrationError("no table given: name at least one CSV file of speeds and thrusts")
     _refuse_duplicates(read)
@@ -996,9 +994,7 @@ _WRITTEN = {
 """Keys of a thruster that an estimate goes to."""
 
 
-def _read(
-    item: ThrustTable | Trial | str | os.PathLike[str], vehicle: Vehicle, columns: Mapping[str, str] | None
-) -> list[ThrustTable]:
+def _read(item: ThrustTable | Trial | str | os.PathLike[str], vehicle: Vehicle) -> list[ThrustTable]:
     if isinstance(item, ThrustTable):
         return [item]
     neutrals = [thruster.esc.pulse_neutral for thruster in vehicle.thrusters.values() if thruster.esc]
@@ -1012,7 +1008,7 @@ def _read(
         trial = item if isinstance(item, Trial) else load_trial(item)
         turned = [name for name, thruster in vehicle.thrusters.items() if thruster.motor_sign == -1]
         return tables_of_trial(trial, neutral=neutral, reversed_wiring=turned)
-    return [read_table(item, columns=columns, neutral=neutral)]
+    return [read_table(item, neutral=neutral)]
 
 
 def _is_trial(path: Path) -> bool:
