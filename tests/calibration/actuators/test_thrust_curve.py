@@ -321,7 +321,8 @@ def test_a_bench_trial_is_a_table_of_its_thruster():
     trial = Trial(
         name="bench", t=t, channels={"rpm_T3": rpm, "force_T3": force, "pwm_T3": 1500.0 - rpm / 8.0}
     )
-    fit = fit_thruster([trial], BLUEROV2.replace({"thrusters.T3.motor_sign": -1}))
+    turned = {"thrusters.T3.motor_sign": -1, "autopilot.directions": (1, 1, -1, 1, 1, 1)}
+    fit = fit_thruster([trial], BLUEROV2.replace(turned))
     assert fit.estimates["T3.c_plus"].estimate == pytest.approx(1.1e-4, rel=0.01)
     assert fit.estimates["T3.c_plus"].path == "thrusters.T3.c_plus" and fit.trials == {"bench": trial.sha256}
 

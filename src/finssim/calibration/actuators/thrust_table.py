@@ -22,8 +22,6 @@ from finssim.calibration.trials.conversion import TIME_UNITS, UNITS
 from finssim.calibration.trials.trial import Trial
 from finssim.text_table import TextTable, read_text_table
 
-__all__ = ["STANDING", "ThrustTable", "find_steps", "levels", "read_table", "tables_of_trial"]
-
 Array = NDArray[np.float64]
 
 LAST = 0.4
