@@ -31,11 +31,6 @@ from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = [
-    "BUTTONS", "GAMEPAD_HELP", "GEARS", "KEYBOARD_HELP", "STICKS", "Device", "Gamepad", "Hands", "Keyboard", "Keys",
-    "Operator", "Pad", "TeleopCommand", "TeleopError", "drive", "run", "shaped",
-]  # fmt: skip
-
 Array = npt.NDArray[np.float64]
 
 Gear = Literal["precision", "cruise", "boost"]

@@ -42,13 +42,6 @@ from finssim.tasks.trajectory_tracking import DISTANCE_SCALE as TRACKING_SCALE
 from finssim.tasks.trajectory_tracking import LOOK_AHEAD
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = [
-    "BASELINES", "NOWHERE", "Agent", "AgentError", "Baseline", "BaselineAgent", "BaselineError", "ConsensusFormation",
-    "FormationPursuit", "Known", "LeadPursuit", "PidAgent", "PolicyAgent", "StationPid", "TargetPid",
-    "TrackingPid", "agent_for", "baseline", "expert_for", "known_in", "memory_from",
-    "memory_leaves", "restarted", "rollout",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 

@@ -14,8 +14,8 @@ from rclpy.node import Node
 
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.draw_plant import site_of
+from finssim.ros2.nodes.conversions import ros_type
 from finssim.ros2.nodes.hardware_bridge import HardwareBridge
-from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 

@@ -16,13 +16,10 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 from finssim.robot.interrupt import follow_parent
-from finssim.ros2.nodes.conversions import nanoseconds
-from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
+from finssim.ros2.nodes.conversions import RosMessages, nanoseconds, ros_type
 from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
-
-__all__ = ["LISTENING", "RobotNode", "TwinError", "matched_callbacks"]
 
 URGENCY = -10
 """Niceness of a node that others wait for; only a privileged user may have it, others do without."""
