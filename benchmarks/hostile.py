@@ -648,8 +648,8 @@ def _run(words: list[str]) -> int:
 
     if words[0] != PARAMETERS:
         return int(boundary.run(app, words))
+    from finssim.ros2.shim.arguments import read_parameters
     from finssim.ros2.shim.exceptions import RosArgumentsError
-    from finssim.ros2.shim.parameter_files import read_parameters
 
     try:
         read_parameters(Path(words[1]), {})

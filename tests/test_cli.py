@@ -50,8 +50,6 @@ COMMANDS = [
     "ardusub-sitl",
     "tasks",
     "tasks show",
-    "randomize",
-    "randomize fit",
     "collect",
     "datasets",
     "compare",

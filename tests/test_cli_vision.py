@@ -507,11 +507,7 @@ def test_mounts_as_json_and_as_a_vehicle(mounting, capsys):
         *("kind", "method", "vehicle", "parameters", "quality", "correlation", "findings", "trials"),
         *("settings", "out", "provenance"),
     }
-    assert (
-        found["kind"] == "mounts"
-        and found["settings"]["estimate"] == "tags"
-        and found["settings"]["seed"] == 9
-    )
+    assert found["kind"] == "mounts" and found["settings"]["seed"] == 9
     assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())
     tags = load_vehicle(mounting / "v.yaml").tags.mounts
     apart = np.linalg.norm(np.asarray(tags[15].position) - np.asarray(tags[16].position))
@@ -520,22 +516,9 @@ def test_mounts_as_json_and_as_a_vehicle(mounting, capsys):
 
 
 @pytest.mark.slow
-def test_mounts_estimates_what_it_is_told(mounting, capsys):
-    """`sensors` finds how the IMU sits and leaves the tag seen most where it is; the report's command says so."""
-    words = ["--estimate", "sensors", "--report", mounting / "report"]
-    found = found_by(capsys, *MOUNT, mounting / "v.yaml", *words)
-    assert "--estimate sensors" in (mounting / "report" / "report.md").read_text("utf-8")
-    assert found["settings"]["estimate"] == "sensors" and "depth.offset" in found["parameters"]
-    before, after = load_vehicle("vehicle.yaml"), load_vehicle(mounting / "v.yaml")
-    kept = found["settings"]["reference_tag"]
-    np.testing.assert_allclose(after.tags.mounts[kept].position, before.tags.mounts[kept].position, atol=1e-9)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ([*MOUNT, "OUT", "--estimate", "camera"], "unknown estimate 'camera'; available: tags, sensors"),
         ([*MOUNT, "OUT", "--vehicle", "bluerov2"], "has no tags"),
         ([*MOUNT, "OUT", "--vehicle", "finrov"], "did you mean 'finsrov'"),
         ([*MOUNT, "OUT", "--pool", "nowhere.yaml"], "nowhere.yaml"),

@@ -11,8 +11,6 @@ import typer
 
 from finssim.doctor import EXTRA_OF_MODULE
 
-__all__ = ["run"]
-
 REFUSED = 2
 INTERRUPTED = 130
 

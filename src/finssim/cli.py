@@ -11,8 +11,6 @@ import typer
 from finssim import __version__, boundary
 from finssim.command_line import Experiment, command_app
 
-__all__ = ["app", "main"]
-
 COMMANDS: dict[str, str | Experiment] = {
     "demo": "finssim.experiments.demo:demo",
     "simulate": "finssim.experiments.simulate:simulate",
@@ -36,8 +34,8 @@ COMMANDS: dict[str, str | Experiment] = {
     "calibrate motor": "finssim.calibration.output.commands:calibrate_motor",
     "calibrate hydrodynamics": "finssim.calibration.output.commands:calibrate_hydrodynamics",
     "calibrate camera": "finssim.calibration.vision.camera:run",
-    "calibrate pool": "finssim.calibration.vision.pool_command:run",
-    "calibrate mounts": "finssim.calibration.vision.mounts_command:run",
+    "calibrate pool": "finssim.calibration.vision.pool_fit:run",
+    "calibrate mounts": "finssim.calibration.vision.mounts:run",
     "replay": "finssim.calibration.replay.replay:run_replay",
     "experiment replay": Experiment("finssim.experiments.replay_experiment:replay_experiment"),
     "experiment localization": Experiment(
@@ -55,7 +53,6 @@ COMMANDS: dict[str, str | Experiment] = {
     "fuse": "finssim.localization.fusion.fuse:run",
     "project": "finssim.localization.points:run_project",
     "backproject": "finssim.localization.points:run_backproject",
-    "randomize fit": "finssim.calibration.output.ranges:fit_ranges",
     "record info": "finssim.robot.record_reader:info",
     "record repair": "finssim.robot.record_reader:repair",
     "play": "finssim.robot.record_reader:play_record",
@@ -75,8 +72,6 @@ GROUPS = {
     "Example: finssim calibrate hydrodynamics --help",
     "experiment": "Reproduce a table of the paper in simulation, beside the paper's own numbers.\n\n"
     "Example: finssim experiment replay --help",
-    "randomize": "Ranges that vehicle, water and sensors are drawn from in every episode of a training.\n\n"
-    "Example: finssim randomize fit --help",
     "record": "Look at records of runs, and mend those that were cut off.\n\nExample: finssim record info run.mcap",
     "ros2": "Be ROS 2 nodes on this machine's ROS domain; those of a sourced ROS 2 see them and are seen.\n\n"
     "Example: finssim ros2 up pool",

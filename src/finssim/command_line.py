@@ -37,8 +37,6 @@ from typing import Annotated, Any
 
 import typer
 
-__all__ = ["Experiment", "command_app", "read"]
-
 ROOT = Path(__file__).parents[1]
 KINDS: Mapping[str, Any] = {
     "str": str, "int": int, "float": float, "bool": bool, "Path": Path, "Literal": str, "Severity": str, "Format": str

@@ -9,8 +9,6 @@ from typing import Any
 
 from finssim.provenance import package_versions, revision
 
-__all__ = ["EXTRAS", "EXTRA_OF_MODULE", "Extra", "doctor", "examine"]
-
 CORE = ("numpy", "scipy", "warp-lang", "pydantic", "PyYAML", "typer", "rich", "onnxruntime")
 """Distributions FinsSim cannot do without."""
 

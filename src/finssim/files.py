@@ -14,8 +14,6 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-__all__ = ["OutputError", "atomic_directory", "atomic_write", "plain_name", "refuse_unwritable"]
-
 LONGEST_NAME = 200
 """Of a file or folder that data names [bytes]: 255 are possible, and suffixes, seeds and digests are added."""
 

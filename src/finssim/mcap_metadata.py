@@ -7,8 +7,6 @@ from pathlib import Path
 
 from finssim.mcap_repair import MAGIC
 
-__all__ = ["mcap_metadata"]
-
 METADATA, CHUNK, DATA_END = 0x0C, 0x06, 0x0F
 """Kinds of records (MCAP specification)."""
 

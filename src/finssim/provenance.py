@@ -11,8 +11,6 @@ from typing import Any
 
 import finssim
 
-__all__ = ["package_versions", "provenance", "revision"]
-
 PACKAGES = (
     "numpy",
     "scipy",

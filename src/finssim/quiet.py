@@ -13,9 +13,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-__all__ = ["start_warp"]
-
-
 _COMPILED = re.compile(r"Module (?P<name>\S+) .* took (?P<ms>[\d.]+) ms +\(compiled\)")
 
 

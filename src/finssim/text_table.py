@@ -14,17 +14,6 @@ from typing import Any
 
 from finssim.files import atomic_write
 
-__all__ = [
-    "EMPTY",
-    "TextTable",
-    "csv_text",
-    "number",
-    "read_text",
-    "read_text_table",
-    "text_table",
-    "write_csv",
-]
-
 EMPTY = frozenset({"", "nan", "none", "null", "na", "n/a", "-", "--"})
 """Words for "no value", in lower case."""
 

@@ -11,16 +11,16 @@ NOISE = NoiseProfile(velocity_std=0.01, gyro_std=0.005, attitude_std=0.004)
 
 
 @cache
-def recorded(name, axes, kind="published"):
+def recorded(name, axes, kind="published", levels=()):
     """Vehicle, programmes and true motion; measuring it again with another seed costs little."""
     vehicle = load_vehicle(name)
-    chosen = programmes(list(axes), vehicle, kind=kind)
+    chosen = programmes(list(axes), vehicle, kind=kind, levels=dict(levels))
     return vehicle, chosen, record(chosen, vehicle, seed=0)
 
 
-def trials(name, *axes, noise=NOISE, seed=0, rate=50.0, kind="published", **columns):
-    """Vehicle and synthetic trials of it."""
-    vehicle, chosen, recording = recorded(name, axes, kind)
+def trials(name, *axes, noise=NOISE, seed=0, rate=50.0, kind="published", levels=(), **columns):
+    """Vehicle and synthetic trials of it; `levels` are pairs of an axis and its magnitudes."""
+    vehicle, chosen, recording = recorded(name, axes, kind, levels)
     return vehicle, trials_of(recording, chosen, vehicle, noise=noise, seed=seed, rate=rate, **columns)
 
 

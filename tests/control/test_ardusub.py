@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from finssim.control import ControlError
-from finssim.control.ardusub import PULSES, Mixer, thrust_tables
-from finssim.control.modes import action_mode
+from finssim.control.ardusub import PULSES, Mixer, dead_band, thrust_tables
+from finssim.control.modes import QUIET, action_mode
 from finssim.vehicles import VehicleError, load_vehicle
 from finssim.vehicles.autopilot import DEMANDS
 
@@ -23,6 +23,19 @@ PUSHES = {
 
 def demand(**parts):
     return np.array([parts.get(name, 0.0) for name in DEMANDS])
+
+
+def asked(vehicle, part):
+    """Demand that an axis of an action makes: past the dead band of the motors, by the gain."""
+    dead = dead_band(vehicle)
+    return vehicle.autopilot.gain * (dead + (1.0 - dead) * (part - QUIET) / (1.0 - QUIET))
+
+
+def axes(vehicle, demands):
+    """Actions that make demands."""
+    dead, size = dead_band(vehicle), np.abs(demands) / vehicle.autopilot.gain
+    beyond = QUIET + (1.0 - QUIET) * (size - dead) / (1.0 - dead)
+    return np.sign(demands) * np.where(size <= dead, size * QUIET / dead, beyond)
 
 
 def test_the_vectored_frame_gives_way_to_the_throttle():
@@ -74,7 +87,14 @@ def test_thrusts_are_those_of_the_speed_controller():
         action = np.array([0.7, -0.2, 0.4, 0.05, -0.1, 0.3])
         f = action_mode("pilot6", vehicle).to_thrusters(action)
         pulses = Mixer.of(vehicle).pulses(
-            demand(forward=0.7, lateral=0.2, throttle=0.4, roll=0.05, pitch=0.1, yaw=-0.3)
+            demand(
+                forward=asked(vehicle, 0.7),
+                lateral=asked(vehicle, 0.2),
+                throttle=asked(vehicle, 0.4),
+                roll=asked(vehicle, 0.05),
+                pitch=asked(vehicle, 0.1),
+                yaw=-asked(vehicle, 0.3),
+            )
         )
         expected = [
             np.clip(t.thrust(t.shaft_speed(pulse, voltage)), t.force_min, t.force_max)
@@ -92,7 +112,7 @@ def test_demands_of_thrusts_give_these_thrusts_again(vehicle):
     random, off = np.random.default_rng(0), []
     for _ in range(200):
         f = mode.to_thrusters(random.uniform(-1.0, 1.0, 6) * random.uniform(0.0, 1.0))
-        again = mixer.demands(f)
+        again = axes(vehicle, mixer.demands(f))
         body = np.array([again[4], -again[5], again[3], again[0], -again[1], -again[2]])
         off.append(np.abs(mode.to_thrusters(body) - f).max())
     # Where the vectored frame clips single motors with all axes near full, the demand is not always reached.
@@ -105,7 +125,7 @@ def test_a_motor_wired_and_declared_the_other_way_gives_the_same_push():
     turned = HEAVY.replace(
         {"thrusters.T3.axis": (-HEAVY.thrusters["T3"].axis).tolist(), "autopilot.directions": [1, 1, -1]}
     )
-    ahead = np.array([0.5, 0, 0, 0, 0, 0])
+    ahead = np.array([0.8, 0, 0, 0, 0, 0])
     for vehicle in (HEAVY, turned):
         tau = vehicle.control_matrix @ action_mode("pilot6", vehicle).to_thrusters(ahead)
         assert tau[0] > 20.0

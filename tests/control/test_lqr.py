@@ -1,7 +1,6 @@
 """The LQR's gains are optimal, its observer finds what pushes, and it holds every published setpoint."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -134,9 +133,9 @@ def test_a_period_of_zero_is_refused(vehicle):
 
 def test_a_disturbance_is_bounded(lqr):
     """Half of the wrench limit at most, whatever the velocity jumps by."""
-    memory = replace(lqr.reset(), nu=np.zeros(6))
+    memory = lqr.reset()._replace(nu=np.zeros(6))
     for _ in range(200):
-        memory = replace(memory, nu=np.zeros(6))
+        memory = memory._replace(nu=np.zeros(6))
         _, memory = lqr.command(memory, at_rest(np.zeros(3), quat_from_yaw(0.0), np.full(6, -5.0)), T1_ONE)
     assert (np.abs(memory.force) <= 0.5 * lqr.body.wrench_limits[:3] + 1e-12).all()
 

@@ -1,7 +1,6 @@
 """The PID places its poles, holds every published setpoint in water known and unknown, and never winds up."""
 
 import math
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -206,7 +205,7 @@ def test_the_command_does_not_depend_on_where_north_is(vehicle):
     commands = []
     for turn in (0.0, 1.3, -2.5):
         world = quat_from_yaw(turn)
-        memory = replace(pid.reset(), force=quat_rotate(world, [1.0, 2.0, 0.5]))
+        memory = pid.reset()._replace(force=quat_rotate(world, [1.0, 2.0, 0.5]))
         measured = at_rest(np.zeros(3), quat_multiply(world, q), 0.1 * np.ones(6))
         commands.append(
             pid.command(memory, measured, Goal(quat_rotate(world, away), quat_multiply(world, goal)))[0]

@@ -13,8 +13,7 @@ from finssim.cli import app
 from finssim.control.pid import axis_model
 from finssim.control.policy import Policy
 from finssim.experiments import demo as demo_module
-from finssim.experiments.demo import FULL, Scope, demo
-from finssim.experiments.identify import identify
+from finssim.experiments.demo import FULL, Scope, demo, identify
 from finssim.experiments.metrics import T1_SETPOINTS
 from finssim.experiments.trials import Motion
 from finssim.files import OutputError

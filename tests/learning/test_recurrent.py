@@ -10,7 +10,7 @@ import yaml
 from torch import nn
 
 import finssim
-from finssim.control.guidance import Station
+from finssim.control.guidance import Known, Station
 from finssim.control.modes import action_mode
 from finssim.control.policy import Policy, PolicyError
 from finssim.learning.episodes import HeldEvaluation
@@ -20,7 +20,7 @@ from finssim.learning.recurrent import RecurrentNetwork
 from finssim.robot.pilots import make_pilot
 from finssim.robot.reading import Reading
 from finssim.tasks import StationKeeping
-from finssim.tasks.agents import NOWHERE, Known, agent_for, expert_for, known_in, restarted
+from finssim.tasks.agents import NOWHERE, agent_for, expert_for, known_in, restarted
 from finssim.tasks.observer import Observer
 from reference.guess import Guess
 from reference.policies import FINSROV, written

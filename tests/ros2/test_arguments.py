@@ -5,10 +5,16 @@ import re
 
 import pytest
 
-from finssim.ros2.shim.arguments import parse_arguments
+from finssim.ros2.shim.arguments import (
+    Remap,
+    expanded,
+    overrides_for,
+    parse_arguments,
+    parsed_value,
+    read_parameters,
+    remapped,
+)
 from finssim.ros2.shim.exceptions import InvalidTopicNameException, RosArgumentsError
-from finssim.ros2.shim.names import Remap, expanded, remapped
-from finssim.ros2.shim.parameter_files import overrides_for, parsed_value, read_parameters
 
 FILE = """
 /**:

@@ -55,7 +55,7 @@ def told(graph, tmp_path, **choices):
         ("pool", {}, "virtual_pool", {"plant": "1", "severity": "realistic", "camera": "pictures"}),
         ("pool", {"severity": "hard", "camera": "corners"}, "virtual_pool", {"severity": "hard"}),
         ("pool", {"plant": "7", "truth": Path("t.fst")}, "virtual_pool", {"plant": "7", "truth": "t.fst"}),
-        ("pool", {"port": 6000}, "hardware_bridge", {"robot": "udp://127.0.0.1:6000"}),
+        ("pool", {"port": 6000}, "**", {"robot": "udp://127.0.0.1:6000"}),
         ("pool", {"port": 6000}, "camera", {"pictures": "udp://127.0.0.1:6001", "pool_file": str(FILE)}),
         ("pool", {"bind": "127.0.0.1:7000"}, "camera", {"pictures_bind": "127.0.0.1:7001"}),
         ("pool", {"bind": "127.0.0.1:7000"}, "virtual_pool", {"bind": "127.0.0.1:7000"}),
@@ -65,7 +65,7 @@ def told(graph, tmp_path, **choices):
         (
             "robot",
             {"robot": "serial:/dev/x", "pool_file": FILE},
-            "hardware_bridge",
+            "**",
             {"robot": "serial:/dev/x"},
         ),
         ("robot", {"site": "open-water"}, "state_estimation", {"pool_file": "none"}),

@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from finssim.ros2.definitions import INTERFACES
+from finssim.ros2.codec import INTERFACES
 from finssim.ros2.graphs import NODES as GRAPH_NODES
-from finssim.ros2.shim.arguments import parse_arguments
-from finssim.ros2.shim.parameter_files import overrides_for
+from finssim.ros2.shim.arguments import overrides_for, parse_arguments
 from finssim.ros2.topics import SERVICES, TOPICS
 from finssim.vehicles.loader import catalogue
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
-from finssim.ros2.urdf import mounts, urdf_of
+from finssim.ros2.nodes.frames import mounts, urdf_of
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.loader import catalogue
 

@@ -3,7 +3,7 @@
 import pytest
 
 from finssim.ros2.errors import Ros2Error
-from finssim.ros2.wire.settings import LOOPBACK, wire_settings
+from finssim.ros2.wire import LOOPBACK, wire_settings
 
 
 def test_without_a_word_it_is_the_loopback():

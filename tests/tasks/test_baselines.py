@@ -128,7 +128,7 @@ def test_an_acceleration_is_read_from_where_a_reference_will_be():
 
 
 def test_memories_start_over_row_by_row():
-    """Rows of the mask are new, the others stay, in tuples and dataclasses; nothing is changed in place."""
+    """Rows of the mask are new, the others stay, in tuples; nothing is changed in place."""
     old = (np.ones(3), PidMemory(np.full((3, 3), 2.0), np.full((3, 3), 3.0)), None)
     fresh = (np.zeros(3), PidMemory(np.zeros((3, 3)), np.zeros((3, 3))), None)
     heading, pid, nothing = restarted(old, fresh, np.array([False, True, False]))

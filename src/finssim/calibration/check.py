@@ -18,14 +18,16 @@ from finssim.calibration.findings import SEVERITIES, Finding, finding, plain
 from finssim.calibration.motion.signals import (
     AttitudeSignal,
     Motion,
+    Offset,
     attitude_samples,
     attitude_signal,
     holds_gravity,
     motion,
+    on_grid,
+    stream_offsets,
     up_in_body,
 )
 from finssim.calibration.motion.smoothing import longest_step
-from finssim.calibration.motion.synchronisation import Offset, on_grid, stream_offsets
 from finssim.calibration.trials.inputs import Drive, drive, implausible
 from finssim.calibration.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
 from finssim.calibration.trials.trial_files import load_trial, trials_at
@@ -34,8 +36,6 @@ from finssim.vehicles import AXES, Vehicle, VehicleError, load_vehicle
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-__all__ = ["as_object", "check", "check_trials", "print_reports", "together"]
 
 # What holds between the trials of a set: vehicles, roles, names, what all of them tell together.
 

@@ -12,8 +12,6 @@ from typing import Any, Literal
 
 import yaml
 
-__all__ = ["Finding", "finding", "plain", "sentences", "wordings"]
-
 Severity = Literal["refused", "care", "note"]
 """What a finding makes of a trial or fit: nothing can rest on it; something may not; worth knowing."""
 

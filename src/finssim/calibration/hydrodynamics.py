@@ -25,8 +25,6 @@ from finssim.calibration.trials.inputs import drive
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle
 
-__all__ = ["fit_hydrodynamics", "scaled"]
-
 METHODS = ("auto", "regression", "simulation")
 
 ENOUGH = 0.03

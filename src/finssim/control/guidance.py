@@ -20,23 +20,6 @@ from finssim.geometry.rotations import (
     wrap_angle,
 )
 
-__all__ = [
-    "Controller",
-    "Goal",
-    "Guide",
-    "Known",
-    "Measured",
-    "Reference",
-    "Station",
-    "Track",
-    "TrackingError",
-    "acceleration_at",
-    "goal_at",
-    "tracking_error",
-    "velocity_at",
-]
-
-
 # What every pose controller is given and how far it is from its goal; the interface controllers share.
 
 

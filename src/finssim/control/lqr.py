@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +25,7 @@ SLOWEST_LAG = 0.02
 """Time constant of thrusters that have none in the file [s]."""
 
 
-@dataclass(frozen=True)
-class LqrMemory:
+class LqrMemory(NamedTuple):
     """What the controller remembers between two commands; n vehicles where they are a batch."""
 
     force: Array

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -32,8 +32,7 @@ ITERATIONS = 30
 """Of the solver, at most: a solution is good enough to act on long before."""
 
 
-@dataclass(frozen=True)
-class NmpcMemory:
+class NmpcMemory(NamedTuple):
     """What the controller remembers between two commands; n vehicles where they are a batch."""
 
     force: Array
@@ -131,16 +130,13 @@ class Nmpc:
         ]
         if not all(np.isfinite(x).all() for x in rows):
             raise ControlError("a state or a goal that is not finite cannot be planned with")
-        memories = [
-            x.reshape(len(rows[0]), *x.shape[len(shape) :])
-            for x in (memory.force, memory.moment, memory.predicted, memory.thrust, memory.queue, memory.plan)
-        ]
+        memories = [x.reshape(len(rows[0]), *x.shape[len(shape) :]) for x in memory]
         results = [
             self._one(NmpcMemory(*(x[i] for x in memories)), *(x[i] for x in rows))
             for i in range(len(rows[0]))
         ]
         tau = np.reshape([wrench for wrench, _ in results], (*shape, 6))
-        after = (np.stack([vars(one)[name] for _, one in results]) for name in vars(memory))
+        after = map(np.stack, zip(*(one for _, one in results), strict=True))
         return tau, NmpcMemory(*(x.reshape(*shape, *x.shape[1:]) for x in after))
 
     def _one(

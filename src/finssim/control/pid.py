@@ -17,21 +17,6 @@ from finssim.geometry.rotations import cross, quat_inverse_rotate, quat_rotate, 
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.body import moved_to_origin
 
-__all__ = [
-    "PAPER_PROFILE",
-    "TRAJECTORY_PROFILE",
-    "AxisModel",
-    "Gains",
-    "PaperMemory",
-    "PaperPid",
-    "PaperProfile",
-    "Pid",
-    "PidMemory",
-    "axis_model",
-    "place_poles",
-]
-
-
 # PID gains that put the poles of an identified axis where they are wanted, the actuators' lag included.
 
 
@@ -188,8 +173,7 @@ INTEGRAL_SHARE = 0.5
 """Largest integral, as a part of the wrench limit."""
 
 
-@dataclass(frozen=True)
-class PidMemory:
+class PidMemory(NamedTuple):
     """What the controller remembers between two commands."""
 
     force: Array
@@ -398,8 +382,7 @@ are then 0.12 to 0.19 m, near the published 0.17 to 0.21 m; with 7 N they would 
 """
 
 
-@dataclass(frozen=True)
-class PaperMemory:
+class PaperMemory(NamedTuple):
     """What the controller remembers, order depth, surge, sway, yaw [m, deg]."""
 
     integral: Array

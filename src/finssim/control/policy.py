@@ -19,23 +19,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from finssim.yaml_file import first_problem, read_mapping
 
-__all__ = [
-    "DESCRIPTION_FILE",
-    "FORMAT",
-    "NETWORK_FILE",
-    "ObservationEntry",
-    "ObservationSchema",
-    "Policy",
-    "PolicyDescription",
-    "PolicyError",
-    "VehicleIdentity",
-    "first_difference",
-    "plain_data",
-    "read_description",
-    "read_file",
-]
-
-
 # What a policy directory says of itself: `policy.yaml`, its schema and how two of them are compared.
 
 

@@ -20,26 +20,6 @@ from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import room
 from finssim.yaml_file import read_mapping
 
-__all__ = [
-    "PUBLISHED_LIMITS",
-    "SHAPES",
-    "TRAJECTORIES",
-    "Limits",
-    "Motion",
-    "Trajectory",
-    "check_limits",
-    "check_vehicle",
-    "circle",
-    "ellipse",
-    "gerono",
-    "helix",
-    "load_trajectory",
-    "polyline",
-    "read_trajectory",
-    "through_points",
-]
-
-
 # Shapes that a trajectory can follow: position and its exact derivative as functions of time.
 #
 # A shape lies in the horizontal plane z = `depth` (negative under water) unless it says otherwise. In the paper's

@@ -17,11 +17,6 @@ from pydantic import (
     model_validator,
 )
 
-__all__ = [
-    "KINDS", "Above0", "Distribution", "Drawn", "Interval", "Part", "Scale", "Share", "bounds_of", "checked",
-    "distribution_of", "sentence", "unknown",
-]  # fmt: skip
-
 KINDS = ("uniform", "log_uniform", "normal", "choice")
 
 MOST_CHOICES = 32

@@ -20,19 +20,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-__all__ = [
-    "LANES",
-    "LaneError",
-    "Loop",
-    "NumberArray",
-    "StructArray",
-    "Trace",
-    "UniformStruct",
-    "VectorArray",
-    "block_source",
-    "lane_function",
-]
-
 LANES = 8
 """Worlds in a block."""
 

@@ -12,11 +12,6 @@ from finssim.engine.ranges_file import AXES, MOST_WAVES, EachScales, Offsets, Ra
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.vehicles.terms import Term
 
-__all__ = [
-    "ENTRIES", "INDEX", "TETHER", "WORLD", "WORLD_END", "Entry", "added_entry", "check_correlated", "drawn_entries",
-    "term_entries", "varies",
-]  # fmt: skip
-
 TURN = Distribution(uniform=(0.0, 6.2831853))
 ALWAYS_FIRST = 0.999
 """A count is the whole part of a number that reaches this far beyond the largest."""

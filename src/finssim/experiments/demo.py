@@ -8,7 +8,7 @@ import shutil
 import sys
 import time
 import webbrowser
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from html import escape
@@ -19,10 +19,15 @@ from typing import Annotated, Any
 import numpy as np
 from rich.console import Console
 
-from finssim.calibration.excitation.programmes import RATE, Programme, programmes, which_axes
-from finssim.calibration.findings import sentences
-from finssim.calibration.output.calibrate import number_in
-from finssim.calibration.output.report import interval_text, number_text, state_text
+from finssim.calibration.excitation.programmes import RATE, STEADY, Programme, programmes, which_axes
+from finssim.calibration.findings import Finding, sentences
+from finssim.calibration.fit import Fit
+from finssim.calibration.output.calibrate import all_findings, calibrated, number_in
+from finssim.calibration.output.report import interval_text, number_text, state_text, write_report
+from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.regression.regress import regress
+from finssim.calibration.replay.replay import Replay, replay
+from finssim.calibration.replay.report import draw_response_envelopes
 from finssim.calibration.trials.trial import Trial
 from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy
@@ -39,7 +44,6 @@ from finssim.experiments.figures import (
     new_figure,
     save_figure,
 )
-from finssim.experiments.identify import HELD_OUT, TRIALS, Identification, commands, identify, vehicle_files
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row
 from finssim.experiments.on_robot import Attendant, OnRobot, kept_folder
 from finssim.experiments.pool_trial import (
@@ -60,7 +64,7 @@ from finssim.page import html_page
 from finssim.pool import draw_plant
 from finssim.pool.draw_plant import site_of
 from finssim.quiet import start_warp
-from finssim.vehicles import AXES, Vehicle, load_vehicle
+from finssim.vehicles import AXES, Provenance, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed
 from finssim.vehicles.defaults import SITES, room
 
@@ -70,8 +74,6 @@ SHARE = 0.9
 """Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""
 BALLASTED = 0.25
 """Weight less buoyancy of a vehicle that floats well enough by itself [N]."""
-STEADY = 0.8
-"""Fastest surge and sway, part of `level_speed` [-]."""
 
 
 def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str, list[float]]:
@@ -178,6 +180,127 @@ def _shuttle(axis: str, level: float, period: float) -> Programme:
         tau_desired=tau,
         phase=phase,
     )
+
+
+# A vehicle nobody measured, trials, and what they make identifiable.
+
+
+TRIALS = "trials"
+SET = "hydrodynamics.calibrated"
+
+HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [7.0], "yaw": [1.0]}
+"""Levels that no trial of the fit has [N, N m]."""
+
+Record = Callable[[Path, Path, int], dict[str, list[Trial]]]
+"""Makes trials: folder that takes ROLE/NAME, file of the rough vehicle, seed -> trials by role (fit, held-out)."""
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What the trials told."""
+
+    vehicle: Vehicle
+    """As read back from its file."""
+    fit: Fit
+    replay: Replay
+    """On the held-out trials, of the identified vehicle."""
+    truth: Vehicle
+    """The vehicle of the catalogue that made the trials, or around which the pool's own was drawn."""
+    findings: tuple[Finding, ...]
+    seconds: float
+
+
+def rough_vehicle(truth: Vehicle) -> Vehicle:
+    """What one knows of a vehicle before any trial: weighed, measured out, thrusters from a bench.
+
+    Its hydrodynamics are guesses: added mass of half the displaced water on every linear axis, damping of the order of
+    other small vehicles, forces growing with the square of the length, moments with its fourth power and moments of
+    inertia with its fifth. Moments are guessed low: a controller that counts on damping which is not there rings.
+    """
+    half = 0.5 * truth.water.density * truth.body.displaced_volume
+    size = room(truth.body.size)
+    force, moment, inertia = size**2, size**4, 0.1 * size**5
+    guess = {
+        f"{SET}.added_mass": [half, half, half, inertia, inertia, inertia],
+        f"{SET}.linear_damping": [20.0 * force] * 3 + [0.5 * moment] * 3,
+        f"{SET}.quadratic_damping": [50.0 * force] * 3 + [moment] * 3,
+    }
+    origin = Provenance("guessed", "", "the order of other small vehicles, before any trial")
+    words = "Hydrodynamics are guesses; the rest is the catalogue's."
+    return _named(truth.replace(guess, origin), f"{truth.name} before any trial", words)
+
+
+def _named(vehicle: Vehicle, title: str, description: str) -> Vehicle:
+    """The same vehicle under words of its own."""
+    return vehicle.model_copy(update={"title": title, "description": description})
+
+
+def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record) -> Identification:
+    """Make trials of a vehicle, identify it from some, replay the others; write all of it.
+
+    Into the folder go `NAME_rough.yaml` (the vehicle before), `trials/fit` and `trials/held-out`,
+    `NAME_identified.yaml`, `calibration` (the report), and `replay.json` with `replay.png`.
+
+    Args:
+        folder: Existing directory.
+        name: Name or file of a vehicle.
+        seed: Of initial conditions and noise of the trials.
+        shown: Name of the folder in the report.
+        record: Makes the trials.
+
+    Returns:
+        What was found.
+    """
+    began = time.perf_counter()
+    truth = load_vehicle(name)
+    name = truth.name
+    start_file, vehicle_file = vehicle_files(name)
+    write_vehicle(rough_vehicle(truth), folder / start_file)
+    recorded = record(folder / TRIALS, folder / start_file, seed)
+    fit = regress(recorded["fit"], load_vehicle(folder / start_file), seed=seed)
+    found = calibrated(fit)
+    findings = tuple(all_findings(fit, found))
+    found = _named(
+        found, f"{name} as identified", "Hydrodynamics from trials where they tell it, else guesses."
+    )
+    write_vehicle(found, folder / vehicle_file)
+    vehicle = load_vehicle(folder / vehicle_file)
+    write_report(
+        fit,
+        folder / "calibration",
+        vehicle,
+        command=commands(shown, name, seed)[1],
+        findings=findings,
+        out=shown / vehicle_file,
+    )
+    scored = replay(recorded["held-out"], vehicle, seed=seed)
+    text = json.dumps(scored.as_json(), indent=2, allow_nan=False) + "\n"
+    (folder / "replay.json").write_text(text, encoding="utf-8")
+    save_figure(draw_response_envelopes(scored.pairs), folder / "replay.png")
+    return Identification(
+        vehicle=vehicle,
+        fit=fit,
+        replay=scored,
+        truth=truth,
+        findings=findings,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def vehicle_files(name: str) -> tuple[str, str]:
+    """Names of the vehicle's files before and after."""
+    return f"{name}_rough.yaml", f"{name}_identified.yaml"
+
+
+def commands(place: Path, name: str, seed: int) -> list[str]:
+    """Command lines that identify and replay from the trials again."""
+    start, vehicle = (place / file for file in vehicle_files(name))
+    trials = place / TRIALS
+    return [
+        f"finssim trials check {trials / 'fit'} --vehicle {start}",
+        f"finssim calibrate hydrodynamics {trials / 'fit'} --vehicle {start} --out {vehicle} --seed {seed}",
+        f"finssim replay {trials / 'held-out'} --vehicle {vehicle}",
+    ]
 
 
 BLUE, ORANGE = COLORS[:2]

@@ -16,7 +16,6 @@ from finssim.experiments import campaign
 from finssim.experiments.campaign import progress_bar, write_json
 from finssim.experiments.figures import (
     draw_envelopes,
-    draw_episodes,
     draw_tracking,
     error_envelope,
     save_figure,
@@ -46,19 +45,6 @@ from finssim.quiet import start_warp
 from finssim.tasks import task_named
 from finssim.tasks.agents import agent_for
 from finssim.vehicles import Vehicle, load_vehicle
-
-__all__ = [
-    "CAPTION",
-    "T1_COLUMNS",
-    "Evaluation",
-    "EvaluationError",
-    "by_target",
-    "cells",
-    "comparison_table",
-    "evaluate",
-    "evaluate_controller",
-    "tables_of",
-]
 
 EVALUATION_FILE = "evaluation.json"
 TRAJECTORIES = "trajectories"
@@ -293,7 +279,7 @@ def evaluate(
         truth (TABLE): By which records are measured, in place of the robot's own estimate: a table (.csv, .parquet) of
             motion capture, t [s], x, y, z [m] and qx, qy, qz, qw or yaw [rad], or the truth file of finssim pool.
         seed: Seed of every random number; equal seeds give equal results.
-        out: Directory for evaluation.json, the figure and trajectories.
+        out: Directory for evaluation.json, trajectories and, of t1 and t2, a figure.
         json: Print one JSON object instead of tables.
         console: Where the table goes; standard output if None.
 
@@ -338,9 +324,6 @@ def evaluate(
                 form = FORMS[task]
                 figure = form.draw({e.label: e.trials for e in evaluations}, title)
                 save_figure(figure, folder / form.figure)
-            else:
-                runs = {e.label: e.result["per_trial"] for e in evaluations}
-                save_figure(draw_episodes(runs, title), folder / "episodes.png")
     if as_json:
         print(json.dumps(document, allow_nan=False))
         return evaluations

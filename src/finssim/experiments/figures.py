@@ -19,7 +19,7 @@ from finssim.experiments.metrics import (
     pose_error,
     resample,
 )
-from finssim.experiments.trials import LABELS, Trial
+from finssim.experiments.trials import Trial
 from finssim.files import atomic_write
 
 Array = NDArray[np.float64]
@@ -197,33 +197,4 @@ def draw_tracking(runs: Mapping[str, Sequence[Trial]], title: str = "") -> Any:
         beside.set_ylim(bottom=0.0)
         clean(above, beside)
     legend_below(figure, rows[0][0], 4)
-    return figure
-
-
-def draw_episodes(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str = "") -> Any:
-    """The figure: for each measure, every episode as a point, a column for each plant, the mean as a bar.
-
-    Args:
-        runs: Label of a column -> measures of its episodes.
-        title: Written above, or left out when empty.
-    """
-    names = [name for name in next(iter(runs.values()))[0] if name not in LABELS]
-    columns = min(len(names), 4)
-    rows = -(-len(names) // columns)
-    figure = new_figure(2.6 * columns, 2.4 * rows, title)
-    rng = np.random.default_rng(0)
-    for k, name in enumerate(names):
-        axes = figure.add_subplot(rows, columns, k + 1)
-        for i, episodes in enumerate(runs.values()):
-            values = [episode[name] for episode in episodes if episode[name] is not None]
-            color = COLORS[i % len(COLORS)]
-            axes.plot(
-                i + rng.uniform(-0.3, 0.3, len(values)), values, ".", color=color, alpha=0.5, markersize=4
-            )
-            if values:
-                axes.hlines(np.mean(values), i - 0.4, i + 0.4, color=color, linewidth=2)
-        clean(axes)
-        axes.set_title(name, fontsize=9)
-        axes.set_xticks(range(len(runs)), list(runs), fontsize=7, rotation=20)
-        axes.set_xlim(-0.6, len(runs) - 0.4)
     return figure

@@ -13,8 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.vision.pool_command import pool_record
-from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
+from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool, pool_record
 from finssim.calibration.vision.pool_model import Settings
 from finssim.calibration.vision.survey import Observations, observe, read_survey
 from finssim.experiments.campaign import Progress, check_choices, write_json

@@ -26,26 +26,6 @@ from finssim.geometry.rotations import quat_rotate
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = [
-    "ERRORS",
-    "EVALUATION_WINDOW",
-    "PAPER_T2",
-    "POSITION_TOLERANCE",
-    "T1_SETPOINTS",
-    "T1_START",
-    "YAW_TOLERANCE",
-    "in_room",
-    "measure_tracking",
-    "measure_trial",
-    "paper_row",
-    "paper_t2_row",
-    "pose_error",
-    "resample",
-    "summarize",
-    "summarize_tracking",
-]
-
-
 # What the paper has: its eight setpoints and the start of T1 in our frames, and its results on its real vehicle.
 
 

@@ -18,8 +18,6 @@ from finssim.tasks.sensing import seen_with
 from finssim.vehicles import Vehicle
 from finssim.yaml_file import first_problem, read_mapping
 
-__all__ = ["Plant", "PlantError", "load_plant"]
-
 SHIPPED = Path(__file__).parent / "plants"
 
 LONGEST_LAG = 5.0

@@ -50,18 +50,6 @@ from finssim.tasks.agents import agent_for
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import room, vehicle_at
 
-__all__ = [
-    "HARDWARE",
-    "Job",
-    "noise_seed",
-    "play",
-    "play_in_pool",
-    "played_trial",
-    "pool_evaluation",
-    "run_on_robot",
-]
-
-
 HARDWARE = "hardware"
 """In place of the severity of a pool, and of what its camera sends."""
 

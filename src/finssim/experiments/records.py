@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.trials.trial_files import read_table
-from finssim.control.ardusub import Mixer
-from finssim.control.guidance import Guide, Reference, Station, Track
-from finssim.control.modes import AXES, ActionMode, action_mode
-from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory
+from finssim.control.ardusub import Mixer, dead_band
+from finssim.control.guidance import Guide, Station, Track
+from finssim.control.modes import AXES, QUIET, ActionMode, action_mode
+from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, Trajectory, load_trajectory
 from finssim.experiments.campaign import Progress
 from finssim.experiments.metrics import MAX_GAP, T1_SETPOINTS, in_room
 from finssim.experiments.tables import Table
-from finssim.experiments.trials import DURATION, Motion, Trial, follows, localization_errors
+from finssim.experiments.trials import DURATION, Motion, Trial, follows, interpolated, localization_errors
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.learning.demonstrations import Episode, about, found_in, save
 from finssim.learning.demonstrations import collect as collect_episodes
@@ -230,7 +230,12 @@ def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[
         lower, upper = vehicle.force_limits
         full = np.where(f >= 0.0, upper, -lower)
         parts = np.divide(f, full, out=np.zeros_like(f), where=full > 0.0)
-    action = np.clip(parts @ np.linalg.pinv(mode.columns), -1.0, 1.0)
+    action = parts @ np.linalg.pinv(mode.columns)
+    if mode.pilot:  # back from past the motors' dead band, as `past_dead_band` has it
+        dead, size = dead_band(vehicle), np.abs(action)
+        beyond = QUIET + (1.0 - QUIET) * (size - dead) / (1.0 - dead)
+        action = np.sign(action) * np.where(size <= dead, size * QUIET / dead, beyond)
+    action = np.clip(action, -1.0, 1.0)
     # Compare the wrench that the actions would give with the one that was commanded.
     limits = np.asarray(vehicle.wrench_limits, float)
     off = np.abs((mode.to_thrusters(action) - f) @ vehicle.control_matrix.T)
@@ -428,7 +433,7 @@ def collect(
         episodes: How many; each agent's is one of its own. Not of records.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        action: What is commanded: wrench6, wrench4 or thruster8; the task's own if not given.
+        action: What is commanded: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
         randomize (FILE): Ranges that vehicle and water are drawn from, by name or file.
         observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
             through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
@@ -663,11 +668,13 @@ def read_record(
         raise DriveError(
             f"{path}: does not tell what the pilot did, in [-1, 1], which '{task}' scores: record a run of this version"
         )
+    longest = {"t1": duration, "t2": math.inf}.get(task, fitted.time_limit)
     if follows(fitted):
         the_guide = guide or trajectory_of(drive, vehicle)
     else:
-        the_guide = GoalHistory.of(drive, steered) if fitted.moving else _station(drive, steered, task)
-    longest = {"t1": duration, "t2": math.inf}.get(task, fitted.time_limit)
+        the_guide = (
+            _goal_history(drive, steered, longest) if fitted.moving else _station(drive, steered, task)
+        )
     full = min(the_guide.duration, longest)
     estimate = drive.motion.between(steered & (t >= 0.0) & (t <= full + 1e-6))
     stopped = float(estimate.t[-1]) < full - EARLY
@@ -686,35 +693,21 @@ def read_record(
     )
 
 
-@dataclass(frozen=True)
-class GoalHistory:
-    """Where a moving goal was, as the record has it; it is a guide."""
+def _goal_history(drive: Drive, steered: NDArray[np.bool_], duration: float) -> Trajectory:
+    """Where a moving goal was, as the record has it; held after its end, up to a time [s].
 
-    t: Array
-    """Time since the start [s], (T,)."""
-    goal: Array
-    """x, y, z [m] and yaw without jumps [rad], world frame, (T, 4)."""
-    name: str = "recorded"
-    duration: float = math.inf
-
-    @classmethod
-    def of(cls, drive: Drive, steered: NDArray[np.bool_]) -> GoalHistory:
-        """Of what was done.
-
-        Raises:
-            DriveError: There was no goal.
-        """
-        goals, rows = _goals(drive, steered), steered & (drive.motion.t >= 0.0)
-        return cls(drive.motion.t[rows], np.column_stack([goals[:, :3], np.unwrap(goals[:, 3])]))
-
-    def at(self, t: ArrayLike) -> Reference:
-        """The goal between the decisions."""
-        rates = np.gradient(self.goal, self.t, axis=0) if len(self.t) > 1 else np.zeros_like(self.goal)
-        pose, rate = (
-            np.stack([np.interp(np.asarray(t, float), self.t, column) for column in rows.T], axis=-1)
-            for rows in (self.goal, rates)
-        )
-        return Reference(pose[..., :3], rate[..., :3], pose[..., 3], rate[..., 3])
+    Raises:
+        DriveError: There was no goal.
+    """
+    goals, t = _goals(drive, steered), drive.motion.t[steered & (drive.motion.t >= 0.0)]
+    place, yaw = goals[:, :3], np.unwrap(goals[:, 3])
+    rates = np.gradient(place, t, axis=0) if len(t) > 1 else np.zeros_like(place)
+    return Trajectory(
+        name="recorded",
+        duration=duration,
+        motion=lambda at: (interpolated(at, t, place), interpolated(at, t, rates)),
+        turning=lambda at: np.interp(at, t, yaw),
+    )
 
 
 def _goals(drive: Drive, steered: NDArray[np.bool_]) -> Array:

@@ -172,7 +172,7 @@ def tasks_show(task: str, *, vehicle: str = "finsrov", action: str | None = None
     Args:
         task (NAME|FILE.py:CLASS): Task, or one's own as FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        action (MODE): wrench6, wrench4 or thruster8; the task's own if not given.
+        action (MODE): wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
 
     Raises:
         EnvironmentSetupError, ControlError, VehicleError: As `describe_task`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,14 +11,12 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from finssim.calibration.output.ranges import write_ranges
 from finssim.control.controllers import COSTLY
 from finssim.control.policy import Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.campaign import Progress, check_choices, run_jobs, write_json
 from finssim.experiments.evaluate import T1_COLUMNS, cells
 from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
-from finssim.experiments.identify import identify
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row, paper_t2_row
 from finssim.experiments.on_robot import Attendant, OnRobot
 from finssim.experiments.pool_trial import (
@@ -33,7 +31,6 @@ from finssim.experiments.pool_trial import (
 from finssim.experiments.statistics import Interval, Statistic, paired_difference, with_interval
 from finssim.experiments.tables import Table, figure_text
 from finssim.experiments.trials import T2_TRAJECTORIES
-from finssim.files import atomic_directory
 from finssim.learning.train import train
 from finssim.provenance import provenance
 from finssim.vehicles import Vehicle, load_vehicle
@@ -43,9 +40,6 @@ Results = Mapping[str, Sequence[Mapping[str, Any]]]
 
 TRAINING_SHARE = 0.4
 """Of the progress bar."""
-INTERVALS = "intervals"
-"""Stands for the ranges that the calibration's intervals give."""
-RANGES_FILE = "ranges.yaml"
 DIFFERENCES_NOTE = (
     "Each figure is the mean of row less reference, over pairs of trials with the same pool, seed and target; in "
     "brackets 95 % from a bootstrap of plants and seeds. paper: the difference of its rows, on hardware, single runs."
@@ -311,14 +305,6 @@ def controllers_of(
         folder: Of the experiment.
     """
     trainings = list(dict.fromkeys(row.training for row in rows.values() if row.training))
-    if any(training.randomize == INTERVALS for training in trainings):
-        progress(0.0, "identifying the vehicle, for the ranges of its intervals")
-        ranges = folder / "identification" / RANGES_FILE
-        if not ranges.is_file():
-            with atomic_directory(ranges.parent, replaces=RANGES_FILE) as place:
-                found = identify(place, vehicle, seed=seeds[0], shown=ranges.parent)
-                write_ranges(found.fit, place / RANGES_FILE, found.vehicle)
-        trainings = [replace(t, randomize=str(ranges)) if t.randomize == INTERVALS else t for t in trainings]
     policies = trained(
         trainings, seeds, folder / "policies", vehicle=vehicle, steps=steps, action=action, progress=progress
     )

@@ -43,22 +43,6 @@ from finssim.tasks.agents import NOWHERE, Agent, rollout
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = [
-    "DURATION",
-    "EPISODES",
-    "PERIOD",
-    "T2_TRAJECTORIES",
-    "EpisodeError",
-    "Motion",
-    "Trial",
-    "follows",
-    "guide_of",
-    "localization_errors",
-    "run_episodes",
-    "run_trials",
-    "summarize_episodes",
-]
-
 Array = NDArray[np.float64]
 Show = Callable[[float], None]
 
@@ -108,7 +92,7 @@ class Motion:
         over a `PERIOD` to either side."""
         position, quaternion = self._pose(t)
         if self.nu is not None:
-            return Track(position, quaternion, _interpolated(t, self.t, self.nu))
+            return Track(position, quaternion, interpolated(t, self.t, self.nu))
         first, last = max(t - PERIOD, float(self.t[0])), min(t + PERIOD, float(self.t[-1]))
         (from_position, from_attitude), (to_position, to_attitude) = self._pose(first), self._pose(last)
         turn = quat_to_rotvec(quat_multiply(quat_conjugate(from_attitude), to_attitude))
@@ -125,8 +109,8 @@ class Motion:
     def _pose(self, t: float) -> tuple[Array, Array]:
         opposite = np.sum(self.quaternion[1:] * self.quaternion[:-1], axis=1) < 0.0
         signs = np.cumprod(np.where(np.concatenate([[False], opposite]), -1.0, 1.0))
-        q = _interpolated(t, self.t, self.quaternion * signs[:, None])
-        return _interpolated(t, self.t, self.position), q / np.linalg.norm(q)
+        q = interpolated(t, self.t, self.quaternion * signs[:, None])
+        return interpolated(t, self.t, self.position), q / np.linalg.norm(q)
 
     def write(self, path: Path) -> None:
         """Write PATH.npz."""
@@ -141,7 +125,7 @@ class Motion:
             return cls(**{field.name: file[field.name] for field in fields(cls) if field.name in file.files})
 
 
-def _interpolated(t: ArrayLike, times: Array, columns: Array) -> Array:
+def interpolated(t: ArrayLike, times: Array, columns: Array) -> Array:
     """Columns (T, n) between their times (T,), at one time (n,) or at several (k, n)."""
     return np.stack([np.interp(t, times, column) for column in columns.T], axis=-1)
 
@@ -153,7 +137,7 @@ def localization_errors(truth: Motion, estimate: Motion) -> dict[str, float] | N
     inside &= np.isfinite(estimate.position).all(axis=1)
     if not inside.any():
         return None
-    error = estimate.position[inside] - _interpolated(t[inside], truth.t, truth.position)
+    error = estimate.position[inside] - interpolated(t[inside], truth.t, truth.position)
     turn = wrap_angle(estimate.yaw[inside] - np.interp(t[inside], truth.t, np.unwrap(truth.yaw)))
     return {
         "position_m": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),

@@ -27,26 +27,6 @@ from finssim.geometry.rotations import (
     quat_to_matrix,
 )
 
-__all__ = [
-    "FROM_CONTROLLER",
-    "FROM_FOSSEN",
-    "FROM_OPTICAL",
-    "TO_CONTROLLER",
-    "TO_FOSSEN",
-    "TO_OPTICAL",
-    "Axes",
-    "acceleration_from_mujoco",
-    "camera_from_optical",
-    "mujoco_acceleration",
-    "mujoco_inertia",
-    "mujoco_velocity",
-    "optical_from_camera",
-    "velocity_from_mujoco",
-    "wrench_from_mujoco",
-    "wxyz_from_xyzw",
-    "xyzw_from_wxyz",
-]
-
 Array = npt.NDArray[np.float64]
 
 

@@ -13,19 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "MeshError",
-    "check_closed",
-    "face_geometry",
-    "load_stl",
-    "mesh_centroid",
-    "mesh_second_moment",
-    "mesh_volume",
-    "outward",
-    "parametric_hull",
-    "write_stl",
-]
-
 # Hull shapes in the cube [-1, 1]³: ellipsoid, tube, rounded box, and the open frame of a small ROV.
 
 _ROUND = 0.5  # reciprocal exponent of a circle

@@ -12,24 +12,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-__all__ = [
-    "cross",
-    "matrix_to_quat",
-    "quat_conjugate",
-    "quat_from_euler",
-    "quat_from_rotvec",
-    "quat_from_yaw",
-    "quat_inverse_rotate",
-    "quat_multiply",
-    "quat_rotate",
-    "quat_to_euler",
-    "quat_to_matrix",
-    "quat_to_rotvec",
-    "quat_yaw",
-    "skew",
-    "wrap_angle",
-]
-
 Array = npt.NDArray[np.float64]
 
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])

@@ -11,27 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.control.guidance import Known
 from finssim.control.modes import action_mode
 from finssim.control.policy import plain_data
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.provenance import provenance
 from finssim.tasks import Environment, make
-from finssim.tasks.agents import NOWHERE, Agent, Known, expert_for, restarted
+from finssim.tasks.agents import NOWHERE, Agent, expert_for, restarted
 from finssim.yaml_file import json_value
-
-__all__ = [
-    "DATASET_FILE",
-    "DatasetError",
-    "Demonstrations",
-    "Episode",
-    "about",
-    "collect",
-    "found_in",
-    "load",
-    "record_episodes",
-    "save",
-]
-
 
 DATASET_FILE = "metadata.json"
 """Which marks a data set of Minari."""

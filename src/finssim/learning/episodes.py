@@ -15,9 +15,6 @@ from finssim.tasks import Environment
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.environment import GREATEST_SEED
 
-__all__ = ["EpisodeEnds", "EpisodeTally", "HELD_WORLDS", "HeldEvaluation", "held_seed"]
-
-
 # How episodes went, kept where the worlds are: on a GPU no step waits for the host.
 
 

@@ -39,16 +39,6 @@ from finssim.tasks.sensing import seen_with
 if TYPE_CHECKING:
     from torch import nn
 
-__all__ = [
-    "CURVES_FILE",
-    "EVALUATION_FILE",
-    "ExportError",
-    "description_of",
-    "export_policy",
-    "onnx_bytes",
-    "save_policy",
-    "write_graph",
-]
 
 # Networks written out as ONNX, operator by operator: layers, with what they remember in front of them or none.
 #

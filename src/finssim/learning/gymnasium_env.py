@@ -19,9 +19,6 @@ from numpy.typing import NDArray
 from finssim.learning.served import one_agent, served
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, Task
 
-__all__ = ["Env", "VectorEnv", "action_space", "observation_space"]
-
-
 # Gymnasium's spaces of an environment's observations and actions.
 
 

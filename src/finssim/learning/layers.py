@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Adam", "Arrays", "Gru", "Parameters", "Row", "Stack", "one_thread"]
-
 Array = Any
 """A NumPy array or a torch tensor, float32."""
 

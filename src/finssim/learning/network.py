@@ -9,17 +9,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = [
-    "Activation",
-    "Cell",
-    "Linear",
-    "Network",
-    "advance_history",
-    "asked",
-    "first_memory",
-    "with_integrals",
-]
-
 Array = Any
 """A NumPy array or a torch tensor."""
 

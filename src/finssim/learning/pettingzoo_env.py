@@ -13,8 +13,6 @@ from finssim.learning.gymnasium_env import action_space, observation_space
 from finssim.learning.served import served
 from finssim.tasks import Environment, EnvironmentSetupError, Task
 
-__all__ = ["PettingZooEnv"]
-
 Observation = NDArray[np.float32]
 
 

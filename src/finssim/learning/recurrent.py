@@ -10,8 +10,6 @@ from torch import nn
 
 from finssim.learning.network import Activation, Cell, Linear, Network
 
-__all__ = ["RecurrentNetwork", "plain_network", "stack"]
-
 ACTIVATIONS = {nn.Tanh: "Tanh", nn.ReLU: "Relu", nn.ELU: "Elu", nn.Identity: "Identity"}
 """Activations with one ONNX operator of the same meaning."""
 

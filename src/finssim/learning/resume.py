@@ -13,8 +13,6 @@ import numpy as np
 
 from finssim.files import OutputError
 
-__all__ = ["RESUME_FILE", "ResumeError", "random_state", "read_state", "set_random_state", "write_state"]
-
 RESUME_FILE = "resume.npz"
 
 ARRAY, TENSOR, PAIRS = "__array__", "__tensor__", "__pairs__"

@@ -13,8 +13,6 @@ from finssim.learning.served import served
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment, Task
 
-__all__ = ["RslRlVecEnv"]
-
 
 class RslRlVecEnv(VecEnv):
     """Observation groups "policy", what the agent sees, and "critic": that, and with privileged=True what was drawn.

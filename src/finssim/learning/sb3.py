@@ -14,8 +14,6 @@ from finssim.learning.gymnasium_env import action_space, observation_space
 from finssim.learning.served import age_episodes, served
 from finssim.tasks import Environment, Task
 
-__all__ = ["Sb3VecEnv"]
-
 
 class Sb3VecEnv(VecEnv):
     """One SB3 environment per agent, stepped together: a world's agents are rows one after the other, and end together.

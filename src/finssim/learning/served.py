@@ -8,8 +8,6 @@ import numpy as np
 
 from finssim.tasks import Environment, EnvironmentSetupError, Task, make
 
-__all__ = ["age_episodes", "one_agent", "served"]
-
 
 def served(
     task: str | Task | Environment, options: dict[str, Any], *, auto_reset: bool = True

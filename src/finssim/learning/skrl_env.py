@@ -15,8 +15,6 @@ from finssim.learning.served import age_episodes, served
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment, Task
 
-__all__ = ["SkrlEnv", "SkrlTeamEnv", "bootstrapping"]
-
 
 class _Worlds:
     """What both forms do with the worlds."""

@@ -7,8 +7,6 @@ import warp as wp
 
 from finssim.tasks import Environment, EnvironmentSetupError
 
-__all__ = ["Tensors"]
-
 
 class Tensors:
     """Views that the environment writes in every step; whoever keeps one over a step makes a copy.

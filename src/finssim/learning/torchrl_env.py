@@ -15,8 +15,6 @@ from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment, EnvironmentSetupError, Task
 from finssim.tasks.environment import GREATEST_SEED
 
-__all__ = ["TorchRlEnv"]
-
 
 class TorchRlEnv(EnvBase):
     """Batch size (worlds,). Keys: observation, action, reward, done, terminated, truncated.

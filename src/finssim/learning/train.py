@@ -20,8 +20,6 @@ from finssim.tasks import Environment, Task, make, task_named
 from finssim.tasks.fitting import authority
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["TrainingError", "settings_of_words", "train"]
-
 
 class TrainingError(ValueError):
     """A training that cannot be started."""
@@ -69,7 +67,7 @@ def train(
             FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        action (MODE): What the policy commands: wrench6, wrench4 or thruster8; the task's own if not given.
+        action (MODE): What the policy commands: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
         randomize (FILE): Ranges that vehicle and water are drawn from: hold_for_position, fossen_learn_to_swim,
             equivalent_box, pool, no_thruster_dynamics, or a file.
         observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,

@@ -34,9 +34,6 @@ from finssim.learning.export import export_policy, onnx_bytes
 from finssim.learning.learners import Learner, LearningError
 from finssim.learning.resume import RESUME_FILE, ResumeError, read_state, write_state
 
-__all__ = ["CHECKPOINTS", "Loop", "TrainingView", "after", "last_checkpoint"]
-
-
 # What a person sees while training: how far, how fast, how well, how long still.
 
 

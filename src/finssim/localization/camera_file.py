@@ -16,8 +16,6 @@ from finssim.geometry.optics import Lens, OpticsError
 from finssim.localization import LocalizationError
 from finssim.yaml_file import read_mapping
 
-__all__ = ["CameraFile", "Fields", "lens_from", "lens_values", "load_camera", "write_camera"]
-
 # Reading typed values out of a YAML mapping, each refusal one sentence with the place.
 
 

@@ -33,8 +33,6 @@ from finssim.provenance import provenance
 from finssim.text_table import write_csv
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["Locator", "Run", "run"]
-
 Array = npt.NDArray[np.float64]
 
 # What is known of the vehicle's height and tilt at the exposure of a picture, from files or from one number.

@@ -20,8 +20,6 @@ from finssim.localization import LocalizationError
 from finssim.localization.pool import load_pool
 from finssim.text_table import csv_text, read_text, text_table, write_csv
 
-__all__ = ["run_backproject", "run_project"]
-
 # Tables of points or pixels, one per row: named columns of numbers, and others that are carried along.
 
 _UNIT = re.compile(r"\s*(\[[^\]]*\]|\([^)]*\)|_m|_px|_pix|_pixels?|_metres|_meters)$")

@@ -20,8 +20,6 @@ from finssim.localization import LocalizationError
 from finssim.localization.camera_file import Fields, lens_from, lens_values, load_camera
 from finssim.yaml_file import read_mapping
 
-__all__ = ["Pool", "load_pool", "write_pool"]
-
 Array = npt.NDArray[np.float64]
 
 FORMAT = 1

@@ -14,8 +14,6 @@ from finssim.geometry.rotations import quat_rotate, quat_yaw
 from finssim.vehicles import Vehicle
 from finssim.yaml_file import read_mapping
 
-__all__ = ["GoalError", "HeardGoal", "check_reachable", "guide_of", "place_of", "station_of"]
-
 
 class GoalError(ValueError):
     """A goal that cannot be read or that the vehicle may not go to."""

@@ -23,23 +23,6 @@ from finssim.robot.messages import Delivery, Picture
 from finssim.robot.pictures import decode_picture, encode_picture
 from finssim.robot.runtime import Runtime
 
-__all__ = [
-    "DEFAULT_PORT",
-    "Carrier",
-    "Exchange",
-    "LockstepClient",
-    "LockstepError",
-    "decode_delivery",
-    "decode_request",
-    "encode_delivery",
-    "encode_refusal",
-    "encode_request",
-    "receive",
-    "run_lockstep",
-    "run_together",
-]
-
-
 REQUEST, DELIVERY, REFUSAL = 1, 2, 3
 LONGEST = 256 * 2**20
 """A longer message is none [bytes]."""

@@ -7,22 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-__all__ = [
-    "HEADING",
-    "POSE",
-    "POSITION",
-    "POSITION_STD",
-    "VELOCITY",
-    "YAW_STD",
-    "CommandEcho",
-    "Delivery",
-    "NavigationAid",
-    "Picture",
-    "TagCorners",
-    "Telemetry",
-    "ThrusterCommand",
-]
-
 Array = npt.NDArray[np.float64]
 
 

@@ -22,25 +22,6 @@ from finssim.robot.link.transports import UdpTransport, host_port
 from finssim.robot.messages import Picture, TagCorners
 from finssim.vehicles import Vehicle
 
-__all__ = [
-    "DEFAULT_CAMERA",
-    "DEFAULT_PICTURES",
-    "LONGEST_FRAGMENT",
-    "Assembler",
-    "NoPictures",
-    "PictureSource",
-    "Posted",
-    "TagFinder",
-    "UdpPictures",
-    "decode_picture",
-    "encode_picture",
-    "fragments",
-    "jpeg",
-    "open_pictures",
-    "picture_of",
-]
-
-
 # Pictures of a record, in JPEG.
 
 

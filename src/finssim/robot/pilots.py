@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from finssim.tasks.agents import Agent
     from finssim.tasks.observer import Observer
 
-__all__ = ["AgentPilot", "ModeSwitch", "Pilot", "WrenchPilot", "make_pilot"]
 
 Array = npt.NDArray[np.float64]
 

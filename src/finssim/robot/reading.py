@@ -10,8 +10,6 @@ import numpy.typing as npt
 
 from finssim.control.guidance import Track
 
-__all__ = ["Reading"]
-
 Array = npt.NDArray[np.float64]
 
 

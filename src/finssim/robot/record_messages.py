@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -223,12 +223,8 @@ DIAGONAL = np.diag_indices(6)
 PRESSURE_VARIANCE = (0.05 * 9.81e3) ** 2
 """Of 0.05 m of water [Pa²]: the published 0.0025 m²."""
 
-ECHO = tuple(field.name for field in fields(CommandEcho) if field.name not in ("received", "applied"))
-
 STATES = ("disarmed", "armed", "hold", "fault")
 """Words for the states of the bridge, in their order."""
-
-THRUSTER_LISTS = ("requested", "force", "achieved", "normalised", "shaft_speed")
 
 MOST = 2**32 - 1
 """Largest count of a uint32."""
@@ -290,21 +286,26 @@ class Messages:
             self.header(stamp, BASE), telemetry.pressure, PRESSURE_VARIANCE
         )
 
+    def filled(self, kind: str, stamp: int, frame: str, values: Mapping[str, Any]) -> Any:
+        """A message of ours with what there is of its fields; others are NaN, 0 or empty, by their type."""
+        fields = {name: make(values.get(name, default)) for name, make, default in fields_of(kind)}
+        return self._of[f"finssim_msgs/msg/{kind}"](header=self.header(stamp, frame), **fields)
+
     def telemetry(self, stamp: int, received: int, telemetry: Telemetry) -> Any:
         """The snapshot as it came."""
-        return self._of["finssim_msgs/msg/HardwareTelemetry"](
-            header=self.header(stamp, IMU),
-            received=self.time(received),
-            sequence=telemetry.sequence & 0xFFFF,
-            mcu_ms=telemetry.mcu_ms & 0xFFFFFFFF,
-            status_flags=telemetry.flags & 0xFFFFFFFF,
-            orientation=self.quaternion(telemetry.quaternion),
-            angular_velocity=self.vector(telemetry.gyro),
-            linear_acceleration=self.vector(telemetry.accel),
-            depth=telemetry.depth,
-            pressure=telemetry.pressure,
-            motor_rpm=floats(telemetry.motor_rpm or ()),
-        )
+        values = {
+            "received": self.time(received),
+            "sequence": telemetry.sequence & 0xFFFF,
+            "mcu_ms": telemetry.mcu_ms & 0xFFFFFFFF,
+            "status_flags": telemetry.flags & 0xFFFFFFFF,
+            "orientation": self.quaternion(telemetry.quaternion),
+            "angular_velocity": self.vector(telemetry.gyro),
+            "linear_acceleration": self.vector(telemetry.accel),
+            "depth": telemetry.depth,
+            "pressure": telemetry.pressure,
+            "motor_rpm": telemetry.motor_rpm or (),
+        }
+        return self.filled("HardwareTelemetry", stamp, IMU, values)
 
     def aid(self, stamp: int, aid: NavigationAid) -> tuple[str, Any] | None:
         """What a navigation instrument measured, with the key of its topic; None where there is no such instrument.
@@ -379,22 +380,9 @@ class Messages:
     def estimator(self, stamp: int, reading: Reading, health: Mapping[str, Any]) -> Any:
         """Whether the estimate may be acted on; what `health` does not tell is NaN, 0 or empty."""
         std = np.asarray(reading.std, float)
-        return self._of["finssim_msgs/msg/EstimatorStatus"](
-            header=self.header(stamp, MAP),
-            ready=bool(reading.ready),
-            mode=reading.mode,
-            reason=reading.reason,
-            vision_age=float(health.get("vision_age", math.nan)),
-            imu_age=float(health.get("imu_age", math.nan)),
-            depth_age=float(health.get("depth_age", math.nan)),
-            fixes_accepted=count(health.get("fixes_accepted", 0)),
-            fixes_rejected=count(health.get("fixes_rejected", 0)),
-            reject_reason=str(health.get("reject_reason", "")),
-            mahalanobis=float(health.get("mahalanobis", math.nan)),
-            position_std=std[:3].copy(),
-            velocity_std=std[3:6].copy(),
-            yaw_std=float(std[6]),
-        )
+        judged = {"position_std": std[:3], "velocity_std": std[3:6], "yaw_std": std[6]}
+        told = {"ready": reading.ready, "mode": reading.mode, "reason": reading.reason}
+        return self.filled("EstimatorStatus", stamp, MAP, {**health, **told, **judged})
 
     def goal(self, stamp: int, position: Any, yaw: float) -> Any:
         """A level pose in the map.
@@ -414,38 +402,21 @@ class Messages:
 
     def command(self, stamp: int, force: Any, source: str) -> Any:
         """Thrusts asked for, canonical order [N]."""
-        return self._of["finssim_msgs/msg/ThrusterCommand"](
-            self.header(stamp, BASE), source, self.names, floats(force)
-        )
+        values = {"source": source, "names": self.names, "force": force}
+        return self.filled("ThrusterCommand", stamp, BASE, values)
 
     def thrusters(self, stamp: int, state: str, values: Mapping[str, Any]) -> Any:
         """What the bridge made of commands."""
-        words = {name: str(values.get(name, "")) for name in ("reason", "source")}
-        lists = {name: floats(values.get(name, ())) for name in THRUSTER_LISTS}
-        return self._of["finssim_msgs/msg/ThrusterState"](
-            header=self.header(stamp, BASE), state=STATES.index(state), names=self.names, **words, **lists
-        )
+        known = {"state": STATES.index(state), "names": self.names}
+        return self.filled("ThrusterState", stamp, BASE, {**values, **known})
 
     def policy(self, stamp: int, pilot: str, values: Mapping[str, Any]) -> Any:
         """One decision of a controller."""
-        words = {name: str(values.get(name, "")) for name in ("task", "policy_sha256", "vehicle_sha256")}
-        lists = {name: floats(values.get(name, ())) for name in ("observation", "action", "force")}
-        return self._of["finssim_msgs/msg/PolicyInfo"](
-            header=self.header(stamp, BASE),
-            pilot=pilot,
-            period=float(values.get("period", math.nan)),
-            compute_time=float(values.get("compute_time", math.nan)),
-            missed=count(values.get("missed", 0)),
-            wrench=floats(values.get("wrench", (math.nan,) * 6)),
-            **words,
-            **lists,
-        )
+        return self.filled("PolicyInfo", stamp, BASE, {**values, "pilot": pilot})
 
     def echo(self, stamp: int, echo: CommandEcho) -> Any:
         """What the motor controller made of a command."""
-        given = {name: getattr(echo, name) for name in ECHO}
-        given |= {"received": floats(echo.received), "applied": floats(echo.applied)}
-        return self._of["finssim_msgs/msg/CommandEcho"](header=self.header(stamp, BASE), **given)
+        return self.filled("CommandEcho", stamp, BASE, vars(echo))
 
     def picture(self, stamp: int, jpeg: bytes) -> Any:
         """A picture in JPEG."""
@@ -502,6 +473,23 @@ class Messages:
 def count(number: Any) -> int:
     """A count as a uint32 holds it, at most `MOST`: a clock that leaps forward makes any number of turns be missed."""
     return min(int(number), MOST)
+
+
+@cache
+def fields_of(kind: str) -> list[tuple[str, Callable[[Any], Any], Any]]:
+    """Fields of a message of ours after its header: name, what makes its value, and the value where there is none."""
+    numbers = {"float64": (float, math.nan), "string": (str, ""), "bool": (bool, False)}
+    made: list[tuple[str, Callable[[Any], Any], Any]] = []
+    for name, (_, detail) in types().fielddefs[f"finssim_msgs/msg/{kind}"][1][1:]:
+        element, length = detail if isinstance(detail, tuple) else (detail, 0)
+        if isinstance(element, tuple):  # a sequence or an array
+            listed = list if element[1][0] == "string" else floats
+            made.append((name, listed, (math.nan,) * length))
+        elif isinstance(detail, tuple):
+            made.append((name, *numbers.get(element, (count, 0))))
+        else:  # a message, which is given as one
+            made.append((name, lambda value: value, None))
+    return made
 
 
 def floats(values: Any) -> npt.NDArray[np.float64]:

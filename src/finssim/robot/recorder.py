@@ -27,8 +27,6 @@ from finssim.robot.reading import Reading
 from finssim.robot.record_messages import METADATA, TOPICS, Messages, definition, offered_qos
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["RecordSink", "Recorder", "recording"]
-
 
 class _Whole:
     """A file opened without a buffer, as a stream that takes every write whole or raises."""

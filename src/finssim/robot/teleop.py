@@ -31,11 +31,6 @@ from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = [
-    "BUTTONS", "GAMEPAD_HELP", "GEARS", "KEYBOARD_HELP", "STICKS", "Device", "Gamepad", "Hands", "Keyboard", "Keys",
-    "Operator", "Pad", "TeleopCommand", "TeleopError", "drive", "run", "shaped",
-]  # fmt: skip
-
 Array = npt.NDArray[np.float64]
 
 Gear = Literal["precision", "cruise", "boost"]
@@ -506,7 +501,7 @@ def run(
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         device (NAME): What is in the hands: gamepad or keyboard.
         robot (WIRE): Wire to the motor controller: udp://HOST:PORT, serial:DEVICE, dry-run, or pool (the virtual pool
-            on this machine).
+            on this machine); or to an autopilot: mavlink or mavlink://KIND:WHERE, as of finssim run.
         bind (ADDRESS:PORT): This end of the wire, for UDP.
         pool_file (FILE): Pool file: camera, water plane and frames (.yaml); without it nobody knows the position.
         pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,

@@ -1,7 +1,5 @@
 """The errors of this layer."""
 
-__all__ = ["MessageError", "Ros2Error"]
-
 
 class Ros2Error(ValueError):
     """A setting, name or definition of ROS 2 cannot be used; the message is one sentence that says what to do."""

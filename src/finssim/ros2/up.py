@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -11,18 +14,101 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 from finssim.robot.goals import check_reachable, guide_of, place_of
-from finssim.robot.interrupt import interruptible
+from finssim.robot.interrupt import PARENT, interruptible
 from finssim.ros2.backend import activate
 from finssim.ros2.errors import Ros2Error
 from finssim.ros2.graphs import Plan, topics_of
-from finssim.ros2.supervisor import Supervisor
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 
 if TYPE_CHECKING:
-    from finssim.ros2.watcher import Watcher
+    from finssim.ros2.nodes.remote import Watcher
 
-__all__ = ["DIED", "FAULT", "Options", "plan_of", "up"]
+__all__ = ["Options", "plan_of"]
+
+
+PATIENCE = 10.0
+"""Time that a node has to end before it is killed [s]."""
+
+
+@dataclass
+class Child:
+    """One node's process."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    dead: bool = False
+
+
+class Supervisor:
+    """Runs the nodes of a plan. Use it as a context: whatever happens, no process is left."""
+
+    def __init__(self, plan: Plan, parameters: Path, say: Callable[[str], None]) -> None:
+        """
+        Args:
+            plan: Nodes and namespace.
+            parameters: File that `plan.write` wrote.
+            say: Takes a sentence for the person who watches.
+        """
+        self._plan, self._parameters, self._say = plan, parameters, say
+        self.children: list[Child] = []
+
+    def __enter__(self) -> Supervisor:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.end()
+
+    def start(self, name: str) -> Child:
+        """Start a node; it ends with this process even if that is killed."""
+        ros = ["--ros-args", "-r", f"__ns:=/{self._plan.namespace}", "--params-file", str(self._parameters)]
+        words = [sys.executable, "-m", "finssim", "ros2", "node", name, *ros]
+        environment = {**os.environ, PARENT: str(os.getpid())}
+        # In a session of its own: Ctrl-C reaches us alone, and the nodes end in our order.
+        process = subprocess.Popen(
+            words,
+            env=environment,
+            start_new_session=True,
+            stdin=subprocess.DEVNULL if name != "teleop" else None,
+        )
+        child = Child(name, process)
+        self.children.append(child)
+        self._say(f"{name}: process {process.pid}")
+        return child
+
+    def look(self) -> list[Child]:
+        """Nodes that have died since the last look, each told once."""
+        died = [c for c in self.children if not c.dead and c.process.poll() is not None]
+        for child in died:
+            child.dead = True
+            self._say(
+                f"{child.name} has died: process {child.process.pid}, {_status(child.process.returncode)}"
+            )
+        return died
+
+    def end(self) -> None:
+        """End all, those first that were started last."""
+        for child in reversed(self.children):
+            if child.process.poll() is None:
+                child.process.send_signal(signal.SIGINT)
+        limit = time.monotonic() + PATIENCE
+        for child in reversed(self.children):
+            try:
+                child.process.wait(max(limit - time.monotonic(), 0.1))
+            except subprocess.TimeoutExpired:
+                self._say(f"{child.name} does not end: killed")
+                child.process.kill()
+                child.process.wait()
+            child.dead = True
+
+
+def _status(code: int) -> str:
+    """A return code in words."""
+    return f"signal {signal.Signals(-code).name}" if code < 0 else f"status {code}"
+
+
+# `finssim ros2 up`: a whole graph of nodes as processes, without ROS installed.
+
 
 DIED, FAULT = 1, 3
 """Exit status where a node died, and where the bridge ended in a fault."""
@@ -59,7 +145,7 @@ class Options:
     """Arm once, as soon as the state is known; otherwise the topic arm does."""
     robot: str = "pool"
     """(ADDRESS) Motor controller of a robot: udp://HOST:PORT, serial:DEVICE, dry-run, or pool for a finssim pool on
-    this machine."""
+    this machine; or its autopilot: mavlink or mavlink://KIND:WHERE, as of finssim run."""
     bind: str = "127.0.0.1:54321"
     """(ADDRESS:PORT) Own end for udp; pictures are taken at the port after it."""
     pictures: str | None = None
@@ -148,7 +234,8 @@ def _wire(plan: Plan, o: Options) -> None:
     pool = plan.graph == "pool" or o.robot == "pool"
     address = f"udp://127.0.0.1:{o.port}" if pool else o.robot
     camera = o.pictures or (f"udp://127.0.0.1:{o.port + 1}" if pool else "none")
-    plan.set("hardware_bridge", robot=address, bind=o.bind, need_reading=False if o.teleop else None)
+    plan.set("/**", robot=address)
+    plan.set("hardware_bridge", bind=o.bind, need_reading=False if o.teleop else None)
     plan.set("camera", pictures=camera, pictures_bind=f"{host}:{int(port) + 1}")
 
 
@@ -173,7 +260,7 @@ def up(graph: str, *, options: Options, say: Callable[[str], None] = print) -> i
     activate()
     import rclpy
 
-    from finssim.ros2.watcher import Watcher
+    from finssim.ros2.nodes.remote import Watcher
 
     with TemporaryDirectory(prefix="finssim-ros2-") as folder:
         pool_file = (options.pool_file or Path(folder) / "pool.yaml").resolve()

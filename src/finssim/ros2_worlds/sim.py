@@ -13,10 +13,10 @@ from finssim.geometry.rotations import quat_from_yaw
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import station_of
 from finssim.robot.reading import Reading
-from finssim.ros2.nodes.bridge_topics import BridgeTopics
+from finssim.ros2.nodes.conversions import ros_type
 from finssim.ros2.nodes.frames import Frames
+from finssim.ros2.nodes.hardware_bridge import BridgeTopics
 from finssim.ros2.nodes.robot_node import RobotNode
-from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.ros2.topics import SERVICES
 from finssim.ros2_worlds.ideal_sensors import IdealSensors
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -42,13 +42,6 @@ from finssim.tasks.trajectory_tracking import DISTANCE_SCALE as TRACKING_SCALE
 from finssim.tasks.trajectory_tracking import LOOK_AHEAD
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = [
-    "BASELINES", "NOWHERE", "Agent", "AgentError", "Baseline", "BaselineAgent", "BaselineError", "ConsensusFormation",
-    "FormationPursuit", "Known", "LeadPursuit", "PidAgent", "PolicyAgent", "StationPid", "TargetPid",
-    "TrackingPid", "agent_for", "baseline", "expert_for", "known_in", "memory_from",
-    "memory_leaves", "restarted", "rollout",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 
@@ -69,7 +62,7 @@ class Baseline(Protocol):
         """Time between two actions [s]."""
 
     def reset(self, n: int) -> Any:
-        """Memory at the start of n episodes: arrays with n rows, in tuples or dataclasses; or None."""
+        """Memory at the start of n episodes: arrays with n rows, in tuples; or None."""
 
     def act(self, memory: Any, observation: NDArray[Any]) -> tuple[NDArray[np.float32], Any]:
         """Actions (n, size) for observations (n, numbers), in the task's own action mode, and the memory after."""
@@ -494,7 +487,7 @@ def baseline(task: str, name: str, vehicle: Vehicle | str = "finsrov") -> Baseli
 
 
 def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
-    """A baseline's memory, which is arrays in tuples or dataclasses, or None, with a function applied to every array.
+    """A baseline's memory, which is arrays in tuples, or None, with a function applied to every array.
 
     Args:
         function: Takes an array and those of `others` in its place.
@@ -503,18 +496,10 @@ def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
     """
     if memory is None or isinstance(memory, np.ndarray):
         return None if memory is None else function(memory, *others)
-    if is_dataclass(memory) and not isinstance(memory, type):
-        parts = {
-            field.name: mapped(function, *(getattr(one, field.name) for one in (memory, *others)))
-            for field in fields(memory)
-        }
-        return replace(memory, **parts)
     if not isinstance(memory, tuple):
-        raise TypeError(
-            f"memory of a baseline is a {type(memory).__name__}, expected arrays in tuples or dataclasses"
-        )
-    children = [mapped(function, *each) for each in zip(memory, *others, strict=True)]
-    return type(memory)(*children) if hasattr(memory, "_fields") else tuple(children)
+        raise TypeError(f"memory of a baseline is a {type(memory).__name__}, expected arrays in tuples")
+    parts = [mapped(function, *each) for each in zip(memory, *others, strict=True)]
+    return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
 
 
 def memory_leaves(memory: Any) -> list[Any]:
@@ -587,7 +572,7 @@ class Agent(Protocol):
     """Part of each wrench limit that action 1 stands for, one number or (6,)."""
 
     def reset(self, n: int) -> Any:
-        """Memory before the first of n episodes' actions: arrays with n rows, in tuples or dataclasses; or None."""
+        """Memory before the first of n episodes' actions: arrays with n rows, in tuples; or None."""
 
     def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions (n, size) and the memory after."""

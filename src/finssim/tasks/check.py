@@ -13,8 +13,6 @@ from finssim.tasks.environment import Environment
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["TaskError", "check_task"]
-
 LARGEST = 20.0
 """An observation beyond this is called unbounded: networks want numbers of order one."""
 

@@ -14,9 +14,6 @@ from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Task
 
-__all__ = ["LOOK", "Drawing", "Schedule"]
-
-
 # Ranges that grow while a policy learns: with the training's progress, its steps, or success.
 
 

@@ -11,19 +11,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = [
-    "about_axis",
-    "angle",
-    "arctangent",
-    "conjugate",
-    "heading",
-    "matrix",
-    "multiply",
-    "rotate",
-    "rotate_inverse",
-    "wrapped",
-]
-
 
 def multiply(p: Tensor, q: Tensor) -> Tensor:
     """The rotation q, then p, (..., 4)."""

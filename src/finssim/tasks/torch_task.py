@@ -17,9 +17,6 @@ from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.terms import End, RewardTerm, Terms, Total
 
-__all__ = ["Start", "TorchTask", "Worlds"]
-
-
 # The terms of every task in plain torch, which go on with what its functions answered; and its draws.
 
 

@@ -13,8 +13,6 @@ from finssim.localization.pool import Pool
 from finssim.robot.messages import TagCorners
 from finssim.vehicles import Vehicle
 
-__all__ = ["Curve", "Frame", "Picture", "Pose", "Source", "Stage", "ViewError", "nowhere"]
-
 Array = npt.NDArray[np.float64]
 
 

@@ -15,9 +15,6 @@ from finssim.vehicles import load_vehicle
 from finssim.viewer.frame import Source, ViewError
 from finssim.viewer.sources.guides import guide_for
 
-__all__ = ["Choice", "open_source", "run"]
-
-
 _DRIVEN = {"policy", "task", "goal", "trajectory", "seed"}
 HEEDED = {
     "pool": _DRIVEN | {"plant", "severity", "camera"},

@@ -11,8 +11,6 @@ from finssim.geometry.rotations import quat_to_matrix
 from finssim.vehicles import Vehicle, VehicleError
 from finssim.viewer.frame import Pose
 
-__all__ = ["Mesh", "force_arrows", "hull_of", "line_of", "tag_plates", "wall_mesh", "wxyz"]
-
 Array = npt.NDArray[np.float64]
 
 ARROW = 1.2

@@ -7,8 +7,6 @@ import numpy.typing as npt
 
 from finssim.vehicles import Vehicle
 
-__all__ = ["box_of"]
-
 Array = npt.NDArray[np.float64]
 
 MARGIN = 0.5

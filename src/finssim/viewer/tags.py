@@ -9,8 +9,6 @@ from finssim.localization.detection.detector import RegionTracker, detector
 from finssim.robot.messages import TagCorners
 from finssim.vehicles import Vehicle
 
-__all__ = ["TagLook"]
-
 LONGEST_STEP = 0.5
 """A picture that is further from the one before is searched as a whole [s]."""
 

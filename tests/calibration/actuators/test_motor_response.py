@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.made_steps import RPM, held, lagged, sampled, step_log
-from finssim.calibration.actuators.motor import LOOP_RATE, cut_steps, fit_motor, fit_response, loop_gains
+from finssim.calibration.actuators.motor import cut_steps, fit_motor, fit_response
 from finssim.calibration.actuators.thrust_table import find_steps, levels
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import programmes
@@ -212,7 +212,6 @@ def test_a_thrust_response_serves_where_no_speed_was_measured():
     )
     fit = fit_motor([force], FINSROV)
     assert fit.estimates["H_LF.time_constant"].estimate == pytest.approx(0.12, rel=0.05)
-    assert not any(name.startswith("speed_loop") for name in fit.estimates)
 
 
 @pytest.mark.parametrize(
@@ -231,37 +230,3 @@ def test_logs_that_show_no_response_are_refused(channels, said):
     t = np.arange(0.0, 10.0, 0.02)
     with pytest.raises(CalibrationError, match=said):
         fit_motor([Trial(name="a", t=t, channels=channels(t))], FINSROV)
-
-
-@pytest.mark.parametrize(("gain", "delay", "tau"), [(0.9, 0.05, 0.12), (0.72, 0.05, 0.12), (0.9, 0.08, 0.08)])
-def test_a_speed_loop_takes_out_what_the_model_misses(gain, delay, tau):
-    """Tuned for one motor and tried on others within its intervals: at most 10 % of overshoot, 1 % of steady error."""
-    period, asked = 1.0 / 200.0, 120.0
-    g = loop_gains(0.9, 0.05, 0.12, late=0.08, loop_rate=200.0)
-    speed = filtered = integral = slope = 0.0
-    before, speeds = 0.0, []
-    waiting, references = [0.0] * round(delay / period), [0.0] * (round(g["reference_delay"] / period) + 1)
-    for _ in range(600):
-        references.append(filtered)
-        error = references.pop(0) - speed
-        slope += ((speed - before) / period - slope) * period / (g["derivative_filter"] + period)
-        before, rate = speed, (asked - filtered) / g["reference_time"]
-        integral += g["ki"] * error * period
-        wanted = (references[1] - references[0]) / period
-        command = g["feedforward"] * (filtered + g["lead"] * rate) + g["kp"] * error + integral
-        waiting.append(command + g["kd"] * (wanted - slope))
-        filtered += rate * period
-        speed += (1.0 - np.exp(-period / tau)) * (gain * waiting.pop(0) - speed)
-        speeds.append(speed)
-    assert max(speeds) < 1.10 * asked
-    assert np.mean(speeds[-150:]) == pytest.approx(asked, rel=0.01)
-
-
-def test_a_step_log_gives_the_gains_of_a_loop():
-    """The feed-forward is one over the gain, and the integral gain that of the rule, or a slower loop's."""
-    vehicle = FINSROV.replace({"thrusters.*.domain": "speed"})
-    trial = step_log(vehicle.thrusters["H_LF"], "H_LF", PULSES, domain="speed", gain=0.9)
-    fit = fit_motor([trial], vehicle)
-    assert fit.estimates["speed_loop.feedforward"].estimate == pytest.approx(1.0 / 0.9, rel=0.01)
-    theta = 0.05 + 1.5 / LOOP_RATE
-    assert 0.3 / (0.9 * 2.0 * theta) < fit.estimates["speed_loop.ki"].estimate <= 1.05 / (0.9 * 2.0 * theta)

@@ -88,34 +88,25 @@ def test_signs_come_from_what_has_them(tmp_path, unsigned):
 
 
 @pytest.mark.parametrize(
-    ("text", "columns", "said"),
+    ("text", "said"),
     [
-        ("RPM,Thrust\n1,2\n2,3\n3,4\n", {}, "'Thrust' has no unit.*force=Thrust=UNIT"),
-        ("a,b\n1,2\n2,3\n", {}, "no column of force and none of speed or pulse among a, b"),
-        ("1,2\n2,3\n3,4\n", {}, "expected a header line"),
-        ("RPM (rpm),RPM 2 (rpm),Thrust (N)\n1,1,2\n2,2,3\n3,3,4\n", {}, "speed could be .*say which"),
+        ("RPM,Thrust\n1,2\n2,3\n3,4\n", r"'Thrust' has no unit.*one of N, kgf.*'Thrust \(N\)'"),
+        ("a,b\n1,2\n2,3\n", "no column of force and none of speed or pulse among a, b: rename one"),
+        ("1,2\n2,3\n3,4\n", "expected a header line"),
+        ("RPM (rpm),RPM 2 (rpm),Thrust (N)\n1,1,2\n2,2,3\n3,3,4\n", "speed could be .*: rename the column"),
         (
             "RPM,Thrust (N)\n500,-1\n-600,2\n700,-3\n",
-            {},
-            "force is negative where speed is positive.*=-Thrust",
+            "force is negative where speed is positive: turn the sign of the column 'Thrust",
         ),
-        ("RPM,Thrust (N)\n1,2\n", {}, "1 rows hold numbers, expected at least 3"),
-        ("RPM,Thrust (N)\n1,2\n2,3\n3,4\n", {"speed": "omega"}, "no column 'omega' for speed; there are RPM"),
-        ("PWM,Thrust (N)\n-1,-9\n0,0\n0.5,2\n1,9\n", {}, "expected 500 to 2500 µs"),
+        ("RPM,Thrust (N)\n1,2\n", "1 rows hold numbers, expected at least 3"),
+        ("PWM,Thrust (N)\n-1,-9\n0,0\n0.5,2\n1,9\n", "expected 500 to 2500 µs"),
     ],
 )
-def test_what_can_be_read_in_two_ways_is_refused(tmp_path, text, columns, said):
+def test_what_can_be_read_in_two_ways_is_refused(tmp_path, text, said):
     path = tmp_path / "a.csv"
     path.write_text(text)
     with pytest.raises(CalibrationError, match=said):
-        read_table(path, columns=columns)
-
-
-def test_a_map_of_columns_decides(tmp_path):
-    rpm, force = made(noise=0.0)
-    path = write(tmp_path / "a.csv", "n,pull,other", rpm, -force / 9.80665, rpm)
-    table = read_table(path, columns={"speed": "n=rpm", "force": "-pull=kgf"})
-    np.testing.assert_allclose(table.force, force, atol=1e-9)
+        read_table(path)
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
@@ -321,7 +312,8 @@ def test_a_bench_trial_is_a_table_of_its_thruster():
     trial = Trial(
         name="bench", t=t, channels={"rpm_T3": rpm, "force_T3": force, "pwm_T3": 1500.0 - rpm / 8.0}
     )
-    fit = fit_thruster([trial], BLUEROV2.replace({"thrusters.T3.motor_sign": -1}))
+    turned = {"thrusters.T3.motor_sign": -1, "autopilot.directions": (1, 1, -1, 1, 1, 1)}
+    fit = fit_thruster([trial], BLUEROV2.replace(turned))
     assert fit.estimates["T3.c_plus"].estimate == pytest.approx(1.1e-4, rel=0.01)
     assert fit.estimates["T3.c_plus"].path == "thrusters.T3.c_plus" and fit.trials == {"bench": trial.sha256}
 

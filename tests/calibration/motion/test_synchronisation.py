@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.moving_body import MovingBody
-from finssim.calibration.motion.signals import up_in_body
-from finssim.calibration.motion.synchronisation import stream_offsets
+from finssim.calibration.motion.signals import stream_offsets, up_in_body
 from finssim.calibration.trials.conversion import shifted
 from finssim.calibration.trials.trial import Conversion, Header, Trial
 from finssim.vehicles import load_vehicle

@@ -14,6 +14,9 @@ from finssim.calibration.regression.regress import axis_data, coasts, prepare, r
 from finssim.calibration.trials.trial import Header
 from finssim.vehicles import AXES
 
+TILTING = (("surge", (41.0, 82.0, 123.0)), ("sway", (31.0, 62.0, 93.0)))
+"""Steps far beyond the speed at which bluerov2 stays level [N]."""
+
 
 def without(some, *columns):
     """Trials that lack these columns."""
@@ -235,7 +238,7 @@ def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
 @pytest.mark.slow
 def test_tilted_samples_are_left_out_unless_the_other_axes_are_fitted():
     """Surge steps pitch bluerov2 to 80°: with a wrong file, surge alone is not believed."""
-    vehicle, some = trials("bluerov2", "surge", "sway", "heave", "yaw")
+    vehicle, some = trials("bluerov2", "surge", "sway", "heave", "yaw", levels=TILTING)
     added = 0.5 * vehicle.hydrodynamics["calibrated"].added_mass
     wrong = vehicle.replace({"hydrodynamics.calibrated.added_mass": added.tolist()})
     alone = regress(some, wrong, axes=["surge", "yaw"])
@@ -250,7 +253,7 @@ def test_tilted_samples_are_left_out_unless_the_other_axes_are_fitted():
 @pytest.mark.slow
 def test_a_vehicle_that_turns_over_needs_trials_of_sway_too():
     """bluerov2 turned over by surge steps also sways: from surge and heave alone, nothing of surge is believed."""
-    vehicle, some = trials("bluerov2", "surge", "heave")
+    vehicle, some = trials("bluerov2", "surge", "heave", levels=TILTING)
     added = 0.5 * vehicle.hydrodynamics["calibrated"].added_mass
     wrong = vehicle.replace({"hydrodynamics.calibrated.added_mass": added.tolist()})
     fit, expected = regress(some, wrong), truth(vehicle)

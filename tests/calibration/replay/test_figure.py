@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.calibration.replay.metrics import Pair, error_ahead, find_phases
+from finssim.calibration.replay.replay import Pair, error_ahead, find_phases
 from finssim.calibration.replay.report import draw_ahead, draw_overlay, draw_response_envelopes, normalised
 
 T = np.arange(501) / 50.0

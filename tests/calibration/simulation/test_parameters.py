@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.simulation.parameters import Parameters
+from finssim.calibration.simulation.shooting import Parameters
 from finssim.engine.plant_arrays import vehicle_parameters
 from finssim.vehicles import AXES, load_vehicle
 

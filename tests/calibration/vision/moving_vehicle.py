@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from finssim.calibration.vision.least_squares import Pose
-from finssim.calibration.vision.tag_mounts import Moment
+from finssim.calibration.vision.mounts import Moment
 from finssim.geometry.optics import Camera, Interface, Lens, project
 from finssim.geometry.rotations import (
     quat_conjugate,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.vision.moving_vehicle import motion
-from finssim.calibration.vision.sensor_mounts import Attitude, imu_clock
+from finssim.calibration.vision.mounts import imu_clock
 from finssim.geometry.rotations import quat_conjugate, quat_from_rotvec, quat_multiply, quat_to_rotvec
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -23,20 +23,19 @@ def recording(rng, late, *, spin=0.3, tilt_noise=0.1, yaw_noise=0.003, uneven=1.
     seen = quat_multiply(quat_from_rotvec(wobble), at(t))
     fine = np.arange(0.0, 60.0, 0.02)
     rate = quat_to_rotvec(quat_multiply(at(fine + 0.005), quat_conjugate(at(fine - 0.005))))[:, 2] / 0.01
-    return Attitude(t=t, quaternion=seen), fine - late, rate + 0.01 + 0.003 * rng.standard_normal(len(fine))
+    return t, seen, fine - late, rate + 0.01 + 0.003 * rng.standard_normal(len(fine))
 
 
 @pytest.mark.parametrize("late", [-0.3, 0.0, 0.08])
 def test_the_offset_comes_back_within_its_interval(late):
     """Though the tilt by the pixels is off by 6 degrees, and the gyro has a bias."""
-    attitude, t, rate = recording(np.random.default_rng(0), late)
-    found = imu_clock(attitude, UP, t, rate)
+    t, seen, t_imu, rate = recording(np.random.default_rng(0), late)
+    found = imu_clock(t, seen, UP, t_imu, rate)
     assert found.identifiable
     assert found.ci95[0] < late < found.ci95[1]
     assert found.estimate == pytest.approx(late, abs=0.02)
 
 
 def test_few_pictures_say_nothing():
-    attitude, t, rate = recording(np.random.default_rng(0), 0.0)
-    short = Attitude(t=attitude.t[:10], quaternion=attitude.quaternion[:10])
-    assert imu_clock(short, UP, t, rate) is None
+    t, seen, t_imu, rate = recording(np.random.default_rng(0), 0.0)
+    assert imu_clock(t[:10], seen[:10], UP, t_imu, rate) is None

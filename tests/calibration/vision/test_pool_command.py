@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.pool_command import run
+from finssim.calibration.vision.pool_fit import run
 from finssim.files import OutputError
 from finssim.geometry.optics import Interface, back_project
 from finssim.localization.camera_file import write_camera

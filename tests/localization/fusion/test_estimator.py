@@ -11,8 +11,8 @@ from finssim.geometry.rotations import wrap_angle
 from finssim.localization import LocalizationError
 from finssim.localization.fusion import position_filter
 from finssim.localization.fusion.attitude import up_of
+from finssim.localization.fusion.error_state import vision_covariance
 from finssim.localization.fusion.estimator import MODELS, Estimator
-from finssim.localization.fusion.fuse_constant_velocity import vision_covariance
 from finssim.localization.fusion.fuse_settings import Settings
 from finssim.localization.fusion.position_filter import PositionState
 from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample

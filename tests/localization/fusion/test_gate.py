@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.localization.fusion.fuse_constant_velocity import GateMemory, due, judge, remember
+from finssim.localization.fusion.error_state import GateMemory, due, judge, remember
 from finssim.localization.fusion.fuse_settings import Gate
 
 

@@ -14,9 +14,8 @@ activate(announce=False)
 import rclpy
 from rclpy.node import Node
 
-from finssim.ros2.nodes.conversions import nanoseconds
+from finssim.ros2.nodes.conversions import nanoseconds, ros_type
 from finssim.ros2.nodes.hardware_bridge import HardwareBridge
-from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.ros2.nodes.state_estimation import StateEstimation
 from finssim.ros2.topics import TOPICS, quality_profile
 from reference.sea import Sea

@@ -22,8 +22,7 @@ from finssim.control.controllers import controller
 from finssim.control.guidance import Station, goal_at
 from finssim.robot.reading import Reading
 from finssim.ros2.nodes.controller import Controller
-from finssim.ros2.nodes.conversions import force_of, nanoseconds
-from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
+from finssim.ros2.nodes.conversions import RosMessages, force_of, nanoseconds, ros_type
 from finssim.ros2.nodes.teleop import Teleop
 from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle

@@ -23,18 +23,19 @@ from finssim.robot.messages import (
 from finssim.robot.reading import Reading
 from finssim.ros2.codec import codec_of
 from finssim.ros2.nodes.conversions import (
+    RosMessages,
     aid_of,
     compressed_of,
     force_of,
     image_of,
     nanoseconds,
     reading_of,
+    ros_type,
     station_of_pose,
     tags_of,
     telemetry_of,
     wrench_of,
 )
-from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
 from finssim.ros2.topics import TOPICS
 from finssim.vehicles import load_vehicle
 

@@ -10,8 +10,8 @@ from finssim.localization.fusion.estimator import Estimator
 from finssim.localization.fusion.fuse_settings import settings_of, site_of
 from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
 from finssim.pool.camera import true_site
-from finssim.ros2.nodes.fix_frame import FixFrame
-from finssim.ros2.nodes.ros_messages import RosMessages
+from finssim.ros2.nodes.conversions import RosMessages
+from finssim.ros2.nodes.frames import FixFrame
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("finsrov")

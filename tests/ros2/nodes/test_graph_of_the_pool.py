@@ -14,8 +14,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from finssim.ros2.nodes.conversions import nanoseconds
-from finssim.ros2.nodes.ros_messages import ros_type
+from finssim.ros2.nodes.conversions import nanoseconds, ros_type
 from finssim.ros2.topics import TOPICS, quality_profile
 
 PATIENCE = 150.0  # [s] for seven processes to start on a machine that does much else

@@ -21,13 +21,11 @@ from finssim.localization.pool import write_pool
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.robot.messages import Picture
 from finssim.robot.reading import Reading
-from finssim.ros2.nodes.conversions import nanoseconds, tags_of, xyz, xyzw
-from finssim.ros2.nodes.frames import Pose
+from finssim.ros2.nodes.conversions import RosMessages, nanoseconds, ros_type, tags_of, xyz, xyzw
+from finssim.ros2.nodes.frames import Pose, urdf_of
 from finssim.ros2.nodes.localizer import Localizer
-from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
 from finssim.ros2.nodes.state_estimation import StateEstimation
 from finssim.ros2.topics import TOPICS, quality_profile
-from finssim.ros2.urdf import urdf_of
 from finssim.ros2_worlds.ideal_sensors import IdealSensors
 from finssim.vehicles import load_vehicle
 

@@ -18,7 +18,7 @@ activate(announce=False)
 import rclpy
 from rclpy.node import Node
 
-from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
+from finssim.ros2.nodes.conversions import RosMessages, ros_type
 from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
 from reference.sea import Sea

@@ -1,1 +1,1 @@
-"""Thrust curves, speed controllers, motor responses and speed loops, from benches and step logs."""
+"""Thrust curves, speed controllers, and motor responses, from benches and step logs."""

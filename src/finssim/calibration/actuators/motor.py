@@ -1,4 +1,4 @@
-"""From step logs to the response of a vehicle's motors, and the gains of a speed loop that follow from it.
+"""From step logs to the response of a vehicle's motors.
 
 First order plus dead time, K e^(-T_d s) / (τ s + 1), in the quantity on which the vehicle file lets the lag act.
 """
@@ -24,7 +24,7 @@ from finssim.calibration.uncertainty import Evidence, correlated_samples, interv
 from finssim.vehicles import Vehicle
 from finssim.vehicles.thruster import Thruster
 
-__all__ = ["LOOP_RATE", "cut_steps", "fit_motor", "fit_response", "loop_gains"]
+__all__ = ["cut_steps", "fit_motor", "fit_response"]
 
 Array = NDArray[np.float64]
 
@@ -419,16 +419,15 @@ class Study:
         return float(u @ y / (u @ u)), float(jackknife(left_out)[0])
 
 
-def study(name: str, trials: Sequence[Trial], thruster: Thruster, domain: str | None = None) -> Study | None:
+def study(name: str, trials: Sequence[Trial], thruster: Thruster) -> Study | None:
     """Fit one thruster over all trials that hold it; None where no command of it holds and changes.
 
     Args:
         name: Of the thruster.
         trials: All of them.
         thruster: As the vehicle file has it; its curve turns thrust and speed into each other.
-        domain: `force` or `speed`; the vehicle file's where not given.
     """
-    chosen = domain or thruster.domain
+    chosen = thruster.domain
     logs = {
         d: [log for trial in trials if (log := log_of(trial, name, thruster, d)) is not None] for d in DOMAINS
     }
@@ -575,7 +574,7 @@ def fit_motor(
         seed: For the record; the intervals need no random numbers.
 
     Returns:
-        Estimates `THRUSTER.time_constant`, `.delay`, `.gain`, `.dead_rpm_plus`, ...; `delay` of all; `speed_loop.*`.
+        Estimates `THRUSTER.time_constant`, `.delay`, `.gain`, `.dead_rpm_plus`, ...; `delay` of all.
 
     Raises:
         CalibrationError: No trial holds a command that steps and its response.
@@ -601,18 +600,17 @@ def fit_motor(
         estimates.insert(0, _common_delay(sure))
         changes["thrusters.*.delay"] = estimates[0].estimate
         changes |= _untested(sure, vehicle, changes, findings)
-    speeds = [_in_speed(found, trials, vehicle) for found in sure if not found.response.hidden]
     return Fit(
         kind="motor",
         method="first order plus dead time",
         vehicle=vehicle,
-        estimates={e.name: e for e in [*estimates, *_loop([s for s in speeds if s is not None])]},
+        estimates={e.name: e for e in estimates},
         changes=changes,
         quality={found.name: quality_of(found) for found in studies},
         curves=tuple(curve_of(found) for found in studies),
         findings=tuple(dict.fromkeys(findings)),
         trials={trial.name: trial.sha256 for trial in trials},
-        settings={"loop_rate": LOOP_RATE, "seed": seed},
+        settings={"seed": seed},
     )
 
 
@@ -660,88 +658,3 @@ def _untested(
         elif name not in tested:
             findings.append(finding("file_response", name))
     return out
-
-
-# Feed-forward plus PID for the motor controller.
-
-LOOP_RATE = 200.0
-"""Of the motor controller [Hz]."""
-
-LEAST_CLOSED = 0.2
-"""Least time constant of the closed loop, as a part of the motor's: keeps the gain below 5 / K."""
-
-GAIN_UNITS = {
-    "feedforward": "-", "kp": "-", "ki": "1/s", "kd": "s", "derivative_filter": "s", "lead": "s",
-    "reference_time": "s", "reference_delay": "s",
-}  # fmt: skip
-
-
-def loop_gains(
-    gain: float, delay: float, time_constant: float, *, late: float, loop_rate: float
-) -> dict[str, float]:
-    """Gains of a speed loop, with r the asked speed and K, T_d, τ of the response:
-
-        ṙ_f = (r - r_f) / λ_r,    u = (r_f + τ ṙ_f) / K + PID(r_f(t - T_d) - ω)
-
-    so that an exact model leaves the PID nothing to do. Its gains are those of the improved SIMC rule (Grimholt and
-    Skogestad 2018, J. Process Control 70: 36-46), in series form K_c = τ / (K (λ + θ)), τ_I = min(τ, 4 (λ + θ)) and
-    τ_D = θ / 3 with θ the longest dead time and one and a half periods of the loop, and λ = θ but at least τ / 5.
-
-    Args:
-        gain: K, steady speed over command [-].
-        delay: T_d [s].
-        time_constant: τ [s].
-        late: The longest dead time to allow for [s].
-        loop_rate: Of the motor controller [Hz].
-
-    Returns:
-        By the names of `GAIN_UNITS`.
-    """
-    theta, tau = late + 1.5 / loop_rate, max(time_constant, 1e-9)
-    closed = max(theta, LEAST_CLOSED * tau)
-    series_gain = tau / (gain * (closed + theta))
-    integral, derivative = min(tau, 4.0 * (closed + theta)), theta / 3.0
-    return {
-        "feedforward": 1.0 / gain,
-        "kp": series_gain * (1.0 + derivative / integral),  # from series to parallel form
-        "ki": series_gain / integral,
-        "kd": series_gain * derivative,
-        "derivative_filter": max(0.5 * derivative, 1.0 / loop_rate),
-        "lead": tau,
-        "reference_time": max(closed, 0.5 * tau),  # the lead then asks for at most twice the steady command
-        "reference_delay": delay,
-    }
-
-
-def _in_speed(found: Study, trials: Sequence[Trial], vehicle: Vehicle) -> Study | None:
-    """The same thruster's speeds, for the speed loop; None where no speed was measured."""
-    if not all(log.measured.startswith("rpm_") for log in found.logs):
-        return None
-    return (
-        found
-        if found.domain == "speed"
-        else study(found.name, trials, vehicle.thrusters[found.name], "speed")
-    )
-
-
-def _loop(studies: Sequence[Study]) -> list[Estimate]:
-    """One set of gains for all motors; none where no speed follows a speed."""
-    usable = [found for found in studies if found.same_unit and found.gain[0] > 0.0]
-    if not usable:
-        return []
-    gain, delay, tau = (
-        float(np.median(values))
-        for values in zip(
-            *((s.gain[0], s.response.delay, s.response.time_constant) for s in usable), strict=True
-        )
-    )
-    late = max(found.response.delay_interval[1] for found in usable)
-    gains = loop_gains(gain, delay, tau, late=min(late, delay + tau), loop_rate=LOOP_RATE)
-    note = f"speed over speed, loop at {LOOP_RATE:g} Hz; follows from gain, delay and time constant"
-    return [
-        Estimate(
-            name=f"speed_loop.{key}", estimate=gains[key], ci95=(math.nan, math.nan), unit=unit, identifiable=True,
-            note=note,
-        )
-        for key, unit in GAIN_UNITS.items()
-    ]  # fmt: skip

@@ -22,8 +22,6 @@ from finssim.calibration.trials.conversion import TIME_UNITS, UNITS
 from finssim.calibration.trials.trial import Trial
 from finssim.text_table import TextTable, read_text_table
 
-__all__ = ["STANDING", "ThrustTable", "find_steps", "levels", "read_table", "tables_of_trial"]
-
 Array = NDArray[np.float64]
 
 LAST = 0.4
@@ -191,8 +189,8 @@ _WORDS = {
 _IMPLIED = {"rpm": ("speed", math.pi / 30.0), "pwm": ("pulse", 1.0)}
 """Words that say the unit too."""
 
-QUANTITIES = tuple(_UNITS)
-"""speed force pulse voltage time"""
+EXAMPLES = {"force": "force (N)", "speed": "speed (rpm)"}
+"""Headers that are recognised."""
 
 
 class Source(NamedTuple):
@@ -204,27 +202,23 @@ class Source(NamedTuple):
     """To rad/s, N, µs, V or s; NaN where the header names no unit."""
 
 
-def find_columns(
-    headers: list[str], used: list[bool], given: Mapping[str, str] | None, shown: str
-) -> dict[str, Source]:
+def find_columns(headers: list[str], used: list[bool], shown: str) -> dict[str, Source]:
     """The column of every quantity that the table has.
 
     Args:
         headers: The header line's cells.
         used: Whether a column holds any number but zero; others are passed over.
-        given: Quantity -> `COLUMN`, `COLUMN=UNIT`, or either after a minus sign that turns the values' sign; what it
-            does not name is found from the headers.
         shown: How messages call the table.
 
     Raises:
-        CalibrationError: Two columns could be meant, a unit is missing, or `given` names what is not there.
+        CalibrationError: Two columns could be meant, or a unit is missing.
     """
     names = [header.strip() for header in headers]
-    found = {quantity: _given(quantity, text, names, shown) for quantity, text in dict(given or {}).items()}
+    found: dict[str, Source] = {}
     candidates: dict[str, list[Source]] = {}
     for column, header in enumerate(names):
         guess = _recognised(header)
-        if guess is not None and used[column] and guess[0] not in found:
+        if guess is not None and used[column]:
             candidates.setdefault(guess[0], []).append(Source(column, header, guess[1]))
     for quantity, sources in candidates.items():
         if len(sources) > 1:
@@ -233,40 +227,16 @@ def find_columns(
         if len(sources) > 1:
             listed = " or ".join(f"'{source.header}'" for source in sources)
             raise CalibrationError(
-                f"{shown}: {quantity} could be {listed}: say which, {quantity}={sources[0].header}"
+                f"{shown}: {quantity} could be {listed}: rename the column that is not meant, or remove it"
             )
         found[quantity] = sources[0]
     for quantity, source in found.items():
         if math.isnan(source.factor):
             raise CalibrationError(
-                f"{shown}: column '{source.header}' has no unit: write it into the header or say it, "
-                f"{quantity}={source.header}=UNIT with one of {_SHOWN[quantity]}"
+                f"{shown}: column '{source.header}' has no unit: write it into the header, one of {_SHOWN[quantity]}, "
+                f"such as '{source.header} ({_SHOWN[quantity].split(',')[0]})'"
             )
     return found
-
-
-def _given(quantity: str, text: str, names: list[str], shown: str) -> Source:
-    if quantity not in _UNITS:
-        raise CalibrationError(f"unknown quantity '{quantity}', expected one of {', '.join(QUANTITIES)}")
-    sign = 1.0
-    for name in (text, text[1:] if text.startswith("-") else None):
-        if name is None:
-            continue
-        sign = 1.0 if name == text else -1.0
-        if name.strip() in names:
-            column = names.index(name.strip())
-            guess = _recognised(names[column])
-            factor = guess[1] if guess and guess[0] == quantity else _unit_of(quantity, names[column])
-            return Source(column, names[column], sign * factor)
-        header, _, unit = name.rpartition("=")
-        if header.strip() in names:
-            factor = _UNITS[quantity].get(_plain(unit), math.nan)
-            if math.isnan(factor):
-                raise CalibrationError(
-                    f"{shown}: unknown unit '{unit}' of {quantity}, expected one of {_SHOWN[quantity]}"
-                )
-            return Source(names.index(header.strip()), header.strip(), sign * factor)
-    raise CalibrationError(f"{shown}: no column '{text}' for {quantity}; there are {', '.join(names)}")
 
 
 def _recognised(header: str) -> tuple[str, float] | None:
@@ -285,10 +255,6 @@ def _recognised(header: str) -> tuple[str, float] | None:
     if len(matches) != 1:
         return None
     return matches[0], 1.0 if matches[0] in ("voltage", "time") else math.nan
-
-
-def _unit_of(quantity: str, header: str) -> float:
-    return _UNITS[quantity].get(_plain(_split(header)[1]), math.nan)
 
 
 def _split(header: str) -> tuple[str, str]:
@@ -349,8 +315,8 @@ def check_pulses(pulse: Array, shown: str) -> None:
     known = pulse[np.isfinite(pulse) & (pulse != 0.0)]
     if known.size and (known.min() < 500.0 or known.max() > 2500.0):
         raise CalibrationError(
-            f"{shown}: pulses run from {known.min():g} to {known.max():g} µs, expected 500 to 2500 µs: give the right "
-            "column or unit, pulse=COLUMN=UNIT"
+            f"{shown}: pulses run from {known.min():g} to {known.max():g} µs, expected 500 to 2500 µs: check the "
+            "column's name and unit"
         )
 
 
@@ -403,8 +369,8 @@ def _same_way(
     if against > 0.5 * np.count_nonzero(clear):
         header = sources[names[1]].header if names[1] in sources else names[1]
         raise CalibrationError(
-            f"{shown}: {names[1]} is negative where {names[0]} is positive: say which of them to turn, such as "
-            f"{names[1]}=-{header}"
+            f"{shown}: {names[1]} is negative where {names[0]} is positive: turn the sign of the "
+            f"column '{header}'"
         )
 
 
@@ -435,9 +401,7 @@ class ThrustTable:
         return replace(self, **columns)
 
 
-def read_table(
-    path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None, neutral: float = 1500.0
-) -> ThrustTable:
+def read_table(path: str | os.PathLike[str], *, neutral: float = 1500.0) -> ThrustTable:
     """Read a table from a CSV file.
 
     Separators `, ; tab`, comment lines after `#`, and units in the headers (rpm, rad/s, N, kgf, lbf, g, ...) are
@@ -446,8 +410,6 @@ def read_table(
 
     Args:
         path: The file.
-        columns: Quantity (speed force pulse voltage time) -> `COLUMN`, `COLUMN=UNIT` or `-COLUMN` (sign turned), for
-            what the headers do not tell.
         neutral: Pulse at which the motor is off [µs], for signs.
 
     Raises:
@@ -456,7 +418,7 @@ def read_table(
     shown = os.fspath(path)
     headers, rows = _cells(Path(path), shown)
     used = [bool(np.any(np.nan_to_num(rows[:, i]) != 0.0)) for i in range(len(headers))]
-    sources = find_columns(headers, used, columns, shown)
+    sources = find_columns(headers, used, shown)
     missing = [
         what
         for what, need in (("force", {"force"}), ("speed or pulse", {"speed", "pulse"}))
@@ -465,7 +427,7 @@ def read_table(
     if missing:
         raise CalibrationError(
             f"{shown}: no column of {' and none of '.join(missing)} among {', '.join(h.strip() for h in headers)}: "
-            f"name it, such as {missing[0].split()[0]}=COLUMN=UNIT (columns of nothing but zeros are passed over)"
+            f"rename one, such as '{EXAMPLES[missing[0].split()[0]]}' (columns of nothing but zeros are passed over)"
         )
     values = {quantity: rows[:, source.column] * source.factor for quantity, source in sources.items()}
     return _table(Path(path).stem, values, sources, shown, neutral)

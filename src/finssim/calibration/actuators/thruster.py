@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial
+from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
 from finssim.vehicles import Esc, Vehicle
 from finssim.vehicles.thruster import Thruster
 
@@ -54,8 +55,8 @@ def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
     """Least squares of |T| = c ω² (paper, eq. 16) over one direction of rotation.
 
     The residuals of real tables are not noise but the curve's own misfit, alike in neighbouring rows. The interval is
-    the widest of three: a jackknife over blocks of neighbouring speeds (heteroscedastic residuals), first-order
-    autocorrelated residuals (long-lived ones), and, of several tables, what the tables' own c's vary by.
+    the widest of three (`finssim.calibration.uncertainty`): from the disagreement of blocks of neighbouring speeds,
+    from that of several tables, and from the rows that count as independent.
 
     Args:
         tables: Speed |ω| [rad/s] and thrust along this direction [N] of the turning rows, (n,) each, per table.
@@ -77,17 +78,7 @@ def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
         keep = error <= limit
     owner = np.concatenate([np.full(len(w), i) for i, (w, _) in enumerate(tables)])
     rows = [keep & (owner == i) for i in range(len(tables))]
-    blocks = [_blocks(square[row], force[row]) for row in rows]
-    per_table = tuple(_slope(*_joined(parts)) for parts in blocks if parts)
-    parts = [part for of_table in blocks for part in of_table]
-    leave_out = (
-        [_slope(*_joined(parts[:i] + parts[i + 1 :])) for i in range(len(parts))] if len(parts) > 1 else []
-    )
-    half_width = jackknife(np.array(leave_out)[:, None])[0] if leave_out else np.inf
-    half_width = max(half_width, _autocorrelated([(square[row], force[row]) for row in rows], c))
-    if len(per_table) > 1:
-        spread = float(np.std(per_table, ddof=1)) / np.sqrt(len(per_table))
-        half_width = max(half_width, t_quantile(len(per_table) - 1) * spread)
+    half_width = _half_width([(square[row], force[row] - c * square[row]) for row in rows if row.any()])
     error = force[keep] - c * square[keep]
     total = float(np.sum((force[keep] - np.mean(force[keep])) ** 2))
     return Side(
@@ -131,33 +122,29 @@ def _blocks(square: Array, force: Array) -> list[tuple[Array, Array]]:
     return [(square[label == i], force[label == i]) for i in np.unique(label)]
 
 
-def _autocorrelated(tables: Sequence[tuple[Array, Array]], c: float) -> float:
-    """Half-width of the interval of c if residuals in order of speed are a first-order autoregression."""
-    from scipy.signal import lfilter  # SciPy is slow to import
-
-    variance, information, independent = 0.0, 0.0, 0.0
-    for square, force in tables:
-        order = np.argsort(square)
-        x, error = square[order], force[order] - c * square[order]
-        n, power = len(x), float(error @ error)
-        if n < 3 or power == 0.0:
-            continue
-        phi = float(error[1:] @ error[:-1]) / power
-        phi = float(
-            np.clip(phi + (1.0 + 3.0 * phi) / n, 0.0, 0.95)
-        )  # least squares finds it too small (Kendall 1954)
-        spread = 2.0 * float(x @ lfilter([1.0], [1.0, -phi], x)) - float(x @ x)  # Σ_ij x_i x_j φ^|i-j|
-        spent = spread / float(x @ x)  # degrees of freedom that fitting c takes out of the residuals
-        variance += power / max(n - spent, 0.5 * n) * spread
-        information += float(x @ x)
-        independent += n * (1.0 - phi**2) / (1.0 + phi**2)
-    if information == 0.0:
-        return 0.0
-    return t_quantile(max(int(independent) - 1, 1)) * float(np.sqrt(variance)) / information
-
-
-def _joined(parts: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-    return np.concatenate([s for s, _ in parts]), np.concatenate([f for _, f in parts])
+def _half_width(tables: Sequence[tuple[Array, Array]]) -> float:
+    """Of the 95 % interval of c, from ω² and residuals of each table; infinite for a single row."""
+    ordered = [(x[np.argsort(x)], error[np.argsort(x)]) for x, error in tables]
+    errors = [error for _, error in ordered]
+    rows = sum(map(len, errors))
+    if rows < 2:
+        return math.inf
+    breaks = np.cumsum([len(error) for error in errors])[:-1].tolist()
+    correlated = correlated_samples(np.concatenate(errors), breaks)
+    least = 1e-26 * float(sum(x @ x for x, _ in ordered)) / rows  # of an exact curve
+    variance = float(sum(error @ error for error in errors)) / (rows - 1) * correlated + least
+    widths = []
+    for groups in ([part for table in ordered for part in _blocks(*table)], ordered):
+        evidence = Evidence(
+            names=("c",),
+            normal=np.array([[[x @ x / variance]] for x, _ in groups]),
+            score=np.array([[x @ error / variance] for x, error in groups]),
+            unit="blocks",
+        )
+        covariance = trial_covariance(evidence)
+        widths.append(float(intervals(np.zeros(1), covariance)[0, 1]))
+    independent = t_quantile(max(int(rows / correlated) - 1, 1)) * math.sqrt(float(covariance.local[0, 0]))
+    return max(*widths, independent)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -936,7 +923,6 @@ def fit_thruster(
     vehicle: Vehicle,
     *,
     group: str | None = None,
-    columns: Mapping[str, str] | None = None,
     voltage: float | None = None,
     pool_voltages: bool = False,
     seed: int = 0,
@@ -947,7 +933,6 @@ def fit_thruster(
         tables: CSV files (see `read_table`), folders of bench trials, or what was read from them.
         vehicle: Whose thrusters they are.
         group: Propeller group that all tables speak about.
-        columns: What the headers do not tell; see `read_table`.
         voltage: At which the numbers shall hold [V], and for tables without a voltage column the voltage they were
             taken at; where not given, the tables' only one, else that of the vehicle file's ESC, else the middle one.
         pool_voltages: Fit all voltages together; otherwise the others only check the prediction.
@@ -959,7 +944,7 @@ def fit_thruster(
     Raises:
         CalibrationError: A table that cannot be read, names that the vehicle does not have, too few rows.
     """
-    read = _named_apart([(item, table) for item in tables for table in _read(item, vehicle, columns)])
+    read = _named_apart([(item, table) for item in tables for table in _read(item, vehicle)])
     if not read:
         raise CalibrationError("no table given: name at least one CSV file of speeds and thrusts")
     _refuse_duplicates(read)
@@ -1009,9 +994,7 @@ _WRITTEN = {
 """Keys of a thruster that an estimate goes to."""
 
 
-def _read(
-    item: ThrustTable | Trial | str | os.PathLike[str], vehicle: Vehicle, columns: Mapping[str, str] | None
-) -> list[ThrustTable]:
+def _read(item: ThrustTable | Trial | str | os.PathLike[str], vehicle: Vehicle) -> list[ThrustTable]:
     if isinstance(item, ThrustTable):
         return [item]
     neutrals = [thruster.esc.pulse_neutral for thruster in vehicle.thrusters.values() if thruster.esc]
@@ -1025,7 +1008,7 @@ def _read(
         trial = item if isinstance(item, Trial) else load_trial(item)
         turned = [name for name, thruster in vehicle.thrusters.items() if thruster.motor_sign == -1]
         return tables_of_trial(trial, neutral=neutral, reversed_wiring=turned)
-    return [read_table(item, columns=columns, neutral=neutral)]
+    return [read_table(item, neutral=neutral)]
 
 
 def _is_trial(path: Path) -> bool:

@@ -20,8 +20,6 @@ from finssim.files import atomic_directory, atomic_write
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["excite"]
-
 Array = NDArray[np.float64]
 
 

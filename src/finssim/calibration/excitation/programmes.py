@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.control.allocation import Allocator
+from finssim.control.pid import axis_model
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle
+from finssim.vehicles.capability import level_speed
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.vehicle import Axis
 
@@ -202,6 +204,8 @@ VALIDATION_LEVELS: dict[Axis, tuple[float, ...]] = {
 }
 """FinsROV's validation sweeps [N, N m]."""
 
+STEADY = 0.8
+"""Fastest surge and sway, part of `level_speed` [-]."""
 FINSROV_LIMITS = (18.586585, 18.068824, 25.636077, 3.791353, 2.535180, 6.947713)
 """Wrench limits of the vehicle that the published levels are for, order of `AXES` [N, N m]."""
 
@@ -286,8 +290,9 @@ def programmes(
     FinsROV was validated. `multisine` drives all axes at once, for coupled fits; see `multisine`.
 
     Levels are FinsROV's, times the ratio of this vehicle's wrench limit to FinsROV's on that axis (two digits), and
-    never above the limit. Where `room` is given, the levels of a linear axis are brought down together until the
-    strongest step, with its coast, stays within it by the damping of the vehicle's file.
+    never above the limit; steps on surge and sway of a vehicle that hovers stay below what tilts it. Where `room` is
+    given, the levels of a linear axis are brought down together until the strongest step, with its coast, stays within
+    it by the damping of the vehicle's file.
 
     Args:
         axes: As for `which_axes`.
@@ -331,6 +336,15 @@ def programmes(
     return out
 
 
+def _level_limit(axis: Axis, vehicle: Vehicle) -> float:
+    """Drag of surge or sway at `STEADY` of the speed at which a vehicle that hovers begins to tilt by itself [N]."""
+    i = AXES.index(axis)
+    if i > 1 or not min(vehicle.wrench_limits[:2]) > 0.0:
+        return math.inf
+    model, v = axis_model(vehicle), STEADY * level_speed(vehicle, axis=i)
+    return float(model.linear_damping[i] * v + model.quadratic_damping[i] * v * v) if v < math.inf else v
+
+
 def _levels(
     axis: Axis, vehicle: Vehicle, levels: Mapping[str, Sequence[float]] | Sequence[float] | None, kind: str
 ) -> tuple[float, ...]:
@@ -339,10 +353,11 @@ def _levels(
     unit = "N" if AXES.index(axis) < 3 else "N m"
     given = levels.get(axis) if isinstance(levels, Mapping) else levels
     if given is None:
-        table = VALIDATION_LEVELS if kind == "validation" else PUBLISHED_LEVELS
-        scale = limit / FINSROV_LIMITS[AXES.index(axis)]
         if kind == "multisine":
             return (0.5 * limit,)
+        limit = min(limit, _level_limit(axis, vehicle))
+        table = VALIDATION_LEVELS if kind == "validation" else PUBLISHED_LEVELS
+        scale = limit / FINSROV_LIMITS[AXES.index(axis)]
         if abs(scale - 1.0) < 0.01:
             scale = 1.0
         return tuple(sorted({min(_two_digits(scale * x), limit) for x in table[axis]}))

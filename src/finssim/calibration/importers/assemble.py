@@ -43,11 +43,6 @@ from finssim.vehicles.autopilot import FRAMES
 from finssim.vehicles.part import Part, did_you_mean, refuse_section, refuse_value
 from finssim.yaml_file import read_mapping
 
-__all__ = [
-    "ArduSubMap", "ColumnMap", "ColumnSource", "Frame", "PhaseColumn", "SourceMap", "SplitRule",
-    "Stream", "TimeColumn", "in_our_axes", "merge", "read_map", "split_rule", "split_table", "trial_of",
-]  # fmt: skip
-
 
 class ColumnSource(Part):
     """Where the numbers of one canonical column come from: sign (scale * column + offset) in `unit`."""

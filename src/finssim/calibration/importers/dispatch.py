@@ -41,8 +41,6 @@ from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import json_value
 
-__all__ = ["import_trials", "print_folders", "read_trials"]
-
 TABLES = (".csv", ".tsv", ".txt", ".dat", ".parquet", ".pq")
 TIME_NAMES = ("t", "time", "time_s", "time_secs", "timestamp", "stamp")
 """Names under which the time is looked for where no map says it; seconds."""

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from scipy.fft import dst
 from scipy.linalg import solveh_banded
 
-__all__ = ["longest_step", "smooth", "spans_of", "stretches", "without_spikes"]
-
 Array = NDArray[np.float64]
 
 FEWEST = 5

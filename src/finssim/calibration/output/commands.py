@@ -24,8 +24,6 @@ from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = []
-
 ONLY_SIMULATION = "needs --method simulation"
 
 
@@ -78,7 +76,7 @@ def calibrate_motor(
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Fit the motors' response to steps: delay and lag [s], dead zone, and tune the speed loop.
+    """Fit the motors' response to steps: delay and lag [s], dead zone.
 
     Example: finssim calibrate motor steps --vehicle mine.yaml --out mine.yaml
 

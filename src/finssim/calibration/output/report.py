@@ -36,12 +36,6 @@ if TYPE_CHECKING:
 
     from finssim.geometry.optics import Lens
 
-__all__ = [
-    "AS_GIVEN", "BLUE", "ExtraTable", "GRAY", "HEADS", "ORANGE", "Report", "command_line",
-    "draw_correlation", "fit_json", "fit_report", "interval_text", "new_figure", "number_text",
-    "picture_axes", "png", "progress_bar", "publish", "refuse_places", "state_text", "write_report",
-]  # fmt: skip
-
 
 def refuse_places(out: Path, report: Path | None, kind: str) -> None:
     """Refuse a file that is no YAML, or a place that cannot be written, before anything is computed."""

@@ -16,11 +16,6 @@ from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.terms import unit_of
 
-__all__ = [
-    "AxisResult", "BIAS_NOTE", "CERTAIN", "LARGE_DELAY", "USEFUL", "curves_of", "drag_known",
-    "hydrostatics", "late_velocity", "outside", "quality", "term_estimate", "trim", "worthless",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 # How much the regression of one axis is worth: figures of the fit, whether it explains anything, and findings.

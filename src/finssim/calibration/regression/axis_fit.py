@@ -43,11 +43,6 @@ from finssim.calibration.uncertainty import (
 )
 from finssim.calibration.vision.least_squares import boxed, huber_weight
 
-__all__ = [
-    "AKAIKE", "AxisData", "Run", "Selection", "Signals", "TERMS", "axis_rows", "cut", "fit_axis",
-    "informative", "joined", "kernel", "select", "signals", "simulate_axis",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 SLOW = 25.0

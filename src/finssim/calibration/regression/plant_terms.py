@@ -15,8 +15,6 @@ from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.terms import TERMS, Term
 
-__all__ = ["Matrices", "known_wrench", "matrices", "unit_wrenches"]
-
 Array = NDArray[np.float64]
 
 

@@ -15,12 +15,13 @@ from rich.table import Table
 from rich.text import Text
 
 from finssim.calibration.findings import Finding, finding, plain, sentences
-from finssim.calibration.replay.metrics import (
+from finssim.calibration.replay.replay import (
     RESAMPLES,
     UNITS,
     Aggregate,
     Ahead,
     Pair,
+    Replay,
     aggregate,
     models_of,
     onset,
@@ -28,7 +29,6 @@ from finssim.calibration.replay.metrics import (
     response_span,
     score,
 )
-from finssim.calibration.replay.replay import Replay
 from finssim.calibration.trials.trial import Array
 from finssim.files import atomic_directory
 from finssim.provenance import provenance
@@ -36,19 +36,6 @@ from finssim.vehicles.vehicle import AXES, Axis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = [
-    "DEFINITION",
-    "MODEL_LABELS",
-    "REPLAY_FILE",
-    "draw_ahead",
-    "draw_overlay",
-    "draw_response_envelopes",
-    "normalised",
-    "print_replay",
-    "replay_json",
-    "write_replay",
-]
 
 MODEL_LABELS = {"calibrated": "Calibrated Fossen", "mesh": "Physics-mesh", "simplified": "Simplified Fossen"}
 COLORS = {"calibrated": "#0072B2", "mesh": "#009E73", "simplified": "#D55E00"}

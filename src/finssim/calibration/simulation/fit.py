@@ -23,10 +23,11 @@ from finssim.calibration.regression.axis_estimates import (
     outside,
 )
 from finssim.calibration.regression.axis_fit import AKAIKE, DAMPING
-from finssim.calibration.simulation.parameters import EXTRAS, Parameters
 from finssim.calibration.simulation.rollout import Segment, Streams, segments, streams
 from finssim.calibration.simulation.shooting import (
     CUT,
+    EXTRAS,
+    Parameters,
     Point,
     Shooting,
     Solution,

@@ -21,8 +21,6 @@ from finssim.geometry.rotations import quat_rotate, quat_to_euler
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.vehicles import Vehicle
 
-__all__ = ["CHANNELS", "Response", "Rollouts", "Segment", "Streams", "segments", "streams", "warm_motors"]
-
 Array = NDArray[np.float64]
 
 CHANNELS = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z", "depth")

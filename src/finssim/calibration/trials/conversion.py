@@ -21,23 +21,6 @@ from finssim.geometry.rotations import (
 )
 from finssim.vehicles.part import did_you_mean
 
-__all__ = [
-    "EXTRA_COLUMNS",
-    "GRAVITY",
-    "SAME_ROW",
-    "TIME_UNITS",
-    "factor",
-    "factor_and_offset",
-    "in_our_frames",
-    "merged",
-    "new_names",
-    "ordered",
-    "sampled",
-    "shifted",
-    "tidy_quaternions",
-    "upside_down",
-]
-
 GRAVITY = 9.80665
 """Standard gravity, of the units g and kgf [m/s²]."""
 

@@ -19,11 +19,6 @@ from finssim.vehicles.capability import terminal_speeds
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.part import did_you_mean
 
-__all__ = [
-    "Drive", "applied_wrench", "delivered", "drive", "implausible", "require_axes", "require_fittable",
-    "thruster_motors", "wrench_motors",
-]  # fmt: skip
-
 # What every fit asks of the trials and axes that it is given.
 
 

@@ -1,14 +1,13 @@
 """Least squares for everything that is calibrated by sight: descent, robust weights, unknowns that one picture owns.
 
 Levenberg and Marquardt's descent takes any state; `arrow_step` is its step where many small groups of unknowns, such as
-the poses of pictures, share only a few; `tukey` is for rows of which some are plainly wrong.
+the poses of pictures, share only a few.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +15,8 @@ from numpy.typing import NDArray
 from finssim.calibration.uncertainty import Evidence
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix
 
-__all__ = [
-    "Block", "Pose", "TukeyFit", "arrow_evidence", "arrow_reduced", "arrow_step", "block_of", "boxed", "descent",
-    "huber_cost", "huber_weight", "tukey",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 State = TypeVar("State")
-
-TUKEY = 4.685
-"""Standard deviations from which a row has no weight: 95 % efficient on normal errors."""
 
 STEADIEST = 1e10
 """Damping at which no step leads down any more."""
@@ -206,75 +197,3 @@ def _eliminated(block: Block, damping: float) -> tuple[Array, Array, Array]:
     inner = np.linalg.solve(bb, np.column_stack([block.ab.T, block.b]))
     aa = block.aa + damping * np.diag(np.diagonal(block.aa))
     return aa - block.ab @ inner[:, :-1], block.a - block.ab @ inner[:, -1], inner
-
-
-@dataclass(frozen=True, kw_only=True)
-class TukeyFit(Generic[State]):
-    """Where `tukey` ended. Rows without a measurement (NaN) are left out of everything."""
-
-    state: State
-    residual: Array
-    """Measured less predicted, (n, k)."""
-    jacobian: Array
-    """Of the prediction, (n, k, P)."""
-    weight: Array
-    """0 where a row disagrees, (n,)."""
-    sigma: float
-    """Robust standard deviation of a residual."""
-
-    @property
-    def rms(self) -> float:
-        """Weighted root mean square length of the residuals."""
-        return float(np.sqrt(np.average(np.sum(self.residual**2, axis=1), weights=self.weight)))
-
-    @property
-    def rejected(self) -> int:
-        """Rows without weight."""
-        return int(np.sum(self.weight <= 0.0))
-
-    def evidence(self, names: tuple[str, ...]) -> Evidence:
-        """What consecutive blocks of rows, a dozen where there are enough, say of the first unknowns."""
-        J, w = self.jacobian[..., : len(names)], self.weight / self.sigma**2
-        parts = np.array_split(np.arange(len(J)), max(2, min(12, len(J) // 4)))
-        return Evidence(
-            names=names,
-            normal=np.array([np.einsum("n,nki,nkj->ij", w[p], J[p], J[p]) for p in parts]),
-            score=np.array([np.einsum("n,nki,nk->i", w[p], J[p], self.residual[p]) for p in parts]),
-            unit="blocks",
-        )
-
-
-def tukey(
-    state: State,
-    linearise: Callable[[State], tuple[Array, Array]],
-    moved: Callable[[State, Array], State],
-    *,
-    rounds: int = 12,
-    rcond: float = 1e-9,
-) -> TukeyFit[State]:
-    """Gauss-Newton steps with Tukey's weights, their scale from the median residual.
-
-    Args:
-        state: Where to begin; the first weights follow from it.
-        linearise: Residuals (n, k) and the derivatives of the prediction (n, k, P) at a state.
-        moved: The state a step (P,) away.
-        rounds: Steps, at most.
-        rcond: Of the largest singular value: directions below it get no step.
-    """
-    for last in (False,) * rounds + (True,):
-        residual, J = linearise(state)
-        good = np.isfinite(residual).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
-        residual, J = residual[good], J[good]
-        k = residual.shape[1]
-        sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
-        size = np.linalg.norm(residual, axis=1)
-        weight = np.clip(1.0 - (size / (TUKEY * k**0.5 * sigma)) ** 2, 0.0, None) ** 2
-        if last:
-            break
-        root = np.sqrt(weight)[:, None]
-        rows, right = (root[..., None] * J).reshape(len(J) * k, -1), (root * residual).ravel()
-        step, *_ = np.linalg.lstsq(rows, right, rcond=rcond)
-        state = moved(state, step)
-        if np.abs(step).max() < 1e-9:
-            break
-    return TukeyFit(state=state, residual=residual, jacobian=J, weight=weight, sigma=sigma)

@@ -18,11 +18,6 @@ from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Camera, Interface, Layer, Lens, Status, project, projection_jacobians
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, skew
 
-__all__ = [
-    "LENS_NAMES", "NAMES", "PoolModel", "Prior", "Settings", "Solution", "active_names", "clearances",
-    "extended_lens", "lens_std", "normal_equations", "residuals", "solve",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 POSE_NAMES = ("camera_x", "camera_y", "camera_z", "rotation_x", "rotation_y", "rotation_z")

@@ -24,8 +24,6 @@ from finssim.text_table import TextTable, read_text, read_text_table, text_table
 from finssim.text_table import number as _number
 from finssim.yaml_file import read_mapping
 
-__all__ = ["Observations", "observe", "observe_combined", "read_survey"]
-
 Array = NDArray[np.float64]
 
 METRES = {**UNITS["length"], "inch": 0.0254}

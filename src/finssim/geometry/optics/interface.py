@@ -11,8 +11,6 @@ import numpy.typing as npt
 
 from finssim.geometry.optics.lens import OpticsError
 
-__all__ = ["Interface", "Layer"]
-
 Array = npt.NDArray[np.float64]
 
 

@@ -15,8 +15,6 @@ import numpy.typing as npt
 
 from finssim.geometry.rotations import quat_to_matrix
 
-__all__ = ["LENS_MODELS", "Camera", "Lens", "OpticsError"]
-
 # The refusal of impossible optics.
 
 

@@ -14,11 +14,6 @@ import numpy.typing as npt
 from finssim.geometry.optics.interface import Interface
 from finssim.geometry.optics.lens import Camera, OpticsError
 
-__all__ = [
-    "Jacobians", "Projection", "Status", "WaterRays", "back_project", "back_project_jacobian", "count_rejections",
-    "plane_jacobian", "project", "projection_jacobians",
-]  # fmt: skip
-
 # Why a pixel has no ray in the water, or a point no pixel.
 
 StatusArray = npt.NDArray[np.int8]

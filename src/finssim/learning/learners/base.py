@@ -15,18 +15,6 @@ from finssim.learning.resume import random_state, set_random_state
 from finssim.tasks import Environment, Task
 from finssim.tasks.agents import expert_for
 
-__all__ = [
-    "ActingLearner",
-    "ON_POLICY",
-    "OnPolicySettings",
-    "RANDOMIZED",
-    "ROLLOUT_SAMPLES",
-    "SETTINGS",
-    "expert_in",
-    "own_settings",
-]
-
-
 # What a learner's settings are for a task, where they are not the defaults: the one place for them.
 
 

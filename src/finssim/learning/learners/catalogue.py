@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from finssim.learning.network import Network
 
-__all__ = ["LEARNERS", "Learner", "LearnerKind", "LearningError", "learner_named"]
-
 
 class LearningError(ValueError):
     """A learner that there is not, that cannot do what is asked, or whose numbers ran away."""

@@ -14,8 +14,6 @@ from finssim.learning.recurrent import stack
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment
 
-__all__ = ["Gail", "GailSettings"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class GailSettings(TorchRlSettings):

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from finssim.control.guidance import Known
 from finssim.learning.demonstrations import Demonstrations, load
 from finssim.learning.learners.base import ActingLearner, expert_in
 from finssim.learning.learners.catalogue import LearningError
@@ -16,9 +17,7 @@ from finssim.learning.recurrent import stack
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment
-from finssim.tasks.agents import NOWHERE, Known, memory_from, memory_leaves, restarted
-
-__all__ = ["Bc", "Dagger", "demonstrations_for"]
+from finssim.tasks.agents import NOWHERE, memory_from, memory_leaves, restarted
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,14 +21,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from finssim.control.guidance import Known
 from finssim.learning.layers import Adam, Array, Arrays, Gru, Parameters, Row, Stack
 from finssim.learning.learners.base import ActingLearner, expert_in
 from finssim.learning.network import Activation, Cell, Linear, Network, advance_history, with_integrals
 from finssim.learning.served import age_episodes
 from finssim.tasks import Environment
-from finssim.tasks.agents import NOWHERE, Known, memory_from, memory_leaves, restarted
-
-__all__ = ["Ppo", "PpoSettings"]
+from finssim.tasks.agents import NOWHERE, memory_from, memory_leaves, restarted
 
 ROLLOUT_SAMPLES = 4096
 """Fewest samples between two updates: with few worlds, rollouts are longer."""

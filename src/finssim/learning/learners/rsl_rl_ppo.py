@@ -19,8 +19,6 @@ from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment
 
-__all__ = ["RslRlPpo", "RslRlSettings"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class RslRlSettings(OnPolicySettings):

@@ -20,9 +20,6 @@ from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.sb3 import Sb3VecEnv
 from finssim.tasks import Environment
 
-__all__ = ["SacSettings", "Sb3Learner", "Sb3Ppo", "Sb3Sac", "TalliedWorlds"]
-
-
 # What the learners of Stable-Baselines3 share: the worlds under a tally, and a logger that only collects.
 
 

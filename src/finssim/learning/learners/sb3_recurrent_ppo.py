@@ -13,8 +13,6 @@ from finssim.learning.learners.base import OnPolicySettings
 from finssim.learning.learners.sb3 import Sb3Ppo
 from finssim.learning.recurrent import RecurrentNetwork
 
-__all__ = ["RecurrentSettings", "Sb3RecurrentPpo"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class RecurrentSettings(OnPolicySettings):

@@ -24,8 +24,6 @@ from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment
 
-__all__ = ["TorchRlIppo", "TorchRlMappo", "TorchRlPpo"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class TorchRlSettings(OnPolicySettings):

@@ -19,8 +19,6 @@ import numpy.typing as npt
 from finssim.localization import LocalizationError
 from finssim.text_table import TextTable, read_text_table, write_csv
 
-__all__ = ["Detection", "Frame", "most_certain", "read_detections", "write_detections"]
-
 Array = npt.NDArray[np.float64]
 
 COLUMNS = (

@@ -15,10 +15,6 @@ from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection
 from finssim.vehicles.equipment import Tags
 
-__all__ = [
-    "EDGES", "FAMILIES", "bitmap", "corners", "family_named", "find_tags", "printable", "tag_corners_b",
-]  # fmt: skip
-
 # Tags found by AprilTag 3, through pupil-apriltags, in our conventions.
 
 Image = npt.NDArray[np.uint8]

@@ -16,8 +16,6 @@ from finssim.files import atomic_write
 from finssim.localization import LocalizationError
 from finssim.text_table import read_text_table
 
-__all__ = ["PICTURE_FILES", "pictures", "read_picture", "write_picture"]
-
 Image = npt.NDArray[np.uint8]
 Timed = tuple[float, str, Image]
 

@@ -15,12 +15,6 @@ import numpy.typing as npt
 
 from finssim.geometry.rotations import quat_from_rotvec, quat_rotate, quat_to_matrix, skew
 
-__all__ = [
-    "Tilt", "TiltGains", "YawInnovation", "YawNoise", "YawState", "capped", "correct", "follow",
-    "height_above_origin", "in_body_axes", "innovation", "predict", "restarted", "roll_pitch", "tilt_from",
-    "up_of", "yaw_rate",
-]  # fmt: skip
-
 Array = npt.NDArray[np.float64]
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame
 from finssim.localization.fusion.attitude import height_above_origin
-from finssim.localization.fusion.error_state import ErrorState
-from finssim.localization.fusion.fuse_constant_velocity import (
+from finssim.localization.fusion.error_state import (
     ConstantVelocity,
+    ErrorState,
 )
 from finssim.localization.fusion.fuse_log import counted, rows_of
 from finssim.localization.fusion.fuse_settings import Settings, Site

@@ -26,8 +26,6 @@ from finssim.localization.poses.methods import TagLocator, check_method
 from finssim.text_table import write_csv
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["Run", "fuse", "run"]
-
 # The table that the fusion writes, and its summary.
 
 Array = npt.NDArray[np.float64]

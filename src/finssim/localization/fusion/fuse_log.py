@@ -20,11 +20,6 @@ from finssim.text_table import EMPTY, TextTable, read_text_table
 from finssim.vehicles import Vehicle
 from finssim.vehicles.equipment import Imu
 
-__all__ = [
-    "Log", "NoFix", "Series", "StreamTable", "counted", "imu_columns", "load_log", "read_stream_table", "rows_of",
-    "series",
-]  # fmt: skip
-
 # Reading the tables of a log: columns of numbers by name, empty cells as NaN.
 
 Array = npt.NDArray[np.float64]

@@ -15,8 +15,6 @@ from finssim.localization.fusion.position_filter import Motion
 from finssim.localization.pool import Pool
 from finssim.vehicles import Vehicle
 
-__all__ = ["PROFILES", "Aids", "Gate", "Settings", "Site", "settings_of", "site_of"]
-
 Array = npt.NDArray[np.float64]
 
 

@@ -8,11 +8,6 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-__all__ = [
-    "Innovation", "Motion", "PositionState", "capped", "correct", "frozen", "innovation", "predict",
-    "process_noise", "restarted", "transition",
-]  # fmt: skip
-
 Array = npt.NDArray[np.float64]
 
 

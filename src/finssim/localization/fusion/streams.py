@@ -11,10 +11,6 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-__all__ = [
-    "DepthSample", "Estimate", "HeadingSample", "ImuSample", "Outcome", "Sample", "VelocitySample",
-    "VisionSample", "changed", "refusal",
-]  # fmt: skip
 
 # Records with some fields changed, hundreds of times a second.
 

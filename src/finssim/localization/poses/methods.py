@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.optics import Camera, Lens, back_project, projection_jacobians
+from finssim.geometry.optics import Camera, Lens, Status, back_project, count_rejections, projection_jacobians
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, quat_to_rotvec, skew
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection
@@ -25,23 +26,522 @@ from finssim.localization.poses import (
     refused,
     tilt_matrix,
 )
-from finssim.localization.poses.planar_fit import WORST, planar_fit
 from finssim.vehicles.equipment import Tags
 
 __all__ = [
-    "METHODS",
-    "NEEDS_DEPTH",
-    "Constraints",
-    "Measurement",
-    "Method",
-    "TagLocator",
-    "check_method",
-    "plane_pose",
-    "refine_pose",
-    "through_lens",
-]
+    "Constraints", "METHODS", "NEEDS_DEPTH", "TagLocator", "check_method", "planar_fit", "plane_pose",
+    "refine_pose", "through_lens",
+]  # fmt: skip
+
+
+# A rigid motion in the plane that lays one set of points on another, measured in pixels.
+
+_MOST_STEPS = 30
+_MOST_TURNS = 8
+_STILL_PLANE = 1e-13
+"""A step that changes the misses by less than the root of this [px²] is the last."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigidFit:
+    """The motion found, and what its uncertainty follows from."""
+
+    xi: tuple[float, float, float]
+    """x, y [m], psi [rad]."""
+    inverse: Array
+    """Inverse of the weighted J'J [m², rad² per px²], (3, 3)."""
+    weighted_J: Array
+    """The curvature of rho times J, (n, 2, 3)."""
+    A: Array
+    """[px/m], (n, 2, 2)."""
+    missed: Array
+    """Distance of each point from its place [px], (n,)."""
+    iterations: int
+    converged: bool
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of `missed` [px]."""
+        return math.sqrt(float(self.missed @ self.missed) / len(self.missed))
+
+    def response(self, shared: Array) -> Array:
+        """How the motion changes with errors that move many points at once.
+
+        Args:
+            shared: Change of each point Q - P per unit of each error, (k, n, 2).
+
+        Returns:
+            (3, k)
+        """
+        in_pixels = (self.A @ shared[..., None])[..., 0].reshape(len(shared), -1)
+        return np.asarray(-self.inverse @ (in_pixels @ self.weighted_J.reshape(-1, 3)).T)
+
+    def inflation(self, std: float) -> float:
+        """Factor on the variance where the misses are larger than noise of `std` [px] explains.
+
+        It is 1 up to the 99 % quantile of chi² (Wilson and Hilferty's approximation), and the ratio to it beyond.
+        """
+        dof = 2 * len(self.missed) - 3
+        k = 2.0 / (9.0 * dof)
+        quantile = dof * (1.0 - k + 2.326 * math.sqrt(k)) ** 3
+        return max(1.0, float(self.missed @ self.missed) / std**2 / quantile)
+
+
+def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | None:
+    """Find xi = (x, y, psi) that minimises sum_i rho(|A_i (Q_i - R(psi) points_i - [x, y])|).
+
+    Levenberg and Marquardt's method with the analytic Jacobian -A [I, R'(psi) points], from the minimum of the plain
+    sum of squares: where no point misses by `huber` or more, its first step is its last.
+
+    Args:
+        Q: Where the points are seen [m], (n, 2).
+        points: Where they are on the body [m], (n, 2).
+        A: Metres to pixels [px/m], (n, 2, 2).
+        huber: Distance [px] from which on Huber's rho grows linearly.
+
+    Returns:
+        The fit, or None where the points are too close together to tell the angle.
+    """
+    xi = _least_squares(Q, points, A)
+    now = _evaluate(xi, Q, points, A, huber)
+    damping, converged = 1e-6, False
+    step_number = 0
+    while step_number < _MOST_STEPS and not converged:
+        step_number += 1
+        inverse = _damped_inverse(now.H, damping)
+        if inverse is None:
+            return None
+        step = -inverse @ now.g
+        converged = bool(-(step @ now.g) < _STILL_PLANE)
+        trial = (xi[0] + step[0], xi[1] + step[1], xi[2] + step[2])
+        then = _evaluate(trial, Q, points, A, huber)
+        if converged or then.cost <= now.cost:  # the last step changes the cost by no more than rounding does
+            xi, now, damping = trial, then, max(0.1 * damping, 1e-12)
+        else:
+            damping = max(10.0 * damping, 1e-6)
+    inverse = _damped_inverse(now.H, 0.0)
+    if inverse is None:
+        return None
+    where = (float(xi[0]), float(xi[1]), math.remainder(float(xi[2]), math.tau))
+    return RigidFit(where, inverse, now.weighted_J, A, now.missed, step_number, converged)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    cost: float
+    H: Array
+    g: Array
+    weighted_J: Array
+    missed: Array
+
+
+def _damped_inverse(H: Array, damping: float) -> Array | None:
+    """Inverse of H + damping diag(H) by its adjugate, None where it is singular: np.linalg costs four times as much."""
+    (a, d, e), (_, b, f), (_, _, c) = H.tolist()
+    scale = a * b * c
+    a, b, c = a * (1.0 + damping), b * (1.0 + damping), c * (1.0 + damping)
+    A, D, E = b * c - f * f, e * f - c * d, d * f - b * e
+    determinant = a * A + d * D + e * E
+    if not determinant > 1e-12 * scale:
+        return None
+    B, F, C = a * c - e * e, d * e - a * f, a * b - d * d
+    return np.asarray(np.array([[A, D, E], [D, B, F], [E, F, C]]) / determinant)
+
+
+def _procrustes(centre: Array, middle: Array, q: Array, p: Array) -> tuple[float, float, float]:
+    """The closed form for equal weights, of the middles of both sets of points and where they are from them."""
+    along = float(np.vdot(p, q))
+    across = float(p[:, 0] @ q[:, 1] - p[:, 1] @ q[:, 0])
+    psi = math.atan2(across, along)
+    c, s = math.cos(psi), math.sin(psi)
+    return (
+        float(centre[0] - c * middle[0] + s * middle[1]),
+        float(centre[1] - s * middle[0] - c * middle[1]),
+        psi,
+    )
+
+
+def _least_squares(Q: Array, points: Array, A: Array) -> tuple[float, float, float]:
+    """The minimum of sum_i |A_i (Q_i - R(psi) points_i - [x, y])|², beside the closed form for equal weights.
+
+    The misses are linear in (x, y, cos psi, sin psi), so the sum is a quadratic form. Without x and y, which it decides
+    for each psi, it is K over (cos psi, sin psi, 1): Newton's method finds its minimum in plain numbers.
+    """
+    n = len(Q)
+    centre, middle = Q.sum(axis=0) / n, points.sum(axis=0) / n
+    q, p = Q - centre, points - middle
+    columns = np.zeros((n, 2, 5))  # of x, y, cos psi and sin psi in R points + [x, y], and -Q
+    columns[:, 0, 0] = columns[:, 1, 1] = 1.0
+    columns[:, :, 2] = p
+    columns[:, 0, 3], columns[:, 1, 3] = -p[:, 1], p[:, 0]
+    columns[:, :, 4] = -q
+    in_pixels = (A @ columns).reshape(-1, 5)
+    G = (in_pixels.T @ in_pixels).tolist()
+    (a, b), d = G[0][:2], G[1][1]
+    determinant = a * d - b * b
+    if not determinant > 0.0:
+        return _procrustes(centre, middle, q, p)
+    # Where x and y are for each of cos psi, sin psi, 1; and what is left of the form.
+    x = [-(d * G[0][k] - b * G[1][k]) / determinant for k in (2, 3, 4)]
+    y = [-(a * G[1][k] - b * G[0][k]) / determinant for k in (2, 3, 4)]
+    cc, ss, cs, c1, s1 = (
+        G[i + 2][j + 2] + G[i + 2][0] * x[j] + G[i + 2][1] * y[j]
+        for i, j in ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))
+    )
+    _, _, psi = begin = _procrustes(centre, middle, q, p)
+    for _ in range(_MOST_TURNS):
+        c, s = math.cos(psi), math.sin(psi)
+        slope = (ss - cc) * c * s + cs * (c * c - s * s) - c1 * s + s1 * c
+        curvature = (ss - cc) * (c * c - s * s) - 4.0 * cs * c * s - c1 * c - s1 * s
+        if not curvature > 0.0:
+            return begin
+        psi -= slope / curvature
+        if abs(slope) < 1e-8 * curvature:  # the error is the square of this, once the step is taken
+            break
+    c, s = math.cos(psi), math.sin(psi)
+    (qx, qy), (px, py) = centre.tolist(), middle.tolist()
+    return (
+        x[0] * c + x[1] * s + x[2] + qx - (c * px - s * py),
+        y[0] * c + y[1] * s + y[2] + qy - (s * px + c * py),
+        psi,
+    )
+
+
+def _evaluate(xi: tuple[float, float, float], Q: Array, points: Array, A: Array, huber: float) -> _State:
+    c, s = math.cos(xi[2]), math.sin(xi[2])
+    turned = points @ np.array([[c, s], [-s, c]])
+    change = np.empty((len(Q), 2, 4))  # columns: Q - P, and P's derivatives by x, y, psi
+    change[:, :, 0] = Q - turned - xi[:2]
+    change[:, :, 1:3] = -_UNIT
+    change[:, 0, 3], change[:, 1, 3] = turned[:, 1], -turned[:, 0]
+    in_pixels = A @ change
+    miss, J = in_pixels[:, :, 0], in_pixels[:, :, 1:]
+    squares = (miss * miss) @ _ONES
+    missed = np.sqrt(squares)
+    flat = J.reshape(-1, 3)
+    if missed.max() <= huber:
+        return _State(float(squares.sum()), flat.T @ flat, flat.T @ miss.ravel(), J, missed)
+    far = missed > huber
+    weight = np.where(far, huber / np.maximum(missed, huber), 1.0)
+    cost = float(np.where(far, huber * (2.0 * missed - huber), squares).sum())
+    # Where rho grows linearly it curves across the miss only; with weights alone the steps would shrink but slowly.
+    towards = np.where(far, 1.0 / np.maximum(missed, huber), 0.0)[:, None] * miss
+    across = J - towards[:, :, None] * np.einsum("ij,ijk->ik", towards, J)[:, None, :]
+    weighted = weight[:, None, None] * across
+    g = flat.T @ (weight[:, None] * miss).ravel()
+    return _State(cost, weighted.reshape(-1, 3).T @ flat, g, weighted, missed)
+
+
+_UNIT, _ONES = np.eye(2), np.ones(2)
+
+
+# Where on its known height each corner lies that a picture shows: eq. 12 of the paper, in the medium it is in.
+
+_STEP = 0.1
+"""Step of the derivative with respect to the pixel [px]: optics change over hundreds of pixels: its error is 1e-4."""
+_STEPS = np.array([[[0.0, 0.0]], [[_STEP, 0.0]], [[0.0, _STEP]]])
+_GRAZING = 1e-3
+"""A ray that makes less than this angle with the plane of heights [rad] does not tell where the corner is."""
+
+
+@dataclass(frozen=True, eq=False)
+class CornerPoints:
+    """Corners on their heights, in a frame g whose z axis points up."""
+
+    Q: Array
+    """Horizontal coordinates [m], (n, 2); NaN where the status is not OK."""
+    per_pixel: Array
+    """dQ/d(u, v) [m/px], (n, 2, 2)."""
+    per_height: Array
+    """dQ/dz [-], (n, 2)."""
+    status: npt.NDArray[np.int8]
+    """(n,)"""
+    in_air: npt.NDArray[np.bool_]
+    """Whether the corner is on the camera's side of the water, (n,)."""
+
+
+def corner_points(pool: Pool, R_pg: Array, pixels: Array, heights: Array, *, straight: bool) -> CornerPoints:
+    """Meet each pixel's ray with the plane on which its corner is.
+
+    Q = S + (z - e3 . S) / (e3 . r) r                                                       (paper, eq. 12)
+
+    The ray is bent at the interface unless it meets the plane before it: then the corner is in the air, and the ray
+    straight.
+
+    Args:
+        pool: Camera and interface.
+        R_pg: Frame g, whose z axis points up, to the pool frame, (3, 3).
+        pixels: (n, 2).
+        heights: Along the z axis of g, from the pool's origin [m], (n,).
+        straight: Leave the water out.
+    """
+    beside = pixels + _STEPS
+    with np.errstate(all="ignore"):
+        if straight:
+            found = _points(*_air(pool, R_pg, beside), heights)
+            return _corner_points(*found, np.ones(len(pixels), bool))
+        rays = back_project(pool.camera, pool.interface, beside)
+        origin, direction = rays.origin @ R_pg, rays.direction @ R_pg
+        centre = float(pool.camera.position @ R_pg[:, 2])
+        # Part of the way from the camera to the water at which the height is reached.
+        part = (heights - centre) / (origin[0, :, 2] - centre)
+        in_air = (part > 0.0) & (part < 1.0)
+        points, slope, status = _points(origin, direction, rays.status, heights)
+        if in_air.any():
+            above = _points(*_air(pool, R_pg, beside[:, in_air]), heights[in_air])
+            points[:, in_air], slope[in_air], status[in_air] = above
+        return _corner_points(points, slope, status, in_air)
+
+
+def _air(pool: Pool, R_pg: Array, pixels: Array) -> tuple[Array, Array, npt.NDArray[np.int8]]:
+    """Straight rays: origin, direction in g, status."""
+    rays, seen = pool.camera.lens.rays(pixels)
+    status = np.where(seen, np.int8(Status.OK), np.int8(Status.NO_RAY)).astype(np.int8)
+    return pool.camera.position @ R_pg, rays @ (pool.camera.R_pc.T @ R_pg), status
+
+
+def _points(
+    origin: Array, direction: Array, status: npt.NDArray[np.int8], heights: Array
+) -> tuple[Array, Array, npt.NDArray[np.int8]]:
+    """Horizontal coordinates (3, n, 2), their change with height (n, 2) and status (n,)."""
+    steep = direction[..., 2]
+    length = (heights - origin[..., 2]) / steep
+    points = origin[..., :2] + length[..., None] * direction[..., :2]
+    slope = direction[0, :, :2] / steep[0, :, None]
+    met = (length > -1e-9).all(axis=0) & (np.abs(steep[0]) > _GRAZING)
+    worst = status.max(axis=0)
+    if met.all() and not worst.any():
+        return points, slope, worst
+    why = np.where(np.abs(steep[0]) > _GRAZING, np.int8(Status.AWAY), np.int8(Status.PARALLEL))
+    return points, slope, np.where((worst == 0) & ~met, why, worst).astype(np.int8)
+
+
+def _corner_points(
+    points: Array, slope: Array, status: npt.NDArray[np.int8], in_air: npt.NDArray[np.bool_]
+) -> CornerPoints:
+    per_pixel = np.empty((points.shape[1], 2, 2))
+    per_pixel[..., 0] = (points[1] - points[0]) / _STEP
+    per_pixel[..., 1] = (points[2] - points[0]) / _STEP
+    return CornerPoints(points[0], per_pixel, slope, status, in_air)
+
 
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+FEWEST = 3
+"""Corners without which there is no measurement."""
+WORST = 4.0
+"""A corner that misses its place by more than this [px], and by more than 8 standard deviations, is an outlier."""
+WORST_WITHOUT_WATER = 40.0
+"""The same where the water is left out, which alone may cost many pixels."""
+_SUSPECTS = (
+    "look at the tag's id, edge and mount, the depth, the tilt and the pool file",
+    "the tags contradict each other: look at their ids and mounts, the depth, the tilt and the pool file",
+)
+
+
+def planar_fit(
+    detections: Iterable[Detection],
+    pool: Pool,
+    tags_b: Mapping[int, Array],
+    constraints: Constraints | None,
+    pixel_std: float = 0.5,
+    *,
+    straight: bool = False,
+) -> Measurement:
+    """Measure x, y and yaw of a vehicle whose height, roll and pitch are known.
+
+    Each corner's height z_i = z_b + e3 . R_y(θ) R_x(φ) P_b,i does not depend on the yaw sought, so that its ray meets
+    its height once, at Q_i; then
+
+        xi* = argmin sum_i rho(| A_i (Q_i - P_i(xi)) |),   P_i = R_z(psi) R_y R_x P_b,i + [x, y, z_b]   (paper, eq. 13)
+
+    with A_i = (dQ_i/d(u, v))^-1, which counts the miss in the pixels where the detector made it, and Huber's rho.
+
+    Args:
+        detections: Tags of one picture.
+        pool: Camera and water.
+        tags_b: Tag id -> corners in the body frame [m], (4, 3).
+        constraints: Height and tilt; without them the measurement is refused.
+        pixel_std: Standard deviation of a corner, per axis [px].
+        straight: Leave the water out: the rays go straight through it.
+
+    Returns:
+        The measurement, with the covariance that pixels, height and tilt give it; or why there is none.
+    """
+    method = "pinhole-depth" if straight else "refractive"
+    pairs = correspondences(detections, tags_b)
+    if not pairs.tags:
+        return refused(method, pairs.why_too_few, pairs.rejected)
+    if constraints is None:
+        return refused(method, "height and tilt are not known: give a depth", pairs.rejected, tags=pairs.tags)
+    R_pg = _frame_of(constraints.up)
+    level = pairs.points_b @ tilt_matrix(constraints.roll, constraints.pitch).T
+    seen = corner_points(pool, R_pg, pairs.pixels, constraints.z_b + level[:, 2], straight=straight)
+    limit = max(WORST_WITHOUT_WATER if straight else WORST, 8.0 * pixel_std)
+    solved = _solve(seen, level, pixel_std, limit, len(pairs.tags))
+    rejected = {**pairs.rejected, **solved.rejected}
+    fit = solved.fit
+    if fit is None:
+        return refused(method, solved.reason, rejected, tags=pairs.tags)
+    return Measurement(
+        method,
+        True,
+        "",
+        R_pg @ np.array([fit.xi[0], fit.xi[1], constraints.z_b]),
+        R_pg @ _about_up(fit.xi[2]) @ tilt_matrix(constraints.roll, constraints.pitch),
+        _covariance(fit, seen, level, solved.used, constraints, R_pg, pixel_std),
+        fit.rms,
+        _tags(pairs, solved.used),
+        int(solved.used.sum()),
+        rejected,
+        fit.iterations,
+        _medium(seen.in_air[solved.used]) if not straight else "",
+    )
+
+
+@lru_cache(maxsize=16)
+def _frame_of(up: tuple[float, float, float]) -> Array:
+    """R_pg of `axes_of_up` for a direction of any length, (3, 3)."""
+    return axes_of_up(np.asarray(up) / np.linalg.norm(up))
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    fit: RigidFit | None
+    used: Flags
+    rejected: dict[str, int]
+    reason: str = ""
+
+
+def _solve(seen: CornerPoints, level: Array, pixel_std: float, limit: float, tags: int) -> _Solved:
+    """Fit the corners that have a point, once more without those that miss by far."""
+    used = seen.status == 0
+    rejected = {} if used.all() else _reasons(seen)
+    if used.sum() < FEWEST:
+        words = ", ".join(f"{n} {name}" for name, n in rejected.items())
+        return _Solved(
+            None, used, rejected, f"fewer than {FEWEST} corners have a ray to their height ({words})"
+        )
+    fit = _fit(seen, level, used, pixel_std)
+    if fit is not None and fit.missed.max() > limit:
+        far = fit.missed > limit
+        few = 2 * int(far.sum()) < len(far) and len(far) - int(far.sum()) >= FEWEST
+        kept = _without(used, far) if few else _without_a_tag(seen, level, used, pixel_std, limit, tags)
+        if kept is None:
+            words = f"{int(far.sum())} of {len(far)} corners miss by more than {limit:.1f} px"
+            return _Solved(None, used, rejected, f"residual too large: {words}: {_SUSPECTS[tags > 1]}")
+        rejected["outlier" if few else "contradicting tag"] = int(used.sum() - kept.sum())
+        used = kept
+        fit = _fit(seen, level, used, pixel_std)
+    if fit is None:
+        return _Solved(None, used, rejected, "the corners lie too close together to tell the heading")
+    if not fit.converged:
+        return _Solved(None, used, rejected, f"did not converge in {fit.iterations} steps")
+    if fit.missed.max() > limit:
+        return _Solved(None, used, rejected, f"residual too large: {fit.rms:.1f} px even without outliers")
+    return _Solved(fit, used, rejected)
+
+
+def _reasons(seen: CornerPoints) -> dict[str, int]:
+    return {name.lower().replace("_", " "): n for name, n in count_rejections(seen.status).items()}
+
+
+def _without(used: Flags, far: Flags) -> Flags:
+    kept = used.copy()
+    kept[np.flatnonzero(used)[far]] = False
+    return kept
+
+
+def _without_a_tag(
+    seen: CornerPoints, level: Array, used: Flags, pixel_std: float, limit: float, tags: int
+) -> Flags | None:
+    """The corners without one tag, if they agree then, and do so for that tag only."""
+    agreeing = []
+    for i in range(tags if tags > 1 else 0):
+        kept = used.copy()
+        kept[4 * i : 4 * i + 4] = False
+        fit = _fit(seen, level, kept, pixel_std) if FEWEST <= kept.sum() < used.sum() else None
+        if fit is not None and fit.converged and fit.missed.max() <= limit:
+            agreeing.append(kept)
+    return agreeing[0] if len(agreeing) == 1 else None
+
+
+def _fit(seen: CornerPoints, level: Array, used: Flags, pixel_std: float) -> RigidFit | None:
+    A = _inverse(seen.per_pixel)
+    if not used.all():
+        return rigid_fit(seen.Q[used], level[used, :2], A[used], 2.5 * pixel_std)
+    return rigid_fit(seen.Q, level[:, :2], A, 2.5 * pixel_std)
+
+
+def _inverse(D: Array) -> Array:
+    """Inverse of 2x2 matrices, (n, 2, 2)."""
+    out = np.empty_like(D)
+    out[:, 0, 0], out[:, 1, 1], out[:, 0, 1], out[:, 1, 0] = D[:, 1, 1], D[:, 0, 0], -D[:, 0, 1], -D[:, 1, 0]
+    with np.errstate(all="ignore"):
+        return out / (D[:, 0, 0] * D[:, 1, 1] - D[:, 0, 1] * D[:, 1, 0])[:, None, None]
+
+
+def _covariance(
+    fit: RigidFit,
+    seen: CornerPoints,
+    level: Array,
+    used: Flags,
+    constraints: Constraints,
+    R_pg: Array,
+    pixel_std: float,
+) -> Array:
+    """Covariance of (x, y, yaw), pool frame: pixels, each for itself; height and tilt, which move all corners at once.
+
+    With the miss e_i = Q_i - P_i, an error δ that all share moves the solution by -H^-1 sum_i J_i' w_i A_i de_i/dδ.
+    """
+    slope, level = seen.per_height[used], level[used]
+    cp, sp = math.cos(constraints.pitch), math.sin(constraints.pitch)
+    # Crossed with the axes of roll, R_y e1 = (cp, 0, -sp), and of pitch, e2: R_g p -> axis x R_g p, side by side.
+    turned = (
+        level
+        @ np.array(
+            [[0.0, -sp, 0.0, 0.0, 0.0, -1.0], [sp, 0.0, cp, 0.0, 0.0, 0.0], [0.0, -cp, 0.0, 1.0, 0.0, 0.0]]
+        )
+    ).reshape(-1, 2, 3)
+    x, y, _ = (tilt_matrix(constraints.roll, constraints.pitch) @ constraints.port).tolist()
+    raised = np.array([1.0, -cp * y, x, 0.0, 0.0])  # dz_b
+    turn = _about_up(fit.xi[2])[:2, :2]
+    shared = np.empty((5, len(slope), 2))
+    shared[0] = slope
+    shared[1:3] = (
+        slope[:, None] * (turned[:, :, 2] + raised[1:3])[:, :, None] - turned[:, :, :2] @ turn.T
+    ).transpose(1, 0, 2)
+    shared[3:] = seen.per_pixel[used].transpose(2, 0, 1)
+    moved = np.empty((4, 5))  # x, y, psi, z_b by height, roll, pitch, u, v
+    moved[:3] = fit.response(shared)
+    moved[3] = raised
+    std = constraints.tilt_std
+    spread = moved * np.array(
+        [constraints.z_std, std, std, constraints.shared_pixel_std, constraints.shared_pixel_std]
+    )
+    P = spread @ spread.T
+    P[:3, :3] += fit.inverse * (pixel_std**2 * fit.inflation(pixel_std))
+    to_pool = np.zeros((3, 4))
+    to_pool[:2, :2], to_pool[:2, 3], to_pool[2, 2] = R_pg[:2, :2], R_pg[:2, 2], R_pg[2, 2]
+    return np.asarray(to_pool @ P @ to_pool.T)
+
+
+def _about_up(angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _tags(pairs: Correspondences, used: Flags) -> tuple[int, ...]:
+    return tuple(tag for i, tag in enumerate(pairs.tags) if used[4 * i : 4 * i + 4].any())
+
+
+def _medium(in_air: Flags) -> str:
+    return "air" if in_air.all() else "both" if in_air.any() else "water"
+
+
+# Ways to measure a pose from the tags of one picture, by name.
+
 
 # Poses to start from: of a flat board from the rays to its points, without regard to water.
 

@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from finssim.geometry.mesh import check_closed, face_geometry, mesh_centroid, mesh_volume
 from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
 
-__all__ = ["HullMesh", "drag_slope", "hull_mesh", "mesh_displacement", "mesh_drag", "mesh_inflow"]
-
 
 @wp.struct
 class HullMesh:

@@ -29,17 +29,6 @@ from finssim.physics.types import mat66, vec6
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.terms import TERMS, Term
 
-__all__ = [
-    "Slot",
-    "TermError",
-    "add_term",
-    "composed",
-    "layout",
-    "parameter_row",
-    "row_length",
-    "term_wrenches",
-]
-
 STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density": float}
 """What a term's functions may take besides its parameters."""
 KINDS = {"float": float, "vec3": wp.vec3, "vec6": vec6, "mat66": mat66}

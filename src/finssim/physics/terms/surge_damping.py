@@ -13,8 +13,6 @@ from finssim.physics.types import linear, mat66, vec6
 from finssim.vehicles.part import Matrix6, zeros
 from finssim.vehicles.terms import Term
 
-__all__ = ["SURGE_DAMPING", "surge_coupled_wrench"]
-
 
 @wp.func
 def surge_coupled_wrench(nu_r: vec6, surge_damping: mat66) -> vec6:

@@ -49,6 +49,9 @@ PARAMETERS = ("JS_GAIN_DEFAULT", "JS_THR_GAIN", "BARO1_GND_PRESS", "BARO2_GND_PR
 
 MANUAL_PERIOD, HEARTBEAT_PERIOD, ASK_AGAIN = 0.03, 1.0, 0.5
 """Between two frames of axes, two heartbeats, and two attempts at the same request [s]."""
+REQUEST_LASTS = 3.0
+"""Whoever asked to arm so long ago is still waited for, at neutral axes, before the autopilot is disarmed again [s]: a
+person presses a key twice, and `ros2 service call` takes its time."""
 SELDOM, SMOOTH = 2.0, 0.2
 """Mean time between two messages, part of that asked for, at which they come too seldom; how much the newest counts."""
 HEARTBEAT_LOST = 3.0
@@ -304,7 +307,7 @@ class MavlinkLink:
         if self._version is None or "JS_GAIN_DEFAULT" not in self._parameters:
             if self._first(now, "known") < 3.0:
                 return "waiting for the autopilot's version and parameters"
-        if now - self._wanted > ASK_AGAIN:
+        if now - self._wanted > ASK_AGAIN:  # a new attempt: what ended the last one is history
             self._others, self._refused = False, ""
             self._strange.clear()
         self._wanted = now
@@ -316,6 +319,7 @@ class MavlinkLink:
             return (
                 f"the autopilot does not arm: {self._refused}" if self._refused else "waiting for it to arm"
             )
+        self._wanted = -math.inf
         return ""
 
     def alarm(self, now: float) -> str:
@@ -350,7 +354,7 @@ class MavlinkLink:
         if self._alive == -math.inf:
             return frames
         frames += self._questions(now)
-        running, wanted = state in ("armed", "hold"), now - self._wanted < ASK_AGAIN
+        running, wanted = state in ("armed", "hold"), now - self._wanted < REQUEST_LASTS
         if self._others or not (running or wanted or self._ours):
             return frames  # somebody else has the vehicle, or nobody asked for it
         if now - self._manual_at >= MANUAL_PERIOD - 1e-6 or not running:

@@ -7,8 +7,6 @@ from finssim.robot.messages import Picture
 from finssim.robot.pictures import DEFAULT_CAMERA, DEFAULT_PICTURES, open_pictures
 from finssim.ros2.nodes.robot_node import RobotNode
 
-__all__ = ["Camera"]
-
 POLL = 90.0
 """Looks for a new picture [Hz]."""
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
@@ -16,15 +18,142 @@ from finssim.geometry.rotations import (
     quat_rotate,
     quat_to_euler,
 )
+from finssim.localization.fusion.estimator import Estimator
+from finssim.localization.fusion.streams import VisionSample
 from finssim.localization.pool import Pool
+from finssim.localization.poses import axes_of_up
 from finssim.robot.reading import Reading
+from finssim.ros2.nodes.conversions import ros_type, xyz, xyzw
 from finssim.ros2.nodes.robot_node import RobotNode
-from finssim.ros2.nodes.ros_messages import ros_type
-from finssim.ros2.urdf import BASE, mounts, urdf_of
-
-__all__ = ["Frames", "Odometer", "Pose"]
+from finssim.vehicles import Vehicle
 
 Array = npt.NDArray[np.float64]
+
+BASE = "base_link"
+
+
+def mounts(vehicle: Vehicle) -> Iterator[tuple[str, Array, Array]]:
+    """Frame, position [m] (3,) and orientation xyzw (4,) in base_link of sensors, tags and thrusters.
+
+    A thruster's x axis is the direction of its positive thrust.
+    """
+    sensors = vehicle.sensors
+    for name, mount in (("imu", sensors.imu), ("pressure", sensors.depth), ("dvl", sensors.dvl)):
+        if mount is not None:
+            yield f"{name}_link", np.asarray(mount.position), np.asarray(mount.orientation)
+    for tag, mount in (vehicle.tags.mounts if vehicle.tags else {}).items():
+        yield f"tag_{tag}_link", np.asarray(mount.position), np.asarray(mount.orientation)
+    for name, thruster in vehicle.thrusters.items():
+        yield f"{name}_link", np.asarray(thruster.position), _along(np.asarray(thruster.axis))
+
+
+def urdf_of(vehicle: Vehicle) -> str:
+    """URDF of a vehicle: mass and inertia without water, hull or envelope, and its `mounts` as fixed joints."""
+    robot, body = ElementTree.Element("robot", name=vehicle.name), vehicle.body
+    base = ElementTree.SubElement(robot, "link", name=BASE)
+    inertial = ElementTree.SubElement(base, "inertial")
+    ElementTree.SubElement(inertial, "origin", xyz=_numbers(body.center_of_gravity), rpy="0 0 0")
+    ElementTree.SubElement(inertial, "mass", value=repr(float(body.mass)))
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = (map(repr, map(float, row)) for row in body.inertia)
+    ElementTree.SubElement(inertial, "inertia", ixx=xx, ixy=xy, ixz=xz, iyy=yy, iyz=yz, izz=zz)
+    for kind in ("visual", "collision"):
+        shape = ElementTree.SubElement(base, kind)
+        hull = vehicle.hull
+        if hull is not None and hull.file is not None:
+            geometry = ElementTree.SubElement(shape, "geometry")
+            scale = _numbers([hull.scale] * 3)
+            ElementTree.SubElement(geometry, "mesh", filename=f"file://{hull.file.resolve()}", scale=scale)
+        else:
+            ElementTree.SubElement(shape, "origin", xyz=_numbers(body.center_of_buoyancy), rpy="0 0 0")
+            geometry = ElementTree.SubElement(shape, "geometry")
+            ElementTree.SubElement(geometry, "box", size=_numbers(body.size))
+    for name, position, orientation in mounts(vehicle):
+        ElementTree.SubElement(robot, "link", name=name)
+        joint = ElementTree.SubElement(
+            robot, "joint", name=f"{name.removesuffix('_link')}_joint", type="fixed"
+        )
+        ElementTree.SubElement(joint, "parent", link=BASE)
+        ElementTree.SubElement(joint, "child", link=name)
+        rpy = _numbers(quat_to_euler(orientation))
+        ElementTree.SubElement(joint, "origin", xyz=_numbers(position), rpy=rpy)
+    ElementTree.indent(robot)
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _numbers(values: npt.ArrayLike) -> str:
+    return " ".join(repr(float(v)) for v in np.asarray(values, float).ravel())
+
+
+def _along(axis: Array) -> Array:
+    """Quaternion of a frame whose x axis is that one; its y axis is level unless that is upright."""
+    side = np.cross([0.0, 0.0, 1.0], axis) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    side = side - axis * (side @ axis)
+    side /= np.linalg.norm(side)
+    return np.asarray(matrix_to_quat(np.column_stack([axis, side, np.cross(axis, side)])))
+
+
+# Fixes between the pool's frame, in which the estimator works, and the map, in which they travel.
+
+
+KNOWN = [0, 1, 2, 5]
+"""x, y, z and yaw among the six of a pose's covariance."""
+UNKNOWN = 1.0e6
+"""Variance of a heading that is not known [rad²]."""
+TILT_VARIANCE = 0.02
+"""Of roll and pitch, which are the attitude filter's [rad²]."""
+
+
+class FixFrame:
+    """One pool's frames. Height and tilt, which a fix does not measure, go along as what was used for it."""
+
+    def __init__(self, pool: Pool, estimator: Estimator) -> None:
+        self._T_wp = pool.T_wp
+        R = self._T_wp[:3, :3]
+        self._q_wg = matrix_to_quat(R @ axes_of_up(estimator.site.up))
+        self._turn = np.eye(4)
+        self._turn[:3, :3] = R
+        self._height_variance = estimator.settings.depth_std**2
+
+    def to_map(self, fix: VisionSample, estimator: Estimator) -> tuple[Array, Array, Array]:
+        """Position [m], quaternion xyzw and covariance (6, 6) in the map.
+
+        Args:
+            fix: Pool frame.
+            estimator: Knows height and tilt at its time.
+        """
+        near = estimator.at(fix.time)
+        height = float(estimator.estimate(fix.time).x[2])
+        place = np.array([*fix.position, height if math.isfinite(height) else 0.0])
+        roll, pitch = (a if math.isfinite(a) else 0.0 for a in (near.roll, near.pitch))
+        level = quat_from_euler(roll, pitch, fix.yaw or 0.0)
+        P = np.diag([0.0, 0.0, self._height_variance, UNKNOWN if fix.yaw is None else 0.0])
+        if fix.covariance is not None:
+            P[np.ix_([0, 1, 3], [0, 1, 3])] += np.array(fix.covariance)
+        full = np.diag([0.0, 0.0, 0.0, TILT_VARIANCE, TILT_VARIANCE, 0.0])
+        full[np.ix_(KNOWN, KNOWN)] = self._turn @ P @ self._turn.T
+        q = np.asarray(quat_multiply(self._q_wg, level))
+        return self._T_wp[:3, :3] @ place + self._T_wp[:3, 3], q, full
+
+    def from_map(self, message: Any, time: float, now: float) -> VisionSample:
+        """The fix in a PoseWithCovarianceStamped; whether its numbers are fit to be used is the estimator's to say.
+
+        Args:
+            message: Map frame.
+            time: Of its stamp [s].
+            now: [s]
+        """
+        pose = message.pose.pose
+        place = self._T_wp[:3, :3].T @ (np.array(xyz(pose.position)) - self._T_wp[:3, 3])
+        level = quat_multiply(quat_conjugate(self._q_wg), np.array(xyzw(pose.orientation)))
+        P = np.array(message.pose.covariance, float).reshape(6, 6)[np.ix_(KNOWN, KNOWN)]
+        R = (self._turn.T @ P @ self._turn)[np.ix_([0, 1, 3], [0, 1, 3])]
+        rows = tuple((float(row[0]), float(row[1]), float(row[2])) for row in 0.5 * (R + R.T))
+        yaw = float(quat_to_euler(level)[2])
+        return VisionSample(time, (float(place[0]), float(place[1])), yaw, rows, now)
+
+
+# Coordinate frames as topics: map, odom and base_link of REP-105, what is mounted where, and the vehicle's URDF.
+
 
 GAP = 0.5
 """After a longer silence the way between two readings is not known, and odom stands still over it [s]."""

@@ -16,10 +16,8 @@ from finssim.localization.pool import load_pool
 from finssim.robot.messages import Picture, TagCorners
 from finssim.robot.perception import Perception
 from finssim.ros2.nodes.conversions import compressed_of, image_of, nanoseconds, tags_of, telemetry_of
-from finssim.ros2.nodes.fix_frame import FixFrame
+from finssim.ros2.nodes.frames import FixFrame
 from finssim.ros2.nodes.robot_node import RobotNode
-
-__all__ = ["Localizer"]
 
 FORMS = {"raw": ("image", image_of), "compressed": ("picture", compressed_of)}
 

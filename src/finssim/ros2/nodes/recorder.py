@@ -11,8 +11,6 @@ from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.topics import TOPICS
 from finssim.vehicles import Vehicle
 
-__all__ = ["RecorderNode"]
-
 LEFT_OUT = ("image", "clock")
 """Raw pictures fill disks, and their compressed ones are kept; simulated time is in every stamp."""
 

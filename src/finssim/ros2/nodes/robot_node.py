@@ -16,13 +16,10 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 from finssim.robot.interrupt import follow_parent
-from finssim.ros2.nodes.conversions import nanoseconds
-from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
+from finssim.ros2.nodes.conversions import RosMessages, nanoseconds, ros_type
 from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
-
-__all__ = ["LISTENING", "RobotNode", "TwinError", "matched_callbacks"]
 
 URGENCY = -10
 """Niceness of a node that others wait for; only a privileged user may have it, others do without."""
@@ -63,9 +60,12 @@ class RobotNode(Node):
         super().__init__(name)
         self.filed = load_vehicle(self.parameter("vehicle", "finsrov"))
         """The vehicle as its file has it, which policies are trained for."""
-        self.vehicle = numbered(
-            vehicle_at(self.parameter("site", "pool"), self.filed), self.parameter("number", 0)
+        self.robot = self.parameter("robot", "pool")
+        """Address of the motor controller, or of an autopilot, whose vehicle has a Doppler log and a compass."""
+        equipped = vehicle_at(
+            self.parameter("site", "pool"), self.filed, navigation=self.robot.startswith("mavlink")
         )
+        self.vehicle = numbered(equipped, self.parameter("number", 0))
         """The same as it is equipped for the site, with the tags of its number among several."""
         self.make = RosMessages(self.vehicle, self.parameter("frame_prefix", ""))
         self._below = "" if self.get_namespace() != "/" else f"{self.vehicle.name.replace('-', '_')}/"

@@ -14,12 +14,9 @@ from finssim.robot.goals import place_of
 from finssim.robot.perception import Perception
 from finssim.robot.runtime import USED
 from finssim.ros2.nodes.conversions import aid_of, telemetry_of
-from finssim.ros2.nodes.fix_frame import FixFrame
-from finssim.ros2.nodes.frames import Frames
+from finssim.ros2.nodes.frames import FixFrame, Frames
 from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.topics import TOPICS
-
-__all__ = ["StateEstimation", "health_values"]
 
 
 class StateEstimation(RobotNode):

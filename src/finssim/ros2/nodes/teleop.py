@@ -18,12 +18,10 @@ from finssim.robot.teleop import (
     Pad,
     TeleopError,
 )
+from finssim.ros2.nodes.conversions import ros_type
 from finssim.ros2.nodes.remote import RemoteBridge
 from finssim.ros2.nodes.robot_node import RobotNode
-from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.ros2.topics import SENSOR, quality_profile
-
-__all__ = ["JoyDevice", "Teleop"]
 
 LAST_WRENCHES = 3
 """Wrenches of zero at the end."""

@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from finssim.ros2.shim.context import Context
-from finssim.ros2.shim.executors import SingleThreadedExecutor
-from finssim.ros2.shim.node import Node
-from finssim.ros2.shim.task import Future
-from finssim.ros2.shim.utilities import (
+from finssim.ros2.shim.context import (
+    Context,
     get_default_context,
     ok,
     renew_default_context,
     shutdown,
     try_shutdown,
 )
+from finssim.ros2.shim.endpoint import Future
+from finssim.ros2.shim.executors import SingleThreadedExecutor
+from finssim.ros2.shim.node import Node
 
 __all__ = [
     "Context",

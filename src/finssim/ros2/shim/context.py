@@ -1,4 +1,4 @@
-"""`rclpy.context`: what a process holds between `init` and `shutdown`: one participant, its nodes, its arguments."""
+"""`rclpy.context`, `rclpy.utilities`: what a process holds between `init` and `shutdown`: participant and nodes."""
 
 from __future__ import annotations
 
@@ -12,10 +12,7 @@ from typing import Any
 from finssim.ros2.shim.arguments import RosArguments, parse_arguments
 from finssim.ros2.shim.exceptions import NotInitializedException
 from finssim.ros2.shim.logging import set_logger_level
-from finssim.ros2.wire.participant import Participant
-from finssim.ros2.wire.settings import wire_settings
-
-__all__ = ["Context"]
+from finssim.ros2.wire import Participant, wire_settings
 
 
 class Context:
@@ -131,3 +128,42 @@ def _on_sigterm(*_: Any) -> None:
     """Only ask: the wire is left where no call on it is under way."""
     for context in _leaving:
         context.asked_to_leave = True
+
+
+# `rclpy.utilities`: the process's context, and arguments without those for ROS.
+
+
+_default: list[Context] = []
+
+
+def get_default_context() -> Context:
+    """The context of `rclpy.init()`."""
+    if not _default:
+        _default.append(Context())
+    return _default[0]
+
+
+def renew_default_context() -> Context:
+    """Replace the context after a shutdown, so that `rclpy.init()` can be called again."""
+    _default.clear()
+    return get_default_context()
+
+
+def ok(*, context: Context | None = None) -> bool:
+    """Whether the context is on the wire."""
+    return (context or get_default_context()).ok()
+
+
+def shutdown(*, context: Context | None = None) -> None:
+    """Leave the wire."""
+    (context or get_default_context()).shutdown()
+
+
+def try_shutdown(*, context: Context | None = None) -> None:
+    """Leave the wire if on it."""
+    (context or get_default_context()).try_shutdown()
+
+
+def remove_ros_args(args: Sequence[str] | None = None) -> list[str]:
+    """A command line without what is for ROS."""
+    return parse_arguments(sys.argv if args is None else args).rest

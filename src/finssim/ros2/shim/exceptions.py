@@ -1,24 +1,5 @@
 """`rclpy.exceptions`: the errors that code written for rclpy catches, with rclpy's bases: none is a ValueError."""
 
-__all__ = [
-    "InvalidHandle",
-    "InvalidNamespaceException",
-    "InvalidNodeNameException",
-    "InvalidParameterException",
-    "InvalidParameterTypeException",
-    "InvalidParameterValueException",
-    "InvalidServiceNameException",
-    "InvalidTopicNameException",
-    "NameValidationException",
-    "NotInitializedException",
-    "ParameterAlreadyDeclaredException",
-    "ParameterException",
-    "ParameterImmutableException",
-    "ParameterNotDeclaredException",
-    "ParameterUninitializedException",
-    "RosArgumentsError",
-]
-
 
 class RosArgumentsError(RuntimeError):
     """Arguments after `--ros-args` that ROS refuses; in rclpy RCLInvalidROSArgsError or UnknownROSArgsError."""

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-__all__ = ["LoggingSeverity", "RcutilsLogger", "get_logger", "get_logger_effective_level", "set_logger_level"]
-
 
 class LoggingSeverity(IntEnum):
     """How grave a line is."""

@@ -5,30 +5,108 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
-from finssim.ros2.shim.arguments import parse_arguments
-from finssim.ros2.shim.client import Client
-from finssim.ros2.shim.clock import Clock, ROSClock
-from finssim.ros2.shim.context import Context
-from finssim.ros2.shim.endpoint import Endpoint
-from finssim.ros2.shim.event_handler import SubscriptionEventCallbacks
+from finssim.ros2.codec import codec_of
+from finssim.ros2.shim.arguments import (
+    check_node,
+    expanded,
+    full_node_name,
+    overrides_for,
+    parse_arguments,
+    remapped,
+)
+from finssim.ros2.shim.context import Context, get_default_context
+from finssim.ros2.shim.endpoint import (
+    Client,
+    Endpoint,
+    Publisher,
+    Service,
+    Subscription,
+    SubscriptionEventCallbacks,
+)
 from finssim.ros2.shim.exceptions import InvalidHandle
+from finssim.ros2.shim.executors import Timer
 from finssim.ros2.shim.logging import RcutilsLogger, get_logger
-from finssim.ros2.shim.names import check_node, full_node_name, remapped
-from finssim.ros2.shim.node_graph import NodeGraph
-from finssim.ros2.shim.node_parameters import NodeParameters
-from finssim.ros2.shim.parameter import Parameter
-from finssim.ros2.shim.parameter_files import overrides_for
-from finssim.ros2.shim.parameter_service import ParameterService
-from finssim.ros2.shim.publisher import Publisher
-from finssim.ros2.shim.qos import qos_profile_parameter_events, qos_profile_services_default
-from finssim.ros2.shim.service import Service
-from finssim.ros2.shim.subscription import Subscription
-from finssim.ros2.shim.time_source import TimeSource
-from finssim.ros2.shim.timer import Timer
-from finssim.ros2.shim.utilities import get_default_context
-from finssim.ros2.wire.participant import NodeRecord
+from finssim.ros2.shim.parameter import NodeParameters, Parameter, ParameterService
+from finssim.ros2.shim.qos import (
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_profile_parameter_events,
+    qos_profile_services_default,
+)
+from finssim.ros2.shim.time import Clock, ROSClock, Time
+from finssim.ros2.wire import NodeRecord
 
-__all__ = ["Node"]
+
+class NodeGraph:
+    """The part of `Node` that looks at the graph."""
+
+    context: Any
+    _name: str
+    _namespace: str
+
+    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
+        """Every node on the wire, this one among them."""
+        return sorted((node.name, node.namespace) for node in self.context.participant.nodes())
+
+    def get_node_names(self) -> list[str]:
+        """Names of every node on the wire."""
+        return [name for name, _ in self.get_node_names_and_namespaces()]
+
+    def count_publishers(self, topic: str) -> int:
+        """Publishers known on a topic."""
+        return self._count(topic, "publications")
+
+    def count_subscribers(self, topic: str) -> int:
+        """Subscriptions known on a topic."""
+        return self._count(topic, "subscriptions")
+
+    def get_topic_names_and_types(self) -> list[tuple[str, list[str]]]:
+        """Every topic on the wire with its types."""
+        found: dict[str, set[str]] = {}
+        for kind in ("publications", "subscriptions"):
+            for topic, name in self.context.participant.endpoints(kind):
+                if topic.startswith("rt/"):
+                    found.setdefault(topic[2:], set()).add(name)
+        return sorted((topic, sorted(names)) for topic, names in found.items())
+
+    def _count(self, topic: str, kind: str) -> int:
+        full = f"rt{expanded(topic, self._name, self._namespace)}"
+        return sum(found == full for found, _ in self.context.participant.endpoints(kind))
+
+
+# Simulated time: the topic /clock drives a node's clock where its parameter `use_sim_time` is true.
+
+
+class TimeSource:
+    """Declares `use_sim_time` on a node and feeds its clock."""
+
+    def __init__(self, node: Any, clock: ROSClock) -> None:
+        self._node, self._clock, self._subscription = node, clock, None
+        if not node.has_parameter("use_sim_time"):
+            node.declare_parameter("use_sim_time", False)
+        self.use_simulated(bool(node.get_parameter("use_sim_time").value))
+
+    def use_simulated(self, simulated: bool) -> None:
+        """Follow /clock, or the system's time."""
+        if simulated == self._clock.ros_time_is_active:
+            return
+        self._clock.ros_time_is_active = simulated
+        for timer in self._node.timers:
+            if timer.clock is self._clock and not timer.is_canceled():
+                timer.reset()
+        if simulated:
+            newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+            clock = codec_of().message("rosgraph_msgs/msg/Clock")
+            self._subscription = self._node.create_subscription(clock, "/clock", self._on_clock, newest)
+        elif self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+
+    def _on_clock(self, message: Any) -> None:
+        self._clock.set_ros_time_override(Time.from_msg(message.clock))
+
+
+# `rclpy.node`: a node: its names, its endpoints, its clock, its parameters.
+
 
 Made = TypeVar("Made", bound=Endpoint)
 

@@ -5,27 +5,8 @@ from __future__ import annotations
 from enum import Enum, IntEnum
 from typing import Any
 
-from finssim.ros2.shim.duration import Duration
-from finssim.ros2.wire.quality import Quality
-
-__all__ = [
-    "DurabilityPolicy",
-    "HistoryPolicy",
-    "InvalidQoSProfileException",
-    "LivelinessPolicy",
-    "QoSDurabilityPolicy",
-    "QoSHistoryPolicy",
-    "QoSLivelinessPolicy",
-    "QoSPresetProfiles",
-    "QoSProfile",
-    "QoSReliabilityPolicy",
-    "ReliabilityPolicy",
-    "qos_profile_parameter_events",
-    "qos_profile_parameters",
-    "qos_profile_sensor_data",
-    "qos_profile_services_default",
-    "qos_profile_system_default",
-]
+from finssim.ros2.shim.time import Duration
+from finssim.ros2.wire import Quality
 
 
 class HistoryPolicy(IntEnum):

@@ -1,15 +1,64 @@
-"""`rclpy.time`: points in time."""
+"""Time as rclpy has it: spans, points in time, and clocks of the system or of the topic /clock."""
 
 from __future__ import annotations
 
+import time
+from enum import IntEnum
 from functools import total_ordering
 from typing import Any
 
 from finssim.ros2.codec import codec_of
-from finssim.ros2.shim.clock_type import ClockType
-from finssim.ros2.shim.duration import Duration
 
-__all__ = ["Time"]
+
+class ClockType(IntEnum):
+    """What a clock counts."""
+
+    UNINITIALIZED = 0
+    ROS_TIME = 1
+    """System time, or that of the topic /clock where `use_sim_time` is set."""
+    SYSTEM_TIME = 2
+    STEADY_TIME = 3
+    """Never jumps; begins anywhere."""
+
+
+# `rclpy.duration`: spans of time.
+
+
+@total_ordering
+class Duration:
+    """A span of time, kept in nanoseconds."""
+
+    def __init__(self, *, seconds: float = 0, nanoseconds: int = 0) -> None:
+        self.nanoseconds = int(seconds * 10**9) + int(nanoseconds)
+        if not -(2**63) <= self.nanoseconds < 2**63:
+            raise OverflowError(f"a duration of {self.nanoseconds} ns: expected less than 2^63")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Duration) and self.nanoseconds == other.nanoseconds
+
+    def __lt__(self, other: Duration) -> bool:
+        return self.nanoseconds < other.nanoseconds
+
+    def __hash__(self) -> int:
+        return hash(self.nanoseconds)
+
+    def __repr__(self) -> str:
+        return f"Duration(nanoseconds={self.nanoseconds})"
+
+    def to_msg(self) -> Any:
+        """As builtin_interfaces/Duration."""
+        seconds, nanoseconds = divmod(self.nanoseconds, 10**9)
+        return codec_of().message("builtin_interfaces/msg/Duration")(sec=seconds, nanosec=nanoseconds)
+
+    @classmethod
+    def from_msg(cls, message: Any) -> Duration:
+        """From builtin_interfaces/Duration."""
+        return cls(nanoseconds=message.sec * 10**9 + message.nanosec)
+
+
+Infinite = Duration(nanoseconds=2**63 - 1)
+
+# `rclpy.time`: points in time.
 
 
 @total_ordering
@@ -74,3 +123,70 @@ class Time:
                 f"times of {self.clock_type.name} and {other.clock_type.name}: compare times of one clock"
             )
         return other.nanoseconds
+
+
+# `rclpy.clock`: what time it is, by the system or by the topic /clock.
+
+
+class Clock:
+    """A clock.
+
+    Args:
+        clock_type: What it counts.
+    """
+
+    def __new__(cls, *, clock_type: ClockType = ClockType.SYSTEM_TIME) -> Any:
+        wanted = ROSClock if clock_type == ClockType.ROS_TIME else cls
+        return super().__new__(wanted)
+
+    def __init__(self, *, clock_type: ClockType = ClockType.SYSTEM_TIME) -> None:
+        self.clock_type = clock_type
+
+    def now(self) -> Time:
+        """The present."""
+        steady = self.clock_type == ClockType.STEADY_TIME
+        return Time(nanoseconds=time.monotonic_ns() if steady else time.time_ns(), clock_type=self.clock_type)
+
+    def tick(self) -> int:
+        """What timers count [ns]: never jumps with the system's time of day."""
+        return time.monotonic_ns()
+
+    @property
+    def real(self) -> bool:
+        """Whether it runs by itself."""
+        return True
+
+    def sleep_for(self, duration: Duration) -> bool:
+        """Sleep by this clock; only for one that runs by itself."""
+        time.sleep(max(duration.nanoseconds, 0) / 1e9)
+        return True
+
+
+class ROSClock(Clock):
+    """System time, until a node with `use_sim_time` feeds it from /clock."""
+
+    def __init__(self, *, clock_type: ClockType = ClockType.ROS_TIME) -> None:
+        super().__init__(clock_type=ClockType.ROS_TIME)
+        self.ros_time_is_active = False
+        self._simulated = 0
+
+    def now(self) -> Time:
+        """The present; 0 while simulated time is used and none has come."""
+        nanoseconds = self._simulated if self.ros_time_is_active else time.time_ns()
+        return Time(nanoseconds=nanoseconds, clock_type=ClockType.ROS_TIME)
+
+    def tick(self) -> int:
+        return self._simulated if self.ros_time_is_active else time.monotonic_ns()
+
+    @property
+    def real(self) -> bool:
+        return not self.ros_time_is_active
+
+    def set_ros_time_override(self, when: Time) -> None:
+        """Set the simulated time."""
+        self._simulated = when.nanoseconds
+
+    def sleep_for(self, duration: Duration) -> bool:
+        if self.ros_time_is_active:
+            raise RuntimeError("sleeping by simulated time in the thread that spins never ends: use a timer")
+        return super().sleep_for(duration)

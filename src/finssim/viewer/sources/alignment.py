@@ -8,8 +8,6 @@ import numpy.typing as npt
 from finssim.viewer.frame import ViewError
 from finssim.viewer.sources.series import PoseSeries
 
-__all__ = ["offset_between"]
-
 Array = npt.NDArray[np.float64]
 
 COARSE, FINE = 0.2, 0.01

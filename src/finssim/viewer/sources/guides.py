@@ -13,8 +13,6 @@ from finssim.robot.goals import check_reachable, guide_of
 from finssim.vehicles import Vehicle
 from finssim.viewer.frame import Pose, nowhere
 
-__all__ = ["goal_pose", "guide_for", "path_of", "start_of"]
-
 POINTS = 240
 """Of a trajectory's line."""
 STATION, TRAJECTORY = "0.8,0.3,-0.6,45", "ellipse"

@@ -22,8 +22,6 @@ from finssim.viewer.sources.series import Errors
 from finssim.viewer.stages import box_of
 from finssim.viewer.tags import TagLook
 
-__all__ = ["PoolSource"]
-
 RATE = 60.0
 """Steps of the robot's loop [Hz]."""
 EVENTS = 8

@@ -28,8 +28,6 @@ from finssim.viewer.stages import box_of
 from finssim.viewer.tags import TagLook
 from finssim.yaml_file import json_value, read_mapping
 
-__all__ = ["RecordSource"]
-
 Array = npt.NDArray[np.float64]
 
 TOPICS = (

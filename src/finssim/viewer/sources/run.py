@@ -13,8 +13,6 @@ from finssim.viewer.frame import Curve, Frame, Stage, ViewError
 from finssim.viewer.sources.series import PoseSeries, Series
 from finssim.viewer.stages import box_of
 
-__all__ = ["RunSource"]
-
 
 class RunSource:
     """One vehicle of one world of a recorded run."""

@@ -20,8 +20,6 @@ from finssim.viewer.sources.guides import goal_pose, path_of, start_of
 from finssim.viewer.sources.series import Errors
 from finssim.viewer.stages import box_of
 
-__all__ = ["SimulatorSource"]
-
 STEP = 0.02
 """Between frames at most [s]; the physics step is half of it."""
 
