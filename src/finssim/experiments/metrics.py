@@ -353,9 +353,9 @@ def _errors(t: Array, position: Array, guide: Guide) -> dict[str, Any]:
 def projected_times(t: Array, position: Array, guide: Guide) -> Array:
     """Times at which the reference is nearest to each position, (T,): never backwards, and never far ahead.
 
-    Both matter where a way crosses or repeats itself. The reference is searched at 50 Hz from the last projection to 2 s
-    or 0.3 m after it, where it rests at a corner and who is beside it would wait there for ever, but not to more than
-    2 s after the sample's own time. Who stops is projected where he stopped.
+    Both matter where a way crosses or repeats itself. The reference is searched at 50 Hz from the last projection to
+    2 s or 0.3 m after it (it rests at corners, where who is beside it would wait for ever), but not to more than 2 s
+    after the sample's own time. Who stops is projected where he stopped.
 
     Args:
         t: Times since the start of the reference [s], increasing, (T,).
