@@ -112,7 +112,12 @@ HOMES = {
         "experiments/figures.py",
         "vehicles/picture.py",
     },
-    "pymavlink": {"calibration/importers/ardusub.py", "pool/ardusub.py", "robot/link/mavlink.py"},
+    "pymavlink": {
+        "calibration/importers/ardusub.py",
+        "experiments/faults.py",
+        "pool/ardusub.py",
+        "robot/link/mavlink.py",
+    },
     "rosbags": {
         "calibration/importers/dispatch.py",
         "robot/record_messages.py",

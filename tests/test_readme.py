@@ -21,6 +21,7 @@ SMALL = {"train": ["--steps", "4096", "--worlds", "64"], "evaluate": ["--trials"
 """Options that make a command's run small; a later option wins over an earlier one."""
 
 EXAMPLES = [path for path in sorted((ROOT / "examples").glob("*.py")) if path.name != "own_term.py"]
+EXAMPLES.append(ROOT / "examples" / "bluerov2" / "loop.py")
 """Without the one whose term stays known in the process; `tests/physics/test_own_term.py` runs it in one of its own."""
 
 SHORT = {

@@ -2,7 +2,7 @@
 
 import pytest
 
-from finssim.experiments.faults import SCENARIOS, fault_job, play
+from finssim.experiments.faults import AUTOPILOT, SCENARIOS, fault_job, play
 
 
 @pytest.fixture
@@ -49,6 +49,16 @@ def test_a_full_disk_ends_the_record_and_not_the_trip(tried, caplog):
     result = tried("full-disk")
     assert result["ok"] and result["state"] == "armed" and result["thrust_gone_s"] is None
     assert result["record_lost_s"] < 1.0 and "recording stopped: File too large" in caplog.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("row", "variant"), [(row, variant) for row, scenario in AUTOPILOT.items() for variant in scenario.faults]
+)
+def test_what_befalls_an_autopilot_ends_as_its_page_says(tmp_path, row, variant):
+    """For the reason named, and in time; who steers by hand has the vehicle, who only looks disturbs nothing."""
+    result = play(fault_job(row, variant, "moving", vehicle="bluerov2_heavy"), tmp_path / "trial")
+    assert result["ok"] and result["speed_m_s"] > 0.2, result
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import resource
 import signal
 import socket
@@ -21,7 +22,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ from finssim.experiments.campaign import Job, Progress, check_choices, run_jobs,
 from finssim.experiments.pool_trial import noise_seed
 from finssim.experiments.tables import Table
 from finssim.pool import TruthError, VirtualPool, read_truth
+from finssim.pool.firmware import Firmware
 from finssim.pool.run import make_plan
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
@@ -38,11 +40,14 @@ from finssim.robot.goals import station_of
 from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.messages import Delivery, Picture, Telemetry
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.record_reader import Record, open_record
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
+from finssim.robot.wiring import link_of
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.defaults import vehicle_at
 
 __all__ = ["SCENARIOS", "Bench", "Fault", "Scenario", "fault_job", "faults_experiment", "tables_of"]
 
@@ -70,6 +75,7 @@ class FaultyWire:
         shift: By how much the robot's clock is ahead of the pool's [s]; a change is a jump of the robot's clock.
         change: Applied to each snapshot of the vehicle; None leaves the bytes alone.
         pictures: Applied to the pictures of an exchange; None leaves them alone.
+        others: What others on an autopilot's wire send at a time [s]; None: nobody else is there.
     """
 
     def __init__(self, pool: VirtualPool, rate: float) -> None:
@@ -82,15 +88,20 @@ class FaultyWire:
         self.shift = 0.0
         self.change: Callable[[Telemetry], Telemetry] | None = None
         self.pictures: Callable[[Sequence[Picture]], Sequence[Picture]] | None = None
+        self.others: Callable[[float], list[bytes]] | None = None
         self._rate, self._turns = rate, 0
-        self._decoder, self._mcu = Decoder(outputs=pool.vehicle.mcu.outputs), Decoder(MCU)
+        self._decoder, mcu = Decoder(outputs=pool.vehicle.mcu.outputs), Decoder(MCU)
+        self._drives: Callable[[bytes], bool] = lambda data: any(c.enable for c in mcu.feed(data))
+        if not isinstance(pool.firmware, Firmware):
+            self._drives = _axes_reader()
         self._rows: list[tuple[float, Array, Array, bool]] = []
 
     def exchange(self, until: float, sent: Sequence[bytes]) -> Delivery:
         """Let the pool go on by one period; `until` is the robot's belief and does not count."""
         self._note(sent)
         self._turns += 1
-        delivery = self.pool.exchange(self._turns / self._rate, sent)
+        more = self.others(self.pool.time) if self.others is not None else ()
+        delivery = self.pool.exchange(self._turns / self._rate, [*sent, *more])
         frames = delivery.frames
         if self.change is not None:
             frames = tuple((time, self._changed(data)) for time, data in frames)
@@ -108,7 +119,7 @@ class FaultyWire:
 
     def _note(self, sent: Sequence[bytes]) -> None:
         plant = self.pool.plant
-        drives = any(command.enable for data in sent for command in self._mcu.feed(data))
+        drives = any(self._drives(data) for data in sent)
         self._rows.append((self.pool.time, plant.position.astype(float), plant.thrust.astype(float), drives))
 
     def _changed(self, data: bytes) -> bytes:
@@ -117,6 +128,19 @@ class FaultyWire:
         if self.change is None or len(messages) != 1 or not isinstance(messages[0], Telemetry):
             return data
         return encode_telemetry(self.change(messages[0]))
+
+
+def _axes_reader() -> Callable[[bytes], bool]:
+    """Whether a frame to an autopilot moves an axis off its middle."""
+    from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+    mav = mavlink.MAVLink(None)
+
+    def drives(data: bytes) -> bool:
+        axes = [m for m in mav.parse_buffer(data) or () if m.get_type() == "MANUAL_CONTROL"]
+        return any((m.x, m.y, m.z, m.r, m.s, m.t) != (0, 0, 500, 0, 0, 0) for m in axes)
+
+    return drives
 
 
 @dataclass
@@ -132,6 +156,8 @@ class Bench:
 
 
 Touch = Callable[[Bench], None]
+STOP_WITHIN = 0.5
+"""Thrusters shall be at zero so soon after a fault, or the vehicle shall stay inside the workspace [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,6 +187,14 @@ class Scenario:
     """What the vehicle is doing."""
     must_fail: bool = False
     """A control: with its watchdogs off, the vehicle has to be seen to fail."""
+    firmware: Literal["mcu", "ardusub"] = "mcu"
+    """What steers the motors."""
+    ends: str = ""
+    """Pattern of the reason for which an autopilot's run must end; empty: it must drive on."""
+    limit: float = STOP_WITHIN
+    """By when its thrusters must stand still, from the fault [s]."""
+    handed_over: bool = False
+    """Somebody has the vehicle then, so that our axes must end rather than all thrust."""
 
 
 RECORDER_TURN = 0.3
@@ -295,6 +329,97 @@ def _blind(lasts: float) -> Scenario:
     return _one(f"{lasts:g} s without vision", see(lambda pictures: ()), end=see(None), lasts=lasts)
 
 
+def another_station(
+    message: str, *fields: float, every: float = 0.04, times: float = math.inf, system: int = 255
+) -> Touch:
+    """Another ground station on an autopilot's wire, which sends a message from now on.
+
+    Args:
+        message: Name of the MAVLink message, in lower case.
+        fields: Of the message, in MAVLink's order.
+        every: Between two of them [s].
+        times: How often it is sent.
+        system: Number of that station.
+    """
+
+    def begin(bench: Bench) -> None:
+        from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+        mav, made = (
+            mavlink.MAVLink(None, system, 190),
+            getattr(mavlink, f"MAVLink_{message}_message")(*fields),
+        )
+        due, left = bench.pool.time, times
+
+        def others(now: float) -> list[bytes]:
+            nonlocal due, left
+            if now < due or left <= 0:
+                return []
+            due, left = now + every, left - 1
+            mav.seq = (mav.seq + 1) % 256
+            return [bytes(made.pack(mav))]
+
+        bench.wire.others = others
+
+    return begin
+
+
+def _command(number: int, *values: float) -> Touch:
+    """One command of another ground station."""
+    return another_station("command_long", 1, 1, number, 0, *values, *[0] * (7 - len(values)), times=1)
+
+
+def _autopilot(title: str, ends: str, limit: float, *faults: Fault, **more: Any) -> Scenario:
+    variants = {"" if len(faults) == 1 else str(i): fault for i, fault in enumerate(faults, 1)}
+    return Scenario(title=title, faults=variants, firmware="ardusub", ends=ends, limit=limit, **more)
+
+
+SILENT, WAITS = "no fresh telemetry", "held longer than"
+AUTOPILOT: Mapping[str, Scenario] = {
+    "ap-none": _autopilot("no fault", "", math.inf, Fault(begin=pool_fault())),
+    "ap-heartbeat": _autopilot(
+        "its heartbeat is lost", "no heartbeat from the autopilot", 3.5, Fault(begin=pool_fault(no_heartbeat=True))
+    ),
+    "ap-our-heartbeat": _autopilot(
+        "ours is lost", "", math.inf, Fault(begin=pool_fault(no_ground_heartbeat=True))
+    ),
+    "ap-silence": _autopilot("telemetry is lost", SILENT, 1.0, Fault(begin=pool_fault(drop=1.0))),
+    "ap-deaf": _autopilot(
+        "what is sent is lost", "what we send is lost|was disarmed", 3.5,
+        Fault(begin=pool_fault(drop_commands=1.0)),
+    ),
+    "ap-joystick": _autopilot(
+        "a joystick steers", "somebody else steers", 0.5,
+        Fault(begin=another_station("manual_control", 1, 0, 0, 500, 400, 0)), handed_over=True,
+    ),
+    "ap-mode": _autopilot(
+        "the mode is changed", "mode to ALT_HOLD", 0.5, Fault(begin=_command(176, 1, 2)), handed_over=True
+    ),
+    "ap-disarm": _autopilot("somebody disarms", "was disarmed", 0.5, Fault(begin=_command(400, 0))),
+    "ap-station": _autopilot(
+        "a second ground station, which looks", "", math.inf,
+        Fault(begin=another_station("heartbeat", 6, 8, 0, 0, 0, 3, every=1.0, system=254)),
+        Fault(begin=another_station("request_data_stream", 1, 1, 0, 2, 1, every=2.0)),
+    ),
+    "ap-dvl": _autopilot(
+        "Doppler log lost for 10 s", WAITS, 4.0,
+        Fault(begin=pool_fault(dvl_silent=True), end=pool_fault(dvl_silent=False), lasts=10.0),
+    ),
+    "ap-depth": _autopilot("depth frozen", WAITS, 4.0, Fault(begin=pool_fault(freeze_depth=True))),
+    "ap-battery": _autopilot(
+        "battery low", "failsafe|was disarmed", 10.5, Fault(begin=pool_fault(battery_voltage=9.0))
+    ),
+    "ap-leak": _autopilot("leak", "failsafe|was disarmed", 1.0, Fault(begin=pool_fault(leak=True))),
+    "ap-spoiled": _autopilot(
+        "a tenth lost and spoiled", "", math.inf, Fault(begin=pool_fault(drop=0.1, corrupt=0.1, drop_commands=0.1))
+    ),
+    "ap-corrupt": _autopilot("all frames spoiled", SILENT, 1.0, Fault(begin=pool_fault(corrupt=1.0))),
+    "ap-reboot": _autopilot(
+        "it restarts", f"restarted|{SILENT}", 0.5, Fault(begin=lambda bench: bench.pool.reboot())
+    ),
+}  # fmt: skip
+"""Those of an emulated ArduSub; what each must end in stands in docs/bluerov2.md."""
+
 SCENARIOS: Mapping[str, Scenario] = {
     "loss-0": _one("no fault", pool_fault()),
     **{f"loss-{percent}": _lost(f"packet loss {percent} %", percent / 100) for percent in (10, 30, 50)},
@@ -327,6 +452,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         motions=("moving",),
         must_fail=True,
     ),
+    **AUTOPILOT,
 }
 """Name -> scenario, in the order of the table; those with processes of their own are `faults.KILLS`."""
 
@@ -338,6 +464,11 @@ MOTIONS = {
     "moving": ("-1.2,-0.3,-0.5,0", "1.2,0.3,-0.5,60", 3.0, 1.5),
 }
 """Name -> start, goal, how long after arming the fault comes, and after the first thrust the kill [s]."""
+TANK_MOTIONS = {
+    "station": ("0,0,-2,0", "0,0,-2,0", 8.0, math.nan),
+    "moving": ("-1.2,-0.3,-2,0", "1.2,0.3,-2,30", 5.0, math.nan),
+}
+"""The same in the tank, of vehicles with an autopilot."""
 WATCHED = 10.0
 """How long the vehicle is watched after a fault that stays, and at least after one that passes [s]."""
 AFTERWARDS = 4.0
@@ -353,8 +484,6 @@ STILL = 0.05
 """Thrust below which a thruster counts as stopped [N]."""
 QUIET = 1.0
 """Thrusters have stopped if none pushed for the last so much of the fault [s]; less is a pause between two pulses."""
-STOP_WITHIN = 0.5
-"""Thrusters shall be at zero so soon after a fault, or the vehicle shall stay inside the workspace [s]."""
 LONGEST_LOSS = 1.0
 """The most that a record may lack at its end [s]."""
 INSET = np.array([0.4, 0.4, 0.2])
@@ -443,22 +572,36 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         empty; `record_lost_s` and `record_problem`; `ok`.
     """
     start_warp()
-    scenario, vehicle = SCENARIOS[job.row], load_vehicle(job.vehicle)
-    start, goal, when, _ = MOTIONS[job.motion]
+    scenario, aided = SCENARIOS[job.row], SCENARIOS[job.row].firmware == "ardusub"
+    site, camera = ("tank", "none") if aided else ("pool", "corners")
+    vehicle = load_vehicle(job.vehicle)
+    vehicle = vehicle_at(site, vehicle, navigation=True) if aided else vehicle
+    start, goal, when, _ = (TANK_MOTIONS if aided else MOTIONS)[job.motion]
     box = inset(vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
     workspace = {"workspace_lower": box[0], "workspace_upper": box[1]}
     seed = noise_seed(job.seed, job.target)
-    plan = make_plan(vehicle, str(job.plant), job.severity, camera="corners", seed=seed)  # type: ignore[arg-type]
-    pool, site = plan.standing(station_of(start), seed=seed), plan.calibrated
+    plan = make_plan(
+        vehicle, str(job.plant), job.severity, camera=camera, seed=seed, site=site, firmware=scenario.firmware
+    )  # type: ignore[arg-type]
+    pool = plan.standing(station_of(start), seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "run.mcap"
         with Recorder(record, vehicle, {"command": "finssim experiment faults"}) as recorder:
             bridge = Bridge(vehicle, BridgeSettings.of(vehicle, **{**workspace, **scenario.settings}))
+            reckoned = (
+                Perception(vehicle, None, mode="error-state", let_in=station_of(start).position[:2])
+                if aided
+                else None
+            )
             runtime = Runtime(
-                vehicle, site, make_pilot("pid", vehicle), station_of(goal), arm=True, bridge=bridge, recorder=recorder
+                vehicle, plan.calibrated, make_pilot("pid", vehicle), station_of(goal), arm=True, bridge=bridge,
+                recorder=recorder, perception=reckoned,
             )  # fmt: skip
+            if aided:
+                runtime.attach(link_of("mavlink", vehicle))
             bench = Bench(pool, FaultyWire(pool, RATE), runtime, recorder)
-            script = _Script(bench, scenario.faults[job.variant], when)
+            limit = scenario.limit if math.isfinite(scenario.limit) else 0.0
+            script = _Script(bench, scenario.faults[job.variant], when, max(WATCHED, limit + AFTERWARDS))
             raised = script.run()
         if math.isnan(script.began):
             raise RuntimeError(f"{job.key()}: the vehicle was never armed: {runtime.refusal}")
@@ -477,15 +620,25 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         **lost,
         "provenance": provenance(),
     }
-    return {**result, "ok": passed(result)}
+    return {**result, "ok": passed(result) and (not aided or ended_as_told(scenario, result))}
+
+
+def ended_as_told(scenario: Scenario, result: Mapping[str, Any]) -> bool:
+    """Whether an autopilot's trial ended for the reason and in the time that its scenario names, or drove on."""
+    if not scenario.ends:
+        return bool(result["state"] == "armed")
+    gone = result["frames_off_s" if scenario.handed_over else "thrust_gone_s"]
+    return (
+        gone is not None and gone <= scenario.limit and re.search(scenario.ends, result["reason"]) is not None
+    )
 
 
 class _Script:
     """Begins and ends the fault, and remembers how the bridge stood before the run was ended."""
 
-    def __init__(self, bench: Bench, fault: Fault, when: float) -> None:
+    def __init__(self, bench: Bench, fault: Fault, when: float, watched: float) -> None:
         self.fault = fault
-        self._bench, self._when = bench, when
+        self._bench, self._when, self._watched = bench, when, watched
         self._armed, self._ended = math.nan, False
         self.began = math.nan
         """Pool's clock [s]; NaN before."""
@@ -512,8 +665,8 @@ class _Script:
     def _over(self, runtime: Runtime) -> bool:
         """Whether the fault and what came of it have been watched for long enough."""
         lasts = self.fault.lasts
-        watched = WATCHED if math.isinf(lasts) else max(WATCHED, lasts + AFTERWARDS)
-        return self._bench.pool.time >= self.began + watched
+        watched = 0.0 if math.isinf(lasts) else lasts + AFTERWARDS
+        return self._bench.pool.time >= self.began + max(self._watched, watched)
 
     def run(self) -> str:
         """Run to the end; returns what was raised, in this thread or in another, or nothing."""
@@ -918,7 +1071,8 @@ def faults_experiment(
     seed: int = 1,
     scenarios: Annotated[Sequence[str] | None, ","] = None,
     severity: str = "realistic",
-    vehicle: str = "finsrov",
+    vehicle: str | None = None,
+    firmware: Literal["mcu", "ardusub"] = "mcu",
     processes: Annotated[int | None, (1, None)] = None,
     progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
@@ -934,7 +1088,10 @@ def faults_experiment(
         seed: Seed of every random number; equal seeds give equal results.
         scenarios (NAMES): Faults, separated by commas; all if not given.
         severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file; finsrov, with ardusub
+            bluerov2_heavy, if not given.
+        firmware (NAME): What steers the motors: mcu, the motor controller of finssim run, or ardusub, an autopilot, in
+            the tank, with a Doppler log in place of the camera.
         processes: Trials at once; as many as processors if not given.
         progress: Told the share that is done and what comes next.
 
@@ -944,8 +1101,11 @@ def faults_experiment(
     Raises:
         ReliabilityError: An unknown scenario.
     """
-    names = list(scenarios or (*KILLS, *SCENARIOS))
-    check_choices(names, [*KILLS, *SCENARIOS], "scenario", ReliabilityError)
+    vehicle = vehicle or {"mcu": "finsrov", "ardusub": "bluerov2_heavy"}[firmware]
+    every = [name for name, scenario in SCENARIOS.items() if scenario.firmware == firmware]
+    every = [*KILLS, *every] if firmware == "mcu" else every
+    names = list(scenarios or every)
+    check_choices(names, every, "scenario", ReliabilityError)
     kills, jobs = list[FaultJob](), list[FaultJob]()
     for name in names:
         variants: Sequence[str] = [""] if name in KILLS else list(SCENARIOS[name].faults)

@@ -252,7 +252,7 @@ def _lockstep_address(wiring: Wiring) -> str:
         raise LinkError("in lock-step all comes over one connection: leave --bind and --pictures out")
     if wiring.robot in ("pool", "mavlink"):
         return f"127.0.0.1:{DEFAULT_PORT}"
-    address = wiring.robot.removeprefix("mavlink://").removeprefix("tcp://")
+    address = wiring.robot.removeprefix("mavlink://tcp:").removeprefix("tcp://")
     if "/" in address or address.startswith("serial:"):
         raise LinkError(
             f"--robot {wiring.robot} is no world in lock-step: give HOST:PORT of finssim pool --lockstep, "

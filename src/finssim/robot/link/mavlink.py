@@ -61,6 +61,7 @@ REMEMBERED = 1.0
 STRANGE, STRANGERS, OF = 12.0, 2, 4
 """Difference from every input that was sent at which one is somebody else's [µs], and how many of the last reports make
 it certain: two pilots take turns."""
+OTHERS = "somebody else steers, or what we send is lost: the autopilot receives other inputs than ours"
 HEADING_PERIOD = 0.2
 """Between headings that are taken from the autopilot's attitude [s]."""
 DVL_FRESH = 1.0
@@ -145,7 +146,7 @@ class MavlinkLink:
         self._gap: dict[int, float] = {}
         self._refused = ""
         self._ours = self._others = False
-        self._wanted = -math.inf
+        self._wanted = self._released = -math.inf
         self._sent: deque[tuple[float, tuple[float, ...]]] = deque(maxlen=128)
         self._strange: deque[bool] = deque(maxlen=OF)
         self._manual_at = self._heartbeat_at = -math.inf
@@ -307,19 +308,21 @@ class MavlinkLink:
         if self._version is None or "JS_GAIN_DEFAULT" not in self._parameters:
             if self._first(now, "known") < 3.0:
                 return "waiting for the autopilot's version and parameters"
+        if now - self._released < ASK_AGAIN:  # its heartbeats may be older than what was asked
+            return "waiting for it to disarm first"
         if now - self._wanted > ASK_AGAIN:  # a new attempt: what ended the last one is history
             self._others, self._refused = False, ""
             self._strange.clear()
         self._wanted = now
         if self._others:
-            return "somebody else steers: the inputs that the autopilot receives are not ours"
+            return OTHERS
         if self.mode != MANUAL:
             return f"waiting for the autopilot to leave {_mode(self.mode)} for MANUAL"
         if not self.armed:
             return (
                 f"the autopilot does not arm: {self._refused}" if self._refused else "waiting for it to arm"
             )
-        self._wanted = -math.inf
+        self._wanted, self.says = -math.inf, ""
         return ""
 
     def alarm(self, now: float) -> str:
@@ -327,7 +330,7 @@ class MavlinkLink:
         if now - self._alive > HEARTBEAT_LOST:
             return f"no heartbeat from the autopilot for {HEARTBEAT_LOST:g} s"
         if self._others:
-            return "somebody else steers: the inputs that the autopilot receives are not ours"
+            return OTHERS
         if self._failing:
             return f"the autopilot is in failsafe: {self.says or 'it does not say why'}"
         if not self.armed:
@@ -372,6 +375,7 @@ class MavlinkLink:
                 self._ours = True
                 frames += self._ask(now, "arm", ASK_AGAIN, self._command(arming, 1.0))
         elif self.armed:
+            self._released = now
             frames += self._ask(now, "disarm", 0.1, self._command(arming, 0.0))
         else:
             self._ours = False
