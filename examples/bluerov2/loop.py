@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 VEHICLE = "bluerov2_heavy"
-WORLD = f"pool --firmware ardusub --vehicle {VEHICLE} --site tank --start 0,0,-2,0 --lockstep --port 0"
+WORLD = f"pool --firmware ardusub --vehicle {VEHICLE} --site tank --start 0,0,-2,0 --lockstep --port 58620"
 TANK = "--site tank --lockstep --pool-file none --let-in 0,0 --arm --robot mavlink://tcp:"
 
 
@@ -29,8 +29,11 @@ def done(line: str) -> None:
 def swim(line: str) -> None:
     """One command on the vehicle, beside the virtual one."""
     with finssim(WORLD, stdout=subprocess.PIPE, text=True) as pool:
-        address = next(words.split()[-1] for words in pool.stdout if words.startswith("lock-step"))
-        done(f"{line} {TANK}{address}")
+        try:
+            address = next(words.split()[-1] for words in pool.stdout if words.startswith("lock-step"))
+            done(f"{line} {TANK}{address}")
+        finally:
+            pool.terminate()
 
 
 folder = Path(tempfile.mkdtemp(prefix="bluerov2-"))
