@@ -107,3 +107,12 @@ def test_what_is_no_series_is_refused():
         measure_tracking([0.0, 0.0], np.zeros((2, 3)), EIGHT)
     with pytest.raises(ValueError, match="expected"):
         measure_tracking([0.0, 1.0], np.zeros((3, 3)), replace(EIGHT, name="x"))
+
+
+def test_a_constant_offset_at_a_corner_that_the_way_rests_at_is_no_end_of_it():
+    """Dead reckoning 5 cm off all along the broken line: it is followed to its end, and 5 cm off at most."""
+    guide = TRAJECTORIES["broken"]
+    t = np.arange(0.0, guide.duration + 0.05, 0.1)
+    measures = measure_tracking(t, guide.at(t).position + np.array([-0.045, 0.02, 0.0]), guide)
+    assert measures["complete"] and measures["completion"] > 0.99
+    assert measures["cross_track_p95_m"] < 0.05

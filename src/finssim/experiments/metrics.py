@@ -263,6 +263,8 @@ DENSE_RATE = 50.0
 
 SEARCH_WINDOW = 2.0
 """A position is projected on the reference at most this long after the last one, and after its own time [s]."""
+SEARCH_WAY = 0.3
+"""Way that is searched ahead at least, however slow the reference is there [m]."""
 
 COMPLETE = 0.98
 """Part of the way that counts as the whole."""
@@ -352,7 +354,8 @@ def projected_times(t: Array, position: Array, guide: Guide) -> Array:
     """Times at which the reference is nearest to each position, (T,): never backwards, and never far ahead.
 
     Both matter where a way crosses or repeats itself. The reference is searched at 50 Hz from the last projection to
-    2 s after it, but not to more than 2 s after the sample's own time. Who stops is projected where he stopped.
+    2 s or 0.3 m after it (it rests at corners, where who is beside it would wait for ever), but not to more than 2 s
+    after the sample's own time. Who stops is projected where he stopped.
 
     Args:
         t: Times since the start of the reference [s], increasing, (T,).
@@ -366,9 +369,11 @@ def projected_times(t: Array, position: Array, guide: Guide) -> Array:
     way = guide.at(times).position
     window = round(SEARCH_WINDOW * DENSE_RATE)
     latest = np.searchsorted(times, t + SEARCH_WINDOW + 1e-9)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=-1))])
+    further = np.searchsorted(length, length + SEARCH_WAY)
     nearest, reached = np.zeros(len(t), dtype=int), 0
     for i, x in enumerate(position):
-        end = max(min(reached + window, int(latest[i])), reached) + 1
+        end = max(min(max(reached + window, int(further[reached])), int(latest[i])), reached) + 1
         reached += int(np.argmin(np.sum((way[reached:end] - x) ** 2, axis=-1)))
         nearest[i] = reached
     return np.asarray(times[nearest])
