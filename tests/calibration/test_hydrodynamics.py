@@ -13,7 +13,7 @@ from finssim.calibration.excitation.synthetic import simulate_programme
 from finssim.calibration.fit import Estimate
 from finssim.calibration.hydrodynamics import fit_hydrodynamics
 from finssim.calibration.importers.dispatch import read_trials
-from finssim.calibration.output.calibrate import calibrated
+from finssim.calibration.output.vehicle_file import calibrated
 from finssim.calibration.regression.axis_estimates import trim
 from finssim.calibration.replay.replay import replay
 from finssim.vehicles import load_vehicle

@@ -283,8 +283,8 @@ def believed(lift):
 @pytest.mark.parametrize("method", ["regression", "simulation"])
 def test_a_calibration_estimates_its_parameter(trials, method, tmp_path):
     """40 N s²/m² from trials of a vehicle whose file says 0: within the interval, which is narrower than a tenth."""
-    from finssim.calibration.output.calibrate import calibrated
     from finssim.calibration.output.ranges import write_ranges
+    from finssim.calibration.output.vehicle_file import calibrated
     from finssim.calibration.regression.regress import regress
     from finssim.calibration.simulation.fit import fit_by_simulation
 

@@ -17,7 +17,7 @@ import numpy as np
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Estimate, Fit
-from finssim.calibration.output.calibrate import SCALED, calibrated
+from finssim.calibration.output.vehicle_file import SCALED, calibrated
 from finssim.calibration.regression.axis_estimates import CERTAIN
 from finssim.calibration.regression.plant_terms import matrices
 from finssim.calibration.regression.regress import regress

@@ -22,9 +22,8 @@ from rich.console import Console
 from finssim.calibration.excitation.programmes import RATE, STEADY, Programme, programmes, which_axes
 from finssim.calibration.findings import Finding, sentences
 from finssim.calibration.fit import Fit
-from finssim.calibration.output.calibrate import all_findings, calibrated, number_in
 from finssim.calibration.output.report import interval_text, number_text, state_text, write_report
-from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.output.vehicle_file import all_findings, calibrated, number_in, write_vehicle
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.replay.replay import Replay, replay
 from finssim.calibration.replay.report import draw_response_envelopes

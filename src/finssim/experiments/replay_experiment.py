@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.excitation.synthetic import Recording, record, trials_of
 from finssim.calibration.fit import Fit
-from finssim.calibration.output.calibrate import calibrated
-from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.output.vehicle_file import calibrated, write_vehicle
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.replay.replay import Replay, replay
 from finssim.calibration.replay.report import DEFINITION, MODEL_LABELS, draw_response_envelopes

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from finssim.calibration.excitation.excite import excite
-from finssim.calibration.excitation.programmes import programmes
+from finssim.calibration.excitation.programmes import excite, programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
 from finssim.calibration.trials.trial_files import load_trial
 from finssim.files import OutputError

@@ -11,9 +11,16 @@ from rich.console import Console
 
 from calibration.made_fits import SET, made_fit
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.output.calibrate import all_findings, calibrated, concerns, kept, number_in
 from finssim.calibration.output.report import fit_json, fit_report, state_text
-from finssim.calibration.output.vehicle_file import number_origins, write_vehicle
+from finssim.calibration.output.vehicle_file import (
+    all_findings,
+    calibrated,
+    concerns,
+    kept,
+    number_in,
+    number_origins,
+    write_vehicle,
+)
 from finssim.vehicles import load_vehicle
 
 

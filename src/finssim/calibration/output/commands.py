@@ -11,7 +11,6 @@ from rich.console import Console
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Fit
-from finssim.calibration.output.calibrate import all_findings, calibrated
 from finssim.calibration.output.report import (
     command_line,
     fit_json,
@@ -20,7 +19,7 @@ from finssim.calibration.output.report import (
     publish,
     refuse_places,
 )
-from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.output.vehicle_file import all_findings, calibrated, write_vehicle
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 

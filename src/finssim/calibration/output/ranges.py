@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate, Fit
-from finssim.calibration.output.calibrate import calibrated, estimate_at
+from finssim.calibration.output.vehicle_file import calibrated, estimate_at
 from finssim.engine.ranges_file import load_ranges
 from finssim.files import atomic_write
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle

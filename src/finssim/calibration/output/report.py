@@ -23,7 +23,7 @@ from rich.text import Text
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, plain, sentences
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
-from finssim.calibration.output.calibrate import kept, number_in
+from finssim.calibration.output.vehicle_file import kept, number_in
 from finssim.files import atomic_directory, atomic_write, refuse_unwritable
 from finssim.page import RECORD_FILE, Page, Pictures
 from finssim.provenance import provenance

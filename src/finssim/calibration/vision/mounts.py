@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.output.calibrate import all_findings, calibrated
 from finssim.calibration.output.report import (
     command_line,
     fit_json,
@@ -30,7 +29,7 @@ from finssim.calibration.output.report import (
     refuse_places,
     write_report,
 )
-from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.output.vehicle_file import all_findings, calibrated, write_vehicle
 from finssim.calibration.uncertainty import Covariance, Evidence, intervals, trial_covariance
 from finssim.calibration.vision.least_squares import (
     Block,
