@@ -121,6 +121,22 @@ def test_its_own_velocity_counts_where_no_log_speaks():
     np.testing.assert_allclose(aid.values, (0.4 / math.sqrt(2), 0.4 / math.sqrt(2), 0.0), atol=1e-6)
 
 
+def test_a_heartbeat_from_before_its_disarming_arms_no_bridge():
+    """Disarmed and asked for again at once: what it said a moment ago no longer holds."""
+    link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
+    off = ThrusterCommand(False, (0.0,) * 8)
+    armed = bytes(mavlink.MAVLink_heartbeat_message(12, 3, 209, 19, 4, 3).pack(auto))
+    link._version, link._parameters = (4, 5), {"JS_GAIN_DEFAULT": 0.5}
+    link.feed(10.0, armed)
+    assert link.prepare(10.0) == ""
+    link.encode(10.0, off, "armed")
+    link.encode(10.1, off, "disarmed")
+    link.feed(10.11, armed)  # on its way meanwhile
+    assert "disarm" in link.prepare(10.12)
+    link.feed(10.3, bytes(mavlink.MAVLink_heartbeat_message(12, 3, 81, 19, 3, 3).pack(auto)))
+    assert link.prepare(10.7) == "waiting for it to arm"
+
+
 def test_signed_frames_pass_and_unsigned_ones_do_not():
     key = bytes(range(32))
     link, stranger = MavlinkLink(HEAVY, key=key), mavlink.MAVLink(None, 1, 1)
