@@ -104,6 +104,14 @@ def test_axes_and_attitude_turn_from_its_frame_to_ours():
     assert heading.kind == HEADING and heading.values[0] == pytest.approx(0.3, abs=1e-6)
 
 
+def test_a_specific_force_beyond_the_instruments_range_is_left_out():
+    """The one before it is used on."""
+    link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
+    for z in (-1000, -32021):
+        link.feed(1.0, bytes(mavlink.MAVLink_raw_imu_message(0, 0, 0, z, 0, 0, 0, 0, 0, 0).pack(auto)))
+    assert link._accel == pytest.approx((0.0, 0.0, 9.80665)) and link.counts["implausible"] == 1
+
+
 def test_its_own_velocity_counts_where_no_log_speaks():
     """North 0.4 m/s with the nose north-east is forward and left; only while its filter says that it knows."""
     link = MavlinkLink(HEAVY)

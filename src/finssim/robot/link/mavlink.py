@@ -70,6 +70,8 @@ CRITICAL = 5
 """HEARTBEAT.system_status of a failsafe."""
 AIDED, NOT_AIDED = 2, 128
 """EKF_STATUS_REPORT.flags: horizontal velocity is known; position is held by assumption."""
+ACCELEROMETER_RANGE = 16000
+"""Of the autopilots' instruments [mg]: of spoiled frames one in 65 536 passes, and the estimator trusts this."""
 STANDARD_ATMOSPHERE = 101325.0
 """At the surface, until the autopilot tells its own [Pa]."""
 G = 9.80665
@@ -233,6 +235,9 @@ class MavlinkLink:
         return made
 
     def _raw_imu(self, now: float, m: Any) -> list[Message]:
+        if max(abs(m.xacc), abs(m.yacc), abs(m.zacc)) > ACCELEROMETER_RANGE:
+            self.counts["implausible"] += 1
+            return []
         x, y, z = (0.001 * G * FROM_FOSSEN.vector([m.xacc, m.yacc, m.zacc])).tolist()
         self._accel = (x, y, z)
         return []
