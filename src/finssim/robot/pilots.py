@@ -86,7 +86,7 @@ class AgentPilot:
         self.agent, self.observer, self.period, self.name = agent, observer, agent.period, agent.name
         self.mode = action_mode(agent.action, vehicle, agent.wrench_scale)
         task = None if observer is None else observer.task
-        reach = task.reach * task.fit.size if hasattr(task, "reach") else math.inf
+        reach = task.approach * task.fit.size if hasattr(task, "approach") else math.inf
         self.reach = reach * (BY_AXES if self.mode.pilot else 1.0)
         """Goals farther away than this are shown so far ahead on the way to them [m]."""
         self.turn = TURN if self.mode.pilot and math.isfinite(reach) else math.inf

@@ -132,7 +132,7 @@ class StationKeeping(PoolTask):
     """Largest starting speed per axis [m/s]."""
     rate: float = 0.35
     """Largest starting turn rate per axis [rad/s]."""
-    reach: ClassVar[float] = 1.2
+    approach: ClassVar[float] = 1.2
     """A robot is shown a goal farther away than this as one so far ahead on the straight way to it: training saw few
     that were farther, and a policy that hurries to one leans beyond what its sensors bear [m]."""
     tolerance: float = 0.10

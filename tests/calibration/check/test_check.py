@@ -22,7 +22,12 @@ COLUMNS = ("u", "v", "w", "p", "q", "r", "ax", "ay", "az", "roll", "pitch", "yaw
 @pytest.fixture(scope="module")
 def simulated():
     """Trials of the simulator with the noise of the vehicle's sensors, by axis."""
-    every = {p.name: p for p in programmes(["surge", "heave", "roll", "yaw"], VEHICLE, seed=3)}
+    every = {
+        p.name: p
+        for p in programmes(
+            ["surge", "heave", "roll", "yaw"], VEHICLE, seed=3, levels={"surge": (41.0, 82.0, 123.0)}
+        )
+    }
     trials = simulate_programme(
         [every[name] for name in NAMES], VEHICLE, seed=3, columns=COLUMNS, inputs=("wrench",)
     )
