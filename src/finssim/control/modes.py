@@ -108,7 +108,7 @@ class ModeData:
 
 @wp.func
 def past_dead_band(part: float, dead_band: float) -> float:
-    """An axis of an action, moved past the outputs at which no motor turns; within +-`QUIET` it stays in them.
+    """An axis of an action, moved on by the outputs at which no motor turns, beyond +-`QUIET`.
 
     Args:
         part: In [-1, 1].

@@ -185,3 +185,12 @@ def test_an_address_that_is_none_is_refused(address):
 def test_a_turned_imu_is_refused():
     with pytest.raises(LinkError, match="AHRS_ORIENTATION"):
         MavlinkLink(HEAVY.replace({"sensors.imu.orientation": [0.0, 0.0, 1.0, 0.0]}))
+
+
+def test_it_waits_for_parameters_but_not_for_ever():
+    """Whatever the clock says: three seconds from the first wish to arm; then axes go out as overrides."""
+    link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
+    beat = mavlink.MAVLink_heartbeat_message(12, 3, 81, 19, 3, 3)
+    for now, waits in ((5000.0, True), (5002.5, True), (5003.5, False)):
+        link.feed(now, bytes(beat.pack(auto)))
+        assert ("version and parameters" in link.prepare(now)) == waits

@@ -54,6 +54,8 @@ REQUEST_LASTS = 3.0
 person presses a key twice, and `ros2 service call` takes its time."""
 SELDOM, SMOOTH = 2.0, 0.2
 """Mean time between two messages, part of that asked for, at which they come too seldom; how much the newest counts."""
+PATIENCE = 3.0
+"""Longest wait for version and parameters before arming [s]; without them axes go out as overrides."""
 HEARTBEAT_LOST = 3.0
 """Longest silence of the autopilot's heartbeat [s]."""
 REMEMBERED = 1.0
@@ -310,9 +312,9 @@ class MavlinkLink:
         """
         if now - self._alive > HEARTBEAT_LOST:
             return "the autopilot has sent no heartbeat yet"
-        if self._version is None or "JS_GAIN_DEFAULT" not in self._parameters:
-            if self._first(now, "known") < 3.0:
-                return "waiting for the autopilot's version and parameters"
+        unknown = self._version is None or "JS_GAIN_DEFAULT" not in self._parameters
+        if unknown and now - self._first(now, "known") < PATIENCE:
+            return "waiting for the autopilot's version and parameters"
         if now - self._released < ASK_AGAIN:  # its heartbeats may be older than what was asked
             return "waiting for it to disarm first"
         if now - self._wanted > ASK_AGAIN:  # a new attempt: what ended the last one is history
