@@ -456,11 +456,11 @@ def _wrongly_accepted(folder: Path) -> None:
 def _what_a_camera_saw(folder: Path) -> None:
     """A survey of points below the water, and a vehicle that swims in a circle."""
     import numpy as np
-    from finssim.localization.detection.tags import tag_corners_b
 
     from finssim.geometry.optics import Interface, Lens, project
     from finssim.localization.camera_file import write_camera
     from finssim.localization.detection.detections import Detection, Frame, write_detections
+    from finssim.localization.detection.families import tag_corners_b
     from finssim.localization.pool import load_pool
     from finssim.vehicles import load_vehicle
 
