@@ -80,7 +80,7 @@ def fit_hydrodynamics(
         vehicle: Gives the rigid body, the motors and what is not fitted.
         axes: Axes to fit; those that the trials excite if None.
         method: One of `METHODS`.
-        estimate: Further parameters: of the vehicle's terms, and by simulation only `ESTIMATE`.
+        estimate: Further parameters, of `ESTIMATE` and of the vehicle's terms; simulation only.
         damping: `auto`, `linear`, `quadratic` or `both`.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²]; regression only.
         horizon: Longest stretch that is simulated without a restart [s]; simulation only.
@@ -90,13 +90,8 @@ def fit_hydrodynamics(
     Raises:
         CalibrationError: No trial can be used, or an option is not the method's.
     """
-    from finssim.calibration.simulation.fit import ESTIMATE
-
     known = dict(known or {})
-    only_simulation = {
-        "further estimates": any(word in ESTIMATE for word in estimate),
-        "a horizon": horizon is not None,
-    }
+    only_simulation = {"further estimates": bool(estimate), "a horizon": horizon is not None}
     asked = [name for name, given in only_simulation.items() if given]
     if method not in METHODS:
         raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
@@ -109,7 +104,7 @@ def fit_hydrodynamics(
 
     def regression(body: Vehicle, **given: Any) -> Fit:
         settings = {"known": known} | given
-        return regress(trials, body, axes=axes, damping=damping, estimate=estimate, seed=seed, **settings)
+        return regress(trials, body, axes=axes, damping=damping, seed=seed, **settings)
 
     def simulation(body: Vehicle) -> Fit:
         from finssim.calibration.simulation.fit import fit_by_simulation

@@ -14,7 +14,6 @@ from finssim.calibration.fit import Curve, Estimate
 from finssim.calibration.regression.axis_fit import TERMS, AxisData, Selection
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.vehicles import AXES, Vehicle
-from finssim.vehicles.terms import unit_of
 
 Array = NDArray[np.float64]
 
@@ -184,9 +183,6 @@ CERTAIN = 0.2
 USEFUL = 0.5
 """The same, up to which an inertia is written to the vehicle file: better than a guess."""
 
-FORMED = 0.01
-"""Error of an estimate of a term's parameter by products of measured velocities, as a part of it; intervals hold it."""
-
 DECADE = 10.0
 
 GAP = np.full(1, np.nan)
@@ -350,45 +346,6 @@ class AxisResult:
         }
         self.changes = {}
         self.findings.append(finding("axis_refused", self.axis, reason=reason))
-
-
-def term_estimate(
-    path: str, chosen: Mapping[int, tuple[AxisData, Selection]]
-) -> tuple[Estimate | None, list[Finding]]:
-    """A parameter of the vehicle's terms from all axes on which it acts, weighted by the squares of their intervals.
-
-    Args:
-        path: Such as `lift.coefficient`.
-        chosen: Data and model of the axes that can be believed.
-
-    Returns:
-        None where it acts on none of them; and a finding where axes disagree, or none has an interval.
-    """
-    values, halves, names = [], [], []
-    for i, (data, selection) in chosen.items():
-        column = len(TERMS) + data.estimated.index(path)
-        low, high = selection.interval[column]
-        if selection.fit.terms[column] and np.isfinite([low, high]).all() and high > low:
-            values.append(float(selection.fit.theta[column]))
-            halves.append(max(high - values[-1], values[-1] - low))
-            names.append(AXES[i])
-    if not values:
-        return None, [finding("term_unfitted", path)]
-    weight = np.asarray(halves) ** -2.0
-    value = float(weight @ values / weight.sum())
-    half = float(np.hypot(weight.sum() ** -0.5, FORMED * value))
-    sure, note = half <= CERTAIN * abs(value), f"from {', '.join(names)}"
-    if not sure:
-        note += f"; known to no better than {_percent(2.0 * half, value)}"
-    said = []
-    if np.any(np.abs(np.asarray(values) - value) > 2.0 * np.hypot(halves, half)):
-        told = tuple(f"{name} {x:.4g} ± {h:.2g}" for name, x, h in zip(names, values, halves, strict=True))
-        said = [finding("term_disagrees", path, estimates=told)]
-    found = Estimate(
-        name=path, estimate=value, ci95=(value - half, value + half), unit=unit_of(path), identifiable=sure, note=note,
-        path=f"{SET}.{path}",
-    )  # fmt: skip
-    return found, said
 
 
 def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]) -> dict[str, float]:

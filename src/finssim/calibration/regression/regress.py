@@ -21,7 +21,6 @@ from finssim.calibration.regression.axis_estimates import (
     hydrostatics,
     late_velocity,
     quality,
-    term_estimate,
     worthless,
 )
 from finssim.calibration.regression.axis_fit import (
@@ -287,8 +286,6 @@ def axis_data(
         rows=tuple(r for _, r, _ in out),
         kernels=tuple(k for _, _, k in out),
         tilted=tilted,
-        estimated=plants[0].estimated,
-        lowest=plants[0].lowest,
     ), said
 
 
@@ -369,7 +366,6 @@ def regress(
     *,
     axes: Sequence[str] | None = None,
     damping: str = "auto",
-    estimate: Sequence[str] = (),
     known: Mapping[str, float] | None = None,
     file_prior: bool = True,
     seed: int = 0,
@@ -386,15 +382,13 @@ def regress(
         vehicle: Gives the rigid body, what is known of couplings, and where the numbers go.
         axes: Axes to fit; all that are excited if None.
         damping: `auto`, `linear`, `quadratic` or `both`.
-        estimate: Parameters of the vehicle's terms to fit too, such as `lift.coefficient`, in which their wrench is
-            linear; each from all axes on which it acts.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
         file_prior: Whether the inertia and drag of the vehicle file count as a prior, within a factor of two or so.
         seed: Kept with the fit; nothing here is random.
 
     Raises:
-        CalibrationError: No trial can be used, one is held out, an axis, damping or parameter is unknown, or two share
-            a name.
+        CalibrationError: No trial can be used, one is held out, an axis or damping is unknown, or two share a
+            name.
     """
     wanted = _wanted(axes)
     if damping not in DAMPING:
@@ -402,9 +396,7 @@ def regress(
     require_fittable(trials, vehicle)
     driven = [trial for trial in trials if not trial.header.passive]
     prepared, findings = prepare(driven, vehicle)
-    chosen, more = _fit_axes(
-        prepared, vehicle, wanted, axes is not None, damping, known or {}, estimate, file_prior
-    )
+    chosen, more = _fit_axes(prepared, vehicle, wanted, axes is not None, damping, known or {}, file_prior)
     findings += more
     file = matrices(vehicle)
     estimates: dict[str, Estimate] = {}
@@ -422,12 +414,6 @@ def regress(
             estimates[buoyancy.name] = buoyancy
             findings += notes
     told = {i: pair for i, pair in chosen.items() if not results[AXES[i]].worthless}
-    for path in estimate:
-        found, notes = term_estimate(path, told)
-        findings += notes
-        if found is not None:
-            estimates[path] = found
-            changes |= {str(found.path): found.estimate} if found.identifiable else {}
     used = {s.name for data, _ in chosen.values() for s in data.signals}
     still, notes = hydrostatics(estimates, vehicle)
     changes |= still
@@ -466,7 +452,6 @@ def regress(
             "damping": damping,
             "axes": [AXES[i] for i in chosen],
             **({"fix": {f"{axis}.m": m for axis, m in known.items()}} if known else {}),
-            **({"estimate": list(estimate)} if estimate else {}),
             "seed": seed,
         },
     )
@@ -484,13 +469,12 @@ def _fit_axes(
     asked: bool,
     damping: str,
     known: Mapping[str, float],
-    estimate: Sequence[str],
     file_prior: bool,
 ) -> tuple[dict[int, tuple[AxisData, Selection]], list[Finding]]:
     """Data and model of every axis that can be fitted; couplings between axes use the estimates of the round before."""
-    file = matrices(vehicle, estimate=estimate)
+    file = matrices(vehicle)
     findings = list[Finding]()
-    waters = [matrices(vehicle, one.trial.header.water.density, estimate=estimate) for one in prepared]
+    waters = [matrices(vehicle, one.trial.header.water.density) for one in prepared]
     active = excited(prepared, vehicle) if prepared else np.zeros((0, 6), bool)
     fitted = {i for i in wanted if active[:, i].any()}
     chosen: dict[int, tuple[AxisData, Selection]] = {}
@@ -564,9 +548,9 @@ def _same(before: AxisData, now: AxisData) -> bool:
 def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correlation | None, list[Finding]]:
     """Of all axes together, block by block, with a finding for every trade-off."""
     names, blocks, findings = list[str](), list[Array](), list[Finding]()
-    for i, (data, selection) in chosen.items():
-        fit, terms = selection.fit, (*TERMS, *data.estimated)
-        own = [f"{AXES[i]}.{name}" for name, on in zip(terms, fit.terms, strict=True) if on]
+    for i, (_, selection) in chosen.items():
+        fit = selection.fit
+        own = [f"{AXES[i]}.{name}" for name, on in zip(TERMS, fit.terms, strict=True) if on]
         found, said = degeneracy(own, fit.covariance.local, fit.free[fit.terms])
         names += own
         blocks.append(found.matrix)
