@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
-from finssim.calibration.fit import Correlation, Estimate, Fit
+from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion, attitude_samples, motion
 from finssim.calibration.motion.smoothing import spans_of
 from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
-    AxisResult,
     curves_of,
     hydrostatics,
     late_velocity,
     quality,
+    regression_result,
     worthless,
 )
 from finssim.calibration.regression.axis_fit import (
@@ -401,25 +401,27 @@ def regress(
     file = matrices(vehicle)
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
-    results: dict[str, AxisResult] = {}
+    figures: dict[str, dict[str, float]] = {}
+    curves: list[Curve] = []
+    told = []
     for i, (data, selection) in chosen.items():
-        results[AXES[i]] = result = AxisResult(data=data, chosen=selection, file=file)
+        result, worthless_for = regression_result(data, selection, file)
         estimates |= result.estimates
         changes |= result.changes
         findings += result.findings
+        figures[AXES[i]] = quality(data, selection)
+        curves += curves_of(data, selection)
+        told += [] if worthless_for else [i]
         if i == 2:
             buoyancy, notes = buoyancy_estimate(data, selection, vehicle)
-            if result.worthless:
-                buoyancy = replace(buoyancy, identifiable=False, note=result.worthless)
+            if worthless_for:
+                buoyancy = replace(buoyancy, identifiable=False, note=worthless_for)
             estimates[buoyancy.name] = buoyancy
             findings += notes
-    told = {i: pair for i, pair in chosen.items() if not results[AXES[i]].worthless}
     used = {s.name for data, _ in chosen.values() for s in data.signals}
     still, notes = hydrostatics(estimates, vehicle)
     changes |= still
     findings += notes
-    figures = {axis: result.quality for axis, result in results.items()}
-    curves = [curve for result in results.values() for curve in curves_of(result.data, result.chosen)]
     findings += late_velocity(figures, explained=[AXES[i] for i in told])
     quiet = _passive(trials, vehicle, [i for i in wanted if i not in told], known or {})
     if quiet is not None:

@@ -1,10 +1,10 @@
-"""The fit of simulations to segments, as `solver` asks for it: finite differences are worlds."""
+"""The fit of simulations to segments; finite differences are worlds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -332,9 +332,6 @@ class Parameters:
         )
 
 
-# The fit of simulations to segments, as `solver` asks for it: finite differences are worlds.
-
-
 CUT = 2.5
 """Whitened residual above which Huber's loss grows linearly."""
 
@@ -368,36 +365,6 @@ class Linear(NamedTuple):
     """d predicted / d z of the sample's own segment, (N, q)."""
 
 
-class Problem(Protocol):
-    """What is fitted."""
-
-    edges: NDArray[np.int64]
-    """First sample of each segment, and N, (S + 1,)."""
-    low: Array
-    high: Array
-    """Box of theta, (P,)."""
-    prior_std: Array
-    """Of z around zero, (S, q)."""
-    prior_mean: Array
-    """What is known of theta beforehand, (P,)."""
-    prior_precision: Array
-    """One over its variance; 0 where nothing is known, (P,)."""
-    judged: int
-    """How many of theta, from the first, have to be accurate; the rest are there for their sake."""
-
-    def residuals(self, points: Point) -> Array:
-        """Measured minus predicted for several points (leading axis C), (N, C); NaN where a point has no answer."""
-
-    def linearise(self, point: Point) -> Linear:
-        """Residuals and derivatives at one point."""
-
-    def noise(self, residual: Array) -> Array:
-        """Standard deviation of every sample, from residuals at a fit, (N,)."""
-
-    def grain(self, theta: Array) -> Array:
-        """Differences of theta that nobody minds, (P,)."""
-
-
 @dataclass(frozen=True)
 class Solution:
     """Where a fit ended."""
@@ -418,7 +385,7 @@ def weights_of(residual: Array, std: Array, cut: float = CUT) -> Array:
     return huber_weight(np.abs(residual / std), cut) / std**2
 
 
-def blocks_of(problem: Problem, linear: Linear, std: Array, point: Point, cut: float = CUT) -> list[Block]:
+def blocks_of(problem: Shooting, linear: Linear, std: Array, point: Point, cut: float = CUT) -> list[Block]:
     """Weighted normal equations of every segment with the prior of z; that of theta is in the first."""
     root = np.sqrt(weights_of(linear.residual, std, cut))
     shared, own, residual = linear.shared * root[:, None], linear.own * root[:, None], linear.residual * root
@@ -434,7 +401,7 @@ def blocks_of(problem: Problem, linear: Linear, std: Array, point: Point, cut: f
 
 
 def step_of(
-    problem: Problem, reduced: tuple[Array, Array, list[Array]], point: Point, damping: float
+    problem: Shooting, reduced: tuple[Array, Array, list[Array]], point: Point, damping: float
 ) -> tuple[Array, Array, Array]:
     """Steps of theta (P,) inside the box and of z (S, q), and standard errors of theta, (P,).
 
@@ -453,7 +420,7 @@ def step_of(
     return step, z, np.sqrt(np.diagonal(np.linalg.inv(A))) / scale
 
 
-def costs_of(problem: Problem, residual: Array, std: Array, points: Point, cut: float = CUT) -> Array:
+def costs_of(problem: Shooting, residual: Array, std: Array, points: Point, cut: float = CUT) -> Array:
     """Half the losses of several points with residuals (N, C), (C,); infinite where one has no answer."""
     prior = np.square(points.z / problem.prior_std).sum(axis=(1, 2))
     prior = prior + (points.theta - problem.prior_mean) ** 2 @ problem.prior_precision
@@ -462,7 +429,7 @@ def costs_of(problem: Problem, residual: Array, std: Array, points: Point, cut: 
 
 
 def solve(
-    problem: Problem,
+    problem: Shooting,
     start: Point,
     *,
     iterations: int = 30,
@@ -860,10 +827,17 @@ FLOOR = 1e-4
 
 
 class Shooting:
-    """Residuals of segments under parameters, trial biases and initial states; satisfies `solver.Problem`.
+    """Residuals of segments under parameters, trial biases and initial states.
 
     Attributes:
         axes_of_trials: Axes with a constant wrench that differs from trial to trial.
+        edges: First sample of each segment, and N, (S + 1,).
+        low: Least theta, (P,).
+        high: Largest theta, (P,).
+        prior_std: Of z around zero, (S, q).
+        prior_mean: What is known of theta beforehand, (P,).
+        prior_precision: One over its variance; 0 where nothing is known, (P,).
+        judged: How many of theta, from the first, have to be accurate; the rest are there for their sake.
     """
 
     def __init__(
