@@ -24,6 +24,7 @@ from finssim.calibration.trials.conversion import (
     merged,
     ordered,
     tidy_quaternions,
+    upside_down,
 )
 from finssim.calibration.trials.trial import (
     COLUMNS,
@@ -31,7 +32,6 @@ from finssim.calibration.trials.trial import (
     NU,
     PHASES,
     Array,
-    Conversion,
     Header,
     Trial,
     column_of,
@@ -203,7 +203,9 @@ class SourceMap(Part):
         return columns
 
 
-HEADER_KEYS = tuple(name for name in Header.model_fields if name != "convert")
+HEADER_KEYS = tuple(Header.model_fields)
+
+GROUPS = tuple(dict.fromkeys(column.group for column in COLUMNS.values()))
 
 
 class ArduSubMap(Part):
@@ -273,6 +275,8 @@ class ColumnMap(Part):
     topics: dict[str, SourceMap] = Field(default_factory=dict)
     ardusub: ArduSubMap = Field(default_factory=ArduSubMap)
     split: SplitRule | None = None
+    time_offsets: dict[str, float] = Field(default_factory=dict)
+    """Column, or group (command velocity rates acceleration attitude position depth) -> seconds added to its times."""
     surface_pressure: float | None = Field(default=None, ge=0.0)
     """Of the surface as the sensor reads it, for `pressure` columns [Pa]; 0 for a gauge."""
     header: dict[str, Any] = Field(default_factory=dict)
@@ -545,6 +549,36 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
     return stream.noting(*(one.about(stream.source) for one in (*untimed, *repaired)))
 
 
+def moved_in_time(streams: Sequence[Stream], offsets: Mapping[str, float]) -> list[Stream]:
+    """The streams with columns, or groups of them, moved in time; their words stay.
+
+    Args:
+        streams: Of a trial.
+        offsets: Column or group -> what is added to its times [s].
+
+    Raises:
+        CalibrationError: A key that is neither a group nor a column of these streams.
+    """
+    known = [*GROUPS, *(name for stream in streams for name in stream.channels)]
+    for key in offsets:
+        if key not in known:
+            raise CalibrationError(
+                f"time_offsets: '{key}' is neither a group nor a column of this log{did_you_mean(key, known)} "
+                f"groups are {', '.join(GROUPS)}"
+            )
+    out = []
+    for stream in streams:
+        groups = {name: column.group if (column := column_of(name)) else "" for name in stream.channels}
+        by = {name: offsets.get(name, offsets.get(group, 0.0)) for name, group in groups.items()}
+        for seconds in dict.fromkeys(
+            [*([] if stream.channels and not stream.words else [0.0]), *by.values()]
+        ):
+            part = {name: values for name, values in stream.channels.items() if by[name] == seconds}
+            words = stream.words if seconds == 0.0 else {}
+            out.append(replace(stream, t=stream.t + seconds, channels=part, words=words))
+    return out
+
+
 def merge(streams: Sequence[Stream]) -> Table:
     """All streams on the union of their times, which start at 0.
 
@@ -602,7 +636,7 @@ LONGEST_BRIDGE = 0.5
 
 def in_our_axes(stream: Stream, frame: Frame) -> Stream:
     """The stream in x forward, y left, z up and a world with z up."""
-    channels = in_our_frames(stream.channels, Conversion(body=frame.body, world=frame.world))
+    channels = in_our_frames(stream.channels, frame.body, frame.world)
     if frame.world == "NED":
         for name, sign in zip(WORLD_VELOCITY, FROM_FOSSEN.A.diagonal(), strict=True):
             if name in channels:
@@ -629,6 +663,8 @@ def trial_of(name: str, table: Table, header: Header, column_map: ColumnMap) -> 
         channels = {c: v for c, v in channels.items() if c not in STICKS} | pulses
         findings += mixed
     findings += tidy_quaternions(channels)
+    if upside_down(channels):
+        findings.append(finding("upside_down"))
     for column in [c for c, v in channels.items() if not np.isfinite(v).any()]:
         findings.append(finding("column_empty", column=column))
         del channels[column]

@@ -26,6 +26,7 @@ from finssim.calibration.importers.assemble import (
     TimeColumn,
     in_our_axes,
     merge,
+    moved_in_time,
     read_map,
     split_rule,
     split_table,
@@ -701,7 +702,9 @@ def read_trials(
     for name, streams, recorded in _groups(
         [Path(path) for path in paths], mapped, format, vehicle, column_map is not None
     ):
-        for piece, table in split_table(name, merge(streams), rule).items():
+        for piece, table in split_table(
+            name, merge(moved_in_time(streams, mapped.time_offsets)), rule
+        ).items():
             header = mapped.header_of(piece if piece in mapped.trials else name, vehicle, recorded)
             trials.append(trial_of(piece, table, header, mapped))
     unknown = [name for name in mapped.trials if name not in {trial.name for trial in trials}]

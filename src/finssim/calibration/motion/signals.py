@@ -417,7 +417,7 @@ class Offset(NamedTuple):
     reference: str
     """Group of columns that it was compared with."""
     seconds: float
-    """What to add to the stream's times so that both agree: a value for `convert.time_offset`."""
+    """What to add to the stream's times so that both agree: a value for `time_offsets` of a map."""
     std: float
     """Standard deviation of `seconds` [s]."""
     correlation: float
