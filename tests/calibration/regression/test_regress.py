@@ -116,9 +116,9 @@ def test_late_motion_is_told_from_inertia():
 
 
 @pytest.mark.slow
-def test_a_velocity_later_than_the_gyro_is_named():
-    """u is logged 120 ms late, the gyro is not: mass within 5 %, its note tells of the lag, and the cause is named."""
-    vehicle, some = trials("bluerov2_heavy", "surge", "sway", "heave", "yaw")
+def test_a_velocity_later_than_the_gyro_costs_no_mass():
+    """u is logged 120 ms late, the gyro is not: mass within 5 %, and its note tells of the lag."""
+    vehicle, some = trials("bluerov2_heavy", "surge")
     late = []
     for t in some:
         shifted = {n: np.interp(t.t - 0.12, t.t, c) if n in "uvw" else c for n, c in t.channels.items()}
@@ -130,8 +130,6 @@ def test_a_velocity_later_than_the_gyro_is_named():
     low, high = fit.estimates["surge.m_eff"].ci95
     assert low < truth(vehicle)["surge.m_eff"] < high
     assert "lags the file's motors" in fit.estimates["surge.m_eff"].note
-    assert "velocity_late" in {one.code for one in fit.findings}
-    assert "velocity_late" not in {one.code for one in regress(some, vehicle).findings}
 
 
 @pytest.mark.slow

@@ -392,7 +392,7 @@ def bench(
         shown: How messages call the target.
         voltage: At which the numbers shall hold [V]; where not given, the only one of the tables, else that of the
             vehicle file's ESC, else the middle one.
-        pool_voltages: Fit the speed controller to all voltages together, rather than to this one alone.
+        pool_voltages: Fit all voltages together, rather than this one alone.
 
     Raises:
         CalibrationError: The tables hold no such voltage, or nothing to fit.
@@ -407,16 +407,12 @@ def bench(
     levels = [level for table in tables for level in split_by_voltage(table)]
     chosen = _reference([volts for volts, _ in levels], thruster, shown, voltage)
     at = [table for volts, table in levels if not abs(volts - chosen) > SAME_VOLTAGE]
-    trends = _trends(levels) if measured else ()
     others = sorted({round(volts, 1) for volts, table in levels if not any(table is t for t in at)})
-    pooled = pool_voltages or not trends
-    fitted = [table for _, table in levels] if pooled else at
-    if trends and pooled:
-        findings.append(finding("voltage_trend", shown, trends=trends))
-    elif trends:
-        findings.append(finding("voltage_chosen", shown, trends=trends, voltage=chosen))
-    elif others and measured:
-        findings.append(finding("voltage_pooled", shown))
+    fitted = [table for _, table in levels] if pool_voltages else at
+    if others and not pool_voltages:
+        findings.append(
+            finding("voltage_chosen", shown, voltage=chosen, others=tuple(f"{v:g}" for v in others))
+        )
     sides, dead, fastest = {}, {}, {}
     for name, sign in SIDES:
         side = fit_side([turning(table, sign) for table in fitted]) if measured else None
@@ -429,8 +425,7 @@ def bench(
         fastest[name] = max(speeds, default=(0.0, False, 0.0))
     esc = None
     if any(np.isfinite(table.pulse).any() for table in tables):
-        on = [table for _, table in levels] if pool_voltages else at
-        esc = _esc(on, thruster, tables, shown, chosen, measured, findings)
+        esc = _esc(fitted, thruster, tables, shown, chosen, measured, findings)
     if not sides and esc is None:
         said = "; ".join(sentences(findings)) or f"{shown}: no row turns the shaft"
         raise CalibrationError(f"{said}: nothing could be fitted")
@@ -480,26 +475,6 @@ def _reference(volts: Sequence[float], thruster: Thruster, shown: str, asked: fl
         listed = ", ".join(f"{v:g}" for v in dict.fromkeys(round(v, 2) for v in known))
         raise CalibrationError(f"{shown}: no table at {asked:g} V; there are {listed} V")
     return min(near, key=lambda v: abs(v - asked))
-
-
-def _trends(levels: Sequence[tuple[float, ThrustTable]]) -> tuple[str, ...]:
-    """How c± change with the voltage, where it is beyond chance and by more than 2 % over the tables."""
-    found = []
-    for name, sign in SIDES:
-        pairs = [
-            (volts, fit_side([turning(table, sign)])) for volts, table in levels if not math.isnan(volts)
-        ]
-        points = np.array([(volts, side.c) for volts, side in pairs if side is not None])
-        if len(points) < 3 or np.ptp(points[:, 0]) < 2.0 * SAME_VOLTAGE:
-            continue
-        V = points[:, 0] - np.mean(points[:, 0])
-        slope = float(V @ points[:, 1] / (V @ V))
-        mean = float(np.mean(points[:, 1]))
-        residual = points[:, 1] - mean - slope * V
-        error = math.sqrt(float(residual @ residual) / (len(V) - 2) / float(V @ V))
-        if abs(slope) > t_quantile(len(V) - 2) * error and abs(slope) * np.ptp(V) > 0.02 * mean:
-            found.append(f"c_{name} changes by {100.0 * slope / mean:+.2g} % per volt")
-    return tuple(found)
 
 
 def _together(zones: Sequence[DeadZone]) -> DeadZone:

@@ -22,9 +22,6 @@ Array = NDArray[np.float64]
 EXPLAINED = 0.2
 """R² below which the model of an axis explains nothing: at 0 the mean of the wrench does as well."""
 
-SEPARATE = 0.05
-"""By how much velocity has to lag the rates to be named [s]."""
-
 MOST_TILTED = 0.4
 """Share of samples at large tilt beyond which what remains is not believed: pitching fast through level."""
 
@@ -157,22 +154,6 @@ def axis_findings(axis: str, data: AxisData, chosen: Selection) -> list[Finding]
     if unknown:
         out.append(finding("velocity_unknown", axis, axes=tuple(str(AXES[j]) for j in unknown)))
     return out
-
-
-def late_velocity(figures: dict[str, dict[str, float]], *, explained: list[str]) -> list[Finding]:
-    """A finding where surge, sway and heave lag the wrench by more than roll, pitch and yaw: two streams, two clocks.
-
-    Args:
-        figures: `quality` of every axis.
-        explained: Axes whose fit is worth something.
-    """
-    lags = [[figures[a]["delay"] for a in some if a in explained] for some in (AXES[:3], AXES[3:])]
-    if not all(lags):
-        return []
-    difference = float(np.median(lags[0]) - np.median(lags[1]))
-    if difference < SEPARATE:
-        return []
-    return [finding("velocity_late", late=difference)]
 
 
 M, D1, D2, BIAS, DELAY, SMOOTHING, K = range(len(TERMS))

@@ -18,7 +18,6 @@ from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
     curves_of,
     hydrostatics,
-    late_velocity,
     quality,
     regression_result,
     worthless,
@@ -422,7 +421,6 @@ def regress(
     still, notes = hydrostatics(estimates, vehicle)
     changes |= still
     findings += notes
-    findings += late_velocity(figures, explained=[AXES[i] for i in told])
     quiet = _passive(trials, vehicle, [i for i in wanted if i not in told], known or {})
     if quiet is not None:
         estimates, changes, figures = (
