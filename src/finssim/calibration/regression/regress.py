@@ -13,7 +13,6 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion, attitude_samples, motion
-from finssim.calibration.motion.smoothing import spans_of
 from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
     curves_of,
@@ -41,21 +40,7 @@ from finssim.calibration.uncertainty import degeneracy
 from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.vehicles import AXES, Vehicle
 
-__all__ = ["axis_data", "coasts", "prepare", "regress"]
-
-# Heave: the buoyancy excess, separated from the damping by dives and the coasts that follow (paper, section III-B).
-
-RISING = 0.01
-"""Vertical speed from which a vehicle rises or sinks by itself [m/s] (published procedure)."""
-
-STEADY = 1.0
-"""How long it has to last [s]: the published 2 s, less half the width of a row's bump at each end."""
-
-LEVEL = 0.9
-"""Last over largest speed in that time; less is the end of a push, not buoyancy."""
-
-HANDS_OFF = 0.05
-"""Part of the largest wrench below which thrust does not count."""
+__all__ = ["axis_data", "prepare", "regress"]
 
 USEFUL = 0.5
 """Half width of the interval, as a part of the excess, up to which it is written to the vehicle file."""
@@ -64,73 +49,30 @@ FAINT = 0.002
 """The same as a part of the weight: what a thousandth of the volume does matters little."""
 
 
-def coasts(data: AxisData) -> list[tuple[str, float]]:
-    """Stretches without thrust at whose end buoyancy and weight alone move the vehicle up or down.
-
-    Args:
-        data: Of heave.
-
-    Returns:
-        Trial, and mean speed over the last `STEADY` seconds, positive up [m/s], of each.
-    """
-    largest = max(float(np.abs(s.tau[np.isfinite(s.tau[:, 2]), 2]).max(initial=0.0)) for s in data.signals)
-    found = []
-    for s, rows in zip(data.signals, data.rows, strict=True):
-        speed, push = rows.X[:, 1], np.interp(s.t[rows.at], s.t, np.nan_to_num(s.tau[:, 2]))
-        free = (np.abs(push) < HANDS_OFF * largest) & (np.abs(speed) > RISING)
-        for b, e in spans_of(free):
-            t = s.t[rows.at[b:e]]
-            last = t > t[-1] - STEADY
-            fading = abs(speed[e - 1]) < LEVEL * np.abs(speed[b:e][last]).max()
-            same = np.sign(speed[b:e][last]) == np.sign(speed[e - 1])
-            if t[-1] - t[0] >= STEADY and same.all() and not fading:
-                found.append((s.name, float(np.mean(speed[b:e][last]))))
-    return found
-
-
-def buoyancy_estimate(data: AxisData, chosen: Selection, vehicle: Vehicle) -> tuple[Estimate, list[Finding]]:
+def buoyancy_estimate(chosen: Selection, vehicle: Vehicle) -> Estimate:
     """B - W from the bias of heave: m w_dot + d1 w + d2 |w| w + b = tau_z, b = -(B - W).
 
-    Args:
-        data: Of heave.
-        chosen: Its model.
-        vehicle: For its weight, which is taken as exact.
+    Coasts and motion both ways tell it from the damping; without them the interval is wide.
 
-    Returns:
-        The estimate, and what to know about it.
+    Args:
+        chosen: The model of heave.
+        vehicle: For its weight, which is taken as exact.
     """
     bias = TERMS.index("bias")
     low, high = (float(x) for x in chosen.interval[bias])
     value = -float(chosen.fit.theta[bias])
-    free = coasts(data)
-    speeds = np.concatenate([r.X[u, 1] for r, u in zip(data.rows, chosen.fit.used, strict=True)])
-    both = bool((speeds > RISING).any() and (speeds < -RISING).any())
-    findings = []
-    if free:
-        fastest = max((speed for _, speed in free), key=abs)
-        note = f"{len(free)} coast{'s' if len(free) > 1 else ''} without thrust, up to {fastest:+.3f} m/s"
-    elif both:
-        note = "from driven motion up and down; no coast without thrust reached 0.01 m/s"
-    else:
-        note = "no coast and one direction only: the excess trades off with the damping"
-        findings.append(finding("buoyancy_traded", "heave"))
-    known = bool(np.isfinite([low, high]).all())
-    known = known and 0.5 * (high - low) <= max(USEFUL * abs(value), FAINT * vehicle.weight)
-    if not known:
-        note += "; not known to half its size"
-    sure = known and (bool(free) or both)
+    half = 0.5 * (high - low)
+    known = bool(np.isfinite(half) and half <= max(USEFUL * abs(value), FAINT * vehicle.weight))
     volume = (vehicle.weight + value) / (vehicle.water.density * vehicle.water.gravity)
-    return (
-        Estimate(
-            name="buoyancy_excess",
-            estimate=value,
-            ci95=(-high, -low),
-            unit="N",
-            identifiable=sure,
-            note=f"{note}; with the file's weight a displaced volume of {volume:.6g} m³",
-            path="body.displaced_volume",
-        ),
-        findings,
+    note = f"with the file's weight a displaced volume of {volume:.6g} m³"
+    return Estimate(
+        name="buoyancy_excess",
+        estimate=value,
+        ci95=(-high, -low),
+        unit="N",
+        identifiable=known,
+        note=note if known else f"not known to half its size: dive and coast; {note}",
+        path="body.displaced_volume",
     )
 
 
@@ -412,11 +354,10 @@ def regress(
         curves += curves_of(data, selection)
         told += [] if worthless_for else [i]
         if i == 2:
-            buoyancy, notes = buoyancy_estimate(data, selection, vehicle)
+            buoyancy = buoyancy_estimate(selection, vehicle)
             if worthless_for:
                 buoyancy = replace(buoyancy, identifiable=False, note=worthless_for)
             estimates[buoyancy.name] = buoyancy
-            findings += notes
     used = {s.name for data, _ in chosen.values() for s in data.signals}
     still, notes = hydrostatics(estimates, vehicle)
     changes |= still
