@@ -383,13 +383,9 @@ def split_table(name: str, table: Table, rule: SplitRule | None) -> dict[str, Ta
     """
     if rule is None:
         return {name: table}
-    pieces = {
-        "phase": _by_phase,
-        "gaps": _by_gaps,
-        "arming": _by_arming,
-        "column": _by_column,
-        "windows": _by_windows,
-    }[rule.by](name, table, rule)
+    pieces = (
+        _windows(name, table, rule) if rule.by == "windows" else _numbered(name, _labels(name, table, rule))
+    )
     long_enough = {
         piece: rows
         for piece, rows in pieces.items()
@@ -414,49 +410,39 @@ def _part(table: Table, rows: Rows) -> Table:
     )
 
 
-def _words(name: str, table: Table, which: str, what: str) -> NDArray[np.str_]:
-    if which not in table.words:
-        raise CalibrationError(f"{name}: cannot be split by {which}: {what}")
-    return table.words[which]
+WORDED = {
+    "phase": ("phase", "no source of the map names a phase column"),
+    "arming": ("arming", "the log says nothing about arming"),
+    "column": ("split", "no source of the map names a split column"),
+}
+"""Rule -> the words that it goes by, and what is said where there are none."""
 
 
-def _runs(labels: NDArray[np.str_]) -> list[tuple[str, Rows]]:
-    """Stretches of equal labels in their order."""
-    number = np.concatenate([[0], np.cumsum(labels[1:] != labels[:-1])])
-    return [(str(labels[number == i][0]), number == i) for i in range(int(number[-1]) + 1)]
+def _labels(name: str, table: Table, rule: SplitRule) -> NDArray[np.int64]:
+    """Number of the piece that each row belongs to, -1 for none, (n,).
+
+    A trial of `phase` begins with each baseline; without baselines, with each excitation after something else.
+    """
+    if rule.by == "gaps":
+        return np.cumsum(np.diff(table.t, prepend=table.t[0]) > rule.longest_gap)
+    column, missing = WORDED[rule.by]
+    if column not in table.words:
+        raise CalibrationError(f"{name}: cannot be split by {column}: {missing}")
+    words = table.words[column]
+    changes = np.concatenate([[True], words[1:] != words[:-1]])
+    if rule.by == "phase":
+        opening = "baseline" if (words == "baseline").any() else "excitation"
+        return np.cumsum(changes & (words == opening)) - 1
+    inside = words == "armed" if rule.by == "arming" else ~np.isin(words, ("", "nan", "None"))
+    return np.where(inside, np.cumsum(changes & inside) - 1, -1)
 
 
-def _numbered(name: str, pieces: list[Rows]) -> dict[str, Rows]:
-    digits = len(str(len(pieces)))
-    return {f"{name}_{i + 1:0{digits}d}": rows for i, rows in enumerate(pieces)}
+def _numbered(name: str, labels: NDArray[np.int64]) -> dict[str, Rows]:
+    count = int(labels.max(initial=-1)) + 1
+    return {f"{name}_{i + 1:0{len(str(count))}d}": labels == i for i in range(count)}
 
 
-def _by_phase(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
-    """A trial begins with each baseline; without baselines, with each excitation after something else."""
-    phase = _words(name, table, "phase", "no source of the map names a phase column")
-    opening = "baseline" if (phase == "baseline").any() else "excitation"
-    begins = (phase == opening) & np.concatenate([[True], phase[:-1] != opening])
-    number = np.cumsum(begins)
-    return _numbered(name, [number == i for i in range(1, int(number[-1]) + 1)] if begins.any() else [])
-
-
-def _by_gaps(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
-    number = np.concatenate([[0], np.cumsum(np.diff(table.t) > rule.longest_gap)])
-    return _numbered(name, [number == i for i in range(int(number[-1]) + 1)])
-
-
-def _by_arming(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
-    arming = _words(name, table, "arming", "the log says nothing about arming")
-    return _numbered(name, [rows for word, rows in _runs(arming) if word == "armed"])
-
-
-def _by_column(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
-    labels = _words(name, table, "split", "no source of the map names a split column")
-    runs = [(word, rows) for word, rows in _runs(labels) if word not in ("", "nan", "None")]
-    return _numbered(name, [rows for _, rows in runs])
-
-
-def _by_windows(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+def _windows(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
     pieces = {window: (table.t >= low) & (table.t <= high) for window, (low, high) in rule.windows.items()}
     empty = [window for window, rows in pieces.items() if not rows.any()]
     if empty:
