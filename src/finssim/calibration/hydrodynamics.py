@@ -106,11 +106,12 @@ def fit_hydrodynamics(
         settings = {"known": known} | given
         return regress(trials, body, axes=axes, damping=damping, seed=seed, **settings)
 
-    def simulation(body: Vehicle) -> Fit:
+    def simulation(body: Vehicle, begin: Fit | None = None) -> Fit:
         from finssim.calibration.simulation.fit import fit_by_simulation
 
+        begin = begin or _or_none(lambda body: regression(body, known={}, file_prior=False), body)
         return fit_by_simulation(
-            trials, body, axes=axes, estimate=estimate, damping=damping, horizon=horizon, seed=seed,
+            trials, body, axes=axes, estimate=estimate, damping=damping, horizon=horizon, begin=begin, seed=seed,
             progress=progress,
         )  # fmt: skip
 
@@ -141,7 +142,7 @@ def _or_none(fit: Callable[[Vehicle], Fit], vehicle: Vehicle) -> Fit | None:
 
 def _better(
     regression: Callable[[Vehicle], Fit],
-    simulation: Callable[[Vehicle], Fit],
+    simulation: Callable[..., Fit],
     body: Vehicle,
     trials: Sequence[Trial],
     before: Mapping[str, float],
@@ -156,7 +157,7 @@ def _better(
         value <= ENOUGH and value <= before.get(axis, math.inf) for axis, value in after.items()
     ):
         return first
-    second = _or_none(simulation, body)
+    second = _or_none(lambda body: simulation(body, first), body)
     if second is None:
         return first
     other = _scores(calibrated(second), trials)

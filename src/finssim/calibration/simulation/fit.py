@@ -32,7 +32,6 @@ from finssim.calibration.simulation.shooting import (
     Point,
     Shooting,
     Solution,
-    costs_of,
     solve,
     weights_of,
 )
@@ -573,14 +572,6 @@ A fast vehicle without fins turns broadside by itself, and derivatives over a lo
 
 HALVINGS = 2
 
-ROUGH = 3.0
-"""Residual, against a twentieth of the range, from which a coarse search comes first."""
-
-COARSE_SEGMENTS = 24
-
-FINE, REACH = 0.02, 20.0
-"""Parts of a coordinate's size: steps of the coarse search are linear up to one, and go no further than the other."""
-
 
 @dataclass
 class Stage:
@@ -606,11 +597,11 @@ class Stages:
         axes: tuple[str, ...],
         estimate: tuple[str, ...],
         length: float | None,
-        seed: int,
+        starts: Sequence[dict[str, float]],
         say: Clock,
     ) -> None:
-        self.prepared, self.vehicle, self.axes, self.seed, self.say = prepared, vehicle, axes, seed, say
-        self.given = length
+        self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
+        self.given, self.starts = length, starts
         self.excites = [excites(s, vehicle) for s in prepared]
         # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does.
         self.imposed = tuple(a for a in ("surge", "sway", "heave", "yaw") if a not in axes)
@@ -631,11 +622,13 @@ class Stages:
         self.biases = [] if self.trial_biases else biased
 
     def first(self, kinds: dict[str, str]) -> Stage:
-        """Short segments from a rough start, then segments of the length that the answer calls for."""
+        """Short segments from the better of the starts, then segments of the length that the answer calls for."""
         short = max(SHORT, 15.0 * sampling(self.prepared))
         self.cut(min(short, self.given or short))
-        problem = self.problem(kinds, {})
-        point = self._rough(problem, problem.start())
+        problem = min(
+            (self.problem(kinds, start) for start in self.starts), key=lambda one: one.cost(one.start())
+        )
+        point = problem.start()
         problem.hold_clocks(True)
         rough = solve(
             problem, point, iterations=12, std=problem.size(), rough=True, report=self.report("start", 0.3)
@@ -742,45 +735,6 @@ class Stages:
             few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
         )
 
-    def _rough(self, problem: Shooting, point: Point) -> Point:
-        """The start, or a better one from a search of orders of magnitude over some of the segments."""
-        from scipy.optimize import differential_evolution
-
-        every = max(1, len(self.segments) // COARSE_SEGMENTS)
-        few = Shooting(
-            self.segments[::every], problem.parameters, problem.measured.names, lagged=self.lagged[::every]
-        )
-        size, own, p = few.size(), few.start(), problem.parameters
-        P = len(p.names)
-
-        def cost(x: Array) -> Array:
-            """Mean loss of parameters (P, C), (C,)."""
-            theta = np.repeat(own.theta[None], x.shape[1], axis=0)
-            theta[:, :P] = x.T
-            points = Point(theta, np.repeat(own.z[None], x.shape[1], axis=0))
-            return costs_of(few, few.residuals(points), size, points) / len(size)
-
-        if cost(point.theta[:P, None])[0] < 0.5 * ROUGH**2:
-            return point
-        self.say("coarse search", 0.2)
-        # Straight from each bound on to a small part of a coordinate's size, in powers of ten beyond.
-        base, unit = np.where(np.isfinite(p.low), p.low, p.start), FINE * p.scale
-
-        def inside(y: Array) -> Array:
-            grown = base[:, None] + unit[:, None] * np.sign(y) * np.expm1(np.abs(y))
-            return np.clip(grown, p.low[:, None], p.high[:, None])
-
-        away = (point.theta[:P] - base) / unit
-        start = np.sign(away) * np.log1p(np.abs(away))
-        reach = np.log1p(REACH / FINE)
-        found = differential_evolution(
-            lambda y: cost(inside(y.reshape(P, -1))),
-            [(0.0 if np.isfinite(low) else -reach, max(reach, at + 1.0)) for low, at in zip(p.low, start, strict=True)],
-            popsize=max(5, 96 // P), maxiter=25, seed=self.seed, x0=start, polish=False, vectorized=True,
-            updating="deferred", tol=0.01,
-        )  # fmt: skip
-        return Point(np.concatenate([inside(found.x[:, None])[:, 0], point.theta[P:]]), point.z)
-
     def result(
         self,
         stage: Stage,
@@ -788,6 +742,7 @@ class Stages:
         remarks: list[Finding],
         *,
         damping: str,
+        seed: int,
     ) -> Fit:
         """The finished fit; intervals hold those of the fuller model `first` from which this one was chosen."""
         p, x = stage.problem.parameters, stage.x
@@ -826,7 +781,7 @@ class Stages:
             "step": STEP,
             "segments": len(self.segments),
             "iterations": stage.solution.iterations,
-            "seed": self.seed,
+            "seed": seed,
         }
         self.say("done")
         return Fit(
@@ -866,6 +821,7 @@ def fit_by_simulation(
     estimate: Sequence[str] = (),
     damping: str = "auto",
     horizon: float | None = None,
+    begin: Fit | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Fit:
@@ -883,7 +839,8 @@ def fit_by_simulation(
             with heave, stiffness with roll and pitch, a bias with the others.
         damping: `auto`, `linear`, `quadratic` or `both`.
         horizon: Length of the segments [s]; from the data if None.
-        seed: Of the coarse search.
+        begin: Of another method: it begins with its numbers where these simulate the trials better than the file's.
+        seed: Recorded; nothing here is random.
         progress: Called with the part done and a few words.
 
     Returns:
@@ -896,7 +853,8 @@ def fit_by_simulation(
     prepared = [streams(trial, vehicle) for trial in trials]
     chosen, remarks = _axes(prepared, vehicle, axes)
     say = Clock(progress)
-    fit = Stages(telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, seed, say)
+    starts = [{}] if begin is None else [{}, {name: e.estimate for name, e in begin.estimates.items()}]
+    fit = Stages(telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, starts, say)
     kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)
     stage = fit.first(kinds)
     first: dict[str, Number] = {}
@@ -905,7 +863,7 @@ def fit_by_simulation(
         if chosen_kinds != kinds:
             first = fit.numbers(stage)
             stage = fit.next(chosen_kinds, stage)
-    return fit.result(stage, first, remarks, damping=damping)
+    return fit.result(stage, first, remarks, damping=damping, seed=seed)
 
 
 def _check(

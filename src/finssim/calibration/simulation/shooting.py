@@ -898,6 +898,11 @@ class Shooting:
         rest = np.zeros(len(self.low) - len(self.parameters.names))
         return Point(np.concatenate([self.parameters.start, rest]), np.zeros(self.prior_std.shape))
 
+    def cost(self, point: Point) -> float:
+        """Half the loss of one point, with what counts as large residuals far from a solution; clocks agree."""
+        one = Point(point.theta[None], point.z[None])
+        return float(costs_of(self, self.residuals(one), self.size(), one)[0])
+
     def residuals(self, points: Point) -> Array:
         """Measured minus predicted of several points, (N, C)."""
         return self._residual(points, self._predicted(points)[0])
