@@ -767,7 +767,7 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
     force limit is the curve at the speed limit, unless the vehicle file chose a lower one.
     """
     before, rows = vehicle.thrusters[target.thrusters[0]], list[Estimate]()
-    at = f" at {result.voltage:g} V" if math.isfinite(result.voltage) else ""
+    volts = f"{result.voltage:g} V" if math.isfinite(result.voltage) else ""
 
     def add(key: str, value: float, half: float, unit: str, sure: bool, note: str = "") -> None:
         ends = (float(value - half), float(value + half))
@@ -779,7 +779,7 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
         if side is None:
             continue
         sure = math.isfinite(side.half_width) and side.c > side.half_width
-        note = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N{at.replace(' at', ',')}"
+        note = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N{volts and ', '}{volts}"
         note += "" if sure else ": too few or too scattered to tell"
         add(f"c_{name}", side.c, side.half_width, "N s²/rad²", sure, note)
         if zone is not None:
@@ -805,7 +805,7 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
             continue
         moves = at_end or speed > old_speed
         note = "beyond the vehicle file's" if moves else "the table ends here; the vehicle file's stays"
-        note = f"full pulse{at}" if at_end else note
+        note = f"full pulse{volts and ' at '}{volts}" if at_end else note
         add(f"rpm_{end}", sign * speed * TO_RPM, scatter * TO_RPM, "rpm", moves, note)
         force = c * (speed if moves else old_speed) ** 2
         half = force * side.half_width / side.c if side else 0.0
