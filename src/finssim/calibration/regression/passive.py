@@ -21,7 +21,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion, attitude_samples, motion
-from finssim.calibration.motion.smoothing import spans_of, without_spikes
+from finssim.calibration.motion.smoothing import spans_of, white_noise, without_spikes
 from finssim.calibration.regression.axis_estimates import AxisResult, Number
 from finssim.calibration.regression.axis_fit import Run, simulate_axis
 from finssim.calibration.regression.plant_terms import Matrices, matrices
@@ -175,7 +175,7 @@ def _ringing(rate: Samples, name: str, axis: str) -> tuple[float, float, float]:
 
     t, y = rate
     smooth = np.convolve(np.pad(y, 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
-    noise = float(np.median(np.abs(np.diff(y, 2)))) / 0.6745 / np.sqrt(6.0)
+    noise = white_noise(y)
     begin = float(t[int(np.argmax(np.abs(smooth)))])
     after = (t >= begin) & (t <= begin + 20.0)
     span = float(t[after][-1] - begin) if after.any() else 0.0

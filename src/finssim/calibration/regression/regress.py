@@ -13,6 +13,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion, attitude_samples, motion
+from finssim.calibration.motion.smoothing import white_noise
 from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
     curves_of,
@@ -33,6 +34,7 @@ from finssim.calibration.regression.axis_fit import (
     select,
     signals,
 )
+from finssim.calibration.regression.passive import passive
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.calibration.trials.inputs import drive, require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
@@ -128,7 +130,7 @@ def prepare(trials: Sequence[Trial], vehicle: Vehicle) -> tuple[list[Prepared], 
             # A row's value acts until the next row: at the row itself the wrench jumps, and the middle of the jump has
             # the same integral under any smooth weight.
             before = np.concatenate([found.tau[:1], found.tau[:-1]])
-            found = _with_wrench(found, 0.5 * (np.where(np.isfinite(before), before, found.tau) + found.tau))
+            found = replace(found, tau=0.5 * (np.where(np.isfinite(before), before, found.tau) + found.tau))
         water = trial.header.water
         moving = water.current is not None and any(water.current)
         current = np.asarray(water.current) if moving else None
@@ -145,10 +147,6 @@ def _up(trial: Trial, found: Motion) -> Array:
     sampled = quat_inverse_rotate(q / np.linalg.norm(q, axis=1, keepdims=True), np.array([0.0, 0.0, 1.0]))
     up = np.stack([np.interp(found.t, t, column) for column in sampled.T], axis=-1)
     return np.where(known[:, None], up, np.nan)
-
-
-def _with_wrench(found: Motion, tau: Array) -> Motion:
-    return replace(found, tau=tau)
 
 
 def excited(prepared: Sequence[Prepared], vehicle: Vehicle) -> NDArray[np.bool_]:
@@ -203,10 +201,11 @@ def axis_data(
     if axis not in (3, 4):
         kept, tilted, cut = _level(kept, keep_tilted)
         said += [one.about(of) for one in cut]
-    spread = [_noise_and_range(s.nu[s.usable, axis]) for s in kept]
-    largest = max((r for _, r in spread), default=0.0)
+    speeds = [s.nu[s.usable & np.isfinite(s.nu[:, axis]), axis] for s in kept]
+    largest = max((float(np.percentile(np.abs(nu), 95.0)) for nu in speeds if len(nu) >= 10), default=0.0)
     out = []
-    for s, (noise, _) in zip(kept, spread, strict=True):
+    for s, nu in zip(kept, speeds, strict=True):
+        noise = float(np.nan_to_num(white_noise(nu)))
         # White noise of n samples shrinks by √n; a bump of half width w averages some 1.2 w rate of them.
         needed = (noise / max(QUIET * largest, 1e-12)) ** 2
         kernels = kernel(
@@ -267,15 +266,6 @@ def _level(found: list[Signals], keep: bool) -> tuple[list[Signals], float, list
     return cut, beyond / total, [finding("tilted_left_out", percent=percent, tilt=LARGEST_TILT)]
 
 
-def _noise_and_range(nu: Array) -> tuple[float, float]:
-    """Standard deviation of white noise from second differences, and the 95th percentile of |nu|."""
-    good = nu[np.isfinite(nu)]
-    if len(good) < 10:
-        return 0.0, 0.0
-    second = np.diff(good, 2)
-    return float(np.median(np.abs(second)) / 0.6745 / np.sqrt(6.0)), float(np.percentile(np.abs(good), 95.0))
-
-
 Array = NDArray[np.float64]
 
 PASSES = 3
@@ -331,7 +321,8 @@ def regress(
         CalibrationError: No trial can be used, one is held out, an axis or damping is unknown, or two share a
             name.
     """
-    wanted = _wanted(axes)
+    require_axes(axes)
+    wanted = [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
     require_fittable(trials, vehicle)
@@ -362,13 +353,15 @@ def regress(
     still, notes = hydrostatics(estimates, vehicle)
     changes |= still
     findings += notes
-    quiet = _passive(trials, vehicle, [i for i in wanted if i not in told], known or {})
-    if quiet is not None:
-        estimates, changes, figures = (
-            estimates | quiet.estimates,
-            changes | quiet.changes,
-            figures | quiet.quality,
-        )
+    quiet_trials, open_axes = (
+        [t for t in trials if t.header.passive],
+        [AXES[i] for i in wanted if i not in told],
+    )
+    if quiet_trials and open_axes:
+        quiet = passive(quiet_trials, vehicle, axes=open_axes, known=known)
+        estimates |= quiet.estimates
+        changes |= quiet.changes
+        figures |= quiet.quality
         findings += quiet.findings
         curves += quiet.curves
         used |= set(quiet.trials)
@@ -396,11 +389,6 @@ def regress(
             "seed": seed,
         },
     )
-
-
-def _wanted(axes: Sequence[str] | None) -> list[int]:
-    require_axes(axes)
-    return [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
 
 
 def _fit_axes(
@@ -501,15 +489,3 @@ def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correla
     from scipy.linalg import block_diag
 
     return Correlation(names=tuple(names), matrix=block_diag(*blocks)), findings
-
-
-def _passive(
-    trials: Sequence[Trial], vehicle: Vehicle, wanted: list[int], known: Mapping[str, float]
-) -> Fit | None:
-    """What trials without thrust show of axes that no driven trial did; None without such trials."""
-    quiet = [trial for trial in trials if trial.header.passive]
-    if not quiet or not wanted:
-        return None
-    from finssim.calibration.regression.passive import passive
-
-    return passive(quiet, vehicle, axes=[AXES[i] for i in wanted], known=known)

@@ -382,38 +382,40 @@ SHOWN = 4
 """Trials in the curve of an axis."""
 
 
-def _column(problem: Shooting, axis: str) -> int | None:
-    """The most direct channel in use that tells of an axis."""
-    names = problem.measured.names
-    return next((names.index(c) for c in TELL[axis] if c in names), None)
+def _shown_by(
+    problem: Shooting, axis: str
+) -> tuple[str, NDArray[np.int64], NDArray[np.int64], dict[int, float]]:
+    """The most direct channel in use that tells of an axis, its samples (n,), their trials (n,), and the range of the
+    channel in each trial, from the 5th to the 95th percentile; no samples where there is no such channel."""
+    m = problem.measured
+    name = next((c for c in TELL[axis] if c in m.names), "")
+    rows = np.flatnonzero(m.channel == m.names.index(name)) if name else np.empty(0, int)
+    trial = problem.groups[m.segment][rows]
+    spans = {
+        int(g): float(np.ptp(np.percentile(m.value[rows][trial == g], [5.0, 95.0]))) for g in np.unique(trial)
+    }
+    return name, rows, trial, spans
 
 
 def quality(
     problem: Shooting, solution: Solution, axes: Sequence[str], used: Sequence[Streams]
 ) -> dict[str, dict[str, float]]:
     """Figures of each axis over the trials that move it: the simulated against the measured channel."""
-    m, out = problem.measured, {}
-    trial = problem.groups[m.segment]
+    out = {}
     for axis in axes:
-        column = _column(problem, axis)
-        if column is None:
+        name, rows, trial, spans = _shown_by(problem, axis)
+        if not name:
             continue
-        rows = np.flatnonzero(m.channel == column)
-        spread = {
-            g: float(np.ptp(np.percentile(m.value[rows][trial[rows] == g], [5.0, 95.0])))
-            for g in np.unique(trial[rows])
-        }
-        moving = [g for g, s in spread.items() if s > 0.2 * max(spread.values())]
-        rows = rows[np.isin(trial[rows], moving)]
-        residual, value = solution.linear.residual[rows], m.value[rows]
-        nrmse = [
-            float(np.sqrt(np.mean(residual[trial[rows] == g] ** 2))) / max(spread[g], 1e-12) for g in moving
-        ]
+        moving = [g for g, span in spans.items() if span > 0.2 * max(spans.values())]
+        inside = np.isin(trial, moving)
+        rows, trial = rows[inside], trial[inside]
+        residual, value = solution.linear.residual[rows], problem.measured.value[rows]
+        rms = {g: float(np.sqrt(np.mean(residual[trial == g] ** 2))) for g in moving}
         low, high = speeds([s.motion for s in used], axis)
         out[axis] = {
             "r2": 1.0 - float(np.mean(residual**2)) / max(float(np.var(value)), 1e-300),
             "rmse": float(np.sqrt(np.mean(residual**2))),
-            "nrmse": float(np.mean(nrmse)),
+            "nrmse": float(np.mean([rms[g] / max(spans[g], 1e-12) for g in moving])),
             "samples": float(len(rows)),
             "rejected": float(np.sum(np.abs(residual) > 2.0 * CUT * solution.std[rows])),
             "trials": float(len(moving)),
@@ -427,35 +429,23 @@ def quality(
 def pictures(problem: Shooting, solution: Solution, axes: Sequence[str]) -> tuple[Curve, ...]:
     """Measured and simulated channel of each axis, over the trials that move it most."""
     m, out = problem.measured, []
-    trial = problem.groups[m.segment]
     clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
     for axis in axes:
-        column = _column(problem, axis)
-        if column is None:
-            continue
-        rows = np.flatnonzero(m.channel == column)
-        present = np.unique(trial[rows])
-        spread = [float(np.ptp(np.percentile(m.value[rows][trial[rows] == g], [5.0, 95.0]))) for g in present]
+        name, rows, trial, spans = _shown_by(problem, axis)
         x, y, p, offset = [], [], [], 0.0
-        for g in np.sort(present[np.argsort(spread)[::-1][:SHOWN]]):
-            those = rows[trial[rows] == g]
+        for g in sorted(sorted(spans, key=lambda g: -spans[g])[:SHOWN]):
+            those = rows[trial == g]
             those = those[np.argsort(clock[those], kind="stable")]
             t = clock[those] - clock[those[0]] + offset
             x += [t, [np.nan]]
             y += [m.value[those], [np.nan]]
             p += [m.value[those] - solution.linear.residual[those], [np.nan]]
             offset = float(t[-1]) + 1.0
-        name = m.names[column]
-        out.append(
-            Curve(
-                title=f"{axis}: {name}, simulated from the inputs alone",
-                x_label="time, trial after trial [s]",
-                y_label=f"{name} [{_unit(name)}]",
-                x=np.concatenate(x),
-                measured=np.concatenate(y),
-                fitted=np.concatenate(p),
-            )
-        )
+        if name:
+            title = f"{axis}: {name}, simulated from the inputs alone"
+            columns = dict(zip(("x", "measured", "fitted"), map(np.concatenate, (x, y, p)), strict=True))
+            labels = {"x_label": "time, trial after trial [s]", "y_label": f"{name} [{_unit(name)}]"}
+            out.append(Curve(title=title, **labels, **columns))
     return tuple(out)
 
 
