@@ -91,13 +91,13 @@ def fit_hydrodynamics(
         CalibrationError: No trial can be used, or an option is not the method's.
     """
     known = dict(known or {})
-    only_simulation = {"further estimates": bool(estimate), "a horizon": horizon is not None}
+    only_simulation = {"--estimate": bool(estimate), "--horizon": horizon is not None}
     asked = [name for name, given in only_simulation.items() if given]
     if method not in METHODS:
         raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
     if asked and (method == "regression" or known):
         raise CalibrationError(
-            f"{asked[0]}: expected the simulation method: a regression looks at one axis at a time"
+            f"{asked[0]} needs --method simulation: a regression looks at one axis at a time"
         )
     if known and method == "simulation":
         raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")

@@ -23,8 +23,6 @@ from finssim.calibration.output.vehicle_file import all_findings, calibrated, wr
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-ONLY_SIMULATION = "needs --method simulation"
-
 
 def calibrate_thruster(
     tables: Sequence[Path],
@@ -145,12 +143,6 @@ def calibrate_hydrodynamics(
     options = {name: value or None for name, value in locals().items() if name not in ("trials", "as_json")}
     options["seed"] = seed
     further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
-    if method == "regression":
-        for given, option in ((further, "--estimate"), (horizon is not None, "--horizon")):
-            if given:
-                raise CalibrationError(
-                    f"{option} {ONLY_SIMULATION}: a regression looks at one axis at a time"
-                )
     chosen = _axes(axes)
     known = _known(fix)
     refuse_places(out, report, "vehicle")

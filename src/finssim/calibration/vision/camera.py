@@ -23,6 +23,7 @@ from finssim.calibration.output.report import (
     ExtraTable,
     Report,
     command_line,
+    draw_arrows,
     interval_text,
     new_figure,
     number_text,
@@ -695,9 +696,6 @@ READING = (
 DIGITS = 7
 """Of the numbers in a record."""
 
-ARROW_SHARE = 0.06
-"""Length of the 95th percentile of the residuals, in widths of the image."""
-
 OF_A_VIDEO = 15
 """Of a video every so many pictures are looked at: its neighbours show the same view."""
 
@@ -830,14 +828,10 @@ def _coverage(fit: CameraFit) -> Figure:
 def _residuals(fit: CameraFit) -> Figure:
     pixels = np.concatenate([view.pixels for view in fit.used])
     residuals = np.concatenate([view.residuals for view in fit.used])
-    size = np.percentile(np.linalg.norm(residuals, axis=1), 95.0)
     figure = new_figure(7.4, 4.0)
     field, cloud = figure.subplots(1, 2, width_ratios=(1.9, 1.0))
-    factor = ARROW_SHARE * fit.lens.width / max(size, 1e-9)
-    arrows = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.0022}
-    field.quiver(*pixels.T, *(factor * residuals.T), color=BLUE, **arrows)
+    draw_arrows(field, pixels, residuals, np.ones(len(pixels), bool), "px", 1.0)
     picture_axes(field, fit.lens)
-    field.set_title(f"residuals, {factor:.0f} times enlarged", fontsize=9)
     cloud.plot(*residuals.T, ".", color=BLUE, markersize=2.5)
     limit = 1.1 * float(np.abs(residuals).max())
     cloud.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal")

@@ -20,12 +20,10 @@ from finssim.calibration.findings import Finding, finding, plain
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.output.report import (
     AS_GIVEN,
-    BLUE,
-    GRAY,
     HEADS,
-    ORANGE,
     Report,
     command_line,
+    draw_arrows,
     draw_correlation,
     new_figure,
     picture_axes,
@@ -58,7 +56,6 @@ from finssim.localization.pool import Pool, write_pool
 from finssim.provenance import provenance
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["CAMERA", "PoolFit", "calibrate_pool", "doubted", "pool_record", "run"]
@@ -1502,7 +1499,7 @@ def _map(fit: PoolFit) -> Figure:
     if not fit.surface:
         across, names = fit.model.tangents, ("along the wall [m]", "along the wall, across [m]")
     axes.plot(*(across @ fit.model.camera.position), "^", color="black", markersize=8, label="camera")
-    _draw_arrows(axes, fit.seen.points @ across.T, 1000.0 * fit.error @ across.T, fit.used, "mm", 1000.0)
+    draw_arrows(axes, fit.seen.points @ across.T, 1000.0 * fit.error @ across.T, fit.used, "mm", 1000.0)
     axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
     return figure
 
@@ -1511,45 +1508,9 @@ def _picture(fit: PoolFit) -> Figure:
     lens = fit.model.camera.lens
     figure = new_figure(7.4, 7.4 * lens.height / lens.width + 0.6)
     axes = figure.subplots()
-    _draw_arrows(axes, fit.seen.pixels, fit.residual, fit.used, "px", 1.0)
+    draw_arrows(axes, fit.seen.pixels, fit.residual, fit.used, "px", 1.0)
     picture_axes(axes, lens)
     return figure
-
-
-ARROW = 0.06
-"""Length of the 95th percentile of arrows in a figure, in widths of what is drawn."""
-
-
-def _draw_arrows(
-    axes: Axes,
-    at: Array,
-    vectors: Array,
-    used: NDArray[np.bool_],
-    unit: str,
-    per: float,
-) -> None:
-    """Points and enlarged arrows, and crosses where there is none; `per` of the arrows' unit make one of the axes'.
-
-    Args:
-        axes: To draw into.
-        at: (N, 2).
-        vectors: (N, 2).
-        used: Which rows the calibration used, (N,).
-        unit: Of the arrows.
-        per: Arrow units in one of the axes' units.
-    """
-    good = used & np.isfinite(vectors).all(axis=1)
-    size = float(np.percentile(np.linalg.norm(vectors[good], axis=1), 95)) if good.any() else 1.0
-    scale = max(size, 1e-12) / max(float(np.ptp(at, axis=0).max()) * ARROW, 1e-12)
-    axes.plot(*at[good].T, ".", color=GRAY, markersize=3)
-    label = f"longest of 95 %: {size:.2g} {unit}, enlarged {per / scale:.2g} times"
-    arrows = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.0022}
-    axes.quiver(*at[good].T, *vectors[good].T, color=BLUE, label=label, **arrows)
-    if not good.all():
-        axes.plot(*at[~good].T, "x", color=ORANGE, markersize=6, label="left out")
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=3, frameon=False)
-    axes.grid(True, color="0.93", linewidth=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 def run(
