@@ -31,7 +31,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "compare": Experiment("finssim.experiments.compare:compare"),
     "sweep": Experiment("finssim.experiments.sweep:sweep"),
     "trials check": "finssim.calibration.check:check",
-    "trials import": "finssim.calibration.importers.dispatch:import_logs",
+    "trials import": "finssim.calibration.importers.dispatch:import_trials",
     "excite": "finssim.experiments.excitation:excite",
     "calibrate thruster": "finssim.calibration.output.commands:calibrate_thruster",
     "calibrate motor": "finssim.calibration.output.commands:calibrate_motor",
