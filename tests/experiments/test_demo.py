@@ -168,7 +168,7 @@ def test_an_interrupted_demonstration_keeps_its_policy_where_it_says(
     if when == "training":
         monkeypatch.setattr(Loop, "_update", stop)
     else:
-        monkeypatch.setattr(demo_module, "run_jobs", interrupt)
+        monkeypatch.setattr(demo_module, "play_jobs", interrupt)
     with pytest.raises(KeyboardInterrupt):
         demo(tmp_path / "demo", steps=100_000 if when == "training" else 8192, scope=SMALL)
     kept = tmp_path / "demo-training" / "interrupted"

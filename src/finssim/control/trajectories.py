@@ -301,51 +301,6 @@ def load_trajectory(
     return trajectory
 
 
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """What a trajectory must keep to."""
-
-    speed: float = math.inf
-    """[m/s]"""
-    acceleration: float = math.inf
-    """[m/s²]"""
-    lower: tuple[float, float, float] = (-math.inf, -math.inf, -math.inf)
-    """Corner of the workspace, world frame [m]."""
-    upper: tuple[float, float, float] = (math.inf, math.inf, math.inf)
-
-
-PUBLISHED_LIMITS = Limits(speed=0.15, acceleration=0.08, lower=(-1.2, -0.7, -0.9), upper=(1.2, 0.7, 0.25))
-"""What the published trajectories keep to, on the paper's vehicle."""
-
-
-def check_limits(trajectory: Trajectory, limits: Limits) -> None:
-    """Refuse a trajectory that exceeds limits.
-
-    Raises:
-        ControlError: Names the limit, the value and the time at which it is exceeded.
-    """
-    t, reference = _samples(trajectory)
-    speed = np.linalg.norm(reference.velocity, axis=-1)
-    change = np.linalg.norm(np.gradient(reference.velocity, t, axis=0), axis=-1)
-    for what, values, limit, unit in (
-        ("speed", speed, limits.speed, "m/s"),
-        ("acceleration", change, limits.acceleration, "m/s²"),
-    ):
-        i = int(np.argmax(values))
-        if values[i] > limit:
-            raise ControlError(
-                f"trajectory {trajectory.name}: {what} reaches {values[i]:.4g} {unit} at {t[i]:.2f} s, "
-                f"expected at most {limit:g}: make it longer or smaller"
-            )
-    outside = (reference.position < limits.lower) | (reference.position > limits.upper)
-    if outside.any():
-        i, axis = np.argwhere(outside)[0]
-        raise ControlError(
-            f"trajectory {trajectory.name}: {'xyz'[axis]} is {reference.position[i, axis]:.4g} m at {t[i]:.2f} s, "
-            f"expected {limits.lower[axis]:g} to {limits.upper[axis]:g}: move it into the workspace"
-        )
-
-
 def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
     """Refuse a trajectory that leaves a vehicle's workspace or is faster than it can go, axis by axis.
 
@@ -354,10 +309,18 @@ def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
     """
     from finssim.vehicles.capability import terminal_speeds
 
-    safety = vehicle.safety
-    lower, upper = (tuple(map(float, x)) for x in (safety.workspace_lower, safety.workspace_upper))
-    check_limits(trajectory, Limits(lower=lower, upper=upper))  # type: ignore[arg-type]
-    t, reference = _samples(trajectory)
+    t = np.linspace(0.0, trajectory.duration, max(3, math.ceil(trajectory.duration / CHECK_STEP) + 1))
+    reference = trajectory.at(t)
+    lower, upper = (
+        np.asarray(x, float) for x in (vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
+    )
+    outside = (reference.position < lower) | (reference.position > upper)
+    if outside.any():
+        i, axis = np.argwhere(outside)[0]
+        raise ControlError(
+            f"trajectory {trajectory.name}: {'xyz'[axis]} is {reference.position[i, axis]:.4g} m at {t[i]:.2f} s, "
+            f"expected {lower[axis]:g} to {upper[axis]:g}: move it into the workspace"
+        )
     speed = np.abs(quat_inverse_rotate(quat_from_yaw(reference.yaw), reference.velocity))
     able = terminal_speeds(vehicle)[:3]
     if np.any(speed > able):
@@ -366,11 +329,6 @@ def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
             f"trajectory {trajectory.name}: {('surge', 'sway', 'heave')[axis]} of {speed[i, axis]:.4g} m/s at "
             f"{t[i]:.2f} s, but {vehicle.name} goes {able[axis]:.4g} m/s at most: make it longer or smaller"
         )
-
-
-def _samples(trajectory: Trajectory) -> tuple[Array, Reference]:
-    t = np.linspace(0.0, trajectory.duration, max(3, math.ceil(trajectory.duration / CHECK_STEP) + 1))
-    return t, trajectory.at(t)
 
 
 # Trajectory files: points in time as CSV or YAML, or a shape with its measures as YAML.

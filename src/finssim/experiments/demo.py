@@ -9,8 +9,9 @@ import sys
 import time
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from html import escape
 from os import environ
 from pathlib import Path
@@ -27,14 +28,14 @@ from finssim.calibration.output.vehicle_file import all_findings, calibrated, nu
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.replay.replay import Replay, replay
 from finssim.calibration.replay.report import draw_response_envelopes
-from finssim.calibration.trials.trial import Trial
-from finssim.control.pid import AxisModel, axis_model
+from finssim.calibration.trials.trial_files import load_trials
+from finssim.control.pid import axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Pool
-from finssim.experiments.campaign import Progress, run_jobs, write_json
+from finssim.experiments.campaign import Progress, write_json
 from finssim.experiments.compare import draw_training, groups_of
-from finssim.experiments.evaluate import CAPTION, Evaluation, by_target, cells, comparison_table
-from finssim.experiments.excitation import pool_trials, trials_on_robot
+from finssim.experiments.evaluate import CAPTION, T1_COLUMNS, Evaluation, by_target, comparison_table
+from finssim.experiments.excitation import record_programmes
 from finssim.experiments.figures import (
     COLORS,
     draw_envelopes,
@@ -50,13 +51,12 @@ from finssim.experiments.pool_trial import (
     HARDWARE,
     Job,
     firmware_of,
-    play,
+    play_jobs,
     pool_evaluation,
-    run_on_robot,
 )
-from finssim.experiments.tables import Table, html_of, print_tables
+from finssim.experiments.tables import Table, cells, html_of, print_tables
 from finssim.experiments.transfer import finished
-from finssim.experiments.trials import Trial as PlayedTrial
+from finssim.experiments.trials import Trial
 from finssim.files import atomic_directory
 from finssim.learning.train import train
 from finssim.page import html_page
@@ -64,7 +64,7 @@ from finssim.pool import draw_plant
 from finssim.pool.draw_plant import site_of
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Provenance, Vehicle, load_vehicle
-from finssim.vehicles.capability import level_speed, terminal_speed
+from finssim.vehicles.capability import level_speed
 from finssim.vehicles.defaults import SITES, room
 
 __all__ = ["demo"]
@@ -93,19 +93,24 @@ def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str
     if vehicle.name == published.name:
         return {axis: list(values) for axis, values in levels.items()}
     ours, theirs, size = axis_model(vehicle), axis_model(published), room(vehicle.body.size)
-    found = {}
+    scaled = {}
     for axis, values in levels.items():
         i = AXES.index(axis)  # type: ignore[arg-type]
         if axis not in vehicle.controlled_axes or not vehicle.wrench_limits[i] > 0.0:
             continue
+        level = np.asarray(values, float)
         scale = size if i < 3 else 1.0
         if i < 2:  # all levels of the axis alike, so that those of different trials stay different
-            fastest = size * _speed(theirs, i, float(published.wrench_limits[i]))
+            fastest = size * float(theirs.terminal_speed(published.wrench_limits)[i])
             scale *= min(1.0, STEADY * level_speed(vehicle, axis=i) / fastest)
-        wanted = [_level(ours, theirs, i, scale, value) for value in values]
+        if min(ours.stiffness[i], theirs.stiffness[i]) > 0.0:
+            level = level * ours.stiffness[i] / theirs.stiffness[i]
+        else:
+            speed = scale * theirs.terminal_speed(level[:, None])[:, i, None]
+            level = (ours.damping(speed) * speed)[:, i]
         most = SHARE * float(vehicle.wrench_limits[i])
-        found[axis] = list(dict.fromkeys(float(f"{min(x, most):.3g}") for x in wanted))
-    return found
+        scaled[axis] = list(dict.fromkeys(float(f"{min(x, most):.3g}") for x in level))
+    return scaled
 
 
 def trimmed(programme: Programme, vehicle: Vehicle) -> Programme:
@@ -123,18 +128,6 @@ def trimmed(programme: Programme, vehicle: Vehicle) -> Programme:
     tau = programme.tau_desired.copy()
     tau[:, 2] += net
     return replace(programme, tau_desired=tau)
-
-
-def _speed(model: AxisModel, i: int, level: float) -> float:
-    return terminal_speed(float(model.linear_damping[i]), float(model.quadratic_damping[i]), level)
-
-
-def _level(ours: AxisModel, theirs: AxisModel, i: int, scale: float, level: float) -> float:
-    stiffness = float(ours.stiffness[i]), float(theirs.stiffness[i])
-    if min(stiffness) > 0.0:
-        return level * stiffness[0] / stiffness[1]
-    v = scale * _speed(theirs, i, level)
-    return float(ours.linear_damping[i] * v + ours.quadratic_damping[i] * v * v)
 
 
 PERIODS = {"surge": 4.0, "sway": 4.0, "heave": 2.4, "roll": 2.0, "pitch": 2.0, "yaw": 4.0}
@@ -156,42 +149,33 @@ def shuttles(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> list[Pr
     Raises:
         CalibrationError: An axis that the vehicle does not control.
     """
-    return [
-        _shuttle(axis, level, PERIODS[axis])
-        for axis in which_axes(list(levels), vehicle)
-        for level in levels[axis]
-    ]
-
-
-def _shuttle(axis: str, level: float, period: float) -> Programme:
-    counts = [round(s * RATE) for s in (1.0, 1.0, WAVES * period, 2.0, 1.0)]
-    phase = np.repeat(np.array(["rest", "baseline", "excitation", "coast", "rest"]), counts)
-    t = np.arange(counts[2]) / RATE
-    tau = np.zeros((len(phase), 6))
-    # A cosine's sign: a quarter of the period forward, half of it back, and so on.
-    tau[phase == "excitation", AXES.index(axis)] = level * np.sign(
-        np.cos(2.0 * math.pi * (t + 1e-6) / period)
-    )
-    return Programme(
-        name=f"{axis}_shuttle_{level:.4g}",
-        axes=(axis,),  # type: ignore[arg-type]
-        rate=RATE,
-        tau_desired=tau,
-        phase=phase,
-    )
+    plan = []
+    for axis in which_axes(list(levels), vehicle):
+        counts = [round(s * RATE) for s in (1.0, 1.0, WAVES * PERIODS[axis], 2.0, 1.0)]
+        phase = np.repeat(np.array(["rest", "baseline", "excitation", "coast", "rest"]), counts)
+        turns = (np.arange(counts[2]) / RATE + 1e-6) / PERIODS[axis]
+        tau = np.zeros((len(phase), 6))
+        # A cosine's sign: a quarter of the period forward, half of it back, and so on.
+        tau[phase == "excitation", AXES.index(axis)] = np.sign(np.cos(2.0 * math.pi * turns))
+        for level in levels[axis]:
+            name = f"{axis}_shuttle_{level:.4g}"
+            plan.append(Programme(name=name, axes=(axis,), rate=RATE, tau_desired=level * tau, phase=phase))
+    return plan
 
 
 # A vehicle nobody measured, trials, and what they make identifiable.
 
 
 TRIALS = "trials"
+VEHICLE_FILES = ("{}_rough.yaml", "{}_identified.yaml")
+"""Of the vehicle before and after."""
 SET = "hydrodynamics.calibrated"
 
 HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [7.0], "yaw": [1.0]}
 """Levels that no trial of the fit has [N, N m]."""
 
-Record = Callable[[Path, Path, int], dict[str, list[Trial]]]
-"""Makes trials: folder that takes ROLE/NAME, file of the rough vehicle, seed -> trials by role (fit, held-out)."""
+Record = Callable[[Mapping[str, Path], str], Mapping[str, Sequence[Path]]]
+"""Makes trials: folders by role (fit, held-out), file of the rough vehicle -> folders of the trials by role."""
 
 
 @dataclass(frozen=True)
@@ -253,9 +237,10 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record)
     began = time.perf_counter()
     truth = load_vehicle(name)
     name = truth.name
-    start_file, vehicle_file = vehicle_files(name)
+    start_file, vehicle_file = (file.format(name) for file in VEHICLE_FILES)
     write_vehicle(rough_vehicle(truth), folder / start_file)
-    recorded = record(folder / TRIALS, folder / start_file, seed)
+    folders = record({role: folder / TRIALS / role for role in ("fit", "held-out")}, str(folder / start_file))
+    recorded = {role: load_trials(paths) for role, paths in folders.items()}
     fit = regress(recorded["fit"], load_vehicle(folder / start_file), seed=seed)
     found = calibrated(fit)
     findings = tuple(all_findings(fit, found))
@@ -286,15 +271,10 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record)
     )
 
 
-def vehicle_files(name: str) -> tuple[str, str]:
-    """Names of the vehicle's files before and after."""
-    return f"{name}_rough.yaml", f"{name}_identified.yaml"
-
-
-def commands(place: Path, name: str, seed: int) -> list[str]:
+def commands(folder: Path, name: str, seed: int) -> list[str]:
     """Command lines that identify and replay from the trials again."""
-    start, vehicle = (place / file for file in vehicle_files(name))
-    trials = place / TRIALS
+    start, vehicle = (folder / file.format(name) for file in VEHICLE_FILES)
+    trials = folder / TRIALS
     return [
         f"finssim trials check {trials / 'fit'} --vehicle {start}",
         f"finssim calibrate hydrodynamics {trials / 'fit'} --vehicle {start} --out {vehicle} --seed {seed}",
@@ -328,7 +308,7 @@ POOL = (
 ROBOT = "hardware, too. Errors are those of the robot's own estimate, whose error is not in them."
 
 
-def _paths(trials: Sequence[PlayedTrial], site: str) -> Any:
+def _paths(trials: Sequence[Trial], site: str) -> Any:
     """The paths of all trials from above and from the side, in the water; start and goals with their headings."""
     size = SITES[site]
     pool = Pool() if size is None else Pool(length=size[0], width=size[1], depth=size[2])
@@ -404,8 +384,9 @@ def _results(evaluations: Sequence[Evaluation]) -> list[Table]:
     """All controllers beside the paper's, the policy's paths, the training, and every setpoint."""
     results = comparison_table([e.result for e in evaluations], "controller")
     heads = [head.replace("\n", " ") for head in results.heads]
-    rows = [[e.label, *cells(e.result)] for e in evaluations]
-    rows += [[f"paper: {name}", *cells(paper_row(name))] for name in ("calibrated", "calibrated + DR", "PID")]
+    rows = [[e.label, *cells(e.result, T1_COLUMNS)] for e in evaluations]
+    papers = ("calibrated", "calibrated + DR", "PID")
+    rows += [[f"paper: {name}", *cells(paper_row(name), T1_COLUMNS)] for name in papers]
     policy = evaluations[0].result
     source = ROBOT if policy["plant"]["name"] == HARDWARE else POOL
     tables = [
@@ -421,7 +402,7 @@ def _results(evaluations: Sequence[Evaluation]) -> list[Table]:
     learnt = {"training.png": "Mean return and share of episodes held while training"}
     tables.append(Table(title="Training", pictures=learnt))
     for e in evaluations:
-        each = [[name, *cells(row)] for name, row in by_target(e.result).items()]
+        each = [[name, *cells(row, T1_COLUMNS)] for name, row in by_target(e.result).items()]
         tables.append(Table(title=f"Every setpoint: {e.label}", heads=[e.label, *heads[1:]], rows=each))
     return tables
 
@@ -458,16 +439,6 @@ class Scope:
     """Tried by the policy with pictures drawn and searched."""
     duration: float = 60.0
     """Of a trial [s]."""
-
-    def of(self, vehicle: Vehicle) -> Scope:
-        """The same for a vehicle: levels that move it as FinsROV's move FinsROV, on the axes that it controls.
-
-        See `matched`.
-        """
-        return replace(
-            self,
-            **{name: matched(getattr(self, name), vehicle) for name in ("levels", "shuttles", "held_out")},
-        )
 
 
 FULL = Scope(
@@ -540,7 +511,7 @@ def demo(
     place = atomic_directory(out, replaces=REPORT_FILE) if robot is None else kept_folder(out)
     with place as folder:
         demonstration = _Demonstration(
-            folder=folder, out=out, name=vehicle, standing=standing, seed=seed, scope=(scope or FULL).of(standing),
+            folder=folder, out=out, name=vehicle, standing=standing, seed=seed, scope=scope or FULL,
             console=console, processes=processes, robot=robot, attendant=attendant, firmware=firmware,
         )  # fmt: skip
         evaluations = demonstration.run(steps)
@@ -605,51 +576,39 @@ class _Demonstration:
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     @contextmanager
-    def _working(self, text: str) -> Iterator[Progress]:
-        """Show what is done, and how far it is."""
+    def _working(self, doing: str) -> Iterator[Progress]:
+        """Show what is done, and how far it is; a robot's session has a line of its own."""
+        text = f"{doing} {'in the virtual pool' if self.robot is None else 'on the robot'}"
         self.tell(text)
-        with self.console.status(text) as status:
-            yield lambda part, what: status.update(f"{text}: {what}")
+        with nullcontext() if self.robot is not None else self.console.status(text) as status:
+            yield lambda part, what: status.update(f"{text}: {what}") if status else None
 
     def _identified(self) -> Identification:
         """Trials, and the vehicle that they make identifiable."""
         standing, scope = self.standing, self.scope
-        plans = {
-            role: programmes(tuple(levels), standing, levels=levels, coast=COAST)
-            for role, levels in (("fit", scope.levels), ("held-out", scope.held_out))
+        levels = {
+            role: matched(x, standing) for role, x in (("fit", scope.levels), ("held-out", scope.held_out))
         }
-        plans["fit"] += shuttles(scope.shuttles, standing) if scope.shuttles else []
+        plans = {
+            role: programmes(tuple(of_role), standing, levels=of_role, coast=COAST)
+            for role, of_role in levels.items()
+        }
+        plans["fit"] += shuttles(matched(scope.shuttles, standing), standing) if scope.shuttles else []
         plans = {role: [trimmed(programme, standing) for programme in plan] for role, plan in plans.items()}
-        if self.robot is not None:
-            robot = self.robot
-            self.tell("recording trials on the robot")
-
-            def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
-                known = load_vehicle(rough)
-                return trials_on_robot(
-                    plans, folder, known, robot, attendant=self.attendant, console=self.console
-                )
-
-            result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=record)
-        else:
+        person: dict[str, Any] = {"attendant": self.attendant, "console": self.console}
+        if self.robot is None:
             spec = site_of(self.site, draw_plant(standing, PLANT, SEVERITY))
             spec.write(self.folder / PLANT_FILE)
-            with self._working("recording trials in the virtual pool") as progress:
-
-                def show(run: Any, result: Mapping[str, Any]) -> None:
-                    unit = "m/s" if run.programme.axes[0] in AXES[:3] else "rad/s"
-                    text = f"up to {result['fastest']:.2f} {unit} in {result['duration']:.0f} s"
-                    text = f"left out: {result['fault']}" if result["fault"] else text
-                    self.tell(f"  {run.target}: {text}")
-
-                def simulated(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
-                    return pool_trials(
-                        plans, folder, vehicle=str(rough), pool_vehicle=self.name, plant=PLANT, severity=SEVERITY,
-                        seed=seed, site=self.site, firmware=self.firmware, leave_out=True, processes=self.processes,
-                        progress=progress, show=show,
-                    )  # fmt: skip
-
-                result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=simulated)
+        with self._working("recording trials") as progress:
+            record = partial(
+                record_programmes, plans, robot=self.robot, **person, pool_vehicle=self.name, plant=PLANT,
+                severity=SEVERITY, seed=self.seed, site=self.site, firmware=self.firmware, leave_out=True,
+                processes=self.processes, progress=progress,
+                show=lambda run, result: self.tell(
+                    f"  {run.target}: {'left out: ' if result['fault'] else ''}{result['fault'] or result['text']}"
+                ),
+            )  # fmt: skip
+            result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=record)
         identifiable = sum(e.identifiable for e in result.fit.estimates.values())
         self.tell(
             f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
@@ -660,7 +619,7 @@ class _Demonstration:
 
     def _deployed(self, policy: Path) -> list[Evaluation]:
         """All controllers in the pool, the policy with pictures too; or all on the robot."""
-        vehicle = str(self.folder / vehicle_files(self.standing.name)[1])
+        vehicle = str(self.folder / VEHICLE_FILES[1].format(self.standing.name))
         pool_vehicle, plant, severity, camera = self.name, PLANT, SEVERITY, FIRMWARES[self.firmware].camera
         if self.robot is not None:
             pool_vehicle, plant, severity, camera = vehicle, 0, HARDWARE, HARDWARE
@@ -681,13 +640,11 @@ class _Demonstration:
         )
         jobs = pictures + [job(row, target, camera) for row in CONTROLLERS for target in self.scope.setpoints]
         place = self.folder / TRIALS_FOLDER
-        if self.robot is not None:
-            results = run_on_robot(jobs, place, self.robot, attendant=self.attendant, console=self.console)
-        else:
-            with self._working("holding setpoints in the virtual pool") as progress:
-                results = run_jobs(
-                    jobs, place, play, processes=self.processes, progress=progress, show=self._show
-                )
+        with self._working("holding setpoints") as progress:
+            results = play_jobs(
+                jobs, place, self.robot, attendant=self.attendant, console=self.console, processes=self.processes,
+                progress=progress, show=self._show,
+            )  # fmt: skip
         evaluations = []
         for row in (*CONTROLLERS, WITH_PICTURES):
             of_row = [result for result in results if result["job"]["row"] == row]
@@ -733,7 +690,7 @@ class _Demonstration:
     def _commands(self) -> list[str]:
         """Command lines that repeat the demonstration's steps by hand."""
         out, seed, name = self.out, self.seed, self.standing.name
-        rough, identified = (out / file for file in vehicle_files(name))
+        rough, identified = (out / file.format(name) for file in VEHICLE_FILES)
         steps = Policy.load(self.folder / "policy").description.training["steps"]
         options = f"--randomize {RANGES} --seed {seed} --steps {steps}"
         action = FIRMWARES[self.firmware].action
