@@ -30,35 +30,24 @@ from finssim.calibration.replay.replay import Replay, replay
 from finssim.calibration.replay.report import draw_response_envelopes
 from finssim.calibration.trials.trial_files import load_trials
 from finssim.control.pid import axis_model
-from finssim.control.policy import DESCRIPTION_FILE, Policy
+from finssim.control.policy import Policy
 from finssim.engine import Pool
-from finssim.experiments.campaign import Progress, write_json
+from finssim.experiments.campaign import Progress
 from finssim.experiments.compare import draw_training, groups_of
-from finssim.experiments.evaluate import CAPTION, T1_COLUMNS, Evaluation, by_target, comparison_table
+from finssim.experiments.evaluate import T1_COLUMNS
 from finssim.experiments.excitation import record_programmes
 from finssim.experiments.figures import (
     COLORS,
-    draw_envelopes,
-    error_envelope,
     legend_below,
     new_figure,
     save_figure,
 )
-from finssim.experiments.metrics import T1_SETPOINTS, paper_row
-from finssim.experiments.on_robot import Attendant, OnRobot, kept_folder
-from finssim.experiments.pool_trial import (
-    FIRMWARES,
-    HARDWARE,
-    Job,
-    firmware_of,
-    play_jobs,
-    pool_evaluation,
-)
+from finssim.experiments.metrics import T1_SETPOINTS
+from finssim.experiments.on_robot import Attendant, OnRobot, take_folder
+from finssim.experiments.pool_trial import FIRMWARES, Job, firmware_of, played_trial
 from finssim.experiments.tables import Table, cells, html_of, print_tables
-from finssim.experiments.transfer import finished
+from finssim.experiments.transfer import T1, Spec, transfer_experiment
 from finssim.experiments.trials import Trial
-from finssim.files import atomic_directory
-from finssim.learning.train import train
 from finssim.page import html_page
 from finssim.pool import draw_plant
 from finssim.pool.draw_plant import site_of
@@ -218,7 +207,7 @@ def _named(vehicle: Vehicle, title: str, description: str) -> Vehicle:
     return vehicle.model_copy(update={"title": title, "description": description})
 
 
-def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record) -> Identification:
+def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identification:
     """Make trials of a vehicle, identify it from some, replay the others; write all of it.
 
     Into the folder go `NAME_rough.yaml` (the vehicle before), `trials/fit` and `trials/held-out`,
@@ -228,7 +217,6 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record)
         folder: Existing directory.
         name: Name or file of a vehicle.
         seed: Of initial conditions and noise of the trials.
-        shown: Name of the folder in the report.
         record: Makes the trials.
 
     Returns:
@@ -253,9 +241,9 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record)
         fit,
         folder / "calibration",
         vehicle,
-        command=commands(shown, name, seed)[1],
+        command=commands(folder, name, seed)[1],
         findings=findings,
-        out=shown / vehicle_file,
+        out=folder / vehicle_file,
     )
     scored = replay(recorded["held-out"], vehicle, seed=seed)
     text = json.dumps(scored.as_json(), indent=2, allow_nan=False) + "\n"
@@ -296,16 +284,6 @@ POOL_VEHICLE = (
     "pool alone. Its propellers push up to 15 % more or less than the bench said, so what is found are effective "
     "masses and dampings: those of the thrust that the vehicle file promises."
 )
-PAPER = (
-    "e_y is the vertical error. Gray rows are the paper's own, on hardware: its real vehicle in its pool. The others "
-    "are of "
-)
-POOL = (
-    "the virtual pool or tank: the robot's whole software, from what locates it to the frames of the motor controller "
-    "or autopilot, "
-    "against a plant that no training has seen. Errors are those of the true pose."
-)
-ROBOT = "hardware, too. Errors are those of the robot's own estimate, whose error is not in them."
 
 
 def _paths(trials: Sequence[Trial], site: str) -> Any:
@@ -366,59 +344,41 @@ def _identification(result: Identification, hardware: bool) -> list[Table]:
     ]
 
 
-def _lead(evaluations: Sequence[Evaluation], seconds: float) -> str:
-    r = evaluations[0].result
-    errors = ""
-    if r["e_p_m"] is not None:
-        errors = f", with {100.0 * r['e_p_m']:.1f} cm and {r['e_psi_deg']:.1f}° of error once settled"
-    place = "on hardware" if r["plant"]["name"] == HARDWARE else "in the virtual pool"
-    others = " and ".join(f"{e.label} {e.result['success']}" for e in evaluations[1:])
+def _lead(result: Mapping[str, Any], spec: Spec, seconds: float | None) -> str:
+    rows = result["rows"]
+    texts = {
+        name: f"{row['success']} of {row['trials']}" for name, row in rows.items() if name != WITH_PICTURES
+    }
+    errors, policy = "", rows.get(POLICY)
+    if policy and policy["e_p_m"]:
+        e_p, e_psi = (policy[key]["value"] for key in ("e_p_m", "e_psi_deg"))
+        errors = f", with {100.0 * e_p:.1f} cm and {e_psi:.1f}° of error once settled"
+    others = "; ".join(f"{spec.rows[name].title}: {text}" for name, text in texts.items() if name != POLICY)
     return (
-        f"A policy trained here in {seconds:.0f} s, from nothing to a file that runs on the vehicle, holds "
-        f"{r['success']} of {r['trials']} published setpoints {place}{errors}. On the same trials, "
-        f"successes: {others}."
+        f"A policy trained here in {math.nan if seconds is None else seconds:.0f} s, from nothing to a file that runs "
+        f"on the vehicle, holds {texts.get(POLICY, 'none')} published setpoints "
+        f"{'on hardware' if result['robot'] else 'in the virtual pool'}{errors}. On the same trials: {others}."
     )
 
 
-def _results(evaluations: Sequence[Evaluation]) -> list[Table]:
-    """All controllers beside the paper's, the policy's paths, the training, and every setpoint."""
-    results = comparison_table([e.result for e in evaluations], "controller")
-    heads = [head.replace("\n", " ") for head in results.heads]
-    rows = [[e.label, *cells(e.result, T1_COLUMNS)] for e in evaluations]
-    papers = ("calibrated", "calibrated + DR", "PID")
-    rows += [[f"paper: {name}", *cells(paper_row(name), T1_COLUMNS)] for name in papers]
-    policy = evaluations[0].result
-    source = ROBOT if policy["plant"]["name"] == HARDWARE else POOL
-    tables = [
-        Table(
-            title="Results", heads=heads, rows=rows, note=f"{CAPTION} {PAPER}{source}",
-            pictures={"envelopes.png": "Position and yaw error against time, median and middle half"},
-        ),
-        Table(
-            title="Paths of the policy",
-            pictures={"paths.png": "Paths of the trials from above and from the side"},
-        ),
-    ]  # fmt: skip
-    learnt = {"training.png": "Mean return and share of episodes held while training"}
-    tables.append(Table(title="Training", pictures=learnt))
-    for e in evaluations:
-        each = [[name, *cells(row, T1_COLUMNS)] for name, row in by_target(e.result).items()]
-        tables.append(Table(title=f"Every setpoint: {e.label}", heads=[e.label, *heads[1:]], rows=each))
-    return tables
+def _setpoints(result: Mapping[str, Any], spec: Spec) -> Table:
+    """Every setpoint of every controller."""
+    rows = [
+        [f"{spec.rows[name].title}, {target}", *cells(figures, T1_COLUMNS)]
+        for name, row in result["rows"].items()
+        for target, figures in row["by_target"].items()
+    ]
+    return Table(
+        title="Every setpoint", heads=["", *(heading for heading, *_ in T1_COLUMNS.values())], rows=rows
+    )
 
 
 PLANT_FILE = "pool.yaml"
 """The plant, for `finssim pool --plant`."""
-TRIALS_FOLDER = "deployed"
-"""A result and a motion for every trial of a controller."""
-
-
 REPORT_FILE = "report.html"
-SEED = 1
-PLANT, SEVERITY, RANGES = 1, "realistic", "pool"
-CONTROLLERS = ("policy", "pid", "pid-paper")
-
-WITH_PICTURES = "policy-with-pictures"
+SEVERITY, RANGES = "realistic", "pool"
+POLICY, WITH_PICTURES = "calibrated-pool", "with-pictures"
+"""Rows of station keeping: the policy that is trained here; and the same, with pictures drawn and searched for tags."""
 COAST = 4.0
 """Longest, after a dive [s]: the pool is shallow, and this vehicle hardly rises."""
 
@@ -494,29 +454,29 @@ def demo(
         firmware (NAME): What steers the motors: mcu, FinsROV's motor controller, or ardusub, an autopilot: commands
             then go by MAVLink, the policy acts by its axes (`pilot6`), and in place of the pool and its camera there is
             a tank, a Doppler log, a compass, and setpoints three times as far.
-        robot: Where trials are made and setpoints held, in place of the virtual pool. What is done stays in `out`, and
-            the next call goes on.
+        robot: Where trials are made and setpoints held, in place of the virtual pool.
         attendant: The person beside that robot, instead of the terminal's keyboard.
 
     Returns:
         Path of the report.
 
     Raises:
-        KeyboardInterrupt: After Ctrl-C. A policy so far is then in `OUT-training/interrupted`, and, but for a robot's,
-            `out` as it was.
+        RobotError: The folder is of another demonstration.
+        KeyboardInterrupt: After Ctrl-C; the same command goes on.
     """
     console, standing = console or Console(stderr=True), load_vehicle(vehicle)
     firmware = firmware_of(firmware, standing, robot)
     start_warp()
-    place = atomic_directory(out, replaces=REPORT_FILE) if robot is None else kept_folder(out)
-    with place as folder:
-        demonstration = _Demonstration(
-            folder=folder, out=out, name=vehicle, standing=standing, seed=seed, scope=scope or FULL,
-            console=console, processes=processes, robot=robot, attendant=attendant, firmware=firmware,
-        )  # fmt: skip
-        evaluations = demonstration.run(steps)
-    simulated = [e.result for e in evaluations if e.result["camera"] != "pictures"]
-    print_tables([comparison_table(simulated, "controller")], Console())
+    about = {
+        "vehicle": {"name": standing.name, "sha256": standing.sha256}, "seed": seed, "steps": steps,
+        "firmware": firmware, "robot": robot is not None,
+    }  # fmt: skip
+    take_folder(Path(out) / "demo.yaml", about)
+    demonstration = _Demonstration(
+        out=Path(out), name=vehicle, standing=standing, seed=seed, steps=steps, scope=scope or FULL, console=console,
+        processes=processes, robot=robot, attendant=attendant, firmware=firmware,
+    )  # fmt: skip
+    print_tables(demonstration.run(), Console())
     report = Path(out) / REPORT_FILE
     print(f"report: {report}")
     display = environ.get("DISPLAY") or environ.get("WAYLAND_DISPLAY") or sys.platform in ("darwin", "win32")
@@ -529,14 +489,14 @@ def demo(
 class _Demonstration:
     """What is done, with what and where."""
 
-    folder: Path
-    """In which it is done."""
     out: Path
-    """Name of that folder afterwards."""
+    """In which it is done."""
     name: str
     """Name or file of the vehicle, as the catalogue has it."""
     standing: Vehicle
     seed: int
+    """Also of the pool."""
+    steps: int | None
     scope: Scope
     console: Console
     processes: int | None
@@ -544,27 +504,55 @@ class _Demonstration:
     attendant: Attendant | None
     firmware: str
 
-    def run(self, steps: int | None) -> list[Evaluation]:
-        """Identify, train, deploy and report; returns an evaluation of each controller, the policy's first."""
-        result = self._identified()
-        began, policy = time.perf_counter(), self.folder / "policy"
-        rescue = self.out.with_name(f"{self.out.name}-training") / "interrupted"
-        if self.robot is None or not finished(policy, result.vehicle):
-            train(
-                "t1", out=policy, vehicle=result.vehicle, action=FIRMWARES[self.firmware].action, randomize=RANGES,
-                seed=self.seed, steps=steps,
-                console=self.console, shown=self.out / "policy", interrupted=rescue,
+    def run(self) -> list[Table]:
+        """Identify, train, deploy and report; returns the tables of what was held."""
+        identification, spec = self._identified(), self._spec()
+        held = self.out / "t1"
+        with self._working("training and holding setpoints") as progress:
+            result = transfer_experiment(
+                spec, out=held, seeds=1, seed=self.seed, rows=list(spec.rows), firmware=self.firmware,
+                vehicle=str(self.out / VEHICLE_FILES[1].format(self.standing.name)), steps=self.steps,
+                processes=self.processes, robot=self.robot, attendant=self.attendant, console=self.console,
+                progress=progress, show=self._show,
+                **({} if self.robot else {"plants": 1, "severity": SEVERITY, "pool_vehicle": self.name}),
             )  # fmt: skip
-        seconds = time.perf_counter() - began
-        try:
-            evaluations = self._deployed(policy)
-            self._report(result, evaluations, seconds)
-        except KeyboardInterrupt:  # the folder goes, and the policy was trained
-            with atomic_directory(rescue, replaces=DESCRIPTION_FILE) as copy:
-                shutil.copytree(policy, copy, dirs_exist_ok=True)
-            self.tell(f"policy kept: {rescue}")
-            raise
-        return evaluations
+        policy, tables = self.out / "policy", spec.tables(result)
+        shutil.copytree(held / "policies" / f"{POLICY}-seed{self.seed}", policy, dirs_exist_ok=True)
+        training = groups_of([str(policy)])
+        draw_training(training, self.out / "training.png")
+        trials = [played_trial(r, held / "trials") for r in result["trials"] if r["job"]["row"] == POLICY]
+        learnt = {"training.png": "Mean return and share of episodes held while training"}
+        drawn = [Table(title="Training", pictures=learnt), _setpoints(result, spec)]
+        if trials:
+            save_figure(_paths(trials, self.site), self.out / "paths.png")
+            paths = {"paths.png": "Paths of the trials from above and from the side"}
+            drawn.insert(0, Table(title="Paths of the policy", pictures=paths))
+        title = f"Station keeping of {self.standing.name}"
+        files = dict(training[0].runs[0].description.files)
+        origin = {"vehicle": result["vehicle"], "seed": self.seed, "policy": files, **result["provenance"]}
+        sections = [
+            f"<h1>{escape(title)}</h1>",
+            f'<p class="lead">{escape(_lead(result, spec, training[0].runs[0].seconds))}</p>',
+            *html_of(_identification(identification, self.robot is not None), self.out),
+            *html_of(tables, held),
+            *html_of(drawn, self.out),
+            "<h2>How to repeat it</h2>",
+            f"<pre>{escape(chr(10).join(self._commands()))}</pre>",
+            "<h2>Provenance</h2>",
+            f"<pre>{escape(json.dumps(origin, indent=2))}</pre>",
+        ]
+        (self.out / REPORT_FILE).write_text(html_page(title, sections), encoding="utf-8")
+        return tables
+
+    def _spec(self) -> Spec:
+        """Station keeping by the policy and two PIDs; one setpoint with pictures, which takes longest, first."""
+        names = (POLICY, "pid", "pid-paper")
+        rows = {name: replace(T1.rows[name], changes={"duration": self.scope.duration}) for name in names}
+        if self.robot is None and self.firmware == "mcu":
+            title, changes = "The same, by pictures", {"duration": self.scope.duration, "camera": "pictures"}
+            seen = replace(rows[POLICY], title=title, changes=changes, targets=self.scope.pictures)
+            rows = {WITH_PICTURES: seen, **rows}
+        return replace(T1, rows=rows, targets=self.scope.setpoints, base=POLICY)
 
     @property
     def site(self) -> str:
@@ -597,18 +585,18 @@ class _Demonstration:
         plans = {role: [trimmed(programme, standing) for programme in plan] for role, plan in plans.items()}
         person: dict[str, Any] = {"attendant": self.attendant, "console": self.console}
         if self.robot is None:
-            spec = site_of(self.site, draw_plant(standing, PLANT, SEVERITY))
-            spec.write(self.folder / PLANT_FILE)
+            spec = site_of(self.site, draw_plant(standing, self.seed, SEVERITY))
+            spec.write(self.out / PLANT_FILE)
         with self._working("recording trials") as progress:
             record = partial(
-                record_programmes, plans, robot=self.robot, **person, pool_vehicle=self.name, plant=PLANT,
+                record_programmes, plans, robot=self.robot, **person, pool_vehicle=self.name, plant=self.seed,
                 severity=SEVERITY, seed=self.seed, site=self.site, firmware=self.firmware, leave_out=True,
                 processes=self.processes, progress=progress,
                 show=lambda run, result: self.tell(
                     f"  {run.target}: {'left out: ' if result['fault'] else ''}{result['fault'] or result['text']}"
                 ),
             )  # fmt: skip
-            result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=record)
+            result = identify(self.out, self.name, seed=self.seed, record=record)
         identifiable = sum(e.identifiable for e in result.fit.estimates.values())
         self.tell(
             f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
@@ -617,81 +605,17 @@ class _Demonstration:
         )
         return result
 
-    def _deployed(self, policy: Path) -> list[Evaluation]:
-        """All controllers in the pool, the policy with pictures too; or all on the robot."""
-        vehicle = str(self.folder / VEHICLE_FILES[1].format(self.standing.name))
-        pool_vehicle, plant, severity, camera = self.name, PLANT, SEVERITY, FIRMWARES[self.firmware].camera
-        if self.robot is not None:
-            pool_vehicle, plant, severity, camera = vehicle, 0, HARDWARE, HARDWARE
-
-        def job(row: str, target: str, camera: str) -> Job:
-            controller = str(policy) if row.startswith("policy") else row
-            return Job(
-                row=row, controller=controller, target=target, camera=camera, vehicle=vehicle, seed=self.seed,
-                pool_vehicle=pool_vehicle, plant=plant, severity=severity, duration=self.scope.duration, site=self.site,
-                firmware=self.firmware,
-            )  # fmt: skip
-
-        # Pictures first: they take longest, and the other processor has time for the rest.
-        pictures = (
-            []
-            if self.robot or camera == "none"
-            else [job(WITH_PICTURES, t, "pictures") for t in self.scope.pictures]
-        )
-        jobs = pictures + [job(row, target, camera) for row in CONTROLLERS for target in self.scope.setpoints]
-        place = self.folder / TRIALS_FOLDER
-        with self._working("holding setpoints") as progress:
-            results = play_jobs(
-                jobs, place, self.robot, attendant=self.attendant, console=self.console, processes=self.processes,
-                progress=progress, show=self._show,
-            )  # fmt: skip
-        evaluations = []
-        for row in (*CONTROLLERS, WITH_PICTURES):
-            of_row = [result for result in results if result["job"]["row"] == row]
-            if of_row:
-                evaluations.append(pool_evaluation(next(j for j in jobs if j.row == row), of_row, place))
-        return evaluations
-
     def _show(self, job: Job, result: Mapping[str, Any]) -> None:
         held = "held" if result["success"] else result["fault"] or "not held"
         if result["e_p_m"] is not None:
             held += f", {result['e_p_m']:.3f} m and {result['e_psi_deg']:.1f}° off"
         self.tell(f"  {job.row} at {job.target}: {held}")
 
-    def _report(self, result: Identification, evaluations: Sequence[Evaluation], seconds: float) -> None:
-        """Write NAME.json of every controller, the pictures and `report.html`."""
-        folder, policy = self.folder, evaluations[0]
-        for evaluation in evaluations:
-            write_json(folder / f"{evaluation.result['controller']['name']}.json", evaluation.result)
-        compared = [e for e in evaluations if e.result["trials"] == policy.result["trials"]]
-        envelopes = {e.label: error_envelope(e.trials) for e in compared}
-        save_figure(draw_envelopes(envelopes), folder / "envelopes.png")
-        save_figure(_paths(policy.trials, self.site), folder / "paths.png")
-        draw_training(groups_of([str(folder / "policy")]), folder / "training.png")
-        title = f"Station keeping of {policy.result['vehicle']['name']}"
-        origin = {
-            "vehicle": policy.result["vehicle"],
-            "hydrodynamics": policy.result["hydrodynamics"],
-            "seed": self.seed,
-            "policy": policy.result["controller"].get("files", {}),
-            **policy.result["provenance"],
-        }
-        sections = [
-            f"<h1>{escape(title)}</h1>",
-            f'<p class="lead">{escape(_lead(compared, seconds))}</p>',
-            *html_of([*_identification(result, self.robot is not None), *_results(evaluations)], folder),
-            "<h2>How to repeat it</h2>",
-            f"<pre>{escape(chr(10).join(self._commands()))}</pre>",
-            "<h2>Provenance</h2>",
-            f"<pre>{escape(json.dumps(origin, indent=2))}</pre>",
-        ]
-        (folder / REPORT_FILE).write_text(html_page(title, sections), encoding="utf-8")
-
     def _commands(self) -> list[str]:
         """Command lines that repeat the demonstration's steps by hand."""
         out, seed, name = self.out, self.seed, self.standing.name
         rough, identified = (out / file.format(name) for file in VEHICLE_FILES)
-        steps = Policy.load(self.folder / "policy").description.training["steps"]
+        steps = Policy.load(out / "policy").description.training["steps"]
         options = f"--randomize {RANGES} --seed {seed} --steps {steps}"
         action = FIRMWARES[self.firmware].action
         options += f" --action {action}" if action else ""
@@ -710,7 +634,7 @@ class _Demonstration:
             return [tank, f"{excite} {robot}", *middle, f"{drive} {robot}"]
         return [
             f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
-            f"{excite} --pool {PLANT} --severity {SEVERITY} --pool-vehicle {self.name}",
+            f"{excite} --pool {seed} --severity {SEVERITY} --pool-vehicle {self.name}",
             *middle,
             f"finssim pool --vehicle {self.name} --plant {out / PLANT_FILE} --pool-file site.yaml --truth truth.fst",
             f"{drive} --robot pool --pool-file site.yaml --arm",

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from rich.console import Console
 
@@ -30,13 +29,13 @@ from finssim.experiments.on_robot import (
     Attendant,
     OnRobot,
     Outcome,
-    RobotError,
     RobotTrial,
     check_starts,
     session,
+    take_folder,
 )
 from finssim.experiments.pool_trial import PoolJob, noise_seed, play_in_pool
-from finssim.files import atomic_directory, atomic_write
+from finssim.files import atomic_directory
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import draw_plant
 from finssim.pool.draw_plant import site_of
@@ -378,7 +377,7 @@ def record_programmes(
         folders: By role: takes NAME, the trials, and records/NAME.mcap.
         vehicle: Name or file, as the robot knows it.
         robot: That plays what has no trial in its folder yet, within the workspace; not opened where nothing is left.
-            None: a virtual pool.
+            None: a virtual pool does.
         attendant: Beside the robot, instead of the terminal's keyboard.
         console: Where a robot's state is told; standard error if None.
         pool: Arguments of `_in_pool`.
@@ -471,6 +470,7 @@ def _in_pool(
         PoolRun(row=role, target=programme.name, programme=programme, vehicle=vehicle, **settings)
         for role, plan in plans.items()
         for programme in plan
+        if not (folders[role] / programme.name).is_dir()
     ]
     body = load_vehicle(vehicle)
     for run in runs:  # what cannot be is refused before anything is played
@@ -490,8 +490,8 @@ def _in_pool(
             (folder / RECORDS).mkdir(parents=True, exist_ok=True)
             shutil.move(made / run.target, folder / run.target)
             shutil.move(made / f"{run.target}.mcap", folder / RECORDS)
-    for role in plans:
-        if all(result["fault"] for run, result in zip(runs, results, strict=True) if run.row == role):
+    for role, plan in plans.items():
+        if not any((folders[role] / programme.name).is_dir() for programme in plan):
             raise CalibrationError(
                 f"the bridge stopped every {role} trial in the virtual pool: {results[0]['fault']}: give lower levels"
             )
@@ -577,13 +577,12 @@ def excite(
             atomic_directory(out, replaces=PLAN_FILE) as folder,
             progress_bar("playing programmes") as progress,
         ):
+            about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
+            take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"pool": about}))
             record_programmes(
                 {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=pool_vehicle, plant=pool, severity=severity,
                 seed=seed, progress=progress,
             )  # fmt: skip
-            about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
-            text = _about(body, played, seed, kind, {"pool": about})
-            (folder / PLAN_FILE).write_text(text, encoding="utf-8")
         folders = [Path(out) / programme.name for programme in played]
     else:
         folders = write_programmes(
@@ -641,7 +640,9 @@ def excite_on_robot(
     start_warp()
     body = load_vehicle(vehicle)
     played = programmes(axes, body, seed=seed, **plan)
-    _take_folder(Path(out), _about(body, played, seed, str(plan.get("kind", "published")), {"robot": True}))
+    take_folder(
+        Path(out) / PLAN_FILE, _about(body, played, seed, str(plan.get("kind", "published")), {"robot": True})
+    )
     folders = {"fit": Path(out)}
     return record_programmes({"fit": played}, folders, vehicle, robot, attendant=attendant, console=console)[
         "fit"
@@ -650,9 +651,9 @@ def excite_on_robot(
 
 def _about(
     vehicle: Vehicle, played: Sequence[Programme], seed: int, kind: str, where: Mapping[str, Any]
-) -> str:
+) -> dict[str, Any]:
     """What the folder is of."""
-    about = {
+    return {
         "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
         "kind": kind,
         **where,
@@ -660,17 +661,3 @@ def _about(
         "programmes": [programme.name for programme in played],
         "sha256": [programme.sha256 for programme in played],
     }
-    return yaml.safe_dump(about, sort_keys=False)
-
-
-def _take_folder(out: Path, about: str) -> None:
-    """Begin a folder, or go on in one that is of the very same plan."""
-    file = out / PLAN_FILE
-    if not out.exists() or not any(out.iterdir()):
-        with atomic_write(file) as temporary:
-            temporary.write_text(about, encoding="utf-8")
-    elif not file.is_file() or file.read_text(encoding="utf-8") != about:
-        raise RobotError(
-            f"{out}: holds other files than trials of these programmes of this vehicle: give a new --out, or the same "
-            "axes, levels, seed and vehicle to go on with them"
-        )

@@ -27,12 +27,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.experiments.campaign import Job, Progress, check_choices, run_jobs, write_json
-from finssim.experiments.pool_trial import noise_seed
+from finssim.experiments.campaign import Progress, check_choices, run_jobs, write_json
+from finssim.experiments.pool_trial import PoolJob, noise_seed
 from finssim.experiments.tables import Table
 from finssim.pool import TruthError, VirtualPool, read_truth
 from finssim.pool.firmware import Firmware
-from finssim.pool.run import make_plan
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.bridge import Bridge, BridgeSettings
@@ -47,7 +46,6 @@ from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import link_of
 from finssim.vehicles import load_vehicle
-from finssim.vehicles.defaults import vehicle_at
 
 __all__ = ["SCENARIOS", "Bench", "Fault", "Scenario", "fault_job", "faults_experiment", "tables_of"]
 
@@ -528,22 +526,25 @@ def _last_activity(time: Array, active: NDArray[np.bool_], began: float) -> floa
 
 
 @dataclass(frozen=True, kw_only=True)
-class FaultJob(Job):
-    """A fault, in what motion, in which pool: the row is the scenario of the catalogue."""
+class FaultJob(PoolJob):
+    """A fault, in what motion, in which pool, whose vehicle is known: the row is the scenario of the catalogue."""
 
     variant: str
     motion: str
     """What the vehicle does: station or moving."""
-    severity: str = "realistic"
-    """nominal, realistic or hard."""
-    vehicle: str = "finsrov"
-    """Name or file."""
+    camera: str = "corners"
 
 
-def fault_job(scenario: str, variant: str = "", motion: str = "station", **settings: Any) -> FaultJob:
+def fault_job(
+    scenario: str, variant: str = "", motion: str = "station", vehicle: str = "finsrov", **settings: Any
+) -> FaultJob:
     """The job of a variant of a scenario; settings are further fields."""
-    target = f"{variant} {motion}".strip()
-    return FaultJob(row=scenario, target=target, variant=variant, motion=motion, **settings)
+    if scenario in SCENARIOS and SCENARIOS[scenario].firmware == "ardusub":
+        settings |= {"firmware": "ardusub", "site": "tank"}
+    return FaultJob(
+        row=scenario, target=f"{variant} {motion}".strip(), variant=variant, motion=motion, vehicle=vehicle,
+        pool_vehicle=vehicle, **settings,
+    )  # fmt: skip
 
 
 def play(job: FaultJob, path: Path) -> dict[str, Any]:
@@ -558,17 +559,13 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         empty; `record_lost_s` and `record_problem`; `ok`.
     """
     start_warp()
-    scenario, aided = SCENARIOS[job.row], SCENARIOS[job.row].firmware == "ardusub"
-    site, camera = ("tank", "none") if aided else ("pool", "corners")
-    vehicle = load_vehicle(job.vehicle)
-    vehicle = vehicle_at(site, vehicle, navigation=True) if aided else vehicle
+    scenario, aided = SCENARIOS[job.row], job.firmware == "ardusub"
+    vehicle = job.equipped()
     start, goal, when, _ = (TANK_MOTIONS if aided else MOTIONS)[job.motion]
     box = inset(vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
     workspace = {"workspace_lower": box[0], "workspace_upper": box[1]}
     seed = noise_seed(job.seed, job.target)
-    plan = make_plan(
-        vehicle, str(job.plant), job.severity, camera=camera, seed=seed, site=site, firmware=scenario.firmware
-    )  # type: ignore[arg-type]
+    plan = job.plan(seed)
     pool = plan.standing(station_of(start), seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "run.mcap"

@@ -18,7 +18,6 @@ from rich.console import Console
 from finssim.control.guidance import Station
 from finssim.control.modes import action_mode
 from finssim.experiments import campaign
-from finssim.experiments.evaluate import Evaluation, evaluation
 from finssim.experiments.metrics import SITE_SIZES, T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.on_robot import (
     GETTING_READY,
@@ -45,8 +44,6 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import link_of
-from finssim.tasks import task_named
-from finssim.tasks.agents import agent_for
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import room, vehicle_at
 
@@ -372,26 +369,3 @@ def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | No
         motion = Motion(t=np.array([0.0, 0.1]), position=nowhere[:, :3], quaternion=nowhere)
     where = {"robot": opened.robot.title, "record": record.name}
     return _result(job, path, motion, outcome, began) | where
-
-
-def pool_evaluation(job: Job, results: Sequence[Mapping[str, Any]], folder: Path) -> Evaluation:
-    """The trials of one controller in the form of an evaluation.
-
-    Args:
-        job: One of them, on setpoints.
-        results: Of `run_jobs`.
-        folder: Where `run_jobs` left the motions.
-    """
-    vehicle, first = load_vehicle(job.vehicle), results[0]
-    agent = agent_for(job.controller, vehicle, task_named("t1"))
-    plant = {"name": "pool", "title": f"virtual pool {job.plant}, {job.severity}, around {job.pool_vehicle}"}
-    if first.get("robot"):
-        plant = {"name": HARDWARE, "title": f"robot {first['robot']}, by its own estimate"}
-    trials = [played_trial(result, folder) for result in results]
-    measures = [
-        {key: value for key, value in result.items() if key not in ("job", "key", "provenance")}
-        for result in results
-    ]
-    about = {"camera": job.camera, "seed": job.seed, "provenance": dict(first["provenance"])}
-    controller = agent.describe() | {"name": job.row}
-    return evaluation(controller, "t1", vehicle, plant, measures, trials, **about)

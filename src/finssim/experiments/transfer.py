@@ -15,7 +15,7 @@ from rich.console import Console
 from finssim.control.controllers import COSTLY
 from finssim.control.policy import Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.campaign import Progress, check_choices, write_json
+from finssim.experiments.campaign import Progress, Show, check_choices, write_json
 from finssim.experiments.evaluate import T1_COLUMNS
 from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row, paper_t2_row
@@ -64,6 +64,8 @@ class Row:
     """Row of the paper's table; None where it has none."""
     changes: dict[str, Any] = field(default_factory=dict)
     """Fields of its jobs."""
+    targets: Sequence[str] | None = None
+    """What is played, if not all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +173,10 @@ def transfer_experiment(
     processes: Annotated[int | None, (1, None)] = None,
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
+    pool_vehicle: Annotated[str | None, "python"] = None,
+    console: Console | None = None,
     progress: Progress = lambda part, what: None,
+    show: Show = lambda job, result: None,
 ) -> dict[str, Any]:
     """Train what the rows need, play every target in every plant with every seed, and write the table.
 
@@ -197,7 +202,10 @@ def transfer_experiment(
         processes: Trials at once; as many as processors if not given.
         robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
         attendant: The person beside that robot, instead of the terminal's keyboard.
+        pool_vehicle: Name or file of the vehicle around which the pools' own are drawn; `vehicle` if None.
+        console: Where a robot's state is told; standard error if None.
         progress: Told the share that is done and what comes next.
+        show: Given each trial of a pool and its result, as soon as there is one.
 
     Returns:
         What NAME.json holds.
@@ -230,13 +238,14 @@ def transfer_experiment(
         camera = sees
     jobs = [
         Job(
-            row=name, controller=controllers[name, s], target=target, vehicle=vehicle, pool_vehicle=vehicle,
-            plant=plant, severity=severity, seed=s, camera=camera, site=site, firmware=firmware, **row.changes,
+            row=name, controller=controllers[name, s], target=target, vehicle=vehicle,
+            pool_vehicle=pool_vehicle or vehicle, plant=plant, severity=severity, seed=s, site=site, firmware=firmware,
+            **{"camera": camera, **row.changes},
         )
-        for name, row in chosen.items() for plant in pools for s in run_seeds for target in targets
+        for name, row in chosen.items() for plant in pools for s in run_seeds for target in row.targets or targets
     ]  # fmt: skip
     results = play_jobs(
-        jobs, folder / "trials", robot, attendant=attendant, processes=processes,
+        jobs, folder / "trials", robot, attendant=attendant, console=console, processes=processes, show=show,
         progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
     )  # fmt: skip
     by_row = {name: [r for r in results if r["job"]["row"] == name] for name in chosen}
@@ -278,7 +287,7 @@ def controllers_of(
     Returns:
         (row, seed) -> directory of a policy, or the name of a PID.
     """
-    controllers = {}
+    controllers, body = {}, load_vehicle(vehicle)
     plan = [(name, row, seed) for name, row in rows.items() for seed in seeds]
     for done, (name, row, seed) in enumerate(plan):
         controllers[name, seed] = row.controller
@@ -289,7 +298,7 @@ def controllers_of(
         policy = folder / "policies" / f"{label}-seed{seed}"
         controllers[name, seed] = str(policy)
         progress(done / len(plan), f"training {label}, seed {seed}")
-        if not finished(policy):
+        if not finished(policy, body):
             train(
                 task, out=policy, vehicle=vehicle, action=action, seed=seed, steps=steps, **options,
                 settings={} if remembers else FORGETFUL, console=Console(stderr=True, quiet=True),
