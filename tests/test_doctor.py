@@ -1,6 +1,7 @@
 """The doctor tells the truth about this machine."""
 
 import json
+import re
 from importlib import metadata
 from importlib.util import find_spec
 
@@ -53,7 +54,7 @@ def test_extras_are_those_of_the_package():
         name, _, marker = requirement.partition("; ")
         if "extra ==" in marker:
             extra = marker.split("extra == ")[1].strip("'\"")
-            declared.setdefault(extra, set()).add(name.split(">")[0].split("[")[0].lower())
+            declared.setdefault(extra, set()).add(re.split(r"[<>=\[]", name)[0].lower())
     for extra in ("all", "dev"):
         declared.pop(extra)
     assert declared == {name: {d.lower() for d in extra.distributions} for name, extra in EXTRAS.items()}

@@ -68,6 +68,9 @@ EXTRAS = {
     ),
     "mujoco": Extra({"mujoco": "mujoco"}, "measure speed as a ratio to MuJoCo's"),
     "mpc": Extra({"casadi": "casadi"}, "control by nonlinear model prediction (nmpc)"),
+    "perception": Extra(
+        {"newton": "newton"}, "let cameras, sonars and altimeters see the worlds of finssim.worlds"
+    ),
     "vision": Extra(
         {"opencv-python-headless": "cv2", "pupil-apriltags": "pupil_apriltags", "matplotlib": "matplotlib"},
         "detect tags, calibrate cameras and pools from pictures, locate a vehicle from pictures or video",

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from finssim.control import ControlError
-from finssim.control.ardusub import PULSES, Mixer, dead_band, thrust_tables
-from finssim.control.modes import QUIET, action_mode
+from finssim.control.ardusub import FROM_BODY, PULSES, Mixer, dead_band, thrust_tables
+from finssim.control.modes import QUIET, action_mode, axis_dead_band, before_dead_band
 from finssim.vehicles import VehicleError, load_vehicle
 from finssim.vehicles.autopilot import DEMANDS
 
@@ -26,16 +26,9 @@ def demand(**parts):
 
 
 def asked(vehicle, part):
-    """Demand that an axis of an action makes: past the dead band of the motors, by the gain."""
+    """Demand that an axis of an action makes: on from where the motors begin to turn up to the gain."""
     dead = dead_band(vehicle)
-    return vehicle.autopilot.gain * (dead + (1.0 - dead) * (part - QUIET) / (1.0 - QUIET))
-
-
-def axes(vehicle, demands):
-    """Actions that make demands."""
-    dead, size = dead_band(vehicle), np.abs(demands) / vehicle.autopilot.gain
-    beyond = QUIET + (1.0 - QUIET) * (size - dead) / (1.0 - dead)
-    return np.sign(demands) * np.where(size <= dead, size * QUIET / dead, beyond)
+    return dead + (vehicle.autopilot.gain - dead) * (part - QUIET) / (1.0 - QUIET)
 
 
 def test_the_vectored_frame_gives_way_to_the_throttle():
@@ -112,7 +105,7 @@ def test_demands_of_thrusts_give_these_thrusts_again(vehicle):
     random, off = np.random.default_rng(0), []
     for _ in range(200):
         f = mode.to_thrusters(random.uniform(-1.0, 1.0, 6) * random.uniform(0.0, 1.0))
-        again = axes(vehicle, mixer.demands(f))
+        again = before_dead_band(mixer.demands(f) / vehicle.autopilot.gain, axis_dead_band(vehicle))
         body = np.array([again[4], -again[5], again[3], again[0], -again[1], -again[2]])
         off.append(np.abs(mode.to_thrusters(body) - f).max())
     # Where the vectored frame clips single motors with all axes near full, the demand is not always reached.
@@ -165,3 +158,42 @@ def test_an_autopilot_that_cannot_be_is_refused(changes, sentence):
 def test_a_vehicle_without_an_autopilot_has_no_axes():
     with pytest.raises(ControlError, match="no 'autopilot' section"):
         action_mode("pilot6", load_vehicle("finsrov"))
+
+
+@pytest.mark.parametrize("gain", [0.25, 0.5, 1.0])
+def test_motors_turn_from_one_percent_of_an_axis_at_any_gain(gain):
+    """Just below `QUIET` nothing turns, just above it something does, and action 1 is the gain's full output."""
+    vehicle = HEAVY.replace({"autopilot.gain": gain})
+    mode = action_mode("pilot6", vehicle)
+    for axis in range(6):
+        action = np.zeros((3, 6))
+        action[:, axis] = 0.95 * QUIET, 1.2 * QUIET, 1.0
+        still, turning, full = mode.to_thrusters(action)
+        assert np.abs(still).max() < 1e-6 < 0.01 < np.abs(turning).max()
+        pulses = Mixer.of(vehicle).pulses(FROM_BODY @ action[2] * gain)
+        expected = [
+            np.clip(t.thrust(t.shaft_speed(pulse)), t.force_min, t.force_max)
+            for t, pulse in zip(vehicle.thrusters.values(), pulses, strict=True)
+        ]
+        np.testing.assert_allclose(full, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_a_gain_that_turns_no_motor_is_refused():
+    with pytest.raises(ControlError, match=r"no motor turns up to 0\.07.* autopilot\.gain is 0\.05"):
+        action_mode("pilot6", HEAVY.replace({"autopilot.gain": 0.05}))
+
+
+def test_the_way_back_past_the_dead_band_is_the_way_there():
+    """Also where an axis is scaled, and where it is switched off."""
+    scale = (1.0, 0.5, 0.3, 1.0, 0.0, 0.8)
+    band = axis_dead_band(HEAVY, scale)
+    assert band[0] == pytest.approx(dead_band(HEAVY) / HEAVY.autopilot.gain)
+    assert band[4] == 1.0
+    action = np.random.default_rng(3).uniform(-1.0, 1.0, (50, 6))
+    size = np.abs(action)
+    there = np.sign(action) * np.where(
+        size <= QUIET, size * band / QUIET, band + (1.0 - band) * (size - QUIET) / (1.0 - QUIET)
+    )
+    back = before_dead_band(there, band)
+    on = band < 1.0
+    np.testing.assert_allclose(back[:, on], action[:, on], atol=1e-12)

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room
-from finssim.experiments.pool_trial import Job, play
+from finssim.experiments.on_robot import OnRobot, RobotError
+from finssim.experiments.pool_trial import Job, play, run_on_robot
 from finssim.experiments.trials import Motion
+from finssim.robot.goals import GoalError
+from finssim.robot.wiring import Wiring
 from finssim.vehicles import load_vehicle
 
 SHORT = Job(row="pid", controller="pid", target="P03", camera="corners", duration=6.0)
@@ -100,3 +103,14 @@ def test_other_vehicles_hold_a_setpoint_of_their_own_pool(played, name):
     assert result["fault"] == "" and result["localization"]["position_m"] < 0.05
     assert np.linalg.norm(series.position[-1] - goal) < 0.05
     np.testing.assert_allclose(result["goal"][:3], goal)
+
+
+def test_a_robot_in_a_tank_may_go_where_the_tank_is(tmp_path):
+    """Setpoints three times as far lie outside the workspace of the vehicle's file, inside that of the site."""
+    job = Job(row="pid", controller="pid", target="P01", vehicle="bluerov2_heavy", plant=0, severity="hardware",
+              camera="hardware", site="tank", firmware="ardusub")  # fmt: skip
+    there = OnRobot(wiring=Wiring(robot="mavlink", lockstep=True), pool_file=None, site="tank")
+    with pytest.raises(RobotError, match="give --arm"):
+        run_on_robot([job], tmp_path, there)
+    with pytest.raises(GoalError, match="outside the workspace"):
+        run_on_robot([job], tmp_path, dataclasses.replace(there, site="pool"))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.messages import Telemetry
-from finssim.robot.teleop import GEARS, LOST, Hands, Operator, shaped
+from finssim.robot.teleop import ARMING, GEARS, LOST, Hands, Operator, shaped
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("finsrov")
@@ -190,3 +190,42 @@ def test_an_unplugged_pad_disarms():
     frame = drive.turn(Hands(present=False))
     assert drive.bridge.state == "disarmed" and not frame.enable and "lost" in drive.operator.message
     assert not drive.turn(replace(FULL, arm=True), 5).enable
+
+
+class SlowAutopilot:
+    """Arms when it is asked often enough, and never gives way."""
+
+    def __init__(self, asks):
+        self.asks = asks
+
+    def prepare(self, now):
+        self.asks -= 1
+        return "waiting for it to arm" if self.asks > 0 else ""
+
+    def alarm(self, now):
+        return ""
+
+
+@pytest.mark.parametrize(
+    ("asks", "meanwhile", "state"),
+    [
+        (40, Hands(), "armed"),
+        (round(1.1 * ARMING / 0.02), Hands(), "disarmed"),
+        (40, FULL, "disarmed"),
+        (40, Hands(stop=True), "fault"),
+        (40, Hands(present=False), "disarmed"),
+        (40, Hands(arm=True), "disarmed"),
+    ],
+    ids=["one press", "too slow", "sticks moved", "emergency stop", "device lost", "second press"],
+)
+def test_one_press_waits_for_an_autopilot_to_arm(asks, meanwhile, state):
+    """It is asked again until it is ready or time is up; whatever else the hands do ends the wait for good."""
+    drive = Drive()
+    drive.bridge.autopilot = SlowAutopilot(asks)
+    drive.turn(Hands(), 2)
+    drive.turn(Hands(arm=True))
+    assert drive.bridge.state == "disarmed" and "waiting" in drive.operator.message
+    drive.turn(Hands(), 10)
+    drive.turn(meanwhile)
+    drive.turn(Hands(), round(1.2 * ARMING / 0.02))
+    assert drive.bridge.state == state, drive.operator.message

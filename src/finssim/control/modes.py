@@ -29,6 +29,8 @@ __all__ = [
     "ModeData",
     "ModeKind",
     "action_mode",
+    "axis_dead_band",
+    "before_dead_band",
     "mode_data",
     "mode_from_dict",
     "thrusts_of",
@@ -100,19 +102,19 @@ class ModeData:
     """Of wrenches to the thrusters; empty where the columns are no wrenches."""
     pilot: wp.bool
     """Whether the columns are demands."""
-    dead_band: wp.array(dtype=float)
-    """Outputs up to this turn no motor [-], (vehicles,); of demands."""
+    dead_band: wp.array(dtype=vec8)
+    """Part of each axis up to which no motor turns [-], (vehicles,); of demands."""
     mixer: MixerData
     """Of demands to the thrusters; empty where the columns are no demands."""
 
 
 @wp.func
 def past_dead_band(part: float, dead_band: float) -> float:
-    """An axis of an action, moved on by the outputs at which no motor turns, beyond +-`QUIET`.
+    """An axis of an action, moved on by the part of it at which no motor turns, beyond +-`QUIET`.
 
     Args:
         part: In [-1, 1].
-        dead_band: Outputs up to this turn no motor [-].
+        dead_band: Up to this no motor turns [-], from `axis_dead_band`.
     """
     size = wp.abs(part)
     if size <= wp.static(QUIET):
@@ -134,7 +136,7 @@ def thrusts_of(action: vec8, vehicle: int, data: ModeData) -> vec8:
     for k in range(data.columns.shape[1]):
         part = wp.clamp(action[k], -1.0, 1.0)
         if data.pilot:
-            part = past_dead_band(part, data.dead_band[vehicle])
+            part = past_dead_band(part, data.dead_band[vehicle][k])
         x += part * data.columns[vehicle, k]
     if data.wrench:
         return allocate(vec6(x[0], x[1], x[2], x[3], x[4], x[5]), vehicle, data.allocation)
@@ -178,7 +180,8 @@ def mode_data(name: str, vehicles: Sequence[Any], scales: Sequence[Any], device:
     data.wrench, data.pilot = wp.bool(kind.wrench), wp.bool(kind.pilot)
     if kind.pilot:
         data.mixer = mixer_data(vehicles, device)
-        data.dead_band = wp.array([dead_band(vehicle) for vehicle in vehicles], dtype=float, device=device)
+        bands = [axis_dead_band(vehicle, scale) for vehicle, scale in zip(vehicles, scales, strict=True)]
+        data.dead_band = wp.array(_padded(bands), dtype=vec8, device=device)
     if kind.wrench:
         data.allocation = allocation_data(
             [vehicle.control_matrix for vehicle in vehicles],
@@ -188,6 +191,37 @@ def mode_data(name: str, vehicles: Sequence[Any], scales: Sequence[Any], device:
             device=device,
         )
     return data
+
+
+def axis_dead_band(vehicle: Any, scale: Any = 1.0) -> Array:
+    """Part of each axis of `pilot6` up to which no motor turns, at the autopilot's gain and voltage [-], (6,).
+
+    Args:
+        vehicle: With an `autopilot` section.
+        scale: Part of each axis that action 1 stands for [-], one number or (6,); an axis at 0 turns no motor at all.
+
+    Raises:
+        ControlError: No motor turns even at action 1 of an axis.
+    """
+    band, gain = dead_band(vehicle), _gain(vehicle)
+    if band >= gain:
+        raise ControlError(
+            f"{vehicle.name}: no motor turns up to {band:.3f} of full output, and autopilot.gain is {gain:g}: raise it"
+        )
+    full = np.broadcast_to(gain * np.asarray(scale, float), (6,))
+    return np.minimum(np.divide(band, full, out=np.ones(6), where=full > 0.0), 1.0)
+
+
+def before_dead_band(part: npt.ArrayLike, dead_band: npt.ArrayLike) -> Array:
+    """Axes of an action which `past_dead_band` moves on to `part`.
+
+    Args:
+        part: In [-1, 1], (..., 6).
+        dead_band: From `axis_dead_band`, (6,).
+    """
+    band, size = np.broadcast_to(dead_band, np.shape(part)), np.abs(part)
+    rest = np.divide(size - band, 1.0 - band, out=np.ones_like(size), where=band < 1.0)
+    return np.sign(part) * np.where(size <= band, size * QUIET / band, QUIET + (1.0 - QUIET) * rest)
 
 
 def _columns(kind: ModeKind, vehicle: Any, scale: Any) -> Array:
@@ -219,7 +253,7 @@ class ActionMode:
     definition: dict[str, tuple[float, ...]]
     """Limits and scale, as `describe` has them: `scale`, with the `limits` of the wrench at action 1 and scale 1 about
     `reference` [N, N m, m], or with `lower` and `upper` of the thrusters [N], and of an autopilot its `factors`, row by
-    row, and `gain` [-]."""
+    row, `gain` and `dead_band` by axis [-]."""
     columns: Array = field(repr=False, compare=False)
     """What each component asks for at 1: a wrench about `reference` [N, N m] or demands of the autopilot [-], (m, 6),
     or parts of the thrusters' limits, (m, n)."""
@@ -310,7 +344,7 @@ def action_mode(name: str, vehicle: Any, scale: float | Sequence[float] = 1.0) -
             "scale": parts,
             "factors": (vehicle.autopilot.factors * vehicle.autopilot.signs(len(tables))[:, None]).ravel(),
             "gain": [vehicle.autopilot.gain],
-            "dead_band": [dead_band(vehicle)],
+            "dead_band": axis_dead_band(vehicle, parts),
         }
     else:
         lower, upper = vehicle.force_limits

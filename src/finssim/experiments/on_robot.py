@@ -218,7 +218,10 @@ class Stages:
             self._begin(runtime, now)
         elif now - self._since > APPROACH:
             why = runtime.refusal or self._way(reading)
-            return self._end("not there", f"not at its start after {APPROACH:g} s: {why}")
+            return self._end(
+                "not there",
+                f"not at its start after {APPROACH:g} s: {why}; is something in its way, or was it let in elsewhere?",
+            )
         return False
 
     def _begin(self, runtime: Runtime, now: float) -> None:

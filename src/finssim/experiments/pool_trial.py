@@ -318,9 +318,10 @@ def play_jobs(
         return campaign.run_jobs(jobs, folder, play, **options)
     vehicle, console = load_vehicle(jobs[0].vehicle), console or Console(stderr=True)
     trials = {job.target: job_trial(job, vehicle) for job in jobs}
-    check_starts({target: start for target, (_, start) in trials.items()}, vehicle)
+    equipped = robot.equipped(vehicle)
+    check_starts({target: start for target, (_, start) in trials.items()}, equipped)
     for trial, _ in trials.values():
-        check_reachable(trial.guide, vehicle)
+        check_reachable(trial.guide, equipped)
 
     def show(job: Job, result: Mapping[str, Any]) -> None:
         held = "done" if result["success"] else result["fault"] or "not held"

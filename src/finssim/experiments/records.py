@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.trials.trial_files import read_table
-from finssim.control.ardusub import Mixer, dead_band
+from finssim.control.ardusub import Mixer
 from finssim.control.guidance import Guide, Station, Track
-from finssim.control.modes import AXES, QUIET, ActionMode, action_mode
+from finssim.control.modes import AXES, ActionMode, action_mode, axis_dead_band, before_dead_band
 from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, Trajectory, load_trajectory
 from finssim.experiments.campaign import Progress
 from finssim.experiments.metrics import MAX_GAP, T1_SETPOINTS, in_room
@@ -231,10 +231,8 @@ def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[
         full = np.where(f >= 0.0, upper, -lower)
         parts = np.divide(f, full, out=np.zeros_like(f), where=full > 0.0)
     action = parts @ np.linalg.pinv(mode.columns)
-    if mode.pilot:  # back from past the motors' dead band, as `past_dead_band` has it
-        dead, size = dead_band(vehicle), np.abs(action)
-        beyond = QUIET + (1.0 - QUIET) * (size - dead) / (1.0 - dead)
-        action = np.sign(action) * np.where(size <= dead, size * QUIET / dead, beyond)
+    if mode.pilot:
+        action = before_dead_band(action, axis_dead_band(vehicle, mode.scale))
     action = np.clip(action, -1.0, 1.0)
     # Compare the wrench that the actions would give with the one that was commanded.
     limits = np.asarray(vehicle.wrench_limits, float)

@@ -734,6 +734,8 @@ class Bridge:
             raise BridgeError(f"slew has {len(self.settings.slew)} rates, expected {self.motors.thrusters}")
         self.autopilot: Autopilot | None = None
         """Has to be ready before the bridge arms, and may end it; None: there is none."""
+        self.getting_ready = False
+        """Whether arming was last refused by nothing but an autopilot that has yet to get ready."""
         self.state = "disarmed"
         self.reason = ""
         """Why it is in hold or fault."""
@@ -754,7 +756,9 @@ class Bridge:
 
     def arm(self, now: float, source: str) -> str:
         """Let commands through from now on. Returns "" or, in one sentence, why it is refused."""
-        why = self._refusal(now) or (self.autopilot.prepare(now) if self.autopilot is not None else "")
+        refusal = self._refusal(now)
+        why = refusal or (self.autopilot.prepare(now) if self.autopilot is not None else "")
+        self.getting_ready = bool(why) and not refusal
         if why:
             self.log.repeat(self._clock.now, "refused", f"{source} may not arm: {why}")
             return why

@@ -47,6 +47,8 @@ EXPO = 0.3
 """Share of the cube in the answer to a deflection: small ones become finer, the full one stays."""
 LOST = 0.5
 """Without news of the device for so long it counts as lost [s]."""
+ARMING = 5.0
+"""A press of the arm button waits so long for an autopilot to get ready [s]."""
 
 
 class TeleopError(ValueError):
@@ -121,9 +123,10 @@ class Device(Protocol):
 class Operator:
     """A person at the controls of a running robot: reads a device at each turn of the loop and does what it shows.
 
-    A vehicle is armed by a press of the arm button alone. A lost device, a released dead-man and the emergency stop
-    each mean no thrust; a lost device disarms, and its return arms nothing: the first look after the start or after a
-    loss only learns which buttons are down.
+    A vehicle is armed by a press of the arm button alone; an autopilot that has yet to get ready is waited for up to
+    `ARMING` seconds, or to the next press. A lost device, a released dead-man and the emergency stop each mean no
+    thrust; a lost device disarms, and its return arms nothing: the first look after the start or after a loss only
+    learns which buttons are down.
     """
 
     def __init__(self, device: Device, swap: Callable[[], None] | None = None) -> None:
@@ -138,7 +141,8 @@ class Operator:
         self.message = ""
         """What to tell the person: why arming was refused, or what is wrong."""
         self._before: Hands | None = None
-        self._heard = -math.inf
+        self._heard = self._arming = -math.inf
+        """When the device was last there, and until when an autopilot is waited for [s]."""
 
     def wrench(self) -> Array:
         """The wanted wrench, body frame [N, N m], (6,); for `pilots.WrenchPilot`."""
@@ -162,7 +166,9 @@ class Operator:
         """Look at the device at a time [s], and arm, disarm or stop as it says."""
         self.command = command = self.look(now)
         armed = bridge.state in ("armed", "hold")
+        waiting, self._arming = now < self._arming, self._arming if not command.stop else -math.inf
         if command.lost:
+            self._arming = -math.inf
             if armed:
                 bridge.disarm(now)
                 self.message = "the device is lost: disarmed"
@@ -174,11 +180,15 @@ class Operator:
         if "acknowledge" in command.pressed and bridge.state == "fault":
             bridge.acknowledge(now)
             self.message = ""
-        if "arm" in command.pressed and armed:
+        if "arm" in command.pressed and (armed or waiting):
             bridge.disarm(now)
-            self.message = ""
-        elif "arm" in command.pressed:
+            self.message, self._arming = "", -math.inf
+        elif waiting or "arm" in command.pressed:
             self.message = bridge.arm(now, "operator")
+            if not bridge.getting_ready:
+                self._arming = -math.inf
+            elif not waiting:
+                self._arming = now + ARMING
         if "mode" in command.pressed and self._swap is not None:
             self._swap()
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from finssim.files import plain_name
 from finssim.vehicles.errors import VehicleError
-from finssim.vehicles.part import did_you_mean
+from finssim.vehicles.part import did_you_mean, sentence_of
 from finssim.vehicles.reading import read_file
 from finssim.vehicles.vehicle import Provenance, Vehicle
 
@@ -193,43 +193,11 @@ def _checked(values: Tree, origins: Origins, name: str, path: Path | None, shown
         return Vehicle(**values, name=name, path=path, provenance=origins)
     except ValidationError as error:
         sentences = [
-            _sentence(detail, shown)
+            sentence_of(detail, shown)
             for detail in error.errors()
             if detail["type"] != "default_factory_not_called"
         ]
         raise VehicleError("\n".join(sentences)) from None
-
-
-def _sentence(detail: Any, shown: str) -> str:
-    """One pydantic complaint in the form `file: section: key value, expectation: what to do`."""
-    where = [str(item) for item in detail["loc"] if not str(item).startswith("<")]
-    kind, given, context = detail["type"], detail.get("input"), detail.get("ctx", {})
-    if kind == "section":
-        return ": ".join(filter(None, [shown, ".".join(where), context["message"]]))
-    bounds = {
-        "greater_than": ("gt", ">"),
-        "greater_than_equal": ("ge", ">="),
-        "less_than": ("lt", "<"),
-        "less_than_equal": ("le", "<="),
-    }
-    if kind == "value":
-        problem = context["message"]
-    elif kind == "missing":
-        problem = "is missing: add it, with its origin"
-    elif kind in bounds:
-        key, sign = bounds[kind]
-        problem = f"is {given}, expected {sign} {context[key]:g}"
-    elif kind == "finite_number":
-        problem = f"is {given}, expected a finite number"
-    elif kind in ("float_type", "int_type", "float_parsing", "int_parsing"):
-        problem = f"is {given!r}, expected {'a whole' if kind.startswith('int') else 'a'} number"
-    elif kind == "literal_error":
-        problem = f"is {given!r}, expected {context['expected']}"
-    elif kind in ("model_type", "model_attributes_type", "dict_type"):
-        problem = f"is {given!r}, expected a section of keys"
-    else:
-        problem = f"is {given!r}: {detail['msg']}"
-    return ": ".join(filter(None, [shown, ".".join(where[:-1]), f"{where[-1]} {problem}"]))
 
 
 def _set(tree: Any, path: list[str], value: Any, shown: str, done: tuple[str, ...] = ()) -> list[str]:

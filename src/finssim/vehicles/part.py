@@ -185,3 +185,35 @@ def zeros(*shape: int) -> NDArray[np.float64]:
 def identity_quaternion() -> NDArray[np.float64]:
     """Read-only [0, 0, 0, 1]: mounted along the body axes."""
     return _frozen(np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+def sentence_of(detail: Any, shown: str) -> str:
+    """One pydantic complaint in the form `file: section: key value, expectation: what to do`."""
+    where = [str(item) for item in detail["loc"] if not str(item).startswith("<")]
+    kind, given, context = detail["type"], detail.get("input"), detail.get("ctx", {})
+    if kind == "section":
+        return ": ".join(filter(None, [shown, ".".join(where), context["message"]]))
+    bounds = {
+        "greater_than": ("gt", ">"),
+        "greater_than_equal": ("ge", ">="),
+        "less_than": ("lt", "<"),
+        "less_than_equal": ("le", "<="),
+    }
+    if kind == "value":
+        problem = context["message"]
+    elif kind == "missing":
+        problem = "is missing: add it, with its origin"
+    elif kind in bounds:
+        key, sign = bounds[kind]
+        problem = f"is {given}, expected {sign} {context[key]:g}"
+    elif kind == "finite_number":
+        problem = f"is {given}, expected a finite number"
+    elif kind in ("float_type", "int_type", "float_parsing", "int_parsing"):
+        problem = f"is {given!r}, expected {'a whole' if kind.startswith('int') else 'a'} number"
+    elif kind == "literal_error":
+        problem = f"is {given!r}, expected {context['expected']}"
+    elif kind in ("model_type", "model_attributes_type", "dict_type"):
+        problem = f"is {given!r}, expected a section of keys"
+    else:
+        problem = f"is {given!r}: {detail['msg']}"
+    return ": ".join(filter(None, [shown, ".".join(where[:-1]), f"{where[-1]} {problem}"]))

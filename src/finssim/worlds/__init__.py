@@ -1,0 +1,23 @@
+"""Worlds as data, and the sensors that see and hear them: cameras, imaging sonars, altimeters, DVL beams.
+
+`finssim.worlds.description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
+(`pip install 'finssim[perception]'`).
+"""
+
+from finssim.worlds.description import World, WorldError, devices, load_device, load_world, sites
+from finssim.worlds.model import WorldBatch
+from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch
+
+__all__ = [
+    "CameraBatch",
+    "Headlight",
+    "RangeBatch",
+    "SonarBatch",
+    "World",
+    "WorldBatch",
+    "WorldError",
+    "devices",
+    "load_device",
+    "load_world",
+    "sites",
+]

@@ -1,0 +1,667 @@
+"""Worlds and their sensors as data: YAML files that are read, checked and refused in one sentence each.
+
+World frame as everywhere: z up, z = 0 on the still water surface. Colours are reflectances and radiances of (red,
+green, blue); radiance 1 is that of white paper lying level just below the surface.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, ValidationError, model_validator
+
+from finssim.files import plain_name
+from finssim.geometry.mesh import MeshError, load_stl
+from finssim.geometry.optics import LENS_MODELS, Lens, OpticsError
+from finssim.geometry.rotations import quat_from_euler, quat_from_yaw
+from finssim.sensors.overhead_camera import Sensor, Water
+from finssim.vehicles.part import (
+    NonNegative,
+    Number,
+    Part,
+    Positive,
+    Positive3,
+    Probability,
+    Quaternion,
+    Vector3,
+    did_you_mean,
+    refuse_section,
+    refuse_value,
+    sentence_of,
+    zeros,
+)
+from finssim.yaml_file import read_mapping
+
+Array = NDArray[np.float64]
+
+SITES, DEVICES = Path(__file__).parent / "catalogue", Path(__file__).parent / "devices"
+LARGEST = 4096
+"""Shapes in one world."""
+FINEST = 1 << 20
+"""Heights of a seabed."""
+
+
+class WorldError(ValueError):
+    """A world or a sensor that cannot be: one sentence that says where, what and what to do."""
+
+
+def _within(low: float, high: float) -> AfterValidator:
+    def check(values: Array) -> Array:
+        if np.any((values < low) | (values > high)):
+            raise refuse_value(f"is {values.tolist()}, expected 3 numbers from {low:g} to {high:g}")
+        return values
+
+    return AfterValidator(check)
+
+
+Colour = Annotated[Vector3, _within(0.0, 1.0)]
+"""Reflectance of red, green and blue, (3,)."""
+NonNegative3 = Annotated[Vector3, _within(0.0, math.inf)]
+Count = Annotated[int, Field(strict=True, ge=1, le=LARGEST)]
+Pixels = Annotated[int, Field(strict=True, ge=1, le=8192)]
+
+
+class Texture(Part):
+    """A pattern on a shape, drawn in the shape's own axes; a seabed's and a plane's lies in x and y."""
+
+    kind: Literal["checker", "stripes", "tiles", "mottled"]
+    """Squares of two colours; bands along z; tiles with joints; patches of random brightness, as sand has."""
+    size: Positive
+    """Of a square, a pair of bands, a tile, a patch [m]."""
+    colour: Colour = Field(default_factory=lambda: zeros(3))
+    """Of every other square or band, and of joints, which are 6 % of a tile wide."""
+    contrast: Probability = 0.3
+    """Of patches: largest change of brightness as a share of it; of tiles: from tile to tile."""
+
+
+class Finish(Part):
+    """What light and sound find on a surface."""
+
+    colour: Colour = Field(default_factory=lambda: zeros(3) + 0.5)
+    """Diffuse reflectance."""
+    texture: Texture | None = None
+    glow: NonNegative3 = Field(default_factory=lambda: zeros(3))
+    """Radiance of its own, as a beacon has."""
+    backscatter_strength_db: Number = -27.0
+    """10 log10 of Lambert's parameter mu [dB]: echo strength of 1 m² seen head-on. The default is that of sea floors
+    (Mackenzie 1961); hard and rough walls have -15 to -5."""
+
+
+class Variation(Part):
+    """How far an object's pose is drawn from that of the file, uniformly, by world."""
+
+    position: NonNegative3 = Field(default_factory=lambda: zeros(3))
+    """Largest shift along x, y, z of its frame [m]."""
+    yaw: NonNegative = 0.0
+    """Largest turn about z of its frame [rad]."""
+
+
+class Repeat(Part):
+    """Copies of a shape in a row."""
+
+    count: Count
+    step: Vector3
+    """From each copy to the next, in the frame of the shape's position [m]."""
+
+
+SIZES = {
+    "box": {"size"},
+    "sphere": {"radius"},
+    "capsule": {"radius", "length"},
+    "cylinder": {"radius", "length"},
+    "plane": set(),
+    "mesh": {"file"},
+    "group": set(),
+}
+"""Kind of shape -> keys that it needs."""
+
+
+class Object(Finish):
+    """A shape with its place, or a group that others stand in."""
+
+    shape: Literal["box", "sphere", "capsule", "cylinder", "plane", "mesh", "group"]
+    position: Vector3
+    """Of the shape's middle, in the world or in `frame` [m]."""
+    orientation: Quaternion | None = None
+    """q_world<shape> (or q_frame<shape>), xyzw; at most one of orientation, axis and yaw."""
+    axis: Vector3 | None = None
+    """Where the shape's z axis points: along a cylinder or capsule, out of a plane; any length but 0."""
+    yaw: Number | None = None
+    """Turn about z [rad]."""
+    frame: str | None = None
+    """An object before this one: this one's position is in its axes, and it moves with it."""
+    size: Positive3 | None = None
+    """Of a box, along its axes [m]."""
+    radius: Positive | None = None
+    """[m]"""
+    length: Positive | None = None
+    """Of the cylinder, or of the straight part of a capsule [m]."""
+    file: str | None = None
+    """STL beside the world file, in metres."""
+    scale: Positive | None = None
+    """Factor on the file's coordinates."""
+    vary: Variation | None = None
+    repeat: Repeat | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> Object:
+        dimensions = {"size", "radius", "length", "file", "scale"}
+        given = {key for key in dimensions if getattr(self, key) is not None}
+        needed = SIZES[self.shape]
+        if needed - given:
+            raise refuse_section(f"a {self.shape} needs {', '.join(sorted(needed - given))}: add it")
+        if surplus := given - needed - ({"scale"} if self.shape == "mesh" else set()):
+            raise refuse_section(f"a {self.shape} has no {', '.join(sorted(surplus))}: remove it")
+        if sum(x is not None for x in (self.orientation, self.axis, self.yaw)) > 1:
+            raise refuse_section("more than one of orientation, axis and yaw: give one")
+        if self.axis is not None and not np.any(self.axis):
+            raise refuse_section("axis is [0, 0, 0], expected a direction")
+        if self.shape == "group" and self.repeat is not None:
+            raise refuse_section("a group has no repeat: give it to the shapes in it")
+        return self
+
+    @property
+    def quaternion(self) -> Array:
+        """Shape to its frame, xyzw, (4,); a shape with an axis is turned to it the shortest way."""
+        if self.orientation is not None:
+            return self.orientation
+        if self.axis is None:
+            return quat_from_yaw(self.yaw or 0.0)
+        z = self.axis / np.linalg.norm(self.axis)
+        if z[2] < -1.0 + 1e-12:
+            return np.array([1.0, 0.0, 0.0, 0.0])
+        q = np.array([-z[1], z[0], 0.0, 1.0 + z[2]])
+        return np.asarray(q / np.linalg.norm(q))
+
+    @property
+    def positions(self) -> Array:
+        """Of the shape and its copies, in its frame [m], (count, 3)."""
+        if self.repeat is None:
+            return self.position[None]
+        return self.position + np.arange(self.repeat.count)[:, None] * self.repeat.step
+
+
+class Basin(Finish):
+    """A rectangular tank: floor and four walls that reach above the water, centred on the world's z axis."""
+
+    size: Positive3
+    """Inner length along x, width along y, depth of the water [m]."""
+    freeboard: NonNegative = 0.3
+    """How far the walls reach above the water [m]."""
+
+
+class Roughness(Part):
+    """Heights as a sum of 48 sine waves of random direction and phase, amplitudes in proportion to their lengths."""
+
+    rms: Positive
+    """Root mean square of the height [m]."""
+    wavelength: Positive
+    """The longest; the shortest is an eighth of it [m]."""
+    seed: Annotated[int, Field(strict=True, ge=0)] = 0
+
+
+class Seabed(Finish):
+    """The bottom: a plane, or a heightfield of a slope, roughness and a table of heights, which add up."""
+
+    depth: Positive
+    """Below the surface at x = y = 0, of the plane that the heights are added to [m]."""
+    slope: tuple[Number, Number] = (0.0, 0.0)
+    """dz/dx, dz/dy of that plane."""
+    size: tuple[Positive, Positive] | None = None
+    """Extent along x and y about the origin [m]; without it the bottom is a plane without end."""
+    spacing: Positive = 0.5
+    """Between heights [m]."""
+    roughness: Roughness | None = None
+    heights: str | None = None
+    """CSV beside the world file: heights [m], one row for each y from least to greatest, stretched over `size`."""
+
+    @model_validator(mode="after")
+    def _extent(self) -> Seabed:
+        rough = self.roughness is not None or self.heights is not None
+        if self.size is None and rough:
+            raise refuse_section("roughness and heights need a size: add it, such as size: [40, 40]")
+        if self.size is not None and self.size[0] / self.spacing * self.size[1] / self.spacing > FINEST:
+            raise refuse_section(f"more than {FINEST} heights: give a smaller size or a wider spacing")
+        return self
+
+
+class WorldWater(Part):
+    """Water as light and sound meet it, the same everywhere in a world."""
+
+    attenuation: NonNegative3
+    """Beam attenuation c of red, green, blue [1/m], (3,)."""
+    veil: NonNegative3
+    """Radiance B of water without end just below the surface: backscattered daylight, (3,)."""
+    daylight_attenuation: NonNegative3
+    """K_d: daylight at depth h is exp(-K_d h) of that just below the surface [1/m], at most c, (3,)."""
+    temperature: Annotated[float, Field(strict=True, ge=-2.0, le=40.0)] = 15.0
+    """[°C], for the speed and the absorption of sound."""
+    salinity: Annotated[float, Field(strict=True, ge=0.0, le=42.0)] = 0.0
+    """[g/kg], for the same."""
+    vary: Annotated[float, Field(strict=True, ge=1.0, le=10.0)] = 1.0
+    """Largest factor by which c and K_d of a world are drawn greater or smaller, log-uniformly."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> WorldWater:
+        if np.any(self.daylight_attenuation > self.attenuation):
+            raise refuse_section(
+                "daylight_attenuation exceeds attenuation: diffuse light fades no faster than a beam, give less"
+            )
+        return self
+
+    @property
+    def optical(self) -> Water:
+        """As the overhead camera has it."""
+        return Water(attenuation=_triple(self.attenuation), veil=_triple(self.veil))
+
+    @property
+    def sound_speed(self) -> float:
+        """At the surface [m/s] (Medwin 1975; 0 to 35 °C, 0 to 45 g/kg).
+
+        c = 1449.2 + 4.6 T - 0.055 T² + 0.00029 T³ + (1.34 - 0.010 T)(S - 35)
+        """
+        T, S = self.temperature, self.salinity
+        return 1449.2 + 4.6 * T - 0.055 * T**2 + 0.00029 * T**3 + (1.34 - 0.010 * T) * (S - 35.0)
+
+    def sound_absorption(self, frequency: float, depth: float = 0.0) -> float:
+        """Absorption of sound [dB/m] (Ainslie & McColm 1998, at pH 8).
+
+        alpha = 0.106 f1 f²/(f1² + f²) + 0.52 (1 + T/43) (S/35) f2 f²/(f2² + f²) e^(-z/6)
+                + 0.00049 f² e^(-(T/27 + z/17))
+
+        in dB/km, with f in kHz, z in km, f1 = 0.78 sqrt(S/35) e^(T/26) of boric acid and f2 = 42 e^(T/17) of magnesium
+        sulphate; the last term is that of the water itself.
+
+        Args:
+            frequency: [Hz].
+            depth: [m].
+        """
+        T, S, f, z = self.temperature, self.salinity / 35.0, frequency / 1e3, depth / 1e3
+        boric, sulphate = 0.78 * math.sqrt(S) * math.exp(T / 26.0), 42.0 * math.exp(T / 17.0)
+        per_km = 0.106 * boric * f**2 / (boric**2 + f**2)
+        per_km += 0.52 * (1.0 + T / 43.0) * S * sulphate * f**2 / (sulphate**2 + f**2) * math.exp(-z / 6.0)
+        per_km += 0.00049 * f**2 * math.exp(-(T / 27.0 + z / 17.0))
+        return per_km / 1e3
+
+
+class Light(Part):
+    """Daylight just below the surface."""
+
+    daylight: NonNegative3 = Field(default_factory=lambda: zeros(3) + 1.0)
+    """Irradiance of a level surface, relative to that which gives white paper radiance 1, (3,)."""
+    sun: Vector3 = Field(default_factory=lambda: zeros(3) + np.array([0.3, 0.2, 0.93]))
+    """Direction towards the sun as seen from below the surface, any length but 0, (3,)."""
+    diffuse: Probability = 0.5
+    """Share of the irradiance that comes evenly from above rather than from the sun."""
+    sky: NonNegative3 = Field(default_factory=lambda: zeros(3) + 1.0)
+    """Radiance of the sky, or the ceiling, as seen through the surface from below, (3,)."""
+
+    @model_validator(mode="after")
+    def _from_above(self) -> Light:
+        if self.sun[2] <= 0.0:
+            raise refuse_section(f"sun is {self.sun.tolist()}, expected a direction that points up (z > 0)")
+        return self
+
+
+class Viewpoint(Part):
+    """Where a vehicle looks from: what `finssim worlds show` draws, and where one may start."""
+
+    position: Vector3
+    """[m]"""
+    yaw: Number = 0.0
+    """[rad]"""
+    pitch: Number = 0.0
+    """[rad], nose down is positive."""
+
+    @property
+    def pose(self) -> Array:
+        """Position [m] and attitude xyzw, world frame, (7,)."""
+        return np.concatenate([self.position, quat_from_euler(0.0, self.pitch, self.yaw)])
+
+
+class World(Part):
+    """A site: what light, sound and hulls meet there. `name` and `path` come from the file's own path."""
+
+    about: str
+    """One line for lists."""
+    water: WorldWater
+    light: Light = Field(default_factory=lambda: Light())
+    basin: Basin | None = None
+    seabed: Seabed | None = None
+    objects: dict[str, Object] = Field(default_factory=dict)
+    viewpoint: Viewpoint
+    name: str = Field(exclude=True)
+    path: Path = Field(exclude=True)
+
+    @model_validator(mode="after")
+    def _objects_fit(self) -> World:
+        before: list[str] = []
+        for name, item in self.objects.items():
+            if item.frame is not None and item.frame not in before:
+                raise refuse_section(
+                    f"objects.{name}: frame is '{item.frame}'{did_you_mean(item.frame, before)} expected an object "
+                    f"that stands before it: {', '.join(before) or 'there is none'}"
+                )
+            before.append(name)
+        if (count := sum(len(item.positions) for item in self.objects.values())) > LARGEST:
+            raise refuse_section(f"objects: {count} shapes with their copies, expected at most {LARGEST}")
+        return self
+
+    def beside(self, file: str, key: str) -> Path:
+        """A file that the world names: it lies beside the world file.
+
+        Args:
+            file: Its name, never a path.
+            key: Who names it, for messages.
+        """
+        return self.path.parent / plain_name(file, f"{self.path}: {key}", WorldError)
+
+    def mesh(self, name: str) -> tuple[Array, NDArray[np.int64]]:
+        """Vertices [m], shape axes, (n, 3), and faces (m, 3) of an object from a file."""
+        item = self.objects[name]
+        path = self.beside(item.file or "", f"objects.{name}: file")
+        try:
+            vertices, faces = load_stl(path)
+        except (OSError, MeshError) as error:
+            raise WorldError(f"{self.path}: objects.{name}: cannot read {path.name}: {error}") from None
+        return vertices * (item.scale or 1.0), faces
+
+    def seabed_heights(self) -> Array | None:
+        """z of the seabed on a grid over its size [m], (ny, nx), row 0 at the least y; None for a plane."""
+        bed = self.seabed
+        if bed is None or bed.size is None:
+            return None
+        nx, ny = (max(2, round(extent / bed.spacing) + 1) for extent in bed.size)
+        x, y = np.linspace(-0.5, 0.5, nx) * bed.size[0], np.linspace(-0.5, 0.5, ny)[:, None] * bed.size[1]
+        z = -bed.depth + bed.slope[0] * x + bed.slope[1] * y
+        if bed.roughness is not None:
+            random = np.random.default_rng(bed.roughness.seed)
+            length = bed.roughness.wavelength * np.exp(random.uniform(math.log(0.125), 0.0, 48))
+            heading, phase = random.uniform(0.0, 2.0 * math.pi, (2, 48))
+            amplitude = length * bed.roughness.rms * math.sqrt(2.0) / np.linalg.norm(length)
+            for a, k, h, p in zip(amplitude, 2.0 * math.pi / length, heading, phase, strict=True):
+                z = z + a * np.sin(k * (np.cos(h) * x + np.sin(h) * y) + p)
+        if bed.heights is not None:
+            z = z + _stretched(self._table(bed.heights), z.shape)
+        return z
+
+    def _table(self, file: str) -> Array:
+        path = self.beside(file, "seabed: heights")
+        try:
+            table = np.loadtxt(path, delimiter=",", ndmin=2, max_rows=4096)
+        except (OSError, ValueError) as error:
+            raise WorldError(f"{self.path}: seabed: heights: cannot read {file}: {error}") from None
+        if min(table.shape) < 2 or table.size > FINEST or not np.isfinite(table).all():
+            raise WorldError(
+                f"{self.path}: seabed: heights: {file} has {table.shape[0]} rows of {table.shape[1]}, expected 2 to "
+                f"{FINEST} finite heights"
+            )
+        return table
+
+
+def _stretched(table: Array, shape: tuple[int, ...]) -> Array:
+    """A table interpolated linearly to another number of rows and columns."""
+    columns = np.linspace(0.0, table.shape[1] - 1.0, shape[1])
+    wide = np.stack([np.interp(columns, np.arange(table.shape[1]), row) for row in table])
+    rows = np.linspace(0.0, table.shape[0] - 1.0, shape[0])
+    return np.stack([np.interp(rows, np.arange(table.shape[0]), column) for column in wide.T], axis=1)
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+# Sensors as data.
+
+
+class Mount(Part):
+    """Where a sensor sits on its vehicle."""
+
+    position: Vector3 = Field(default_factory=lambda: zeros(3))
+    """From the body origin, body axes [m]."""
+    pitch: Number = 0.0
+    """Its x axis, along which it looks, turned down from the body's [rad]."""
+    yaw: Number = 0.0
+    """And to the left [rad]."""
+
+    @property
+    def quaternion(self) -> Array:
+        """q_body<sensor>, xyzw, (4,)."""
+        return quat_from_euler(0.0, self.pitch, self.yaw)
+
+
+class Port(Part):
+    """A flat window between a lens in air and the water, square to the view."""
+
+    distance: Positive
+    """From the centre of the lens to the window's inner face [m]."""
+    thickness: Positive
+    """[m]"""
+    index: Annotated[float, Field(strict=True, ge=1.0, le=3.0)] = 1.49
+    """Refractive index; acrylic has 1.49."""
+
+
+class CameraDevice(Part):
+    """A camera on a vehicle. Pixels and coefficients as OpenCV's; a dome port centred on the lens needs nothing."""
+
+    about: str
+    source: str
+    """Where the figures are from."""
+    width: Pixels
+    height: Pixels
+    focal_length: Positive
+    """[px] of the full picture; behind a flat port that of the lens in air."""
+    model: Literal["plumb_bob", "rational", "fisheye"] = "plumb_bob"
+    distortion: tuple[Number, ...] = ()
+    port: Port | None = None
+    exposure: Positive | Literal["auto"] = "auto"
+    """Fraction of the full scale that radiance 1 reaches, or fitted to the last picture."""
+    white_balance: Probability = 0.0
+    """Share of the colour cast that automatic exposure takes out (gray world)."""
+    full_well: Positive = 10_000.0
+    """[electrons]"""
+    read_noise: NonNegative = 5.0
+    """[electrons]"""
+    gamma: Positive = 2.2
+    """Numbers are (charge)^(1/gamma)."""
+    rate: Positive
+    """[Hz]"""
+    mount: Mount = Field(default_factory=lambda: Mount())
+
+    @model_validator(mode="after")
+    def _optics(self) -> CameraDevice:
+        try:
+            self.lens()
+        except OpticsError as error:
+            raise refuse_section(str(error)) from None
+        return self
+
+    def lens(self, width: int | None = None) -> Lens:
+        """The lens, for pictures of another width [px] and the same proportions too."""
+        scale = (width or self.width) / self.width
+        columns, rows, focal = (
+            width or self.width,
+            max(1, round(self.height * scale)),
+            self.focal_length * scale,
+        )
+        middle = 0.5 * (columns - 1), 0.5 * (rows - 1)
+        return Lens(columns, rows, focal, focal, *middle, self.model, self.distortion)
+
+    @property
+    def sensor(self) -> Sensor:
+        """From light to numbers, as the overhead camera has it."""
+        gain = 1.0 if self.exposure == "auto" else self.exposure
+        return Sensor(
+            gain=gain,
+            full_well=self.full_well,
+            read_noise=self.read_noise,
+            gamma=self.gamma,
+            colour=True,
+        )
+
+
+class SonarDevice(Part):
+    """A multibeam imaging sonar: its picture is echo strength by beam and range."""
+
+    about: str
+    source: str
+    """Where the figures are from."""
+    frequency: Positive
+    """[Hz]"""
+    beams: Count
+    """Evenly over the sector."""
+    sector: Annotated[float, Field(strict=True, gt=0.0, le=math.pi)]
+    """Horizontal field of view [rad]."""
+    beam_width: Positive
+    """Of one beam across, between its half-power points on reception [rad]."""
+    vertical_beam_width: Annotated[float, Field(strict=True, gt=0.0, le=math.pi)]
+    """Between half-power points, one way [rad]."""
+    range: Positive
+    """[m]"""
+    minimum_range: NonNegative = 0.0
+    """[m]"""
+    bins: Count
+    """Range cells from 0 to `range`."""
+    elevations: Count = 16
+    """Rays of a beam, over 1.5 vertical beam widths: what is computed, not a figure of the device."""
+    noise_level_db: Number = -110.0
+    """Noise in a range cell before gain, as echo strength at 1 m [dB]."""
+    gain_spreading: NonNegative = 30.0
+    """Time-varying gain [dB per decade of range]; 40 undoes the loss of a small target, 20 that of a wall."""
+    display: tuple[Number, Number] = (-80.0, -20.0)
+    """Echo strengths after gain that are 0 and 255 in the picture [dB]."""
+    rate: Positive
+    """[Hz]"""
+    mount: Mount = Field(default_factory=lambda: Mount())
+
+    @model_validator(mode="after")
+    def _display_rises(self) -> SonarDevice:
+        if not self.display[0] < self.display[1]:
+            raise refuse_section(f"display is {list(self.display)}, expected the lower level first")
+        return self
+
+
+class RangeDevice(Part):
+    """An altimeter, a rangefinder, or the beams of a DVL: the distance along each beam."""
+
+    about: str
+    source: str
+    """Where the figures are from."""
+    beams: Annotated[int, Field(strict=True, ge=1, le=16)] = 1
+    """One along the sensor's x axis, or several evenly around it."""
+    beam_angle: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
+    """Of each beam from the x axis [rad]."""
+    beam_width: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
+    """Between half-power points, one way [rad]; 0 for a single ray."""
+    rays: Count = 37
+    """In a beam: what is computed, not a figure of the device."""
+    quantile: Probability = 0.1
+    """Share of a beam's echo that has come when the range is taken; 0 for the first."""
+    minimum_range: NonNegative
+    """[m]"""
+    range: Positive
+    """[m]"""
+    noise: NonNegative = 0.0
+    """Standard deviation, as a share of the range."""
+    rate: Positive
+    """[Hz]"""
+    mount: Mount = Field(default_factory=lambda: Mount())
+
+
+Device = CameraDevice | SonarDevice | RangeDevice
+KINDS: dict[str, type[CameraDevice] | type[SonarDevice] | type[RangeDevice]] = {
+    "camera": CameraDevice,
+    "sonar": SonarDevice,
+    "range": RangeDevice,
+}
+"""`kind` of a sensor file -> what it holds."""
+assert set(CameraDevice.model_fields["model"].annotation.__args__) == set(LENS_MODELS)  # type: ignore[union-attr]
+
+
+# Files.
+
+
+def sites() -> list[str]:
+    """Names of the worlds that come with FinsSim."""
+    return sorted(path.stem for path in SITES.glob("*.yaml"))
+
+
+def devices() -> list[str]:
+    """Names of the sensors that come with FinsSim."""
+    return sorted(path.stem for path in DEVICES.glob("*.yaml"))
+
+
+def load_world(name_or_path: str | os.PathLike[str]) -> World:
+    """Read and check a world.
+
+    Args:
+        name_or_path: A site of the catalogue such as `pool`, or the path of a YAML file.
+
+    Raises:
+        WorldError: Unknown name, or a file that is refused; the message says where, what and what to do.
+    """
+    path, shown = _locate(name_or_path, SITES, sites(), "site")
+    tree = _read(path, shown, such_as="water: {attenuation: [0.4, 0.1, 0.08]}")
+    world = _checked(World, {**tree, "name": path.stem, "path": path}, shown)
+    for name, item in world.objects.items():
+        if item.file is not None:
+            world.mesh(name)
+    world.seabed_heights()
+    return world
+
+
+def load_device(name_or_path: str | os.PathLike[str]) -> Device:
+    """Read and check a sensor.
+
+    Args:
+        name_or_path: A sensor of the catalogue such as `ping`, or the path of a YAML file.
+
+    Raises:
+        WorldError: Unknown name, or a file that is refused; the message says where, what and what to do.
+    """
+    path, shown = _locate(name_or_path, DEVICES, devices(), "sensor")
+    tree = _read(path, shown, such_as="kind: camera")
+    kind = tree.pop("kind", None)
+    if kind not in KINDS:
+        raise WorldError(f"{shown}: kind is {kind!r}, expected one of {', '.join(KINDS)}")
+    return _checked(KINDS[kind], tree, shown)
+
+
+def _locate(
+    name_or_path: str | os.PathLike[str], catalogue: Path, names: list[str], what: str
+) -> tuple[Path, str]:
+    text = os.fspath(name_or_path)
+    path = Path(text)
+    if path.suffix in (".yaml", ".yml") or path.name != text:
+        if not path.is_file():
+            raise WorldError(
+                f"{text}: no such file: give the path of a {what}'s file, or one of {', '.join(names)}"
+            )
+        return path, text
+    if text not in names:
+        raise WorldError(f"unknown {what} '{text}'{did_you_mean(text, names)} available: {', '.join(names)}")
+    return catalogue / f"{text}.yaml", f"{catalogue.name}/{text}.yaml"
+
+
+def _read(path: Path, shown: str, such_as: str) -> dict[Any, Any]:
+    tree = read_mapping(path, WorldError, such_as=such_as, shown=shown)
+    for key in ("name", "path"):
+        if key in tree:
+            raise WorldError(f"{shown}: unknown key '{key}': the name is that of the file")
+    return tree
+
+
+P = TypeVar("P", bound=Part)
+
+
+def _checked(kind: type[P], tree: dict[Any, Any], shown: str) -> P:
+    try:
+        return kind(**{str(key): value for key, value in tree.items()})
+    except ValidationError as error:
+        kept = [e for e in error.errors() if e["type"] != "default_factory_not_called"]
+        raise WorldError("\n".join(sentence_of(e, shown) for e in kept)) from None

@@ -1,0 +1,810 @@
+"""Ray sensors of many vehicles at once: cameras, imaging sonars, altimeters and the beams of a DVL.
+
+Each takes the poses of N vehicles, and leaves arrays on the device:
+
+    batch = WorldBatch("dock", worlds=256)
+    camera = CameraBatch(batch, load_device("low_light_camera"), width=64)
+    picture = camera.update(poses, seed=step)      # uint8 (256, 48, 64, 3)
+
+Newton's ray caster gives depth, shape and normal of every ray; what light and sound make of them is here. All sensors
+ask it for the same three outputs, so that its kernel is compiled once.
+"""
+# mypy: ignore-errors
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from scipy.special import ndtri
+
+from finssim.sensors.overhead_camera.photometry import fresnel, noise_key, refracted, through_water
+from finssim.worlds.description import CameraDevice, Mount, RangeDevice, SonarDevice, WorldError
+from finssim.worlds.model import Optics, Surface, WorldBatch
+from finssim.worlds.rays import WATER_INDEX, camera_rays, cones, fan, ray_elevations
+
+wp.set_module_options({"enable_backward": False})
+
+MISS = wp.constant(wp.uint32(0xFFFFFFFF))
+LEVELS = 4096
+"""Of the converter behind a camera's pixels (12 bits), before the numbers are encoded to 8."""
+LAMP_STEPS = wp.constant(8)
+AUTO_MEAN = 0.42
+"""Mean of a picture that automatic exposure aims at, as a share of the full scale after gamma."""
+
+
+@wp.kernel(enable_backward=False)
+def _place_views(
+    poses: wp.array(dtype=wp.transform),
+    mount: wp.transform,
+    world_of_view: wp.array(dtype=int),
+    optics: Optics,
+    views: wp.array(dtype=wp.transform),
+    dimming: wp.array(dtype=wp.vec3),
+):
+    """Sensor poses in the world, and daylight at their depths as a share of that at the surface."""
+    v = wp.tid()
+    views[v] = wp.transform_multiply(poses[v], mount)
+    depth = wp.max(-wp.transform_get_translation(views[v])[2], 0.0)
+    K = optics.daylight_attenuation[world_of_view[v]]
+    dimming[v] = wp.vec3(wp.exp(-K[0] * depth), wp.exp(-K[1] * depth), wp.exp(-K[2] * depth))
+
+
+class RayBatch:
+    """A bundle of rays for each of N vehicles: what all these sensors share.
+
+    Args:
+        batch: The worlds. Vehicles are in order of world, as many in each.
+        rays: The bundle, sensor axes, (rows, columns, 2, 3).
+        mount: Where the sensor sits on its vehicle.
+        vehicles: In each world.
+    """
+
+    def __init__(self, batch: WorldBatch, rays: np.ndarray, mount: Mount, vehicles: int = 1) -> None:
+        self.batch, self.device, self.count = batch, batch.device, batch.worlds * vehicles
+        shape = (self.count, *rays.shape[:2])
+        with wp.ScopedDevice(self.device):
+            self.rays = wp.array(np.float32(rays[:, :, None]), dtype=wp.vec3)
+            self.depth, self.normal = wp.zeros(shape, dtype=float), wp.zeros(shape, dtype=wp.vec3)
+            self.shape_index = wp.zeros(shape, dtype=wp.uint32)
+            self.world_of_view = wp.array(np.arange(self.count) // vehicles, dtype=int)
+            self.views = wp.zeros(self.count, dtype=wp.transform)
+            self.dimming = wp.zeros(self.count, dtype=wp.vec3)
+        self._mount = wp.transform(wp.vec3(*mount.position), wp.quat(*map(float, mount.quaternion)))
+
+    def cast(self, poses: wp.array) -> None:
+        """Trace the rays: depth from where each enters the water [m], index of the shape, normal.
+
+        Args:
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+
+        Raises:
+            WorldError: Another number of vehicles.
+        """
+        if len(poses) != self.count:
+            raise WorldError(
+                f"{len(poses)} poses for {self.count} vehicles: give one for each, in order of world"
+            )
+        inputs = [poses, self._mount, self.world_of_view, self.batch.optics, self.views, self.dimming]
+        wp.launch(_place_views, self.count, inputs, device=self.device)
+        self.batch.caster.update(
+            self.batch.state,
+            self.views,
+            self.rays,
+            depth_image=self.depth,
+            normal_image=self.normal,
+            shape_index_image=self.shape_index,
+            world_indices=self.world_of_view,
+            sync_deformables=False,
+        )
+
+
+# Cameras.
+
+
+@wp.struct
+class Lamp:
+    """A vehicle's light: a point with a round, even beam that ends softly."""
+
+    position: wp.vec3  # body axes [m]
+    axis: wp.vec3  # of its beam, body axes, unit
+    intensity: wp.vec3  # irradiance at 1 m on its axis, without water, relative to daylight at the surface
+    cosine: float  # of the beam's half angle
+
+
+@dataclass(frozen=True, kw_only=True)
+class Headlight:
+    """A light on the vehicle."""
+
+    position: tuple[float, float, float]
+    """Body axes [m]."""
+    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    """Of its beam, body axes, unit length."""
+    intensity: float = 0.5
+    """Irradiance at 1 m on its axis, without water, relative to daylight just below the surface [-]."""
+    half_angle: float = 1.0
+    """At which it has faded to half of what it has on its axis [rad]."""
+
+
+@wp.func
+def mottled(local: wp.vec3, grain: wp.array2d(dtype=float)) -> float:
+    """Random brightness at a point, about 0.
+
+    Args:
+        local: Shape axes, in sizes of the pattern.
+        grain: A periodic field, sixteen patches along each side.
+    """
+    # Skewed along z, so that upright faces have a pattern too.
+    u = (local[0] + 0.37 * local[2]) / 16.0
+    v = (local[1] + 0.61 * local[2]) / 16.0
+    n = grain.shape[0]
+    x = float(n) * (u - wp.floor(u))
+    y = float(n) * (v - wp.floor(v))
+    a = wp.min(int(x), n - 1)
+    b = wp.min(int(y), n - 1)
+    c = wp.where(a + 1 == n, 0, a + 1)
+    d = wp.where(b + 1 == n, 0, b + 1)
+    fy = y - float(b)
+    left = grain[a, b] + fy * (grain[a, d] - grain[a, b])
+    right = grain[c, b] + fy * (grain[c, d] - grain[c, b])
+    return left + (x - float(a)) * (right - left)
+
+
+@wp.func
+def patterned(kind: int, local: wp.vec3, colour: wp.vec3, second: wp.vec3, contrast: float) -> wp.vec3:
+    """Reflectance at a point of squares, bands or tiles.
+
+    Args:
+        kind: A value of `TEXTURES`.
+        local: The point, shape axes, in sizes of the pattern.
+        colour: Of the one.
+        second: Of the other, or of joints.
+        contrast: From tile to tile.
+    """
+    # A hair inside the face, so that points on it fall on one side of the pattern.
+    cx = int(wp.floor(local[0] + 1.0e-3))
+    cy = int(wp.floor(local[1] + 1.0e-3))
+    cz = int(wp.floor(local[2] + 1.0e-3))
+    if kind == 1:
+        return wp.where((cx + cy + cz) & 1 == 1, second, colour)
+    if kind == 2:
+        return wp.where(local[2] - float(cz) > 0.5, second, colour)
+    # On a face of an axis-aligned slab one coordinate is constant, perhaps at a joint: that one does not count.
+    dx = wp.abs(local[0] - float(cx) - 0.5)
+    dy = wp.abs(local[1] - float(cy) - 0.5)
+    dz = wp.abs(local[2] - float(cz) - 0.5)
+    if (dx > 0.47 and dx < 0.4995) or (dy > 0.47 and dy < 0.4995) or (dz > 0.47 and dz < 0.4995):
+        return second
+    mixed = (cx * 73856093) ^ (cy * 19349663) ^ (cz * 83492791)
+    mixed = (mixed ^ (mixed >> 13)) * 1274126177
+    return (1.0 - contrast * float((mixed >> 16) & 255) / 255.0) * colour
+
+
+@wp.func
+def below_surface(ray: wp.vec3, veil: wp.vec3, sky: wp.vec3) -> wp.vec3:
+    """Radiance that comes down through the still water surface, or is thrown back by it (Fresnel, Snell's window).
+
+    Args:
+        ray: Unit direction from the eye upwards, world frame [-].
+        veil: Radiance of the water itself.
+        sky: Of what lies above.
+    """
+    out = refracted(ray, wp.vec3(0.0, 0.0, -1.0), WATER_INDEX)
+    if out[2] <= 0.0:
+        return veil
+    share = fresnel(ray[2], out[2], WATER_INDEX, 1.0)
+    return share * veil + (1.0 - share) * sky
+
+
+@wp.func
+def lamp_light(point: wp.vec3, lamp: Lamp, position: wp.vec3, axis: wp.vec3, attenuation: wp.vec3) -> wp.vec4:
+    """Irradiance of a lamp at a point, and in the fourth number the distance.
+
+    E = I f(angle) exp(-c r)/r², with f = 1/(1 + ((1 - cos angle)/(1 - cos half))²)
+
+    Args:
+        point: World frame [m].
+        lamp: Its beam and intensity.
+        position: Of the lamp, world frame [m].
+        axis: Of its beam, world frame, unit [-].
+        attenuation: c [1/m].
+    """
+    way = point - position
+    r = wp.max(wp.length(way), 0.05)
+    off = (1.0 - wp.dot(way, axis) / r) / (1.0 - lamp.cosine)
+    level = 1.0 / ((1.0 + off * off) * r * r)
+    return wp.vec4(
+        lamp.intensity[0] * level * wp.exp(-attenuation[0] * r),
+        lamp.intensity[1] * level * wp.exp(-attenuation[1] * r),
+        lamp.intensity[2] * level * wp.exp(-attenuation[2] * r),
+        r,
+    )
+
+
+@wp.func
+def rgb(light: wp.vec4) -> wp.vec3:
+    """Its first three numbers."""
+    return wp.vec3(light[0], light[1], light[2])
+
+
+@wp.func
+def lamps_seen(
+    origin: wp.vec3, ray: wp.vec3, path: float, normal: wp.vec3, reflectance: wp.vec3, c: wp.vec3, veil: wp.vec3,
+    lamps: wp.array(dtype=Lamp), pose: wp.transform,
+) -> wp.vec3:  # fmt: skip
+    """What the vehicle's lamps add to a ray: rho E e^(-c s) of the surface, and the veil between.
+
+    The veil is the integral of c B E e^(-c s) along the ray, by the midpoint rule over equal shares of its logarithm:
+    the water scatters lamplight back as it does daylight.
+
+    Args:
+        origin: Where the ray enters the water, world frame [m].
+        ray: Unit direction, world frame.
+        path: s, to the surface or the end of the water [m].
+        normal: Of the surface, world frame, unit [-].
+        reflectance: rho; 0 where there is none.
+        c: Beam attenuation [1/m].
+        veil: B.
+        lamps: On the vehicle.
+        pose: Of the vehicle, body to world.
+    """
+    radiance = wp.vec3(0.0)
+    far = wp.min(path, 8.0)
+    near = wp.min(0.15, 0.5 * far)
+    ratio = wp.pow(far / near, 1.0 / float(LAMP_STEPS))
+    for k in range(lamps.shape[0]):
+        lamp = lamps[k]
+        position = wp.transform_point(pose, lamp.position)
+        axis = wp.transform_vector(pose, lamp.axis)
+        if path < 1.0e6:
+            point = origin + path * ray
+            light = lamp_light(point, lamp, position, axis, c)
+            cosine = wp.max(wp.dot(normal, position - point) / light[3], 0.0)
+            radiance += through_water(wp.cw_mul(reflectance, cosine * rgb(light)), c, wp.vec3(0.0), path)
+        here = near
+        for _ in range(LAMP_STEPS):
+            middle = here * wp.sqrt(ratio)
+            light = lamp_light(origin + middle * ray, lamp, position, axis, c)
+            glow = (here * (ratio - 1.0)) * wp.cw_mul(wp.cw_mul(c, veil), rgb(light))
+            radiance += through_water(glow, c, wp.vec3(0.0), middle)
+            here = here * ratio
+    return radiance
+
+
+@wp.kernel(enable_backward=False)
+def _take_picture(
+    rays: wp.array4d(dtype=wp.vec3),
+    depth: wp.array3d(dtype=float),
+    shape_index: wp.array3d(dtype=wp.uint32),
+    normal: wp.array3d(dtype=wp.vec3),
+    views: wp.array(dtype=wp.transform),
+    poses: wp.array(dtype=wp.transform),
+    world_of_view: wp.array(dtype=int),
+    dimming: wp.array(dtype=wp.vec3),
+    optics: Optics,
+    surfaces: wp.array(dtype=Surface),
+    grain: wp.array2d(dtype=float),
+    lamps: wp.array(dtype=Lamp),
+    gain: wp.array(dtype=wp.vec3),
+    full_well: float,
+    read_noise: float,
+    code: wp.array(dtype=wp.uint8),
+    normal_quantiles: wp.array(dtype=float),
+    key: int,
+    span: int,
+    linear: wp.array3d(dtype=wp.vec3),
+    picture: wp.array4d(dtype=wp.uint8),
+):
+    """Radiance of every pixel, and its 8-bit numbers.
+
+    With the eye at depth h and the ray rising by u per metre, daylight at path s is D e^(K u s), D = e^(-K h). The
+    surface's radiance rho E and the veil gathered on the way (the integral of c B D e^(K u s) e^(-c s)) are together
+
+        L = D [ rho E e^(-(c - K u) s) + B c/(c - K u) (1 - e^(-(c - K u) s)) ]
+
+    which is `through_water` with c - K u in place of c. Daylight on a surface, relative to that on a level one, is of
+    the sun, of what lies above, and of the water below (d is the diffuse share, s the sun's direction):
+
+        E = (1 - d) max(n . s, 0)/s_z + d (1 + n_z)/2 + B (1 - n_z)/2
+
+    Then charge with shot and read noise, 12 bits, and the code's 8. A thread takes `span` pixels of a row. `linear` may
+    be empty; without noise, which a negative key means, a number is that of the mean charge.
+    """
+    v, i, block = wp.tid()
+    view = views[v]
+    pose = poses[v]
+    c = optics.attenuation[world_of_view[v]]
+    K = optics.daylight_attenuation[world_of_view[v]]
+    veil = optics.veil
+    daylight = optics.daylight
+    diffuse = optics.diffuse
+    sun = (1.0 - diffuse) / optics.sun[2] * optics.sun
+    dim = dimming[v]
+    gains = full_well * gain[v]
+    noise_floor = read_noise * read_noise
+    digits = float(code.shape[0] - 1) / full_well
+    lit = lamps.shape[0] > 0
+    keep = linear.shape[0] > 0
+    for j in range(block * span, wp.min(block * span + span, depth.shape[2])):
+        ray = wp.transform_vector(view, rays[i, j, 0, 1])
+        origin = wp.transform_point(view, rays[i, j, 0, 0])
+        path = float(1.0e9)
+        if ray[2] > 1.0e-6:
+            path = wp.max(-origin[2], 0.0) / ray[2]
+        index = shape_index[v, i, j]
+        n = normal[v, i, j]
+        reflectance = wp.vec3(0.0)
+        start = wp.vec3(0.0)
+        glow = wp.vec3(0.0)
+        if index != MISS and depth[v, i, j] < path:
+            path = depth[v, i, j]
+            shape = int(index)
+            reflectance = surfaces[shape].colour
+            kind = surfaces[shape].texture
+            if kind > 0:
+                local = (
+                    wp.transform_point(surfaces[shape].inverse, origin + path * ray) / surfaces[shape].size
+                )
+                contrast = surfaces[shape].contrast
+                if kind == 4:
+                    reflectance = (1.0 + contrast * mottled(local, grain)) * reflectance
+                else:
+                    reflectance = patterned(kind, local, reflectance, surfaces[shape].second, contrast)
+            above = 0.5 * (1.0 + n[2])
+            level = wp.max(wp.dot(n, sun), 0.0) + diffuse * above
+            start = wp.cw_mul(reflectance, level * daylight + (1.0 - above) * veil)
+            glow = surfaces[shape].glow
+        elif ray[2] > 1.0e-6:
+            start = below_surface(ray, veil, optics.sky)
+        # Light that falls off with depth takes K u from the exponent; a beacon's own light does not.
+        net = c - ray[2] * K
+        net = wp.vec3(wp.max(net[0], 1.0e-6), wp.max(net[1], 1.0e-6), wp.max(net[2], 1.0e-6))
+        colour = wp.cw_mul(dim, through_water(start, net, wp.cw_mul(veil, wp.cw_div(c, net)), path))
+        if glow[0] + glow[1] + glow[2] > 0.0:
+            colour += through_water(glow, c, wp.vec3(0.0), path)
+        if lit:
+            colour += lamps_seen(origin, ray, path, n, reflectance, c, veil, lamps, pose)
+        if wp.length_sq(ray) < 0.5:
+            colour = wp.vec3(0.0)  # the lens has no ray here
+        if keep:
+            linear[v, i, j] = colour
+        bits = wp.uint32(0)
+        if key >= 0:
+            # Numbers of the normal distribution by their quantiles, 10 bits each, from one hash of the pixel.
+            bits = wp.rand_init(key, (v * depth.shape[1] + i) * depth.shape[2] + j)
+        for k in range(3):
+            charge = wp.max(gains[k] * colour[k], 0.0)
+            if key >= 0:
+                # Shot noise, of variance `charge`, is normal in place of Poisson: alike above 20 electrons.
+                drawn = normal_quantiles[int(bits & wp.uint32(1023))]
+                bits = bits >> wp.uint32(11)
+                charge += drawn * wp.sqrt(charge + noise_floor)
+            picture[v, i, j, k] = code[int(wp.clamp(charge * digits, 0.0, float(code.shape[0] - 1)) + 0.5)]
+
+
+@wp.kernel(enable_backward=False)
+def _meter(
+    picture: wp.array4d(dtype=wp.uint8),
+    target: float,
+    gamma: float,
+    balance: float,
+    gain: wp.array(dtype=wp.vec3),
+):
+    """Automatic exposure and white balance: move gains towards what would have given the last picture the target mean.
+
+    Of the differences between the channels' means, the share `balance` is taken out (gray world).
+    """
+    v = wp.tid()
+    total = wp.vec3(0.0)
+    rows = wp.min(picture.shape[1], 16)
+    columns = wp.min(picture.shape[2], 16)
+    for i in range(rows):
+        for j in range(columns):
+            y = (2 * i + 1) * picture.shape[1] / (2 * rows)
+            x = (2 * j + 1) * picture.shape[2] / (2 * columns)
+            for k in range(3):
+                total[k] = total[k] + float(picture[v, y, x, k])
+    mean = total / (255.0 * float(rows * columns))
+    common = wp.max((mean[0] + mean[1] + mean[2]) / 3.0, 0.01)
+    change = wp.clamp(wp.pow(target / common, gamma), 0.25, 4.0)
+    old = gain[v]
+    # A channel's gain over their mean goes a third of the way to what the share asks for, within a factor of 4.
+    level = (old[0] + old[1] + old[2]) / 3.0
+    new = wp.vec3(0.0)
+    for k in range(3):
+        linear = wp.pow(wp.max(mean[k], 0.01) / common, gamma)
+        unbalanced = linear * level / old[k]
+        aim = wp.pow(wp.max(unbalanced, 1.0e-3), -balance)
+        relative = old[k] / level * wp.pow(aim * level / old[k], 0.34)
+        new[k] = wp.clamp(level * change * wp.clamp(relative, 0.25, 4.0), 0.02, 200.0)
+    gain[v] = new
+
+
+class CameraBatch(RayBatch):
+    """A camera on each of N vehicles.
+
+    Args:
+        batch: The worlds.
+        camera: Lens, port, exposure, mount.
+        width: Of the pictures, in place of the camera's own [px]; their height follows.
+        vehicles: In each world.
+        lamps: Lights on each vehicle.
+        linear: Keep the radiance too.
+    """
+
+    picture: wp.array
+    """Red, green, blue, row 0 at the top; uint8 (N, height, width, 3)."""
+    radiance: wp.array
+    """Before noise and gain, relative to white paper just below the surface; vec3 (N, height, width), or empty."""
+    gain: wp.array
+    """Share of the full scale that radiance 1 reaches in red, green, blue; vec3 (N,)."""
+
+    def __init__(
+        self,
+        batch: WorldBatch,
+        camera: CameraDevice,
+        *,
+        width: int | None = None,
+        vehicles: int = 1,
+        lamps: tuple[Headlight, ...] = (),
+        linear: bool = False,
+    ) -> None:
+        self.camera, self.lens, sensor = camera, camera.lens(width), camera.sensor
+        super().__init__(batch, camera_rays(self.lens, camera.port), camera.mount, vehicles)
+        shape = self.depth.shape
+        # A pixel's neighbours are the next threads on a GPU, and the next of the same thread on a processor.
+        self._span = 1 if self.device.is_cuda else shape[2]
+        code = 255.0 * np.linspace(0.0, 1.0, LEVELS) ** (1.0 / sensor.gamma) + 0.5
+        with wp.ScopedDevice(self.device):
+            self.picture = wp.zeros((*shape, 3), dtype=wp.uint8)
+            self.radiance = wp.zeros(shape if linear else (0, 0, 0), dtype=wp.vec3)
+            self.gain = wp.full(self.count, wp.vec3(sensor.gain), dtype=wp.vec3)
+            self._normal = wp.array(np.float32(ndtri((np.arange(1024) + 0.5) / 1024)), dtype=float)
+            self._code = wp.array(np.uint8(code), dtype=wp.uint8)
+            self._lamps = wp.array([_lamp(lamp) for lamp in lamps], dtype=Lamp)
+        self._sensor = sensor
+
+    def update(self, poses: wp.array, *, seed: int | None = None, time: float = 0.0) -> wp.array:
+        """Take a picture of each world.
+
+        Args:
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            seed: Of the noise; None for none.
+            time: Of the pictures [s]: pictures of other times have other noise.
+
+        Returns:
+            `picture`, which the next update overwrites.
+        """
+        self.cast(poses)
+        sensor, key = self._sensor, -1 if seed is None else noise_key(seed, time)
+        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, poses, self.world_of_view]
+        inputs += [
+            self.dimming,
+            self.batch.optics,
+            self.batch.surfaces,
+            self.batch.grain,
+            self._lamps,
+            self.gain,
+        ]
+        inputs += [sensor.full_well, sensor.read_noise, self._code, self._normal, key, self._span]
+        inputs += [self.radiance, self.picture]
+        views, rows, columns = self.depth.shape
+        wp.launch(_take_picture, (views, rows, -(-columns // self._span)), inputs, device=self.device)
+        if self.camera.exposure == "auto":
+            inputs = [self.picture, AUTO_MEAN, sensor.gamma, self.camera.white_balance, self.gain]
+            wp.launch(_meter, self.count, inputs, device=self.device)
+        return self.picture
+
+
+def _lamp(light: Headlight) -> Lamp:
+    lamp = Lamp()
+    lamp.position, lamp.axis = wp.vec3(*light.position), wp.vec3(*light.axis)
+    lamp.intensity, lamp.cosine = wp.vec3(light.intensity), math.cos(light.half_angle)
+    return lamp
+
+
+# Imaging sonars.
+
+
+@wp.kernel(enable_backward=False)
+def _echo_rays(
+    rays: wp.array4d(dtype=wp.vec3),
+    depth: wp.array3d(dtype=float),
+    shape_index: wp.array3d(dtype=wp.uint32),
+    normal: wp.array3d(dtype=wp.vec3),
+    views: wp.array(dtype=wp.transform),
+    surfaces: wp.array(dtype=Surface),
+    weight: wp.array(dtype=float),
+    absorption: float,
+    steps: wp.vec2,
+    energy: wp.array3d(dtype=float),
+    spread: wp.array3d(dtype=wp.vec2),
+):
+    """Echo of every ray and the ranges it comes from.
+
+    A ray of solid angle dW that strikes a Lambertian surface of parameter mu at range r under cosine k returns
+
+        e = b² dW mu k 10^(-2 alpha r/10)/r²,   from the sonar equation with A = dW r²/k and S_b = mu k²
+
+    relative to the source's level at 1 m. (Lambert's law: 10 log mu + 10 log k²; b² dW is `weight`.) It comes from the
+    ranges of its footprint: half-way to the rays above and below where they strike the same shape, else as far as the
+    normal says; so that no gaps open between rays on a slanting floor.
+    """
+    v, i, j = wp.tid()
+    r = depth[v, i, j]
+    index = shape_index[v, i, j]
+    energy[v, i, j] = 0.0
+    if index != MISS and r > 0.0:
+        d = rays[i, j, 0, 1]
+        n = wp.quat_rotate_inv(wp.transform_get_rotation(views[v]), normal[v, i, j])
+        k = wp.max(wp.abs(wp.dot(n, d)), 1.0e-3)
+        flat = wp.sqrt(wp.max(d[0] * d[0] + d[1] * d[1], 1.0e-9))
+        up = wp.vec3(-d[2] * d[0] / flat, -d[2] * d[1] / flat, flat)
+        aside = wp.vec3(-d[1] / flat, d[0] / flat, 0.0)
+        # Half the footprint along elevation and azimuth, by dr/dangle = r (n · e)/(n · d).
+        half = 0.5 * r * steps[0] * wp.min(wp.abs(wp.dot(n, up)) / k, 20.0)
+        across = 0.5 * r * steps[1] * flat * wp.min(wp.abs(wp.dot(n, aside)) / k, 5.0)
+        low = r
+        high = r
+        count = int(0)
+        for side in range(2):
+            other = i + 2 * side - 1
+            if other >= 0 and other < depth.shape[1]:
+                if shape_index[v, other, j] == index:
+                    way = wp.clamp(0.5 * (depth[v, other, j] - r), -2.0 * half - 1.0e-3, 2.0 * half + 1.0e-3)
+                    low = wp.min(low, r + way)
+                    high = wp.max(high, r + way)
+                    count += 1
+        if count < 2:
+            # At an edge: as far to the other side as the footprint lets it, but no farther than to this one.
+            low = wp.min(low, r - wp.min(half, wp.where(count == 0, half, high - r)))
+            high = wp.max(high, r + wp.min(half, wp.where(count == 0, half, r - low)))
+        spread[v, i, j] = wp.vec2(low - across, high + across)
+        energy[v, i, j] = (
+            weight[i] * surfaces[int(index)].backscatter * k * wp.pow(10.0, -0.2 * absorption * r) / (r * r)
+        )
+
+
+@wp.kernel(enable_backward=False)
+def _gather_echoes(
+    energy: wp.array3d(dtype=float),
+    spread: wp.array3d(dtype=wp.vec2),
+    taps: wp.array(dtype=float),
+    bin_length: float,
+    intensity: wp.array3d(dtype=float),
+):
+    """Echo by beam and range cell: rays of the beam's own and the neighbouring directions, by its pattern."""
+    v, b = wp.tid()
+    bins = intensity.shape[2]
+    reach = taps.shape[0] / 2
+    for k in range(bins):
+        intensity[v, b, k] = 0.0
+    for t in range(taps.shape[0]):
+        j = b + t - reach
+        if j >= 0 and j < energy.shape[2]:
+            for i in range(energy.shape[1]):
+                e = energy[v, i, j] * taps[t]
+                if e > 0.0:
+                    low = spread[v, i, j][0] / bin_length
+                    high = wp.max(spread[v, i, j][1] / bin_length, low + 1.0e-3)
+                    first = wp.max(int(wp.floor(low)), 0)
+                    last = wp.min(int(wp.floor(high)), bins - 1)
+                    for k in range(first, last + 1):
+                        overlap = wp.min(high, float(k + 1)) - wp.max(low, float(k))
+                        if overlap > 0.0:
+                            intensity[v, b, k] = intensity[v, b, k] + e * overlap / (high - low)
+
+
+@wp.kernel(enable_backward=False)
+def _receive(
+    noise: float,
+    gain: wp.array(dtype=float),
+    floor_db: float,
+    span_db: float,
+    key: int,
+    intensity: wp.array3d(dtype=float),
+    picture: wp.array3d(dtype=wp.uint8),
+):
+    """Noise and speckle, gain, and 8 bits of the level.
+
+    Echoes of many scatterers and noise add as complex normal numbers: power is (I + N) times a draw of the exponential
+    distribution, amplitude Rayleigh. Without a seed (key < 0) it is I + N itself.
+    """
+    v, b, k = wp.tid()
+    power = intensity[v, b, k] + noise
+    if key >= 0:
+        state = wp.rand_init(key, (v * intensity.shape[1] + b) * intensity.shape[2] + k)
+        power = -power * wp.log(1.0 - wp.randf(state))
+    power = power * gain[k]
+    intensity[v, b, k] = power
+    level = 4.3429448 * wp.log(wp.max(power, 1.0e-30))
+    picture[v, b, k] = wp.uint8(255.0 * wp.clamp((level - floor_db) / span_db, 0.0, 1.0) + 0.5)
+
+
+class SonarBatch(RayBatch):
+    """An imaging sonar on each of N vehicles.
+
+    Args:
+        batch: The worlds; their water's temperature and salinity give the absorption of sound.
+        sonar: The device.
+        beams: In place of its own, over the same sector.
+        bins: In place of its own, over the same range.
+        vehicles: In each world.
+    """
+
+    intensity: wp.array
+    """Power after gain, relative to the source's level at 1 m; float (N, beams, bins), beam 0 at the left."""
+    picture: wp.array
+    """Its level between the device's `display` levels; uint8 (N, beams, bins)."""
+
+    def __init__(
+        self,
+        batch: WorldBatch,
+        sonar: SonarDevice,
+        *,
+        beams: int | None = None,
+        bins: int | None = None,
+        vehicles: int = 1,
+    ) -> None:
+        rays = fan(sonar, beams)
+        super().__init__(batch, rays, sonar.mount, vehicles)
+        self.sonar, self.bins = sonar, bins or sonar.bins
+        self.absorption = batch.world.water.sound_absorption(sonar.frequency)
+        """[dB/m]"""
+        count = rays.shape[1]
+        elevation, spacing = ray_elevations(sonar), sonar.sector / count
+        self._steps = wp.vec2(float(elevation[1] - elevation[0]) if len(elevation) > 1 else 0.0, spacing)
+        two_way = np.exp(-8.0 * math.log(2.0) * (elevation / sonar.vertical_beam_width) ** 2)
+        solid = max(self._steps[0], 1e-6) * spacing * np.cos(elevation) / math.pi
+        ranges = (np.arange(self.bins) + 0.5) * self.bin_length
+        loss = sonar.gain_spreading * np.log10(ranges) + 2.0 * self.absorption * ranges
+        gain = np.where(ranges >= sonar.minimum_range, 10.0 ** (0.1 * loss), 0.0)
+        with wp.ScopedDevice(self.device):
+            self._weight = wp.array(np.float32(two_way * solid), dtype=float)
+            self._taps = wp.array(np.float32(beam_pattern(sonar.beam_width, spacing, count)), dtype=float)
+            self._gain = wp.array(np.float32(gain), dtype=float)
+            self._energy = wp.zeros(self.depth.shape, dtype=float)
+            self._spread = wp.zeros(self.depth.shape, dtype=wp.vec2)
+            self.intensity = wp.zeros((self.count, count, self.bins), dtype=float)
+            self.picture = wp.zeros(self.intensity.shape, dtype=wp.uint8)
+
+    @property
+    def bin_length(self) -> float:
+        """Length of a range cell [m]."""
+        return self.sonar.range / self.bins
+
+    def update(self, poses: wp.array, *, seed: int | None = None, time: float = 0.0) -> wp.array:
+        """One ping of each vehicle.
+
+        Args:
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            seed: Of speckle and noise; None for the mean power.
+            time: Of the ping [s]: pings of other times have other speckle.
+
+        Returns:
+            `picture`, which the next update overwrites.
+        """
+        self.cast(poses)
+        sonar = self.sonar
+        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, self.batch.surfaces]
+        inputs += [self._weight, self.absorption, self._steps, self._energy, self._spread]
+        wp.launch(_echo_rays, self.depth.shape, inputs, device=self.device)
+        inputs = [self._energy, self._spread, self._taps, self.bin_length, self.intensity]
+        wp.launch(_gather_echoes, self.intensity.shape[:2], inputs, device=self.device)
+        low, high = sonar.display
+        key = -1 if seed is None else noise_key(seed, time)
+        inputs = [10.0 ** (0.1 * sonar.noise_level_db), self._gain, low, high - low, key]
+        inputs += [self.intensity, self.picture]
+        wp.launch(_receive, self.intensity.shape, inputs, device=self.device)
+        return self.picture
+
+
+def beam_pattern(width: float, spacing: float, beams: int) -> np.ndarray:
+    """How a receiving beam weighs the directions of its neighbours: sinc² of an even line array, sum 1, (odd,).
+
+    Args:
+        width: Between half-power points [rad]: sinc²(0.443) = 1/2.
+        spacing: Of the beams [rad].
+        beams: How many; the pattern ends after its first side lobes, at 2.5 widths.
+    """
+    reach = min(int(2.5 * width / spacing), beams - 1)
+    taps = np.sinc(0.8859 * np.arange(-reach, reach + 1) * spacing / width) ** 2
+    return taps / taps.sum()
+
+
+# Altimeters, rangefinders, the beams of a DVL.
+
+
+@wp.kernel(enable_backward=False)
+def _take_ranges(
+    rays: wp.array4d(dtype=wp.vec3),
+    depth: wp.array3d(dtype=float),
+    shape_index: wp.array3d(dtype=wp.uint32),
+    normal: wp.array3d(dtype=wp.vec3),
+    views: wp.array(dtype=wp.transform),
+    surfaces: wp.array(dtype=Surface),
+    weight: wp.array(dtype=float),
+    quantile: float,
+    shortest: float,
+    longest: float,
+    noise: float,
+    key: int,
+    ranges: wp.array2d(dtype=float),
+):
+    """Range of each beam: where the given share of its echo has come; infinite beyond the device's reach."""
+    v, b = wp.tid()
+    rotation = wp.transform_get_rotation(views[v])
+    total = float(0.0)
+    for j in range(depth.shape[2]):
+        total += _ray_echo(depth, shape_index, normal, surfaces, rays, rotation, weight, v, b, j)
+    best = float(wp.inf)
+    for j in range(depth.shape[2]):
+        r = depth[v, b, j]
+        if shape_index[v, b, j] != MISS and r < best:
+            nearer = float(0.0)
+            for i in range(depth.shape[2]):
+                if depth[v, b, i] <= r:
+                    nearer += _ray_echo(depth, shape_index, normal, surfaces, rays, rotation, weight, v, b, i)
+            if nearer >= quantile * total:
+                best = r
+    if key >= 0:
+        state = wp.rand_init(key, v * depth.shape[1] + b)
+        best = best * (1.0 + noise * wp.randn(state))
+    if best < shortest or best > longest:
+        best = float(wp.inf)
+    ranges[v, b] = best
+
+
+@wp.func
+def _ray_echo(
+    depth: wp.array3d(dtype=float), shape_index: wp.array3d(dtype=wp.uint32), normal: wp.array3d(dtype=wp.vec3),
+    surfaces: wp.array(dtype=Surface), rays: wp.array4d(dtype=wp.vec3), rotation: wp.quat,
+    weight: wp.array(dtype=float), v: int, b: int, j: int,
+) -> float:  # fmt: skip
+    """Echo of one ray as `_echo_rays` has it, without absorption; 0 for a miss."""
+    index = shape_index[v, b, j]
+    r = depth[v, b, j]
+    if index == MISS or r <= 0.0:
+        return 0.0
+    ray = wp.quat_rotate(rotation, rays[b, j, 0, 1])
+    return weight[j] * surfaces[int(index)].backscatter * wp.abs(wp.dot(normal[v, b, j], ray)) / (r * r)
+
+
+class RangeBatch(RayBatch):
+    """An altimeter, a rangefinder or a DVL's beams on each of N vehicles.
+
+    Args:
+        batch: The worlds.
+        ranger: The device.
+        vehicles: In each world.
+    """
+
+    ranges: wp.array
+    """Along each beam [m], infinite where nothing is within reach; float (N, beams)."""
+
+    def __init__(self, batch: WorldBatch, ranger: RangeDevice, *, vehicles: int = 1) -> None:
+        rays, weight = cones(ranger)
+        super().__init__(batch, rays, ranger.mount, vehicles)
+        self.ranger = ranger
+        self._weight = wp.array(np.float32(weight), dtype=float, device=self.device)
+        self.ranges = wp.zeros((self.count, ranger.beams), dtype=float, device=self.device)
+
+    def update(self, poses: wp.array, *, seed: int | None = None, time: float = 0.0) -> wp.array:
+        """Measure.
+
+        Args:
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            seed: Of the noise; None for none.
+            time: Of the measurement [s]: others have other noise.
+
+        Returns:
+            `ranges`, which the next update overwrites.
+        """
+        self.cast(poses)
+        ranger, key = self.ranger, -1 if seed is None else noise_key(seed, time)
+        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, self.batch.surfaces]
+        inputs += [self._weight, ranger.quantile, ranger.minimum_range, ranger.range, ranger.noise, key]
+        wp.launch(_take_ranges, self.ranges.shape, [*inputs, self.ranges], device=self.device)
+        return self.ranges
