@@ -119,7 +119,7 @@ def test_a_vehicle_refuses_what_it_cannot_follow():
     """FinsROV goes 0.345 m/s sideways, and its pool ends at y = 1 m."""
 
     def line(y, duration):
-        motion = polyline([(0.0, 0.0, -0.5), (0.0, y, -0.5)], [duration])
+        _, motion = polyline([(0.0, 0.0, -0.5), (0.0, y, -0.5)], [duration])
         return Trajectory(name="line", duration=duration, motion=motion)
 
     check_vehicle(line(0.8, 4.0), FINSROV)

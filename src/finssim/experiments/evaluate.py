@@ -124,53 +124,31 @@ FORMS: Mapping[str, Form] = {
 """Every other task is measured in episodes as in training, by itself."""
 
 
-def by_target(result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """A row for each setpoint or trajectory of a result, in the order in which they were tried first."""
-    form, trials = FORMS[result["task"]], result["per_trial"]
-    names = dict.fromkeys(str(trial[form.kind]) for trial in trials)
-    return {name: form.summarize([x for x in trials if x[form.kind] == name]) for name in names}
-
-
 def tables_of(results: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """The table of one evaluation, a row for each target; or of several plants, a row for each."""
-    first = results[0]
+    """A row for each target and plant, of several plants in T1 for each plant alone; and the paper's."""
+    first, several = results[0], len(results) > 1
     title = f"{first['task']} · {first['controller']['name']} · {first['vehicle']['name']}"
-    if len(results) == 1:
+    if not several:
         plant = first["plant"]
         title += f", {first['hydrodynamics']} · plant {plant['name']}: {plant.get('title', '')}"
     if first["task"] not in FORMS:
         return [_episodes_table(results, title)]
     form = FORMS[first["task"]]
-    if len(results) > 1 and form.kind == "setpoint":
-        return [comparison_table(results, "plant", title)]
     rows: list[list[str] | None] = []
     for result in results:
-        place = f"{result['plant']['name']}, " if results[1:] else ""
-        rows += [[f"{place}{name}", *cells(row, form.columns)] for name, row in by_target(result).items()]
-        rows.append(None)
-    if len(results) > 1:
-        return [_table(form, title, f"plant, {form.kind}", rows, form.caption)]
-    paper = paper_name(first)
-    rows += [["all", *cells(first, form.columns)], None]
-    rows += [
-        [f"paper, {name}".removesuffix(", "), *cells(row, form.columns)]
-        for name, row in form.paper(paper).items()
-    ]
-    note = f"{form.caption} paper: its vehicle in its pool, {paper}, for orientation."
-    return [_table(form, title, form.kind, rows, note)]
-
-
-def comparison_table(results: Sequence[Mapping[str, Any]], by: str, title: str = "") -> Table:
-    """A row for each evaluation of T1, named by its controller or plant, and the paper's rows that answer to them."""
-    papers = dict.fromkeys(paper_name(result) for result in results)
-    rows: list[list[str] | None] = [[result[by]["name"], *cells(result, T1_COLUMNS)] for result in results]
-    rows += [None, *([f"paper, {name}", *cells(paper_row(name), T1_COLUMNS)] for name in papers)]
-    return _table(FORMS["t1"], title, by, rows, f"{CAPTION} paper: its real vehicle in its pool.")
-
-
-def _table(form: Form, title: str, kind: str, rows: Sequence[list[str] | None], note: str) -> Table:
+        prefix, trials = f"{result['plant']['name']}, " if several else "", result["per_trial"]
+        names = () if several and form.kind == "setpoint" else dict.fromkeys(t[form.kind] for t in trials)
+        for name in names:
+            of_target = form.summarize([trial for trial in trials if trial[form.kind] == name])
+            rows.append([f"{prefix}{name}", *cells(of_target, form.columns)])
+        label = f"{prefix}all" if names else result["plant"]["name"]
+        rows += [[label, *cells(result, form.columns)], *([None] if names else [])]
+    for paper in dict.fromkeys(paper_name(result) for result in results):
+        for name, row in form.paper(paper).items():
+            rows.append([f"paper, {name or paper}", *cells(row, form.columns)])
     heads = [heading.replace(" [", "\n[") for heading, *_ in form.columns.values()]  # for 80 columns
-    return Table(title=title, heads=[kind, *heads], rows=rows, note=note)
+    note = f"{form.caption} paper: its real vehicle in its pool."
+    return [Table(title=title, heads=[form.kind, *heads], rows=rows, note=note)]
 
 
 def _episodes_table(results: Sequence[Mapping[str, Any]], title: str) -> Table:
