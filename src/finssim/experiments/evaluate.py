@@ -143,11 +143,12 @@ def tables_of(results: Sequence[Mapping[str, Any]]) -> list[Table]:
             rows.append([f"{prefix}{name}", *cells(of_target, form.columns)])
         label = f"{prefix}all" if names else result["plant"]["name"]
         rows += [[label, *cells(result, form.columns)], *([None] if names else [])]
-    for paper in dict.fromkeys(paper_name(result) for result in results):
+    papers = dict.fromkeys(paper_name(result) for result in results)
+    for paper in papers:
         for name, row in form.paper(paper).items():
             rows.append([f"paper, {name or paper}", *cells(row, form.columns)])
     heads = [heading.replace(" [", "\n[") for heading, *_ in form.columns.values()]  # for 80 columns
-    note = f"{form.caption} paper: its real vehicle in its pool."
+    note = f"{form.caption} paper: its vehicle in its pool, {', '.join(papers)}, for orientation."
     return [Table(title=title, heads=[form.kind, *heads], rows=rows, note=note)]
 
 
