@@ -50,7 +50,11 @@ EXTRAS = {
     ),
     "sb3-contrib": Extra({"sb3-contrib": "sb3_contrib"}, "learn with recurrent PPO of SB3-Contrib"),
     "imitation": Extra({"minari": "minari"}, "collect demonstrations and learn from them"),
-    "sweep": Extra({"ray": "ray"}, "train over seeds and settings on many machines"),
+    "sweep": Extra(
+        {"ray": "ray", "optuna": "optuna"},
+        "train over seeds and settings on many machines, search for settings",
+    ),
+    "wandb": Extra({"wandb": "wandb"}, "send the curves of a training to Weights & Biases"),
     "logs": Extra(
         {
             "matplotlib": "matplotlib",

@@ -1,7 +1,11 @@
 """`finssim sweep`: results of every job, from one machine or from two of which one is lost."""
 
 import contextlib
+import io
 import json
+import math
+import shutil
+import tarfile
 import time
 from pathlib import Path
 
@@ -94,6 +98,51 @@ def test_a_sweep_is_done_once_and_goes_on_where_it_was(tmp_path, sweep_file, cap
     assert now.keys() == kept.keys()
     assert {path for path in kept if now[path] != kept[path]} == {gone / "policy.onnx"}
     assert {row["run"] for row in result["rows"]} <= {row["run"] for row in again["rows"]}
+
+
+def test_a_search_finds_the_least_and_proposes_the_same_again(tmp_path, monkeypatch):
+    """Of a made-up training whose error is how far log10 of the learning rate is from -4, and 1 more with a GRU."""
+    played, packed = [], io.BytesIO()
+    tarfile.open(fileobj=packed, mode="w:gz").close()
+
+    def made_up(job):
+        played.append(job.key)
+        rate, memory = job.options["settings"]["learning_rate"], job.options["settings"]["memory"]
+        error = abs(math.log10(rate) + 4.0) + (1.0 if memory else 0.0)
+        if job.seed == 2 and rate > 5e-4:
+            raise RuntimeError("diverged")
+        return {
+            "training_s": 0.0,
+            "machine": "here",
+            "plants": {"nominal": {"e_p_m": error}},
+        }, packed.getvalue()
+
+    def here(jobs, processes):
+        for job in jobs:
+            try:
+                yield job, made_up(job)
+            except RuntimeError as error:
+                yield job, error
+
+    monkeypatch.setattr(command, "_here", here)
+    file = tmp_path / "sweep.yaml"
+    options = {
+        "settings.learning_rate": {"low": 1e-6, "high": 1e-2, "log": True}, "settings.memory": {"choice": [0, 32]},
+    }  # fmt: skip
+    plan = {"task": "t1", "seeds": 2, "search": {"trials": 24, "minimise": "e_p_m", "options": options}}
+    file.write_text(yaml.safe_dump(plan), encoding="utf-8")
+    result = command.sweep(file, out=tmp_path / "out")
+    best = result["best"]
+    assert len(result["rows"]) == len(played) == 48 and best["value"] < 0.3
+    assert best["options"]["settings.memory"] == 0 and not result["ok"]
+    values = [r["plants"]["nominal"]["e_p_m"] for r in result["rows"] if "plants" in r]
+    assert best["value"] == pytest.approx(min(values))
+    gone = sorted((tmp_path / "out" / "runs").iterdir())[-3]
+    shutil.rmtree(gone)
+    failed = {row["run"] for row in result["rows"] if "error" in row}
+    played.clear()
+    again = command.sweep(file, out=tmp_path / "out")
+    assert again["best"] == best and set(played) == {gone.name} | failed
 
 
 @pytest.fixture

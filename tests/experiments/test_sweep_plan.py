@@ -7,6 +7,7 @@ from finssim.experiments.plants import PlantError
 from finssim.experiments.sweep import SweepError, load_sweep
 
 PLAIN = {"task": "t1", "seeds": 2, "train": {"steps": 1000}}
+SEARCH = {"trials": 3, "minimise": "e_p_m", "options": {"steps": {"low": 10, "high": 99}}}
 
 
 def written(folder, **changes):
@@ -72,6 +73,22 @@ def test_a_plant_that_is_not_there_is_told_before_any_training(tmp_path):
         ({"evaluate": {"trials": 0}}, "evaluate.trials: Input should be greater than or equal to 1"),
         ({"evaluate": {"plants": []}}, "evaluate.plants: Tuple should have at least 1 item"),
         ({"tusk": "t1"}, "tusk: Extra inputs are not permitted"),
+        ({"search": SEARCH | {"maximise": "success"}}, "expected either 'minimise' or 'maximise'"),
+        ({"search": SEARCH, "grid": {"action": ["wrench6"]}}, "leave 'settings' and 'grid' out"),
+        ({"search": SEARCH | {"options": {"stepz": {"choice": [1]}}}}, "'stepz' is no option of a training"),
+        ({"search": SEARCH | {"options": {"a.b": {"choice": [1]}}}}, "one with a dot is settings.NAME"),
+        (
+            {"search": SEARCH | {"options": {"steps": {"low": 1}}}},
+            "expected either 'low' and 'high', or 'choice'",
+        ),
+        (
+            {"search": SEARCH | {"options": {"steps": {"low": 2, "high": 1}}}},
+            "low is 2, expected less than high",
+        ),
+        (
+            {"search": SEARCH | {"options": {"steps": {"low": 0, "high": 1, "log": True}}}},
+            "'log' needs a 'low' above 0",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path, changes, sentence):

@@ -10,7 +10,7 @@ import os
 import socket
 import tempfile
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +18,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from rich.console import Console
 
@@ -85,6 +86,63 @@ class Evaluate(BaseModel):
     trials: int | None = Field(default=None, ge=1)
 
 
+class Span(BaseModel):
+    """What an option of a search may be: a number from `low` to `high`, an integer where both are; or of `choice`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    low: int | float | None = None
+    high: int | float | None = None
+    log: bool = False
+    """Drawn by its logarithm."""
+    choice: tuple[Any, ...] = ()
+
+    @model_validator(mode="after")
+    def _either(self) -> Span:
+        if bool(self.choice) == (self.low is not None and self.high is not None):
+            raise ValueError("expected either 'low' and 'high', or 'choice'")
+        if self.low is not None and self.high is not None and self.log and self.low <= 0:
+            raise ValueError(f"'log' needs a 'low' above 0, and it is {self.low}")
+        if self.low is not None and self.high is not None and not self.low < self.high:
+            raise ValueError(f"low is {self.low}, expected less than high, {self.high}")
+        return self
+
+    def distribution(self) -> Any:
+        """As Optuna has it."""
+        from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+        if self.choice:
+            return CategoricalDistribution(self.choice)
+        whole = isinstance(self.low, int) and isinstance(self.high, int)
+        return (IntDistribution if whole else FloatDistribution)(self.low, self.high, log=self.log)
+
+
+class Search(BaseModel):
+    """Settings that Optuna proposes from how those before them did, by its tree-structured Parzen estimator."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    trials: int = Field(ge=1, le=100_000)
+    """Settings that are tried."""
+    batch: int = Field(default=4, ge=1)
+    """Of these at once, none of which knows of the others."""
+    minimise: str | None = None
+    """Measure of an evaluation, whose mean over seeds and plants is to be small."""
+    maximise: str | None = None
+    """Or large."""
+    options: dict[str, Span] = Field(min_length=1)
+    """Option of a training, or settings.NAME of its learner -> what it may be."""
+
+    @model_validator(mode="after")
+    def _one(self) -> Search:
+        for name in self.options:
+            if "." in name and not name.startswith("settings."):
+                raise ValueError(f"'{name}' is no option: one with a dot is settings.NAME, of the learner")
+        if (self.minimise is None) == (self.maximise is None):
+            raise ValueError("expected either 'minimise' or 'maximise', a measure such as e_p_m")
+        return self
+
+
 class Sweep(BaseModel):
     """A sweep file."""
 
@@ -100,6 +158,8 @@ class Sweep(BaseModel):
     """Name -> options that differ."""
     grid: dict[str, list[Any]] = Field(default_factory=dict)
     """Option -> values; every combination is a setting, on top of each of `settings`."""
+    search: Search | None = None
+    """Instead of settings and grid."""
     evaluate: Evaluate = Evaluate()
 
     @field_validator("seeds", mode="before")
@@ -114,7 +174,10 @@ class Sweep(BaseModel):
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds are {list(self.seeds)}, expected at least one, each once")
         known = [name for name in inspect.signature(train).parameters if name not in SAME_FOR_ALL]
-        for options in (self.train, self.grid, *self.settings.values()):
+        if self.search is not None and (self.settings or self.grid):
+            raise ValueError("a search proposes the settings itself: leave 'settings' and 'grid' out")
+        searched = {name.partition(".")[0]: None for name in self.search.options} if self.search else {}
+        for options in (self.train, self.grid, searched, *self.settings.values()):
             for name in options:
                 if name not in known:
                     raise ValueError(f"'{name}' is no option of a training; available: {', '.join(known)}")
@@ -128,10 +191,18 @@ class Sweep(BaseModel):
             for name, own in (self.settings or {"": {}}).items()
             for combination in combinations
         ]
+        return self.jobs_of(dict(variants))
+
+    def jobs_of(self, variants: Mapping[str, Mapping[str, Any]]) -> list[Job]:
+        """Settings, each with every seed.
+
+        Args:
+            variants: Name -> options of the training.
+        """
         return [
             Job(name, seed, self.task, self.vehicle, options, self.evaluate.plants, self.evaluate.trials)
             for seed in self.seeds
-            for name, options in variants
+            for name, options in variants.items()
         ]
 
 
@@ -166,7 +237,7 @@ def load_sweep(path: str | Path) -> Sweep:
 def _placed(value: Any, folder: Path, key: Any = "") -> Any:
     """What a sweep file holds, with files beside it by their whole paths."""
     if isinstance(value, dict):
-        return {name: _placed(one, folder, name) for name, one in value.items()}
+        return {name: _placed(one, folder, key if key in FILES else name) for name, one in value.items()}
     if isinstance(value, list):
         return [_placed(one, folder, key) for one in value]
     beside = folder / value if isinstance(value, str) and key in FILES else None
@@ -274,27 +345,107 @@ def sweep(
         SweepError: The file says what cannot be, or no cluster answers.
         KeyboardInterrupt: After Ctrl-C; what was finished stays.
     """
-    jobs, runs, began = load_sweep(file).jobs(), out / "runs", time.perf_counter()
-    files = {job.key: runs / job.key / ROW_FILE for job in jobs}
-    rows = {key: kept_result(path) for key, path in files.items() if path.is_file()}
-    missing = [job for job in jobs if job.key not in rows]
+    plan, runs, began = load_sweep(file), out / "runs", time.perf_counter()
+    rows: dict[str, dict[str, Any]] = {}
     screen = Console(stderr=True)
-    played = _here(missing, processes) if address is None else _on_cluster(missing, address)
-    with closing(played):
-        for job, outcome in played if missing else ():
-            rows[job.key] = row = _keep(job, outcome, runs)
-            progress(len(rows) / len(jobs), f"{len(rows)} of {len(jobs)} trainings")
-            if not screen.is_terminal:
-                error = f": {row['error']}" if "error" in row else ""
-                screen.print(f"{len(rows)} of {len(jobs)}: {job.key}{error}", highlight=False)
+    total = len(plan.seeds) * plan.search.trials if plan.search else len(plan.jobs())
+
+    def played(jobs: Sequence[Job]) -> list[dict[str, Any]]:
+        """The rows of jobs, those that are missing after playing them."""
+        for job in jobs:
+            if (path := runs / job.key / ROW_FILE).is_file():
+                rows[job.key] = kept_result(path)
+        missing = [job for job in jobs if job.key not in rows]
+        if missing:
+            outcomes = _here(missing, processes) if address is None else _on_cluster(missing, address)
+            with closing(outcomes):
+                for job, outcome in outcomes:
+                    rows[job.key] = row = _keep(job, outcome, runs)
+                    progress(len(rows) / total, f"{len(rows)} of {total} trainings")
+                    if not screen.is_terminal:
+                        error = f": {row['error']}" if "error" in row else ""
+                        screen.print(f"{len(rows)} of {total}: {job.key}{error}", highlight=False)
+        return [rows[job.key] for job in jobs]
+
+    best = _searched(plan, plan.search, played) if plan.search else None
     result = {
-        "rows": [rows[job.key] for job in jobs],
+        "rows": list(rows.values()) if plan.search else played(plan.jobs()),
+        **({"best": best} if plan.search else {}),
         "ok": all("error" not in row for row in rows.values()),
         "seconds": time.perf_counter() - began,
         "provenance": provenance(),
     }
     write_json(out / RESULT_FILE, result, tables_of(result))
     return result
+
+
+def _searched(
+    plan: Sweep, search: Search, played: Callable[[Sequence[Job]], list[dict[str, Any]]]
+) -> dict[str, Any]:
+    """Play what Optuna proposes, batch by batch; an interrupted search proposes the same again.
+
+    Args:
+        plan: Of which it is.
+        search: What is proposed.
+        played: Rows of jobs.
+
+    Returns:
+        The best setting: `name`, `options`, `measure`, and `value`, its mean; nothing if every training failed.
+
+    Raises:
+        SweepError: No such measure.
+    """
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    direction, measure = ("minimize", search.minimise) if search.minimise else ("maximize", search.maximise)
+    study = optuna.create_study(direction=direction, sampler=optuna.samplers.TPESampler(seed=plan.seeds[0]))
+    space = {name: span.distribution() for name, span in search.options.items()}
+    variants: dict[str, Mapping[str, Any]] = {}
+    for first in range(0, search.trials, search.batch):
+        asked = [study.ask(space) for _ in range(min(search.batch, search.trials - first))]
+        names = [f"try-{trial.number:04d}" for trial in asked]
+        variants |= {name: _with(plan.train, trial.params) for name, trial in zip(names, asked, strict=True)}
+        made = played(plan.jobs_of({name: variants[name] for name in names}))
+        for name, trial in zip(names, asked, strict=True):
+            values = [
+                _value(one, str(measure)) for row in made if row["name"] == name
+                for one in row.get("plants", {}).values()
+            ]  # fmt: skip
+            failed = not values or None in values or any("error" in r for r in made if r["name"] == name)
+            state = optuna.trial.TrialState.FAIL if failed else None
+            study.tell(trial, None if failed else float(np.mean(np.array(values, float))), state=state)
+    done = study.get_trials(states=[optuna.trial.TrialState.COMPLETE])
+    if not done:
+        return {}
+    name = f"try-{study.best_trial.number:04d}"
+    return {"name": name, "options": dict(study.best_params), "measure": measure, "value": study.best_value}
+
+
+def _with(options: Mapping[str, Any], proposed: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a training with what is proposed; settings.NAME goes to its learner."""
+    own = {name: value for name, value in proposed.items() if "." not in name}
+    inner = {name.partition(".")[2]: value for name, value in proposed.items() if "." in name}
+    return {
+        **options,
+        **own,
+        **({"settings": {**dict(options.get("settings", {})), **inner}} if inner else {}),
+    }
+
+
+def _value(result: Mapping[str, Any], measure: str) -> float | None:
+    """A measure of an evaluation; of successes their share.
+
+    Raises:
+        SweepError: It is not measured.
+    """
+    have = {key: one["value"] for key, one in result.get("metrics", {}).items()} or {
+        key: one for key, one in result.items() if isinstance(one, int | float) or one is None
+    }
+    if measure not in have:
+        raise SweepError(f"search: no measure '{measure}'; available: {', '.join(have)}")
+    value = have[measure]
+    return value / result["trials"] if measure == "success" and "metrics" not in result else value
 
 
 def _keep(job: Job, outcome: Any, runs: Path) -> dict[str, Any]:
@@ -328,4 +479,9 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
             texts = cells(one.get("metrics", one), columns)
             rows.append([row["name"], str(row["seed"]), plant, f"{row['training_s']:.0f}", *texts])
     heads = ["run", "seed", "plant", "time [s]", *measures]
-    return [Table(title="Sweep", heads=heads, rows=rows, left=(0, 2))]
+    tables = [Table(title="Sweep", heads=heads, rows=rows, left=(0, 2))]
+    if best := result.get("best"):
+        rows = [[name, str(value)] for name, value in best["options"].items()]
+        title = f"Best: {best['name']}, {best['measure']} {best['value']:.4g}"
+        tables.append(Table(title=title, heads=["option", "value"], rows=rows, left=(0, 1)))
+    return tables

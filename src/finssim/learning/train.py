@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -42,6 +43,7 @@ def train(
     init: str | Path | None = None,
     settings: Annotated[Mapping[str, Any] | Sequence[str], "--set"] = (),
     resume: bool = False,
+    wandb: str | None = None,
     device: str = "cpu",
     console: Console | None = None,
     shown: Annotated[Path | None, "python"] = None,
@@ -83,6 +85,8 @@ def train(
         settings (NAME=VALUE): Change of a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be
             given several times.
         resume: Go on from the last checkpoint of a training that was killed.
+        wandb (PROJECT): Project of Weights & Biases that the curves are sent to, besides TensorBoard; with
+            WANDB_MODE=offline they are written beside the policy for a later 'wandb sync'.
         device (DEVICE): Where to compute: cpu or cuda.
         console: Where progress is shown; standard error if None.
         shown: Name of the directory in messages, where `out` is a temporary one.
@@ -105,6 +109,8 @@ def train(
             raise TrainingError(f"{name} is {number}, expected 1 or more")
     if until is not None and not 0.0 < until <= 1.0:
         raise TrainingError(f"until is {until}, expected a share of successes above 0, at most 1")
+    if wandb is not None:
+        import_module("wandb")  # where it is missing it is missed before anything is made
     kind, the_task = learner_named(learner), task_named(task)
     kind.check(the_task)
     chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
@@ -157,7 +163,7 @@ def train(
             kind(environment, values, seed=seed, device=device), description, side,
             evaluate=HeldEvaluation(worlds_of(HELD_WORLDS, full, held_seed(seed)), device),
             show=view.update, progress=environment.set_progress,
-            identity=_identity(description), until=until,
+            identity=_identity(description), until=until, project=wandb,
         )  # fmt: skip
         if checkpoint is not None:
             loop.resume(checkpoint)

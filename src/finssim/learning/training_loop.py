@@ -144,6 +144,8 @@ class Loop:
     """What must be equal for a training to go on from a checkpoint."""
     until: float | None = None
     """Share of successes among the held episodes: reached in two evaluations in a row, the training is done."""
+    project: str | None = None
+    """Of Weights & Biases, which is sent the curves too; None: nothing is sent."""
     curves: list[dict[str, Any]] = field(default_factory=list)
     best: Best | None = None
     """The network that did best in the held evaluations, the later of equals: what a training leaves behind."""
@@ -159,7 +161,8 @@ class Loop:
         Raises:
             LearningError: A number of the learner stopped being finite.
         """
-        log = _CurveLog(self.side / "tensorboard", self.learner.steps)
+        run = _wandb_run(self.project, self.side, self.identity) if self.project is not None else None
+        log = _CurveLog(self.side / "tensorboard", self.learner.steps, run)
         total = self.learner.settings.steps
         try:
             while self.learner.steps < total and not self.reached:
@@ -312,10 +315,17 @@ def after(description: PolicyDescription, steps: int, complete: bool, best: int)
 
 
 class _CurveLog:
-    """Rows of the curves as TensorBoard reads them, without torch."""
+    """Rows of the curves as TensorBoard reads them, without torch; and for Weights & Biases."""
 
-    def __init__(self, folder: Path, steps: int) -> None:
-        """Go on after so many steps: what a killed or an earlier training logged later, TensorBoard is to forget."""
+    def __init__(self, folder: Path, steps: int, run: Any = None) -> None:
+        """Go on after so many steps: what a killed or an earlier training logged later, TensorBoard is to forget.
+
+        Args:
+            folder: Of TensorBoard.
+            steps: Done so far.
+            run: Of Weights & Biases, which takes the rows too.
+        """
+        self._run = run
         os.makedirs(folder, exist_ok=True)
         self._writer = EventFileWriter(str(folder))
         start = SessionLog(status=SessionLog.START)
@@ -325,10 +335,39 @@ class _CurveLog:
         """Log a row."""
         values = [Summary.Value(tag=_tag(name), simple_value=value) for name, value in row.items()]
         self._writer.add_event(Event(wall_time=time.time(), step=row["steps"], summary=Summary(value=values)))
+        if self._run is not None:
+            self._run.log({_tag(name): value for name, value in row.items()}, step=row["steps"])
 
     def close(self) -> None:
         """Write what is left."""
         self._writer.close()
+        if self._run is not None:
+            self._run.finish()
+
+
+def _wandb_run(project: str, side: Path, identity: Mapping[str, Any]) -> Any:
+    """The run of Weights & Biases for a training; one that is gone on with goes on in the same run.
+
+    Raises:
+        LearningError: It cannot be begun: nobody is logged in, or nothing answers.
+    """
+    import wandb
+
+    side.mkdir(parents=True, exist_ok=True)
+    file = side / "wandb-run.txt"
+    name = side.name.removesuffix("-training")
+    number = file.read_text(encoding="utf-8").strip() if file.is_file() else None
+    try:
+        run = wandb.init(
+            project=project, name=name, id=number, resume="allow", dir=side, config=dict(identity),
+            settings=wandb.Settings(silent=True, console="off"),
+        )  # fmt: skip
+    except wandb.errors.Error as error:
+        raise LearningError(
+            f"Weights & Biases: {' '.join(str(error).split()).rstrip('.')}, or set WANDB_MODE=offline"
+        ) from error
+    file.write_text(f"{run.id}\n", encoding="utf-8")
+    return run
 
 
 def _tag(name: str) -> str:
