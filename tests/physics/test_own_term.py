@@ -280,16 +280,13 @@ def believed(lift):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["regression", "simulation"])
-def test_a_calibration_estimates_its_parameter(trials, method, tmp_path):
+def test_a_calibration_estimates_its_parameter(trials, tmp_path):
     """40 N s²/m² from trials of a vehicle whose file says 0: within the interval, which is narrower than a tenth."""
     from finssim.calibration.output.ranges import write_ranges
     from finssim.calibration.output.vehicle_file import calibrated
-    from finssim.calibration.regression.regress import regress
     from finssim.calibration.simulation.fit import fit_by_simulation
 
-    fit_by = regress if method == "regression" else fit_by_simulation
-    fit = fit_by(trials, believed(0.0), axes=("surge", "heave"), estimate=("wing.lift",))
+    fit = fit_by_simulation(trials, believed(0.0), axes=("surge", "heave"), estimate=("wing.lift",))
     found = fit.estimates["wing.lift"]
     assert found.identifiable and found.unit == "N s²/m²"
     assert found.ci95[0] <= 40.0 <= found.ci95[1] and np.ptp(found.ci95) < 4.0
@@ -316,16 +313,13 @@ def test_a_known_wing_does_not_bias_what_is_fitted(trials):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["regression", "simulation"])
-def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials, method):
+def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials):
     from finssim.calibration.errors import CalibrationError
-    from finssim.calibration.regression.regress import regress
     from finssim.calibration.simulation.fit import fit_by_simulation
 
-    fit_by = regress if method == "regression" else fit_by_simulation
     for vehicle, name in ((load_vehicle("bluerov2"), "wing.lift"), (believed(1.0), "wing.lft")):
         with pytest.raises(CalibrationError, match=f"cannot estimate '{name}'"):
-            fit_by(trials, vehicle, axes=("heave",), estimate=(name,))
+            fit_by_simulation(trials, vehicle, axes=("heave",), estimate=(name,))
 
 
 def test_the_page_shows_the_example():

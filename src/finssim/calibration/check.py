@@ -155,24 +155,24 @@ class AxisReport:
     axis: str
     source: str
     """Of the velocity: measured, derived from ..., or nothing."""
-    fastest: float
+    fastest: float = np.nan
     """95th percentile of the speed [m/s, rad/s]."""
-    noise: float
+    noise: float = np.nan
     """Of one velocity sample [m/s, rad/s]."""
-    decades: float
+    decades: float = 0.0
     """log10 of the fastest over the slowest speed that stands out of the noise."""
-    strongest: float
+    strongest: float = 0.0
     """95th percentile of the wrench [N, N m]."""
-    work: float
+    work: float = 0.0
     """Done by the inputs along this axis [J]; of a passive trial 0."""
-    both_directions: bool
-    driven: float
+    both_directions: bool = False
+    driven: float = 0.0
     """Time of input [s]."""
-    coasts: float
+    coasts: float = 0.0
     """Time of motion without input [s]."""
-    rests: float
+    rests: float = 0.0
     """Time without input and motion [s]."""
-    excited: bool
+    excited: bool = False
     tells: dict[str, Told] = field(default_factory=dict)
     """By parameter."""
 
@@ -182,18 +182,18 @@ class TrialReport:
     """One trial."""
 
     name: str
-    vehicle: str | None
-    role: str | None
-    duration: float
+    vehicle: str | None = None
+    role: str | None = None
+    duration: float = 0.0
     """[s]"""
-    rows: int
-    inputs: str
+    rows: int = 0
+    inputs: str = ""
     """What drove it: rpm, force, tau, pwm, command, passive, or nothing."""
-    streams: tuple[StreamReport, ...]
-    axes: tuple[AxisReport, ...]
-    offsets: dict[str, dict[str, Any]]
+    streams: tuple[StreamReport, ...] = ()
+    axes: tuple[AxisReport, ...] = ()
+    offsets: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Group of columns -> reference, seconds, std and correlation."""
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = ()
     sha256: str = ""
 
     @property
@@ -258,20 +258,26 @@ def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
     console.print()
 
 
+def _table(heads: Sequence[str], left: Sequence[str], title: str | None = None) -> Table:
+    """An empty table of columns, some of them to the left."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
+    for name in heads:
+        table.add_column(name, justify="left" if name in left else "right", overflow="fold")
+    return table
+
+
 def _streams(streams: Sequence[StreamReport]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for name in ("columns", "samples", "rate", "jitter", "gaps", "longest", "missing"):
-        table.add_column(name, justify="left" if name == "columns" else "right", overflow="fold")
+    heads = ("columns", "samples", "rate", "jitter", "gaps", "longest", "missing")
+    table = _table(heads, ("columns",))
     for s in streams:
-        table.add_row(
-            escape(_short(s.columns)),
-            str(s.samples),
+        times = (
             f"{s.rate:.3g} Hz",
             f"{s.jitter:.0%}",
             str(s.gaps),
             f"{s.longest_gap:.2g} s",
             f"{s.missing:.0%}",
         )
+        table.add_row(escape(_short(s.columns)), str(s.samples), *times)
     return table
 
 
@@ -284,36 +290,17 @@ def _short(columns: Sequence[str]) -> str:
 
 
 def _axes(axes: Sequence[AxisReport]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for name in (
-        "axis",
-        "velocity",
-        "up to",
-        "noise",
-        "decades",
-        "input",
-        "both ways",
-        "coast",
-        "rest",
-    ):
-        table.add_column(name, justify="left" if name in ("axis", "velocity") else "right")
+    heads = ("axis", "velocity", "up to", "noise", "decades", "input", "both ways", "coast", "rest")
+    table = _table(heads, ("axis", "velocity"))
     for a in axes:
         if not a.source or a.fastest != a.fastest:
             table.add_row(a.axis, a.source.removeprefix("derived ") or "[dim]unknown[/dim]", *[""] * 7)
             continue
-        style = "" if a.excited else "dim"
-        table.add_row(
-            a.axis,
-            a.source.removeprefix("derived "),
-            f"{a.fastest:.2g}",
-            f"{a.noise:.1g}",
-            f"{a.decades:.1f}",
-            f"{a.strongest:.3g}" if a.strongest > 1e-6 else "-",
-            "yes" if a.both_directions else "no",
-            f"{a.coasts:.1f} s",
-            f"{a.rests:.1f} s",
-            style=style,
-        )
+        force = f"{a.strongest:.3g}" if a.strongest > 1e-6 else "-"
+        speeds = (f"{a.fastest:.2g}", f"{a.noise:.1g}", f"{a.decades:.1f}")
+        rest = (force, "yes" if a.both_directions else "no", f"{a.coasts:.1f} s", f"{a.rests:.1f} s")
+        source = a.source.removeprefix("derived ")
+        table.add_row(a.axis, source, *speeds, *rest, style="" if a.excited else "dim")
     return table
 
 
@@ -341,10 +328,7 @@ def _tells(axes: Sequence[AxisReport], passive: bool) -> Table:
 
 def _print_overview(reports: Sequence[TrialReport], console: Console) -> None:
     """Trials that tell each parameter of each axis, together."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title="trials that tell", title_justify="left")
-    table.add_column("axis")
-    for parameter in PARAMETERS:
-        table.add_column(parameter, justify="right")
+    table = _table(("axis", *PARAMETERS), ("axis",), "trials that tell")
     for axis in AXES:
         counts = [len(told_by(reports, axis, parameter)) for parameter in PARAMETERS]
         table.add_row(axis, *(str(count) if count else "[dim]-[/dim]" for count in counts))
@@ -459,9 +443,7 @@ def _values(trial: Trial, name: str) -> list[Finding]:
     found = []
     if name in ("z", "depth") and (above := float(np.percentile(y if name == "z" else -y, 99.0))) > FLYING:
         found.append(
-            finding("above_surface", height=above, column=name)
-            if name == "z"
-            else finding("depth_above_surface", height=above)
+            finding("above_surface" if name == "z" else "depth_above_surface", height=above, column=name)
         )
     begins = np.flatnonzero(np.concatenate([[True], np.diff(y) != 0.0]))
     lengths = np.diff(np.concatenate([begins, [len(y)]]))
@@ -474,14 +456,11 @@ def _values(trial: Trial, name: str) -> list[Finding]:
     if span > STUCK and lengths[longest] > 10.0 * usual:
         at = begins[longest]
         found.append(finding("stuck", value=y[at], span=span, start=t[at]))
-    for extreme, highest in ((y.max(), True), (y.min(), False)):
+    for extreme, code in ((y.max(), "clipped_above"), (y.min(), "clipped_below")):
         # A signal that passes through its extreme touches it once.
         runs = lengths[y[begins] == extreme]
         if runs.sum() >= max(10.0, 0.02 * len(y)) and runs.max() >= 4.0 * usual:
-            at_limit = {"value": extreme, "samples": runs.sum()}
-            found.append(
-                finding("clipped_above", **at_limit) if highest else finding("clipped_below", **at_limit)
-            )
+            found.append(finding(code, value=extreme, samples=runs.sum()))
     return found
 
 
@@ -521,18 +500,16 @@ def _wrench_beyond(vehicle: Vehicle, inputs: Drive) -> list[Finding]:
             continue
         beyond = float((tau > 1.05 * limit).sum() / (tau > 0.0).sum())
         if beyond > OFTEN:
-            fields = {
-                "column": inputs.names[i],
-                "limit": float(limit),
-                "unit": "N" if i < 3 else "N m",
-                "vehicle": vehicle.name,
-                "share": beyond,
-                "axis": str(axis),
-            }
             found.append(
-                finding("command_beyond", **fields)
-                if inputs.commanded
-                else finding("wrench_beyond", **fields)
+                finding(
+                    "command_beyond" if inputs.commanded else "wrench_beyond",
+                    column=inputs.names[i],
+                    limit=float(limit),
+                    unit="N" if i < 3 else "N m",
+                    vehicle=vehicle.name,
+                    share=beyond,
+                    axis=str(axis),
+                )
             )
     return found
 
@@ -965,20 +942,7 @@ def axis_reports(motion: Motion, inputs: Drive, vehicle: Vehicle) -> list[AxisRe
 def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle) -> AxisReport:
     nu, tau, dt = motion.nu[:, i], motion.tau[:, i], 1.0 / motion.rate
     known = np.isfinite(nu) & np.isfinite(tau)
-    blank = AxisReport(
-        axis=AXES[i],
-        source=motion.nu_source[i],
-        fastest=np.nan,
-        noise=np.nan,
-        decades=0.0,
-        strongest=0.0,
-        work=0.0,
-        both_directions=False,
-        driven=0.0,
-        coasts=0.0,
-        rests=0.0,
-        excited=False,
-    )
+    blank = AxisReport(axis=AXES[i], source=motion.nu_source[i])
     if known.sum() < 10:
         return blank
     speed, wrench = np.abs(nu[known]), np.abs(tau[known])
@@ -1071,36 +1035,25 @@ def check(
         except CalibrationError as error:
             if len(paths) == 1 and place == Path(paths[0]):
                 raise
-            trials.append(_refused(place.name, str(error)))
-    reports = _checked(trials, given)
+            trials.append(TrialReport(name=place.name, findings=(finding("unusable", reason=str(error)),)))
+    reports = check_trials(trials, given)
     common = together(reports)
     if as_json:
-        print(json.dumps(as_object(reports, common), indent=2, ensure_ascii=False))
+        found = [one.as_json() for one in reports], [one.as_json() for one in common]
+        print(json.dumps(dict(zip(("trials", "together"), found, strict=True)), indent=2, ensure_ascii=False))
         return
     from rich.console import Console
 
     print_reports(reports, Console(), common)
 
 
-def check_trials(trials: Sequence[Trial], vehicle: Vehicle | None = None) -> list[TrialReport]:
-    """One report per trial.
+def check_trials(trials: Sequence[Trial | TrialReport], vehicle: Vehicle | None = None) -> list[TrialReport]:
+    """One report per trial; a trial that could not be read has its report already.
 
     Args:
         trials: In the order of the reports.
         vehicle: That made them; without it each trial's header names its own.
     """
-    return _checked(trials, vehicle)
-
-
-def as_object(reports: Sequence[TrialReport], common: Sequence[Finding]) -> dict[str, Any]:
-    """What `--json` prints."""
-    return {
-        "trials": [report.as_json() for report in reports],
-        "together": [one.as_json() for one in common],
-    }
-
-
-def _checked(trials: Sequence[Trial | TrialReport], vehicle: Vehicle | None) -> list[TrialReport]:
     seen: dict[str, str] = {}
     reports = []
     for trial in trials:
@@ -1113,21 +1066,6 @@ def _checked(trials: Sequence[Trial | TrialReport], vehicle: Vehicle | None) -> 
     return reports
 
 
-def _refused(name: str, reason: str) -> TrialReport:
-    return TrialReport(
-        name=name,
-        vehicle=None,
-        role=None,
-        duration=0.0,
-        rows=0,
-        inputs="",
-        streams=(),
-        axes=(),
-        offsets={},
-        findings=(finding("unusable", reason=reason),),
-    )
-
-
 def _one(trial: Trial, given: Vehicle | None) -> TrialReport:
     streams, findings = stream_reports(trial)
     findings += unit_findings(trial)
@@ -1137,10 +1075,7 @@ def _one(trial: Trial, given: Vehicle | None) -> TrialReport:
         role=trial.header.role,
         duration=trial.duration,
         rows=len(trial.t),
-        inputs="",
         streams=tuple(streams),
-        axes=(),
-        offsets={},
         findings=tuple(findings),
         sha256=trial.sha256,
     )

@@ -80,7 +80,7 @@ def fit_hydrodynamics(
         vehicle: Gives the rigid body, the motors and what is not fitted.
         axes: Axes to fit; those that the trials excite if None.
         method: One of `METHODS`.
-        estimate: Further parameters: of the vehicle's terms, and by simulation only `ESTIMATE`.
+        estimate: Further parameters, of `ESTIMATE` and of the vehicle's terms; simulation only.
         damping: `auto`, `linear`, `quadratic` or `both`.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²]; regression only.
         horizon: Longest stretch that is simulated without a restart [s]; simulation only.
@@ -90,32 +90,28 @@ def fit_hydrodynamics(
     Raises:
         CalibrationError: No trial can be used, or an option is not the method's.
     """
-    from finssim.calibration.simulation.fit import ESTIMATE
-
     known = dict(known or {})
-    only_simulation = {
-        "further estimates": any(word in ESTIMATE for word in estimate),
-        "a horizon": horizon is not None,
-    }
+    only_simulation = {"--estimate": bool(estimate), "--horizon": horizon is not None}
     asked = [name for name, given in only_simulation.items() if given]
     if method not in METHODS:
         raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
     if asked and (method == "regression" or known):
         raise CalibrationError(
-            f"{asked[0]}: expected the simulation method: a regression looks at one axis at a time"
+            f"{asked[0]} needs --method simulation: a regression looks at one axis at a time"
         )
     if known and method == "simulation":
         raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")
 
     def regression(body: Vehicle, **given: Any) -> Fit:
         settings = {"known": known} | given
-        return regress(trials, body, axes=axes, damping=damping, estimate=estimate, seed=seed, **settings)
+        return regress(trials, body, axes=axes, damping=damping, seed=seed, **settings)
 
-    def simulation(body: Vehicle) -> Fit:
+    def simulation(body: Vehicle, begin: Fit | None = None) -> Fit:
         from finssim.calibration.simulation.fit import fit_by_simulation
 
+        begin = begin or _or_none(lambda body: regression(body, known={}, file_prior=False), body)
         return fit_by_simulation(
-            trials, body, axes=axes, estimate=estimate, damping=damping, horizon=horizon, seed=seed,
+            trials, body, axes=axes, estimate=estimate, damping=damping, horizon=horizon, begin=begin, seed=seed,
             progress=progress,
         )  # fmt: skip
 
@@ -146,7 +142,7 @@ def _or_none(fit: Callable[[Vehicle], Fit], vehicle: Vehicle) -> Fit | None:
 
 def _better(
     regression: Callable[[Vehicle], Fit],
-    simulation: Callable[[Vehicle], Fit],
+    simulation: Callable[..., Fit],
     body: Vehicle,
     trials: Sequence[Trial],
     before: Mapping[str, float],
@@ -161,7 +157,7 @@ def _better(
         value <= ENOUGH and value <= before.get(axis, math.inf) for axis, value in after.items()
     ):
         return first
-    second = _or_none(simulation, body)
+    second = _or_none(lambda body: simulation(body, first), body)
     if second is None:
         return first
     other = _scores(calibrated(second), trials)

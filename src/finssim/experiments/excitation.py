@@ -586,8 +586,8 @@ def excite(
         folders = [Path(out) / programme.name for programme in played]
     else:
         folders = write_programmes(
-            axes, vehicle=vehicle, out=out, simulate=simulate, rate=rate, noise=noise, seed=seed, room=room,
-            hydrodynamics=hydrodynamics, inputs=inputs, **plan,
+            axes, vehicle=vehicle, out=out, simulate=simulate, noise=noise, seed=seed, room=room,
+            simulation={"rate": rate, "hydrodynamics": hydrodynamics, "inputs": inputs}, **plan,
         )  # fmt: skip
     print_folders(folders, as_json)
     return folders

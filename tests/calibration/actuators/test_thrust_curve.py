@@ -248,7 +248,9 @@ def test_the_fit_at_16_v_predicts_the_other_voltages_with_the_error_it_states():
         figures = fit.quality[f"T200 at {volts} V"]
         assert figures["nrmse_thrust_from_speed"] < 0.017 and figures["r2_thrust_from_speed"] > 0.996
         assert figures["nrmse_speed_from_pulse"] < speed_error
-    assert any("c_plus changes by +0.39 % per volt" in one.values.get("trends", ()) for one in fit.findings)
+    assert [one.values["others"] for one in fit.findings if one.code == "voltage_chosen"] == [
+        ("10", "12", "14", "18", "20")
+    ]
     alone = fit_thruster([AT_16_V], BLUEROV2)
     assert fit.estimates["T200.c_plus"].estimate == pytest.approx(
         alone.estimates["T200.c_plus"].estimate, rel=1e-3

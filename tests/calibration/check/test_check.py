@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.calibration.check import as_object, check, check_trials, print_reports, together
+from finssim.calibration.check import check, check_trials, print_reports, together
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
 from finssim.calibration.trials.trial_files import write_trial
@@ -328,7 +328,7 @@ def test_an_offset_that_several_trials_share_is_told_once(simulated):
 def test_the_report_is_json_and_fits_a_hundred_columns(simulated):
     """Programs get plain finite values; people lines that do not wrap."""
     reports = check_trials(list(simulated.values()), VEHICLE)
-    text = json.dumps(as_object(reports, together(reports)), allow_nan=False)
+    text = json.dumps({"trials": [one.as_json() for one in reports]}, allow_nan=False)
     assert json.loads(text)["trials"][0]["axes"]["surge"]["tells"]["m_eff"]["can"] is True
     page = StringIO()
     print_reports(reports, Console(file=page, width=100), together(reports))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from calibration.moving_body import MovingBody
+from finssim.calibration.importers.assemble import Stream, merge, moved_in_time
 from finssim.calibration.motion.signals import stream_offsets, up_in_body
-from finssim.calibration.trials.conversion import shifted
-from finssim.calibration.trials.trial import Conversion, Header, Trial
+from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("bluerov2")
@@ -21,6 +21,16 @@ NOISE = {
 }
 
 
+def moved(t, channels, offsets):
+    """A trial whose groups of columns are moved in time."""
+    streams = [
+        Stream(source=name, t=t[np.isfinite(x)], channels={name: x[np.isfinite(x)]})
+        for name, x in channels.items()
+    ]
+    table = merge(moved_in_time(streams, offsets))
+    return Trial(name="made", t=table.t, channels=table.channels, header=Header(passive=True))
+
+
 def log(late, noise=0.0, seed=0):
     """A trial in which every group of columns comes late by some seconds."""
     body = MovingBody(seed)
@@ -29,8 +39,7 @@ def log(late, noise=0.0, seed=0):
     for group, size in NOISE.items():
         for name, values in body.columns(T, group).items():
             channels[name] = values + noise * size * rng.normal(size=len(T))
-    t, channels = shifted(T, channels, Conversion(time_offset=late))
-    return Trial(name="made", t=t, channels=channels, header=Header(passive=True))
+    return moved(T, channels, late)
 
 
 LATE = {"attitude": 0.12, "position": 0.31, "depth": -0.08, "acceleration": 0.055}
@@ -54,13 +63,12 @@ def test_shifts_put_in_are_found(seed, noise):
 @pytest.mark.parametrize(
     "late", [LATE, {"velocity": 0.15}, {"velocity": 0.1, "attitude": 0.03, "depth": 0.05}]
 )
-def test_what_is_found_is_what_the_header_takes(late):
-    """Applying the offsets found as `convert.time_offset`, all at once, leaves none."""
+def test_what_is_found_is_what_a_map_takes(late):
+    """Applying the offsets found as `time_offsets`, all at once, leaves none."""
     made = log(late)
     found = stream_offsets(made, VEHICLE)
-    asked = Conversion(time_offset={group: found[group].seconds for group in late})
-    t, channels = shifted(made.t, made.channels, asked)
-    again = stream_offsets(Trial(name="made", t=t, channels=channels, header=made.header), VEHICLE)
+    offsets = {group: found[group].seconds for group in late}
+    again = stream_offsets(moved(made.t, made.channels, offsets), VEHICLE)
     assert all(abs(offset.seconds) < 0.002 for offset in again.values())
 
 

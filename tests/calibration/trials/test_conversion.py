@@ -3,24 +3,26 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.trials.conversion import shifted
-from finssim.calibration.trials.trial import Conversion
-from finssim.calibration.trials.trial_files import load_trial
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.importers.assemble import Stream, merge, moved_in_time
+from finssim.calibration.importers.dispatch import read_trials
 from finssim.geometry.frames import TO_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_multiply, quat_rotate, quat_to_euler
 
-NED = "convert: {body: FRD, world: NED}"
+NED = "frame: {body: FRD, world: NED}"
 
 
-def log(folder, columns, header=NED):
-    """A trial of these columns, values constant over three rows or given as lists."""
+def log(folder, columns, how=NED):
+    """A trial imported from these columns, values constant over three rows or given as lists."""
     n = 3
     filled = {"t": [0.0, 1.0, 2.0]} | {k: np.broadcast_to(v, n).tolist() for k, v in columns.items()}
     folder.mkdir(exist_ok=True)
     lines = [",".join(filled), *(",".join(map(repr, row)) for row in zip(*filled.values(), strict=True))]
     (folder / "data.csv").write_text("\n".join(lines) + "\n")
-    (folder / "trial.yaml").write_text(header)
-    return load_trial(folder)
+    named = "" if "columns" in how else f"columns: [{', '.join(columns)}]\n"
+    (folder / "map.yaml").write_text(f"time: t\n{named}{how}")
+    (trial,) = read_trials([folder / "data.csv"], column_map=folder / "map.yaml")
+    return trial
 
 
 def test_a_dive_with_the_nose_down_in_ned(tmp_path):
@@ -83,7 +85,7 @@ def test_one_attitude_in_four_pairs_of_frames(tmp_path, body, world, form):
     names = ("qx", "qy", "qz", "qw") if form == "quaternion" else ("roll", "pitch", "yaw")
     values = logged.T if form == "quaternion" else quat_to_euler(logged)
     trial = log(
-        tmp_path / "a", dict(zip(names, values, strict=True)), f"convert: {{body: {body}, world: {world}}}"
+        tmp_path / "a", dict(zip(names, values, strict=True)), f"frame: {{body: {body}, world: {world}}}"
     )
     c = [trial.channels[name] for name in names]
     back = np.stack(c, axis=-1) if form == "quaternion" else quat_from_euler(*c)
@@ -93,46 +95,58 @@ def test_one_attitude_in_four_pairs_of_frames(tmp_path, body, world, form):
 
 def test_a_heading_alone_turns_with_the_world_only(tmp_path):
     """The x axis is forward in both body conventions, so a heading knows only the world's."""
-    header = "convert: {{body: {}, world: {}}}"
+    how = "frame: {{body: {}, world: {}}}"
     for body, world, sign in [("FRD", "z_up", 1), ("FLU", "NED", -1), ("FRD", "NED", -1)]:
-        trial = log(tmp_path / (body + world), {"yaw": [0.1, 3.0, 4.0]}, header.format(body, world))
+        trial = log(tmp_path / (body + world), {"yaw": [0.1, 3.0, 4.0]}, how.format(body, world))
         np.testing.assert_allclose(trial.channels["yaw"], sign * np.array([0.1, 3.0, 4.0]))
 
 
 def test_a_forgotten_convention_is_noticed(tmp_path):
     """With body axes named that the attitude does not have, the vehicle lies on its back, and a note says so."""
-    trial = log(tmp_path / "a", {"roll": 0.1, "pitch": 0.0, "yaw": 0.0}, "convert: {body: FRD}")
+    trial = log(tmp_path / "a", {"roll": 0.1, "pitch": 0.0, "yaw": 0.0}, "frame: {body: FRD, world: z_up}")
     assert "upside_down" in {one.code for one in trial.findings}
-    assert not log(tmp_path / "b", {"roll": 0.1, "pitch": 0.0, "yaw": 0.0}).findings
+    upright = log(tmp_path / "b", {"roll": 0.1, "pitch": 0.0, "yaw": 0.0})
+    assert "upside_down" not in {one.code for one in upright.findings}
 
 
 def test_units_names_and_offsets_come_first(tmp_path):
-    """Renaming, then scale, then offset, then frames: degrees in NED with a compass error of 10° to the right."""
-    header = "convert: {rename: {hdg: yaw, T1: force_T1}, scale: {yaw: 0.017453292519943295, force_*: 9.81},"
-    header += " offset: {yaw: 0.17453292519943295}, body: FRD, world: NED}"
-    c = log(tmp_path / "a", {"hdg": 90.0, "T1": 2.0}, header).channels
+    """Scale, offset and unit come before frames: degrees in NED with a compass error of 10° to the right."""
+    how = "columns: {yaw: {column: hdg, offset: 10, unit: deg}, force_T1: {column: T1, unit: kgf}}\n" + NED
+    c = log(tmp_path / "a", {"hdg": 90.0, "T1": 2.0}, how).channels
     assert np.rad2deg(c["yaw"][0]) == pytest.approx(-100.0)
-    assert c["force_T1"][0] == pytest.approx(19.62)
+    assert c["force_T1"][0] == pytest.approx(19.6133)
 
 
-def test_a_time_offset_moves_one_stream(tmp_path):
+def test_a_time_offset_moves_one_stream():
     """A group is moved, one of its columns by its own offset; nothing is interpolated, rows are a union."""
     t = np.arange(4) * 0.1
-    channels = {name: np.arange(4.0) for name in ("u", "roll", "yaw")}
-    moved_t, moved = shifted(t, channels, Conversion(time_offset={"attitude": 0.05, "yaw": -0.1}))
-    np.testing.assert_allclose(moved_t, [-0.1, 0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35])
-    for name, by in (("u", 0.0), ("roll", 0.05), ("yaw", -0.1)):
-        good = np.isfinite(moved[name])
-        np.testing.assert_allclose(moved_t[good], t + by)
-        np.testing.assert_array_equal(moved[name][good], np.arange(4.0))
+    stream = Stream(source="log", t=t, channels={name: np.arange(4.0) for name in ("u", "roll", "yaw")})
+    table = merge(moved_in_time([stream], {"attitude": 0.05, "yaw": -0.1}))
+    np.testing.assert_allclose(table.t, [0.0, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45], atol=1e-9)
+    for name, by in (("u", 0.1), ("roll", 0.15), ("yaw", 0.0)):
+        good = np.isfinite(table.channels[name])
+        np.testing.assert_allclose(table.t[good], t + by, atol=1e-9)
+        np.testing.assert_array_equal(table.channels[name][good], np.arange(4.0))
 
 
 def test_phases_stay_with_the_clock(tmp_path):
     """Moving a stream in time leaves the phases where the clock had them."""
-    folder = tmp_path / "a"
-    folder.mkdir()
-    (folder / "data.csv").write_text("t,u,r,phase\n0,1,1,baseline\n1,2,2,excitation\n2,3,3,coast\n")
-    (folder / "trial.yaml").write_text("convert: {time_offset: {r: 0.5}}")
-    trial = load_trial(folder)
+    (tmp_path / "data.csv").write_text("t,u,r,phase\n0,1,1,baseline\n1,2,2,excitation\n2,3,3,coast\n")
+    (tmp_path / "map.yaml").write_text("time: t\ncolumns: [u, r]\nphase: phase\ntime_offsets: {r: 0.5}")
+    (trial,) = read_trials([tmp_path / "data.csv"], column_map=tmp_path / "map.yaml")
     np.testing.assert_allclose(trial.t, [0.0, 0.5, 1.0, 1.5, 2.0, 2.5])
     assert trial.phase.tolist() == ["baseline"] * 2 + ["excitation"] * 2 + ["coast"] * 2
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("time_offsets: {atitude: 2}", "'atitude' .* did you mean 'attitude'"),
+        ("columns: {u: vx}", "no column 'vx'"),
+        ("columns: {uu: u}", "names 'uu'"),
+    ],
+)
+def test_a_map_of_what_the_log_has_not_is_refused(tmp_path, how, message):
+    """One sentence that says what there is."""
+    with pytest.raises(CalibrationError, match=message):
+        log(tmp_path / "a", {"u": 1.0}, how)

@@ -123,7 +123,7 @@ def test_level_boards_do_not_tell_the_focal_length():
 def test_an_empty_border_is_spoken_of():
     fit = calibrate_camera(views(LENSES["plumb_bob"], 12, np.random.default_rng(0), reach=0.1))
     assert "edges_empty" in {one.code for one in fit.findings}
-    assert fit.reach.anywhere > 2.0 * fit.reach.inside
+    assert fit.error95[1] > 2.0 * fit.error95[0]
 
 
 def test_pictures_of_several_sizes_are_refused_by_name():

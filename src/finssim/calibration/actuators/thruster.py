@@ -392,7 +392,7 @@ def bench(
         shown: How messages call the target.
         voltage: At which the numbers shall hold [V]; where not given, the only one of the tables, else that of the
             vehicle file's ESC, else the middle one.
-        pool_voltages: Fit the speed controller to all voltages together, rather than to this one alone.
+        pool_voltages: Fit all voltages together, rather than this one alone.
 
     Raises:
         CalibrationError: The tables hold no such voltage, or nothing to fit.
@@ -407,16 +407,12 @@ def bench(
     levels = [level for table in tables for level in split_by_voltage(table)]
     chosen = _reference([volts for volts, _ in levels], thruster, shown, voltage)
     at = [table for volts, table in levels if not abs(volts - chosen) > SAME_VOLTAGE]
-    trends = _trends(levels) if measured else ()
     others = sorted({round(volts, 1) for volts, table in levels if not any(table is t for t in at)})
-    pooled = pool_voltages or not trends
-    fitted = [table for _, table in levels] if pooled else at
-    if trends and pooled:
-        findings.append(finding("voltage_trend", shown, trends=trends))
-    elif trends:
-        findings.append(finding("voltage_chosen", shown, trends=trends, voltage=chosen))
-    elif others and measured:
-        findings.append(finding("voltage_pooled", shown))
+    fitted = [table for _, table in levels] if pool_voltages else at
+    if others and not pool_voltages:
+        findings.append(
+            finding("voltage_chosen", shown, voltage=chosen, others=tuple(f"{v:g}" for v in others))
+        )
     sides, dead, fastest = {}, {}, {}
     for name, sign in SIDES:
         side = fit_side([turning(table, sign) for table in fitted]) if measured else None
@@ -429,8 +425,7 @@ def bench(
         fastest[name] = max(speeds, default=(0.0, False, 0.0))
     esc = None
     if any(np.isfinite(table.pulse).any() for table in tables):
-        on = [table for _, table in levels] if pool_voltages else at
-        esc = _esc(on, thruster, tables, shown, chosen, measured, findings)
+        esc = _esc(fitted, thruster, tables, shown, chosen, measured, findings)
     if not sides and esc is None:
         said = "; ".join(sentences(findings)) or f"{shown}: no row turns the shaft"
         raise CalibrationError(f"{said}: nothing could be fitted")
@@ -480,26 +475,6 @@ def _reference(volts: Sequence[float], thruster: Thruster, shown: str, asked: fl
         listed = ", ".join(f"{v:g}" for v in dict.fromkeys(round(v, 2) for v in known))
         raise CalibrationError(f"{shown}: no table at {asked:g} V; there are {listed} V")
     return min(near, key=lambda v: abs(v - asked))
-
-
-def _trends(levels: Sequence[tuple[float, ThrustTable]]) -> tuple[str, ...]:
-    """How c± change with the voltage, where it is beyond chance and by more than 2 % over the tables."""
-    found = []
-    for name, sign in SIDES:
-        pairs = [
-            (volts, fit_side([turning(table, sign)])) for volts, table in levels if not math.isnan(volts)
-        ]
-        points = np.array([(volts, side.c) for volts, side in pairs if side is not None])
-        if len(points) < 3 or np.ptp(points[:, 0]) < 2.0 * SAME_VOLTAGE:
-            continue
-        V = points[:, 0] - np.mean(points[:, 0])
-        slope = float(V @ points[:, 1] / (V @ V))
-        mean = float(np.mean(points[:, 1]))
-        residual = points[:, 1] - mean - slope * V
-        error = math.sqrt(float(residual @ residual) / (len(V) - 2) / float(V @ V))
-        if abs(slope) > t_quantile(len(V) - 2) * error and abs(slope) * np.ptp(V) > 0.02 * mean:
-            found.append(f"c_{name} changes by {100.0 * slope / mean:+.2g} % per volt")
-    return tuple(found)
 
 
 def _together(zones: Sequence[DeadZone]) -> DeadZone:
@@ -786,8 +761,66 @@ CHOSEN_LIMIT = 0.02
 
 
 def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estimate]:
-    """Everything found about a target, named `TARGET.c_plus` and so on."""
-    return [*_curve(target, result), *_limits(target, result, vehicle), *_controller(target, result)]
+    """Everything found about a target, named `TARGET.c_plus` and so on.
+
+    A speed limit moves where the table reached the end of the pulse, or went beyond the limit of the vehicle file. The
+    force limit is the curve at the speed limit, unless the vehicle file chose a lower one.
+    """
+    before, rows = vehicle.thrusters[target.thrusters[0]], list[Estimate]()
+    volts = f"{result.voltage:g} V" if math.isfinite(result.voltage) else ""
+
+    def add(key: str, value: float, half: float, unit: str, sure: bool, note: str = "") -> None:
+        ends = (float(value - half), float(value + half))
+        path = None if key == "reverse_ratio" else _path(target, key)
+        rows.append(_estimate(target, key, value, ends, unit, sure, note, path))
+
+    for name, sign in SIDES:
+        side, zone = result.sides.get(name), result.dead.get(name)
+        if side is None:
+            continue
+        sure = math.isfinite(side.half_width) and side.c > side.half_width
+        note = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N{volts and ', '}{volts}"
+        note += "" if sure else ": too few or too scattered to tell"
+        add(f"c_{name}", side.c, side.half_width, "N s²/rad²", sure, note)
+        if zone is not None:
+            low, high = sorted(sign * TO_RPM * end for end in zone.interval)
+            note = zone.note or f"slowest speed that turns; {side.c * zone.speed**2:.2g} N there"
+            key, value = f"dead_rpm_{name}", sign * TO_RPM * zone.speed + 0.0
+            rows.append(
+                _estimate(target, key, value, (low, high), "rpm", zone.known, note, _path(target, key))
+            )
+    if len(result.sides) == 2:
+        plus, minus = result.sides["plus"], result.sides["minus"]
+        half = minus.c / plus.c * math.hypot(plus.half_width / plus.c, minus.half_width / minus.c)
+        add("reverse_ratio", minus.c / plus.c, half, "-", math.isfinite(half))
+    for name, sign in SIDES:
+        end, side = "max" if sign > 0.0 else "min", result.sides.get(name)
+        c, old_c = side.c if side else getattr(before, f"c_{name}"), getattr(before, f"c_{name}")
+        old_speed, old_force = (
+            sign * getattr(before, f"rpm_{end}") / TO_RPM,
+            sign * getattr(before, f"force_{end}"),
+        )
+        speed, at_end, scatter = result.fastest[name]
+        if speed <= 0.0:
+            continue
+        moves = at_end or speed > old_speed
+        note = "beyond the vehicle file's" if moves else "the table ends here; the vehicle file's stays"
+        note = f"full pulse{volts and ' at '}{volts}" if at_end else note
+        add(f"rpm_{end}", sign * speed * TO_RPM, scatter * TO_RPM, "rpm", moves, note)
+        force = c * (speed if moves else old_speed) ** 2
+        half = force * side.half_width / side.c if side else 0.0
+        if old_force < (1.0 - CHOSEN_LIMIT) * old_c * old_speed**2 and old_force < force:
+            add(f"force_{end}", sign * old_force, 0.0, "N", False, "the vehicle file's own, below the curve")
+        else:
+            add(f"force_{end}", sign * force, half, "N", math.isfinite(half), f"c_{name} at the speed limit")
+    units = {"dead": "µs", "zero": "µs", "emf": "V s/rad", "load": "V s²/rad²"}
+    together = "zero, emf and load of a direction vary together: the speed they give is surer than each"
+    for key, ends in result.esc.intervals.items() if result.esc is not None else ():
+        note = result.esc.unsure.get(key, "" if key.startswith("dead") else together)
+        value, sure = float(getattr(result.esc.esc, key)), key not in result.esc.unsure
+        unit, key = units[key.partition("_")[0]], f"esc.{key}"
+        rows.append(_estimate(target, key, value, ends, unit, sure, note, _path(target, key)))
+    return rows
 
 
 def _path(target: Target, key: str) -> str:
@@ -797,125 +830,20 @@ def _path(target: Target, key: str) -> str:
     return f"thrusters.*.{key}" if target.name == "all" else f"thruster_groups.{target.name}.{key}"
 
 
-def _curve(target: Target, result: Bench) -> list[Estimate]:
-    """c±, their ratio and the dead zone."""
-    estimates = []
-    for name, sign in SIDES:
-        side = result.sides.get(name)
-        if side is None:
-            continue
-        sure = math.isfinite(side.half_width) and side.c > side.half_width
-        rows = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N"
-        if math.isfinite(result.voltage):
-            rows += f", {result.voltage:g} V"
-        note = rows if sure else f"{rows}: too few or too scattered to tell"
-        estimates.append(
-            _estimate(target, f"c_{name}", side.c, side.half_width, "N s²/rad²", sure=sure, note=note)
-        )
-        zone = result.dead.get(name)
-        if zone is not None:
-            ends = sorted(sign * TO_RPM * end for end in zone.interval)
-            estimates.append(
-                Estimate(
-                    name=f"{target.name}.dead_rpm_{name}",
-                    estimate=sign * TO_RPM * zone.speed + 0.0,
-                    ci95=(ends[0], ends[1]),
-                    unit="rpm",
-                    identifiable=zone.known,
-                    note=zone.note or f"slowest speed that turns; {side.c * zone.speed**2:.2g} N there",
-                    path=_path(target, f"dead_rpm_{name}"),
-                )
-            )
-    if len(result.sides) == 2:
-        plus, minus = result.sides["plus"], result.sides["minus"]
-        ratio = minus.c / plus.c
-        half = ratio * math.hypot(plus.half_width / plus.c, minus.half_width / minus.c)
-        estimates.append(
-            _estimate(target, "reverse_ratio", ratio, half, "-", sure=math.isfinite(half), path=False)
-        )
-    return estimates
-
-
-def _limits(target: Target, result: Bench, vehicle: Vehicle) -> list[Estimate]:
-    """Fastest speeds and the thrusts there.
-
-    A speed limit moves where the table reached the end of the pulse, or went beyond the limit of the vehicle file. The
-    force limit is the curve at the speed limit, unless the vehicle file chose a lower one.
-    """
-    estimates = []
-    before = vehicle.thrusters[target.thrusters[0]]
-    for name, sign in SIDES:
-        end = "max" if sign > 0.0 else "min"
-        side = result.sides.get(name)
-        c = side.c if side else getattr(before, f"c_{name}")
-        relative = side.half_width / side.c if side else 0.0
-        old_speed = sign * getattr(before, f"rpm_{end}") / TO_RPM
-        old_force = sign * getattr(before, f"force_{end}")
-        speed, at_end, scatter = result.fastest[name]
-        if speed <= 0.0:
-            continue
-        moves = at_end or speed > old_speed
-        if not at_end:
-            note = "beyond the vehicle file's" if moves else "the table ends here; the vehicle file's stays"
-        else:
-            note = f"full pulse{f' at {result.voltage:g} V' if math.isfinite(result.voltage) else ''}"
-        estimates.append(
-            _estimate(
-                target, f"rpm_{end}", sign * speed * TO_RPM, scatter * TO_RPM, "rpm", sure=moves, note=note
-            )
-        )
-        force = c * (speed if moves else old_speed) ** 2
-        chosen = (
-            old_force < (1.0 - CHOSEN_LIMIT) * getattr(before, f"c_{name}") * old_speed**2
-            and old_force < force
-        )
-        note = "the vehicle file's own, below the curve" if chosen else f"c_{name} at the speed limit"
-        value, half = (old_force, 0.0) if chosen else (force, relative * force)
-        sure = not chosen and math.isfinite(half)
-        estimates.append(_estimate(target, f"force_{end}", sign * value, half, "N", sure=sure, note=note))
-    return estimates
-
-
-def _controller(target: Target, result: Bench) -> list[Estimate]:
-    """The numbers of the pulse's law."""
-    if result.esc is None:
-        return []
-    units = {"dead": "µs", "zero": "µs", "emf": "V s/rad", "load": "V s²/rad²"}
-    together = "zero, emf and load of a direction vary together: the speed they give is surer than each"
-    return [
-        Estimate(
-            name=f"{target.name}.esc.{key}",
-            estimate=float(getattr(result.esc.esc, key)),
-            ci95=interval,
-            unit=units[key.partition("_")[0]],
-            identifiable=key not in result.esc.unsure,
-            note=result.esc.unsure.get(key, "" if key.startswith("dead") else together),
-            path=_path(target, f"esc.{key}"),
-        )
-        for key, interval in result.esc.intervals.items()
-    ]
-
-
 def _estimate(
     target: Target,
     key: str,
     value: float,
-    half: float,
+    ends: tuple[float, float],
     unit: str,
-    *,
     sure: bool,
-    note: str = "",
-    path: bool = True,
+    note: str,
+    path: str | None,
 ) -> Estimate:
     return Estimate(
-        name=f"{target.name}.{key}",
-        estimate=float(value),
-        ci95=(float(value - half), float(value + half)),
-        unit=unit,
-        identifiable=sure,
-        note=note,
-        path=_path(target, key) if path else None,
-    )
+        name=f"{target.name}.{key}", estimate=float(value), ci95=ends, unit=unit, identifiable=sure, note=note,
+        path=path,
+    )  # fmt: skip
 
 
 def fit_thruster(

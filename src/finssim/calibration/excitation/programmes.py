@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,13 +71,17 @@ def within(room: float, force: Array, rate: float, axis: Axis, vehicle: Vehicle)
         axis: surge, sway or heave.
         vehicle: Whose mass and damping count.
     """
+    return _largest(lambda factor: travel(factor * force, rate, axis, vehicle) <= room)
+
+
+def _largest(fits: Callable[[float], bool]) -> float:
+    """Largest factor up to 1 that fits, to 0.1 %; all below one that fits do."""
     low, high = 0.0, 1.0
-    if travel(force, rate, axis, vehicle) <= room:
+    if fits(high):
         return high
-    for _ in range(8):
+    for _ in range(10):
         middle = 0.5 * (low + high)
-        fits = travel(middle * force, rate, axis, vehicle) <= room
-        low, high = (middle, high) if fits else (low, middle)
+        low, high = (middle, high) if fits(middle) else (low, middle)
     return low
 
 
@@ -170,13 +174,7 @@ def _feasible(tau: Array, vehicle: Vehicle) -> float:
         missing = np.abs(allocator.achieved(thrust) - factor * tau) * weights
         return bool(missing.max() < 2e-3)
 
-    low, high = 0.0, 1.0
-    if given(high):
-        return high
-    for _ in range(10):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if given(middle) else (low, middle)
-    return low
+    return _largest(given)
 
 
 KINDS = ("published", "validation", "multisine")
@@ -440,19 +438,10 @@ def excite(
     vehicle: Vehicle | str,
     out: str | Path,
     simulate: bool = False,
-    kind: str = "published",
-    levels: Mapping[str, Sequence[float]] | Sequence[float] | None = None,
-    repeats: int = 1,
-    rate: float = 50.0,
     noise: str = "sensors",
     seed: int = 0,
-    coast: float = 30.0,
-    duration: float = 60.0,
-    band: tuple[float, float] = (0.05, 1.0),
-    room: float | None = None,
-    hydrodynamics: str = "calibrated",
-    columns: Sequence[str] | None = None,
-    inputs: Sequence[Any] = ("rpm", "wrench"),
+    simulation: Mapping[str, Any] | None = None,
+    **plan: Any,
 ) -> list[Path]:
     """Write programmes, each into a folder of its own under `out`; or the trials that they make in the simulator.
 
@@ -461,19 +450,10 @@ def excite(
         vehicle: A `Vehicle`, a catalogue name or a file.
         out: Folder to make.
         simulate: Run them in the simulator and write trials, rather than what to run on a robot.
-        kind: `published`, `validation` or `multisine`; this and the next as for `programmes`.
-        levels: Magnitudes [N, N m].
-        repeats: How often every programme comes.
-        rate: Of a simulated trial's rows [Hz].
         noise: Name of a noise profile, for simulated trials.
         seed: Of a multi-sine's phases, and of a simulation's initial conditions and noise.
-        coast: Longest coast after a dive [s].
-        duration: Of a multi-sine [s].
-        band: Of a multi-sine [Hz].
-        room: Longest way along a linear axis [m].
-        hydrodynamics: Set of the vehicle that is simulated.
-        columns: Measured columns of simulated trials.
-        inputs: Inputs that simulated trials log.
+        simulation: Further arguments of `simulate_programme`: rate, hydrodynamics, columns, inputs.
+        plan: Further arguments of `programmes`: kind, levels, repeats, coast, duration, band, room.
 
     Returns:
         The folders written.
@@ -483,44 +463,24 @@ def excite(
     """
     start_warp()
     chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
-    plan = programmes(
-        axes,
-        chosen,
-        levels=levels,
-        kind=kind,
-        repeats=repeats,
-        seed=seed,
-        coast=coast,
-        duration=duration,
-        band=band,
-        room=room,
-    )
+    played = programmes(axes, chosen, seed=seed, **plan)
     out = Path(out)
-    names = [out / programme.name for programme in plan]
+    names = [out / programme.name for programme in played]
     with atomic_directory(out, replaces="programmes.yaml") as folder:
         if simulate:
             from finssim.calibration.excitation.synthetic import simulate_programme
 
-            for trial in simulate_programme(
-                plan,
-                chosen,
-                noise=noise,
-                seed=seed,
-                rate=rate,
-                columns=columns,
-                inputs=inputs,
-                hydrodynamics=hydrodynamics,
-            ):
+            for trial in simulate_programme(played, chosen, noise=noise, seed=seed, **(simulation or {})):
                 write_trial(trial, folder / trial.name)
         else:
-            for programme in plan:
+            for programme in played:
                 write_programme(programme, chosen, folder / programme.name)
         about = {
             "vehicle": {"name": chosen.name, "sha256": chosen.sha256},
-            "kind": kind,
+            "kind": plan.get("kind", "published"),
             "simulated": simulate,
             "seed": seed,
-            "programmes": [programme.name for programme in plan],
+            "programmes": [programme.name for programme in played],
         }
         if simulate:
             about["noise"] = noise

@@ -24,6 +24,7 @@ from finssim.calibration.trials.conversion import (
     merged,
     ordered,
     tidy_quaternions,
+    upside_down,
 )
 from finssim.calibration.trials.trial import (
     COLUMNS,
@@ -31,7 +32,6 @@ from finssim.calibration.trials.trial import (
     NU,
     PHASES,
     Array,
-    Conversion,
     Header,
     Trial,
     column_of,
@@ -203,7 +203,9 @@ class SourceMap(Part):
         return columns
 
 
-HEADER_KEYS = tuple(name for name in Header.model_fields if name != "convert")
+HEADER_KEYS = tuple(Header.model_fields)
+
+GROUPS = tuple(dict.fromkeys(column.group for column in COLUMNS.values()))
 
 
 class ArduSubMap(Part):
@@ -273,6 +275,8 @@ class ColumnMap(Part):
     topics: dict[str, SourceMap] = Field(default_factory=dict)
     ardusub: ArduSubMap = Field(default_factory=ArduSubMap)
     split: SplitRule | None = None
+    time_offsets: dict[str, float] = Field(default_factory=dict)
+    """Column, or group (command velocity rates acceleration attitude position depth) -> seconds added to its times."""
     surface_pressure: float | None = Field(default=None, ge=0.0)
     """Of the surface as the sensor reads it, for `pressure` columns [Pa]; 0 for a gauge."""
     header: dict[str, Any] = Field(default_factory=dict)
@@ -379,13 +383,9 @@ def split_table(name: str, table: Table, rule: SplitRule | None) -> dict[str, Ta
     """
     if rule is None:
         return {name: table}
-    pieces = {
-        "phase": _by_phase,
-        "gaps": _by_gaps,
-        "arming": _by_arming,
-        "column": _by_column,
-        "windows": _by_windows,
-    }[rule.by](name, table, rule)
+    pieces = (
+        _windows(name, table, rule) if rule.by == "windows" else _numbered(name, _labels(name, table, rule))
+    )
     long_enough = {
         piece: rows
         for piece, rows in pieces.items()
@@ -410,49 +410,39 @@ def _part(table: Table, rows: Rows) -> Table:
     )
 
 
-def _words(name: str, table: Table, which: str, what: str) -> NDArray[np.str_]:
-    if which not in table.words:
-        raise CalibrationError(f"{name}: cannot be split by {which}: {what}")
-    return table.words[which]
+WORDED = {
+    "phase": ("phase", "no source of the map names a phase column"),
+    "arming": ("arming", "the log says nothing about arming"),
+    "column": ("split", "no source of the map names a split column"),
+}
+"""Rule -> the words that it goes by, and what is said where there are none."""
 
 
-def _runs(labels: NDArray[np.str_]) -> list[tuple[str, Rows]]:
-    """Stretches of equal labels in their order."""
-    number = np.concatenate([[0], np.cumsum(labels[1:] != labels[:-1])])
-    return [(str(labels[number == i][0]), number == i) for i in range(int(number[-1]) + 1)]
+def _labels(name: str, table: Table, rule: SplitRule) -> NDArray[np.int64]:
+    """Number of the piece that each row belongs to, -1 for none, (n,).
+
+    A trial of `phase` begins with each baseline; without baselines, with each excitation after something else.
+    """
+    if rule.by == "gaps":
+        return np.cumsum(np.diff(table.t, prepend=table.t[0]) > rule.longest_gap)
+    column, missing = WORDED[rule.by]
+    if column not in table.words:
+        raise CalibrationError(f"{name}: cannot be split by {column}: {missing}")
+    words = table.words[column]
+    changes = np.concatenate([[True], words[1:] != words[:-1]])
+    if rule.by == "phase":
+        opening = "baseline" if (words == "baseline").any() else "excitation"
+        return np.cumsum(changes & (words == opening)) - 1
+    inside = words == "armed" if rule.by == "arming" else ~np.isin(words, ("", "nan", "None"))
+    return np.where(inside, np.cumsum(changes & inside) - 1, -1)
 
 
-def _numbered(name: str, pieces: list[Rows]) -> dict[str, Rows]:
-    digits = len(str(len(pieces)))
-    return {f"{name}_{i + 1:0{digits}d}": rows for i, rows in enumerate(pieces)}
+def _numbered(name: str, labels: NDArray[np.int64]) -> dict[str, Rows]:
+    count = int(labels.max(initial=-1)) + 1
+    return {f"{name}_{i + 1:0{len(str(count))}d}": labels == i for i in range(count)}
 
 
-def _by_phase(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
-    """A trial begins with each baseline; without baselines, with each excitation after something else."""
-    phase = _words(name, table, "phase", "no source of the map names a phase column")
-    opening = "baseline" if (phase == "baseline").any() else "excitation"
-    begins = (phase == opening) & np.concatenate([[True], phase[:-1] != opening])
-    number = np.cumsum(begins)
-    return _numbered(name, [number == i for i in range(1, int(number[-1]) + 1)] if begins.any() else [])
-
-
-def _by_gaps(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
-    number = np.concatenate([[0], np.cumsum(np.diff(table.t) > rule.longest_gap)])
-    return _numbered(name, [number == i for i in range(int(number[-1]) + 1)])
-
-
-def _by_arming(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
-    arming = _words(name, table, "arming", "the log says nothing about arming")
-    return _numbered(name, [rows for word, rows in _runs(arming) if word == "armed"])
-
-
-def _by_column(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
-    labels = _words(name, table, "split", "no source of the map names a split column")
-    runs = [(word, rows) for word, rows in _runs(labels) if word not in ("", "nan", "None")]
-    return _numbered(name, [rows for _, rows in runs])
-
-
-def _by_windows(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+def _windows(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
     pieces = {window: (table.t >= low) & (table.t <= high) for window, (low, high) in rule.windows.items()}
     empty = [window for window, rows in pieces.items() if not rows.any()]
     if empty:
@@ -545,6 +535,36 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
     return stream.noting(*(one.about(stream.source) for one in (*untimed, *repaired)))
 
 
+def moved_in_time(streams: Sequence[Stream], offsets: Mapping[str, float]) -> list[Stream]:
+    """The streams with columns, or groups of them, moved in time; their words stay.
+
+    Args:
+        streams: Of a trial.
+        offsets: Column or group -> what is added to its times [s].
+
+    Raises:
+        CalibrationError: A key that is neither a group nor a column of these streams.
+    """
+    known = [*GROUPS, *(name for stream in streams for name in stream.channels)]
+    for key in offsets:
+        if key not in known:
+            raise CalibrationError(
+                f"time_offsets: '{key}' is neither a group nor a column of this log{did_you_mean(key, known)} "
+                f"groups are {', '.join(GROUPS)}"
+            )
+    out = []
+    for stream in streams:
+        groups = {name: column.group if (column := column_of(name)) else "" for name in stream.channels}
+        by = {name: offsets.get(name, offsets.get(group, 0.0)) for name, group in groups.items()}
+        for seconds in dict.fromkeys(
+            [*([] if stream.channels and not stream.words else [0.0]), *by.values()]
+        ):
+            part = {name: values for name, values in stream.channels.items() if by[name] == seconds}
+            words = stream.words if seconds == 0.0 else {}
+            out.append(replace(stream, t=stream.t + seconds, channels=part, words=words))
+    return out
+
+
 def merge(streams: Sequence[Stream]) -> Table:
     """All streams on the union of their times, which start at 0.
 
@@ -602,7 +622,7 @@ LONGEST_BRIDGE = 0.5
 
 def in_our_axes(stream: Stream, frame: Frame) -> Stream:
     """The stream in x forward, y left, z up and a world with z up."""
-    channels = in_our_frames(stream.channels, Conversion(body=frame.body, world=frame.world))
+    channels = in_our_frames(stream.channels, frame.body, frame.world)
     if frame.world == "NED":
         for name, sign in zip(WORLD_VELOCITY, FROM_FOSSEN.A.diagonal(), strict=True):
             if name in channels:
@@ -629,6 +649,8 @@ def trial_of(name: str, table: Table, header: Header, column_map: ColumnMap) -> 
         channels = {c: v for c, v in channels.items() if c not in STICKS} | pulses
         findings += mixed
     findings += tidy_quaternions(channels)
+    if upside_down(channels):
+        findings.append(finding("upside_down"))
     for column in [c for c, v in channels.items() if not np.isfinite(v).any()]:
         findings.append(finding("column_empty", column=column))
         del channels[column]

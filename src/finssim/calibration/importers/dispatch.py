@@ -6,26 +6,25 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.importers.assemble import (
     ColumnMap,
     ColumnSource,
-    PhaseColumn,
     SourceMap,
     SplitRule,
     Stream,
     TimeColumn,
     in_our_axes,
     merge,
+    moved_in_time,
     read_map,
     split_rule,
     split_table,
@@ -33,7 +32,7 @@ from finssim.calibration.importers.assemble import (
 )
 from finssim.calibration.trials.conversion import TIME_UNITS, factor
 from finssim.calibration.trials.trial import Array, Trial, column_of
-from finssim.calibration.trials.trial_files import Table, read_table
+from finssim.calibration.trials.trial_files import Table, read_table, write_trial
 from finssim.files import plain_name
 from finssim.mcap_metadata import mcap_metadata
 from finssim.mcap_repair import MAGIC, whole_mcap
@@ -68,29 +67,47 @@ def read_stream(path: Path, source: SourceMap | None) -> Stream:
         raise CalibrationError(
             f"{shown}: no columns: give 'columns: {{u: NAME, ...}}' of its columns {_column_list(table)}"
         )
-    t = _time(table, source.time, shown) + source.time_offset
+    t = _time(table, source.time, shown)
+    numbers = {
+        name: _numbers(table, spec.column, shown)
+        for name, spec in source.columns.items()
+        if spec.column is not None
+    }
+    words = {name: _text(table, column, shown) for name, column in worded(source).items()}
+    return _stream(shown, source.columns, source, t, numbers, words).noting(*findings)
+
+
+def worded(source: SourceMap) -> dict[str, str]:
+    """`phase` and `split` -> the column or field that holds their words, where the map names one."""
+    phase = {"phase": source.phase.column} if source.phase is not None else {}
+    return phase | ({"split": source.split} if source.split is not None else {})
+
+
+def _stream(
+    name: str,
+    columns: Mapping[str, ColumnSource],
+    source: SourceMap,
+    times: Array | list[float],
+    numbers: Mapping[str, Array | list[float]],
+    words: Mapping[str, list[str]],
+) -> Stream:
+    """A stream of raw numbers and words, by canonical column, at times of the log's clock [s]."""
+    t = np.asarray(times) + source.time_offset
     channels = {}
-    for name, spec in source.columns.items():
-        raw = np.zeros(len(t)) if spec.column is None else _numbers(table, spec.column, shown)
-        channels[name] = values_of(raw, name, spec)
-    words = {}
-    if source.phase is not None:
-        words["phase"] = spoken(_text(table, source.phase.column, shown), source.phase)
-    if source.split is not None:
-        words["split"] = np.array(_text(table, source.split, shown), dtype=np.str_)
-    stream = Stream(source=shown, t=t, channels=channels, words=words, findings=findings)
-    return in_our_axes(stream, source.frame)
-
-
-def values_of(raw: Array, name: str, spec: ColumnSource) -> Array:
-    """Values of a canonical column from the numbers of the log: a constant, or scaled, shifted, in our unit, signed."""
-    given = np.full(len(raw), spec.value) if spec.column is None else raw
-    return np.asarray(spec.sign * (spec.scale * given + spec.offset) * factor(spec.unit, name), dtype=float)
-
-
-def spoken(words: Iterable[str], phase: PhaseColumn) -> NDArray[np.str_]:
-    """Words of the log as phases."""
-    return np.array([phase.words.get(word, "") if phase.words else word for word in words], dtype=np.str_)
+    for column, spec in columns.items():
+        # The last message of a damaged bag may lack its last fields.
+        raw = np.full(len(t), np.nan if spec.value is None else spec.value)
+        given = numbers.get(column, ())
+        raw[: len(given)] = given
+        channels[column] = spec.sign * (spec.scale * raw + spec.offset) * factor(spec.unit, column)
+    known = source.phase.words if source.phase is not None else {}
+    said = {
+        key: np.array(
+            [known.get(word, "") if known and key == "phase" else word for word in of], dtype=np.str_
+        )
+        for key, of in words.items()
+    }
+    return in_our_axes(Stream(source=name, t=t, channels=channels, words=said), source.frame)
 
 
 def _by_names(table: Table, shown: str) -> SourceMap:
@@ -532,7 +549,7 @@ def _collect(
         topic: (
             [],
             {name: [] for name in columns},
-            {name: [] for name in ("phase", "split") if _worded(topics[topic], name)},
+            {name: [] for name in worded(topics[topic])},
         )
         for topic, columns in sources.items()
     }
@@ -548,7 +565,7 @@ def _collect(
                 if spec.column is not None:
                     numbers[name].append(number_at(message, spec.column, topic))
             for name, said in words.items():
-                said.append(word_at(message, _worded(topics[topic], name), topic))
+                said.append(word_at(message, worded(topics[topic])[name], topic))
     except CalibrationError:
         raise
     except Exception as error:  # a damaged bag breaks in whatever layer reads it
@@ -556,35 +573,6 @@ def _collect(
             raise CalibrationError(f"the bag breaks at its first messages: {error}") from None
         findings.append(finding("bag_damaged", reason=str(error).splitlines()[0][:120]))
     return collected
-
-
-def _worded(source: SourceMap, name: str) -> str:
-    """The field that holds the words of a topic, "" for none."""
-    return (source.phase.column if source.phase else "") if name == "phase" else source.split or ""
-
-
-def _stream(
-    topic: str,
-    columns: dict[str, ColumnSource],
-    source: SourceMap,
-    times: list[float],
-    numbers: dict[str, list[float]],
-    words: dict[str, list[str]],
-) -> Stream:
-    t = np.array(times) + source.time_offset
-    channels = {}
-    for name, spec in columns.items():
-        # The last message of a damaged bag may lack its last fields.
-        raw = np.full(len(t), np.nan)
-        raw[: len(numbers[name])] = numbers[name]
-        channels[name] = values_of(raw, name, spec)
-    said = {
-        name: spoken(list_, source.phase)
-        if name == "phase" and source.phase
-        else np.array(list_, dtype=np.str_)
-        for name, list_ in words.items()
-    }
-    return in_our_axes(Stream(source=topic, t=t, channels=channels, words=said), source.frame)
 
 
 def _listed(known: Mapping[str, str]) -> str:
@@ -599,7 +587,13 @@ Group = tuple[str, list[Stream], dict[str, Any]]
 ARDUPILOT = (".bin", ".tlog")
 
 
-def import_logs(
+def print_folders(folders: Sequence[Path], as_json: bool) -> None:
+    """Print where trials were written, a line each or as one JSON object."""
+    names = [str(folder) for folder in folders]
+    print(json.dumps({"trials": names}) if as_json else "\n".join(names))
+
+
+def import_trials(
     logs: Sequence[Path],
     *,
     out: Path,
@@ -608,73 +602,35 @@ def import_logs(
     vehicle: str | None = None,
     split: str | None = None,
     as_json: bool = False,
-) -> None:
+) -> list[Path]:
     """Make trial folders of logs, in SI units and the body frame x forward, y left, z up.
 
     Example: finssim trials import dive.BIN --vehicle bluerov2 --split arming --out trials
 
     Args:
         logs (LOG): Tables (.csv, .parquet), ArduSub logs (.BIN, .tlog, .mcap of BlueOS), ROS 2 bags (.mcap, .db3,
-            folder).
+            folder). Tables and bags that belong together make one trial.
         out (DIR): Folder in which the trial folders are made.
         column_map (FILE): Map of the log's columns or topics, with units and frames (.yaml).
         format (FORMAT): auto (by suffix), csv, ardupilot or rosbag.
-        vehicle (NAME|FILE): Vehicle that made the logs.
-        split (RULE): Several trials of one log: by phase, gaps, gaps=SECONDS, arming or column.
-        as_json: Print one JSON object instead of tables.
-    """
-    folders = import_trials(
-        logs, out=out, column_map=column_map, format=format, vehicle=vehicle, split=split,
-        say=lambda sentence: print(sentence, file=sys.stderr),
-    )  # fmt: skip
-    print_folders(folders, as_json)
-
-
-def print_folders(folders: Sequence[Path], as_json: bool) -> None:
-    """Print where trials were written, a line each or as one JSON object."""
-    names = [str(folder) for folder in folders]
-    print(json.dumps({"trials": names}) if as_json else "\n".join(names))
-
-
-def import_trials(
-    paths: Sequence[Path],
-    *,
-    out: Path,
-    column_map: Path | None = None,
-    format: Format = "auto",
-    vehicle: str | None = None,
-    split: str | SplitRule | None = None,
-    say: Callable[[str], None] | None = None,
-) -> list[Path]:
-    """Make trial folders of logs.
-
-    Args:
-        paths: Tables, ArduSub logs, bags. Tables and bags that belong together make one trial.
-        out: Folder in which the trial folders are made.
-        column_map: Map file; not needed for ArduSub logs, nor where names and types tell enough.
-        format: Kind of the logs; by their suffix if `auto`.
-        vehicle: Name or file of the vehicle; before the map's.
-        split: What makes several trials of one log; before the map's.
-        say: Told each sentence about what was repaired or left out.
+        vehicle (NAME|FILE): Vehicle that made the logs; before the map's.
+        split (RULE): Several trials of one log: by phase, gaps, gaps=SECONDS, arming or column; before the map's.
+        as_json: Print one JSON object instead of a line for each trial.
 
     Returns:
-        The folders, in the order of their trials.
+        The folders, in the order of their trials; what was repaired or left out is told on standard error.
 
     Raises:
         CalibrationError: A log or map that cannot be used; nothing is written then.
         OutputError: A folder that holds other files, or cannot be written.
     """
-    from finssim.calibration.trials.trial_files import write_trial
-
-    trials = read_trials(paths, column_map=column_map, format=format, vehicle=vehicle, split=split)
     folders = []
-    for trial in trials:
-        folder = Path(out) / trial.name
-        write_trial(trial, folder)
-        folders.append(folder)
-        if say is not None:
-            for one in trial.findings:
-                say(str(one.about(trial.name)))
+    for trial in read_trials(logs, column_map=column_map, format=format, vehicle=vehicle, split=split):
+        folders.append(Path(out) / trial.name)
+        write_trial(trial, folders[-1])
+        for one in trial.findings:
+            print(one.about(trial.name), file=sys.stderr)
+    print_folders(folders, as_json)
     return folders
 
 
@@ -701,7 +657,9 @@ def read_trials(
     for name, streams, recorded in _groups(
         [Path(path) for path in paths], mapped, format, vehicle, column_map is not None
     ):
-        for piece, table in split_table(name, merge(streams), rule).items():
+        for piece, table in split_table(
+            name, merge(moved_in_time(streams, mapped.time_offsets)), rule
+        ).items():
             header = mapped.header_of(piece if piece in mapped.trials else name, vehicle, recorded)
             trials.append(trial_of(piece, table, header, mapped))
     unknown = [name for name in mapped.trials if name not in {trial.name for trial in trials}]

@@ -26,7 +26,7 @@ from finssim.geometry.rotations import (
 from finssim.vehicles import Vehicle
 
 __all__ = [
-    "AttitudeSignal", "Motion", "Offset", "attitude_samples", "attitude_signal", "holds_gravity", "motion",
+    "AttitudeSignal", "Motion", "Offset", "attitude_samples", "attitude_signal", "holds_gravity", "motion", "offset",
     "on_grid", "stream_offsets", "up_in_body",
 ]  # fmt: skip
 
@@ -417,7 +417,7 @@ class Offset(NamedTuple):
     reference: str
     """Group of columns that it was compared with."""
     seconds: float
-    """What to add to the stream's times so that both agree: a value for `convert.time_offset`."""
+    """What to add to the stream's times so that both agree: a value for `time_offsets` of a map."""
     std: float
     """Standard deviation of `seconds` [s]."""
     correlation: float
@@ -445,28 +445,28 @@ def stream_offsets(trial: Trial, vehicle: Vehicle) -> dict[str, Offset]:
         return {}
     omega, _ = on_grid(trial, ("p", "q", "r"), t, 2)
     attitude = attitude_signal(trial, t)
-    found = {"attitude": _offset("rates", omega, attitude.rates)}
+    found = {"attitude": offset("rates", omega, attitude.rates)}
     if found["attitude"] is not None:  # the others are compared through the attitude as it should be
         attitude = attitude_signal(trial, t - found["attitude"].seconds)
     nu, nu_slope = on_grid(trial, ("u", "v", "w"), t, 2)
     reference, predicted = _predicted(trial, vehicle, t, attitude.quaternion, nu, nu_slope, omega)
     measured = on_grid(trial, ACCELERATION, t, 2)[0]
     if not _sampled_together(trial):
-        found["acceleration"] = _offset(reference, predicted, measured)
+        found["acceleration"] = offset(reference, predicted, measured)
     elif reference == "velocity":
         weight = _gravity(trial, vehicle, attitude.quaternion)
-        found["velocity"] = _offset("acceleration", measured - weight, predicted - weight)
+        found["velocity"] = offset("acceleration", measured - weight, predicted - weight)
     nu = on_grid(trial, ("u", "v", "w"), t - _seconds(found.get("velocity")), 2)[0]
     through_world = quat_rotate(attitude.turn, nu)
     if not attitude.tilt:
         through_world[:, 2] = np.nan
-    found["position"] = _offset("velocity", through_world, on_grid(trial, ("x", "y", "z"), t, 3)[1])
+    found["position"] = offset("velocity", through_world, on_grid(trial, ("x", "y", "z"), t, 3)[1])
     if trial.has("z"):
         vertical = on_grid(trial, ("z",), t - _seconds(found["position"]), 3)[1]
     else:
         vertical = through_world[:, 2:]
     depth = on_grid(trial, ("depth",), t, 3)[1]
-    found["depth"] = _offset("position" if trial.has("z") else "velocity", vertical, -depth)
+    found["depth"] = offset("position" if trial.has("z") else "velocity", vertical, -depth)
     return {group: offset for group, offset in found.items() if offset is not None}
 
 
@@ -519,8 +519,17 @@ def _gravity(trial: Trial, vehicle: Vehicle, quaternion: Array) -> Array:
     return np.zeros((len(quaternion), 3))
 
 
-def _offset(reference: str, fixed: Array, moved: Array) -> Offset | None:
-    """The offset of `moved` to `fixed`, (m, c) each, from the peak of their correlation."""
+def offset(reference: str, fixed: Array, moved: Array) -> Offset | None:
+    """The offset of a signal to another of the same motion, from the peak of their correlation.
+
+    Args:
+        reference: Name of the fixed signal.
+        fixed: At `RATE`, NaN where unknown, (m, c).
+        moved: The same of the signal whose times are in question, (m, c).
+
+    Returns:
+        None if they do not agree on any motion.
+    """
     both = np.isfinite(fixed).any(axis=0) & np.isfinite(moved).any(axis=0)
     if not both.any():
         return None

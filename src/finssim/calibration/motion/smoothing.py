@@ -78,6 +78,20 @@ def spans_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(b), int(e)) for b, e in edges.reshape(-1, 2)]
 
 
+def white_noise(values: Array) -> float:
+    """Standard deviation of white noise on a signal that is smooth from sample to sample, from its second differences.
+
+    Args:
+        values: Evenly sampled, finite, (n,).
+
+    Returns:
+        NaN for fewer than ten samples.
+    """
+    if len(values) < 10:
+        return math.nan
+    return float(np.median(np.abs(np.diff(values, 2)))) / (0.6745 * math.sqrt(6.0))
+
+
 def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:
     """Which samples are not spikes: far from the median of their five nearest, by the spread of all such distances.
 

@@ -23,8 +23,6 @@ from finssim.calibration.output.vehicle_file import all_findings, calibrated, wr
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-ONLY_SIMULATION = "needs --method simulation"
-
 
 def calibrate_thruster(
     tables: Sequence[Path],
@@ -125,8 +123,8 @@ def calibrate_hydrodynamics(
         method (METHOD): regression: each axis by its equation of motion; simulation: what simulates the trials best;
             auto: the regression where it replays the trials very well, else the simulation unless that replays them
             worse.
-        estimate (NAMES): Also fit, of thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k (simulation
-            method); or parameters of the vehicle's terms, such as lift.coefficient (either method).
+        estimate (NAMES): Also fit, of thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k or the parameters
+            of the vehicle's terms, such as lift.coefficient (simulation method).
         damping (KIND): Drag: linear, quadratic, both, or auto to choose.
         fix (AXIS.m=N): Inertias that are known, added mass included [kg, kg m²]: yaw.m=0.6,surge.m=24 (regression).
         horizon: Longest stretch simulated without a restart [s] (simulation method).
@@ -145,15 +143,6 @@ def calibrate_hydrodynamics(
     options = {name: value or None for name, value in locals().items() if name not in ("trials", "as_json")}
     options["seed"] = seed
     further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
-    if method == "regression":
-        from finssim.calibration.simulation.fit import ESTIMATE
-
-        words = [name for name in further if name in ESTIMATE]
-        for given, option in ((words, "--estimate"), (horizon is not None, "--horizon")):
-            if given:
-                raise CalibrationError(
-                    f"{option} {ONLY_SIMULATION}: a regression looks at one axis at a time"
-                )
     chosen = _axes(axes)
     known = _known(fix)
     refuse_places(out, report, "vehicle")

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -85,6 +86,8 @@ def progress_bar() -> Iterator[Callable[..., None]]:
         bar = bars.add_task("fit", total=1.0)
         yield lambda part, words="fit": bars.update(bar, completed=part, description=words)
 
+
+Array = NDArray[np.float64]
 
 BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
 PER_FIGURE = 6
@@ -226,6 +229,42 @@ def picture_axes(axes: Axes, lens: Lens) -> None:
     """Axes of pixels over a lens's picture."""
     axes.set(xlim=(-0.5, lens.width - 0.5), ylim=(lens.height - 0.5, -0.5), aspect="equal")
     axes.set(xlabel="u [px]", ylabel="v [px]")
+
+
+ARROW = 0.06
+"""Length of the 95th percentile of arrows in a figure, in widths of what is drawn."""
+
+
+def draw_arrows(
+    axes: Axes,
+    at: Array,
+    vectors: Array,
+    used: NDArray[np.bool_],
+    unit: str,
+    per: float,
+) -> None:
+    """Points and enlarged arrows, and crosses where there is none; `per` of the arrows' unit make one of the axes'.
+
+    Args:
+        axes: To draw into.
+        at: (N, 2).
+        vectors: (N, 2).
+        used: Which rows the calibration used, (N,).
+        unit: Of the arrows.
+        per: Arrow units in one of the axes' units.
+    """
+    good = used & np.isfinite(vectors).all(axis=1)
+    size = float(np.percentile(np.linalg.norm(vectors[good], axis=1), 95)) if good.any() else 1.0
+    scale = max(size, 1e-12) / max(float(np.ptp(at, axis=0).max()) * ARROW, 1e-12)
+    axes.plot(*at[good].T, ".", color=GRAY, markersize=3)
+    label = f"longest of 95 %: {size:.2g} {unit}, enlarged {per / scale:.2g} times"
+    arrows = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.0022}
+    axes.quiver(*at[good].T, *vectors[good].T, color=BLUE, label=label, **arrows)
+    if not good.all():
+        axes.plot(*at[~good].T, "x", color=ORANGE, markersize=6, label="left out")
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=3, frameon=False)
+    axes.grid(True, color="0.93", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def new_figure(width: float, height: float, constrained: bool = True) -> Figure:

@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import os
-import re
 import shutil
 import textwrap
 from collections import Counter
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
@@ -270,7 +270,7 @@ def _flow(node: Any, path: Key, inherited: Provenance | None, origins: Mapping[K
         items = [_flow(item, (*path, str(i)), common, origins) for i, item in enumerate(node)]
         value, marks = f"[{', '.join(items)}]", _marks(common, inherited)
     else:
-        value, marks = _scalar(node), _marks(origins.get(path, inherited), inherited)
+        value, marks = _word(node), _marks(origins.get(path, inherited), inherited)
     if not marks:
         return value
     return "{" + ", ".join([f"value: {value}", *(f"{k}: {_word(t)}" for k, t in marks.items())]) + "}"
@@ -344,42 +344,16 @@ def _record(record: Mapping[str, Any]) -> Iterator[str]:
             yield f"{lead}{key}:"
             yield from (f"      {_word(name)}: {json.dumps(digest)}" for name, digest in value.items())
         else:
-            yield f"{lead}{key}: {_plain(value)}"
+            yield f"{lead}{key}: {_word(value)}"
         lead = "    "
 
 
-def _plain(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_word(str(k))}: {_plain(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(_plain(v) for v in value)}]"
-    return _scalar(value)
-
-
-def _scalar(value: Any) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int):
-        return str(value)
-    if isinstance(value, float):
-        return repr(value).replace("inf", ".inf").replace("nan", ".nan")
-    return _word(str(value))
-
-
-def _word(text: str) -> str:
-    """A string as YAML: bare where it can only be read as that string, else in double quotes."""
-    if re.fullmatch(r"[A-Za-z_][\w./-]*", text, flags=re.ASCII) and text not in (
-        "null",
-        "true",
-        "false",
-        "n",
-    ):
-        return text
-    if re.fullmatch(r"[0-9]{1,9}", text) and not (len(text) > 1 and text[0] == "0"):
-        return text  # a key such as the number of a tag
-    return json.dumps(text, ensure_ascii=False)
+def _word(value: Any) -> str:
+    """A value as YAML on one line, as it may stand inside a list or mapping."""
+    text = yaml.safe_dump(
+        [value], default_flow_style=True, sort_keys=False, allow_unicode=True, width=math.inf
+    )
+    return str(text).strip()[1:-1]
 
 
 def _prose(text: str) -> list[str]:

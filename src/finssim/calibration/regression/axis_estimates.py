@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from finssim.calibration.fit import Curve, Estimate
 from finssim.calibration.regression.axis_fit import TERMS, AxisData, Selection
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.vehicles import AXES, Vehicle
-from finssim.vehicles.terms import unit_of
 
 Array = NDArray[np.float64]
 
@@ -22,9 +21,6 @@ Array = NDArray[np.float64]
 
 EXPLAINED = 0.2
 """R² below which the model of an axis explains nothing: at 0 the mean of the wrench does as well."""
-
-SEPARATE = 0.05
-"""By how much velocity has to lag the rates to be named [s]."""
 
 MOST_TILTED = 0.4
 """Share of samples at large tilt beyond which what remains is not believed: pitching fast through level."""
@@ -160,22 +156,6 @@ def axis_findings(axis: str, data: AxisData, chosen: Selection) -> list[Finding]
     return out
 
 
-def late_velocity(figures: dict[str, dict[str, float]], *, explained: list[str]) -> list[Finding]:
-    """A finding where surge, sway and heave lag the wrench by more than roll, pitch and yaw: two streams, two clocks.
-
-    Args:
-        figures: `quality` of every axis.
-        explained: Axes whose fit is worth something.
-    """
-    lags = [[figures[a]["delay"] for a in some if a in explained] for some in (AXES[:3], AXES[3:])]
-    if not all(lags):
-        return []
-    difference = float(np.median(lags[0]) - np.median(lags[1]))
-    if difference < SEPARATE:
-        return []
-    return [finding("velocity_late", late=difference)]
-
-
 M, D1, D2, BIAS, DELAY, SMOOTHING, K = range(len(TERMS))
 
 CERTAIN = 0.2
@@ -184,9 +164,6 @@ CERTAIN = 0.2
 USEFUL = 0.5
 """The same, up to which an inertia is written to the vehicle file: better than a guess."""
 
-FORMED = 0.01
-"""Error of an estimate of a term's parameter by products of measured velocities, as a part of it; intervals hold it."""
-
 DECADE = 10.0
 
 GAP = np.full(1, np.nan)
@@ -194,154 +171,144 @@ GAP = np.full(1, np.nan)
 
 SET = "hydrodynamics.calibrated"
 
-LAG_NOTE = "and not a delay, the inertia may read too high: fit the motors first"
-
 BIAS_NOTE = (
     "a constant force; above zero it opposes motion in the positive direction, as damping does: tether, trim or the "
     "offset of a sensor"
 )
 
+UNITS = {
+    "m_eff": ("kg", "kg m²"),
+    "d1": ("N s/m", "N m s"),
+    "d2": ("N s²/m²", "N m s²"),
+    "bias": ("N", "N m"),
+    "k": ("N m/rad", "N m/rad"),
+}
+"""Of the numbers of an axis: along it, and about it."""
+
+
+class Number(NamedTuple):
+    """A number of an axis as it was fitted."""
+
+    value: float
+    ends: tuple[float, float]
+    """95 % interval; not finite where the trials do not determine it."""
+    free: float | None = None
+    """What it would be without the bound that it rests on; None where it rests on none."""
+
 
 @dataclass(kw_only=True)
 class AxisResult:
-    """What the report says of one axis.
+    """Estimates, changes of the vehicle file and findings of one axis, from its numbers.
 
     What the data know well is written, and so is what they know badly where the vehicle file's number lies outside the
     interval: a wide interval is a better answer than a number that it excludes.
     """
 
-    data: AxisData
-    """Its trials."""
-    chosen: Selection
-    """The model and its intervals."""
+    axis: str
+    numbers: Mapping[str, Number]
+    """Of `UNITS`, what was fitted."""
     file: Matrices
     """The vehicle as its file has it."""
+    speeds: tuple[float, float]
+    """Lowest and highest that the damping rests on [m/s, rad/s]."""
+    drag_known: bool
+    """Whether the damping is known well enough to be written; both of its terms are, or neither."""
+    dropped: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Damping that was left out, because the data do not show it -> its 95 % interval."""
+    given: float | None = None
+    """Effective inertia where it is known [kg, kg m²]."""
     estimates: dict[str, Estimate] = field(default_factory=dict)
     changes: dict[str, Any] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         """Estimate term by term."""
-        data, chosen = self.data, self.chosen
-        low, high = speed_range(data, chosen)
-        speeds = {"low": low, "high": high, "unit": "m/s" if data.axis < 3 else "rad/s"}
-        self.inertia()
-        self.added_mass(float(self.file.M_RB[data.axis, data.axis]))
-        self.damping(speeds)
-        if data.restoring:
-            self.add("k", K, "N m/rad", "body.center_of_buoyancy.2")
-        self.bias()
+        self.i = AXES.index(self.axis)
+        low, high = self.speeds
+        unit = "m/s" if self.i < 3 else "rad/s"
+        if self.given is not None:
+            self.note("m_eff", self.given, (self.given, self.given), True, "given")
+        elif "m_eff" in self.numbers:
+            self.add("m_eff")
+        if f"{self.axis}.m_eff" in self.estimates:
+            self.added_mass(float(self.file.M_RB[self.i, self.i]))
+        for name, family in (("d1", "linear_damping"), ("d2", "quadratic_damping")):
+            if name in self.dropped:
+                note = f"not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}"
+                self.note(name, 0.0, self.dropped[name], False, note, self.path(family))
+            elif name in self.numbers:
+                self.add(name, self.path(family))
+            if self.drag_known:
+                self.changes[self.path(family)] = max(self.value(name), 0.0)
+        if not self.drag_known:
+            self.findings.append(finding("damping_unknown", self.axis, low=low, high=high, unit=unit))
+        if "k" in self.numbers:
+            self.add("k", "body.center_of_buoyancy.2")
+        if "bias" in self.numbers:  # identifiable wherever it has an interval, for it may well be zero
+            bias = self.add("bias")
+            self.note("bias", bias.estimate, bias.ci95, bool(np.isfinite(bias.ci95).all()), BIAS_NOTE)
         if 0.0 < low and high < DECADE * low:
-            self.findings.append(finding("few_speeds", self.axis, **speeds))
-        self.findings += axis_findings(self.axis, data, chosen)
-        self.quality = quality(data, chosen)
-        self.worthless = worthless(data, self.quality, chosen)
-        if self.worthless:
-            self.believe_nothing(self.worthless)
-
-    @property
-    def axis(self) -> str:
-        """By name."""
-        return AXES[self.data.axis]
-
-    def unit(self, translation: str, rotation: str) -> str:
-        """That of the axis."""
-        return translation if self.data.axis < 3 else rotation
+            self.findings.append(finding("few_speeds", self.axis, low=low, high=high, unit=unit))
 
     def path(self, family: str) -> str:
         """Of the axis' own entry in a matrix of the vehicle file."""
-        return f"{SET}.{family}.{self.data.axis}.{self.data.axis}"
+        return f"{SET}.{family}.{self.i}.{self.i}"
 
-    def add(self, name: str, term: int, unit: str, path: str | None = None) -> Estimate:
-        """Take the estimate of a term, and a finding where it rests on its bound."""
-        fit = self.chosen.fit
-        value, (lower, upper) = fit.theta[term], self.chosen.interval[term]
-        note, sure = "", bool(np.isfinite([lower, upper]).all())
-        if fit.active[term]:
-            note, sure = f"held at its bound 0; free, it would be {fit.free[term]:.3g}", False
-            self.findings.append(finding("at_bound", f"{self.axis}.{name}", free=fit.free[term], unit=unit))
-        elif sure and 0.5 * (upper - lower) > CERTAIN * abs(value):
-            note, sure = f"known to no better than {_percent(upper - lower, value)}", False
-        found = Estimate(
-            name=f"{self.axis}.{name}", estimate=float(value), ci95=(float(lower), float(upper)), unit=unit,
-            identifiable=sure, note=note, path=path,
-        )  # fmt: skip
-        self.estimates[found.name] = found
-        return found
+    def value(self, name: str) -> float:
+        """Of a number; 0 where it was not fitted."""
+        return self.numbers[name].value if name in self.numbers else 0.0
 
-    def inertia(self) -> None:
-        """m_eff, and in its note a lag that may be part of it."""
-        if self.data.inertia is not None:
-            m, name = self.data.inertia, f"{self.axis}.m_eff"
-            self.estimates[name] = Estimate(
-                name=name,
-                estimate=m,
-                ci95=(m, m),
-                unit=self.unit("kg", "kg m²"),
-                identifiable=True,
-                note="given",
+    def note(
+        self,
+        name: str,
+        value: float,
+        ends: tuple[float, float],
+        sure: bool,
+        note: str,
+        path: str | None = None,
+    ) -> Estimate:
+        """Take an estimate."""
+        unit = UNITS["m_eff" if name == "added_mass" else name][self.i > 2]
+        name, ends = f"{self.axis}.{name}", (float(ends[0]), float(ends[1]))
+        self.estimates[name] = Estimate(
+            name=name, estimate=float(value), ci95=ends, unit=unit, identifiable=sure, note=note, path=path
+        )
+        return self.estimates[name]
+
+    def add(self, name: str, path: str | None = None) -> Estimate:
+        """Take the estimate of a number, and a finding where it rests on its bound."""
+        value, (low, high), free = self.numbers[name]
+        unit, note, sure = UNITS[name][self.i > 2], "", False
+        if free is not None:
+            note = "held at its bound" + (
+                f"; free, it would be {free:.3g} {unit}" if np.isfinite(free) else ""
             )
-            return
-        whole = self.add("m_eff", M, self.unit("kg", "kg m²"))
-        lag = self.data.shift + self.chosen.fit.theta[DELAY]
-        if self.data.shift and not self.chosen.fit.active[M]:
-            late = (
-                f"the motion lags the file's motors by {lag * 1e3:.0f} ms: if that is a lag of first order "
-            )
-            note = "; ".join(filter(None, [whole.note, late + LAG_NOTE]))
-            self.estimates[whole.name] = replace(whole, note=note)
+            self.findings.append(finding("at_bound", f"{self.axis}.{name}", free=free, unit=unit))
+        elif not np.isfinite([low, high]).all():
+            note = "the trials do not determine it"
+        elif 0.5 * (high - low) > CERTAIN * abs(value):
+            size = f"±{min(50.0 * (high - low) / abs(value), 9999.0):.0f} %" if value else "its own size"
+            note = f"known to no better than {size}"
+        else:
+            sure = True
+        return self.note(name, value, (low, high), sure, note, path)
 
     def added_mass(self, rigid: float) -> None:
         """m_eff less the rigid part."""
         whole = self.estimates[f"{self.axis}.m_eff"]
-        value, ends = whole.estimate - rigid, np.array(whole.ci95) - rigid
-        unit, path = whole.unit, self.path("added_mass")
-        sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {unit} as exact"
+        value, ends = whole.estimate - rigid, (whole.ci95[0] - rigid, whole.ci95[1] - rigid)
+        sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {whole.unit} as exact"
         if value <= 0.0:
-            sure = False
-            note = f"m_eff is below the file's rigid {rigid:.4g} {unit}"
-            self.findings.append(
-                finding("inertia_too_small", self.axis, effective=whole.estimate, rigid=rigid, unit=unit)
-            )
+            sure, note = False, f"m_eff is below the file's rigid {rigid:.4g} {whole.unit}"
+            fields = {"effective": whole.estimate, "rigid": rigid, "unit": whole.unit}
+            self.findings.append(finding("inertia_too_small", self.axis, **fields))
         elif ends[0] <= 0.0:
             sure, note = False, "not distinguishable from zero"
         half = 0.5 * (whole.ci95[1] - whole.ci95[0])
-        before = float(self.file.M_A[self.data.axis, self.data.axis])
+        before, path = float(self.file.M_A[self.i, self.i]), self.path("added_mass")
         if value > 0.0 and (half < USEFUL * whole.estimate or outside(before, ends)):
             self.changes[path] = value
-        name = f"{self.axis}.added_mass"
-        self.estimates[name] = Estimate(
-            name=name, estimate=value, ci95=_pair(ends), unit=unit, identifiable=sure, note=note, path=path
-        )
-
-    def damping(self, speeds: Mapping[str, Any]) -> None:
-        """d1 and d2; both go to the vehicle file or neither."""
-        theta = self.chosen.fit.theta
-        for name, term, family, unit in (
-            ("d1", D1, "linear_damping", self.unit("N s/m", "N m s")),
-            ("d2", D2, "quadratic_damping", self.unit("N s²/m²", "N m s²")),
-        ):
-            if name in self.chosen.dropped:
-                whole = f"{self.axis}.{name}"
-                self.estimates[whole] = Estimate(
-                    name=whole, estimate=0.0, ci95=_pair(self.chosen.interval[term]), unit=unit, identifiable=False,
-                    note="not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}".format(**speeds),
-                    path=self.path(family),
-                )  # fmt: skip
-            elif self.chosen.fit.terms[term]:
-                self.add(name, term, unit, self.path(family))
-        i = self.data.axis
-        if _damping_known(self.data, self.chosen, (float(self.file.D1[i, i]), float(self.file.D2[i, i]))):
-            self.changes[self.path("linear_damping")] = max(float(theta[D1]), 0.0)
-            self.changes[self.path("quadratic_damping")] = max(float(theta[D2]), 0.0)
-        else:
-            self.findings.append(finding("damping_unknown", self.axis, **speeds))
-
-    def bias(self) -> None:
-        """b, identifiable wherever it has an interval, for it may well be zero."""
-        found = self.add("bias", BIAS, self.unit("N", "N m"))
-        sure = bool(np.isfinite(found.ci95).all())
-        self.estimates[found.name] = replace(found, identifiable=sure, note=BIAS_NOTE)
+        self.note("added_mass", value, ends, sure, note, path)
 
     def believe_nothing(self, reason: str) -> None:
         """Leave the numbers as they are, call none of them identifiable and write none."""
@@ -352,43 +319,41 @@ class AxisResult:
         self.findings.append(finding("axis_refused", self.axis, reason=reason))
 
 
-def term_estimate(
-    path: str, chosen: Mapping[int, tuple[AxisData, Selection]]
-) -> tuple[Estimate | None, list[Finding]]:
-    """A parameter of the vehicle's terms from all axes on which it acts, weighted by the squares of their intervals.
+def regression_result(data: AxisData, chosen: Selection, file: Matrices) -> tuple[AxisResult, str]:
+    """The result of an axis from its regression, and why nothing of it can be believed; empty where it can.
 
     Args:
-        path: Such as `lift.coefficient`.
-        chosen: Data and model of the axes that can be believed.
-
-    Returns:
-        None where it acts on none of them; and a finding where axes disagree, or none has an interval.
+        data: Its trials.
+        chosen: Its model.
+        file: The vehicle as its file has it.
     """
-    values, halves, names = [], [], []
-    for i, (data, selection) in chosen.items():
-        column = len(TERMS) + data.estimated.index(path)
-        low, high = selection.interval[column]
-        if selection.fit.terms[column] and np.isfinite([low, high]).all() and high > low:
-            values.append(float(selection.fit.theta[column]))
-            halves.append(max(high - values[-1], values[-1] - low))
-            names.append(AXES[i])
-    if not values:
-        return None, [finding("term_unfitted", path)]
-    weight = np.asarray(halves) ** -2.0
-    value = float(weight @ values / weight.sum())
-    half = float(np.hypot(weight.sum() ** -0.5, FORMED * value))
-    sure, note = half <= CERTAIN * abs(value), f"from {', '.join(names)}"
-    if not sure:
-        note += f"; known to no better than {_percent(2.0 * half, value)}"
-    said = []
-    if np.any(np.abs(np.asarray(values) - value) > 2.0 * np.hypot(halves, half)):
-        told = tuple(f"{name} {x:.4g} ± {h:.2g}" for name, x, h in zip(names, values, halves, strict=True))
-        said = [finding("term_disagrees", path, estimates=told)]
-    found = Estimate(
-        name=path, estimate=value, ci95=(value - half, value + half), unit=unit_of(path), identifiable=sure, note=note,
-        path=f"{SET}.{path}",
+    fit, i, axis = chosen.fit, data.axis, AXES[data.axis]
+    numbers = {}
+    for term, name in enumerate(TERMS):
+        if name in UNITS and fit.terms[term]:
+            ends = (float(chosen.interval[term, 0]), float(chosen.interval[term, 1]))
+            free = float(fit.free[term]) if fit.active[term] else None
+            numbers[name] = Number(float(fit.theta[term]), ends, free)
+    dropped = {name: tuple(chosen.interval[TERMS.index(name)]) for name in chosen.dropped}
+    before = (float(file.D1[i, i]), float(file.D2[i, i]))
+    result = AxisResult(
+        axis=axis, numbers=numbers, file=file, speeds=speed_range(data, chosen), dropped=dropped,
+        drag_known=_damping_known(data, chosen, before), given=data.inertia,
     )  # fmt: skip
-    return found, said
+    if data.shift and data.inertia is None and not fit.active[M]:
+        lag = 1e3 * (data.shift + fit.theta[DELAY])
+        late = (
+            f"the motion lags the file's motors by {lag:.0f} ms: if that is a lag of first order and not a delay, the "
+            "inertia may read too high: fit the motors first"
+        )
+        whole = result.estimates[f"{axis}.m_eff"]
+        note = "; ".join(filter(None, [whole.note, late]))
+        result.estimates[whole.name] = replace(whole, note=note)
+    result.findings += axis_findings(axis, data, chosen)
+    reason = worthless(data, quality(data, chosen), chosen)
+    if reason:
+        result.believe_nothing(reason)
+    return result, reason
 
 
 def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]) -> dict[str, float]:
@@ -483,13 +448,3 @@ def curves_of(data: AxisData, chosen: Selection) -> list[Curve]:
             )
         )  # fmt: skip
     return out
-
-
-def _pair(ends: Array) -> tuple[float, float]:
-    return float(ends[0]), float(ends[1])
-
-
-def _percent(width: float, value: float) -> str:
-    if value == 0.0:
-        return "its own size"
-    return f"±{50.0 * width / abs(value):.0f} %"

@@ -8,11 +8,10 @@ vanishes at its ends, and integration by parts moves the derivative onto it (the
 both sides):
 
     ∫ phi tau = -m ∫ phi_dot nu + d1 ∫ phi nu + d2 ∫ phi |nu| nu + b ∫ phi (+ k ∫ phi sin eta)
-                + c1 ∫ phi tau_dot - c2 ∫ phi tau_dot_dot (- Σ θ_j ∫ phi tau_j)
+                + c1 ∫ phi tau_dot - c2 ∫ phi tau_dot_dot
 
 The last two allow for a motion that was recorded late by c1 [s] and smoothed by a filter of variance 2 c2 [s²]: to
-second order, that filter may act on tau instead. tau_j are the wrenches of the vehicle's further terms for units of the
-parameters θ_j that are fitted. Equations hold about the reference point of the hydrodynamic
+second order, that filter may act on tau instead. Equations hold about the reference point of the hydrodynamic
 coefficients; what the vehicle file knows (Coriolis terms, couplings off the diagonal, gravity and buoyancy but for the
 parts that are fitted) is moved to the left side.
 
@@ -33,7 +32,7 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.motion.signals import Motion
 from finssim.calibration.motion.smoothing import spans_of, without_spikes
-from finssim.calibration.regression.plant_terms import Matrices, known_wrench, unit_wrenches
+from finssim.calibration.regression.plant_terms import Matrices, known_wrench
 from finssim.calibration.uncertainty import (
     Covariance,
     Evidence,
@@ -115,8 +114,6 @@ class Signals:
     """Within the phases that are fitted, (n,)."""
     unknown: tuple[int, ...]
     """Axes whose velocity is unknown; their couplings are taken as zero."""
-    unit: Array
-    """Wrench of the vehicle's terms for a unit of each parameter that is fitted, (n, 6, k)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,8 +122,7 @@ class Rows:
 
     name: str
     X: Array
-    """Columns nu_dot, nu, |nu| nu, 1, tau_dot, -tau_dot_dot, sin eta (zero but on roll and pitch), and -tau_j of the
-    parameters of terms, (n, 7 + k)."""
+    """Columns nu_dot, nu, |nu| nu, 1, tau_dot, -tau_dot_dot, sin eta (zero but on roll and pitch), (n, 7)."""
     y: Array
     """(n,)"""
     at: NDArray[np.int64]
@@ -189,7 +185,6 @@ def signals(
         usable=motion.valid & matrices.submerged(motion.position, up),
         wanted=np.isin(phase, ["excitation", "coast"]) if named else np.ones(n, bool),
         unknown=tuple(int(i) for i in np.flatnonzero(~known)),
-        unit=unit_wrenches(*state, matrices),
     )
 
 
@@ -221,9 +216,8 @@ def axis_rows(found: Signals, axis: int, kernels: Kernel) -> Rows | None:
         _, constant = _filtered(offset[cut, None], kernels)
         _, first = _filtered(left[cut, None], kernels, kernels.phi_dot)
         _, second = _filtered(left[cut, None], kernels, kernels.phi_dot_dot)
-        _, terms = _filtered(found.unit[cut, axis], kernels)
         moving = _columns(nu[cut], None if sine is None else sine[cut], kernels)
-        X.append(np.concatenate([moving[:, :3], constant, first, -second, moving[:, 3:], -terms], axis=1))
+        X.append(np.concatenate([moving[:, :3], constant, first, -second, moving[:, 3:]], axis=1))
         y.append(rhs[:, 0])
         at.append(begin + centre)
     return Rows(
@@ -249,7 +243,7 @@ def simulated_columns(nu: Array, sine: Array | None, rows: Rows, kernels: Kernel
     moving = np.concatenate(
         [_columns(nu[b:e], None if sine is None else sine[b:e], kernels) for b, e in rows.spans]
     )
-    return np.concatenate([moving[:, :3], rows.X[:, 3:6], moving[:, 3:], rows.X[:, 7:]], axis=1)
+    return np.concatenate([moving[:, :3], rows.X[:, 3:6], moving[:, 3:]], axis=1)
 
 
 def _columns(nu: Array, sine: Array | None, kernels: Kernel) -> Array:
@@ -577,18 +571,11 @@ class AxisData:
 
     prior: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """What was known of some of `TERMS` before any trial: mean and standard deviation."""
-    estimated: tuple[str, ...] = ()
-    """Paths of the parameters of the vehicle's terms that are fitted too."""
-    lowest: tuple[float, ...] = ()
-    """Their bounds."""
 
     @property
     def terms(self) -> NDArray[np.bool_]:
-        """Which of `TERMS` and of `estimated` the rows can tell: a stiffness where there is one, terms that act."""
-        largest = np.max(
-            [np.abs(rows.X[:, len(TERMS) :]).max(axis=0, initial=0.0) for rows in self.rows], axis=0
-        )
-        return np.append([name != "k" or self.restoring for name in TERMS], largest > 0.0)
+        """Which of `TERMS` the rows can tell: a stiffness where there is one, (7,)."""
+        return np.array([name != "k" or self.restoring for name in TERMS])
 
     @property
     def restoring(self) -> bool:
@@ -596,8 +583,8 @@ class AxisData:
         return self.axis in (3, 4)
 
     def prior_moments(self) -> tuple[Array, Array]:
-        """Means and inverse variances of all terms, (7 + k,) each; zero where nothing was known."""
-        mean, inverse = np.zeros((2, len(TERMS) + len(self.estimated)))
+        """Means and inverse variances of all terms, (7,) each; zero where nothing was known."""
+        mean, inverse = np.zeros((2, len(TERMS)))
         for name, (value, std) in self.prior.items():
             mean[TERMS.index(name)], inverse[TERMS.index(name)] = value, std**-2
         mean[TERMS.index("delay")] -= self.shift
@@ -609,13 +596,13 @@ class AxisFit:
     """Result for one choice of terms."""
 
     terms: NDArray[np.bool_]
-    """Which of `TERMS`, and then of `AxisData.estimated`, are fitted, (7 + k,)."""
+    """Which of `TERMS` are fitted, (7,)."""
     theta: Array
-    """Zero where not fitted, but for a known inertia, (7 + k,)."""
+    """Zero where not fitted, but for a known inertia, (7,)."""
     free: Array
-    """The same without bounds, (7 + k,)."""
+    """The same without bounds, (7,)."""
     active: NDArray[np.bool_]
-    """Terms that a bound holds, (7 + k,)."""
+    """Terms that a bound holds, (7,)."""
     evidence: Evidence
     """Of the fitted terms."""
     covariance: Covariance
@@ -638,7 +625,7 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
 
     Args:
         data: The axis.
-        terms: Which of `TERMS` and `data.estimated` to fit, (7 + k,); of `data.terms`.
+        terms: Which of `TERMS` to fit, (7,); of `data.terms`.
         iterations: Rounds of instruments and weights.
     """
     p, kept = len(terms), terms
@@ -685,7 +672,7 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
         sums = moments(X[inside], Z[inside], y[inside], weight, group).of(kept)
     free = np.zeros(p)
     free[kept], N_g, scores, rss = solve(sums, ratio, before)
-    lower = np.array([0.0, 0.0, 0.0, -np.inf, -np.inf, -np.inf, 0.0, *data.lowest])[kept]
+    lower = np.array([0.0, 0.0, 0.0, -np.inf, -np.inf, -np.inf, 0.0])[kept]
     normal = N_g.sum(axis=0) + np.diag(before[1]) + 1e-12 * np.eye(kept.sum())
     theta, active = np.zeros(p), np.zeros(p, bool)
     theta[kept] = free[kept]
@@ -699,7 +686,7 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
         cut = moments(X[inside], Z[inside], y[inside], weight, blocks).of(kept)
         _, N_g, scores, _ = solve(cut, 0.0, before)
         unit = "blocks"
-    names = tuple(name for name, on in zip((*TERMS, *data.estimated), kept, strict=True) if on)
+    names = tuple(name for name, on in zip(TERMS, kept, strict=True) if on)
     found = evidence(names, N_g, scores, variance, unit, np.diag(inverse))
     ends = np.cumsum([len(rows.y) for rows in data.rows])[:-1]
     return AxisFit(
@@ -760,7 +747,6 @@ def _simulate(data: AxisData, theta: Array, pieces: list[list[Piece]]) -> tuple[
     for found, own in zip(data.signals, pieces, strict=True):
         left = np.where(np.isfinite(found.left[:, data.axis]), found.left[:, data.axis], 0.0)
         wrench = np.interp(found.t - delay, found.t, left) - b * _offset(found, data.axis)
-        wrench = wrench + found.unit[:, data.axis] @ theta[len(TERMS) :]
         places.append((slice(len(runs), len(runs) + len(own)), own, len(found.t)))
         runs += [piece.run(wrench) for piece in own]
     lines = simulate_axis(np.array([m, max(d1, 0.0), max(d2, 0.0), k]), runs)

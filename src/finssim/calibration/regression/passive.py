@@ -21,7 +21,8 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion, attitude_samples, motion
-from finssim.calibration.motion.smoothing import spans_of, without_spikes
+from finssim.calibration.motion.smoothing import spans_of, white_noise, without_spikes
+from finssim.calibration.regression.axis_estimates import AxisResult, Number
 from finssim.calibration.regression.axis_fit import Run, simulate_axis
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.calibration.trials.trial import NU, Trial
@@ -174,7 +175,7 @@ def _ringing(rate: Samples, name: str, axis: str) -> tuple[float, float, float]:
 
     t, y = rate
     smooth = np.convolve(np.pad(y, 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
-    noise = float(np.median(np.abs(np.diff(y, 2)))) / 0.6745 / np.sqrt(6.0)
+    noise = white_noise(y)
     begin = float(t[int(np.argmax(np.abs(smooth)))])
     after = (t >= begin) & (t <= begin + 20.0)
     span = float(t[after][-1] - begin) if after.any() else 0.0
@@ -335,8 +336,6 @@ class FreeMotion:
 
     def _predicted(self, points: Sequence[Array]) -> list[Array]:
         """What the samples of every release would be, (n, C) each."""
-        if self.axis not in (*SWINGING, "heave"):
-            return [self._coast(*pair) for pair in zip(self.releases, points, strict=True)]
         out = []
         for release, (nu, s) in zip(self.releases, self._lines(points), strict=True):
             parts = [
@@ -345,17 +344,6 @@ class FreeMotion:
             ]
             out.append(np.concatenate([np.stack(part, axis=1) for part in parts]))
         return out
-
-    def _coast(self, release: Release, point: Array) -> Array:
-        """The samples of a coast: nu_dot = -c1 nu - c2 |nu| nu has a closed form, (n, C)."""
-        _, _, c1, c2 = self.ratios(point)
-        c1, c2, nu = c1 + 1e-12, c2 + 1e-12, point[:, self.shared]
-        fallen = -np.expm1(-c1 * (release.t - release.begin)[:, None])
-        grown = c2 * np.abs(nu) / c1 * fallen
-        rates = len(release.rate[0])
-        place = point[:, self.shared + 1] if release.own > 1 else 0.0
-        travel = place + np.sign(nu) * np.log1p(grown[rates:]) / c2
-        return np.concatenate([nu * (1.0 - fallen[:rates]) / (1.0 + grown[:rates]), travel])
 
     def _points(self, x: Array) -> list[Array]:
         """Shared and own unknowns of every release, (1, ...) each."""
@@ -566,156 +554,116 @@ def _steady(release: Release, axis: str) -> Release:
 
 # From free motions to estimates, changes of the vehicle file and findings.
 
-SET = "hydrodynamics.calibrated"
+Of = Callable[[tuple[Array, ...]], Array]
+"""A number of w2, e, c1 and c2, (C,) each -> (C,)."""
 
 
-@dataclass(kw_only=True)
 class _Result:
     """What the free motion of one axis shows."""
 
-    free: FreeMotion
-    full: FreeMotion
-    """With the fullest drag: for intervals of what was left out."""
-    plant: Matrices
-    known: float | None
-    """Effective inertia that is known [kg, kg m²]."""
-    estimates: dict[str, Estimate] = field(default_factory=dict)
-    changes: dict[str, Any] = field(default_factory=dict)
-    findings: list[Finding] = field(default_factory=list)
+    def __init__(self, free: FreeMotion, full: FreeMotion, file: Matrices, known: float | None) -> None:
+        """
+        Args:
+            free: The best of its fits.
+            full: That with the fullest drag, for intervals of what was left out.
+            file: The vehicle as its file has it.
+            known: Effective inertia that is known [kg, kg m²].
+        """
+        self.free, self.full, self.file, self.i = free, full, file, AXES.index(free.axis)
+        self.low, self.top = free.speeds()
+        self.estimates: dict[str, Estimate] = {}
+        self.changes: dict[str, Any] = {}
+        self.findings = [
+            finding("equilibrium_moved", r.trial, axis=free.axis) for r in free.releases if r.pieces
+        ]
+        k, swings = float(file.arm[2]), free.axis in SWINGING
+        m, unit = float((file.M_RB + file.M_A)[self.i, self.i]), "kg" if self.i < 3 else "kg m²"
+        stiff = swings and known is None and k > 0.0
+        source, m = ("the file's", m) if known is None else ("the given", known)
+        self.note = (
+            f"with the file's k = {k:.4g} N m/rad" if stiff else f"with {source} inertia {m:.4g} {unit}"
+        )
+        inertia: Of = lambda r: k / r[0] if stiff else np.full(len(r[0]), m)  # noqa: E731
+        numbers = {}
+        if swings:
+            self.swing()
+            name, of = ("m_eff", inertia) if stiff else ("k", lambda r: inertia(r) * r[0])
+            numbers[name] = self.number(free, of, positive=True)
+        elif free.axis == "heave":
+            self.rise(m)
+        if free.axis != "heave":
+            self.damping(inertia, numbers, known)
 
-    def __post_init__(self) -> None:
-        """Name everything that the motion shows."""
-        axis = self.free.axis
-        self.i, self.linear = AXES.index(axis), AXES.index(axis) < 3
-        self.rigid = float(self.plant.M_RB[self.i, self.i])
-        self.file = self.rigid + float(self.plant.M_A[self.i, self.i])
-        self.k = float(self.plant.arm[2])
-        self.low, self.top = self.free.speeds()
-        self.unit = "kg" if self.linear else "kg m²"
-        stiff = axis in SWINGING and self.known is None and self.k > 0.0
-        m, source = (self.file, "the file's") if self.known is None else (self.known, "the given")
-        self.note = f"with {source} inertia {m:.4g} {self.unit}"
-        if stiff:
-            self.note = f"with the file's k = {self.k:.4g} N m/rad"
-        self.m = None if stiff else m
-        if axis in SWINGING:
-            self.swing(stiff)
-        elif axis == "heave":
-            self.rise()
-        if self.known is not None:
-            self.estimates[f"{axis}.m_eff"] = Estimate(
-                name=f"{axis}.m_eff", estimate=m, ci95=(m, m), unit=self.unit, identifiable=True, note="given"
-            )  # fmt: skip
-            self.changes[self.path("added_mass")] = m - self.rigid
-        if axis != "heave":
-            self.damping()
-        if any(release.pieces for release in self.free.releases):
-            moving = tuple(r.trial for r in self.free.releases if r.pieces)
-            self.findings += [finding("equilibrium_moved", trial, axis=axis) for trial in moving]
+    def number(self, fit: FreeMotion, of: Of, *, positive: bool = False) -> Number:
+        """A number with its interval; one that cannot be negative has the interval of its logarithm."""
+        value, low, high = fit.interval(of, positive=positive)
+        return Number(value, (low if positive else max(low, 0.0), high))
 
-    def inertia(self, ratios: tuple[Array, ...]) -> Array:
-        """Of the file's stiffness, or as known [kg, kg m²], (C,)."""
-        return self.k / ratios[0] if self.m is None else np.full(len(ratios[0]), self.m)
-
-    def path(self, family: str) -> str:
-        """Of the axis' own entry in a matrix of the vehicle file."""
-        return f"{SET}.{family}.{self.i}.{self.i}"
-
-    def add(
-        self,
-        name: str,
-        unit: str,
-        of: Callable[[tuple[Array, ...]], Array],
-        note: str = "",
-        path: str | None = None,
-    ) -> Estimate:
-        """A number that cannot be negative."""
-        value, low, high = self.free.interval(of, positive=True)
-        sure = bool(0.5 * (high - low) <= USEFUL * abs(value))
-        whole = name if name == "buoyancy_excess" else f"{self.free.axis}.{name}"
-        self.estimates[whole] = Estimate(
-            name=whole, estimate=value, ci95=(low, high), unit=unit, identifiable=sure,
-            note=note if sure or note else "not known to half its size", path=path,
+    def add(self, name: str, number: Number, unit: str, note: str = "", path: str | None = None) -> Estimate:
+        """Take an estimate that rests on no assumption, or on the one that its note names."""
+        value, (low, high), _ = number
+        sure = bool(value > 0.0 and 0.5 * (high - low) <= USEFUL * value)
+        self.estimates[name] = Estimate(
+            name=name, estimate=value, ci95=(low, high), unit=unit, identifiable=sure, path=path,
+            note=note or ("" if sure else "not known to half its size"),
         )  # fmt: skip
-        return self.estimates[whole]
+        return self.estimates[name]
 
-    def swing(self, stiff: bool) -> None:
-        """Frequency, damping ratio, and the inertia of a known stiffness or the stiffness of a known inertia."""
-        self.add("natural_frequency", "rad/s", lambda r: np.sqrt(r[0]))
-        # A quadratic term counts as the linear one that takes the same energy out of the largest swing.
-        rubbed = 8.0 / (3.0 * math.pi) * self.top
-        note = f"at a swing of {self.top:.2g} rad/s"
-        self.add("damping_ratio", "-", lambda r: (r[2] + rubbed * r[3]) / (2.0 * np.sqrt(r[0])), note)
-        if not stiff:
-            self.add("k", "N m/rad", lambda r: self.inertia(r) * r[0], self.note, "body.center_of_buoyancy.2")
-            return
-        whole = self.add("m_eff", self.unit, self.inertia, self.note)
-        value, low, high = (x - self.rigid for x in (whole.estimate, *whole.ci95))
-        path, axis = self.path("added_mass"), self.free.axis
-        self.estimates[f"{axis}.added_mass"] = Estimate(
-            name=f"{axis}.added_mass", estimate=value, ci95=(low, high), unit=self.unit,
-            identifiable=whole.identifiable and low > 0.0, note=self.note, path=path,
-        )  # fmt: skip
-        if value <= 0.0:
-            self.findings.append(
-                finding(
-                    "inertia_below_rigid",
-                    axis,
-                    assumed=self.note,
-                    inertia=whole.estimate,
-                    rigid=self.rigid,
-                )
-            )
-        elif whole.identifiable:
-            self.changes[path] = value
+    def swing(self) -> None:
+        """Frequency, and damping ratio: a quadratic term counts as the linear one that takes the same energy out of the
+        largest swing."""
+        axis, rubbed = self.free.axis, 8.0 / (3.0 * math.pi) * self.top
+        frequency = self.number(self.free, lambda r: np.sqrt(r[0]), positive=True)
+        ratio = self.number(
+            self.free, lambda r: (r[2] + rubbed * r[3]) / (2.0 * np.sqrt(r[0])), positive=True
+        )
+        self.add(f"{axis}.natural_frequency", frequency, "rad/s")
+        self.add(f"{axis}.damping_ratio", ratio, "-", f"at a swing of {self.top:.2g} rad/s")
 
-    def rise(self) -> None:
+    def rise(self, m: float) -> None:
         """Terminal speed, and the excess of buoyancy that the acceleration shows, which the file does not take over."""
-        shape = SHAPES[self.free.terms]
+        linear = self.free.terms == LINEAR
+        speed: Of = (lambda r: r[1] / r[2]) if linear else (lambda r: np.sqrt(r[1] / r[3]))
         trials = ", ".join(r.trial for r in self.free.releases)
-        note = f"of a rise with {shape} drag: {trials}"
-        speed = (lambda r: r[1] / r[2]) if self.free.terms == LINEAR else (lambda r: np.sqrt(r[1] / r[3]))
-        self.add("terminal_speed", "m/s", speed, note)
-        words = f"from the acceleration, {self.note}"
-        excess = self.add("buoyancy_excess", "N", lambda r: self.file * r[1], words, "body.displaced_volume")
-        low, high = excess.ci95
-        fields: dict[str, Any] = {"file": self.plant.excess, "low": low, "high": high}
-        if self.plant.excess < 0.0 < low:
+        note = f"of a rise with {SHAPES[self.free.terms]} drag: {trials}"
+        self.add("heave.terminal_speed", self.number(self.free, speed, positive=True), "m/s", note)
+        excess = self.number(self.free, lambda r: m * r[1], positive=True)
+        note, (low, high) = f"from the acceleration, {self.note}", excess.ends
+        self.add("buoyancy_excess", excess, "N", note, "body.displaced_volume")
+        fields = {"file": self.file.excess, "low": low, "high": high}
+        if self.file.excess < 0.0 < low:
             self.findings.append(finding("buoyancy_sign", "heave", **fields))
-        elif not low <= self.plant.excess <= high:
+        elif not low <= self.file.excess <= high:
             self.findings.append(finding("buoyancy_contradicted", "heave", **fields))
 
-    def damping(self) -> None:
-        """Drag over inertia, and the drag itself; both terms go to the vehicle file or none."""
-        free, top = self.free, self.top
-        per = ("m/s", "1/m") if self.linear else ("rad/s", "1/rad")
-        share = ""
+    def damping(self, inertia: Of, numbers: dict[str, Number], known: float | None) -> None:
+        """Drag over inertia, and the drag itself with what else rests on an assumption."""
+        free, top, axis = self.free, self.top, self.free.axis
+        rate, share = "m/s" if self.i < 3 else "rad/s", ""
         if free.terms == BOTH:
             quadratic = free.theta[3] * top / (free.theta[2] + free.theta[3] * top)
             share = f", {quadratic:.0%} of it quadratic at the fastest"
-        speeds = f"speeds of {self.low:.2g}-{top:.2g} {per[0]}"
         alone = "" if free.terms == BOTH else " alone"
-        note = f"{SHAPES[free.terms]} drag{alone} explains {speeds}{share}"
-        drag, low, high = free.interval(lambda r: self.inertia(r) * (r[2] + r[3] * top))
-        known = 0.5 * (high - low) <= USEFUL * drag
-        for j, (name, family) in enumerate((("d1", "linear_damping"), ("d2", "quadratic_damping"))):
-            unit = ("N s/m", "N s²/m²")[j] if self.linear else ("N m s", "N m s²")[j]
+        note = f"{SHAPES[free.terms]} drag{alone} explains speeds of {self.low:.2g}-{top:.2g} {rate}{share}"
+        dropped = {}
+        for j, (name, unit) in enumerate((("d1", "1/s"), ("d2", "1/m" if self.i < 3 else "1/rad"))):
             fit = free if free.terms[j] else self.full
-            for kind, of, words, path in (
-                (f"{name}/m_eff", lambda r, j=j: r[2 + j], note, None),
-                (name, lambda r, j=j: self.inertia(r) * r[2 + j], self.note, self.path(family)),
-            ):
-                value, low, high = fit.interval(of)
-                if not free.terms[j]:
-                    value = low = 0.0
-                whole = f"{free.axis}.{kind}"
-                self.estimates[whole] = Estimate(
-                    name=whole, estimate=value, ci95=(max(low, 0.0), high), path=path,
-                    unit=("1/s", per[1])[j] if path is None else unit, note=words,
-                    identifiable=bool(value > 0.0 and 0.5 * (high - max(low, 0.0)) <= USEFUL * value),
-                )  # fmt: skip
-                if path is not None and known:
-                    self.changes[path] = value
+            ratio = self.number(fit, lambda r, j=j: r[2 + j])
+            drag = self.number(fit, lambda r, j=j: inertia(r) * r[2 + j])
+            if free.terms[j]:
+                numbers[name] = drag
+            else:
+                ratio, dropped[name] = Number(0.0, (0.0, ratio.ends[1])), (0.0, drag.ends[1])
+            self.add(f"{axis}.{name}/m_eff", ratio, unit, note)
+        value, low, high = free.interval(lambda r: inertia(r) * (r[2] + r[3] * top))
+        result = AxisResult(
+            axis=axis, numbers=numbers, file=self.file, speeds=(self.low, top), dropped=dropped, given=known,
+            drag_known=0.5 * (high - low) <= USEFUL * value,
+        )  # fmt: skip
+        for name, e in result.estimates.items():
+            self.estimates[name] = replace(e, note="; ".join(filter(None, [e.note, self.note])))
+        self.changes |= result.changes
+        self.findings += result.findings
 
     def quality(self, fits: Sequence[FreeMotion]) -> dict[str, float]:
         """Figures of the fit, with the residual of either kind of drag."""
@@ -760,7 +708,7 @@ def passive(
             chosen, *fits = free_motion(trials, axis, vehicle, refused=refused)
         except CalibrationError:
             continue
-        result = _Result(free=chosen, full=fits[-1], plant=plant, known=(known or {}).get(axis))
+        result = _Result(chosen, fits[-1], plant, (known or {}).get(axis))
         estimates |= result.estimates
         changes |= result.changes
         findings += result.findings

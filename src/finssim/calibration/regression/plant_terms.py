@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -32,10 +32,6 @@ class Matrices:
     """Further terms of the wrench."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """Of these, by path."""
-    estimated: tuple[str, ...] = ()
-    """Paths of the parameters among these that are fitted; zero in `parameters`."""
-    lowest: tuple[float, ...] = ()
-    """Bounds of these."""
     density: float
     """Of the water [kg/m³]."""
     excess: float
@@ -73,23 +69,16 @@ class Matrices:
         return ~(height > -self.half_height)
 
 
-def matrices(
-    vehicle: Vehicle,
-    density: float | None = None,
-    hydrodynamics: str = "calibrated",
-    *,
-    estimate: Sequence[str] = (),
-) -> Matrices:
+def matrices(vehicle: Vehicle, density: float | None = None, hydrodynamics: str = "calibrated") -> Matrices:
     """Of a vehicle file.
 
     Args:
         vehicle: The vehicle.
         density: Of the water [kg/m³]; the file's where not given.
         hydrodynamics: Which set.
-        estimate: Parameters of its terms that are to be fitted.
 
     Raises:
-        CalibrationError: The set has no coefficients to calibrate, or no such parameter.
+        CalibrationError: The set has no coefficients to calibrate.
     """
     chosen = vehicle.hydrodynamics.get(hydrodynamics)
     if not isinstance(chosen, HydrodynamicSet):
@@ -97,12 +86,6 @@ def matrices(
             f"{vehicle.name}: no coefficients in hydrodynamics.{hydrodynamics}, expected a set with linear_damping and "
             "quadratic_damping: add one, zeros will do, for the fit to fill"
         )
-    for path in estimate:
-        if path not in chosen.term_scalars:
-            known = ", ".join(chosen.term_scalars) or "its vehicle file has no terms"
-            raise CalibrationError(
-                f"{vehicle.name}: cannot estimate '{path}' by regression; available: {known}"
-            )
     r = np.asarray(chosen.reference_point, float)
     H = twist_shift(r.tolist())
     back = np.linalg.inv(H)
@@ -115,9 +98,7 @@ def matrices(
         D1=np.array(chosen.linear_damping, float),
         D2=np.array(chosen.quadratic_damping, float),
         terms=tuple(TERMS[name] for name in sorted(chosen.terms)),
-        parameters=chosen.term_parameters | dict.fromkeys(estimate, 0.0),
-        estimated=tuple(estimate),
-        lowest=tuple(chosen.term_scalars[path][0] for path in estimate),
+        parameters=chosen.term_parameters,
         density=vehicle.water.density if density is None else density,
         excess=buoyancy - vehicle.weight,
         arm=buoyancy * (body.center_of_buoyancy - r) - vehicle.weight * (body.center_of_gravity - r),
@@ -163,37 +144,6 @@ def known_wrench(nu: Array, up: Array, depth: Array, rate: float, plant: Matrice
     known[:, 4] += x * up[:, 2]
     known[:, 5] -= x * up[:, 1] - y * up[:, 0]
     return np.asarray(known)
-
-
-def unit_wrenches(nu: Array, up: Array, depth: Array, plant: Matrices) -> Array:
-    """What the estimated parameters of terms add to the wrench, each by its unit.
-
-    Args:
-        nu: About the reference point, body frame, zero where unknown [m/s, rad/s], (n, 6).
-        up: World z in the body frame, (n, 3).
-        depth: Of the body origin [m], zero where unknown, (n,).
-        plant: The vehicle.
-
-    Returns:
-        (n, 6, k) [N, N m by the units of the parameters]
-
-    Raises:
-        CalibrationError: The wrench is not linear in one of them.
-    """
-    if not plant.estimated:
-        return np.zeros((len(nu), 6, 0))
-    values = [{}, *({path: x} for x in (1.0, 2.0) for path in plant.estimated)]
-    rows = [parameter_row(plant.terms, {**plant.parameters, **own}) for own in values]
-    tau = term_wrenches(plant.terms, rows, _smooth(nu), up, depth, plant.density)
-    once, twice = np.split(tau[:, 1:] - tau[:, :1], 2, axis=1)
-    for j, path in enumerate(plant.estimated):
-        if np.abs(twice[:, j] - 2.0 * once[:, j]).max(initial=0.0) > 1e-3 * np.abs(once[:, j]).max(
-            initial=0.0
-        ):
-            raise CalibrationError(
-                f"the wrench is not proportional to {path}, as a regression needs it: give --method simulation"
-            )
-    return np.asarray(np.swapaxes(once, 1, 2))
 
 
 def _smooth(nu: Array) -> Array:

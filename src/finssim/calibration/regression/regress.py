@@ -11,17 +11,15 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
-from finssim.calibration.fit import Correlation, Estimate, Fit
+from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion, attitude_samples, motion
-from finssim.calibration.motion.smoothing import spans_of
+from finssim.calibration.motion.smoothing import white_noise
 from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
-    AxisResult,
     curves_of,
     hydrostatics,
-    late_velocity,
     quality,
-    term_estimate,
+    regression_result,
     worthless,
 )
 from finssim.calibration.regression.axis_fit import (
@@ -36,6 +34,7 @@ from finssim.calibration.regression.axis_fit import (
     select,
     signals,
 )
+from finssim.calibration.regression.passive import passive
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.calibration.trials.inputs import drive, require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
@@ -43,21 +42,7 @@ from finssim.calibration.uncertainty import degeneracy
 from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.vehicles import AXES, Vehicle
 
-__all__ = ["axis_data", "coasts", "prepare", "regress"]
-
-# Heave: the buoyancy excess, separated from the damping by dives and the coasts that follow (paper, section III-B).
-
-RISING = 0.01
-"""Vertical speed from which a vehicle rises or sinks by itself [m/s] (published procedure)."""
-
-STEADY = 1.0
-"""How long it has to last [s]: the published 2 s, less half the width of a row's bump at each end."""
-
-LEVEL = 0.9
-"""Last over largest speed in that time; less is the end of a push, not buoyancy."""
-
-HANDS_OFF = 0.05
-"""Part of the largest wrench below which thrust does not count."""
+__all__ = ["axis_data", "prepare", "regress"]
 
 USEFUL = 0.5
 """Half width of the interval, as a part of the excess, up to which it is written to the vehicle file."""
@@ -66,73 +51,30 @@ FAINT = 0.002
 """The same as a part of the weight: what a thousandth of the volume does matters little."""
 
 
-def coasts(data: AxisData) -> list[tuple[str, float]]:
-    """Stretches without thrust at whose end buoyancy and weight alone move the vehicle up or down.
-
-    Args:
-        data: Of heave.
-
-    Returns:
-        Trial, and mean speed over the last `STEADY` seconds, positive up [m/s], of each.
-    """
-    largest = max(float(np.abs(s.tau[np.isfinite(s.tau[:, 2]), 2]).max(initial=0.0)) for s in data.signals)
-    found = []
-    for s, rows in zip(data.signals, data.rows, strict=True):
-        speed, push = rows.X[:, 1], np.interp(s.t[rows.at], s.t, np.nan_to_num(s.tau[:, 2]))
-        free = (np.abs(push) < HANDS_OFF * largest) & (np.abs(speed) > RISING)
-        for b, e in spans_of(free):
-            t = s.t[rows.at[b:e]]
-            last = t > t[-1] - STEADY
-            fading = abs(speed[e - 1]) < LEVEL * np.abs(speed[b:e][last]).max()
-            same = np.sign(speed[b:e][last]) == np.sign(speed[e - 1])
-            if t[-1] - t[0] >= STEADY and same.all() and not fading:
-                found.append((s.name, float(np.mean(speed[b:e][last]))))
-    return found
-
-
-def buoyancy_estimate(data: AxisData, chosen: Selection, vehicle: Vehicle) -> tuple[Estimate, list[Finding]]:
+def buoyancy_estimate(chosen: Selection, vehicle: Vehicle) -> Estimate:
     """B - W from the bias of heave: m w_dot + d1 w + d2 |w| w + b = tau_z, b = -(B - W).
 
-    Args:
-        data: Of heave.
-        chosen: Its model.
-        vehicle: For its weight, which is taken as exact.
+    Coasts and motion both ways tell it from the damping; without them the interval is wide.
 
-    Returns:
-        The estimate, and what to know about it.
+    Args:
+        chosen: The model of heave.
+        vehicle: For its weight, which is taken as exact.
     """
     bias = TERMS.index("bias")
     low, high = (float(x) for x in chosen.interval[bias])
     value = -float(chosen.fit.theta[bias])
-    free = coasts(data)
-    speeds = np.concatenate([r.X[u, 1] for r, u in zip(data.rows, chosen.fit.used, strict=True)])
-    both = bool((speeds > RISING).any() and (speeds < -RISING).any())
-    findings = []
-    if free:
-        fastest = max((speed for _, speed in free), key=abs)
-        note = f"{len(free)} coast{'s' if len(free) > 1 else ''} without thrust, up to {fastest:+.3f} m/s"
-    elif both:
-        note = "from driven motion up and down; no coast without thrust reached 0.01 m/s"
-    else:
-        note = "no coast and one direction only: the excess trades off with the damping"
-        findings.append(finding("buoyancy_traded", "heave"))
-    known = bool(np.isfinite([low, high]).all())
-    known = known and 0.5 * (high - low) <= max(USEFUL * abs(value), FAINT * vehicle.weight)
-    if not known:
-        note += "; not known to half its size"
-    sure = known and (bool(free) or both)
+    half = 0.5 * (high - low)
+    known = bool(np.isfinite(half) and half <= max(USEFUL * abs(value), FAINT * vehicle.weight))
     volume = (vehicle.weight + value) / (vehicle.water.density * vehicle.water.gravity)
-    return (
-        Estimate(
-            name="buoyancy_excess",
-            estimate=value,
-            ci95=(-high, -low),
-            unit="N",
-            identifiable=sure,
-            note=f"{note}; with the file's weight a displaced volume of {volume:.6g} m³",
-            path="body.displaced_volume",
-        ),
-        findings,
+    note = f"with the file's weight a displaced volume of {volume:.6g} m³"
+    return Estimate(
+        name="buoyancy_excess",
+        estimate=value,
+        ci95=(-high, -low),
+        unit="N",
+        identifiable=known,
+        note=note if known else f"not known to half its size: dive and coast; {note}",
+        path="body.displaced_volume",
     )
 
 
@@ -188,7 +130,7 @@ def prepare(trials: Sequence[Trial], vehicle: Vehicle) -> tuple[list[Prepared], 
             # A row's value acts until the next row: at the row itself the wrench jumps, and the middle of the jump has
             # the same integral under any smooth weight.
             before = np.concatenate([found.tau[:1], found.tau[:-1]])
-            found = _with_wrench(found, 0.5 * (np.where(np.isfinite(before), before, found.tau) + found.tau))
+            found = replace(found, tau=0.5 * (np.where(np.isfinite(before), before, found.tau) + found.tau))
         water = trial.header.water
         moving = water.current is not None and any(water.current)
         current = np.asarray(water.current) if moving else None
@@ -205,10 +147,6 @@ def _up(trial: Trial, found: Motion) -> Array:
     sampled = quat_inverse_rotate(q / np.linalg.norm(q, axis=1, keepdims=True), np.array([0.0, 0.0, 1.0]))
     up = np.stack([np.interp(found.t, t, column) for column in sampled.T], axis=-1)
     return np.where(known[:, None], up, np.nan)
-
-
-def _with_wrench(found: Motion, tau: Array) -> Motion:
-    return replace(found, tau=tau)
 
 
 def excited(prepared: Sequence[Prepared], vehicle: Vehicle) -> NDArray[np.bool_]:
@@ -263,10 +201,11 @@ def axis_data(
     if axis not in (3, 4):
         kept, tilted, cut = _level(kept, keep_tilted)
         said += [one.about(of) for one in cut]
-    spread = [_noise_and_range(s.nu[s.usable, axis]) for s in kept]
-    largest = max((r for _, r in spread), default=0.0)
+    speeds = [s.nu[s.usable & np.isfinite(s.nu[:, axis]), axis] for s in kept]
+    largest = max((float(np.percentile(np.abs(nu), 95.0)) for nu in speeds if len(nu) >= 10), default=0.0)
     out = []
-    for s, (noise, _) in zip(kept, spread, strict=True):
+    for s, nu in zip(kept, speeds, strict=True):
+        noise = float(np.nan_to_num(white_noise(nu)))
         # White noise of n samples shrinks by √n; a bump of half width w averages some 1.2 w rate of them.
         needed = (noise / max(QUIET * largest, 1e-12)) ** 2
         kernels = kernel(
@@ -287,8 +226,6 @@ def axis_data(
         rows=tuple(r for _, r, _ in out),
         kernels=tuple(k for _, _, k in out),
         tilted=tilted,
-        estimated=plants[0].estimated,
-        lowest=plants[0].lowest,
     ), said
 
 
@@ -329,15 +266,6 @@ def _level(found: list[Signals], keep: bool) -> tuple[list[Signals], float, list
     return cut, beyond / total, [finding("tilted_left_out", percent=percent, tilt=LARGEST_TILT)]
 
 
-def _noise_and_range(nu: Array) -> tuple[float, float]:
-    """Standard deviation of white noise from second differences, and the 95th percentile of |nu|."""
-    good = nu[np.isfinite(nu)]
-    if len(good) < 10:
-        return 0.0, 0.0
-    second = np.diff(good, 2)
-    return float(np.median(np.abs(second)) / 0.6745 / np.sqrt(6.0)), float(np.percentile(np.abs(good), 95.0))
-
-
 Array = NDArray[np.float64]
 
 PASSES = 3
@@ -369,7 +297,6 @@ def regress(
     *,
     axes: Sequence[str] | None = None,
     damping: str = "auto",
-    estimate: Sequence[str] = (),
     known: Mapping[str, float] | None = None,
     file_prior: bool = True,
     seed: int = 0,
@@ -386,62 +313,55 @@ def regress(
         vehicle: Gives the rigid body, what is known of couplings, and where the numbers go.
         axes: Axes to fit; all that are excited if None.
         damping: `auto`, `linear`, `quadratic` or `both`.
-        estimate: Parameters of the vehicle's terms to fit too, such as `lift.coefficient`, in which their wrench is
-            linear; each from all axes on which it acts.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
         file_prior: Whether the inertia and drag of the vehicle file count as a prior, within a factor of two or so.
         seed: Kept with the fit; nothing here is random.
 
     Raises:
-        CalibrationError: No trial can be used, one is held out, an axis, damping or parameter is unknown, or two share
-            a name.
+        CalibrationError: No trial can be used, one is held out, an axis or damping is unknown, or two share a
+            name.
     """
-    wanted = _wanted(axes)
+    require_axes(axes)
+    wanted = [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
     require_fittable(trials, vehicle)
     driven = [trial for trial in trials if not trial.header.passive]
     prepared, findings = prepare(driven, vehicle)
-    chosen, more = _fit_axes(
-        prepared, vehicle, wanted, axes is not None, damping, known or {}, estimate, file_prior
-    )
+    chosen, more = _fit_axes(prepared, vehicle, wanted, axes is not None, damping, known or {}, file_prior)
     findings += more
     file = matrices(vehicle)
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
-    results: dict[str, AxisResult] = {}
+    figures: dict[str, dict[str, float]] = {}
+    curves: list[Curve] = []
+    told = []
     for i, (data, selection) in chosen.items():
-        results[AXES[i]] = result = AxisResult(data=data, chosen=selection, file=file)
+        result, worthless_for = regression_result(data, selection, file)
         estimates |= result.estimates
         changes |= result.changes
         findings += result.findings
+        figures[AXES[i]] = quality(data, selection)
+        curves += curves_of(data, selection)
+        told += [] if worthless_for else [i]
         if i == 2:
-            buoyancy, notes = buoyancy_estimate(data, selection, vehicle)
-            if result.worthless:
-                buoyancy = replace(buoyancy, identifiable=False, note=result.worthless)
+            buoyancy = buoyancy_estimate(selection, vehicle)
+            if worthless_for:
+                buoyancy = replace(buoyancy, identifiable=False, note=worthless_for)
             estimates[buoyancy.name] = buoyancy
-            findings += notes
-    told = {i: pair for i, pair in chosen.items() if not results[AXES[i]].worthless}
-    for path in estimate:
-        found, notes = term_estimate(path, told)
-        findings += notes
-        if found is not None:
-            estimates[path] = found
-            changes |= {str(found.path): found.estimate} if found.identifiable else {}
     used = {s.name for data, _ in chosen.values() for s in data.signals}
     still, notes = hydrostatics(estimates, vehicle)
     changes |= still
     findings += notes
-    figures = {axis: result.quality for axis, result in results.items()}
-    curves = [curve for result in results.values() for curve in curves_of(result.data, result.chosen)]
-    findings += late_velocity(figures, explained=[AXES[i] for i in told])
-    quiet = _passive(trials, vehicle, [i for i in wanted if i not in told], known or {})
-    if quiet is not None:
-        estimates, changes, figures = (
-            estimates | quiet.estimates,
-            changes | quiet.changes,
-            figures | quiet.quality,
-        )
+    quiet_trials, open_axes = (
+        [t for t in trials if t.header.passive],
+        [AXES[i] for i in wanted if i not in told],
+    )
+    if quiet_trials and open_axes:
+        quiet = passive(quiet_trials, vehicle, axes=open_axes, known=known)
+        estimates |= quiet.estimates
+        changes |= quiet.changes
+        figures |= quiet.quality
         findings += quiet.findings
         curves += quiet.curves
         used |= set(quiet.trials)
@@ -466,15 +386,9 @@ def regress(
             "damping": damping,
             "axes": [AXES[i] for i in chosen],
             **({"fix": {f"{axis}.m": m for axis, m in known.items()}} if known else {}),
-            **({"estimate": list(estimate)} if estimate else {}),
             "seed": seed,
         },
     )
-
-
-def _wanted(axes: Sequence[str] | None) -> list[int]:
-    require_axes(axes)
-    return [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
 
 
 def _fit_axes(
@@ -484,13 +398,12 @@ def _fit_axes(
     asked: bool,
     damping: str,
     known: Mapping[str, float],
-    estimate: Sequence[str],
     file_prior: bool,
 ) -> tuple[dict[int, tuple[AxisData, Selection]], list[Finding]]:
     """Data and model of every axis that can be fitted; couplings between axes use the estimates of the round before."""
-    file = matrices(vehicle, estimate=estimate)
+    file = matrices(vehicle)
     findings = list[Finding]()
-    waters = [matrices(vehicle, one.trial.header.water.density, estimate=estimate) for one in prepared]
+    waters = [matrices(vehicle, one.trial.header.water.density) for one in prepared]
     active = excited(prepared, vehicle) if prepared else np.zeros((0, 6), bool)
     fitted = {i for i in wanted if active[:, i].any()}
     chosen: dict[int, tuple[AxisData, Selection]] = {}
@@ -564,9 +477,9 @@ def _same(before: AxisData, now: AxisData) -> bool:
 def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correlation | None, list[Finding]]:
     """Of all axes together, block by block, with a finding for every trade-off."""
     names, blocks, findings = list[str](), list[Array](), list[Finding]()
-    for i, (data, selection) in chosen.items():
-        fit, terms = selection.fit, (*TERMS, *data.estimated)
-        own = [f"{AXES[i]}.{name}" for name, on in zip(terms, fit.terms, strict=True) if on]
+    for i, (_, selection) in chosen.items():
+        fit = selection.fit
+        own = [f"{AXES[i]}.{name}" for name, on in zip(TERMS, fit.terms, strict=True) if on]
         found, said = degeneracy(own, fit.covariance.local, fit.free[fit.terms])
         names += own
         blocks.append(found.matrix)
@@ -576,15 +489,3 @@ def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correla
     from scipy.linalg import block_diag
 
     return Correlation(names=tuple(names), matrix=block_diag(*blocks)), findings
-
-
-def _passive(
-    trials: Sequence[Trial], vehicle: Vehicle, wanted: list[int], known: Mapping[str, float]
-) -> Fit | None:
-    """What trials without thrust show of axes that no driven trial did; None without such trials."""
-    quiet = [trial for trial in trials if trial.header.passive]
-    if not quiet or not wanted:
-        return None
-    from finssim.calibration.regression.passive import passive
-
-    return passive(quiet, vehicle, axes=[AXES[i] for i in wanted], known=known)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
+from finssim.calibration.motion.smoothing import white_noise
 from finssim.calibration.simulation.rollout import Response, Rollouts, Segment, Streams, segments, streams
 from finssim.calibration.trials.trial import NU, Array, Trial
 from finssim.files import atomic_directory, refuse_unwritable
@@ -501,7 +502,7 @@ def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
             t_raw, values = s.measured[name]
             raw[name] = resampled(t_raw, values, clock)
             measured[name] = resampled(m.t, smooth[name], clock) if name in smooth else raw[name]
-            source[name], noise[name] = "measured", _sample_noise(values)
+            source[name], noise[name] = "measured", white_noise(values)
     return Pair(
         name=trial.name,
         sha256=trial.sha256,
@@ -529,14 +530,6 @@ def _rate(s: Streams, vehicle: Vehicle) -> float:
     rates = [1.0 / float(np.median(np.diff(t))) for t in clocks if len(t) > 1]
     rate = min([RATE, s.motion.rate, *rates])
     return float(round(rate)) if rate >= 2.0 and abs(rate / round(rate) - 1.0) < 0.01 else rate
-
-
-def _sample_noise(values: Array) -> float:
-    """Standard deviation of white noise on a signal that is smooth from sample to sample: of its second differences."""
-    if len(values) < 10:
-        return float("nan")
-    second = np.diff(values, n=2)
-    return float(1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6.0))
 
 
 def _axes_of_passive(pair: Pair) -> Pair:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -14,15 +14,16 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion
+from finssim.calibration.output.vehicle_file import SCALED
 from finssim.calibration.regression.axis_estimates import (
-    BIAS_NOTE,
     CERTAIN,
-    USEFUL,
+    AxisResult,
+    Number,
     drag_known,
     hydrostatics,
-    outside,
 )
 from finssim.calibration.regression.axis_fit import AKAIKE, DAMPING
+from finssim.calibration.regression.plant_terms import matrices
 from finssim.calibration.simulation.rollout import Segment, Streams, segments, streams
 from finssim.calibration.simulation.shooting import (
     CUT,
@@ -31,7 +32,6 @@ from finssim.calibration.simulation.shooting import (
     Point,
     Shooting,
     Solution,
-    costs_of,
     solve,
     weights_of,
 )
@@ -137,17 +137,7 @@ def _blocks(problem: Shooting, trial: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 LAG_CERTAIN = 0.05
-"""The same for a delay [s]."""
-
-UNITS = {
-    "m_eff": ("kg", "kg m²"),
-    "added_mass": ("kg", "kg m²"),
-    "d1": ("N s/m", "N m s"),
-    "d2": ("N s²/m²", "N m s²"),
-    "bias": ("N", "N m"),
-}
-
-FAMILY = {"added_mass": "added_mass", "d1": "linear_damping", "d2": "quadratic_damping"}
+"""Half width of the interval of a delay up to which it counts as identifiable [s]."""
 
 PATHS = {
     "buoyancy_excess": "body.displaced_volume",
@@ -159,140 +149,93 @@ PATHS = {
 }
 """Coordinates besides those of the axes that are reported, and where they stand in the vehicle file."""
 
-
-@dataclass(frozen=True)
-class Quantity:
-    """One number of the report: a coordinate of the vector, plus a constant."""
-
-    name: str
-    unit: str
-    path: str | None
-    kind: str
-    """m_eff, added_mass, d1, d2, bias, k, or the name of the coordinate."""
-    coordinate: str
-    """Its name; zero where it is not free."""
-    rigid: float = 0.0
-    """Rigid inertia of the axis [kg, kg m²]; in m_eff, and beside added_mass."""
+SIGNED = ("buoyancy_excess", "current.x", "current.y")
+"""Of these, those that may well be zero: determined wherever they have an interval."""
 
 
-def quantities(p: Parameters, axes: Sequence[str]) -> list[Quantity]:
-    """What a fit reports of some axes, in the report's order."""
-    out = []
-    base = f"hydrodynamics.{p.hydrodynamics}"
-    for axis, i in zip(p.axes, p.index, strict=True):
-        if axis not in axes:
-            continue
-        for kind in ("m_eff", "added_mass", "d1", "d2"):
-            path = f"{base}.{FAMILY[kind]}.{i}.{i}" if kind in FAMILY else None
-            coordinate = f"{axis}.{'added_mass' if kind == 'm_eff' else kind}"
-            rigid = float(p.M_RB[i, i]) if coordinate.endswith("added_mass") else 0.0
-            out.append(Quantity(f"{axis}.{kind}", UNITS[kind][int(i > 2)], path, kind, coordinate, rigid))
-        if "k" in p.names and axis in ("roll", "pitch"):
-            out.append(Quantity(f"{axis}.k", "N m/rad", "body.center_of_buoyancy.2", "k", "k"))
-        if (bias := f"{axis}.bias") in p.names:
-            out.append(Quantity(bias, UNITS["bias"][int(i > 2)], None, "bias", bias))
-    out += [Quantity(c.name, c.unit, PATHS[c.name], c.name, c.name) for c in p.coordinates if c.name in PATHS]
-    return out + [Quantity(path, unit_of(path), f"{base}.{path}", path, path) for path in p.terms]
-
-
-def spread(
-    p: Parameters, listed: Sequence[Quantity], x: Array, found: Confidence, own_error: float
-) -> tuple[Array, Array, Array]:
-    """Values (Q,), intervals (Q, 2) and p-values of being zero (Q,)."""
-    from scipy.stats import norm
-
-    local = np.diagonal(found.covariance.local)
-    half = intervals(np.zeros(len(local)), found.covariance)[:, 1]
-    value, ends, p_value = np.zeros(len(listed)), np.zeros((len(listed), 2)), np.ones(len(listed))
-    for q, quantity in enumerate(listed):
-        if quantity.coordinate not in p.names:
-            continue
-        c = p.names.index(quantity.coordinate)
-        offset = quantity.rigid if quantity.kind == "m_eff" else 0.0
-        value[q] = x[c] + offset
-        if not np.isfinite(local[c]):
-            ends[q] = -np.inf, np.inf
-            continue
-        free = value[q] + np.clip(found.free[c] - x[c], -1e6, 1e6)
-        width = np.hypot(half[c], own_error * abs(x[c] + quantity.rigid))
-        ends[q] = max(min(free - width, value[q]), p.low[c] + offset), max(free + width, value[q])
-        # Akaike's criterion compares likelihoods, hence independent errors: a term kept for nothing costs little.
-        p_value[q] = 2.0 * norm.sf(max(free, 0.0) / max(np.sqrt(local[c]), 1e-300))
-    return value, ends, p_value
-
-
-def estimates(
-    p: Parameters,
-    x: Array,
-    found: Confidence,
-    *,
-    axes: Sequence[str],
-    own_error: float = 0.0,
-    wider: dict[str, tuple[float, float]] | None = None,
-    dropped: dict[str, str] | None = None,
-) -> tuple[dict[str, Estimate], dict[str, float], list[Finding]]:
-    """Named estimates.
+def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> dict[str, Number]:
+    """Every coordinate with its 95 % interval, by name.
 
     Args:
         p: What was free.
         x: Where it ended, (P,).
         found: Evidence there.
-        axes: Which to report.
         own_error: Of the simulation itself, as a part of an estimate; intervals hold it too.
-        wider: Intervals of the fuller model that this one was chosen from; both are covered.
-        dropped: Quantity -> why it was left out.
-
-    Returns:
-        Estimates by name, the p-value of each being zero, and which rest on a bound.
     """
-    listed = quantities(p, axes)
-    value, ends, p_value = spread(p, listed, x, found, own_error)
-    at_low = {name for name, xi, low in zip(p.names, x, p.low, strict=True) if xi <= low}
-    free = dict(zip(p.names, found.free, strict=False))
+    local, out = np.diagonal(found.covariance.local), {}
+    half = intervals(np.zeros(len(local)), found.covariance)[:, 1]
+    for c, name in enumerate(p.names):
+        low, high, value = -np.inf, np.inf, float(x[c])
+        if np.isfinite(local[c]):
+            free = value + float(np.clip(found.free[c] - value, -1e6, 1e6))
+            width = float(np.hypot(half[c], own_error * abs(value + rigid_part(p, name))))
+            low, high = max(min(free - width, value), p.low[c]), max(free + width, value)
+        out[name] = Number(value, (low, high), float(found.free[c]) if value <= p.low[c] else None)
+    return out
+
+
+def rigid_part(p: Parameters, name: str) -> float:
+    """Rigid inertia of the axis of an added mass [kg, kg m²]; 0 of any other coordinate."""
+    axis, _, kind = name.partition(".")
+    return float(p.M_RB[AXES.index(axis), AXES.index(axis)]) if kind == "added_mass" else 0.0
+
+
+def axis_result(
+    p: Parameters, numbers: Mapping[str, Number], first: Mapping[str, Number], axis: str, **known: Any
+) -> AxisResult:
+    """The result of one axis.
+
+    Args:
+        p: What was free.
+        numbers: Of `numbers_of`.
+        first: The same of the fuller model from which this one was chosen: damping that was left out has its interval.
+        axis: Which.
+        known: Further fields of `AxisResult`.
+    """
+    mass, rigid = numbers[f"{axis}.added_mass"], rigid_part(p, f"{axis}.added_mass")
+    free = None if mass.free is None else mass.free + rigid
+    own = {"m_eff": Number(mass.value + rigid, (mass.ends[0] + rigid, mass.ends[1] + rigid), free)}
+    own |= {n: numbers[f"{axis}.{n}"] for n in ("d1", "d2", "bias") if f"{axis}.{n}" in numbers}
+    if "k" in numbers and axis in ("roll", "pitch"):
+        own["k"] = numbers["k"]
+    dropped = {
+        n: (0.0, first[f"{axis}.{n}"].ends[1])
+        for n in ("d1", "d2")
+        if n not in own and f"{axis}.{n}" in first
+    }
+    return AxisResult(axis=axis, numbers=own, file=matrices(p.vehicle), dropped=dropped, **known)
+
+
+def other_estimates(
+    p: Parameters, numbers: Mapping[str, Number]
+) -> tuple[dict[str, Estimate], list[Finding]]:
+    """Of what no axis has for itself, and which of them rest on a bound."""
     out, bounds = dict[str, Estimate](), list[Finding]()
-    for q, quantity in enumerate(listed):
-        low, high = float(ends[q, 0]), float(ends[q, 1])
-        if wider and quantity.name in wider:
-            low, high = min(low, wider[quantity.name][0]), max(high, wider[quantity.name][1])
-        sure, note = _verdict(quantity, float(value[q]), low, high)
-        if dropped and quantity.name in dropped:
-            sure, note = False, dropped[quantity.name]
-        elif quantity.coordinate in at_low:
-            sure, note = False, "held at its bound"
-            if np.isfinite(low + high):
-                note += f"; free, it would be {free[quantity.coordinate]:.3g} {quantity.unit}"
-            bounds.append(
-                finding("at_bound", quantity.name, free=free[quantity.coordinate], unit=quantity.unit)
-            )
-        elif quantity.kind == "added_mass" and sure and value[q] <= 0.0:
-            sure, note = False, f"m_eff is below the file's rigid {quantity.rigid:.4g} {quantity.unit}"
-        out[quantity.name] = Estimate(
-            name=quantity.name,
-            estimate=float(value[q]),
+    units = {c.name: c.unit for c in p.coordinates if c.name in PATHS} | {
+        path: unit_of(path) for path in p.terms
+    }
+    for name, unit in units.items():
+        value, (low, high), free = numbers[name]
+        half, note = 0.5 * (high - low), ""
+        limit = LAG_CERTAIN if name == "thrust_delay" else np.inf if name in SIGNED else CERTAIN * abs(value)
+        if free is not None:
+            note = f"held at its bound; free, it would be {free:.3g} {unit}"
+            bounds.append(finding("at_bound", name, free=free, unit=unit))
+        elif not np.isfinite(half):
+            note = "the trials do not determine it"
+        elif half > limit:
+            note = f"known to no better than ±{half:.2g} {unit}"
+        path = PATHS[name] if name in PATHS else f"hydrodynamics.{p.hydrodynamics}.{name}"
+        out[name] = Estimate(
+            name=name,
+            estimate=value,
             ci95=(low, high),
-            unit=quantity.unit,
-            identifiable=sure,
+            unit=unit,
+            identifiable=not note,
             note=note,
-            path=quantity.path,
+            path=path,
         )
-    return out, {quantity.name: float(p_value[q]) for q, quantity in enumerate(listed)}, bounds
-
-
-def _verdict(quantity: Quantity, value: float, low: float, high: float) -> tuple[bool, str]:
-    """Whether a quantity is determined, and what to say of it."""
-    half = 0.5 * (high - low)
-    if not np.isfinite(half):
-        return False, "the trials say nothing of it"
-    if quantity.kind in ("bias", "buoyancy_excess", "current.x", "current.y"):
-        return True, BIAS_NOTE if quantity.kind == "bias" else ""
-    if quantity.kind == "thrust_delay":
-        return half <= LAG_CERTAIN, "" if half <= LAG_CERTAIN else f"known to no better than ±{half:.2g} s"
-    if half > CERTAIN * abs(value):
-        percent = 100.0 * half / max(abs(value), 1e-300)
-        return False, f"known to no better than ±{min(percent, 9999.0):.0f} %"
-    if quantity.kind == "added_mass" and low <= 0.0:
-        return False, "not distinguishable from zero"
-    return True, ""
+    return out, bounds
 
 
 # What trials show: which axes they excite, which measurements tell of an axis, how fast the vehicle answers.
@@ -438,41 +381,41 @@ LATE = 0.03
 SHOWN = 4
 """Trials in the curve of an axis."""
 
-DECADE = 10.0
 
-
-def _column(problem: Shooting, axis: str) -> int | None:
-    """The most direct channel in use that tells of an axis."""
-    names = problem.measured.names
-    return next((names.index(c) for c in TELL[axis] if c in names), None)
+def _shown_by(
+    problem: Shooting, axis: str
+) -> tuple[str, NDArray[np.int64], NDArray[np.int64], dict[int, float]]:
+    """The most direct channel in use that tells of an axis, its samples (n,), their trials (n,), and the range of the
+    channel in each trial, from the 5th to the 95th percentile; no samples where there is no such channel."""
+    m = problem.measured
+    name = next((c for c in TELL[axis] if c in m.names), "")
+    rows = np.flatnonzero(m.channel == m.names.index(name)) if name else np.empty(0, int)
+    trial = problem.groups[m.segment][rows]
+    spans = {
+        int(g): float(np.ptp(np.percentile(m.value[rows][trial == g], [5.0, 95.0]))) for g in np.unique(trial)
+    }
+    return name, rows, trial, spans
 
 
 def quality(
     problem: Shooting, solution: Solution, axes: Sequence[str], used: Sequence[Streams]
 ) -> dict[str, dict[str, float]]:
     """Figures of each axis over the trials that move it: the simulated against the measured channel."""
-    m, out = problem.measured, {}
-    trial = problem.groups[m.segment]
+    out = {}
     for axis in axes:
-        column = _column(problem, axis)
-        if column is None:
+        name, rows, trial, spans = _shown_by(problem, axis)
+        if not name:
             continue
-        rows = np.flatnonzero(m.channel == column)
-        spread = {
-            g: float(np.ptp(np.percentile(m.value[rows][trial[rows] == g], [5.0, 95.0])))
-            for g in np.unique(trial[rows])
-        }
-        moving = [g for g, s in spread.items() if s > 0.2 * max(spread.values())]
-        rows = rows[np.isin(trial[rows], moving)]
-        residual, value = solution.linear.residual[rows], m.value[rows]
-        nrmse = [
-            float(np.sqrt(np.mean(residual[trial[rows] == g] ** 2))) / max(spread[g], 1e-12) for g in moving
-        ]
+        moving = [g for g, span in spans.items() if span > 0.2 * max(spans.values())]
+        inside = np.isin(trial, moving)
+        rows, trial = rows[inside], trial[inside]
+        residual, value = solution.linear.residual[rows], problem.measured.value[rows]
+        rms = {g: float(np.sqrt(np.mean(residual[trial == g] ** 2))) for g in moving}
         low, high = speeds([s.motion for s in used], axis)
         out[axis] = {
             "r2": 1.0 - float(np.mean(residual**2)) / max(float(np.var(value)), 1e-300),
             "rmse": float(np.sqrt(np.mean(residual**2))),
-            "nrmse": float(np.mean(nrmse)),
+            "nrmse": float(np.mean([rms[g] / max(spans[g], 1e-12) for g in moving])),
             "samples": float(len(rows)),
             "rejected": float(np.sum(np.abs(residual) > 2.0 * CUT * solution.std[rows])),
             "trials": float(len(moving)),
@@ -486,35 +429,23 @@ def quality(
 def pictures(problem: Shooting, solution: Solution, axes: Sequence[str]) -> tuple[Curve, ...]:
     """Measured and simulated channel of each axis, over the trials that move it most."""
     m, out = problem.measured, []
-    trial = problem.groups[m.segment]
     clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
     for axis in axes:
-        column = _column(problem, axis)
-        if column is None:
-            continue
-        rows = np.flatnonzero(m.channel == column)
-        present = np.unique(trial[rows])
-        spread = [float(np.ptp(np.percentile(m.value[rows][trial[rows] == g], [5.0, 95.0]))) for g in present]
+        name, rows, trial, spans = _shown_by(problem, axis)
         x, y, p, offset = [], [], [], 0.0
-        for g in np.sort(present[np.argsort(spread)[::-1][:SHOWN]]):
-            those = rows[trial[rows] == g]
+        for g in sorted(sorted(spans, key=lambda g: -spans[g])[:SHOWN]):
+            those = rows[trial == g]
             those = those[np.argsort(clock[those], kind="stable")]
             t = clock[those] - clock[those[0]] + offset
             x += [t, [np.nan]]
             y += [m.value[those], [np.nan]]
             p += [m.value[those] - solution.linear.residual[those], [np.nan]]
             offset = float(t[-1]) + 1.0
-        name = m.names[column]
-        out.append(
-            Curve(
-                title=f"{axis}: {name}, simulated from the inputs alone",
-                x_label="time, trial after trial [s]",
-                y_label=f"{name} [{_unit(name)}]",
-                x=np.concatenate(x),
-                measured=np.concatenate(y),
-                fitted=np.concatenate(p),
-            )
-        )
+        if name:
+            title = f"{axis}: {name}, simulated from the inputs alone"
+            columns = dict(zip(("x", "measured", "fitted"), map(np.concatenate, (x, y, p)), strict=True))
+            labels = {"x_label": "time, trial after trial [s]", "y_label": f"{name} [{_unit(name)}]"}
+            out.append(Curve(title=title, **labels, **columns))
     return tuple(out)
 
 
@@ -528,7 +459,6 @@ def fit_findings(
     problem: Shooting,
     solution: Solution,
     found: Confidence,
-    estimates: dict[str, Estimate],
     used: Sequence[Streams],
 ) -> list[Finding]:
     """What a reader should know before using the numbers."""
@@ -537,19 +467,7 @@ def fit_findings(
         out.append(finding("interrupted"))
     elif not solution.converged:
         out.append(finding("not_converged", iterations=solution.iterations))
-    p = problem.parameters
-    for axis, i in zip(p.axes, p.index, strict=True):
-        if f"{axis}.m_eff" not in estimates:
-            continue
-        whole, added = estimates[f"{axis}.m_eff"], estimates[f"{axis}.added_mass"]
-        if added.estimate <= 0.0:
-            fields = {"effective": whole.estimate, "rigid": p.M_RB[i, i], "unit": whole.unit}
-            out.append(finding("inertia_too_small", axis, **fields))
-        low, high = speeds([s.motion for s in used], axis)
-        if 0.0 < low and high < DECADE * low:
-            unit = "m/s" if i < 3 else "rad/s"
-            out.append(finding("few_speeds", axis, low=low, high=high, unit=unit))
-    P = len(p.names)
+    P = len(problem.parameters.names)
     for stream, late, (low, high) in zip(
         problem.errors.streams, solution.point.theta[P : problem.shared], found.interval[P:], strict=True
     ):
@@ -575,72 +493,42 @@ class Clock:
             self.progress(self.part, f"{words}, {spent:.0f} s")
 
 
-# The stages of a simulation-error fit: short segments first, then longer ones, then other choices of parameters.
-
 # From a simulation-error fit to changes of the vehicle file: only what the trials determine.
 
 
 def changes(
-    p: Parameters,
-    x: Array,
-    found: dict[str, Estimate],
-    evidence: Confidence,
-    axes: Sequence[str],
-    speed: dict[str, float],
-    scaled: bool,
+    p: Parameters, x: Array, found: Mapping[str, Estimate], axes: dict[str, Any], scaled: bool
 ) -> dict[str, Any]:
-    """Changes of the vehicle file; an axis' damping changes as a pair, where its force at top speed is known.
+    """Changes of the vehicle file.
 
     Args:
         p: What was free.
         x: Where it ended, (P,).
-        found: Its estimates.
-        evidence: For the error of the damping force.
-        axes: Which to write.
-        speed: Highest speed of each axis [m/s or rad/s].
+        found: All estimates.
+        axes: Changes of the axes' own numbers.
         scaled: Whether a thrust scale belongs to the thrusters' curves.
     """
-    out: dict[str, Any] = {}
-    base = f"hydrodynamics.{p.hydrodynamics}"
-    new = dict(
-        zip(("added_mass", "linear_damping", "quadratic_damping"), (m[0] for m in p.matrices(x)), strict=True)
-    )
-    chosen = p.set
-    written: dict[str, list[int]] = {"added_mass": [], "linear_damping": [], "quadratic_damping": []}
-    for axis in axes:
-        i = AXES.index(axis)
-        whole = found[f"{axis}.m_eff"]
-        half = 0.5 * (whole.ci95[1] - whole.ci95[0])
-        added = found[f"{axis}.added_mass"]
-        before = float(np.asarray(chosen.added_mass, float)[i, i])
-        if added.estimate > 0.0 and (half <= USEFUL * whole.estimate or outside(before, added.ci95)):
-            written["added_mass"].append(i)
-        if _drag_known(p, x, evidence, axis, speed.get(axis, 0.0)):
-            written["linear_damping"].append(i)
-            written["quadratic_damping"].append(i)
-    # The numbers of axes that nobody measured, but that were simulated: the others hold with these.
-    for axis in p.unseen:
-        for rows in written.values():
-            rows.append(AXES.index(axis))
-    for family, rows in written.items():
-        old = np.asarray(getattr(chosen, family), float)
-        for i in rows:
-            for j in range(6):
-                # Couplings are written where the fit did away with them.
-                if i == j or new[family][i, j] != old[i, j]:
-                    out[f"{base}.{family}.{i}.{j}"] = float(new[family][i, j])
+    out = dict(axes)
+    for path, matrix in _matrices(p, x).items():
+        old = np.asarray(getattr(p.set, path.rpartition(".")[2]), float)
+        for i, axis in enumerate(AXES):
+            # Axes that nobody measured were simulated: the others hold with their numbers.
+            if f"{path}.{i}.{i}" in axes or axis in p.unseen:
+                for j in range(6):
+                    # Couplings are written where the fit did away with them.
+                    if i == j or matrix[i, j] != old[i, j]:
+                        out[f"{path}.{i}.{j}"] = float(matrix[i, j])
     out |= hydrostatics(found, p.vehicle)[0]
     for name, path in (("thrust_lag", "time_constant"), ("thrust_delay", "delay")):
         if name in found and found[name].identifiable:
             out[f"thrusters.*.{path}"] = max(found[name].estimate, 1e-4 if path == "time_constant" else 0.0)
     for path in p.terms:
         if found[path].identifiable:
-            out[f"{base}.{path}"] = found[path].estimate
+            out[str(found[path].path)] = found[path].estimate
     if "thrust_scale" in found and found["thrust_scale"].identifiable and scaled:
         scale = found["thrust_scale"].estimate
         for name, thruster in p.vehicle.thrusters.items():
-            for key in ("c_plus", "c_minus", "force_min", "force_max"):
-                out[f"thrusters.{name}.{key}"] = scale * float(getattr(thruster, key))
+            out |= {f"thrusters.{name}.{key}": scale * float(getattr(thruster, key)) for key in SCALED}
     return out
 
 
@@ -674,14 +562,6 @@ A fast vehicle without fins turns broadside by itself, and derivatives over a lo
 
 HALVINGS = 2
 
-ROUGH = 3.0
-"""Residual, against a twentieth of the range, from which a coarse search comes first."""
-
-COARSE_SEGMENTS = 24
-
-FINE, REACH = 0.02, 20.0
-"""Parts of a coordinate's size: steps of the coarse search are linear up to one, and go no further than the other."""
-
 
 @dataclass
 class Stage:
@@ -707,11 +587,11 @@ class Stages:
         axes: tuple[str, ...],
         estimate: tuple[str, ...],
         length: float | None,
-        seed: int,
+        starts: Sequence[dict[str, float]],
         say: Clock,
     ) -> None:
-        self.prepared, self.vehicle, self.axes, self.seed, self.say = prepared, vehicle, axes, seed, say
-        self.given = length
+        self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
+        self.given, self.starts = length, starts
         self.excites = [excites(s, vehicle) for s in prepared]
         # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does.
         self.imposed = tuple(a for a in ("surge", "sway", "heave", "yaw") if a not in axes)
@@ -732,11 +612,13 @@ class Stages:
         self.biases = [] if self.trial_biases else biased
 
     def first(self, kinds: dict[str, str]) -> Stage:
-        """Short segments from a rough start, then segments of the length that the answer calls for."""
+        """Short segments from the better of the starts, then segments of the length that the answer calls for."""
         short = max(SHORT, 15.0 * sampling(self.prepared))
         self.cut(min(short, self.given or short))
-        problem = self.problem(kinds, {})
-        point = self._rough(problem, problem.start())
+        problem = min(
+            (self.problem(kinds, start) for start in self.starts), key=lambda one: one.cost(one.start())
+        )
+        point = problem.start()
         problem.hold_clocks(True)
         rough = solve(
             problem, point, iterations=12, std=problem.size(), rough=True, report=self.report("start", 0.3)
@@ -790,6 +672,10 @@ class Stages:
         solution = solve(problem, point, std=std, report=self.report("fit", toward))
         return Stage(problem, solution, confidence(problem, solution))
 
+    def numbers(self, stage: Stage) -> dict[str, Number]:
+        """Of a stage."""
+        return numbers_of(stage.problem.parameters, stage.x, stage.found, self.own_error)
+
     def report(self, words: str, toward: float) -> Callable[[int, float], None]:
         return lambda i, rms: self.say(f"{words}: iteration {i}, residual {rms:.4g} σ", toward)
 
@@ -839,70 +725,42 @@ class Stages:
             few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
         )
 
-    def _rough(self, problem: Shooting, point: Point) -> Point:
-        """The start, or a better one from a search of orders of magnitude over some of the segments."""
-        from scipy.optimize import differential_evolution
-
-        every = max(1, len(self.segments) // COARSE_SEGMENTS)
-        few = Shooting(
-            self.segments[::every], problem.parameters, problem.measured.names, lagged=self.lagged[::every]
-        )
-        size, own, p = few.size(), few.start(), problem.parameters
-        P = len(p.names)
-
-        def cost(x: Array) -> Array:
-            """Mean loss of parameters (P, C), (C,)."""
-            theta = np.repeat(own.theta[None], x.shape[1], axis=0)
-            theta[:, :P] = x.T
-            points = Point(theta, np.repeat(own.z[None], x.shape[1], axis=0))
-            return costs_of(few, few.residuals(points), size, points) / len(size)
-
-        if cost(point.theta[:P, None])[0] < 0.5 * ROUGH**2:
-            return point
-        self.say("coarse search", 0.2)
-        # Straight from each bound on to a small part of a coordinate's size, in powers of ten beyond.
-        base, unit = np.where(np.isfinite(p.low), p.low, p.start), FINE * p.scale
-
-        def inside(y: Array) -> Array:
-            grown = base[:, None] + unit[:, None] * np.sign(y) * np.expm1(np.abs(y))
-            return np.clip(grown, p.low[:, None], p.high[:, None])
-
-        away = (point.theta[:P] - base) / unit
-        start = np.sign(away) * np.log1p(np.abs(away))
-        reach = np.log1p(REACH / FINE)
-        found = differential_evolution(
-            lambda y: cost(inside(y.reshape(P, -1))),
-            [(0.0 if np.isfinite(low) else -reach, max(reach, at + 1.0)) for low, at in zip(p.low, start, strict=True)],
-            popsize=max(5, 96 // P), maxiter=25, seed=self.seed, x0=start, polish=False, vectorized=True,
-            updating="deferred", tol=0.01,
-        )  # fmt: skip
-        return Point(np.concatenate([inside(found.x[:, None])[:, 0], point.theta[P:]]), point.z)
-
     def result(
         self,
         stage: Stage,
-        wider: dict[str, tuple[float, float]],
-        dropped: dict[str, str],
+        first: Mapping[str, Number],
         remarks: list[Finding],
         *,
         damping: str,
+        seed: int,
     ) -> Fit:
-        """The finished fit."""
+        """The finished fit; intervals hold those of the fuller model `first` from which this one was chosen."""
         p, x = stage.problem.parameters, stage.x
-        found, _, bounds = estimates(
-            p, x, stage.found, axes=self.axes, own_error=self.own_error, wider=wider, dropped=dropped
-        )
-        top = {axis: speeds([s.motion for s in self.used], axis)[1] for axis in self.axes}
+        numbers = self.numbers(stage)
+        for name in numbers.keys() & first.keys():
+            (low, high), (a, b) = numbers[name].ends, first[name].ends
+            numbers[name] = numbers[name]._replace(ends=(min(low, a), max(high, b)))
+        found, axes, bounds = dict[str, Estimate](), dict[str, Any](), list[Finding]()
+        for axis in self.axes:
+            own = speeds([s.motion for s in self.used], axis)
+            known = _drag_known(p, x, stage.found, axis, own[1])
+            result = axis_result(p, numbers, first, axis, speeds=own, drag_known=known)
+            found |= result.estimates
+            axes |= result.changes
+            bounds += result.findings
+        others, held = other_estimates(p, numbers)
+        found |= others
         sources = {s.drive.source for s in self.used}
-        new = changes(p, x, found, stage.found, self.axes, top, scaled=sources <= {"rpm", "pwm"})
+        new = changes(p, x, found, axes, scaled=sources <= {"rpm", "pwm"})
         P, local = stage.problem.judged, stage.found.covariance.local
         correlation, traded = degeneracy(p.names[:P], local[:P, :P], stage.found.free[:P])
         left_out = [one.trial.name for one in self.prepared if one not in self.used]
         remarks = [
             *remarks,
             *(finding("trial_left_out", name) for name in left_out),
-            *fit_findings(stage.problem, stage.solution, stage.found, found, self.used),
+            *fit_findings(stage.problem, stage.solution, stage.found, self.used),
             *bounds,
+            *held,
             *traded,
         ]
         settings: dict[str, Any] = {
@@ -913,7 +771,7 @@ class Stages:
             "step": STEP,
             "segments": len(self.segments),
             "iterations": stage.solution.iterations,
-            "seed": self.seed,
+            "seed": seed,
         }
         self.say("done")
         return Fit(
@@ -953,6 +811,7 @@ def fit_by_simulation(
     estimate: Sequence[str] = (),
     damping: str = "auto",
     horizon: float | None = None,
+    begin: Fit | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Fit:
@@ -970,7 +829,8 @@ def fit_by_simulation(
             with heave, stiffness with roll and pitch, a bias with the others.
         damping: `auto`, `linear`, `quadratic` or `both`.
         horizon: Length of the segments [s]; from the data if None.
-        seed: Of the coarse search.
+        begin: Of another method: it begins with its numbers where these simulate the trials better than the file's.
+        seed: Recorded; nothing here is random.
         progress: Called with the part done and a few words.
 
     Returns:
@@ -983,20 +843,17 @@ def fit_by_simulation(
     prepared = [streams(trial, vehicle) for trial in trials]
     chosen, remarks = _axes(prepared, vehicle, axes)
     say = Clock(progress)
-    fit = Stages(telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, seed, say)
+    starts = [{}] if begin is None else [{}, {name: e.estimate for name, e in begin.estimates.items()}]
+    fit = Stages(telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, starts, say)
     kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)
     stage = fit.first(kinds)
-    wider: dict[str, tuple[float, float]] = {}
-    dropped: dict[str, str] = {}
+    first: dict[str, Number] = {}
     if damping == "auto" and not stage.solution.interrupted:
-        first, p_value, _ = estimates(
-            stage.problem.parameters, stage.x, stage.found, axes=chosen, own_error=fit.own_error
-        )
-        kinds, dropped = _select(kinds, p_value, prepared)
-        if dropped:
-            wider = {name: e.ci95 for name, e in first.items()}
-            stage = fit.next(kinds, stage)
-    return fit.result(stage, wider, dropped, remarks, damping=damping)
+        chosen_kinds = _select(kinds, stage)
+        if chosen_kinds != kinds:
+            first = fit.numbers(stage)
+            stage = fit.next(chosen_kinds, stage)
+    return fit.result(stage, first, remarks, damping=damping, seed=seed)
 
 
 def _check(
@@ -1039,19 +896,24 @@ def _axes(
     return chosen, remarks
 
 
-def _select(
-    kinds: dict[str, str], p_value: dict[str, float], prepared: Sequence[Streams]
-) -> tuple[dict[str, str], dict[str, str]]:
-    """Damping of each axis by Akaike's criterion, and what that leaves out."""
-    new, dropped = dict(kinds), {}
+def _select(kinds: dict[str, str], stage: Stage) -> dict[str, str]:
+    """Damping of each axis by Akaike's criterion.
+
+    It compares likelihoods, hence errors that are independent: a term that stays for nothing costs little.
+    """
+    from scipy.stats import norm
+
+    names, new = stage.problem.parameters.names, dict(kinds)
+    std = np.sqrt(np.diagonal(stage.found.covariance.local))
     for axis in kinds:
-        weak = [name for name in ("d1", "d2") if p_value[f"{axis}.{name}"] > AKAIKE]
-        if weak:
-            name = max(weak, key=lambda n: p_value[f"{axis}.{n}"])
-            low, high = speeds([s.motion for s in prepared], axis)
-            new[axis] = "quadratic" if name == "d1" else "linear"
-            unit = "m/s" if AXES.index(axis) < 3 else "rad/s"
-            dropped[f"{axis}.{name}"] = (
-                f"not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}"
+        p_value = {}
+        for name in ("d1", "d2"):
+            c = names.index(f"{axis}.{name}")
+            known = bool(np.isfinite(std[c]))
+            p_value[name] = (
+                2.0 * norm.sf(max(stage.found.free[c], 0.0) / max(std[c], 1e-300)) if known else 1.0
             )
-    return new, dropped
+        weakest = max(p_value, key=lambda name: p_value[name])
+        if p_value[weakest] > AKAIKE:
+            new[axis] = "quadratic" if weakest == "d1" else "linear"
+    return new

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -281,70 +281,7 @@ def _sink(m: Motion, vehicle: Vehicle, a: float, b: float) -> float:
     return DEEP if float(center.max()) < -reach else 0.0
 
 
-# Motors that were already running when a segment begins: their state and their delay line, for every candidate.
-
-
-def warm_motors(
-    before: Array, fields: Mapping[str, Array], step: float, substeps: int, *, slots: int
-) -> tuple[Array, Array]:
-    """Run the commands before a segment through limits, dead zone, delay, lag and slew as the simulator does.
-
-    Args:
-        before: Commanded forces of the steps before the start, the newest last [N], (m, S, 8).
-        fields: Plant fields by (C, S, ...); either axis may be 1.
-        step: Between commands [s].
-        substeps: Physics steps in it.
-        slots: Of the simulator's delay line.
-
-    Returns:
-        State of the lag at the start [N or rad/s], (C, S, 8), and the delay line as the simulator keeps it before its
-        first step: slot -k holds the command of k steps before, (C, S, slots, 8). C may be 1.
-    """
-    f = {
-        k: np.asarray(fields[k], float)
-        for k in (
-            "force_min",
-            "force_max",
-            "dead_minus",
-            "dead_plus",
-            "time_constant",
-            "slew",
-            "c_plus",
-            "c_minus",
-        )
-    }
-    delay = np.asarray(fields["delay"], float)
-    speed = np.asarray(fields["speed_lag"])[..., None] != 0
-    told = np.clip(before[:, None], f["force_min"], f["force_max"])
-    told = np.where((told > f["dead_minus"]) & (told < f["dead_plus"]), 0.0, told)
-    if speed.any():
-        c = np.where(told >= 0.0, f["c_plus"], f["c_minus"])
-        omega = np.sign(told) * np.sqrt(np.abs(told) / np.where(c > 0.0, c, np.inf))
-        told = np.where(speed, omega, told)
-    m, C, S = told.shape[0], max(told.shape[1], delay.shape[0], f["time_constant"].shape[0]), told.shape[2]
-    told = np.broadcast_to(told, (m, C, S, 8))
-    line = np.zeros((C, S, slots, 8))
-    count = min(m, slots - 1)
-    line[:, :, slots - count :] = np.moveaxis(told[m - count :], 0, 2)
-    tc = np.broadcast_to(f["time_constant"], (C, S, 8))
-    if not (tc > 0.0).any() and not (delay > 0.0).any():
-        return told[-1], line
-
-    h = step / substeps
-    alpha = np.where(tc > 0.0, -np.expm1(-h / np.where(tc > 0.0, tc, 1.0)), 1.0)
-    late = np.broadcast_to(delay, (C, S))
-    x = told[0]
-    worlds = np.indices((C, S))
-    for i in range(m):
-        for k in range(substeps):
-            age = late - k * h
-            old, new = (np.maximum(np.ceil(a / step - 1e-4), 0).astype(int) for a in (age, age - h))
-            part = np.clip((age / step - new) / (h / step), 0.0, 1.0)[..., None]
-            older, newer = (told[(np.maximum(i - ago, 0), *worlds)] for ago in (old, new))
-            target = np.where((new != old)[..., None], part * older + (1.0 - part) * newer, older)
-            x = x + np.clip(alpha * (target - x), -h * f["slew"], h * f["slew"])
-    return x, line
-
+# Many candidate plants over many segments at once.
 
 Single = NDArray[np.float32]
 
@@ -436,7 +373,7 @@ class Rollouts:
         n = int(self._lengths.max())
         self._force = np.zeros((n, len(segments), MAX_THRUSTERS), np.float32)
         memory = max(len(s.before) for s in segments)
-        self._before = np.zeros((memory, len(segments), MAX_THRUSTERS))
+        self._before = np.zeros((memory, len(segments), MAX_THRUSTERS), np.float32)
         for i, s in enumerate(segments):
             k = s.force.shape[1]
             self._force[: s.steps, i, :k] = s.force
@@ -553,28 +490,41 @@ class Rollouts:
         density = np.array([s.density for s in self.segments]) / self.vehicle.water.density
         for name in ("volume", "form_drag", "skin_drag"):
             fields[name] = fields[name] * density
-        for name, values in fields.items():
-            write(sim.plant.fields[name], values)
-        start = {k.removeprefix("initial."): a for k, a in given.items() if k.startswith("initial.")}
-        for name, own in (("nu", "velocity"), ("quaternion", "quaternion"), ("position", "position")):
-            values = start.get(name, np.stack([getattr(s, name) for s in self.segments])[None])
-            if name == "position":
-                sink = np.array([s.sink for s in self.segments])
-                values = values + sink[:, None] * [0.0, 0.0, 1.0]
-            write(getattr(sim.state, own), values)
         if self._moving:
             own_current = np.stack([s.current for s in self.segments])[None]
             write(sim.water.current, given.get("current", own_current))
         write(sim.command.disturbance, given.get("tau", np.zeros((1, 1, 6))))
+        start = {k.removeprefix("initial."): a for k, a in given.items() if k.startswith("initial.")}
+        self._place(sim, write, {})
         sim.reset()
-        sim.refresh()
-        actuator, line = warm_motors(
-            self._before, fields, self.step, sim.substeps, slots=sim.state.commands.shape[2]
-        )
-        write(sim.state.actuator, actuator)
-        ring = sim.state.commands.numpy().reshape(C, S, -1, MAX_THRUSTERS)
-        ring[...] = line
+        # Motors without lag come to the first command in one step; with theirs they then follow the others.
+        lagged = any(np.any(fields[name]) for name in ("time_constant", "delay"))
+        swift = fields | {"time_constant": 0.0, "delay": 0.0, "slew": NO_LIMIT}
+        for own, commands in ((swift, self._before[:1]), (fields, self._before[1:] if lagged else ())):
+            for name, values in own.items():
+                write(sim.plant.fields[name], values)
+            sim.refresh()
+            for command in commands:
+                self._command(sim, C)[...] = command
+                sim.step()
+            if own is swift:
+                ring = sim.state.commands.numpy().reshape(C, S, -1, MAX_THRUSTERS)
+                ring[...] = sim.state.actuator.numpy().reshape(C, S, 1, MAX_THRUSTERS)
+        self._place(sim, write, start)
         return self._march(sim, C, out)
+
+    def _place(
+        self, sim: Simulator, write: Callable[[Any, NDArray[Any]], None], start: dict[str, NDArray[Any]]
+    ) -> None:
+        """Put every world into the state `start` where it says one, else into its segment's own."""
+        for name, own in (("nu", "velocity"), ("quaternion", "quaternion"), ("position", "position")):
+            values = start.get(name, np.stack([getattr(s, name) for s in self.segments])[None])
+            if name == "position":
+                values = values + np.array([s.sink for s in self.segments])[:, None] * [0.0, 0.0, 1.0]
+            write(getattr(sim.state, own), values)
+
+    def _command(self, sim: Simulator, C: int) -> Single:
+        return np.asarray(sim.command.thrust.numpy().reshape(C, len(self.segments), MAX_THRUSTERS))
 
     def _impulses(self, sim: Simulator, C: int) -> list[Single]:
         """Change of nu for a unit change of the imposed axes by an impulse on these alone, (C, segments, 6, axes)."""
@@ -593,8 +543,9 @@ class Rollouts:
             nu[:, those] = now
 
     def _march(self, sim: Simulator, C: int, out: dict[str, Single]) -> NDArray[np.bool_]:
+        """Simulate the segments; writes what every world does and tells which came to the end."""
         n, S = self._force.shape[:2]
-        command = sim.command.thrust.numpy().reshape(C, S, MAX_THRUSTERS)
+        command, begin = self._command(sim, C), sim.state.steps.numpy().reshape(C, S).copy()
         views = {
             name: getattr(sim.state, own).numpy().reshape(C, S, -1)
             for name, own in (("nu", "velocity"), ("position", "position"), ("quaternion", "quaternion"))
@@ -613,7 +564,7 @@ class Rollouts:
         out["position"][..., 2] -= np.array([s.sink for s in self.segments], np.float32)
         # A frozen world has counted the step in which it broke.
         frozen = sim.state.frozen.numpy().reshape(C, S) != 0
-        reached = np.where(frozen, sim.state.steps.numpy().reshape(C, S) - 1, n)
+        reached = np.where(frozen, sim.state.steps.numpy().reshape(C, S) - 1 - begin, n)
         last = np.minimum(reached, self._lengths)
         late = np.arange(n + 1)[:, None, None] > last
         for values in out.values():

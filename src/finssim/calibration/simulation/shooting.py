@@ -1,15 +1,16 @@
-"""The fit of simulations to segments, as `solver` asks for it: finite differences are worlds."""
+"""The fit of simulations to segments; finite differences are worlds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.regression.axis_estimates import UNITS
 from finssim.calibration.simulation.rollout import CHANNELS, Response, Rollouts, Segment
 from finssim.calibration.vision.least_squares import (
     Block,
@@ -184,7 +185,11 @@ class Parameters:
     # -- coordinates --------------------------------------------------------------------------------------------
 
     def _coordinates(self) -> list[Coordinate]:
-        out = self._diagonal()
+        kinds = {"linear": ("d1",), "quadratic": ("d2",), "both": ("d1", "d2")}
+        out = []
+        for axis, floor in zip(self.axes, self.mass_floor().tolist(), strict=True):
+            out += [self._of_axis(axis, "added_mass", floor)]
+            out += [self._of_axis(axis, kind) for kind in kinds[self.damping[axis]]]
         w, inf = self.vehicle, np.inf
         weight, B = w.weight, w.buoyancy
         z = self.r_h[2]
@@ -201,27 +206,26 @@ class Parameters:
             "thrust_delay": [Coordinate("thrust_delay", "s", late, 0.0, LONGEST_DELAY, 0.2)],
             "current": [Coordinate(f"current.{a}", "m/s", 0.0, -5.0, 5.0, 0.2) for a in "xy"],
         }
-        for extra in EXTRAS:
-            if extra in self.extras:
-                out += table[extra]
+        out += [c for extra in EXTRAS if extra in self.extras for c in table[extra]]
         out += [term_coordinate(self.set, w, path) for path in self.terms]
-        for axis in self.biases:
-            i = AXES.index(axis)
-            size = 0.5 * float((self.M_RB + self.M_A)[i, i])
-            out.append(Coordinate(f"{axis}.bias", "N" if i < 3 else "N m", 0.0, -inf, inf, max(size, 1e-3)))
+        out += [self._of_axis(axis, "bias", -inf) for axis in self.biases]
         for axis in self.imposed:
             i = AXES.index(axis)
-            m, own = float((self.M_RB + self.M_A)[i, i]), float(self.M_A[i, i])
-            out.append(
-                Coordinate(f"{axis}.added_mass", "kg" if i < 3 else "kg m²", own, min(own, 0.0), inf, m)
-            )
-        for axis in self.unseen:
-            i = AXES.index(axis)
-            m = float((self.M_RB + self.M_A)[i, i])
-            for name, matrix, size in (("d1", self.D1, m), ("d2", self.D2, 3.0 * m)):
-                unit = ("N s/m", "N s²/m²")[name == "d2"] if i < 3 else ("N m s", "N m s²")[name == "d2"]
-                out.append(Coordinate(f"{axis}.{name}", unit, float(matrix[i, i]), 0.0, inf, size))
-        return out
+            out.append(self._of_axis(axis, "added_mass", min(float(self.M_A[i, i]), 0.0)))
+        return out + [self._of_axis(axis, kind) for axis in self.unseen for kind in ("d1", "d2")]
+
+    def _of_axis(self, axis: str, kind: str, low: float = 0.0) -> Coordinate:
+        """An axis' own added mass, d1, d2 or bias, from the vehicle file's number on."""
+        i = AXES.index(axis)
+        m, bias = float((self.M_RB + self.M_A)[i, i]), np.zeros((6, 6))
+        own, size = {
+            "added_mass": (self.M_A, m),
+            "d1": (self.D1, m),
+            "d2": (self.D2, 3.0 * m),
+            "bias": (bias, max(0.5 * m, 1e-3)),
+        }[kind]
+        unit = UNITS["m_eff" if kind == "added_mass" else kind][i > 2]
+        return Coordinate(f"{axis}.{kind}", unit, float(own[i, i]), low, np.inf, size)
 
     @property
     def nuisances(self) -> int:
@@ -242,25 +246,6 @@ class Parameters:
         kappa = MARGIN * float(np.linalg.eigvalsh(M / np.sqrt(np.outer(c, c)))[0])
         return np.asarray((base - kappa * c)[self.index])
 
-    def _diagonal(self) -> list[Coordinate]:
-        out = []
-        for axis, i, floor in zip(self.axes, self.index, self.mass_floor(), strict=True):
-            linear = i < 3
-            m = float((self.M_RB + self.M_A)[i, i])
-            out.append(
-                Coordinate(
-                    f"{axis}.added_mass", "kg" if linear else "kg m²", float(self.M_A[i, i]), floor, np.inf, m
-                )
-            )
-            kind = self.damping[axis]
-            if kind in ("linear", "both"):
-                unit = "N s/m" if linear else "N m s"
-                out.append(Coordinate(f"{axis}.d1", unit, float(self.D1[i, i]), 0.0, np.inf, m))
-            if kind in ("quadratic", "both"):
-                unit = "N s²/m²" if linear else "N m s²"
-                out.append(Coordinate(f"{axis}.d2", unit, float(self.D2[i, i]), 0.0, np.inf, 3.0 * m))
-        return out
-
     # -- plants -------------------------------------------------------------------------------------------------
 
     def value(self, x: Array, name: str, default: float | None = None) -> Any:
@@ -271,16 +256,11 @@ class Parameters:
         """M_A, D1 and D2 at the set's reference point, (W, 6, 6) each."""
         x = np.clip(np.atleast_2d(x), self.low, self.high)
         M_A, D1, D2 = (np.repeat(m[None], len(x), axis=0) for m in (self.M_A, self.D1, self.D2))
-        for axis in self.imposed:
-            i = AXES.index(axis)
-            M_A[:, i, i] = self.value(x, f"{axis}.added_mass")
-        for axis in self.unseen:
-            i = AXES.index(axis)
-            D1[:, i, i], D2[:, i, i] = self.value(x, f"{axis}.d1"), self.value(x, f"{axis}.d2")
-        for axis, i in zip(self.axes, self.index, strict=True):
-            for matrix, word in ((M_A, "added_mass"), (D1, "d1"), (D2, "d2")):
-                if f"{axis}.{word}" in self._at:
-                    matrix[:, i, i] = self.value(x, f"{axis}.{word}")
+        for name, c in self._at.items():
+            axis, _, kind = name.partition(".")
+            if axis in AXES and kind != "bias":
+                i = AXES.index(axis)
+                {"added_mass": M_A, "d1": D1, "d2": D2}[kind][:, i, i] = x[:, c]
         return M_A, D1, D2
 
     def buoyancy_height(self, k: Any, volume: Any) -> Any:
@@ -332,9 +312,6 @@ class Parameters:
         )
 
 
-# The fit of simulations to segments, as `solver` asks for it: finite differences are worlds.
-
-
 CUT = 2.5
 """Whitened residual above which Huber's loss grows linearly."""
 
@@ -368,36 +345,6 @@ class Linear(NamedTuple):
     """d predicted / d z of the sample's own segment, (N, q)."""
 
 
-class Problem(Protocol):
-    """What is fitted."""
-
-    edges: NDArray[np.int64]
-    """First sample of each segment, and N, (S + 1,)."""
-    low: Array
-    high: Array
-    """Box of theta, (P,)."""
-    prior_std: Array
-    """Of z around zero, (S, q)."""
-    prior_mean: Array
-    """What is known of theta beforehand, (P,)."""
-    prior_precision: Array
-    """One over its variance; 0 where nothing is known, (P,)."""
-    judged: int
-    """How many of theta, from the first, have to be accurate; the rest are there for their sake."""
-
-    def residuals(self, points: Point) -> Array:
-        """Measured minus predicted for several points (leading axis C), (N, C); NaN where a point has no answer."""
-
-    def linearise(self, point: Point) -> Linear:
-        """Residuals and derivatives at one point."""
-
-    def noise(self, residual: Array) -> Array:
-        """Standard deviation of every sample, from residuals at a fit, (N,)."""
-
-    def grain(self, theta: Array) -> Array:
-        """Differences of theta that nobody minds, (P,)."""
-
-
 @dataclass(frozen=True)
 class Solution:
     """Where a fit ended."""
@@ -418,7 +365,7 @@ def weights_of(residual: Array, std: Array, cut: float = CUT) -> Array:
     return huber_weight(np.abs(residual / std), cut) / std**2
 
 
-def blocks_of(problem: Problem, linear: Linear, std: Array, point: Point, cut: float = CUT) -> list[Block]:
+def blocks_of(problem: Shooting, linear: Linear, std: Array, point: Point, cut: float = CUT) -> list[Block]:
     """Weighted normal equations of every segment with the prior of z; that of theta is in the first."""
     root = np.sqrt(weights_of(linear.residual, std, cut))
     shared, own, residual = linear.shared * root[:, None], linear.own * root[:, None], linear.residual * root
@@ -434,7 +381,7 @@ def blocks_of(problem: Problem, linear: Linear, std: Array, point: Point, cut: f
 
 
 def step_of(
-    problem: Problem, reduced: tuple[Array, Array, list[Array]], point: Point, damping: float
+    problem: Shooting, reduced: tuple[Array, Array, list[Array]], point: Point, damping: float
 ) -> tuple[Array, Array, Array]:
     """Steps of theta (P,) inside the box and of z (S, q), and standard errors of theta, (P,).
 
@@ -453,7 +400,7 @@ def step_of(
     return step, z, np.sqrt(np.diagonal(np.linalg.inv(A))) / scale
 
 
-def costs_of(problem: Problem, residual: Array, std: Array, points: Point, cut: float = CUT) -> Array:
+def costs_of(problem: Shooting, residual: Array, std: Array, points: Point, cut: float = CUT) -> Array:
     """Half the losses of several points with residuals (N, C), (C,); infinite where one has no answer."""
     prior = np.square(points.z / problem.prior_std).sum(axis=(1, 2))
     prior = prior + (points.theta - problem.prior_mean) ** 2 @ problem.prior_precision
@@ -462,7 +409,7 @@ def costs_of(problem: Problem, residual: Array, std: Array, points: Point, cut: 
 
 
 def solve(
-    problem: Problem,
+    problem: Shooting,
     start: Point,
     *,
     iterations: int = 30,
@@ -860,10 +807,17 @@ FLOOR = 1e-4
 
 
 class Shooting:
-    """Residuals of segments under parameters, trial biases and initial states; satisfies `solver.Problem`.
+    """Residuals of segments under parameters, trial biases and initial states.
 
     Attributes:
         axes_of_trials: Axes with a constant wrench that differs from trial to trial.
+        edges: First sample of each segment, and N, (S + 1,).
+        low: Least theta, (P,).
+        high: Largest theta, (P,).
+        prior_std: Of z around zero, (S, q).
+        prior_mean: What is known of theta beforehand, (P,).
+        prior_precision: One over its variance; 0 where nothing is known, (P,).
+        judged: How many of theta, from the first, have to be accurate; the rest are there for their sake.
     """
 
     def __init__(
@@ -943,6 +897,11 @@ class Shooting:
         """The vehicle file's numbers, the measured initial states, no errors of sensors."""
         rest = np.zeros(len(self.low) - len(self.parameters.names))
         return Point(np.concatenate([self.parameters.start, rest]), np.zeros(self.prior_std.shape))
+
+    def cost(self, point: Point) -> float:
+        """Half the loss of one point, with what counts as large residuals far from a solution; clocks agree."""
+        one = Point(point.theta[None], point.z[None])
+        return float(costs_of(self, self.residuals(one), self.size(), one)[0])
 
     def residuals(self, points: Point) -> Array:
         """Measured minus predicted of several points, (N, C)."""

@@ -1,16 +1,16 @@
-"""Units and conventions of logs, and how they become ours: as the header asks (`convert`), when a trial is read."""
+"""Units, clocks and axes of logs, and how they become ours."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.trials.trial import COLUMNS, INPUT_PREFIXES, Conversion, column_of
+from finssim.calibration.trials.trial import column_of
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import (
     matrix_to_quat,
@@ -262,75 +262,35 @@ EULER = ("roll", "pitch", "yaw")
 QUATERNION = ("qx", "qy", "qz", "qw")
 WORLD = (("x", "y", "z"),)
 
-GROUPS = tuple(dict.fromkeys(column.group for column in COLUMNS.values()))
-
 LENGTH_TOLERANCE = 1e-6
 """Quaternions within this of unit length are left as they are, so that our own files read back bit for bit."""
 
 
-def new_names(columns: Iterable[str], convert: Conversion) -> dict[str, str]:
-    """Column of the log -> its name in the trial, from `convert.rename`.
+def in_our_frames(channels: Channels, body: str, world: str) -> Channels:
+    """Columns in x forward, y left, z up of the body and a world with z up.
 
-    Raises:
-        CalibrationError: A renamed column does not exist, a new name is no column of a trial, or two get one name.
+    Args:
+        channels: By canonical name.
+        body: FLU or FRD, of the log.
+        world: z_up or NED, of the log.
     """
-    columns = list(columns)
-    for old, new in convert.rename.items():
-        if old not in columns:
-            raise CalibrationError(
-                f"the log has no column '{old}'{did_you_mean(old, columns)} it has {_some(columns)}",
-                "convert.rename",
-            )
-        if new not in ("t", "phase") and column_of(new) is None:
-            raise CalibrationError(
-                f"'{new}' is not a column of a trial{did_you_mean(new, ['t', 'phase', *COLUMNS])} "
-                f"columns are t, phase, {', '.join(COLUMNS)} and {', '.join(f'{p}NAME' for p in INPUT_PREFIXES)}",
-                "convert.rename",
-            )
-    names = {name: convert.rename.get(name, name) for name in columns}
-    for new in convert.rename.values():
-        twice = [old for old, name in names.items() if name == new]
-        if len(twice) > 1:
-            raise CalibrationError(f"columns {_some(twice)} would all be '{new}'", "convert.rename")
-    return names
-
-
-def factor_and_offset(columns: Iterable[str], convert: Conversion) -> dict[str, tuple[float, float]]:
-    """Column -> its factor and what is added afterwards, for the columns that `convert.scale` and `offset` name.
-
-    Raises:
-        CalibrationError: They name a column that the log does not have.
-    """
-    columns = list(columns)
-    found: dict[str, tuple[float, float]] = {}
-    for key, factor in convert.scale.items():
-        for name in _named(key, columns, "scale"):
-            found[name] = (factor, 0.0)
-    for key, offset in convert.offset.items():
-        for name in _named(key, columns, "offset"):
-            found[name] = (found.get(name, (1.0, 0.0))[0], offset)
-    return found
-
-
-def in_our_frames(channels: Channels, convert: Conversion) -> Channels:
-    """Body axes to x forward, y left, z up and world axes to z up."""
-    body, world = convert.body == "FRD", convert.world == "NED"
+    turned, sunk = body == "FRD", world == "NED"
     result = dict(channels)
     signs: list[tuple[tuple[str, ...], Array]] = []
-    if body:
+    if turned:
         signs += [(names, FROM_FOSSEN.A.diagonal()) for names in POLAR]
         signs += [(names, FROM_FOSSEN.axial_map.diagonal()) for names in AXIAL]
-    if world:
+    if sunk:
         signs += [(names, FROM_FOSSEN.A.diagonal()) for names in WORLD]
-    if body and world:
+    if turned and sunk:
         signs.append((EULER, FROM_FOSSEN.axial_map.diagonal()))
         signs.append((QUATERNION, FROM_FOSSEN.quaternion(np.ones(4))))
     for names, sign in signs:
         for name, s in zip(names, sign, strict=True):
             if name in result:
                 result[name] = s * result[name]
-    if body != world:
-        result.update(_attitude_of_one_side(channels, body))
+    if turned != sunk:
+        result.update(_attitude_of_one_side(channels, turned))
     return result
 
 
@@ -390,41 +350,3 @@ def upside_down(channels: Mapping[str, Array]) -> bool:
         return False
     q = q[np.isfinite(q).all(axis=-1)]
     return len(q) > 0 and float(np.median(quat_rotate(q, np.array([0.0, 0.0, 1.0]))[:, 2])) < -0.5
-
-
-def shifted(t: Array, channels: Channels, convert: Conversion) -> tuple[Array, Channels]:
-    """Columns moved in time by `convert.time_offset`, on a union time base with NaN where a stream has no sample.
-
-    Raises:
-        CalibrationError: It names neither a column of the log nor a group.
-    """
-    asked = convert.time_offset
-    for key in asked:
-        if key not in GROUPS and key not in channels:
-            raise CalibrationError(
-                f"'{key}' is neither a group nor a column of this log"
-                f"{did_you_mean(key, [*GROUPS, *channels])} groups are {', '.join(GROUPS)}",
-                "convert.time_offset",
-            )
-    streams, moved = {}, False
-    for name, values in channels.items():
-        column = column_of(name)
-        by = asked.get(name, asked.get(column.group if column else "", 0.0))
-        moved |= by != 0.0
-        good = np.isfinite(values)
-        streams[name] = (t[good] + by, values[good])
-    return merged(streams) if moved else (t, channels)
-
-
-def _named(key: str, columns: list[str], where: str) -> list[str]:
-    found = [name for name in columns if name == key or (key.endswith("*") and name.startswith(key[:-1]))]
-    if not found:
-        raise CalibrationError(
-            f"this log has no column '{key}'{did_you_mean(key, columns)} it has {_some(columns)}",
-            f"convert.{where}",
-        )
-    return found
-
-
-def _some(names: list[str], most: int = 12) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

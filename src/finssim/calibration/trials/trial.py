@@ -17,32 +17,13 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding
 from finssim.vehicles.vehicle import Axis
 
-__all__ = ["Array", "Conversion", "Header", "NU", "PHASES", "TAU", "Trial", "TrialWater", "column_of"]
+__all__ = ["Array", "Header", "NU", "PHASES", "TAU", "Trial", "TrialWater", "column_of"]
 
 Point = tuple[float, float, float]
 
 
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Conversion(_Section):
-    """From the log's conventions to ours; applied once, when the trial is read, in the order given here."""
-
-    rename: dict[str, str] = Field(default_factory=dict)
-    """Column of the log -> canonical column."""
-    scale: dict[str, float] = Field(default_factory=dict)
-    """Canonical column -> factor to SI, after renaming; -1 turns a sign, 0.0174533 makes radians of degrees.
-    `force_*` stands for every column that begins so."""
-    offset: dict[str, float] = Field(default_factory=dict)
-    """Canonical column -> added after scaling; `force_*` as in `scale`."""
-    body: Literal["FLU", "FRD"] = "FLU"
-    """Body axes of velocities, wrenches, accelerations and attitudes in the log."""
-    world: Literal["z_up", "NED"] = "z_up"
-    """World axes of position and attitude in the log."""
-    time_offset: dict[str, float] = Field(default_factory=dict)
-    """Canonical column, or group (`command velocity rates acceleration attitude position depth`) -> seconds added to
-    its times."""
 
 
 class TrialWater(_Section):
@@ -94,11 +75,10 @@ class Header(_Section):
     voltage: float | None = Field(default=None, gt=0.0)
     """Of the battery [V], for pulse widths; a column `voltage` comes first."""
     water: TrialWater = Field(default_factory=TrialWater)
-    convert: Conversion = Field(default_factory=Conversion)
 
     def meaning(self) -> dict[str, Any]:
         """The parts that change what the numbers mean, as plain values: all but description, role and vehicle."""
-        return self.model_dump(mode="json", exclude={"description", "role", "vehicle", "convert", "axis"})
+        return self.model_dump(mode="json", exclude={"description", "role", "vehicle", "axis"})
 
 
 # The canonical columns of a trial: names, units, frames.
@@ -173,7 +153,7 @@ PHASES = ("baseline", "excitation", "coast", "rest")
 class Trial:
     """Measurements over one time base; streams of other rates leave NaN where they have no sample.
 
-    Frames and units are those of `finssim.calibration.trials.trial`; conversions that the header asks for are done.
+    Frames and units are those of `finssim.calibration.trials.trial`.
     """
 
     name: str

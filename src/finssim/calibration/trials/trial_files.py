@@ -18,21 +18,11 @@ from pydantic import BaseModel, ValidationError
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.trials.conversion import (
-    factor_and_offset,
-    in_our_frames,
-    new_names,
-    ordered,
-    sampled,
-    shifted,
-    tidy_quaternions,
-    upside_down,
-)
+from finssim.calibration.trials.conversion import ordered, sampled, tidy_quaternions, upside_down
 from finssim.calibration.trials.trial import (
     COLUMNS,
     INPUT_PREFIXES,
     PHASES,
-    Conversion,
     Header,
     Trial,
     TrialWater,
@@ -241,7 +231,7 @@ def _read_parquet(path: Path) -> Table:
     return table
 
 
-# From the columns of a log to a trial: names, times, units, frames.
+# From the columns of a table to a trial.
 
 # Samples that a log repeats: a stream of 10 Hz written into every row of a table of 50 Hz is still one of 10 Hz.
 
@@ -312,36 +302,30 @@ EPOCH = 1.0e8
 
 
 def trial_from_table(name: str, table: Table, header: Header, path: Path | None = None) -> Trial:
-    """A trial from the columns of a log: renamed, scaled, in our frames, in order of time, each repair a finding.
+    """A trial from the columns of a table, in order of time, each repair a finding.
 
     Args:
         name: Of the trial.
-        table: Columns as logged.
-        header: Its `convert` section is applied; the trial's header no longer has it.
-        path: Where the log was read.
+        table: Columns as written, in SI and our frames.
+        header: What they mean.
+        path: Where the table was read.
 
     Raises:
-        CalibrationError: No time, fewer than two rows, no usable column, or a conversion of what is not there.
+        CalibrationError: No time, fewer than two rows, or no usable column.
     """
-    findings = list(table.findings)
-    names = new_names(table.columns, header.convert)
-    numbers = {names[old]: values for old, values in table.numbers.items()}
-    words = {names[old]: values for old, values in table.words.items()}
-    if "t" not in numbers and "t" not in words:
+    findings, numbers, words = list(table.findings), dict(table.numbers), dict(table.words)
+    if "t" not in table.columns:
         raise CalibrationError(_no_time(table.columns))
-    change = factor_and_offset([*numbers, *words], header.convert)
-    t = _seconds(numbers.pop("t", None), words.pop("t", None), change.get("t", (1.0, 0.0)), findings)
+    t = _seconds(numbers.pop("t", None), words.pop("t", None), findings)
     phase = _phases(words.pop("phase", None), findings)
     channels = _canonical(numbers, list(words), findings)
     for column, values in channels.items():
         infinite = np.isinf(values)
         if infinite.any():
             findings.append(finding("infinite_numbers", column=column, cells=infinite.sum()))
-        factor, offset = change.get(column, (1.0, 0.0))
-        channels[column] = np.where(infinite, np.nan, values) * factor + offset
+        channels[column] = np.where(infinite, np.nan, values)
     t, channels, phase = _in_order(t, channels, phase, findings)
     findings += without_repeats(channels)
-    channels = in_our_frames(channels, header.convert)
     findings += tidy_quaternions(channels)
     if upside_down(channels):
         findings.append(finding("upside_down"))
@@ -351,11 +335,6 @@ def trial_from_table(name: str, table: Table, header: Header, path: Path | None 
             f"{', '.join(f'{p}NAME' for p in INPUT_PREFIXES)} with numbers in them; "
             f"found {', '.join(table.columns[:12])}"
         )
-    old = t
-    t, channels = shifted(t, channels, header.convert)
-    if phase is not None and t is not old:
-        phase = phase[np.clip(np.searchsorted(old, t, side="right") - 1, 0, None)]
-    header = header.model_copy(update={"convert": type(header.convert)()})
     return Trial(
         name=name, t=t, channels=channels, phase=phase, header=header, findings=tuple(findings), path=path
     )
@@ -363,18 +342,14 @@ def trial_from_table(name: str, table: Table, header: Header, path: Path | None 
 
 def _no_time(columns: list[str]) -> str:
     like = [c for c in columns if re.search(r"time|stamp|^t\b|^t_|_t$|secs|sec$", c, re.IGNORECASE)]
-    hint = f"'{like[0]}'" if like else "the column of times"
     return (
-        f"no column 't' (time in s); the log has {', '.join(columns[:12])}: say which it is in trial.yaml, "
-        f"'convert: {{rename: {{{like[0] if like else 'NAME'}: t}}}}' makes {hint} the time"
+        f"no column 't' (time in s); the table has {', '.join(columns[:12])}: import it with a map that names the "
+        f"time, 'time: {like[0] if like else 'NAME'}' (finssim trials import FILE --map MAP)"
     )
 
 
-def _seconds(
-    numbers: Array | None, words: list[str] | None, change: tuple[float, float], findings: list[Finding]
-) -> Array:
+def _seconds(numbers: Array | None, words: list[str] | None, findings: list[Finding]) -> Array:
     """Times in s from numbers or dates; those that count from 1970 begin at 0."""
-    factor, offset = change
     if numbers is None:
         try:
             dates = np.array([w.removesuffix("Z") or "NaT" for w in words or []], dtype="datetime64[ns]")
@@ -387,10 +362,10 @@ def _seconds(
         findings.append(finding("dates", start=str(start)))
         return np.where(np.isnat(dates), np.nan, (dates - start) / np.timedelta64(1, "s"))
     known = numbers[np.isfinite(numbers)]
-    if len(known) and abs(known[0] * factor + offset) > EPOCH:
-        findings.append(finding("epoch", start=known[0] * factor + offset))
-        return (numbers - known[0]) * factor
-    return numbers * factor + offset
+    if len(known) and abs(known[0]) > EPOCH:
+        findings.append(finding("epoch", start=known[0]))
+        return numbers - known[0]
+    return numbers
 
 
 def _phases(words: list[str] | None, findings: list[Finding]) -> NDArray[np.str_] | None:
@@ -450,7 +425,6 @@ def _in_order(
 # Reading and writing `trial.yaml`.
 
 _POINT = "3 numbers [x, y, z] in m"
-_MAP = "a map such as"
 
 EXPECTED = {
     "vehicle": "the name or file of a vehicle",
@@ -468,21 +442,14 @@ EXPECTED = {
     "acceleration": "specific_force, kinematic or auto",
     "velocity": "ground or water",
     "voltage": "a voltage > 0 in V",
-    "water": f"{_MAP} {{density: 1025.0}}",
+    "water": "a map such as {density: 1025.0}",
     "water.density": "a density > 0 in kg/m³",
     "water.depth": "a depth > 0 in m",
     "water.current": "3 numbers [x, y, z] in m/s, world frame",
-    "convert": f"{_MAP} {{body: FRD}}",
-    "convert.rename": f"{_MAP} {{vx_mps: u}}",
-    "convert.scale": f"{_MAP} {{yaw: 0.0174533}}, with factors that are not 0",
-    "convert.offset": f"{_MAP} {{depth: 0.05}}",
-    "convert.body": "FLU or FRD",
-    "convert.world": "z_up or NED",
-    "convert.time_offset": f"{_MAP} {{attitude: -0.08}}, in s",
 }
 """Key -> what may stand there."""
 
-SECTIONS: dict[str, type[BaseModel]] = {"": Header, "water": TrialWater, "convert": Conversion}
+SECTIONS: dict[str, type[BaseModel]] = {"": Header, "water": TrialWater}
 
 
 def read_header(path: Path) -> Header:
@@ -497,19 +464,15 @@ def read_header(path: Path) -> Header:
     if isinstance(tree.get("axis"), str):
         tree["axis"] = [tree["axis"]]
     try:
-        header = Header.model_validate(tree)
+        return Header.model_validate(tree)
     except ValidationError as error:
         sentences = dict.fromkeys(_sentence(detail, tree) for detail in error.errors())
         raise CalibrationError("\n".join(f"{path}: {sentence}" for sentence in sentences)) from None
-    zero = [name for name, factor in header.convert.scale.items() if factor == 0.0]
-    if zero:
-        raise CalibrationError(f"{path}: convert.scale: {zero[0]} is 0, expected a factor that is not 0")
-    return header
 
 
 def header_text(header: Header) -> str:
-    """`trial.yaml` of a header: what differs from the defaults, without the conversions that have been done."""
-    tree = header.model_dump(mode="json", exclude_defaults=True, exclude={"convert"})
+    """`trial.yaml` of a header: what differs from the defaults."""
+    tree = header.model_dump(mode="json", exclude_defaults=True)
     return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True) if tree else "{}\n"
 
 
@@ -524,6 +487,8 @@ def _sentence(detail: Any, tree: dict[Any, Any]) -> str:
     where = [str(part) for part in detail["loc"]]
     section = where[0] if where[0] in SECTIONS and len(where) > 1 else ""
     name = ".".join(where[: 2 if section else 1])
+    if detail["type"] == "extra_forbidden" and name == "convert":
+        return "convert is gone: import the table with a map of its columns, units, frame and clocks (trials import)"
     if detail["type"] == "extra_forbidden":
         known = list(SECTIONS[section].model_fields)
         return f"unknown key '{name}'{did_you_mean(where[-1], known)} known keys: {', '.join(known)}"
@@ -557,8 +522,7 @@ def load_trial(path: str | os.PathLike[str]) -> Trial:
     try:
         return trial_from_table(name, table, header, path)
     except CalibrationError as error:
-        shown = header_path if header_path and error.subject else data
-        raise CalibrationError(f"{shown}: {error}") from None
+        raise CalibrationError(f"{data}: {error}") from None
 
 
 def load_trials(paths: Iterable[str | os.PathLike[str]]) -> list[Trial]:
@@ -597,7 +561,7 @@ def write_trial(
     """Write a trial as a folder of `trial.yaml` and data that reads back with the same `sha256`.
 
     Args:
-        trial: In canonical columns; conversions of its header are done and not written.
+        trial: In canonical columns.
         folder: New or empty, or an earlier trial of ours, which is replaced.
         format: Of the data.
 

@@ -23,6 +23,7 @@ from finssim.calibration.output.report import (
     ExtraTable,
     Report,
     command_line,
+    draw_arrows,
     interval_text,
     new_figure,
     number_text,
@@ -279,7 +280,7 @@ UNSURE_CENTRE = 0.02
 """The same for the principal point, in widths of the image."""
 
 COLUMNS, ROWS = 12, 9
-"""Cells of the picture in which corners are counted."""
+"""Points of the picture at which the uncertainty of a pixel is computed."""
 
 TWO_SIGMA_PLANE = 5.991
 """95 % point of chi-squared with two degrees of freedom."""
@@ -455,8 +456,10 @@ class CameraFit:
     """Root of the mean squared distance of corners over the views used [px]."""
     held_out_rms: float
     """The same for views that the lens was not fitted to, only their pose; NaN if there are too few views [px]."""
-    reach: LensReach
-    """How well pixels are known over the picture."""
+    error95: tuple[float, float]
+    """Largest radius of the 95 % circle of a pixel of known direction, where corners were seen and anywhere [px]."""
+    covariance: Covariance
+    """Of the lens's numbers, in the order of `lens_names`."""
     findings: tuple[Finding, ...]
     settings: dict[str, Any] = field(default_factory=dict)
 
@@ -487,7 +490,11 @@ def calibrate_camera(views: Sequence[BoardView], *, model: str = "plumb_bob", se
         bundle = adjust(some, model)
     covariance = trial_covariance(evidence(bundle, some))
     every = _views(views, {view.name: i for i, view in enumerate(used)}, bundle)
-    reach = lens_reach(bundle.lens, np.concatenate([view.pixels for view in some]), covariance)
+    pixels = np.concatenate([view.pixels for view in some])
+    error95 = tuple(
+        float(np.nanmax(pixel_error(bundle.lens, at, pixels, covariance)))
+        for at in (pixels, picture_grid(bundle.lens))
+    )
     half = intervals(np.zeros(len(covariance.names)), covariance)[:, 1]
     estimates = _estimates(bundle.lens, half)
     return CameraFit(
@@ -497,8 +504,9 @@ def calibrate_camera(views: Sequence[BoardView], *, model: str = "plumb_bob", se
         views=every,
         rms=_rms(np.concatenate(bundle.residuals)),
         held_out_rms=_held_out(some, model, seed),
-        reach=reach,
-        findings=camera_findings(bundle.lens, [v for v in every if not v.left_out], estimates, reach),
+        error95=error95,
+        covariance=covariance,
+        findings=camera_findings(bundle.lens, [v for v in every if not v.left_out], estimates, error95),
         settings={"model": model, "seed": seed},
     )
 
@@ -606,65 +614,36 @@ def _estimates(lens: Lens, half: Array) -> dict[str, Estimate]:
 # How well a calibrated lens is known over the picture, and where the pictures taken say nothing about it.
 
 
-@dataclass(frozen=True, kw_only=True)
-class LensReach:
-    """Over a grid of cells of the picture."""
-
-    counts: NDArray[np.int64]
-    """Corners in each cell, (rows, columns)."""
-    error95: Array
-    """Radius of the 95 % circle of a pixel whose direction is known, at the cell's centre [px], (rows, columns); a turn
-    of the whole camera, which any pose takes up, is not in it. NaN where the lens cannot see."""
-    edges: dict[str, float]
-    """Empty border of the picture at left, right, top, bottom, as a share of its width or height."""
-
-    @property
-    def inside(self) -> float:
-        """Largest error in cells with corners [px]."""
-        return float(np.nanmax(np.where(self.counts > 0, self.error95, np.nan)))
-
-    @property
-    def anywhere(self) -> float:
-        """Largest error over the picture [px]."""
-        return float(np.nanmax(self.error95))
+def picture_grid(lens: Lens) -> Array:
+    """Centres of `COLUMNS` by `ROWS` cells of the picture [px], (rows, columns, 2)."""
+    u, v = (size * (np.arange(n) + 0.5) / n - 0.5 for size, n in ((lens.width, COLUMNS), (lens.height, ROWS)))
+    return np.stack(np.meshgrid(u, v), axis=-1)
 
 
-def lens_reach(lens: Lens, pixels: Array, covariance: Covariance) -> LensReach:
-    """Count corners over the picture and carry the covariance of the lens to pixels.
+def pixel_error(lens: Lens, at: Array, corners: Array, covariance: Covariance) -> Array:
+    """Radius of the 95 % circle of pixels whose direction is known [px], (...); NaN where the lens cannot see.
+
+    d pixel = A d lens + B turn, without the turn of the whole camera that takes most of it away at the corners: any
+    pose takes that up.
 
     Args:
         lens: The lens.
-        pixels: All corners used, (n, 2).
+        at: Pixels, (..., 2).
+        corners: Pixels of the corners that were used, (n, 2).
         covariance: Of the lens's numbers, in the order of `Lens.parameter_jacobian`.
     """
-    u_edges = np.linspace(-0.5, lens.width - 0.5, COLUMNS + 1)
-    v_edges = np.linspace(-0.5, lens.height - 0.5, ROWS + 1)
-    counts = np.histogram2d(pixels[:, 1], pixels[:, 0], (v_edges, u_edges))[0].astype(np.int64)
-    u, v = np.meshgrid(0.5 * (u_edges[1:] + u_edges[:-1]), 0.5 * (v_edges[1:] + v_edges[:-1]))
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    return LensReach(
-        counts=counts,
-        error95=_error95(lens, np.stack([u, v], axis=-1), counts > 0, covariance),
-        edges={
-            "left": float((low[0] + 0.5) / lens.width),
-            "right": float((lens.width - 0.5 - high[0]) / lens.width),
-            "top": float((low[1] + 0.5) / lens.height),
-            "bottom": float((lens.height - 0.5 - high[1]) / lens.height),
-        },
-    )
 
+    def derivatives(pixels: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        rays, ok = lens.rays(pixels)
+        safe = np.where(ok[..., None], rays, np.array([0.0, 0.0, 1.0]))
+        return lens.parameter_jacobian(safe), -lens.project_jacobian(safe) @ skew(safe), ok
 
-def _error95(lens: Lens, pixels: Array, covered: NDArray[np.bool_], covariance: Covariance) -> Array:
-    """d pixel = A d lens + B turn, with the turn that takes most of it away over the covered cells, (rows, columns)."""
-    rays, ok = lens.rays(pixels)
-    safe = np.where(ok[..., None], rays, np.array([0.0, 0.0, 1.0]))
-    A = lens.parameter_jacobian(safe)
-    B = -lens.project_jacobian(safe) @ skew(safe)
-    fitted = covered & ok
-    turn = -np.linalg.pinv(B[fitted].reshape(-1, 3)) @ A[fitted].reshape(-1, A.shape[-1])
+    A, B, ok = derivatives(corners)
+    turn = -np.linalg.pinv(B[ok].reshape(-1, 3)) @ A[ok].reshape(-1, A.shape[-1])
+    A, B, ok = derivatives(at)
     J = A + B @ turn
     if not np.isfinite(covariance.local).all():
-        return np.full(pixels.shape[:-1], np.nan)
+        return np.full(at.shape[:-1], np.nan)
     # The information gives the shape, the disagreement of the views the size: alone, theirs would lack directions.
     ratio = covariance.std**2 / np.maximum(np.diagonal(covariance.local), 1e-300)
     S = max(float(np.mean(ratio)), 1.0) * J @ covariance.local @ np.swapaxes(J, -1, -2)
@@ -673,7 +652,7 @@ def _error95(lens: Lens, pixels: Array, covered: NDArray[np.bool_], covariance: 
 
 
 def camera_findings(
-    lens: Lens, views: Sequence[View], estimates: Mapping[str, Estimate], reach: LensReach
+    lens: Lens, views: Sequence[View], estimates: Mapping[str, Estimate], error95: tuple[float, float]
 ) -> tuple[Finding, ...]:
     """Coverage, tilt and what cannot be told, and what to photograph; none if nothing is to say."""
     tilts, findings = np.array([view.tilt for view in views]), []
@@ -682,7 +661,7 @@ def camera_findings(
         findings.append(finding("views_flat", tilt=math.degrees(tilts.max())))
     elif tilted < 3:
         findings.append(finding("few_tilted", views=tilted))
-    empty = {side: share for side, share in reach.edges.items() if share > BORDER}
+    empty = {side: share for side, share in empty_edges(lens, views).items() if share > BORDER}
     if empty:
         shares = tuple(f"{100.0 * share:.0f} % of the {side} edge" for side, share in empty.items())
         findings.append(finding("edges_empty", sides=tuple(empty), shares=shares))
@@ -695,9 +674,17 @@ def camera_findings(
     nothing = [e.name for e in estimates.values() if e.identifiable and e.note]
     if lens.model == "rational" and len(nothing) >= 3:
         findings.append(finding("coefficients_zero", parameters=tuple(nothing)))
-    if np.isfinite(reach.anywhere) and reach.anywhere >= LARGE_ERROR:
-        findings.append(finding("pixels_uncertain", inside=reach.inside, anywhere=reach.anywhere))
+    if np.isfinite(error95[1]) and error95[1] >= LARGE_ERROR:
+        findings.append(finding("pixels_uncertain", inside=error95[0], anywhere=error95[1]))
     return tuple(findings)
+
+
+def empty_edges(lens: Lens, views: Sequence[View]) -> dict[str, float]:
+    """Border of the picture without a corner at left, right, top and bottom, as a share of its width or height [-]."""
+    pixels, size = np.concatenate([view.pixels for view in views]), np.array([lens.width, lens.height])
+    low, high = (pixels.min(axis=0) + 0.5) / size, (size - 0.5 - pixels.max(axis=0)) / size
+    shares = zip(("left", "right", "top", "bottom"), (low[0], high[0], low[1], high[1]), strict=True)
+    return {side: float(share) for side, share in shares}
 
 
 READING = (
@@ -708,9 +695,6 @@ READING = (
 
 DIGITS = 7
 """Of the numbers in a record."""
-
-ARROW_SHARE = 0.06
-"""Length of the 95th percentile of the residuals, in widths of the image."""
 
 OF_A_VIDEO = 15
 """Of a video every so many pictures are looked at: its neighbours show the same view."""
@@ -748,8 +732,8 @@ def camera_json(fit: CameraFit, out: Path | None = None) -> dict[str, Any]:
     ]
     record = {
         "per_view": views,
-        "error95_px": {"where_seen": fit.reach.inside, "anywhere": fit.reach.anywhere},
-        "empty_edges": fit.reach.edges,
+        "error95_px": dict(zip(("where_seen", "anywhere"), fit.error95, strict=True)),
+        "empty_edges": empty_edges(fit.lens, fit.used),
         "correlation": fit.correlation.as_json(),
     }
     return {
@@ -770,10 +754,10 @@ def camera_report(fit: CameraFit) -> Report:
     summary = [
         f"residual {fit.rms:.3f} px rms of a corner, worst view {worst.name} {worst.rms:.3f} px; {held_out}"
     ]
-    if math.isfinite(fit.reach.anywhere):
+    if math.isfinite(fit.error95[1]):
         summary.append(
-            f"a pixel is known to {fit.reach.inside:.2f} px (95 %) where corners were seen, to "
-            f"{fit.reach.anywhere:.2f} px anywhere in the picture"
+            f"a pixel is known to {fit.error95[0]:.2f} px (95 %) where corners were seen, to "
+            f"{fit.error95[1]:.2f} px anywhere in the picture"
         )
     return Report(
         title="Camera calibration",
@@ -823,7 +807,8 @@ def _coverage(fit: CameraFit) -> Figure:
     width, height = fit.lens.width, fit.lens.height
     figure = new_figure(7.4, 7.4 * height / width + 0.3)
     axes = figure.subplots()
-    error = fit.reach.error95
+    corners = np.concatenate([view.pixels for view in fit.used])
+    error = pixel_error(fit.lens, picture_grid(fit.lens), corners, fit.covariance)
     image = axes.imshow(
         np.clip(np.ma.masked_invalid(error), 0.03, 30.0),
         extent=(-0.5, width - 0.5, height - 0.5, -0.5),
@@ -831,9 +816,6 @@ def _coverage(fit: CameraFit) -> Figure:
         norm=LogNorm(0.03, 30.0),
         alpha=0.75,
     )
-    for i, j in np.argwhere(np.isfinite(error)):
-        u, v = (j + 0.5) / COLUMNS * width, (i + 0.5) / ROWS * height
-        axes.text(u, v, f"{error[i, j]:.1f}", ha="center", va="center", fontsize=7, color="0.25")
     for view in fit.views:
         mark = {"color": ORANGE, "marker": "x"} if view.left_out else {"color": "black", "marker": "."}
         axes.plot(*view.pixels.T, linestyle="", markersize=2.5, **mark)
@@ -846,14 +828,10 @@ def _coverage(fit: CameraFit) -> Figure:
 def _residuals(fit: CameraFit) -> Figure:
     pixels = np.concatenate([view.pixels for view in fit.used])
     residuals = np.concatenate([view.residuals for view in fit.used])
-    size = np.percentile(np.linalg.norm(residuals, axis=1), 95.0)
     figure = new_figure(7.4, 4.0)
     field, cloud = figure.subplots(1, 2, width_ratios=(1.9, 1.0))
-    factor = ARROW_SHARE * fit.lens.width / max(size, 1e-9)
-    arrows = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.0022}
-    field.quiver(*pixels.T, *(factor * residuals.T), color=BLUE, **arrows)
+    draw_arrows(field, pixels, residuals, np.ones(len(pixels), bool), "px", 1.0)
     picture_axes(field, fit.lens)
-    field.set_title(f"residuals, {factor:.0f} times enlarged", fontsize=9)
     cloud.plot(*residuals.T, ".", color=BLUE, markersize=2.5)
     limit = 1.1 * float(np.abs(residuals).max())
     cloud.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal")

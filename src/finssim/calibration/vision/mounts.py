@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
+from finssim.calibration.motion.signals import RATE, offset
+from finssim.calibration.motion.smoothing import smooth
 from finssim.calibration.output.report import (
     command_line,
     fit_json,
@@ -30,7 +32,7 @@ from finssim.calibration.output.report import (
     write_report,
 )
 from finssim.calibration.output.vehicle_file import all_findings, calibrated, write_vehicle
-from finssim.calibration.uncertainty import Covariance, Evidence, intervals, trial_covariance
+from finssim.calibration.uncertainty import Covariance, intervals, trial_covariance
 from finssim.calibration.vision.least_squares import (
     Block,
     Pose,
@@ -891,16 +893,8 @@ def calibrate_mounts(log: MountLog, pool: Pool, vehicle: Vehicle, *, name: str, 
     )
 
 
-LONGEST_OFFSET, OFFSET_STEP = 1.0, 0.02
-"""Offsets of the clock that are tried: up to [s], every [s]."""
-
-NUDGE = 0.005
-"""Step of the derivative with respect to the offset [s]."""
-
 FEWEST = 20
 """Turns without which no offset is fitted."""
-
-CLOCK_BLOCKS = 12
 
 UNSURE_CLOCK = 0.05
 """Half width of the 95 % interval of the offset beyond which it does not count as identified [s]."""
@@ -922,8 +916,8 @@ def imu_clock(
 ) -> Estimate | None:
     """What is to be added to the IMU's times, from turns about the vertical between neighbouring pictures.
 
-    n · log(R_2 R_1ᵀ) = ∫ ω · up dt over the same time, less a bias; ω and up in any one frame of the vehicle, so that
-    neither the IMU's mounting nor the tilt is needed.
+    n · log(R_2 R_1ᵀ) is the turn from one picture to the next; its rate is compared with ω · up, ω and up in any one
+    frame of the vehicle, so that neither the IMU's mounting nor the tilt is needed.
 
     Args:
         t_picture: Times of the pictures, increasing [s], (n,).
@@ -933,48 +927,20 @@ def imu_clock(
         vertical_rate: ω · up [rad/s], (m,).
 
     Returns:
-        `imu.time_offset` [s], or None if there are too few pictures.
+        `imu.time_offset` [s], or None if there are too few pictures or both do not show one motion.
     """
-    from scipy.optimize import least_squares
-
     turn = quat_to_rotvec(quat_multiply(attitude[1:], quat_conjugate(attitude[:-1]))) @ up_p
-    start, end = t_picture[:-1], t_picture[1:]
-    inside = (start > t_imu[0] + LONGEST_OFFSET) & (end < t_imu[-1] - LONGEST_OFFSET) & (end - start < 3.0)
-    turn, start, end = turn[inside], start[inside], end[inside]
-    if len(turn) < FEWEST:
+    heading = np.concatenate([[0.0], np.cumsum(turn)])
+    t = np.arange(max(t_picture[0], t_imu[0]), min(t_picture[-1], t_imu[-1]), 1.0 / RATE)
+    if len(turn) < FEWEST or len(t) < FEWEST:
         return None
-    steps = 0.5 * (vertical_rate[1:] + vertical_rate[:-1]) * np.diff(t_imu)
-    heading = np.concatenate([[0.0], np.cumsum(steps)])
-
-    def error(x: Array) -> Array:
-        """Of the turns, with bias [rad/s] and offset [s]."""
-        later, earlier = (np.interp(t - x[1], t_imu, heading) for t in (end, start))
-        return np.asarray(turn - later + earlier + x[0] * (end - start))
-
-    def slopes(x: Array) -> Array:
-        return np.stack([end - start, (error(x + [0.0, NUDGE]) - error(x - [0.0, NUDGE])) / (2.0 * NUDGE)], 1)
-
-    def spread(offset: float) -> float:
-        off = error(np.array([0.0, offset]))
-        return float(np.median(np.abs(off - np.median(off))))
-
-    first = min(np.arange(-LONGEST_OFFSET, LONGEST_OFFSET + 1e-9, OFFSET_STEP), key=spread)
-    bias = -float(np.median(error(np.array([0.0, first])) / (end - start)))
-    sigma = 1.4826 * max(spread(first), 1e-9)
-    x = least_squares(error, [bias, first], slopes, loss="huber", f_scale=1.345 * sigma, x_scale="jac").x
-    J, r = slopes(x), error(x)
-    w = huber_weight(np.abs(r), 1.345 * sigma) / sigma**2
-    parts = np.array_split(np.arange(len(r)), max(2, min(CLOCK_BLOCKS, len(r) // 4)))
-    evidence = Evidence(
-        names=("bias", "offset"),
-        normal=np.array([(w[p, None] * J[p]).T @ J[p] for p in parts]),
-        score=np.array([-(w[p] * r[p]) @ J[p] for p in parts]),
-        unit="blocks",
-    )
-    half = float(intervals(x, trial_covariance(evidence))[1, 1] - x[1])
+    seen = smooth(t_picture, heading[:, None], t, order=3).slope
+    found = offset("pictures", seen, smooth(t_imu, vertical_rate[:, None], t).value)
+    if found is None:
+        return None
+    half = 1.96 * found.std
     note = "the vehicle turns too evenly to tell the clocks apart: taken as 0"
-    sure = half < UNSURE_CLOCK and abs(x[1]) <= LONGEST_OFFSET
-    return Estimate.within("imu.time_offset", x[1], half, "s", sure, note)
+    return Estimate.within("imu.time_offset", found.seconds, half, "s", half < UNSURE_CLOCK, note)
 
 
 def _curves(found: MountFit) -> tuple[Curve, ...]:

@@ -20,12 +20,10 @@ from finssim.calibration.findings import Finding, finding, plain
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.output.report import (
     AS_GIVEN,
-    BLUE,
-    GRAY,
     HEADS,
-    ORANGE,
     Report,
     command_line,
+    draw_arrows,
     draw_correlation,
     new_figure,
     picture_axes,
@@ -58,7 +56,6 @@ from finssim.localization.pool import Pool, write_pool
 from finssim.provenance import provenance
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["CAMERA", "PoolFit", "calibrate_pool", "doubted", "pool_record", "run"]
@@ -1282,29 +1279,19 @@ TOO_DEEP = 1.5
 LEAST_THICKNESS = 0.02
 """Thickness of the points, over their lesser width, below which their mirror image cannot be told from them."""
 
-AGAINST = 0.002
-"""Clearance of a point from the plane below which the plane ends against it [m]."""
 
-MOST_ABOVE = 0.4
-"""Share of the points that may be marks above the water."""
-
-MET = 4.0, 3.0
-"""Residual of straight lines that meets a mark: so many residuals of the rest, and so many pixels more."""
-
-
-def doubted(fit: PoolFit, lens: Lens, *, lens_told: bool = True) -> PoolFit:
+def doubted(fit: PoolFit, *, lens_told: bool = True) -> PoolFit:
     """The calibration with what speaks against it put first.
 
     Args:
         fit: The calibration.
-        lens: That it began with.
         lens_told: Somebody said how sure the lens is.
 
     Raises:
         CalibrationError: It cannot be a camera before water; says which number to check.
     """
     _refuse_depth(fit)
-    found = [*_touching(fit), *_unmarked(fit, lens), *_handed(fit)]
+    found = [*_touching(fit), *_handed(fit)]
     exact = [] if lens_told or "focal" in fit.lens_fitted else [finding("lens_exact")]
     return replace(fit, findings=(*_straight(fit), *found, *fit.findings, *exact))
 
@@ -1357,52 +1344,6 @@ def _straight(fit: PoolFit) -> list[Finding]:
     if not errors[1] < STRAIGHTER * errors[0]:
         return []
     return [finding("straight_better", straight=errors[1], refraction=errors[0])]
-
-
-def _unmarked(fit: PoolFit, lens: Lens) -> list[Finding]:
-    """Marks above the water that nobody called dry, for which the plane was put over them, or the lens bent."""
-    seen, rows = fit.seen, _highest(fit)
-    if not rows.any():
-        return []
-    try:
-        other = calibrate_pool(seen.subset(~rows), lens, fit.settings)
-    except (CalibrationError, np.linalg.LinAlgError):
-        return []
-    marks = seen.subset(rows)
-    above = clearances(other.model, marks.points) + other.model.interface.thickness < 0.0
-    if not (above & _met(other, marks)).all():
-        return []
-    return [
-        finding(
-            "marks_unmarked",
-            marks=marks.names,
-            clearance=other.model.clearance,
-            instead=fit.model.clearance,
-        )
-    ]
-
-
-def _highest(fit: PoolFit) -> NDArray[np.bool_]:
-    """Points nearest to the plane, down to the widest gap between heights, (N,).
-
-    None of them where nothing is odd: the plane ends against no point, and the lens gave up nothing.
-    """
-    seen, model = fit.seen, fit.model
-    distance = np.where(seen.dry, np.inf, clearances(model, seen.points))
-    bent = fit.settings.fit is None and bool(fit.lens_fitted)
-    order = np.sort(distance[~seen.dry])
-    most = int(MOST_ABOVE * len(order))
-    if most < 1 or not (bent or float(distance[fit.used].min()) < AGAINST):
-        return np.zeros(len(seen), bool)
-    gap = int(np.argmax(np.diff(order[: most + 1])))
-    return np.asarray(distance <= order[gap])
-
-
-def _met(fit: PoolFit, marks: Observations) -> NDArray[np.bool_]:
-    """Which marks the camera sees where straight lines say, (K,)."""
-    off = marks.pixels - fit.model.predict(marks.points, np.ones(len(marks), bool))
-    times, more = MET
-    return np.asarray(np.linalg.norm(off, axis=1) < times * rms(fit.residual[fit.used]) + more)
 
 
 def _handed(fit: PoolFit) -> list[Finding]:
@@ -1558,7 +1499,7 @@ def _map(fit: PoolFit) -> Figure:
     if not fit.surface:
         across, names = fit.model.tangents, ("along the wall [m]", "along the wall, across [m]")
     axes.plot(*(across @ fit.model.camera.position), "^", color="black", markersize=8, label="camera")
-    _draw_arrows(axes, fit.seen.points @ across.T, 1000.0 * fit.error @ across.T, fit.used, "mm", 1000.0)
+    draw_arrows(axes, fit.seen.points @ across.T, 1000.0 * fit.error @ across.T, fit.used, "mm", 1000.0)
     axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
     return figure
 
@@ -1567,45 +1508,9 @@ def _picture(fit: PoolFit) -> Figure:
     lens = fit.model.camera.lens
     figure = new_figure(7.4, 7.4 * lens.height / lens.width + 0.6)
     axes = figure.subplots()
-    _draw_arrows(axes, fit.seen.pixels, fit.residual, fit.used, "px", 1.0)
+    draw_arrows(axes, fit.seen.pixels, fit.residual, fit.used, "px", 1.0)
     picture_axes(axes, lens)
     return figure
-
-
-ARROW = 0.06
-"""Length of the 95th percentile of arrows in a figure, in widths of what is drawn."""
-
-
-def _draw_arrows(
-    axes: Axes,
-    at: Array,
-    vectors: Array,
-    used: NDArray[np.bool_],
-    unit: str,
-    per: float,
-) -> None:
-    """Points and enlarged arrows, and crosses where there is none; `per` of the arrows' unit make one of the axes'.
-
-    Args:
-        axes: To draw into.
-        at: (N, 2).
-        vectors: (N, 2).
-        used: Which rows the calibration used, (N,).
-        unit: Of the arrows.
-        per: Arrow units in one of the axes' units.
-    """
-    good = used & np.isfinite(vectors).all(axis=1)
-    size = float(np.percentile(np.linalg.norm(vectors[good], axis=1), 95)) if good.any() else 1.0
-    scale = max(size, 1e-12) / max(float(np.ptp(at, axis=0).max()) * ARROW, 1e-12)
-    axes.plot(*at[good].T, ".", color=GRAY, markersize=3)
-    label = f"longest of 95 %: {size:.2g} {unit}, enlarged {per / scale:.2g} times"
-    arrows = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.0022}
-    axes.quiver(*at[good].T, *vectors[good].T, color=BLUE, label=label, **arrows)
-    if not good.all():
-        axes.plot(*at[~good].T, "x", color=ORANGE, markersize=6, label="left out")
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=3, frameon=False)
-    axes.grid(True, color="0.93", linewidth=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 def run(
@@ -1690,7 +1595,7 @@ def run(
     seen = _observations(list(map(Path, inputs)), surveyed, unit, z, edge, family)
     _refuse_pixels(seen, file)
     lens_told = focal_sigma is not None or center_sigma is not None or any(_lens_sigma(file))
-    found = doubted(calibrate_pool(seen, file.lens, settings), file.lens, lens_told=lens_told)
+    found = doubted(calibrate_pool(seen, file.lens, settings), lens_told=lens_told)
     hashes = {
         str(path): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in map(Path, [*inputs, *filter(None, [surveyed]), camera])
