@@ -29,6 +29,8 @@ from finssim.worlds.rays import WATER_INDEX, camera_rays, cones, fan, ray_elevat
 wp.set_module_options({"enable_backward": False})
 
 MISS = wp.constant(wp.uint32(0xFFFFFFFF))
+SKIPPED = wp.constant(-101)
+"""In place of a view's world: Newton leaves its outputs as they are (`WorldRenderFlag.DISABLE_PRESERVE`)."""
 LEVELS = 4096
 """Of the converter behind a camera's pixels (12 bits), before the numbers are encoded to 8."""
 LAMP_STEPS = wp.constant(8)
@@ -41,12 +43,19 @@ def _place_views(
     poses: wp.array(dtype=wp.transform),
     mount: wp.transform,
     world_of_view: wp.array(dtype=int),
+    mask: wp.array(dtype=int),
     optics: Optics,
     views: wp.array(dtype=wp.transform),
+    worlds: wp.array(dtype=int),
     dimming: wp.array(dtype=wp.vec3),
 ):
-    """Sensor poses in the world, and daylight at their depths as a share of that at the surface."""
+    """Sensor poses, their worlds or SKIPPED, and daylight at their depths as a share of that at the surface."""
     v = wp.tid()
+    worlds[v] = SKIPPED
+    if mask.shape[0] > 0:
+        if mask[v] == 0:
+            return
+    worlds[v] = world_of_view[v]
     views[v] = wp.transform_multiply(poses[v], mount)
     depth = wp.max(-wp.transform_get_translation(views[v])[2], 0.0)
     K = optics.daylight_attenuation[world_of_view[v]]
@@ -98,6 +107,8 @@ class RayBatch:
             self.world_of_view = wp.array(np.arange(self.count) // vehicles, dtype=int)
             self.views = wp.zeros(self.count, dtype=wp.transform)
             self.dimming = wp.zeros(self.count, dtype=wp.vec3)
+            self.worlds = wp.zeros(self.count, dtype=int)
+            self._all = wp.zeros(0, dtype=int)
         self._mount = wp.transform(wp.vec3(*mount.position), wp.quat(*map(float, mount.quaternion)))
 
     def _span(self, columns: int) -> int:
@@ -109,11 +120,12 @@ class RayBatch:
         views, rows, columns = array.shape[:3]
         return views, rows, columns // self._span(columns)
 
-    def cast(self, poses: wp.array) -> None:
+    def cast(self, poses: wp.array, mask: wp.array | None = None) -> None:
         """Trace the rays: depth from where each enters the water [m], index of the shape, normal.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            mask: Which vehicles' sensors measure; the others' outputs stay. int (N,); all if None.
 
         Raises:
             WorldError: Another number of vehicles.
@@ -122,7 +134,14 @@ class RayBatch:
             raise WorldError(
                 f"{len(poses)} poses for {self.count} vehicles: give one for each, in order of world"
             )
-        inputs = [poses, self._mount, self.world_of_view, self.batch.optics, self.views, self.dimming]
+        inputs = [
+            poses,
+            self._mount,
+            self.world_of_view,
+            self._all if mask is None else mask,
+            self.batch.optics,
+        ]
+        inputs += [self.views, self.worlds, self.dimming]
         wp.launch(_place_views, self.count, inputs, device=self.device)
         self.batch.caster.update(
             self.batch.state,
@@ -131,7 +150,7 @@ class RayBatch:
             depth_image=self.depth,
             normal_image=self.normal,
             shape_index_image=self.shape_index,
-            world_indices=self.world_of_view,
+            world_indices=self.worlds,
             sync_deformables=False,
         )
 
@@ -316,7 +335,7 @@ def _take_picture(
     normal: wp.array3d(dtype=wp.vec3),
     views: wp.array(dtype=wp.transform),
     poses: wp.array(dtype=wp.transform),
-    world_of_view: wp.array(dtype=int),
+    worlds: wp.array(dtype=int),
     dimming: wp.array(dtype=wp.vec3),
     optics: Optics,
     surfaces: wp.array(dtype=Surface),
@@ -348,10 +367,13 @@ def _take_picture(
     be empty; without noise, which a negative key means, a number is that of the mean charge.
     """
     v, i, block = wp.tid()
+    w = worlds[v]
+    if w == SKIPPED:
+        return
     view = views[v]
     pose = poses[v]
-    c = optics.attenuation[world_of_view[v]]
-    K = optics.daylight_attenuation[world_of_view[v]]
+    c = optics.attenuation[w]
+    K = optics.daylight_attenuation[w]
     veil = optics.veil
     daylight = optics.daylight
     diffuse = optics.diffuse
@@ -421,6 +443,7 @@ def _take_picture(
 
 @wp.kernel(enable_backward=False)
 def _meter(
+    worlds: wp.array(dtype=int),
     picture: wp.array4d(dtype=wp.uint8),
     target: float,
     gamma: float,
@@ -432,6 +455,8 @@ def _meter(
     Of the differences between the channels' means, the share `balance` is taken out (gray world).
     """
     v = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
     total = wp.vec3(0.0)
     rows = wp.min(picture.shape[1], 16)
     columns = wp.min(picture.shape[2], 16)
@@ -499,20 +524,23 @@ class CameraBatch(RayBatch):
             self._lamps = wp.array([_lamp(lamp) for lamp in lamps], dtype=Lamp)
         self._sensor = sensor
 
-    def update(self, poses: wp.array, *, seed: int | None = None, time: float = 0.0) -> wp.array:
+    def update(
+        self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
+    ) -> wp.array:
         """Take a picture of each world.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
             seed: Of the noise; None for none.
             time: Of the pictures [s]: pictures of other times have other noise.
+            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
 
         Returns:
             `picture`, which the next update overwrites.
         """
-        self.cast(poses)
+        self.cast(poses, mask)
         sensor, key = self._sensor, -1 if seed is None else noise_key(seed, time)
-        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, poses, self.world_of_view]
+        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, poses, self.worlds]
         inputs += [
             self.dimming,
             self.batch.optics,
@@ -525,7 +553,14 @@ class CameraBatch(RayBatch):
         inputs += [self._span(self.depth.shape[2]), self.radiance, self.picture]
         wp.launch(_take_picture, self._blocks(self.depth), inputs, device=self.device)
         if self.camera.exposure == "auto":
-            inputs = [self.picture, AUTO_MEAN, sensor.gamma, self.camera.white_balance, self.gain]
+            inputs = [
+                self.worlds,
+                self.picture,
+                AUTO_MEAN,
+                sensor.gamma,
+                self.camera.white_balance,
+                self.gain,
+            ]
             wp.launch(_meter, self.count, inputs, device=self.device)
         return self.picture
 
@@ -542,6 +577,7 @@ def _lamp(light: Headlight) -> Lamp:
 
 @wp.kernel(enable_backward=False)
 def _echo_rays(
+    worlds: wp.array(dtype=int),
     rays: wp.array4d(dtype=wp.vec3),
     depth: wp.array3d(dtype=float),
     shape_index: wp.array3d(dtype=wp.uint32),
@@ -567,6 +603,8 @@ def _echo_rays(
     normal says; so that no gaps open between rays on a slanting floor. `energy` is that of one range cell.
     """
     v, i, block = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
     rotation = wp.transform_get_rotation(views[v])
     decay = 0.2 * wp.log(10.0) * absorption
     for j in range(block * span, wp.min(block * span + span, depth.shape[2])):
@@ -610,6 +648,7 @@ def _echo_rays(
 
 @wp.kernel(enable_backward=False)
 def _gather_echoes(
+    worlds: wp.array(dtype=int),
     energy: wp.array3d(dtype=float),
     spread: wp.array3d(dtype=wp.vec2),
     taps: wp.array(dtype=float),
@@ -617,6 +656,8 @@ def _gather_echoes(
 ):
     """Echo by beam and range cell: rays of the beam's own and the neighbouring directions, by its pattern."""
     v, b = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
     bins = intensity.shape[2]
     reach = taps.shape[0] / 2
     for k in range(bins):
@@ -635,6 +676,7 @@ def _gather_echoes(
 
 @wp.kernel(enable_backward=False)
 def _receive(
+    worlds: wp.array(dtype=int),
     noise: float,
     gain: wp.array(dtype=float),
     floor_db: float,
@@ -651,6 +693,8 @@ def _receive(
     distribution, amplitude Rayleigh. Without a seed (key < 0) it is I + N itself.
     """
     v, b, block = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
     bins = intensity.shape[2]
     first = (v * intensity.shape[1] + b) * bins
     scale = 255.0 / span_db
@@ -716,28 +760,47 @@ class SonarBatch(RayBatch):
         """Length of a range cell [m]."""
         return self.sonar.range / self.bins
 
-    def update(self, poses: wp.array, *, seed: int | None = None, time: float = 0.0) -> wp.array:
+    def update(
+        self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
+    ) -> wp.array:
         """One ping of each vehicle.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
             seed: Of speckle and noise; None for the mean power.
             time: Of the ping [s]: pings of other times have other speckle.
+            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
 
         Returns:
             `picture`, which the next update overwrites.
         """
-        self.cast(poses)
+        self.cast(poses, mask)
         sonar = self.sonar
-        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, self.batch.surfaces]
+        inputs = [
+            self.worlds,
+            self.rays,
+            self.depth,
+            self.shape_index,
+            self.normal,
+            self.views,
+            self.batch.surfaces,
+        ]
         inputs += [self._weight, self.absorption, self._steps, 1.0 / self.bin_length]
         inputs += [self._span(self.depth.shape[2]), self._energy, self._spread]
         wp.launch(_echo_rays, self._blocks(self.depth), inputs, device=self.device)
-        inputs = [self._energy, self._spread, self._taps, self.intensity]
+        inputs = [self.worlds, self._energy, self._spread, self._taps, self.intensity]
         wp.launch(_gather_echoes, self.intensity.shape[:2], inputs, device=self.device)
         low, high = sonar.display
         key = -1 if seed is None else noise_key(seed, time)
-        inputs = [10.0 ** (0.1 * sonar.noise_level_db), self._gain, low, high - low, self._exponential, key]
+        inputs = [
+            self.worlds,
+            10.0 ** (0.1 * sonar.noise_level_db),
+            self._gain,
+            low,
+            high - low,
+            self._exponential,
+            key,
+        ]
         inputs += [self._span(self.bins), self.intensity, self.picture]
         wp.launch(_receive, self._blocks(self.intensity), inputs, device=self.device)
         return self.picture
@@ -761,6 +824,7 @@ def beam_pattern(width: float, spacing: float, beams: int) -> np.ndarray:
 
 @wp.kernel(enable_backward=False)
 def _take_ranges(
+    worlds: wp.array(dtype=int),
     rays: wp.array4d(dtype=wp.vec3),
     depth: wp.array3d(dtype=float),
     shape_index: wp.array3d(dtype=wp.uint32),
@@ -777,6 +841,8 @@ def _take_ranges(
 ):
     """Range of each beam: where the given share of its echo has come; infinite beyond the device's reach."""
     v, b = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
     rotation = wp.transform_get_rotation(views[v])
     total = float(0.0)
     for j in range(depth.shape[2]):
@@ -833,20 +899,31 @@ class RangeBatch(RayBatch):
         self._weight = wp.array(np.float32(weight), dtype=float, device=self.device)
         self.ranges = wp.zeros((self.count, ranger.beams), dtype=float, device=self.device)
 
-    def update(self, poses: wp.array, *, seed: int | None = None, time: float = 0.0) -> wp.array:
+    def update(
+        self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
+    ) -> wp.array:
         """Measure.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
             seed: Of the noise; None for none.
             time: Of the measurement [s]: others have other noise.
+            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
 
         Returns:
             `ranges`, which the next update overwrites.
         """
-        self.cast(poses)
+        self.cast(poses, mask)
         ranger, key = self.ranger, -1 if seed is None else noise_key(seed, time)
-        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, self.batch.surfaces]
+        inputs = [
+            self.worlds,
+            self.rays,
+            self.depth,
+            self.shape_index,
+            self.normal,
+            self.views,
+            self.batch.surfaces,
+        ]
         inputs += [self._weight, ranger.quantile, ranger.minimum_range, ranger.range, ranger.noise, key]
         wp.launch(_take_ranges, self.ranges.shape, [*inputs, self.ranges], device=self.device)
         return self.ranges
