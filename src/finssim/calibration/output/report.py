@@ -70,7 +70,7 @@ def command_line(kind: str, inputs: Iterable[Path], options: Mapping[str, Any]) 
         for item in value if isinstance(value, (list, tuple)) else [value]:
             if item is True:
                 words.append(option)
-            elif item is not None and item is not False:
+            elif item is not None and item is not False and item != "":
                 words += [option, str(item)]
     return shlex.join(words)
 
