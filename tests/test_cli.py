@@ -23,6 +23,7 @@ COMMANDS = [
     "vehicles show",
     "validate",
     "bench",
+    "bench cameras",
     "doctor",
     "trials",
     "trials check",
@@ -64,6 +65,9 @@ COMMANDS = [
     "ros2",
     "ros2 node",
     "ros2 up",
+    "worlds",
+    "worlds list",
+    "worlds show",
 ]
 
 

@@ -18,6 +18,7 @@ from finssim.tasks import TASKS
 from finssim.tasks.sensing import load_sensing
 from finssim.vehicles import VehicleError, load_vehicle
 from finssim.vehicles.check import check_vehicle
+from finssim.worlds import load_world
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -86,6 +87,13 @@ def test_the_rov_on_the_page_is_sound_and_its_log_is_read(tmp_path, monkeypatch)
     assert load_vehicle("water.yaml").thruster_names == load_vehicle("minnow.yaml").thruster_names
     (trial,) = read_trials([Path("dive_surge.csv")], column_map=Path("log.yaml"))
     assert trial.channels["v"][0] == -0.0067 and trial.channels["rpm_back_right"][1] == 835.0
+
+
+def test_the_world_on_the_page_loads(tmp_path):
+    """The example file is a world, with its mooring and what moves with it."""
+    (example,) = blocks(ROOT / "docs" / "worlds.md", "yaml")
+    (tmp_path / "buoy.yaml").write_text(example, encoding="utf-8")
+    assert load_world(tmp_path / "buoy.yaml").objects["buoy"].frame == "mooring"
 
 
 def test_every_range_on_the_page_of_randomisation_loads(tmp_path):

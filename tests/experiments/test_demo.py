@@ -4,19 +4,23 @@ import contextlib
 import io
 import json
 import re
+from dataclasses import replace
 
 import pytest
+from rich.console import Console
 
 from finssim import boundary
+from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.trials.trial_files import load_trials
 from finssim.cli import app
 from finssim.control.pid import axis_model
 from finssim.control.policy import Policy
 from finssim.experiments import demo as demo_module
 from finssim.experiments.demo import FULL, Scope, demo, identify
+from finssim.experiments.figures import new_figure, save_figure
 from finssim.experiments.metrics import T1_SETPOINTS
+from finssim.experiments.on_robot import RobotError
 from finssim.experiments.trials import Motion
-from finssim.files import OutputError
 from finssim.learning.training_loop import Loop
 from finssim.pool import load_plant_spec
 from finssim.vehicles import load_vehicle
@@ -56,6 +60,7 @@ def test_policy_results_and_report_are_there(folder):
     assert [path.name for path in folder.parent.iterdir()] == ["demo"]
     assert {p.name for p in folder.iterdir()} == {
         "trials",
+        "demo.yaml",
         "finsrov_rough.yaml",
         "finsrov_identified.yaml",
         "calibration",
@@ -63,13 +68,7 @@ def test_policy_results_and_report_are_there(folder):
         "replay.png",
         "pool.yaml",
         "policy",
-        "policy-training",
-        "deployed",
-        "policy.json",
-        "policy-with-pictures.json",
-        "pid.json",
-        "pid-paper.json",
-        "envelopes.png",
+        "t1",
         "paths.png",
         "training.png",
         "report.html",
@@ -93,22 +92,25 @@ def test_the_identified_vehicle_is_as_fast_as_the_plant_and_the_policy_is_for_it
 def test_each_trial_is_told_as_soon_as_it_is_over(made):
     """First the speeds that trials reached, then what was identified, then who held what."""
     lines = made[2].splitlines()
-    at = [next(i for i, line in enumerate(lines) if line.startswith(s)) for s in ("identified", "holding")]
+    at = [next(i for i, line in enumerate(lines) if line.startswith(s)) for s in ("identified", "training")]
     assert sum(": up to " in line for line in lines[: at[0]]) == 4 and at[0] < at[1]
     assert sum(" at P01: " in line for line in lines[at[1] :]) == 3
-    assert "  policy-with-pictures at P02: not held" in lines
+    assert "  with-pictures at P02: not held" in lines
 
 
 def test_controllers_met_the_plant_that_the_trials_came_from_through_the_whole_stack(folder):
     """Every trial begins at the published start, in the pool of pool.yaml, and localization was at work in it."""
     assert load_plant_spec(folder / "pool.yaml").seed == 1
-    for name, camera in (("policy", "corners"), ("pid", "corners"), ("policy-with-pictures", "pictures")):
-        result = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-        (trial,) = result["per_trial"]
-        assert result["camera"] == camera and trial["fault"] == ""
-        assert trial["localization"]["position_m"] < 0.05
-    for file in (folder / "deployed").glob("*.npz"):
-        assert abs(Motion.read(file.with_suffix("")).position[0]).max() < 0.6
+    result = json.loads((folder / "t1" / "t1.json").read_text(encoding="utf-8"))
+    rows = {trial["job"]["row"]: trial for trial in result["trials"]}
+    assert set(rows) == {"calibrated-pool", "with-pictures", "pid", "pid-paper"}
+    for name, trial in rows.items():
+        assert trial["job"]["camera"] == ("pictures" if name == "with-pictures" else "corners")
+        assert (
+            trial["job"]["plant"] == 1 and trial["fault"] == "" and trial["localization"]["position_m"] < 0.05
+        )
+        motion = Motion.read(folder / "t1" / "trials" / trial["key"])
+        assert abs(motion.position[0]).max() < 0.6
 
 
 def test_the_full_demonstration_tries_all_setpoints_and_axes():
@@ -130,34 +132,32 @@ def test_the_report_loads_nothing(folder):
 
 def test_the_report_has_every_controller_the_paper_and_the_provenance(folder):
     html = (folder / "report.html").read_text(encoding="utf-8")
-    policy = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
+    result = json.loads((folder / "t1" / "t1.json").read_text(encoding="utf-8"))
     for word in (
-        "policy, pool",
-        "policy-with-pictures, pool",
-        "pid, pool",
-        "pid-paper, pool",
-        "paper: PID",
-        "P01",
+        "Pool ranges, integrating",
+        "The same, by pictures",
+        "PID, tuned from the model",
+        "PID, published gains",
+        "  paper: PID",
+        "PID, published gains, P01",
         "Provenance",
         "surge.d1",
     ):
         assert f">{word}<" in html
     vehicle = f"--vehicle {folder / 'finsrov_identified.yaml'}"
     assert f"finssim train t1 {vehicle} --randomize pool --seed 1 --steps 8192 --out policy" in html
-    assert "on hardware" in html
-    assert policy["vehicle"]["sha256"] in html and str(policy["provenance"]["revision"]) in html
+    assert result["vehicle"]["sha256"] in html and str(result["provenance"]["revision"]) in html
 
 
-def interrupt(*_, **__):
-    raise KeyboardInterrupt
+def test_an_interrupted_demonstration_goes_on(tmp_path, monkeypatch, made):
+    """Ctrl-C in the second rollout: the same call identifies, trains and deploys; other settings are refused."""
 
+    def identified(folder, *_, **__):
+        write_vehicle(made[1].vehicle, folder / "finsrov_identified.yaml")
+        save_figure(new_figure(1.0, 1.0), folder / "replay.png")
+        return made[1]
 
-@pytest.mark.parametrize("when", ["training", "deployment"])
-def test_an_interrupted_demonstration_keeps_its_policy_where_it_says(
-    tmp_path, monkeypatch, capsys, made, when
-):
-    """Ctrl-C in the second rollout, or in the pool: a whole policy beside the demonstration, and nothing else."""
-    monkeypatch.setattr(demo_module, "identify", lambda *_, **__: made[1])
+    monkeypatch.setattr(demo_module, "identify", identified)
     update = Loop._update
 
     def stop(self, total):
@@ -165,19 +165,18 @@ def test_an_interrupted_demonstration_keeps_its_policy_where_it_says(
             raise KeyboardInterrupt
         return update(self, total)
 
-    if when == "training":
-        monkeypatch.setattr(Loop, "_update", stop)
-    else:
-        monkeypatch.setattr(demo_module, "run_jobs", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        demo(tmp_path / "demo", steps=100_000 if when == "training" else 8192, scope=SMALL)
-    kept = tmp_path / "demo-training" / "interrupted"
-    assert Policy.load(kept).description.training["complete"] is (when == "deployment")
-    assert f": {kept}" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["demo-training"]
+    options = {"steps": 65_536, "scope": replace(SMALL, pictures=()), "console": Console(quiet=True)}
+    with monkeypatch.context() as patch:
+        patch.setattr(Loop, "_update", stop)
+        with pytest.raises(KeyboardInterrupt):
+            demo(tmp_path / "demo", **options)
+    assert demo(tmp_path / "demo", **options) == tmp_path / "demo" / "report.html"
+    assert Policy.load(tmp_path / "demo" / "policy").description.training["complete"]
+    with pytest.raises(RobotError, match="made with other settings"):
+        demo(tmp_path / "demo", **{**options, "seed": 2})
 
 
 def test_somebodys_files_are_not_replaced(tmp_path):
     (tmp_path / "thesis.tex").write_text("years", encoding="utf-8")
-    with pytest.raises(OutputError, match="already holds files"):
+    with pytest.raises(RobotError, match="holds other files"):
         demo(tmp_path, steps=1)

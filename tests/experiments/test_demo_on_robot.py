@@ -7,8 +7,7 @@ from rich.console import Console
 
 from finssim.control.policy import Policy
 from finssim.experiments.demo import Scope, demo
-from finssim.experiments.on_robot import OnRobot
-from finssim.files import OutputError
+from finssim.experiments.on_robot import OnRobot, RobotError
 from finssim.robot.wiring import Wiring
 from finssim.vehicles import load_vehicle
 from reference.pools import Person, lockstep_pool
@@ -42,11 +41,12 @@ def test_the_loop_goes_on_where_it_was_interrupted_and_ends_in_a_report(tmp_path
     assert first.stat().st_mtime_ns == before
     vehicle = load_vehicle(out / "finsrov_identified.yaml")
     assert Policy.load(out / "policy", vehicle=vehicle).description.training["steps"] == 8192
-    for name in ("policy", "pid", "pid-paper"):
-        result = json.loads((out / f"{name}.json").read_text())
-        assert result["plant"]["name"] == "hardware" and result["trials"] == 1
+    result = json.loads((out / "t1" / "t1.json").read_text())
+    assert result["robot"] and {name: row["trials"] for name, row in result["rows"].items()} == dict.fromkeys(
+        ("calibrated-pool", "pid", "pid-paper"), 1
+    )
     page = report.read_text()
-    assert "policy, hardware" in page and "setpoints on hardware" in page and "trials of a robot" in page
+    assert "integrating, hardware" in page and "setpoints on hardware" in page and "trials of a robot" in page
     assert f"finssim run --policy policy --vehicle {out / 'finsrov_identified.yaml'}" in page
 
 
@@ -56,5 +56,5 @@ def test_somebodys_folder_is_refused(tmp_path):
     robot = OnRobot(
         wiring=Wiring(robot="127.0.0.1:1", lockstep=True), pool_file=tmp_path / "p.yaml", arm=True
     )
-    with pytest.raises(OutputError, match="already holds files"):
+    with pytest.raises(RobotError, match="holds other files"):
         demo(tmp_path, robot=robot, scope=SMALL, console=QUIET)

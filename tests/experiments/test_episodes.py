@@ -95,7 +95,7 @@ def test_means_have_intervals_and_what_is_missing_is_counted():
     row = summarize_episodes(trials)
     low, high = row["metrics"]["return"]["ci95"]
     assert row["metrics"]["return"]["value"] == 1.5 and 0.0 <= low < 1.5 < high <= 3.0
-    assert row["metrics"]["time"] == {"value": 1.0, "ci95": [1.0, 1.0]}
+    assert row["metrics"]["time"] == {"value": 1.0, "ci95": [1.0, 1.0], "count": 3}
     assert (row["trials"], row["valid"]) == (5, 4)
 
 

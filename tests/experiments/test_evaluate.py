@@ -141,7 +141,7 @@ def test_json_is_one_object_with_the_agreed_keys(capsys, policy):
 def test_the_table_has_a_row_per_setpoint_all_and_the_papers(capsys):
     evaluate("pid", console=Console(width=100))
     out = capsys.readouterr().out
-    assert all(f"{name} " in out for name in [*T1_SETPOINTS, "all", "paper"])
+    assert all(f"{name} " in out for name in [*T1_SETPOINTS, "all", "paper, PID"])
     assert "8/8" in out and "44.08" in out and "its vehicle in its pool, PID, for orientation" in out
 
 

@@ -13,7 +13,7 @@ from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.trials.trial_files import load_trials
 from finssim.cli import app
-from finssim.experiments.excitation import PoolRun, play_programme, pool_trials
+from finssim.experiments.excitation import PoolRun, play_programme, record_programmes
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow
@@ -93,10 +93,10 @@ def test_a_programme_that_the_bridge_stops_is_refused(tmp_path):
 
     write_vehicle(light, tmp_path / "light.yaml")
     with pytest.raises(CalibrationError, match="roll_hard in the virtual pool: .*tilt"):
-        pool_trials(
+        record_programmes(
             {"fit": [hard]},
-            tmp_path / "out",
-            vehicle=str(tmp_path / "light.yaml"),
+            {"fit": tmp_path / "out"},
+            str(tmp_path / "light.yaml"),
             pool_vehicle="finsrov",
             severity="nominal",
             processes=1,

@@ -109,7 +109,7 @@ def test_where_nothing_was_located_the_table_says_so(result):
     """In place of a figure; and no gain is claimed over it."""
     result["results"]["published"] = {**result["results"]["published"], "pinhole": NOTHING}
     for text in (printed(result), markdown_of(tables_of(result))):
-        assert "none" in text and "0/12" in text
+        assert "–" in text and "0/12" in text
         assert "calibrated on the same half" not in " ".join(text.split())
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.on_robot import OnRobot, RobotError
-from finssim.experiments.pool_trial import Job, play, run_on_robot
+from finssim.experiments.pool_trial import Job, play, play_jobs
 from finssim.experiments.trials import Motion
 from finssim.robot.goals import GoalError
 from finssim.robot.wiring import Wiring
@@ -111,6 +111,6 @@ def test_a_robot_in_a_tank_may_go_where_the_tank_is(tmp_path):
               camera="hardware", site="tank", firmware="ardusub")  # fmt: skip
     there = OnRobot(wiring=Wiring(robot="mavlink", lockstep=True), pool_file=None, site="tank")
     with pytest.raises(RobotError, match="give --arm"):
-        run_on_robot([job], tmp_path, there)
+        play_jobs([job], tmp_path, there)
     with pytest.raises(GoalError, match="outside the workspace"):
-        run_on_robot([job], tmp_path, dataclasses.replace(there, site="pool"))
+        play_jobs([job], tmp_path, dataclasses.replace(there, site="pool"))

@@ -1,11 +1,12 @@
 """The experiments run from their command to their table, go on where they were, and refuse what they do not know."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from finssim.experiments.tables import html_of, markdown_of
-from finssim.experiments.transfer import T1, T2, row_figures, scores, trained, transfer_experiment
+from finssim.experiments.transfer import T1, T2, controllers_of, row_figures, scores, transfer_experiment
 
 pytestmark = pytest.mark.slow
 
@@ -68,14 +69,16 @@ def test_what_is_unknown_is_refused_before_anything_is_trained(tmp_path, wrong, 
 
 def test_a_finished_policy_is_not_trained_again(tmp_path):
     """An unfinished one is."""
-    training = T1.rows["calibrated-pool"].training
-    (place,) = trained([training], [5], tmp_path, vehicle="finsrov", steps=4096).values()
-    first = (place / "policy.onnx").stat().st_mtime_ns
-    trained([training], [5], tmp_path, vehicle="finsrov", steps=4096)
-    assert (place / "policy.onnx").stat().st_mtime_ns == first
-    (place / "policy.onnx").write_bytes(b"cut short")
-    trained([training], [5], tmp_path, vehicle="finsrov", steps=4096)
-    assert (place / "policy.onnx").stat().st_size > 1000
+    rows = {name: T1.rows[name] for name in ("pid", "calibrated-pool")}
+    controllers = controllers_of("t1", rows, [5], tmp_path, "finsrov", 4096)
+    network = Path(controllers["calibrated-pool", 5]) / "policy.onnx"
+    assert controllers["pid", 5] == "pid" and network.parent.parent == tmp_path / "policies"
+    first = network.stat().st_mtime_ns
+    controllers_of("t1", rows, [5], tmp_path, "finsrov", 4096)
+    assert network.stat().st_mtime_ns == first
+    network.write_bytes(b"cut short")
+    controllers_of("t1", rows, [5], tmp_path, "finsrov", 4096)
+    assert network.stat().st_size > 1000
 
 
 @pytest.mark.parametrize("spec", [T1, T2], ids=lambda spec: spec.name)

@@ -9,7 +9,7 @@ from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges
 from finssim.experiments.plants import load_plant
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
-from finssim.tasks.drawing import LOOK
+from finssim.tasks.schedule import LOOK
 
 MASS = (0.6, 1.8)
 ALWAYS, NEVER = {"episode_return": -1e9}, {"episode_return": 1e9}
@@ -24,7 +24,7 @@ def environment(worlds=200, time_limit=1.0, task=None, **parts) -> Environment:
 
 def masses(env: Environment) -> np.ndarray:
     """Drawn factor of every world."""
-    return env.drawing.draws.numpy(["mass"])[:, 0, 0]
+    return env.draws.numpy(["mass"])[:, 0, 0]
 
 
 def run(env: Environment, steps: int) -> None:
@@ -38,7 +38,7 @@ def test_ranges_widen_linearly_with_the_share_of_the_training(done, width):
     """width = start + (1 - start) (done - from) / (to - from); what is drawn next fills just that."""
     env = environment(worlds=1500, curriculum={"start": 0.2, "over": [0.1, 0.6]})
     env.set_progress(done)
-    assert env.drawing.schedule.width == pytest.approx(width)
+    assert env.schedule.width == pytest.approx(width)
     env.reset()
     low, high = 1.0 - width * 0.4, 1.0 + width * 0.8
     x = masses(env)
@@ -50,7 +50,7 @@ def test_a_curriculum_starts_with_the_vehicle_of_the_file():
     env = environment(
         curriculum={}, thrust={"failure": {"uniform": [0.0, 0.0], "probability": 0.5}}, current=(0.1, 0.3)
     )
-    values = env.drawing.draws
+    values = env.draws
     for name in ("mass", "thrust.failure.0"):
         assert (values.numpy([name]) == 1.0).all()
     np.testing.assert_allclose(values.numpy(["current"]), 0.1, rtol=1e-6)  # the end nearest to still water
@@ -63,11 +63,11 @@ def test_ranges_widen_with_the_environments_own_steps():
     """Counted over all worlds; nobody has to tell."""
     env = environment(worlds=10, curriculum={"by": "steps", "over": [0, 2000]})
     run(env, LOOK - 1)
-    assert env.drawing.schedule.width == 0.0
+    assert env.schedule.width == 0.0
     run(env, 1)
-    assert env.drawing.schedule.width == pytest.approx(LOOK * 10 / 2000)
+    assert env.schedule.width == pytest.approx(LOOK * 10 / 2000)
     run(env, 3 * LOOK)
-    assert env.drawing.schedule.width == 1.0
+    assert env.schedule.width == 1.0
 
 
 @pytest.mark.parametrize(
@@ -79,15 +79,15 @@ def test_ranges_widen_with_success_and_narrow_without(success, start, width):
     plan = {"by": "success", "start": start, "episodes": 100, "success": success}
     env = environment(worlds=20, curriculum=plan)
     run(env, 5 * LOOK)
-    assert env.drawing.schedule.width == pytest.approx(width)
+    assert env.schedule.width == pytest.approx(width)
 
 
 def test_too_few_episodes_are_not_judged():
     env = environment(worlds=20, curriculum={"by": "success", "episodes": 101, "success": ALWAYS})
     run(env, LOOK)
-    assert env.drawing.schedule.width == 0.0
+    assert env.schedule.width == 0.0
     run(env, LOOK)
-    assert env.drawing.schedule.width == pytest.approx(0.1)
+    assert env.schedule.width == pytest.approx(0.1)
 
 
 def test_success_is_counted_from_what_the_task_holds():
@@ -96,7 +96,7 @@ def test_success_is_counted_from_what_the_task_holds():
     held = np.array([0.0, 1.0, 1.8, 1.95, 2.5, 9.0], np.float32)
     env.arrays.held.assign(held)
     env.step(np.zeros((6, 6)))
-    counts = env.drawing.schedule.counts
+    counts = env.schedule.counts
     assert counts.tried.numpy().tolist() == [1] * 6
     inside = env.arrays.final_held.numpy() >= 2.0 - 1e-4
     np.testing.assert_array_equal(counts.succeeded.numpy(), inside.astype(int))
@@ -106,9 +106,9 @@ def test_a_seed_starts_the_schedule_over_and_a_reset_does_not():
     env = environment(worlds=20, curriculum={"by": "success", "episodes": 50, "success": ALWAYS})
     run(env, 2 * LOOK)
     env.reset()
-    assert env.drawing.schedule.width == pytest.approx(0.2)
+    assert env.schedule.width == pytest.approx(0.2)
     env.reset(seed=3)
-    assert env.drawing.schedule.width == 0.0 and not masses(env).std()
+    assert env.schedule.width == 0.0 and not masses(env).std()
 
 
 def test_a_saved_environment_goes_on_with_its_schedule():
@@ -124,7 +124,7 @@ def test_a_saved_environment_goes_on_with_its_schedule():
     other.load_state(one.state())
     for env in (one, other):
         run(env, LOOK + 20)
-    assert one.drawing.schedule.width == other.drawing.schedule.width > 0.5
+    assert one.schedule.width == other.schedule.width > 0.5
     np.testing.assert_array_equal(one.arrays.observation.numpy(), other.arrays.observation.numpy())
     np.testing.assert_array_equal(masses(one), masses(other))
 
@@ -134,7 +134,7 @@ def test_an_evaluation_draws_from_the_whole_ranges(tmp_path):
     path = tmp_path / "plant.yaml"
     path.write_text("ranges: {name: test, mass: [0.6, 1.8], curriculum: {}}\n", encoding="utf-8")
     env = Environment(StationKeeping(), worlds=200, **load_plant(path).environment_arguments())
-    assert env.drawing.schedule is None and masses(env).min() < 0.65 and masses(env).max() > 1.7
+    assert env.schedule is None and masses(env).min() < 0.65 and masses(env).max() > 1.7
 
 
 @pytest.mark.parametrize(

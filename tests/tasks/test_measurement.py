@@ -63,7 +63,7 @@ def test_a_drawn_deviation_is_that_of_its_world():
     """Noise over the drawn deviation is normal with deviation 1."""
     env = environment(position_std=[0.005, 0.05])
     seen, true = run(env, 12)
-    std = env.drawing.draws.numpy(["sensors.position_std"])[:, 0, 0]
+    std = env.draws.numpy(["sensors.position_std"])[:, 0, 0]
     assert np.ptp(std) > 0.04
     assert ((seen - true) / std[None, :, None]).std() == pytest.approx(1.0, abs=0.03)
 
@@ -72,7 +72,7 @@ def test_a_drawn_delay_is_that_of_its_world():
     """To the nearest control step; nothing is older than the episode."""
     env = environment(delay=[0.0, 0.44])
     seen, true = run(env, 10)
-    steps = np.rint(env.drawing.draws.numpy(["sensors.delay"])[:, 0, 0].astype(float) / 0.1).astype(int)
+    steps = np.rint(env.draws.numpy(["sensors.delay"])[:, 0, 0].astype(float) / 0.1).astype(int)
     assert set(steps) == {0, 1, 2, 3, 4}
     for w in range(WORLDS):
         np.testing.assert_array_equal(seen[10, w], true[10 - steps[w], w])
@@ -82,7 +82,7 @@ def test_a_drawn_gap_is_that_of_its_world():
     env = environment(dropout={"choice": [0.0, 0.6]})
     seen, _ = run(env, 25)
     repeated = (seen[1:] == seen[:-1]).all(axis=2).mean(axis=0)
-    chance = env.drawing.draws.numpy(["sensors.dropout"])[:, 0, 0]
+    chance = env.draws.numpy(["sensors.dropout"])[:, 0, 0]
     assert not repeated[chance == 0.0].any()
     assert repeated[chance > 0.0].mean() == pytest.approx(0.6, abs=0.02)
 

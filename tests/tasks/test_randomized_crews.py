@@ -35,7 +35,7 @@ def test_every_task_runs_with_drawn_vehicles_and_privileged_numbers(task):
 def test_the_vehicles_of_a_world_share_its_water():
     """And nothing else: chaser and prey have thrusters of their own."""
     env = make("pursuit", worlds=30, randomize="pool", seed=5)
-    drawn = env.drawing.draws.numpy(["current", "thrust.all"])
+    drawn = env.draws.numpy(["current", "thrust.all"])
     np.testing.assert_array_equal(drawn[:, 0, 0], drawn[:, 1, 0])
     assert (drawn[:, 0, 1] != drawn[:, 1, 1]).all()
 
@@ -44,7 +44,7 @@ def test_the_vehicles_of_a_world_share_its_water():
 def test_no_vehicle_of_one_seed_is_another_of_the_next_seeds():
     """Trainings of seeds 1, 2, 3, ... share no vehicle, in whatever place."""
     first, *others = (
-        make("pursuit", worlds=4, randomize="fossen_learn_to_swim", seed=1 + k).drawing.draws.numpy()[0, v, 0]
+        make("pursuit", worlds=4, randomize="fossen_learn_to_swim", seed=1 + k).draws.numpy()[0, v, 0]
         for k, v in [(0, 1), *((k, 0) for k in range(20))]
     )
     assert first not in others

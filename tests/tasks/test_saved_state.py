@@ -97,10 +97,10 @@ def test_ranges_that_grow_go_on_growing(by):
     )
     whole, other = (made("t1", randomize=Randomization(growing)) for _ in range(2))
     act(whole, 45, seed=0)
-    before = whole.drawing.schedule.width
+    before = whole.schedule.width
     other.load_state(whole.state())
     first, second = act(whole, 12, seed=1), act(other, 12, seed=1)
-    assert other.drawing.schedule.width == whole.drawing.schedule.width > before
+    assert other.schedule.width == whole.schedule.width > before
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
 
 

@@ -170,7 +170,7 @@ def test_ranges_draw_the_noise_of_fixes_by_world():
     )
     env = made(fixes(), vehicle=carrying(), randomization=Randomization(ranges))
     seen = run(env, 12)
-    drawn = env.drawing.draws.numpy(["sensors.delay", "sensors.position_bias"])[:, 0]
+    drawn = env.draws.numpy(["sensors.delay", "sensors.position_bias"])[:, 0]
     steps = np.rint(drawn[:, 0].astype(float) / 0.1).astype(int)
     ring = env.sensing.estimates.position.numpy()[:, 0]
     was = [

@@ -30,6 +30,8 @@ Array = npt.NDArray[np.float64]
 
 Motion = Callable[[Array], tuple[Array, Array]]
 """Times since the start [s], (...) -> position [m] and velocity [m/s], world frame, (..., 3) each."""
+Timed = tuple[float, Motion]
+"""A motion and its duration [s]."""
 
 DEPTH = -0.5
 """Height of the published trajectories [m]."""
@@ -38,7 +40,7 @@ TABLE_SIZE = 2048
 """Knots of the ellipse's table: its spline is then exact to 1e-10 rad."""
 
 
-def polyline(points: Sequence[Sequence[float]], durations: Sequence[float]) -> Motion:
+def polyline(points: Sequence[Sequence[float]], durations: Sequence[float]) -> Timed:
     """Straight segments from point to point, each begun and ended at rest: s = 3u² - 2u³.
 
     Args:
@@ -62,10 +64,10 @@ def polyline(points: Sequence[Sequence[float]], durations: Sequence[float]) -> M
         way = corners[i + 1] - corners[i]
         return corners[i] + s[..., None] * way, (s_dot / times[i])[..., None] * way
 
-    return motion
+    return float(times.sum()), motion
 
 
-def circle(radius: float, turns: float, duration: float, depth: float = DEPTH) -> Motion:
+def circle(radius: float, turns: float, duration: float, depth: float = DEPTH) -> Timed:
     """Circles about the pool's middle at constant speed, counter-clockwise from (radius, 0).
 
     Args:
@@ -78,7 +80,7 @@ def circle(radius: float, turns: float, duration: float, depth: float = DEPTH) -
     return helix(radius, turns, duration, depth, depth)
 
 
-def helix(radius: float, turns: float, duration: float, bottom: float, top: float) -> Motion:
+def helix(radius: float, turns: float, duration: float, bottom: float, top: float) -> Timed:
     """A circle that rises steadily from `bottom` to `top` (heights in the world frame [m])."""
     _positive(radius=radius, turns=turns, duration=duration)
     rate, climb = 2.0 * math.pi * turns / duration, (top - bottom) / duration
@@ -88,10 +90,10 @@ def helix(radius: float, turns: float, duration: float, bottom: float, top: floa
         position = np.stack([c, s, bottom + climb * t], axis=-1)
         return position, np.stack([-rate * s, rate * c, np.full_like(c, climb)], axis=-1)
 
-    return motion
+    return duration, motion
 
 
-def gerono(a: float, b: float, duration: float, depth: float = DEPTH) -> Motion:
+def gerono(a: float, b: float, duration: float, depth: float = DEPTH) -> Timed:
     """A figure of eight at constant phase rate: x = a sin θ, y = b sin θ cos θ (Gerono's lemniscate).
 
     Args:
@@ -109,10 +111,10 @@ def gerono(a: float, b: float, duration: float, depth: float = DEPTH) -> Motion:
         x_dot, y_dot = a * rate * np.cos(phase), b * rate * np.cos(2.0 * phase)
         return np.stack([x, y, np.full_like(x, depth)], axis=-1), np.stack([x_dot, y_dot, 0.0 * x], axis=-1)
 
-    return motion
+    return duration, motion
 
 
-def ellipse(a: float, b: float, duration: float, depth: float = DEPTH) -> Motion:
+def ellipse(a: float, b: float, duration: float, depth: float = DEPTH) -> Timed:
     """One turn of an ellipse, slower at its four vertices, begun and ended at rest.
 
     The speed along the arc follows 0.5 + 0.5 sin² 2θ, and time itself runs by s = 3u² - 2u³. That reading of what is
@@ -152,10 +154,10 @@ def ellipse(a: float, b: float, duration: float, depth: float = DEPTH) -> Motion
         position = np.stack([a * c, b * n, np.full_like(c, depth)], axis=-1)
         return position, np.stack([-a * rate * n, b * rate * c, 0.0 * c], axis=-1)
 
-    return motion
+    return duration, motion
 
 
-SHAPES: dict[str, Callable[..., Motion]] = {
+SHAPES: dict[str, Callable[..., Timed]] = {
     "polyline": polyline,
     "circle": circle,
     "helix": helix,
@@ -244,18 +246,16 @@ class Trajectory:
 def _catalogue() -> dict[str, Trajectory]:
     left, right = (-1.0, -0.4, DEPTH), (1.0, 0.4, DEPTH)
     corners = [left, right, (1.0, -0.4, DEPTH), (-1.0, 0.4, DEPTH), left]
-    motions: dict[str, tuple[float, Motion]] = {
-        "straight": (30.0, polyline([left, right], [30.0])),
-        "broken": (90.0, polyline(corners, [32.0, 13.0, 32.0, 13.0])),
-        "ellipse": (92.70, ellipse(1.0, 0.4, 92.70)),
-        "lemniscate": (30.0, gerono(0.4, 0.2, 30.0)),
-        "circle": (960.0 / 7.0, circle(0.5, 3.0, 960.0 / 7.0)),
-        "figure_eight": (117.0857, gerono(1.0, 0.8, 117.0857)),
-        "helix": (80.0, helix(0.4, 2.0, 80.0, -0.6, -0.4)),
+    motions = {
+        "straight": polyline([left, right], [30.0]),
+        "broken": polyline(corners, [32.0, 13.0, 32.0, 13.0]),
+        "ellipse": ellipse(1.0, 0.4, 92.70),
+        "lemniscate": gerono(0.4, 0.2, 30.0),
+        "circle": circle(0.5, 3.0, 960.0 / 7.0),
+        "figure_eight": gerono(1.0, 0.8, 117.0857),
+        "helix": helix(0.4, 2.0, 80.0, -0.6, -0.4),
     }
-    return {
-        name: Trajectory(name=name, duration=time, motion=motion) for name, (time, motion) in motions.items()
-    }
+    return {name: Trajectory(name=name, duration=time, motion=way) for name, (time, way) in motions.items()}
 
 
 TRAJECTORIES = _catalogue()
@@ -301,51 +301,6 @@ def load_trajectory(
     return trajectory
 
 
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """What a trajectory must keep to."""
-
-    speed: float = math.inf
-    """[m/s]"""
-    acceleration: float = math.inf
-    """[m/s²]"""
-    lower: tuple[float, float, float] = (-math.inf, -math.inf, -math.inf)
-    """Corner of the workspace, world frame [m]."""
-    upper: tuple[float, float, float] = (math.inf, math.inf, math.inf)
-
-
-PUBLISHED_LIMITS = Limits(speed=0.15, acceleration=0.08, lower=(-1.2, -0.7, -0.9), upper=(1.2, 0.7, 0.25))
-"""What the published trajectories keep to, on the paper's vehicle."""
-
-
-def check_limits(trajectory: Trajectory, limits: Limits) -> None:
-    """Refuse a trajectory that exceeds limits.
-
-    Raises:
-        ControlError: Names the limit, the value and the time at which it is exceeded.
-    """
-    t, reference = _samples(trajectory)
-    speed = np.linalg.norm(reference.velocity, axis=-1)
-    change = np.linalg.norm(np.gradient(reference.velocity, t, axis=0), axis=-1)
-    for what, values, limit, unit in (
-        ("speed", speed, limits.speed, "m/s"),
-        ("acceleration", change, limits.acceleration, "m/s²"),
-    ):
-        i = int(np.argmax(values))
-        if values[i] > limit:
-            raise ControlError(
-                f"trajectory {trajectory.name}: {what} reaches {values[i]:.4g} {unit} at {t[i]:.2f} s, "
-                f"expected at most {limit:g}: make it longer or smaller"
-            )
-    outside = (reference.position < limits.lower) | (reference.position > limits.upper)
-    if outside.any():
-        i, axis = np.argwhere(outside)[0]
-        raise ControlError(
-            f"trajectory {trajectory.name}: {'xyz'[axis]} is {reference.position[i, axis]:.4g} m at {t[i]:.2f} s, "
-            f"expected {limits.lower[axis]:g} to {limits.upper[axis]:g}: move it into the workspace"
-        )
-
-
 def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
     """Refuse a trajectory that leaves a vehicle's workspace or is faster than it can go, axis by axis.
 
@@ -354,10 +309,18 @@ def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
     """
     from finssim.vehicles.capability import terminal_speeds
 
-    safety = vehicle.safety
-    lower, upper = (tuple(map(float, x)) for x in (safety.workspace_lower, safety.workspace_upper))
-    check_limits(trajectory, Limits(lower=lower, upper=upper))  # type: ignore[arg-type]
-    t, reference = _samples(trajectory)
+    t = np.linspace(0.0, trajectory.duration, max(3, math.ceil(trajectory.duration / CHECK_STEP) + 1))
+    reference = trajectory.at(t)
+    lower, upper = (
+        np.asarray(x, float) for x in (vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
+    )
+    outside = (reference.position < lower) | (reference.position > upper)
+    if outside.any():
+        i, axis = np.argwhere(outside)[0]
+        raise ControlError(
+            f"trajectory {trajectory.name}: {'xyz'[axis]} is {reference.position[i, axis]:.4g} m at {t[i]:.2f} s, "
+            f"expected {lower[axis]:g} to {upper[axis]:g}: move it into the workspace"
+        )
     speed = np.abs(quat_inverse_rotate(quat_from_yaw(reference.yaw), reference.velocity))
     able = terminal_speeds(vehicle)[:3]
     if np.any(speed > able):
@@ -366,11 +329,6 @@ def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
             f"trajectory {trajectory.name}: {('surge', 'sway', 'heave')[axis]} of {speed[i, axis]:.4g} m/s at "
             f"{t[i]:.2f} s, but {vehicle.name} goes {able[axis]:.4g} m/s at most: make it longer or smaller"
         )
-
-
-def _samples(trajectory: Trajectory) -> tuple[Array, Reference]:
-    t = np.linspace(0.0, trajectory.duration, max(3, math.ceil(trajectory.duration / CHECK_STEP) + 1))
-    return t, trajectory.at(t)
 
 
 # Trajectory files: points in time as CSV or YAML, or a shape with its measures as YAML.
@@ -394,7 +352,12 @@ def read_trajectory(path: Path) -> Trajectory:
     """
     try:
         if path.suffix.lower() == ".csv":
-            return through_points(path.stem, _rows_of_table(path))
+            table = read_text_table(path, ControlError)
+            if tuple(table.names) not in (COLUMNS, COLUMNS[:4]):
+                raise ControlError(
+                    f"its header is '{','.join(table.names)}', expected t,x,y,z or t,x,y,z,yaw"
+                )
+            return through_points(path.stem, table.rows)
         data = read_mapping(path, ControlError, such_as="points: [[0, 0, 0, -0.5], [10, 1, 0, -0.5]]")
         return _from_mapping(path.stem, data)
     except ControlError as error:
@@ -440,40 +403,22 @@ def _from_mapping(name: str, data: Mapping[str, Any]) -> Trajectory:
         raise ControlError(f"unknown key '{unknown[0]}'; available: {', '.join(sorted(KEYS))}")
     if ("points" in data) == ("shape" in data):
         raise ControlError("expected either 'points' or 'shape'")
-    options: dict[str, Any] = {"heading": data.get("heading", "fixed"), "yaw": _number(data, "yaw", 0.0)}
+    yaw = data.get("yaw", 0.0)
+    if isinstance(yaw, bool) or not isinstance(yaw, int | float):
+        raise ControlError(f"yaw is {yaw!r}, expected a number")
+    options: dict[str, Any] = {"heading": data.get("heading", "fixed"), "yaw": float(yaw)}
     name = str(data.get("name", name))
     if "points" in data:
         return through_points(name, data["points"], **options)
-    motion, duration = _shape(data["shape"])
-    return Trajectory(name=name, duration=duration, motion=motion, **options)
-
-
-def _shape(data: Any) -> tuple[Motion, float]:
-    if not isinstance(data, Mapping) or data.get("kind") not in SHAPES:
+    shape = data["shape"]
+    if not isinstance(shape, Mapping) or shape.get("kind") not in SHAPES:
         raise ControlError(f"shape: expected a mapping whose 'kind' is one of {', '.join(SHAPES)}")
-    arguments = {str(key): value for key, value in data.items() if key != "kind"}
-    if data["kind"] == "polyline":
-        durations = arguments.get("durations", [])
-    else:
-        durations = [_number(arguments, "duration", math.nan)]
     try:
-        return SHAPES[data["kind"]](**arguments), float(np.sum(np.asarray(durations, float)))
+        arguments = {str(key): value for key, value in shape.items() if key != "kind"}
+        duration, motion = SHAPES[shape["kind"]](**arguments)
     except (TypeError, ValueError) as error:
         raise ControlError(f"shape: {str(error).replace('()', '')}") from None
-
-
-def _number(data: Mapping[str, Any], key: str, otherwise: float) -> float:
-    value = data.get(key, otherwise)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ControlError(f"{key} is {value!r}, expected a number")
-    return float(value)
-
-
-def _rows_of_table(path: Path) -> list[list[str]]:
-    table = read_text_table(path, ControlError)
-    if tuple(table.names) not in (COLUMNS, COLUMNS[:4]):
-        raise ControlError(f"its header is '{','.join(table.names)}', expected t,x,y,z or t,x,y,z,yaw")
-    return table.rows
+    return Trajectory(name=name, duration=duration, motion=motion, **options)
 
 
 def _checked_points(points: Any) -> Array:

@@ -12,10 +12,10 @@ import numpy as np
 
 from finssim.experiments.campaign import Progress, check_choices, run_jobs, write_json
 from finssim.experiments.evaluate import Job, play
-from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
+from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
 from finssim.experiments.plants import Plant, load_plant
 from finssim.experiments.statistics import with_interval
-from finssim.experiments.tables import Table, figure_text
+from finssim.experiments.tables import Columns, Table, cells
 from finssim.experiments.transfer import T1, controllers_of
 from finssim.provenance import provenance
 from finssim.vehicles import load_vehicle
@@ -24,7 +24,11 @@ TRAINING_SHARE = 0.3
 """Of the progress bar."""
 HELD = 0.9
 """A row tolerates what leaves it this share of its trials, and everything milder."""
-RESULT_FILE = "anatomy.json"
+FIGURES: Columns = {
+    "success": ("held", ".3f"),
+    "e_p_m": ("e_p, median [mm]", ".2f", 1000.0),
+    "t_s_s": ("t_s, mean [s]", ".2f"),
+}
 LEAST = 0.1
 """Errors below this are drawn as this [mm]."""
 
@@ -123,8 +127,8 @@ def anatomy(
     check_choices(names, ROWS, "row", ValueError)
     folder, run_seeds = Path(out), range(seed, seed + seeds)
     controllers = controllers_of(
-        {name: T1.rows[name] for name in names}, run_seeds, folder, vehicle, steps,
-        lambda part, what: progress(TRAINING_SHARE * part, what),
+        "t1", {name: T1.rows[name] for name in names}, run_seeds, folder, vehicle, steps,
+        progress=lambda part, what: progress(TRAINING_SHARE * part, what),
     )  # fmt: skip
     plants = {
         (name, k): Plant(name=f"{name}-{k}", **CAUSES[name].plant(amount))
@@ -143,9 +147,11 @@ def anatomy(
         jobs, folder / "trials", play, processes=processes,
         progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
     )  # fmt: skip
-    played: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
-    for job, one in zip(jobs, results, strict=True):
-        played.setdefault((job.row, job.target, job.plant), []).append(one)
+
+    def figures(row: str, name: str, k: int) -> dict[str, Any]:
+        pairs = zip(jobs, results, strict=True)
+        return _figures([one for job, one in pairs if (job.row, job.target, job.plant) == (row, name, k)])
+
     body = load_vehicle(vehicle)
     result = {
         "experiment": "anatomy", "vehicle": {"name": body.name, "sha256": body.sha256}, "trials": trials,
@@ -154,15 +160,15 @@ def anatomy(
             name: {
                 "title": CAUSES[name].title, "unit": CAUSES[name].unit, "amounts": list(CAUSES[name].amounts),
                 "rows": {
-                    row: [_figures(played[row, name, k]) for k in range(len(CAUSES[name].amounts))] for row in names
+                    row: [figures(row, name, k) for k in range(len(CAUSES[name].amounts))] for row in names
                 },
             }
             for name in chosen
         },
-        FOREIGN: {row: _figures(played[row, FOREIGN, 0]) for row in names},
+        FOREIGN: {row: figures(row, FOREIGN, 0) for row in names},
         "provenance": provenance(),
     }  # fmt: skip
-    write_json(folder / RESULT_FILE, result, tables_of(result))
+    write_json(folder / "anatomy.json", result, tables_of(result))
     draw(result, folder / "anatomy.png")
     return result
 
@@ -171,11 +177,8 @@ def _figures(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Success, median error and mean settling time over all trials, with intervals from redrawing trials."""
     out: dict[str, Any] = {}
     for key, statistic in (("success", np.mean), ("e_p_m", np.median), ("t_s_s", np.mean)):
-        values = [
-            float(x) for result in results for trial in result["per_trial"] if (x := trial[key]) is not None
-        ]
-        interval = with_interval({i: [x] for i, x in enumerate(values)}, statistic)
-        out[key] = interval and interval.as_json()
+        values = (trial[key] for result in results for trial in result["per_trial"] if trial[key] is not None)
+        out[key] = with_interval({i: [float(x)] for i, x in enumerate(values)}, statistic)
     return out
 
 
@@ -196,14 +199,8 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     lines = []
     for cause in result["causes"].values():
         found = [tolerated(cause, row) for row in rows]
-        cells = ["none" if x is None else f"{x:g}{'+' * (x == cause['amounts'][-1])}" for x in found]
-        lines.append([f"{cause['title']} [{cause['unit']}]", *cells])
-    heads = ("held", "e_p, median [mm]", "t_s, mean [s]")
-    foreign = [
-        [title, *(figure_text(result[FOREIGN][row][key], form, factor) for key, form, factor in
-                  (("success", ".3f", 1.0), ("e_p_m", ".2f", 1000.0), ("t_s_s", ".2f", 1.0)))]
-        for row, title in rows.items()
-    ]  # fmt: skip
+        amounts = ["none" if x is None else f"{x:g}{'+' * (x == cause['amounts'][-1])}" for x in found]
+        lines.append([f"{cause['title']} [{cause['unit']}]", *amounts])
     return [
         Table(
             title="What is tolerated (T1)", headline=f"T1 with one thing wrong, {about}",
@@ -213,7 +210,8 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         ),
         Table(
             title="Everything wrong at once", headline=f"T1 in the plant '{FOREIGN}', another in each trial, {about}",
-            heads=["", *heads], rows=foreign,
+            heads=["", *(heading for heading, *_ in FIGURES.values())],
+            rows=[[title, *cells(result[FOREIGN][row], FIGURES)] for row, title in rows.items()],
             note="in brackets 95 % from a bootstrap of the trials of these trainings; times to settle are of those "
             "that hold.",
         ),
@@ -234,14 +232,8 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
             errors = [
                 max(1000.0 * one["e_p_m"]["value"], LEAST) if one["e_p_m"] else math.nan for one in figures
             ]
-            axes.plot(
-                cause["amounts"],
-                errors,
-                "-" if i < len(COLORS) else "--",
-                linewidth=1.3,
-                color=color,
-                label=title,
-            )
+            dash = "-" if i < len(COLORS) else "--"
+            axes.plot(cause["amounts"], errors, dash, linewidth=1.3, color=color, label=title)
             for amount, error, one in zip(cause["amounts"], errors, figures, strict=True):
                 inside = color if one["success"]["value"] >= HELD else "white"
                 axes.plot(amount, error, "o", markersize=4, color=color, markerfacecolor=inside)
@@ -252,7 +244,5 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
         axes.set_axis_off()
     for axes in panels[::across]:
         axes.set_ylabel("e_p [mm]", fontsize=8)
-    figure.legend(
-        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=False
-    )
+    legend_below(figure, panels[0], 4)
     save_figure(figure, path)

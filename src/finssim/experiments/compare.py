@@ -20,13 +20,8 @@ from finssim.experiments.campaign import Progress, run_jobs, write_json
 from finssim.experiments.evaluate import Job, play
 from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
 from finssim.experiments.plants import load_plant
-from finssim.experiments.statistics import (
-    better,
-    interquartile_mean,
-    probability_of_improvement,
-    with_bootstrap,
-)
-from finssim.experiments.tables import Table
+from finssim.experiments.statistics import interquartile_mean, probability_of_improvement, with_bootstrap
+from finssim.experiments.tables import Table, figure_text
 from finssim.provenance import provenance
 from finssim.tasks import TASKS
 
@@ -196,7 +191,6 @@ NOTE = (
     "interquartile mean over seeds and targets; in brackets 95 % of a bootstrap over the seeds, stratified by target. "
     "With fewer than five seeds an interval is too narrow; with fewer than three nobody is called better."
 )
-VERDICT_OF = {True: "better", False: "worse", None: "open"}
 VERDICTS = {
     "better": "{a} is better than {b} in {measure}",
     "worse": "{b} is better than {a} in {measure}",
@@ -210,9 +204,9 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         [
             name,
             str(len(group["seeds"])),
-            "–" if group["steps"] is None else f"{group['steps']:,}",
-            "–" if group["seconds"] is None else f"{group['seconds']:.0f}",
-            *(_cell(group["measures"][measure]) for measure in result["measures"]),
+            figure_text(group["steps"], ",.0f"),
+            figure_text(group["seconds"], ".0f"),
+            *(figure_text(group["measures"][measure], ".4g") for measure in result["measures"]),
         ]
         for name, group in result["groups"].items()
     ]
@@ -230,12 +224,6 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         intervals=True,
     )
     return [table]
-
-
-def _cell(figure: Mapping[str, Any]) -> str:
-    bounds = ", ".join("–" if x is None else f"{x:.4g}" for x in figure["ci95"])
-    value = "not reached" if figure["value"] is None else f"{figure['value']:.4g}"
-    return f"{value} [{bounds}]"
 
 
 CURVES = {
@@ -274,8 +262,8 @@ def curve_of(group: Group, name: str) -> tuple[NDArray[np.float64], NDArray[np.f
     rows = np.array([_at(steps, run, name) for run in group.runs])
     band = np.empty((3, POINTS))
     for k in range(POINTS):
-        found = with_bootstrap([rows[:, k : k + 1]], interquartile_mean, CURVE_RESAMPLES)
-        band[:, k] = found.low, found.value, found.high
+        figure = with_bootstrap([rows[:, k : k + 1]], interquartile_mean, CURVE_RESAMPLES)
+        band[:, k] = figure["ci95"][0], figure["value"], figure["ci95"][1]
     return steps, band
 
 
@@ -386,8 +374,7 @@ def comparison(
             "steps": group.runs[0].description.training.get("steps"),
             "seconds": sum(seconds) / len(seconds) if seconds else None,
             "measures": {
-                name: with_bootstrap([scores[group.name, name]], interquartile_mean).as_json()
-                for name in names
+                name: with_bootstrap([scores[group.name, name]], interquartile_mean) for name in names
             },
         }
     pairs = []
@@ -395,9 +382,11 @@ def comparison(
         both = scores[a, name], scores[b, name]
         improvement = partial(probability_of_improvement, less_is_better=less_is_better(name))
         chance = with_bootstrap(both, improvement)
-        verdict = VERDICT_OF[better(chance) if min(map(len, both)) >= FEWEST else None]
+        low, high = chance["ci95"]
+        verdict = "better" if low > 0.5 else "worse" if high < 0.5 else "open"
+        verdict = verdict if min(map(len, both)) >= FEWEST else "open"
         about = {"a": a, "b": b, "measure": name, "verdict": verdict}
-        pairs.append({**about, "probability": chance.value, "ci95": [chance.low, chance.high]})
+        pairs.append({**about, "probability": chance["value"], "ci95": chance["ci95"]})
     return {
         "task": task,
         "measures": {name: less_is_better(name) for name in names},

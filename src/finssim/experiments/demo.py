@@ -9,8 +9,9 @@ import sys
 import time
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from html import escape
 from os import environ
 from pathlib import Path
@@ -27,44 +28,32 @@ from finssim.calibration.output.vehicle_file import all_findings, calibrated, nu
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.replay.replay import Replay, replay
 from finssim.calibration.replay.report import draw_response_envelopes
-from finssim.calibration.trials.trial import Trial
-from finssim.control.pid import AxisModel, axis_model
-from finssim.control.policy import DESCRIPTION_FILE, Policy
+from finssim.calibration.trials.trial_files import load_trials
+from finssim.control.pid import axis_model
+from finssim.control.policy import Policy
 from finssim.engine import Pool
-from finssim.experiments.campaign import Progress, run_jobs, write_json
+from finssim.experiments.campaign import Progress
 from finssim.experiments.compare import draw_training, groups_of
-from finssim.experiments.evaluate import CAPTION, Evaluation, by_target, cells, comparison_table
-from finssim.experiments.excitation import pool_trials, trials_on_robot
+from finssim.experiments.evaluate import T1_COLUMNS
+from finssim.experiments.excitation import record_programmes
 from finssim.experiments.figures import (
     COLORS,
-    draw_envelopes,
-    error_envelope,
     legend_below,
     new_figure,
     save_figure,
 )
-from finssim.experiments.metrics import T1_SETPOINTS, paper_row
-from finssim.experiments.on_robot import Attendant, OnRobot, kept_folder
-from finssim.experiments.pool_trial import (
-    FIRMWARES,
-    HARDWARE,
-    Job,
-    firmware_of,
-    play,
-    pool_evaluation,
-    run_on_robot,
-)
-from finssim.experiments.tables import Table, html_of, print_tables
-from finssim.experiments.transfer import finished
-from finssim.experiments.trials import Trial as PlayedTrial
-from finssim.files import atomic_directory
-from finssim.learning.train import train
+from finssim.experiments.metrics import T1_SETPOINTS
+from finssim.experiments.on_robot import Attendant, OnRobot, take_folder
+from finssim.experiments.pool_trial import FIRMWARES, Job, firmware_of, played_trial
+from finssim.experiments.tables import Table, cells, html_of, print_tables
+from finssim.experiments.transfer import T1, Spec, transfer_experiment
+from finssim.experiments.trials import Trial
 from finssim.page import html_page
 from finssim.pool import draw_plant
 from finssim.pool.draw_plant import site_of
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Provenance, Vehicle, load_vehicle
-from finssim.vehicles.capability import level_speed, terminal_speed
+from finssim.vehicles.capability import level_speed
 from finssim.vehicles.defaults import SITES, room
 
 __all__ = ["demo"]
@@ -93,19 +82,24 @@ def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str
     if vehicle.name == published.name:
         return {axis: list(values) for axis, values in levels.items()}
     ours, theirs, size = axis_model(vehicle), axis_model(published), room(vehicle.body.size)
-    found = {}
+    scaled = {}
     for axis, values in levels.items():
         i = AXES.index(axis)  # type: ignore[arg-type]
         if axis not in vehicle.controlled_axes or not vehicle.wrench_limits[i] > 0.0:
             continue
+        level = np.asarray(values, float)
         scale = size if i < 3 else 1.0
         if i < 2:  # all levels of the axis alike, so that those of different trials stay different
-            fastest = size * _speed(theirs, i, float(published.wrench_limits[i]))
+            fastest = size * float(theirs.terminal_speed(published.wrench_limits)[i])
             scale *= min(1.0, STEADY * level_speed(vehicle, axis=i) / fastest)
-        wanted = [_level(ours, theirs, i, scale, value) for value in values]
+        if min(ours.stiffness[i], theirs.stiffness[i]) > 0.0:
+            level = level * ours.stiffness[i] / theirs.stiffness[i]
+        else:
+            speed = scale * theirs.terminal_speed(level[:, None])[:, i, None]
+            level = (ours.damping(speed) * speed)[:, i]
         most = SHARE * float(vehicle.wrench_limits[i])
-        found[axis] = list(dict.fromkeys(float(f"{min(x, most):.3g}") for x in wanted))
-    return found
+        scaled[axis] = list(dict.fromkeys(float(f"{min(x, most):.3g}") for x in level))
+    return scaled
 
 
 def trimmed(programme: Programme, vehicle: Vehicle) -> Programme:
@@ -123,18 +117,6 @@ def trimmed(programme: Programme, vehicle: Vehicle) -> Programme:
     tau = programme.tau_desired.copy()
     tau[:, 2] += net
     return replace(programme, tau_desired=tau)
-
-
-def _speed(model: AxisModel, i: int, level: float) -> float:
-    return terminal_speed(float(model.linear_damping[i]), float(model.quadratic_damping[i]), level)
-
-
-def _level(ours: AxisModel, theirs: AxisModel, i: int, scale: float, level: float) -> float:
-    stiffness = float(ours.stiffness[i]), float(theirs.stiffness[i])
-    if min(stiffness) > 0.0:
-        return level * stiffness[0] / stiffness[1]
-    v = scale * _speed(theirs, i, level)
-    return float(ours.linear_damping[i] * v + ours.quadratic_damping[i] * v * v)
 
 
 PERIODS = {"surge": 4.0, "sway": 4.0, "heave": 2.4, "roll": 2.0, "pitch": 2.0, "yaw": 4.0}
@@ -156,42 +138,33 @@ def shuttles(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> list[Pr
     Raises:
         CalibrationError: An axis that the vehicle does not control.
     """
-    return [
-        _shuttle(axis, level, PERIODS[axis])
-        for axis in which_axes(list(levels), vehicle)
-        for level in levels[axis]
-    ]
-
-
-def _shuttle(axis: str, level: float, period: float) -> Programme:
-    counts = [round(s * RATE) for s in (1.0, 1.0, WAVES * period, 2.0, 1.0)]
-    phase = np.repeat(np.array(["rest", "baseline", "excitation", "coast", "rest"]), counts)
-    t = np.arange(counts[2]) / RATE
-    tau = np.zeros((len(phase), 6))
-    # A cosine's sign: a quarter of the period forward, half of it back, and so on.
-    tau[phase == "excitation", AXES.index(axis)] = level * np.sign(
-        np.cos(2.0 * math.pi * (t + 1e-6) / period)
-    )
-    return Programme(
-        name=f"{axis}_shuttle_{level:.4g}",
-        axes=(axis,),  # type: ignore[arg-type]
-        rate=RATE,
-        tau_desired=tau,
-        phase=phase,
-    )
+    plan = []
+    for axis in which_axes(list(levels), vehicle):
+        counts = [round(s * RATE) for s in (1.0, 1.0, WAVES * PERIODS[axis], 2.0, 1.0)]
+        phase = np.repeat(np.array(["rest", "baseline", "excitation", "coast", "rest"]), counts)
+        turns = (np.arange(counts[2]) / RATE + 1e-6) / PERIODS[axis]
+        tau = np.zeros((len(phase), 6))
+        # A cosine's sign: a quarter of the period forward, half of it back, and so on.
+        tau[phase == "excitation", AXES.index(axis)] = np.sign(np.cos(2.0 * math.pi * turns))
+        for level in levels[axis]:
+            name = f"{axis}_shuttle_{level:.4g}"
+            plan.append(Programme(name=name, axes=(axis,), rate=RATE, tau_desired=level * tau, phase=phase))
+    return plan
 
 
 # A vehicle nobody measured, trials, and what they make identifiable.
 
 
 TRIALS = "trials"
+VEHICLE_FILES = ("{}_rough.yaml", "{}_identified.yaml")
+"""Of the vehicle before and after."""
 SET = "hydrodynamics.calibrated"
 
 HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [7.0], "yaw": [1.0]}
 """Levels that no trial of the fit has [N, N m]."""
 
-Record = Callable[[Path, Path, int], dict[str, list[Trial]]]
-"""Makes trials: folder that takes ROLE/NAME, file of the rough vehicle, seed -> trials by role (fit, held-out)."""
+Record = Callable[[Mapping[str, Path], str], Mapping[str, Sequence[Path]]]
+"""Makes trials: folders by role (fit, held-out), file of the rough vehicle -> folders of the trials by role."""
 
 
 @dataclass(frozen=True)
@@ -234,7 +207,7 @@ def _named(vehicle: Vehicle, title: str, description: str) -> Vehicle:
     return vehicle.model_copy(update={"title": title, "description": description})
 
 
-def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record) -> Identification:
+def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identification:
     """Make trials of a vehicle, identify it from some, replay the others; write all of it.
 
     Into the folder go `NAME_rough.yaml` (the vehicle before), `trials/fit` and `trials/held-out`,
@@ -244,7 +217,6 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record)
         folder: Existing directory.
         name: Name or file of a vehicle.
         seed: Of initial conditions and noise of the trials.
-        shown: Name of the folder in the report.
         record: Makes the trials.
 
     Returns:
@@ -253,9 +225,10 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record)
     began = time.perf_counter()
     truth = load_vehicle(name)
     name = truth.name
-    start_file, vehicle_file = vehicle_files(name)
+    start_file, vehicle_file = (file.format(name) for file in VEHICLE_FILES)
     write_vehicle(rough_vehicle(truth), folder / start_file)
-    recorded = record(folder / TRIALS, folder / start_file, seed)
+    folders = record({role: folder / TRIALS / role for role in ("fit", "held-out")}, str(folder / start_file))
+    recorded = {role: load_trials(paths) for role, paths in folders.items()}
     fit = regress(recorded["fit"], load_vehicle(folder / start_file), seed=seed)
     found = calibrated(fit)
     findings = tuple(all_findings(fit, found))
@@ -268,9 +241,9 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record)
         fit,
         folder / "calibration",
         vehicle,
-        command=commands(shown, name, seed)[1],
+        command=commands(folder, name, seed)[1],
         findings=findings,
-        out=shown / vehicle_file,
+        out=folder / vehicle_file,
     )
     scored = replay(recorded["held-out"], vehicle, seed=seed)
     text = json.dumps(scored.as_json(), indent=2, allow_nan=False) + "\n"
@@ -286,15 +259,10 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path, record: Record)
     )
 
 
-def vehicle_files(name: str) -> tuple[str, str]:
-    """Names of the vehicle's files before and after."""
-    return f"{name}_rough.yaml", f"{name}_identified.yaml"
-
-
-def commands(place: Path, name: str, seed: int) -> list[str]:
+def commands(folder: Path, name: str, seed: int) -> list[str]:
     """Command lines that identify and replay from the trials again."""
-    start, vehicle = (place / file for file in vehicle_files(name))
-    trials = place / TRIALS
+    start, vehicle = (folder / file.format(name) for file in VEHICLE_FILES)
+    trials = folder / TRIALS
     return [
         f"finssim trials check {trials / 'fit'} --vehicle {start}",
         f"finssim calibrate hydrodynamics {trials / 'fit'} --vehicle {start} --out {vehicle} --seed {seed}",
@@ -316,19 +284,9 @@ POOL_VEHICLE = (
     "pool alone. Its propellers push up to 15 % more or less than the bench said, so what is found are effective "
     "masses and dampings: those of the thrust that the vehicle file promises."
 )
-PAPER = (
-    "e_y is the vertical error. Gray rows are the paper's own, on hardware: its real vehicle in its pool. The others "
-    "are of "
-)
-POOL = (
-    "the virtual pool or tank: the robot's whole software, from what locates it to the frames of the motor controller "
-    "or autopilot, "
-    "against a plant that no training has seen. Errors are those of the true pose."
-)
-ROBOT = "hardware, too. Errors are those of the robot's own estimate, whose error is not in them."
 
 
-def _paths(trials: Sequence[PlayedTrial], site: str) -> Any:
+def _paths(trials: Sequence[Trial], site: str) -> Any:
     """The paths of all trials from above and from the side, in the water; start and goals with their headings."""
     size = SITES[site]
     pool = Pool() if size is None else Pool(length=size[0], width=size[1], depth=size[2])
@@ -386,58 +344,41 @@ def _identification(result: Identification, hardware: bool) -> list[Table]:
     ]
 
 
-def _lead(evaluations: Sequence[Evaluation], seconds: float) -> str:
-    r = evaluations[0].result
-    errors = ""
-    if r["e_p_m"] is not None:
-        errors = f", with {100.0 * r['e_p_m']:.1f} cm and {r['e_psi_deg']:.1f}° of error once settled"
-    place = "on hardware" if r["plant"]["name"] == HARDWARE else "in the virtual pool"
-    others = " and ".join(f"{e.label} {e.result['success']}" for e in evaluations[1:])
+def _lead(result: Mapping[str, Any], spec: Spec, seconds: float | None) -> str:
+    rows = result["rows"]
+    texts = {
+        name: f"{row['success']} of {row['trials']}" for name, row in rows.items() if name != WITH_PICTURES
+    }
+    errors, policy = "", rows.get(POLICY)
+    if policy and policy["e_p_m"]:
+        e_p, e_psi = (policy[key]["value"] for key in ("e_p_m", "e_psi_deg"))
+        errors = f", with {100.0 * e_p:.1f} cm and {e_psi:.1f}° of error once settled"
+    others = "; ".join(f"{spec.rows[name].title}: {text}" for name, text in texts.items() if name != POLICY)
     return (
-        f"A policy trained here in {seconds:.0f} s, from nothing to a file that runs on the vehicle, holds "
-        f"{r['success']} of {r['trials']} published setpoints {place}{errors}. On the same trials, "
-        f"successes: {others}."
+        f"A policy trained here in {math.nan if seconds is None else seconds:.0f} s, from nothing to a file that runs "
+        f"on the vehicle, holds {texts.get(POLICY, 'none')} published setpoints "
+        f"{'on hardware' if result['robot'] else 'in the virtual pool'}{errors}. On the same trials: {others}."
     )
 
 
-def _results(evaluations: Sequence[Evaluation]) -> list[Table]:
-    """All controllers beside the paper's, the policy's paths, the training, and every setpoint."""
-    results = comparison_table([e.result for e in evaluations], "controller")
-    heads = [head.replace("\n", " ") for head in results.heads]
-    rows = [[e.label, *cells(e.result)] for e in evaluations]
-    rows += [[f"paper: {name}", *cells(paper_row(name))] for name in ("calibrated", "calibrated + DR", "PID")]
-    policy = evaluations[0].result
-    source = ROBOT if policy["plant"]["name"] == HARDWARE else POOL
-    tables = [
-        Table(
-            title="Results", heads=heads, rows=rows, note=f"{CAPTION} {PAPER}{source}",
-            pictures={"envelopes.png": "Position and yaw error against time, median and middle half"},
-        ),
-        Table(
-            title="Paths of the policy",
-            pictures={"paths.png": "Paths of the trials from above and from the side"},
-        ),
-    ]  # fmt: skip
-    learnt = {"training.png": "Mean return and share of episodes held while training"}
-    tables.append(Table(title="Training", pictures=learnt))
-    for e in evaluations:
-        each = [[name, *cells(row)] for name, row in by_target(e.result).items()]
-        tables.append(Table(title=f"Every setpoint: {e.label}", heads=[e.label, *heads[1:]], rows=each))
-    return tables
+def _setpoints(result: Mapping[str, Any], spec: Spec) -> Table:
+    """Every setpoint of every controller."""
+    rows = [
+        [f"{spec.rows[name].title}, {target}", *cells(figures, T1_COLUMNS)]
+        for name, row in result["rows"].items()
+        for target, figures in row["by_target"].items()
+    ]
+    return Table(
+        title="Every setpoint", heads=["", *(heading for heading, *_ in T1_COLUMNS.values())], rows=rows
+    )
 
 
 PLANT_FILE = "pool.yaml"
 """The plant, for `finssim pool --plant`."""
-TRIALS_FOLDER = "deployed"
-"""A result and a motion for every trial of a controller."""
-
-
 REPORT_FILE = "report.html"
-SEED = 1
-PLANT, SEVERITY, RANGES = 1, "realistic", "pool"
-CONTROLLERS = ("policy", "pid", "pid-paper")
-
-WITH_PICTURES = "policy-with-pictures"
+SEVERITY, RANGES = "realistic", "pool"
+POLICY, WITH_PICTURES = "calibrated-pool", "with-pictures"
+"""Rows of station keeping: the policy that is trained here; and the same, with pictures drawn and searched for tags."""
 COAST = 4.0
 """Longest, after a dive [s]: the pool is shallow, and this vehicle hardly rises."""
 
@@ -458,16 +399,6 @@ class Scope:
     """Tried by the policy with pictures drawn and searched."""
     duration: float = 60.0
     """Of a trial [s]."""
-
-    def of(self, vehicle: Vehicle) -> Scope:
-        """The same for a vehicle: levels that move it as FinsROV's move FinsROV, on the axes that it controls.
-
-        See `matched`.
-        """
-        return replace(
-            self,
-            **{name: matched(getattr(self, name), vehicle) for name in ("levels", "shuttles", "held_out")},
-        )
 
 
 FULL = Scope(
@@ -523,29 +454,29 @@ def demo(
         firmware (NAME): What steers the motors: mcu, FinsROV's motor controller, or ardusub, an autopilot: commands
             then go by MAVLink, the policy acts by its axes (`pilot6`), and in place of the pool and its camera there is
             a tank, a Doppler log, a compass, and setpoints three times as far.
-        robot: Where trials are made and setpoints held, in place of the virtual pool. What is done stays in `out`, and
-            the next call goes on.
+        robot: Where trials are made and setpoints held, in place of the virtual pool.
         attendant: The person beside that robot, instead of the terminal's keyboard.
 
     Returns:
         Path of the report.
 
     Raises:
-        KeyboardInterrupt: After Ctrl-C. A policy so far is then in `OUT-training/interrupted`, and, but for a robot's,
-            `out` as it was.
+        RobotError: The folder is of another demonstration.
+        KeyboardInterrupt: After Ctrl-C; the same command goes on.
     """
     console, standing = console or Console(stderr=True), load_vehicle(vehicle)
     firmware = firmware_of(firmware, standing, robot)
     start_warp()
-    place = atomic_directory(out, replaces=REPORT_FILE) if robot is None else kept_folder(out)
-    with place as folder:
-        demonstration = _Demonstration(
-            folder=folder, out=out, name=vehicle, standing=standing, seed=seed, scope=(scope or FULL).of(standing),
-            console=console, processes=processes, robot=robot, attendant=attendant, firmware=firmware,
-        )  # fmt: skip
-        evaluations = demonstration.run(steps)
-    simulated = [e.result for e in evaluations if e.result["camera"] != "pictures"]
-    print_tables([comparison_table(simulated, "controller")], Console())
+    about = {
+        "vehicle": {"name": standing.name, "sha256": standing.sha256}, "seed": seed, "steps": steps,
+        "firmware": firmware, "robot": robot is not None,
+    }  # fmt: skip
+    take_folder(Path(out) / "demo.yaml", about)
+    demonstration = _Demonstration(
+        out=Path(out), name=vehicle, standing=standing, seed=seed, steps=steps, scope=scope or FULL, console=console,
+        processes=processes, robot=robot, attendant=attendant, firmware=firmware,
+    )  # fmt: skip
+    print_tables(demonstration.run(), Console())
     report = Path(out) / REPORT_FILE
     print(f"report: {report}")
     display = environ.get("DISPLAY") or environ.get("WAYLAND_DISPLAY") or sys.platform in ("darwin", "win32")
@@ -558,14 +489,14 @@ def demo(
 class _Demonstration:
     """What is done, with what and where."""
 
-    folder: Path
-    """In which it is done."""
     out: Path
-    """Name of that folder afterwards."""
+    """In which it is done."""
     name: str
     """Name or file of the vehicle, as the catalogue has it."""
     standing: Vehicle
     seed: int
+    """Also of the pool."""
+    steps: int | None
     scope: Scope
     console: Console
     processes: int | None
@@ -573,27 +504,55 @@ class _Demonstration:
     attendant: Attendant | None
     firmware: str
 
-    def run(self, steps: int | None) -> list[Evaluation]:
-        """Identify, train, deploy and report; returns an evaluation of each controller, the policy's first."""
-        result = self._identified()
-        began, policy = time.perf_counter(), self.folder / "policy"
-        rescue = self.out.with_name(f"{self.out.name}-training") / "interrupted"
-        if self.robot is None or not finished(policy, result.vehicle):
-            train(
-                "t1", out=policy, vehicle=result.vehicle, action=FIRMWARES[self.firmware].action, randomize=RANGES,
-                seed=self.seed, steps=steps,
-                console=self.console, shown=self.out / "policy", interrupted=rescue,
+    def run(self) -> list[Table]:
+        """Identify, train, deploy and report; returns the tables of what was held."""
+        identification, spec = self._identified(), self._spec()
+        held = self.out / "t1"
+        with self._working("training and holding setpoints") as progress:
+            result = transfer_experiment(
+                spec, out=held, seeds=1, seed=self.seed, rows=list(spec.rows), firmware=self.firmware,
+                vehicle=str(self.out / VEHICLE_FILES[1].format(self.standing.name)), steps=self.steps,
+                processes=self.processes, robot=self.robot, attendant=self.attendant, console=self.console,
+                progress=progress, show=self._show,
+                **({} if self.robot else {"plants": 1, "severity": SEVERITY, "pool_vehicle": self.name}),
             )  # fmt: skip
-        seconds = time.perf_counter() - began
-        try:
-            evaluations = self._deployed(policy)
-            self._report(result, evaluations, seconds)
-        except KeyboardInterrupt:  # the folder goes, and the policy was trained
-            with atomic_directory(rescue, replaces=DESCRIPTION_FILE) as copy:
-                shutil.copytree(policy, copy, dirs_exist_ok=True)
-            self.tell(f"policy kept: {rescue}")
-            raise
-        return evaluations
+        policy, tables = self.out / "policy", spec.tables(result)
+        shutil.copytree(held / "policies" / f"{POLICY}-seed{self.seed}", policy, dirs_exist_ok=True)
+        training = groups_of([str(policy)])
+        draw_training(training, self.out / "training.png")
+        trials = [played_trial(r, held / "trials") for r in result["trials"] if r["job"]["row"] == POLICY]
+        learnt = {"training.png": "Mean return and share of episodes held while training"}
+        drawn = [Table(title="Training", pictures=learnt), _setpoints(result, spec)]
+        if trials:
+            save_figure(_paths(trials, self.site), self.out / "paths.png")
+            paths = {"paths.png": "Paths of the trials from above and from the side"}
+            drawn.insert(0, Table(title="Paths of the policy", pictures=paths))
+        title = f"Station keeping of {self.standing.name}"
+        files = dict(training[0].runs[0].description.files)
+        origin = {"vehicle": result["vehicle"], "seed": self.seed, "policy": files, **result["provenance"]}
+        sections = [
+            f"<h1>{escape(title)}</h1>",
+            f'<p class="lead">{escape(_lead(result, spec, training[0].runs[0].seconds))}</p>',
+            *html_of(_identification(identification, self.robot is not None), self.out),
+            *html_of(tables, held),
+            *html_of(drawn, self.out),
+            "<h2>How to repeat it</h2>",
+            f"<pre>{escape(chr(10).join(self._commands()))}</pre>",
+            "<h2>Provenance</h2>",
+            f"<pre>{escape(json.dumps(origin, indent=2))}</pre>",
+        ]
+        (self.out / REPORT_FILE).write_text(html_page(title, sections), encoding="utf-8")
+        return tables
+
+    def _spec(self) -> Spec:
+        """Station keeping by the policy and two PIDs; one setpoint with pictures, which takes longest, first."""
+        names = (POLICY, "pid", "pid-paper")
+        rows = {name: replace(T1.rows[name], changes={"duration": self.scope.duration}) for name in names}
+        if self.robot is None and self.firmware == "mcu":
+            title, changes = "The same, by pictures", {"duration": self.scope.duration, "camera": "pictures"}
+            seen = replace(rows[POLICY], title=title, changes=changes, targets=self.scope.pictures)
+            rows = {WITH_PICTURES: seen, **rows}
+        return replace(T1, rows=rows, targets=self.scope.setpoints, base=POLICY)
 
     @property
     def site(self) -> str:
@@ -605,51 +564,39 @@ class _Demonstration:
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     @contextmanager
-    def _working(self, text: str) -> Iterator[Progress]:
-        """Show what is done, and how far it is."""
+    def _working(self, doing: str) -> Iterator[Progress]:
+        """Show what is done, and how far it is; a robot's session has a line of its own."""
+        text = f"{doing} {'in the virtual pool' if self.robot is None else 'on the robot'}"
         self.tell(text)
-        with self.console.status(text) as status:
-            yield lambda part, what: status.update(f"{text}: {what}")
+        with nullcontext() if self.robot is not None else self.console.status(text) as status:
+            yield lambda part, what: status.update(f"{text}: {what}") if status else None
 
     def _identified(self) -> Identification:
         """Trials, and the vehicle that they make identifiable."""
         standing, scope = self.standing, self.scope
-        plans = {
-            role: programmes(tuple(levels), standing, levels=levels, coast=COAST)
-            for role, levels in (("fit", scope.levels), ("held-out", scope.held_out))
+        levels = {
+            role: matched(x, standing) for role, x in (("fit", scope.levels), ("held-out", scope.held_out))
         }
-        plans["fit"] += shuttles(scope.shuttles, standing) if scope.shuttles else []
+        plans = {
+            role: programmes(tuple(of_role), standing, levels=of_role, coast=COAST)
+            for role, of_role in levels.items()
+        }
+        plans["fit"] += shuttles(matched(scope.shuttles, standing), standing) if scope.shuttles else []
         plans = {role: [trimmed(programme, standing) for programme in plan] for role, plan in plans.items()}
-        if self.robot is not None:
-            robot = self.robot
-            self.tell("recording trials on the robot")
-
-            def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
-                known = load_vehicle(rough)
-                return trials_on_robot(
-                    plans, folder, known, robot, attendant=self.attendant, console=self.console
-                )
-
-            result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=record)
-        else:
-            spec = site_of(self.site, draw_plant(standing, PLANT, SEVERITY))
-            spec.write(self.folder / PLANT_FILE)
-            with self._working("recording trials in the virtual pool") as progress:
-
-                def show(run: Any, result: Mapping[str, Any]) -> None:
-                    unit = "m/s" if run.programme.axes[0] in AXES[:3] else "rad/s"
-                    text = f"up to {result['fastest']:.2f} {unit} in {result['duration']:.0f} s"
-                    text = f"left out: {result['fault']}" if result["fault"] else text
-                    self.tell(f"  {run.target}: {text}")
-
-                def simulated(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
-                    return pool_trials(
-                        plans, folder, vehicle=str(rough), pool_vehicle=self.name, plant=PLANT, severity=SEVERITY,
-                        seed=seed, site=self.site, firmware=self.firmware, leave_out=True, processes=self.processes,
-                        progress=progress, show=show,
-                    )  # fmt: skip
-
-                result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=simulated)
+        person: dict[str, Any] = {"attendant": self.attendant, "console": self.console}
+        if self.robot is None:
+            spec = site_of(self.site, draw_plant(standing, self.seed, SEVERITY))
+            spec.write(self.out / PLANT_FILE)
+        with self._working("recording trials") as progress:
+            record = partial(
+                record_programmes, plans, robot=self.robot, **person, pool_vehicle=self.name, plant=self.seed,
+                severity=SEVERITY, seed=self.seed, site=self.site, firmware=self.firmware, leave_out=True,
+                processes=self.processes, progress=progress,
+                show=lambda run, result: self.tell(
+                    f"  {run.target}: {'left out: ' if result['fault'] else ''}{result['fault'] or result['text']}"
+                ),
+            )  # fmt: skip
+            result = identify(self.out, self.name, seed=self.seed, record=record)
         identifiable = sum(e.identifiable for e in result.fit.estimates.values())
         self.tell(
             f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
@@ -658,83 +605,17 @@ class _Demonstration:
         )
         return result
 
-    def _deployed(self, policy: Path) -> list[Evaluation]:
-        """All controllers in the pool, the policy with pictures too; or all on the robot."""
-        vehicle = str(self.folder / vehicle_files(self.standing.name)[1])
-        pool_vehicle, plant, severity, camera = self.name, PLANT, SEVERITY, FIRMWARES[self.firmware].camera
-        if self.robot is not None:
-            pool_vehicle, plant, severity, camera = vehicle, 0, HARDWARE, HARDWARE
-
-        def job(row: str, target: str, camera: str) -> Job:
-            controller = str(policy) if row.startswith("policy") else row
-            return Job(
-                row=row, controller=controller, target=target, camera=camera, vehicle=vehicle, seed=self.seed,
-                pool_vehicle=pool_vehicle, plant=plant, severity=severity, duration=self.scope.duration, site=self.site,
-                firmware=self.firmware,
-            )  # fmt: skip
-
-        # Pictures first: they take longest, and the other processor has time for the rest.
-        pictures = (
-            []
-            if self.robot or camera == "none"
-            else [job(WITH_PICTURES, t, "pictures") for t in self.scope.pictures]
-        )
-        jobs = pictures + [job(row, target, camera) for row in CONTROLLERS for target in self.scope.setpoints]
-        place = self.folder / TRIALS_FOLDER
-        if self.robot is not None:
-            results = run_on_robot(jobs, place, self.robot, attendant=self.attendant, console=self.console)
-        else:
-            with self._working("holding setpoints in the virtual pool") as progress:
-                results = run_jobs(
-                    jobs, place, play, processes=self.processes, progress=progress, show=self._show
-                )
-        evaluations = []
-        for row in (*CONTROLLERS, WITH_PICTURES):
-            of_row = [result for result in results if result["job"]["row"] == row]
-            if of_row:
-                evaluations.append(pool_evaluation(next(j for j in jobs if j.row == row), of_row, place))
-        return evaluations
-
     def _show(self, job: Job, result: Mapping[str, Any]) -> None:
         held = "held" if result["success"] else result["fault"] or "not held"
         if result["e_p_m"] is not None:
             held += f", {result['e_p_m']:.3f} m and {result['e_psi_deg']:.1f}° off"
         self.tell(f"  {job.row} at {job.target}: {held}")
 
-    def _report(self, result: Identification, evaluations: Sequence[Evaluation], seconds: float) -> None:
-        """Write NAME.json of every controller, the pictures and `report.html`."""
-        folder, policy = self.folder, evaluations[0]
-        for evaluation in evaluations:
-            write_json(folder / f"{evaluation.result['controller']['name']}.json", evaluation.result)
-        compared = [e for e in evaluations if e.result["trials"] == policy.result["trials"]]
-        envelopes = {e.label: error_envelope(e.trials) for e in compared}
-        save_figure(draw_envelopes(envelopes), folder / "envelopes.png")
-        save_figure(_paths(policy.trials, self.site), folder / "paths.png")
-        draw_training(groups_of([str(folder / "policy")]), folder / "training.png")
-        title = f"Station keeping of {policy.result['vehicle']['name']}"
-        origin = {
-            "vehicle": policy.result["vehicle"],
-            "hydrodynamics": policy.result["hydrodynamics"],
-            "seed": self.seed,
-            "policy": policy.result["controller"].get("files", {}),
-            **policy.result["provenance"],
-        }
-        sections = [
-            f"<h1>{escape(title)}</h1>",
-            f'<p class="lead">{escape(_lead(compared, seconds))}</p>',
-            *html_of([*_identification(result, self.robot is not None), *_results(evaluations)], folder),
-            "<h2>How to repeat it</h2>",
-            f"<pre>{escape(chr(10).join(self._commands()))}</pre>",
-            "<h2>Provenance</h2>",
-            f"<pre>{escape(json.dumps(origin, indent=2))}</pre>",
-        ]
-        (folder / REPORT_FILE).write_text(html_page(title, sections), encoding="utf-8")
-
     def _commands(self) -> list[str]:
         """Command lines that repeat the demonstration's steps by hand."""
         out, seed, name = self.out, self.seed, self.standing.name
-        rough, identified = (out / file for file in vehicle_files(name))
-        steps = Policy.load(self.folder / "policy").description.training["steps"]
+        rough, identified = (out / file.format(name) for file in VEHICLE_FILES)
+        steps = Policy.load(out / "policy").description.training["steps"]
         options = f"--randomize {RANGES} --seed {seed} --steps {steps}"
         action = FIRMWARES[self.firmware].action
         options += f" --action {action}" if action else ""
@@ -753,7 +634,7 @@ class _Demonstration:
             return [tank, f"{excite} {robot}", *middle, f"{drive} {robot}"]
         return [
             f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
-            f"{excite} --pool {PLANT} --severity {SEVERITY} --pool-vehicle {self.name}",
+            f"{excite} --pool {seed} --severity {SEVERITY} --pool-vehicle {self.name}",
             *middle,
             f"finssim pool --vehicle {self.name} --plant {out / PLANT_FILE} --pool-file site.yaml --truth truth.fst",
             f"{drive} --robot pool --pool-file site.yaml --arm",

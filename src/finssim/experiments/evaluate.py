@@ -29,7 +29,7 @@ from finssim.experiments.metrics import (
     summarize_tracking,
 )
 from finssim.experiments.plants import Plant, load_plant
-from finssim.experiments.tables import Table, figure_text, print_tables
+from finssim.experiments.tables import Columns, Table, cells, figure_text, print_tables
 from finssim.experiments.trials import (
     EPISODES,
     T2_TRAJECTORIES,
@@ -77,18 +77,6 @@ T2_CAPTION = (
 EPISODES_CAPTION = "means over episodes; in brackets 95 % of a bootstrap over them."
 
 
-def cells(row: Mapping[str, Any], columns: Mapping[str, tuple[str, str]] = T1_COLUMNS) -> list[str]:
-    """A row's figures as text, in the order of the columns; – where there is none."""
-    return [
-        f"{row['success']}/{row['trials']}"
-        if key == "success"
-        else "–"
-        if row.get(key) is None
-        else format(row[key], form)
-        for key, (_, form) in columns.items()
-    ]
-
-
 def paper_name(result: Mapping[str, Any]) -> str:
     """The row of the paper's table that is nearest to what was evaluated."""
     controller = result["controller"]
@@ -108,7 +96,7 @@ class Form(NamedTuple):
     kind: str
     """What a trial goes to: the key of its name in a row."""
     targets: Sequence[str]
-    columns: Mapping[str, tuple[str, str]]
+    columns: Columns
     caption: str
     summarize: Callable[[Sequence[Mapping[str, Any]]], dict[str, Any]]
     paper: Callable[[str], dict[str, dict[str, Any]]]
@@ -136,53 +124,32 @@ FORMS: Mapping[str, Form] = {
 """Every other task is measured in episodes as in training, by itself."""
 
 
-def by_target(result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """A row for each setpoint or trajectory of a result, in the order in which they were tried first."""
-    form, trials = FORMS[result["task"]], result["per_trial"]
-    names = dict.fromkeys(str(trial[form.kind]) for trial in trials)
-    return {name: form.summarize([x for x in trials if x[form.kind] == name]) for name in names}
-
-
 def tables_of(results: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """The table of one evaluation, a row for each target; or of several plants, a row for each."""
-    first = results[0]
+    """A row for each target and plant, of several plants in T1 for each plant alone; and the paper's."""
+    first, several = results[0], len(results) > 1
     title = f"{first['task']} · {first['controller']['name']} · {first['vehicle']['name']}"
-    if len(results) == 1:
+    if not several:
         plant = first["plant"]
         title += f", {first['hydrodynamics']} · plant {plant['name']}: {plant.get('title', '')}"
     if first["task"] not in FORMS:
         return [_episodes_table(results, title)]
     form = FORMS[first["task"]]
-    if len(results) > 1 and form.kind == "setpoint":
-        return [comparison_table(results, "plant", title)]
     rows: list[list[str] | None] = []
     for result in results:
-        place = f"{result['plant']['name']}, " if results[1:] else ""
-        rows += [[f"{place}{name}", *cells(row, form.columns)] for name, row in by_target(result).items()]
-        rows.append(None)
-    if len(results) > 1:
-        return [_table(form, title, f"plant, {form.kind}", rows, form.caption)]
-    paper = paper_name(first)
-    rows += [["all", *cells(first, form.columns)], None]
-    rows += [
-        [f"paper, {name}".removesuffix(", "), *cells(row, form.columns)]
-        for name, row in form.paper(paper).items()
-    ]
-    note = f"{form.caption} paper: its vehicle in its pool, {paper}, for orientation."
-    return [_table(form, title, form.kind, rows, note)]
-
-
-def comparison_table(results: Sequence[Mapping[str, Any]], by: str, title: str = "") -> Table:
-    """A row for each evaluation of T1, named by its controller or plant, and the paper's rows that answer to them."""
+        prefix, trials = f"{result['plant']['name']}, " if several else "", result["per_trial"]
+        names = () if several and form.kind == "setpoint" else dict.fromkeys(t[form.kind] for t in trials)
+        for name in names:
+            of_target = form.summarize([trial for trial in trials if trial[form.kind] == name])
+            rows.append([f"{prefix}{name}", *cells(of_target, form.columns)])
+        label = f"{prefix}all" if names else result["plant"]["name"]
+        rows += [[label, *cells(result, form.columns)], *([None] if names else [])]
     papers = dict.fromkeys(paper_name(result) for result in results)
-    rows: list[list[str] | None] = [[result[by]["name"], *cells(result)] for result in results]
-    rows += [None, *([f"paper, {name}", *cells(paper_row(name))] for name in papers)]
-    return _table(FORMS["t1"], title, by, rows, f"{CAPTION} paper: its real vehicle in its pool.")
-
-
-def _table(form: Form, title: str, kind: str, rows: Sequence[list[str] | None], note: str) -> Table:
-    heads = [heading.replace(" [", "\n[") for heading, _ in form.columns.values()]  # for 80 columns
-    return Table(title=title, heads=[kind, *heads], rows=rows, note=note)
+    for paper in papers:
+        for name, row in form.paper(paper).items():
+            rows.append([f"paper, {name or paper}", *cells(row, form.columns)])
+    heads = [heading.replace(" [", "\n[") for heading, *_ in form.columns.values()]  # for 80 columns
+    note = f"{form.caption} paper: its vehicle in its pool, {', '.join(papers)}, for orientation."
+    return [Table(title=title, heads=[form.kind, *heads], rows=rows, note=note)]
 
 
 def _episodes_table(results: Sequence[Mapping[str, Any]], title: str) -> Table:
@@ -224,16 +191,44 @@ class Evaluation:
         return name if plant == "nominal" else f"{name}, {plant}"
 
 
-def summary_of(task: str, measures: Sequence[dict[str, Any]], trials: Sequence[Trial] = ()) -> dict[str, Any]:
-    """The measures over all trials, and `per_trial`; of T1 and T2 with the names of what they went to."""
+def evaluation(
+    controller: Mapping[str, Any],
+    task: str,
+    vehicle: Vehicle,
+    plant: Mapping[str, Any],
+    measures: Sequence[dict[str, Any]],
+    trials: Sequence[Trial] = (),
+    **about: Any,
+) -> Evaluation:
+    """The evaluation of trials that were measured.
+
+    Args:
+        controller: Who steered, as plain data.
+        task: Name; of T1 and T2 each trial has the name of what it went to.
+        vehicle: As the controller knows it.
+        plant: Where, as plain data.
+        measures: Of each trial.
+        trials: Of T1 and T2.
+        about: What else the result says.
+    """
     form = FORMS.get(task)
     if form is None:
-        return summarize_episodes(measures)
-    rows = [
-        {"trial": i, form.kind: trial.name, **row}
-        for i, (trial, row) in enumerate(zip(trials, measures, strict=True))
-    ]
-    return {**form.summarize(rows), "per_trial": rows}
+        summary = summarize_episodes(measures)
+    else:
+        pairs = enumerate(zip(trials, measures, strict=True))
+        rows = [{"trial": i, form.kind: trial.name, **row} for i, (trial, row) in pairs]
+        summary = {**form.summarize(rows), "per_trial": rows}
+    result = {
+        "controller": dict(controller),
+        "task": task,
+        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
+        "hydrodynamics": "calibrated",
+        "plant": dict(plant),
+        "provenance": provenance(),
+        **about,
+        **summary,
+    }
+    return Evaluation(result, trials)
 
 
 def evaluate(
@@ -358,21 +353,12 @@ def _recorded(
     measures = [
         {"trial": i, "record": trial.path.name, **trial.scores(task, body)} for i, trial in enumerate(trials)
     ]
+    controller = {"kind": "pid", "action": "wrench6", "hydrodynamics": "calibrated"} | pilots[0]
     source = "its own estimate" if truth is None else truth.name
-    result = {
-        "controller": {"kind": "pid", "action": "wrench6", "hydrodynamics": "calibrated"} | pilots[0],
-        "task": task,
-        "vehicle": {"name": body.name, "sha256": body.sha256},
-        "hydrodynamics": "calibrated",
-        "plant": {"name": "record", "title": f"as recorded, by {source}"},
-        "records": [
-            {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in records
-        ],
-        "truth": truth and truth.name,
-        **summary_of(task, measures, trials),
-        "provenance": provenance(),
-    }
-    return Evaluation(result, trials)
+    plant = {"name": "record", "title": f"as recorded, by {source}"}
+    files = [{"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in records]
+    about = {"records": files, "truth": truth and truth.name}
+    return evaluation(controller, task, body, plant, measures, trials, **about)
 
 
 def _plants(names: Sequence[str | Path]) -> list[Plant]:
@@ -418,33 +404,21 @@ def evaluate_controller(
     start_warp()
     body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     agent = agent_for(controller, body, the_task)
-    guides = [guide_of(x, body) for x in trajectories] or None
-    options: dict[str, Any] = {
-        "trials": trials,
-        "hydrodynamics": hydrodynamics,
-        "seed": seed,
-        "record": record,
-    }
     played: list[Trial] = []
     with progress_bar(f"{trials} trials") as show:
+        options: dict[str, Any] = {
+            "trials": trials, "hydrodynamics": hydrodynamics, "seed": seed, "record": record, "show": show,
+        }  # fmt: skip
         if task in FORMS:
-            played = run_trials(agent, the_task, body, plant, guides=guides, show=show, **options)
+            guides = [guide_of(x, body) for x in trajectories] or None
+            played = run_trials(agent, the_task, body, plant, guides=guides, **options)
             limits = plant.changed(body).force_limits
             measures = [trial.measures(task, limits) for trial in played]
         else:
-            measures = run_episodes(agent, the_task, body, plant, show=show, **options)
-    result = {
-        "controller": agent.describe(),
-        "task": task,
-        "vehicle": {"name": body.name, "sha256": body.sha256},
-        "hydrodynamics": plant.hydrodynamics or hydrodynamics,
-        "plant": plant.model_dump(mode="json", exclude_defaults=True),
-        **plant.told_of_sight(body),
-        "seed": seed,
-        **summary_of(task, measures, played),
-        "provenance": provenance(),
-    }
-    return Evaluation(result, played)
+            measures = run_episodes(agent, the_task, body, plant, **options)
+    where = plant.model_dump(mode="json", exclude_defaults=True)
+    about = {"hydrodynamics": plant.hydrodynamics or hydrodynamics, "seed": seed, **plant.told_of_sight(body)}
+    return evaluation(agent.describe(), task, body, where, measures, played, **about)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from rich.console import Console
 
@@ -20,34 +19,33 @@ from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.excitation.programmes import excite as write_programmes
 from finssim.calibration.importers.dispatch import print_folders, read_trials
 from finssim.calibration.trials.trial import Trial
-from finssim.calibration.trials.trial_files import load_trial, load_trials, write_trial
+from finssim.calibration.trials.trial_files import write_trial
 from finssim.control import ControlError
 from finssim.control.allocation import Allocator
 from finssim.control.controllers import controller
 from finssim.control.guidance import Goal, Guide, Measured, Station, goal_at
-from finssim.experiments.campaign import Job, Progress, Show, progress_bar, run_jobs
+from finssim.experiments.campaign import Progress, Show, progress_bar, run_jobs
 from finssim.experiments.on_robot import (
     Attendant,
     OnRobot,
-    RobotError,
+    Outcome,
     RobotTrial,
-    Session,
     check_starts,
     session,
+    take_folder,
 )
-from finssim.experiments.pool_trial import noise_seed, play_in_pool
-from finssim.files import atomic_directory, atomic_write
+from finssim.experiments.pool_trial import PoolJob, noise_seed, play_in_pool
+from finssim.files import atomic_directory
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import draw_plant
 from finssim.pool.draw_plant import site_of
 from finssim.pool.plant_spec import Basin
-from finssim.pool.run import make_plan
 from finssim.quiet import start_warp
 from finssim.robot.perception import Perception
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import AXES, Vehicle, load_vehicle
-from finssim.vehicles.defaults import room, vehicle_at
+from finssim.vehicles.defaults import room
 
 Array = NDArray[np.float64]
 
@@ -313,22 +311,13 @@ PLAN_FILE = "programmes.yaml"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoolRun(Job):
+class PoolRun(PoolJob):
     """A programme, who plays it and where; the row is the role of its trial: fit or held-out."""
 
     programme: Programme
-    vehicle: str
-    """Name or file of the vehicle as the robot knows it."""
-    pool_vehicle: str
-    """Name or file of the vehicle around which the pool's own is drawn."""
-    severity: str = "realistic"
-    """nominal, realistic or hard."""
+    camera: str = "corners"
     hold: str | None = "pid"
     """PID that keeps the other axes."""
-    site: str = "pool"
-    """pool, tank or open-water."""
-    firmware: str = "mcu"
-    """mcu or ardusub, as of `pool_trial.Job`."""
 
     @property
     def water(self) -> Box:
@@ -345,77 +334,147 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
         path: Folder that takes TARGET, the trial, and TARGET.mcap, the record.
 
     Returns:
-        `fault` (why the bridge ended it early, or empty), `duration` [s], `fastest` (the highest speed along the
-        programme's first axis, as the robot estimates it [m/s, rad/s]) and the `notes` of the import.
+        `fault` (why the bridge ended it early, or empty), `text` (of `fastest_text`) and the `notes` of the import.
     """
     start_warp()
     record = path / f"{run.target}.mcap"
     record.parent.mkdir(parents=True, exist_ok=True)
     record.unlink(missing_ok=True)
     vehicle, seed = load_vehicle(run.vehicle), noise_seed(run.seed, run.row, run.target)
-    camera: Any = "none" if run.firmware == "ardusub" else "corners"
-    where: Any = {"site": run.site, "firmware": run.firmware}
-    pool = make_plan(run.pool_vehicle, str(run.plant), run.severity, camera=camera, seed=seed, **where)  # type: ignore[arg-type]
     place = place_of(run.programme, vehicle, run.water)
     trial = programme_trial(run.programme, vehicle, place, hold=run.hold)
     about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
     with Recorder(record, vehicle, about, pictures="none") as recorder:
         outcome = play_in_pool(
-            trial,
-            Station(place.position, place.yaw),
-            vehicle_at(run.site, vehicle, navigation=run.firmware == "ardusub"),
-            pool,
-            seed=seed,
-            recorder=recorder,
-            mode=ESTIMATOR if run.firmware == "mcu" else "error-state",
-        )
-    t, pilot = outcome.runtime.t, outcome.trial.pilot
-    assert isinstance(pilot, ProgrammePilot)
+            trial, Station(place.position, place.yaw), run.equipped(), run.plan(seed), seed=seed, recorder=recorder,
+            mode=ESTIMATOR,
+        )  # fmt: skip
     return {
         "fault": outcome.fault,
-        "duration": 0.0 if math.isnan(t) else t,
-        "fastest": pilot.fastest,
+        "text": fastest_text(run.programme, outcome),
         "notes": list(map(str, write_trial_of(record, path / run.target, run.row).findings)),
     }
 
 
-def pool_trials(
-    plans: Mapping[str, Sequence[Programme]],
-    folder: Path,
+Plans = Mapping[str, Sequence[Programme]]
+"""Role of the trials (fit, held-out) -> programmes."""
+
+
+def record_programmes(
+    plans: Plans,
+    folders: Mapping[str, Path],
+    vehicle: str,
+    robot: OnRobot | None = None,
+    *,
+    attendant: Attendant | None = None,
+    console: Console | None = None,
+    **pool: Any,
+) -> dict[str, list[Path]]:
+    """Make trials of programmes, played by the robot's whole software at the start that `place_of` gives each.
+
+    Args:
+        plans: What is played.
+        folders: By role: takes NAME, the trials, and records/NAME.mcap.
+        vehicle: Name or file, as the robot knows it.
+        robot: That plays what has no trial in its folder yet, within the workspace; not opened where nothing is left.
+            None: a virtual pool does.
+        attendant: Beside the robot, instead of the terminal's keyboard.
+        console: Where a robot's state is told; standard error if None.
+        pool: Arguments of `_in_pool`.
+
+    Returns:
+        Folders of the trials by role, in the order of the programmes, without those that were skipped or left out.
+
+    Raises:
+        RobotError: It may not be armed, or stopped with nobody there to help.
+        KeyboardInterrupt: Ctrl-C; of a robot the same call goes on.
+        CalibrationError: A programme that the water has no room for, or that the pool's bridge stopped.
+        GoalError, LinkError, VehicleError, OutputError: As they say.
+    """
+    if robot is None:
+        _in_pool(plans, folders, vehicle, **pool)
+    else:
+        _on_robot(plans, folders, load_vehicle(vehicle), robot, attendant, console)
+    made = {role: [folders[role] / programme.name for programme in plan] for role, plan in plans.items()}
+    return {role: [path for path in paths if path.is_dir()] for role, paths in made.items()}
+
+
+def _on_robot(
+    plans: Plans,
+    folders: Mapping[str, Path],
+    vehicle: Vehicle,
+    robot: OnRobot,
+    attendant: Attendant | None,
+    console: Console | None,
+) -> None:
+    remaining = [
+        (role, programme, folders[role] / programme.name)
+        for role, plan in plans.items()
+        for programme in plan
+        if not (folders[role] / programme.name).is_dir()
+    ]
+    places = {path: place_of(programme, vehicle, box_of(vehicle)) for _, programme, path in remaining}
+    starts = {path: Station(place.position, place.yaw) for path, place in places.items()}
+    check_starts({path.name: start for path, start in starts.items()}, vehicle)
+    if not remaining:
+        return
+    with session(robot, vehicle, attendant=attendant, console=console) as opened:
+        for role, programme, path in remaining:
+            record = folders[role] / RECORDS / f"{programme.name}.mcap"
+            if not record.is_file():
+                outcome = opened.trial(
+                    lambda programme=programme, path=path: programme_trial(programme, vehicle, places[path]),
+                    starts[path],
+                    record,
+                    counts=False,
+                    exact=False,
+                    perception=lambda: Perception(opened.equipped, opened.site, mode=ESTIMATOR),
+                    about={"command": "finssim excite", **about_programme(programme, robot.title)},
+                )
+                if outcome is None:
+                    continue
+                opened.say(f"  {fastest_text(programme, outcome)}")
+            write_trial_of(record, path, role)
+
+
+def fastest_text(programme: Programme, outcome: Outcome) -> str:
+    """How fast a programme made the vehicle, and how long it took."""
+    pilot, t = outcome.trial.pilot, outcome.runtime.t
+    assert isinstance(pilot, ProgrammePilot)
+    unit = "m/s" if programme.axes[0] in AXES[:3] else "rad/s"
+    return f"up to {pilot.fastest:.2f} {unit} in {0.0 if math.isnan(t) else t:.0f} s"
+
+
+def _in_pool(
+    plans: Plans,
+    folders: Mapping[str, Path],
+    vehicle: str,
     *,
     leave_out: bool = False,
     processes: int | None = None,
     progress: Progress = lambda part, what: None,
     show: Show = lambda job, result: None,
     **settings: Any,
-) -> dict[str, list[Trial]]:
-    """Play programmes in a pool; the robot's whole software does, at the start that `place_of` gives each.
+) -> None:
+    """The same in a pool.
 
     Args:
-        plans: Role of the trials (fit, held-out) -> programmes.
-        folder: Takes ROLE/NAME, the trials, and ROLE/records/NAME.mcap.
+        plans, folders, vehicle: As of `record_programmes`.
         leave_out: Leave out the trials that the bridge stopped, instead of refusing all; `show` is given their fault.
         processes: As many as there are processors if None.
         progress: Told the share that is done and what is left.
         show: Given each run and its result, of `play_programme`, as soon as there is one.
         settings: Of every `PoolRun`.
-
-    Returns:
-        The trials by role, in the order of the programmes; a trial is complete.
-
-    Raises:
-        CalibrationError: A programme that the pool has no room for, or that the bridge stopped.
-        PlantSpecError: A vehicle that cannot be put into a pool.
     """
     runs = [
-        PoolRun(row=role, target=programme.name, programme=programme, **settings)
+        PoolRun(row=role, target=programme.name, programme=programme, vehicle=vehicle, **settings)
         for role, plan in plans.items()
         for programme in plan
+        if not (folders[role] / programme.name).is_dir()
     ]
-    body = load_vehicle(runs[0].vehicle)
+    body = load_vehicle(vehicle)
     for run in runs:  # what cannot be is refused before anything is played
         place_of(run.programme, body, runs[0].water)
-    trials: dict[str, list[Trial]] = {role: [] for role in plans}
     with tempfile.TemporaryDirectory() as scratch:
         results = run_jobs(
             runs, Path(scratch), play_programme, processes=processes, progress=progress, show=show
@@ -427,18 +486,15 @@ def pool_trials(
                 raise CalibrationError(
                     f"{run.target} in the virtual pool: {result['fault']}: give lower levels, or fewer axes at once"
                 )
-            made, role = Path(scratch) / result["key"], folder / run.row
-            (role / RECORDS).mkdir(parents=True, exist_ok=True)
-            shutil.move(made / run.target, role / run.target)
-            shutil.move(made / f"{run.target}.mcap", role / RECORDS)
-            trials[run.row].append(load_trial(role / run.target))
-    for role_name, made_of in trials.items():
-        if not made_of:
+            made, folder = Path(scratch) / result["key"], folders[run.row]
+            (folder / RECORDS).mkdir(parents=True, exist_ok=True)
+            shutil.move(made / run.target, folder / run.target)
+            shutil.move(made / f"{run.target}.mcap", folder / RECORDS)
+    for role, plan in plans.items():
+        if not any((folders[role] / programme.name).is_dir() for programme in plan):
             raise CalibrationError(
-                f"the bridge stopped every {role_name} trial in the virtual pool: {results[0]['fault']}: give lower "
-                "levels"
+                f"the bridge stopped every {role} trial in the virtual pool: {results[0]['fault']}: give lower levels"
             )
-    return trials
 
 
 def excite(
@@ -521,16 +577,12 @@ def excite(
             atomic_directory(out, replaces=PLAN_FILE) as folder,
             progress_bar("playing programmes") as progress,
         ):
-            pool_trials(
-                {"fit": played}, folder, vehicle=vehicle, pool_vehicle=pool_vehicle, plant=pool,
-                severity=severity, seed=seed, progress=progress,
-            )  # fmt: skip
-            for made in (folder / "fit").iterdir():
-                made.rename(folder / made.name)
-            (folder / "fit").rmdir()
             about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
-            text = _about(body, played, seed, kind, {"pool": about})
-            (folder / PLAN_FILE).write_text(text, encoding="utf-8")
+            take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"pool": about}))
+            record_programmes(
+                {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=pool_vehicle, plant=pool, severity=severity,
+                seed=seed, progress=progress,
+            )  # fmt: skip
         folders = [Path(out) / programme.name for programme in played]
     else:
         folders = write_programmes(
@@ -583,96 +635,25 @@ def excite_on_robot(
         The folders of the trials, without those that were skipped.
 
     Raises:
-        RobotError: It may not be armed, stopped with nobody there to help, or the folder is of another plan.
-        KeyboardInterrupt: Ctrl-C; the same command goes on.
-        CalibrationError, GoalError, LinkError, VehicleError, OutputError: As they say.
+        RobotError: The folder is of another plan; and as `record_programmes`.
     """
     start_warp()
     body = load_vehicle(vehicle)
     played = programmes(axes, body, seed=seed, **plan)
-    _take_folder(Path(out), _about(body, played, seed, str(plan.get("kind", "published")), {"robot": True}))
-    with session(robot, body, attendant=attendant, console=console) as opened:
-        return robot_trials(played, Path(out), opened)
-
-
-def robot_trials(
-    plan: Sequence[Programme], folder: Path, opened: Session, *, role: str = "fit"
-) -> list[Path]:
-    """Play on an open robot what has no trial in a folder yet; returns the folders of the trials.
-
-    Args:
-        plan: Programmes.
-        folder: Takes NAME, the trials, and records/NAME.mcap.
-        opened: The robot.
-        role: Of the trials: fit or held-out.
-
-    Raises:
-        As `excite_on_robot`.
-    """
-    vehicle = opened.vehicle
-    places = {programme.name: place_of(programme, vehicle, box_of(vehicle)) for programme in plan}
-    starts = {name: Station(place.position, place.yaw) for name, place in places.items()}
-    check_starts(starts, vehicle)
-    made = []
-    for programme in plan:
-        name = programme.name
-        record = folder / RECORDS / f"{name}.mcap"
-        if not record.is_file():
-            outcome = opened.trial(
-                lambda programme=programme: programme_trial(programme, vehicle, places[programme.name]),
-                starts[name],
-                record,
-                counts=False,
-                exact=False,
-                perception=lambda: Perception(opened.equipped, opened.site, mode=ESTIMATOR),
-                about={"command": "finssim excite", **about_programme(programme, opened.robot.title)},
-            )
-            if outcome is None:
-                continue
-            assert isinstance(outcome.trial.pilot, ProgrammePilot)
-            unit = "m/s" if programme.axes[0] in AXES[:3] else "rad/s"
-            opened.say(f"  up to {outcome.trial.pilot.fastest:.2f} {unit} in {outcome.runtime.t:.0f} s")
-        if not (folder / name).is_dir():
-            write_trial_of(record, folder / name, role)
-        made.append(folder / name)
-    return made
-
-
-def trials_on_robot(
-    plans: Mapping[str, Sequence[Programme]],
-    folder: Path,
-    vehicle: Vehicle,
-    robot: OnRobot,
-    *,
-    attendant: Attendant | None = None,
-    console: Console | None = None,
-) -> dict[str, list[Trial]]:
-    """What `pool_trials` does in a pool, on a robot: the trials by role, without those that were skipped.
-
-    Args:
-        plans: Role of the trials (fit, held-out) -> programmes.
-        folder: Takes ROLE/NAME and ROLE/records/NAME.mcap; what is there is not played again.
-        vehicle: As the robot knows it.
-        robot: Which, and how; not opened where nothing is left to play.
-        attendant: Instead of the terminal's keyboard.
-        console: Where it is told how it stands; standard error if None.
-
-    Raises:
-        As `excite_on_robot`; CalibrationError too where every programme of a role was skipped.
-    """
-    folders = {role: [folder / role / programme.name for programme in plan] for role, plan in plans.items()}
-    if not all(path.is_dir() for paths in folders.values() for path in paths):
-        with session(robot, vehicle, attendant=attendant, console=console) as opened:
-            for role, plan in plans.items():
-                robot_trials(plan, folder / role, opened, role=role)
-    return {role: load_trials([path for path in paths if path.is_dir()]) for role, paths in folders.items()}
+    take_folder(
+        Path(out) / PLAN_FILE, _about(body, played, seed, str(plan.get("kind", "published")), {"robot": True})
+    )
+    folders = {"fit": Path(out)}
+    return record_programmes({"fit": played}, folders, vehicle, robot, attendant=attendant, console=console)[
+        "fit"
+    ]
 
 
 def _about(
     vehicle: Vehicle, played: Sequence[Programme], seed: int, kind: str, where: Mapping[str, Any]
-) -> str:
+) -> dict[str, Any]:
     """What the folder is of."""
-    about = {
+    return {
         "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
         "kind": kind,
         **where,
@@ -680,17 +661,3 @@ def _about(
         "programmes": [programme.name for programme in played],
         "sha256": [programme.sha256 for programme in played],
     }
-    return yaml.safe_dump(about, sort_keys=False)
-
-
-def _take_folder(out: Path, about: str) -> None:
-    """Begin a folder, or go on in one that is of the very same plan."""
-    file = out / PLAN_FILE
-    if not out.exists() or not any(out.iterdir()):
-        with atomic_write(file) as temporary:
-            temporary.write_text(about, encoding="utf-8")
-    elif not file.is_file() or file.read_text(encoding="utf-8") != about:
-        raise RobotError(
-            f"{out}: holds other files than trials of these programmes of this vehicle: give a new --out, or the same "
-            "axes, levels, seed and vehicle to go on with them"
-        )

@@ -27,12 +27,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.experiments.campaign import Job, Progress, check_choices, run_jobs, write_json
-from finssim.experiments.pool_trial import noise_seed
+from finssim.experiments.campaign import Progress, check_choices, run_jobs, write_json
+from finssim.experiments.pool_trial import PoolJob, noise_seed
 from finssim.experiments.tables import Table
 from finssim.pool import TruthError, VirtualPool, read_truth
 from finssim.pool.firmware import Firmware
-from finssim.pool.run import make_plan
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.bridge import Bridge, BridgeSettings
@@ -47,7 +46,6 @@ from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import link_of
 from finssim.vehicles import load_vehicle
-from finssim.vehicles.defaults import vehicle_at
 
 __all__ = ["SCENARIOS", "Bench", "Fault", "Scenario", "fault_job", "faults_experiment", "tables_of"]
 
@@ -135,12 +133,11 @@ def _axes_reader() -> Callable[[bytes], bool]:
     from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
     mav = mavlink.MAVLink(None)
-
-    def drives(data: bytes) -> bool:
-        axes = [m for m in mav.parse_buffer(data) or () if m.get_type() == "MANUAL_CONTROL"]
-        return any((m.x, m.y, m.z, m.r, m.s, m.t) != (0, 0, 500, 0, 0, 0) for m in axes)
-
-    return drives
+    return lambda data: any(
+        (m.x, m.y, m.z, m.r, m.s, m.t) != (0, 0, 500, 0, 0, 0)
+        for m in mav.parse_buffer(data) or ()
+        if m.get_type() == "MANUAL_CONTROL"
+    )
 
 
 @dataclass
@@ -242,26 +239,18 @@ def stuck_pictures(bench: Bench) -> None:
     bench.wire.pictures = change
 
 
-def see(pictures: Callable[[Sequence[Picture]], Sequence[Picture]] | None) -> Touch:
-    """Changes what the camera sends from now on; nothing if None."""
-
-    def begin(bench: Bench) -> None:
-        bench.wire.pictures = pictures
-
-    return begin
-
-
 def two_publishers(bench: Bench) -> None:
     """Somebody else commands full thrust, at every step."""
     bridge, now = bench.runtime.bridge, bench.pool.time + bench.wire.shift
     bridge.command(now, np.full_like(bridge.force, 5.0), "intruder", stamp=now)
 
 
-def jump_robot_clock(step: float) -> Touch:
-    """The robot's clock jumps by so much [s]."""
+def on_wire(**fields: Any) -> Touch:
+    """Sets fields of the wire."""
 
     def begin(bench: Bench) -> None:
-        bench.wire.shift += step
+        for name, value in fields.items():
+            setattr(bench.wire, name, value)
 
     return begin
 
@@ -269,13 +258,7 @@ def jump_robot_clock(step: float) -> Touch:
 def jump_mcu_clock(step: float) -> Touch:
     """The motor controller's clock jumps by so much [s]; its sequence goes on."""
     moved = round(1000.0 * step)
-
-    def begin(bench: Bench) -> None:
-        bench.wire.change = lambda telemetry: replace(
-            telemetry, mcu_ms=(telemetry.mcu_ms + moved) % (1 << 32)
-        )
-
-    return begin
+    return on_wire(change=lambda telemetry: replace(telemetry, mcu_ms=(telemetry.mcu_ms + moved) % (1 << 32)))
 
 
 def full_disk(bench: Bench) -> None:
@@ -326,7 +309,8 @@ def _jumps(title: str, touch: Callable[[float], Touch], *steps: float) -> Scenar
 
 
 def _blind(lasts: float) -> Scenario:
-    return _one(f"{lasts:g} s without vision", see(lambda pictures: ()), end=see(None), lasts=lasts)
+    blind, sighted = on_wire(pictures=lambda pictures: ()), on_wire(pictures=None)
+    return _one(f"{lasts:g} s without vision", blind, end=sighted, lasts=lasts)
 
 
 def another_station(
@@ -345,17 +329,15 @@ def another_station(
     def begin(bench: Bench) -> None:
         from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-        mav, made = (
-            mavlink.MAVLink(None, system, 190),
-            getattr(mavlink, f"MAVLink_{message}_message")(*fields),
-        )
-        due, left = bench.pool.time, times
+        mav = mavlink.MAVLink(None, system, 190)
+        made = getattr(mavlink, f"MAVLink_{message}_message")(*fields)
+        due, remaining = bench.pool.time, times
 
         def others(now: float) -> list[bytes]:
-            nonlocal due, left
-            if now < due or left <= 0:
+            nonlocal due, remaining
+            if now < due or remaining <= 0:
                 return []
-            due, left = now + every, left - 1
+            due, remaining = now + every, remaining - 1
             mav.seq = (mav.seq + 1) % 256
             return [bytes(made.pack(mav))]
 
@@ -442,7 +424,9 @@ SCENARIOS: Mapping[str, Scenario] = {
     "blind-10": _blind(10.0),
     "second-publisher": _one("second publisher", two_publishers, during=two_publishers),
     "mcu-reboot": _one("MCU reboot", lambda bench: bench.pool.reboot()),
-    "robot-clock": _jumps("robot's clock jumps", jump_robot_clock, -3600.0, -2.0, -0.2, 0.5, 2.0, 3600.0),
+    "robot-clock": _jumps(
+        "robot's clock jumps", lambda step: on_wire(shift=step), -3600.0, -2.0, -0.2, 0.5, 2.0, 3600.0
+    ),
     "mcu-clock": _jumps("MCU's clock jumps", jump_mcu_clock, -100.0, -2.0, -0.2, 0.5, 2.0, 100.0),
     "full-disk": _one("full disk", full_disk, cuts_record=True),
     "control": Scenario(
@@ -542,22 +526,25 @@ def _last_activity(time: Array, active: NDArray[np.bool_], began: float) -> floa
 
 
 @dataclass(frozen=True, kw_only=True)
-class FaultJob(Job):
-    """A fault, in what motion, in which pool: the row is the scenario of the catalogue."""
+class FaultJob(PoolJob):
+    """A fault, in what motion, in which pool, whose vehicle is known: the row is the scenario of the catalogue."""
 
     variant: str
     motion: str
     """What the vehicle does: station or moving."""
-    severity: str = "realistic"
-    """nominal, realistic or hard."""
-    vehicle: str = "finsrov"
-    """Name or file."""
+    camera: str = "corners"
 
 
-def fault_job(scenario: str, variant: str = "", motion: str = "station", **settings: Any) -> FaultJob:
+def fault_job(
+    scenario: str, variant: str = "", motion: str = "station", vehicle: str = "finsrov", **settings: Any
+) -> FaultJob:
     """The job of a variant of a scenario; settings are further fields."""
-    target = f"{variant} {motion}".strip()
-    return FaultJob(row=scenario, target=target, variant=variant, motion=motion, **settings)
+    if scenario in SCENARIOS and SCENARIOS[scenario].firmware == "ardusub":
+        settings |= {"firmware": "ardusub", "site": "tank"}
+    return FaultJob(
+        row=scenario, target=f"{variant} {motion}".strip(), variant=variant, motion=motion, vehicle=vehicle,
+        pool_vehicle=vehicle, **settings,
+    )  # fmt: skip
 
 
 def play(job: FaultJob, path: Path) -> dict[str, Any]:
@@ -572,17 +559,13 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         empty; `record_lost_s` and `record_problem`; `ok`.
     """
     start_warp()
-    scenario, aided = SCENARIOS[job.row], SCENARIOS[job.row].firmware == "ardusub"
-    site, camera = ("tank", "none") if aided else ("pool", "corners")
-    vehicle = load_vehicle(job.vehicle)
-    vehicle = vehicle_at(site, vehicle, navigation=True) if aided else vehicle
+    scenario, aided = SCENARIOS[job.row], job.firmware == "ardusub"
+    vehicle = job.equipped()
     start, goal, when, _ = (TANK_MOTIONS if aided else MOTIONS)[job.motion]
     box = inset(vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
     workspace = {"workspace_lower": box[0], "workspace_upper": box[1]}
     seed = noise_seed(job.seed, job.target)
-    plan = make_plan(
-        vehicle, str(job.plant), job.severity, camera=camera, seed=seed, site=site, firmware=scenario.firmware
-    )  # type: ignore[arg-type]
+    plan = job.plan(seed)
     pool = plan.standing(station_of(start), seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "run.mcap"
@@ -786,103 +769,99 @@ class Process:
         return ""
 
 
-class Pair(NamedTuple):
-    """A robot in a pool, each in a process of its own."""
+@dataclass(frozen=True)
+class Pair:
+    """A robot in a pool, each in a process of its own, and what they write."""
 
     pool: Process
     robot: Process
     port: int
     """Of the motor controller."""
+    truth: Path
+    record: Path
+
+    def next_truth(self) -> float:
+        """Wait until the truth file grows; returns the pool's clock then [s].
+
+        The pool writes half a second at a time, so that the last record is as old as one look takes.
+        """
+        size = self.truth.stat().st_size
+        _await(lambda: self.truth.stat().st_size > size, "the truth file does not grow", self.pool)
+        return float(read_truth(self.truth).time[-1])
+
+    def turning(self) -> bool:
+        """Whether the thrusters turn, as the truth file tells."""
+        try:
+            return bool(abs(read_truth(self.truth).thrust[-50:]).max(initial=0.0) > STILL)
+        except TruthError:
+            return False  # not begun yet
 
 
 @contextmanager
-def pair(
-    folder: Path, vehicle: str, goal: str, *, pool: Sequence[str], robot: Sequence[str]
-) -> Iterator[Pair]:
-    """Both at work on free ports, the robot armed.
+def pair(job: FaultJob, folder: Path) -> Iterator[Pair]:
+    """Both at work on free ports, the robot armed and the thrusters turning.
 
     Args:
-        folder: Takes what they say, and the pool's file.
-        vehicle: Name or file.
-        goal: As `finssim run` takes it.
-        pool: Further words of `finssim pool`.
-        robot: Further words of `finssim run`.
+        job: Which vehicle, where to.
+        folder: Takes what they write.
 
     Raises:
-        ReliabilityError: The pool never stood.
+        ReliabilityError: The pool never stood, or the vehicle never drove.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port: int = free.getsockname()[
             1
         ]  # and the five after it: another attempt is made where they are taken
-    peer = port + 4
-    end, both = f"127.0.0.1:{peer}", ["--vehicle", vehicle, "--pool-file", str(folder / "pool.yaml")]
-    world = ["pool", *both, "--port", str(port), "--robot", end, *pool]
-    ours = ["run", *both, "--goal", goal, "--arm", "--json", "--bind", end, *robot]
-    wires = ["--robot", f"udp://127.0.0.1:{port}", "--pictures", f"udp://127.0.0.1:{port + 1}"]
-    with Process(world, folder, "pool") as first:
-        silent = "the pool never said 'pictures: '"
-        _await(
-            lambda: "pictures: " in first.said,
-            10.0 * POLL,
-            lambda: first.running,
-            lambda: f"{silent}: {first.complained.strip()[-300:] or 'no error'}",
-        )
-        with Process([*ours, *wires], folder, "robot") as second:
-            yield Pair(first, second, port)
+    start, goal, *_ = MOTIONS[job.motion]
+    truth, record = folder / "truth", folder / "run.mcap"
+    end, both = f"127.0.0.1:{port + 4}", ["--vehicle", job.vehicle, "--pool-file", str(folder / "pool.yaml")]
+    world = ["pool", *both, "--port", str(port), "--robot", end, "--plant", str(job.plant), "--start", start]
+    world += [
+        "--severity",
+        job.severity,
+        "--seed",
+        str(job.seed),
+        "--camera",
+        "corners",
+        "--truth",
+        str(truth),
+    ]
+    ours = [
+        "run",
+        *both,
+        "--goal",
+        goal,
+        "--arm",
+        "--json",
+        "--bind",
+        end,
+        "--policy",
+        "pid",
+        "--record",
+        str(record),
+    ]
+    ours += ["--robot", f"udp://127.0.0.1:{port}", "--pictures", f"udp://127.0.0.1:{port + 1}"]
+    with Process(world, folder, "pool") as pool:
+        _await(lambda: "pictures: " in pool.said, "the pool never said 'pictures: '", pool)
+        with Process(ours, folder, "robot") as robot:
+            both_at_work = Pair(pool, robot, port, truth, record)
+            _await(both_at_work.turning, "no thruster ever turned", robot, 20.0 * POLL)
+            yield both_at_work
 
 
-def _await(
-    ready: Callable[[], bool], poll: float, running: Callable[[], bool], failure: Callable[[], str]
-) -> None:
-    """Wait for something.
-
-    Args:
-        ready: Whether it has come about.
-        poll: Between looks [s].
-        running: Whether it still can.
-        failure: What is raised if it does not, or takes too long.
+def _await(ready: Callable[[], bool], failure: str, process: Process, poll: float = POLL) -> None:
+    """Wait for what a process is to bring about.
 
     Raises:
-        ReliabilityError: It did not come about.
+        ReliabilityError: It has ended, or takes too long.
     """
     deadline = time.monotonic() + STARTING
     while not ready():
-        if not running() or time.monotonic() > deadline:
-            raise ReliabilityError(failure())
+        if not process.running or time.monotonic() > deadline:
+            last = (process.complained + process.said).strip()[-300:] or "it said nothing"
+            raise ReliabilityError(f"{failure}: {process.name}: {last}")
         time.sleep(poll)
-
-
-def await_thrust(truth: Path, bound: float, process: Process) -> None:
-    """Wait until the thrusters of a pool turn, as its truth file tells.
-
-    Raises:
-        ReliabilityError: They never do, or the process that should turn them has ended.
-    """
-
-    def turning() -> bool:
-        try:
-            return bool(abs(read_truth(truth).thrust[-50:]).max(initial=0.0) > bound)
-        except TruthError:
-            return False  # not begun yet
-
-    def failure() -> str:
-        why = (process.complained + process.said).strip()[-300:] or "it said nothing"
-        return f"no thruster ever turned: {process.name}: {why}"
-
-    _await(turning, 20.0 * POLL, lambda: process.running, failure)
-
-
-def await_flush(truth: Path) -> float:
-    """Wait for the next piece of a truth file that grows; returns the pool's clock then [s].
-
-    The pool writes half a second at a time, so that the last record is as old as one look takes.
-    """
-    size = truth.stat().st_size
-    still = f"{truth} does not grow: the pool stands still"
-    _await(lambda: truth.stat().st_size > size, POLL, lambda: True, lambda: still)
-    return float(read_truth(truth).time[-1])
 
 
 def play_kill(job: FaultJob, path: Path) -> dict[str, Any]:
@@ -896,19 +875,11 @@ def play_kill(job: FaultJob, path: Path) -> dict[str, Any]:
         ReliabilityError: The vehicle never drove, in three attempts: a machine with too much to do stops it
             before it is to be killed.
     """
-    begin, goal, _, delay = MOTIONS[job.motion]
     for attempt in range(ATTEMPTS):
         try:
-            with tempfile.TemporaryDirectory() as name:
-                folder = Path(name)
-                truth, record = folder / "truth", folder / "run.mcap"
-                world = ["--plant", str(job.plant), "--severity", job.severity, "--seed", str(job.seed)]
-                world += ["--camera", "corners", "--start", begin, "--truth", str(truth)]
-                ours = ["--policy", "pid", "--record", str(record)]
-                with pair(folder, job.vehicle, goal, pool=world, robot=ours) as both:
-                    await_thrust(truth, STILL, both.robot)
-                    time.sleep(delay)
-                    result = KILLS[job.row][1](job, both, truth, record)
+            with tempfile.TemporaryDirectory() as folder, pair(job, Path(folder)) as both:
+                time.sleep(MOTIONS[job.motion][3])
+                result = KILLS[job.row][1](job, both)
                 break
         except ReliabilityError:
             if attempt == ATTEMPTS - 1:
@@ -916,13 +887,13 @@ def play_kill(job: FaultJob, path: Path) -> dict[str, Any]:
     return {**result, "provenance": provenance(), "ok": passed(result)}
 
 
-def _kill_robot(job: FaultJob, both: Pair, file: Path, record: Path) -> dict[str, Any]:
+def _kill_robot(job: FaultJob, both: Pair) -> dict[str, Any]:
     """The motor controller is left alone: its own timeout has to stop the motors."""
-    began, killed = await_flush(file), time.monotonic()
+    began, killed = both.next_truth(), time.monotonic()
     both.robot.kill()
     time.sleep(WATCHED_ALIVE)
     both.pool.end()
-    truth, safety = read_truth(file), load_vehicle(job.vehicle).safety
+    truth, safety = read_truth(both.truth), load_vehicle(job.vehicle).safety
     course = Course(truth.time, truth.position, truth.thrust, np.full(len(truth.time), math.nan))
     box = inset(safety.workspace_lower, safety.workspace_upper)
     return {
@@ -931,22 +902,22 @@ def _kill_robot(job: FaultJob, both: Pair, file: Path, record: Path) -> dict[str
         "state": "gone",
         "reason": "the motor controller stops by itself",
         "raised": both.pool.broke(),
-        **_record_cut(record, killed),
+        **_record_cut(both.record, killed),
     }
 
 
-def _kill_pool(job: FaultJob, both: Pair, file: Path, record: Path) -> dict[str, Any]:
+def _kill_pool(job: FaultJob, both: Pair) -> dict[str, Any]:
     """Vehicle and camera fall silent: the robot has to stop commanding.
 
     What it sends is heard at the pool's port, as soon as the system has given that free, and its bridge has put into
     the record when it stopped: the later of the two counts.
     """
-    began, killed = await_flush(file), time.monotonic()
+    began, killed = both.next_truth(), time.monotonic()
     both.pool.kill()
     heard = _last_enabled(both, killed)
     both.robot.end()
-    ended, truth = time.monotonic(), read_truth(file)
-    stopped = _first_stop(record, killed)
+    ended, truth = time.monotonic(), read_truth(both.truth)
+    stopped = _first_stop(both.record, killed)
     off = None if heard is None or stopped is None else max(heard, stopped - killed)
     summary = json.loads(both.robot.said or "{}")
     course = Course(truth.time, truth.position, truth.thrust, np.ones(len(truth.time)))
@@ -958,7 +929,7 @@ def _kill_pool(job: FaultJob, both: Pair, file: Path, record: Path) -> dict[str,
         "state": summary.get("state", "no answer"),
         "reason": summary.get("reason", ""),
         "raised": both.robot.broke(),
-        **_record_cut(record, ended),
+        **_record_cut(both.record, ended),
     }
 
 
@@ -1106,34 +1077,27 @@ def faults_experiment(
     every = [*KILLS, *every] if firmware == "mcu" else every
     names = list(scenarios or every)
     check_choices(names, every, "scenario", ReliabilityError)
-    kills, jobs = list[FaultJob](), list[FaultJob]()
-    for name in names:
-        variants: Sequence[str] = [""] if name in KILLS else list(SCENARIOS[name].faults)
-        (kills if name in KILLS else jobs).extend(
-            fault_job(name, variant, motion, plant=s, seed=s, severity=severity, vehicle=vehicle)
-            for variant in variants
-            for motion in (MOTIONS if name in KILLS else SCENARIOS[name].motions)
-            for s in range(seed, seed + seeds)
-        )
+    variants = {name: [""] if name in KILLS else list(SCENARIOS[name].faults) for name in names}
+    jobs = [
+        fault_job(name, variant, motion, plant=s, seed=s, severity=severity, vehicle=vehicle)
+        for name in names
+        for variant in variants[name]
+        for motion in (MOTIONS if name in KILLS else SCENARIOS[name].motions)
+        for s in range(seed, seed + seeds)
+    ]
+    kills = [job for job in jobs if job.row in KILLS]
+    jobs = [job for job in jobs if job.row not in KILLS]
     weight = KILL_WEIGHT * len(kills)
     share, folder, body = weight / (weight + len(jobs)), Path(out), load_vehicle(vehicle)
-    if kills:
-        progress(0.0, f"{len(kills)} kills in real time")
     # A kill has the machine to itself.
     results = run_jobs(
-        kills,
-        folder / "trials",
-        play_kill,
-        processes=1,
-        show=lambda job, _: progress(0.5 * share, job.target),
-    )
+        kills, folder / "trials", play_kill, processes=1,
+        progress=lambda part, what: progress(share * part, f"kills in real time: {what}"),
+    )  # fmt: skip
     results += run_jobs(
-        jobs,
-        folder / "trials",
-        play,
-        processes=processes,
+        jobs, folder / "trials", play, processes=processes,
         progress=lambda part, what: progress(share + (1.0 - share) * part, what),
-    )
+    )  # fmt: skip
     rows = {name: [r for r in results if r["job"]["row"] == name] for name in names}
     result = {
         "experiment": "faults",

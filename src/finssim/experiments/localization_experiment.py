@@ -20,7 +20,7 @@ from finssim.experiments.campaign import Progress, check_choices, write_json
 from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
 from finssim.experiments.metrics import PAPER
 from finssim.experiments.statistics import bootstrap
-from finssim.experiments.tables import Table
+from finssim.experiments.tables import Columns, Table, cells, figure_text
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.geometry.optics import Camera, Interface, Lens, Status, project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_euler, quat_to_matrix
@@ -408,9 +408,9 @@ WORDS = {
     "pinhole": "pinhole PnP",
     "pinhole, refractive pose": "pinhole PnP, as paper",
 }
-HEADS = ("", "RMSE [cm]", "95 % of it", "P95 [cm]", "95 % of it", "located")
-CALIBRATION = {
-    "seed": ("seed", ""),
+HEADS = ("", "RMSE [cm]", "P95 [cm]", "located")
+CALIBRATION: Columns = {
+    "seed": ("seed", ".0f"),
     "camera_height_mm": ("camera height [mm]", ".2f"),
     "water_height_mm": ("water [mm]", ".2f"),
     "camera_over_water_mm": ("camera over water [mm]", ".2f"),
@@ -558,39 +558,33 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         rows = [
             [
                 WORDS[method],
-                *_texts(m["rmse_cm"], m["rmse_ci95_cm"]),
-                *_texts(m["p95_cm"], m["p95_ci95_cm"]),
+                *(
+                    figure_text({"value": m[f"{x}_cm"], "ci95": m[f"{x}_ci95_cm"]}, ".2f")
+                    for x in ("rmse", "p95")
+                ),
                 f"{m['located']}/{m['pictures']}",
             ]
             for method, m in methods.items()
         ]
-        tables.append(Table(title=f"ours, {name} conditions: {WORDS[name]}", heads=HEADS, rows=rows))
+        tables.append(
+            Table(title=f"ours, {name} conditions: {WORDS[name]}", heads=HEADS, rows=rows, intervals=True)
+        )
     rows = [
-        [f"paper, {WORDS[m]}", f"{p['rmse_cm']:.2f}", "", f"{p['p95_cm']:.2f}", "", ""]
+        [f"paper, {WORDS[m]}", f"{p['rmse_cm']:.2f}", f"{p['p95_cm']:.2f}", ""]
         for m, p in result["paper"].items()
     ]
     paper = "the paper: its camera over its pool"
-    rows_wrong = [
-        [format(c[key], form) for key, (_, form) in CALIBRATION.items()] for c in result["calibration"]
-    ]
     return [
         *tables,
         Table(title=paper, heads=HEADS, rows=rows, note=NOTE, pictures={"error_map.png": "Error map"}),
         Table(
             title="what the calibrations got wrong",
-            heads=[heading for heading, _ in CALIBRATION.values()],
-            rows=rows_wrong,
+            heads=[heading for heading, *_ in CALIBRATION.values()],
+            rows=[cells(c, CALIBRATION) for c in result["calibration"]],
             left=(),
             note=f"FinsSim {origin['finssim']}, revision {origin['revision']}, seeds {result['seeds']}.",
         ),
     ]
-
-
-def _texts(value: float | None, interval: Sequence[float | None]) -> tuple[str, str]:
-    """A figure, and its interval."""
-    low, high = interval
-    bounds = "" if low is None or high is None else f"[{low:.2f}, {high:.2f}]"
-    return "none" if value is None else f"{value:.2f}", bounds
 
 
 def _headline(result: Mapping[str, Any]) -> str:

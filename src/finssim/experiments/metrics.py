@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -117,7 +118,7 @@ MAX_GAP = 0.25
 MIN_VALID = 0.9
 """Smallest share of the window's grid points that must have a value."""
 
-MEANS = ("e_p_m", "e_y_m", "e_psi_deg", "J_p_m", "J_psi_deg")
+MEANS = ("e_p_m", "e_y_m", "e_psi_deg", "J_p_m", "J_psi_deg", "t_s_s")
 
 
 def measure_trial(t: ArrayLike, position: ArrayLike, yaw: ArrayLike, goal: ArrayLike) -> dict[str, Any]:
@@ -166,26 +167,37 @@ def measure_trial(t: ArrayLike, position: ArrayLike, yaw: ArrayLike, goal: Array
     return measures
 
 
-def summarize(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def summarize(
+    trials: Sequence[Mapping[str, Any]],
+    counts: str = "success",
+    valid: str = "e_p_m",
+    means: Sequence[str] = MEANS,
+) -> dict[str, Any]:
     """One controller's row of the table, from the measures of its trials.
 
-    Errors are means over the trials that have them, jitters over the successful ones, t_s is their median. A trial that
-    has no late errors (it ended early, or its samples are missing) still counts as a trial without success.
+    Each figure is a mean over the trials that have it, errors over all, jitters over the successful; t_s is the median.
+    A trial without errors (it ended early, or its samples are missing) still counts as a trial without success.
 
     Args:
-        trials: What `measure_trial` gave, possibly with more keys.
+        trials: What `measure_trial` or `measure_tracking` gave, possibly with more keys.
+        counts: Key of what is counted.
+        valid: Key of an error, which a valid trial has.
+        means: Keys of the figures.
 
     Returns:
-        `trials` and `valid` (trials that have late errors), `success` (count), `e_p_m`, `e_y_m`, `e_psi_deg`, `t_s_s`,
-        `J_p_m`, `J_psi_deg` (None where no trial has one).
+        `trials`, `valid` (trials that have errors), `success` or what else is counted, and the figures, None where no
+        trial has one.
     """
     row: dict[str, Any] = {
         "trials": len(trials),
-        "valid": sum(trial["e_p_m"] is not None for trial in trials),
-        "success": sum(bool(trial["success"]) for trial in trials),
+        "valid": sum(trial[valid] is not None for trial in trials),
+        counts: sum(bool(trial[counts]) for trial in trials),
     }
-    means = {key: _over(np.mean, trials, key) for key in MEANS}
-    return row | means | {"t_s_s": _over(np.median, trials, "t_s_s")}
+    for key in means:
+        values = [trial[key] for trial in trials if trial[key] is not None]
+        statistic: Any = np.median if key == "t_s_s" else np.mean
+        row[key] = float(statistic(values)) if values else None
+    return row
 
 
 def pose_error(position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
@@ -251,11 +263,6 @@ def _first_run(held: NDArray[np.bool_], length: int) -> slice | None:
 def _rms(x: Array) -> float:
     """Root mean square of the values there are."""
     return math.sqrt(float(np.nanmean(np.square(x))))
-
-
-def _over(statistic: Any, trials: Sequence[Mapping[str, Any]], key: str) -> float | None:
-    values = [trial[key] for trial in trials if trial[key] is not None]
-    return float(statistic(values)) if values else None
 
 
 DENSE_RATE = 50.0
@@ -412,15 +419,5 @@ def effort_measures(t: Array, thrust: Array, limits: tuple[ArrayLike, ArrayLike]
     }
 
 
-def summarize_tracking(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """One row of the table, from the measures of its trials: means over the trials that have them.
-
-    Returns:
-        `trials`, `valid` (trials with errors), `complete` (count) and the means of `MEASURES`, None where none has one.
-    """
-    row: dict[str, Any] = {
-        "trials": len(trials),
-        "valid": sum(trial["p95_m"] is not None for trial in trials),
-        "complete": sum(bool(trial["complete"]) for trial in trials),
-    }
-    return row | {key: _over(np.mean, trials, key) for key in MEASURES}
+summarize_tracking = partial(summarize, counts="complete", valid="p95_m", means=MEASURES)
+"""One row of the table of T2: `trials`, `valid`, `complete` (count) and the means of `MEASURES`."""

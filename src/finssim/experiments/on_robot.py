@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
+import yaml
 from rich.console import Console
 from rich.status import Status
 
 from finssim.control.guidance import Guide, Station
-from finssim.files import atomic_directory, refuse_unwritable
+from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_yaw, wrap_angle
 from finssim.localization.pool import Pool, load_pool
 from finssim.robot.goals import check_reachable, place_of
@@ -262,8 +263,6 @@ class Stages:
         return f"({x:+.2f}, {y:+.2f}, {z:+.2f}) m and {math.degrees(self._turn(reading)):+.0f}° to go"
 
 
-MARK = ".on-robot"
-"""File by which a folder of such trials is known."""
 ABORTED = "aborted"
 """Folder of the records of trials that were stopped and do not count."""
 
@@ -541,18 +540,25 @@ def session(
         yield Session(robot, vehicle, site, drive, attendant, console)
 
 
-@contextmanager
-def kept_folder(out: Path) -> Iterator[Path]:
-    """A folder in which trials on a robot stay as they are made: new, empty, or begun by an earlier call.
+def take_folder(file: Path, about: Mapping[str, Any]) -> None:
+    """Begin a folder in which things stay as they are made, or go on in one that is of the very same settings.
+
+    Args:
+        file: In the folder, which may be new: takes the settings.
+        about: Plain data.
 
     Raises:
-        OutputError: It holds somebody's files.
+        RobotError: It holds somebody's files, or is of other settings.
     """
-    if out.exists() and not (out / MARK).is_file():
-        refuse_unwritable(atomic_directory(out))
-    out.mkdir(parents=True, exist_ok=True)
-    (out / MARK).touch()
-    yield out
+    text, out = yaml.safe_dump(dict(about), sort_keys=False), file.parent
+    if not out.exists() or not any(out.iterdir()):
+        with atomic_write(file) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    elif not file.is_file() or file.read_text(encoding="utf-8") != text:
+        raise RobotError(
+            f"{out}: holds other files, or what was made with other settings: give a new --out, or the same settings, "
+            "such as vehicle and seed, to go on"
+        )
 
 
 def check_starts(starts: Mapping[str, Station], vehicle: str | Vehicle) -> None:

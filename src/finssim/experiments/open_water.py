@@ -17,7 +17,8 @@ from finssim.control.trajectories import Trajectory
 from finssim.experiments.campaign import Progress, check_choices, write_json
 from finssim.experiments.on_robot import RobotTrial
 from finssim.experiments.pool_trial import play_in_pool
-from finssim.experiments.tables import Table
+from finssim.experiments.tables import Columns, Table, cells
+from finssim.experiments.trials import interpolated
 from finssim.geometry.rotations import quat_yaw
 from finssim.pool import read_truth
 from finssim.pool.draw_plant import positioning_of
@@ -41,6 +42,16 @@ PERIOD = 0.5
 INSIDE = 5.991
 """95 % of squared Mahalanobis distances in the plane are smaller."""
 WAYS = ("line", "square")
+COLUMNS: Columns = {
+    "seed": ("seed", ".0f"),
+    "way_m": ("way [m]", ".1f"),
+    "drift_m": ("drift [m]", ".2f"),
+    "drift": ("drift [%]", ".2f", 100.0),
+    "std_m": ("std [m]", ".2f"),
+    "nees": ("NEES", ".2f"),
+    "inside": ("inside", ".0%"),
+    "off_m": ("off way [m]", ".2f"),
+}
 
 
 def way_of(shape: str, duration: float, speed: float) -> Trajectory:
@@ -66,7 +77,7 @@ def way_of(shape: str, duration: float, speed: float) -> Trajectory:
 
     def motion(t: Array) -> tuple[Array, Array]:
         i = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(times) - 1)
-        return points[i] + ((t - starts[i]) / times[i])[..., None] * steps[i], steps[i] / times[i][..., None]
+        return interpolated(t, starts, points), steps[i] / times[i][..., None]
 
     return Trajectory(name=shape, duration=float(starts[-1]), motion=motion)
 
@@ -132,7 +143,7 @@ def swim(
     if not rows:
         raise ValueError(f"open water: never armed: {runtime.refusal or 'no state'}")
     a = np.array(rows)
-    true = np.stack([np.interp(a[:, 0], truth.time, column) for column in truth.position.T], axis=1)
+    true = interpolated(a[:, 0], truth.time, truth.position)
     yaw = np.interp(a[:, 0], truth.time, np.unwrap(quat_yaw(truth.quaternion)))
     error, P = a[:, 1:3] - true[:, :2], a[:, 4:8].reshape(-1, 2, 2)
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
@@ -205,12 +216,6 @@ def open_water(
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
     """A row for each way."""
     title = f"{result['vehicle']['name']}, {result['shape']}, positioning {result['positioning']}"
-    heads = ("seed", "way [m]", "drift [m]", "drift [%]", "std [m]", "NEES", "inside", "off way [m]", "")
-    rows = [
-        [
-            str(t["seed"]), f"{t['way_m']:.1f}", f"{t['drift_m']:.2f}", f"{100.0 * t['drift_m'] / t['way_m']:.2f}",
-            f"{t['std_m']:.2f}", f"{t['nees']:.2f}", f"{100.0 * t['inside']:.0f} %", f"{t['off_m']:.2f}", t["fault"],
-        ]
-        for t in result["trials"]
-    ]  # fmt: skip
-    return [Table(title=title, heads=heads, rows=rows, left=())]
+    heads = [*(heading for heading, *_ in COLUMNS.values()), ""]
+    drifts = [{**t, "drift": t["drift_m"] / t["way_m"]} for t in result["trials"]]
+    return [Table(title=title, heads=heads, rows=[[*cells(t, COLUMNS), t["fault"]] for t in drifts], left=())]

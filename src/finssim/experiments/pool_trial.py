@@ -18,7 +18,6 @@ from rich.console import Console
 from finssim.control.guidance import Station
 from finssim.control.modes import action_mode
 from finssim.experiments import campaign
-from finssim.experiments.evaluate import Evaluation, summary_of
 from finssim.experiments.metrics import SITE_SIZES, T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.on_robot import (
     GETTING_READY,
@@ -45,8 +44,6 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import link_of
-from finssim.tasks import task_named
-from finssim.tasks.agents import agent_for
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import room, vehicle_at
 
@@ -84,11 +81,9 @@ def firmware_of(name: str, vehicle: Vehicle, robot: OnRobot | None = None) -> st
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job(campaign.Job):
-    """A controller, what it knows, where it is put, and what it is to do: a setpoint of T1 or a trajectory of T2."""
+class PoolJob(campaign.Job):
+    """What the robot's whole software does in a pool, whose vehicle it knows only so well."""
 
-    controller: str
-    """Policy directory, or the name of a PID."""
     vehicle: str = "finsrov"
     """Name or file of the vehicle as controller and localization know it."""
     pool_vehicle: str = "finsrov"
@@ -97,6 +92,30 @@ class Job(campaign.Job):
     """nominal, realistic or hard."""
     camera: str = "pictures"
     """pictures (drawn and searched for tags) or corners (of the tags, with noise)."""
+    site: str = "pool"
+    """pool, tank or open-water."""
+    firmware: str = "mcu"
+    """mcu or ardusub: an autopilot, on whose vehicle a Doppler log and a compass take the camera's place."""
+
+    def plan(self, seed: int) -> PoolPlan:
+        """Of its pool, with a seed for noise."""
+        camera: Any = "none" if self.firmware == "ardusub" else self.camera
+        return make_plan(
+            self.pool_vehicle, str(self.plant), self.severity, camera=camera, seed=seed, site=self.site,
+            firmware=self.firmware,
+        )  # type: ignore[arg-type]  # fmt: skip
+
+    def equipped(self) -> Vehicle:
+        """The vehicle as the robot knows it there."""
+        return vehicle_at(self.site, load_vehicle(self.vehicle), navigation=self.firmware == "ardusub")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(PoolJob):
+    """A controller and what it is to do: a setpoint of T1 or a trajectory of T2."""
+
+    controller: str
+    """Policy directory, or the name of a PID."""
     fusion: bool = True
     """Whether the controller sees the fused state, or what each sensor said last."""
     position_noise: float = 0.0
@@ -105,10 +124,6 @@ class Job(campaign.Job):
     """Added to what the controller sees [rad]."""
     duration: float = 60.0
     """[s]; of T2 the trajectory's own."""
-    site: str = "pool"
-    """pool, tank or open-water."""
-    firmware: str = "mcu"
-    """mcu or ardusub: an autopilot, on whose vehicle a Doppler log and a compass take the camera's place."""
 
     @property
     def task(self) -> str:
@@ -224,23 +239,13 @@ def play(job: Job, path: Path) -> dict[str, Any]:
         against the truth, rms) and how the robot's loop did.
     """
     start_warp()
-    began = time.perf_counter()
-    vehicle = load_vehicle(job.vehicle)
-    plan = make_plan(
-        job.pool_vehicle,
-        str(job.plant),
-        job.severity,
-        camera="none" if job.firmware == "ardusub" else job.camera,
-        seed=noise_seed(job.seed, job.target),
-        site=job.site,
-        firmware=job.firmware,
-    )  # type: ignore[arg-type]
-    seed = noise_seed(job.seed, job.target)
-    trial, start = job_trial(job, vehicle, seed=seed)
+    began, seed = time.perf_counter(), noise_seed(job.seed, job.target)
+    trial, start = job_trial(job, load_vehicle(job.vehicle), seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "truth"
-        ours = vehicle_at(job.site, vehicle, navigation=job.firmware == "ardusub")
-        outcome = play_in_pool(trial, start, ours, plan, seed=seed, truth=file, fusion=job.fusion)
+        outcome = play_in_pool(
+            trial, start, job.equipped(), job.plan(seed), seed=seed, truth=file, fusion=job.fusion
+        )
         truth = read_truth(file)
     t = truth.time - outcome.runtime.started
     rows = np.flatnonzero((t >= 0.0) & (t <= trial.duration + 1e-6))
@@ -280,24 +285,27 @@ def played_trial(result: Mapping[str, Any], folder: Path) -> Trial:
     return Trial(name=target, guide=guide, motion=Motion.read(folder / result["key"]))
 
 
-def run_on_robot(
+def play_jobs(
     jobs: Sequence[Job],
     folder: Path,
-    robot: OnRobot,
+    robot: OnRobot | None = None,
     *,
     attendant: Attendant | None = None,
     console: Console | None = None,
+    **options: Any,
 ) -> list[dict[str, Any]]:
-    """Play on a robot what has no result yet, scored by its own estimate; those that are skipped are left out.
+    """Play in their pools, or on a robot, what has no result yet, scored by the truth or by the robot's own estimate.
 
-    A trial that the bridge stopped counts. With nobody beside the water nothing is played after it.
+    Of a robot: a trial that the bridge stopped counts; with nobody beside the water nothing is played after it. Those
+    that are skipped are left out.
 
     Args:
-        jobs: Of one vehicle; plant 0, severity and camera `HARDWARE`.
-        folder: Takes KEY.json, KEY.npz and KEY.mcap of each, made if missing.
-        robot: Which, and how; not opened where nothing is left to play.
+        jobs: On a robot of one vehicle; plant 0, severity and camera `HARDWARE`.
+        folder: Takes KEY.json, KEY.npz and, of a robot, KEY.mcap of each, made if missing.
+        robot: Which, and how; not opened where nothing is left to play. None: in pools.
         attendant: Instead of the terminal's keyboard.
         console: Where it is told how it stands; standard error if None.
+        options: Of `run_jobs`, for pools.
 
     Raises:
         RobotError: A trial was stopped, and nobody is there to look at the vehicle; the next call goes on. Or every
@@ -306,6 +314,8 @@ def run_on_robot(
         PolicyError, ControlError: A controller does not fit the vehicle.
         KeyboardInterrupt: Ctrl-C, or the operator ended the session.
     """
+    if robot is None:
+        return campaign.run_jobs(jobs, folder, play, **options)
     vehicle, console = load_vehicle(jobs[0].vehicle), console or Console(stderr=True)
     trials = {job.target: job_trial(job, vehicle) for job in jobs}
     equipped = robot.equipped(vehicle)
@@ -325,14 +335,14 @@ def run_on_robot(
     with ExitStack() as stack:
         opened: list[Session] = []
 
-        def play(job: Job, path: Path) -> dict[str, Any] | None:
+        def play_next(job: Job, path: Path) -> dict[str, Any] | None:
             if not opened:
                 opened.append(
                     stack.enter_context(session(robot, vehicle, attendant=attendant, console=console))
                 )
             return _play_on_robot(job, path, opened[0])
 
-        results = campaign.run_jobs(jobs, folder, play, processes=1, show=show)
+        results = campaign.run_jobs(jobs, folder, play_next, processes=1, show=show)
     if not results:
         raise RobotError("every trial was skipped: there is nothing to report")
     return results
@@ -360,35 +370,3 @@ def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | No
         motion = Motion(t=np.array([0.0, 0.1]), position=nowhere[:, :3], quaternion=nowhere)
     where = {"robot": opened.robot.title, "record": record.name}
     return _result(job, path, motion, outcome, began) | where
-
-
-def pool_evaluation(job: Job, results: Sequence[Mapping[str, Any]], folder: Path) -> Evaluation:
-    """The trials of one controller in the form of an evaluation.
-
-    Args:
-        job: One of them, on setpoints.
-        results: Of `run_jobs`.
-        folder: Where `run_jobs` left the motions.
-    """
-    vehicle, first = load_vehicle(job.vehicle), results[0]
-    agent = agent_for(job.controller, vehicle, task_named("t1"))
-    plant = {"name": "pool", "title": f"virtual pool {job.plant}, {job.severity}, around {job.pool_vehicle}"}
-    if first.get("robot"):
-        plant = {"name": HARDWARE, "title": f"robot {first['robot']}, by its own estimate"}
-    trials = [played_trial(result, folder) for result in results]
-    measures = [
-        {key: value for key, value in result.items() if key not in ("job", "key", "provenance")}
-        for result in results
-    ]
-    result = {
-        "controller": agent.describe() | {"name": job.row},
-        "task": "t1",
-        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
-        "hydrodynamics": "calibrated",
-        "plant": plant,
-        "camera": job.camera,
-        "seed": job.seed,
-        **summary_of("t1", measures, trials),
-        "provenance": dict(first["provenance"]),
-    }
-    return Evaluation(result, trials)

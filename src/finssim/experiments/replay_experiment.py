@@ -26,7 +26,7 @@ from finssim.experiments.campaign import Progress, write_json
 from finssim.experiments.figures import save_figure
 from finssim.experiments.metrics import PAPER
 from finssim.experiments.statistics import RESAMPLES, SEED, bootstrap
-from finssim.experiments.tables import Table
+from finssim.experiments.tables import Table, figure_text
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.pool.plant_spec import CoupledMatrix
 from finssim.provenance import provenance
@@ -76,14 +76,15 @@ class ReplayPlant:
             recording, programmes, vehicle, noise="sensors", seed=seed, inputs=("rpm",), sampling="instant"
         )
         random = np.random.default_rng([seed, 2])
-
-        def noisy(name: str, values: Array) -> Array:
-            if not name.startswith("rpm_"):
-                return values
-            turning = np.where(values != 0.0, 1.0, 0.0)
-            return np.asarray(values + self.spec["rpm_noise"] * turning * random.standard_normal(len(values)))
-
-        return [replace(t, channels={k: noisy(k, v) for k, v in t.channels.items()}) for t in logged]
+        trials = []
+        for trial in logged:
+            speeds = {k: v for k, v in trial.channels.items() if k.startswith("rpm_")}
+            noisy = {
+                k: v + self.spec["rpm_noise"] * (v != 0.0) * random.standard_normal(len(v))
+                for k, v in speeds.items()
+            }
+            trials.append(replace(trial, channels={**trial.channels, **noisy}))
+        return trials
 
     def forces(self, vehicle: Vehicle) -> Callable[[Simulator], None]:
         """What acts besides the engine's own forces: coupled damping and the loss of thrust, from the present state."""
@@ -132,13 +133,10 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     for key, title in LEVELS.items():
         rows = []
         for model, m in result[key]["models"].items():
-            values = [f"{m['by_axis'][a]:.3f}" if a in m["by_axis"] else "–" for a in axes]
-            rows.append([f"ours, {MODEL_LABELS[model]}", f"{m['aggregate']:.3f}", _range(m["ci95"]), *values])
-        tables.append(Table(title=title, heads=["", "NRMSE", "95 % interval", *axes], rows=rows))
-    theirs = [
-        [f"paper, {MODEL_LABELS[model]}", f"{p['aggregate']:.3f}", _range(p["ci95"])]
-        for model, p in result["paper"].items()
-    ]
+            values = [figure_text(m["by_axis"].get(a), ".3f") for a in axes]
+            rows.append([f"ours, {MODEL_LABELS[model]}", _nrmse(m), *values])
+        tables.append(Table(title=title, heads=["", "NRMSE", *axes], rows=rows, intervals=True))
+    theirs = [[f"paper, {MODEL_LABELS[model]}", _nrmse(p)] for model, p in result["paper"].items()]
     hashes = ", ".join(fit["vehicle_sha256"][:12] for fit in result["fits"])
     origin = result["provenance"]
     about = (
@@ -147,8 +145,9 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     )
     paper = Table(
         title="the paper: its vehicle in its pool",
-        heads=["", "NRMSE", "95 % interval"],
+        heads=["", "NRMSE"],
         rows=theirs,
+        intervals=True,
         note=NOTE,
         sentences=[DEFINITION, about],
         pictures={"envelope.png": "Response envelopes"},
@@ -166,8 +165,8 @@ def _headline(result: Mapping[str, Any]) -> str:
     )
 
 
-def _range(ci95: Sequence[float]) -> str:
-    return f"[{ci95[0]:.3f}, {ci95[1]:.3f}]"
+def _nrmse(figures: Mapping[str, Any]) -> str:
+    return figure_text({"value": figures["aggregate"], "ci95": figures["ci95"]}, ".3f")
 
 
 AXES: tuple[Axis, ...] = ("surge", "sway", "heave", "yaw")
@@ -230,14 +229,10 @@ def replay_experiment(
         )
     refuse_unwritable(atomic_directory(out, replaces=RESULT_FILE))
     start_warp()
-    body, water = load_vehicle(vehicle), ReplayPlant()
-    done = [
-        experiment_seed(
-            body, water, seed + k, repeats, axes,
-            lambda part, what, k=k: progress((k + part) / seeds, f"seed {k + 1} of {seeds}: {what}"),
-        )
-        for k in range(seeds)
-    ]  # fmt: skip
+    body, water, done = load_vehicle(vehicle), ReplayPlant(), []
+    for k in range(seeds):
+        progress(k / seeds, f"seed {k + 1} of {seeds}")
+        done.append(experiment_seed(body, water, seed + k, repeats, axes))
     result = {
         "experiment": "replay",
         "vehicle": {"name": body.name, "sha256": body.sha256},
@@ -250,7 +245,18 @@ def replay_experiment(
         },
         "same_levels": pooled([one.same_levels for one in done]),
         "other_levels": pooled([one.other_levels for one in done]),
-        "fits": [_fit(one) for one in done],
+        "fits": [
+            {
+                "seed": one.seed,
+                "method": one.fit.method,
+                "vehicle_sha256": one.vehicle.sha256,
+                "parameters": {name: e.as_json() for name, e in one.fit.estimates.items()},
+                "findings": [finding.as_json() for finding in one.fit.findings],
+                "trials": dict(one.fit.trials),
+                "held_out": {p.name: p.sha256 for p in one.same_levels.pairs},
+            }
+            for one in done
+        ],
         "paper": {m: {"aggregate": v, "ci95": list(ci)} for m, (v, ci) in PAPER_TABLE_3.items()},
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "unit": "seed, then trial"},
         "provenance": provenance(),
@@ -271,21 +277,14 @@ def experiment_seed(
     seed: int,
     repeats: int = REPEATS,
     axes: Sequence[str] = AXES,
-    progress: Progress = lambda part, what: None,
 ) -> SeedResult:
-    """One seed of the experiment; arguments as for `replay_experiment`, `say` is told the share that is done."""
-    progress(0.0, "trials")
-    plan = programmes(axes, vehicle, kind="published", repeats=repeats)
-    trials = plant.trials(plan, vehicle, seed)
-    fitted, held_out = trials[0::2], trials[1::2]
-    progress(0.35, "identification")
-    fit = regress(fitted, vehicle, axes=axes, seed=seed)
-    found = calibrated(fit)
-    progress(0.6, "replay")
-    same = replay(held_out, found, hydrodynamics=MODELS)
-    progress(0.85, "replay of other levels")
+    """One seed of the experiment; arguments as for `replay_experiment`."""
+    trials = plant.trials(programmes(axes, vehicle, kind="published", repeats=repeats), vehicle, seed)
+    fit = regress(trials[0::2], vehicle, axes=axes, seed=seed)
+    fitted = calibrated(fit)
+    same = replay(trials[1::2], fitted, hydrodynamics=MODELS)
     sweeps = plant.trials(programmes(axes, vehicle, kind="validation"), vehicle, seed + 1_000_000)
-    return SeedResult(seed, fit, found, same, replay(sweeps, found, hydrodynamics=MODELS))
+    return SeedResult(seed, fit, fitted, same, replay(sweeps, fitted, hydrodynamics=MODELS))
 
 
 def pooled(replays: Sequence[Replay]) -> dict[str, Any]:
@@ -327,15 +326,3 @@ def _values(one: Replay, model: str) -> dict[str, NDArray[np.float64]]:
             if s.value is not None:
                 values.setdefault(axis, []).append(s.value)
     return {axis: np.array(each) for axis, each in values.items()}
-
-
-def _fit(one: SeedResult) -> dict[str, Any]:
-    return {
-        "seed": one.seed,
-        "method": one.fit.method,
-        "vehicle_sha256": one.vehicle.sha256,
-        "parameters": {name: e.as_json() for name, e in one.fit.estimates.items()},
-        "findings": [finding.as_json() for finding in one.fit.findings],
-        "trials": dict(one.fit.trials),
-        "held_out": {p.name: p.sha256 for p in one.same_levels.pairs},
-    }

@@ -18,7 +18,7 @@ from finssim.experiments.tables import Table, print_tables
 from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_to_euler
 from finssim.provenance import provenance
-from finssim.text_table import write_csv
+from finssim.text_table import number, write_csv
 from finssim.vehicles import AXES, load_vehicle
 
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
@@ -40,29 +40,24 @@ def parse_wrench(text: str) -> NDArray[np.float64]:
     Raises:
         CommandError: An axis is unknown or given twice, or a number is missing or not finite.
     """
-    tau = np.zeros(6)
-    seen: set[str] = set()
-    words = text.replace(",", " ").split()
-    if not words:
-        raise CommandError('command is empty: give axis=number, such as "surge=10 yaw=1" [N, N m]')
-    for word in words:
-        axis, _, number = word.partition("=")
+    wrench: dict[str, float] = {}
+    for word in text.replace(",", " ").split():
+        axis, _, digits = word.partition("=")
         if axis not in AXES:
             close = difflib.get_close_matches(axis, AXES, n=1)
             hint = f"; did you mean '{close[0]}'?" if close else ""
             raise CommandError(f"command: unknown axis '{axis}'; available: {', '.join(AXES)}{hint}")
-        if axis in seen:
+        if axis in wrench:
             raise CommandError(f"command: '{axis}' is given twice")
-        seen.add(axis)
-        i = AXES.index(axis)
-        try:
-            tau[i] = float(number)
-        except ValueError:
-            expected = f"expected a number: {axis}=1.5 [{UNITS[i]}]"
-            raise CommandError(f"command: {axis} is '{number}', {expected}") from None
-        if not math.isfinite(tau[i]):
-            raise CommandError(f"command: {axis} is {tau[i]}, expected a finite number [{UNITS[i]}]")
-    return tau
+        unit, value = UNITS[AXES.index(axis)], number(digits)
+        if value is None or not digits:
+            raise CommandError(f"command: {axis} is '{digits}', expected a number: {axis}=1.5 [{unit}]")
+        if not math.isfinite(value):
+            raise CommandError(f"command: {axis} is {value}, expected a finite number [{unit}]")
+        wrench[axis] = value
+    if not wrench:
+        raise CommandError('command is empty: give axis=number, such as "surge=10 yaw=1" [N, N m]')
+    return np.array([wrench.get(axis, 0.0) for axis in AXES])
 
 
 CONTROL_STEP = 0.1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 import time
@@ -69,9 +68,8 @@ def soak(
     runtime = Runtime(body, site, make_pilot("pid", body), station, arm=True)
     began = time.perf_counter()
     samples: list[tuple[float, ...]] = []
-    with (folder / "soak.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(HEADS)
+    with (folder / "soak.csv").open("w", buffering=1, encoding="utf-8") as file:  # a line at a time
+        print(*HEADS, sep=",", file=file)
 
         def sample(runtime: Runtime) -> None:
             """A row of the table for every so much of vehicle time."""
@@ -80,8 +78,7 @@ def soak(
             error = float(np.linalg.norm(pool.plant.position - runtime.guide.at(0.0).position))
             row = (pool.time, time.perf_counter() - began, memory_mib(), error)
             samples.append(row)
-            writer.writerow([*(f"{value:.4f}" for value in row), runtime.bridge.state])
-            file.flush()
+            print(*(f"{value:.4f}" for value in row), runtime.bridge.state, sep=",", file=file)
             text = f"{row[0] / 3600.0:.2f} h, {row[2]:.1f} MiB, {runtime.bridge.state}"
             progress(min(pool.time / duration, 1.0), text)
 

@@ -132,7 +132,9 @@ def play(
         "task": fitted.name, "controller": policy, "vehicle": body.sha256,
         "plant": plant, "severity": severity, "seed": seed,
     }  # fmt: skip
-    rows = _kept(out, about)
+    file = None if out is None else out / ROWS
+    kept = kept_result(file) if file is not None and file.is_file() else {}
+    rows = list(kept["episodes"]) if kept and kept == {**about, "episodes": kept["episodes"]} else []
     for k in range(len(rows), episodes):
         guide = list(TRAJECTORIES.values())[k % len(TRAJECTORIES)] if follows(fitted) else None
         record = out / f"episode_{k}" if out is not None and records else None
@@ -143,21 +145,12 @@ def play(
         )
         measured = site.run()
         rows.append({"trial": k, **{name: x if np.isfinite(x) else None for name, x in measured.items()}})
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            keep_result(out / ROWS, {**about, "episodes": rows})
+        if file is not None:
+            keep_result(file, {**about, "episodes": rows})
         show(f"episode {k + 1} of {episodes}: success {measured.get('success', float('nan')):g}")
     agent, nominal = make_pilot(policy, body, task=task).agent, load_plant("nominal")
     batch = run_episodes(agent, fitted_task(task, vehicles), body, nominal, trials=BATCH, seed=seed)
     return {**about, "stack": summarize_episodes(rows[:episodes]), "batch": summarize_episodes(batch)}
-
-
-def _kept(out: Path | None, about: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Episodes of an earlier run with the same settings."""
-    if out is None or not (out / ROWS).is_file():
-        return []
-    data = kept_result(out / ROWS)
-    return list(data["episodes"]) if {**about, "episodes": data.get("episodes")} == data else []
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:

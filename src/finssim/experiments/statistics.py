@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,21 +24,13 @@ TRIM = 0.25
 """Part of the scores that is left out at each end."""
 
 
-@dataclass(frozen=True)
-class Interval:
-    """A figure and where its bootstrap puts it."""
+Figure = dict[str, Any]
+"""`value`, `ci95` (where 95 % of redrawn figures lie) and `count`, the trials or runs it rests on; None: infinite."""
 
-    value: float
-    low: float
-    high: float
-    """2.5 and 97.5 %."""
-    count: int
-    """Trials or runs it rests on."""
 
-    def as_json(self) -> dict[str, Any]:
-        """Plain data; a number that is infinite is None."""
-        value, low, high = (x if math.isfinite(x) else None for x in (self.value, self.low, self.high))
-        return {"value": value, "ci95": [low, high], "count": self.count}
+def _figure(value: float, bounds: Array, count: int) -> Figure:
+    value, low, high = (float(x) if math.isfinite(x) else None for x in (value, *bounds))
+    return {"value": value, "ci95": [low, high], "count": count}
 
 
 def bootstrap(redraw: Callable[[np.random.Generator], ArrayLike], resamples: int | None = None) -> Array:
@@ -59,7 +50,7 @@ def bootstrap(redraw: Callable[[np.random.Generator], ArrayLike], resamples: int
 
 def with_interval(
     values: Mapping[Hashable, Sequence[float]], statistic: Statistic = np.mean
-) -> Interval | None:
+) -> Figure | None:
     """A statistic over all values and its interval from redrawing whole clusters.
 
     Trials of one plant and seed share their vehicle, camera, water and network, so they are no independent draws: the
@@ -82,14 +73,13 @@ def with_interval(
         drawn = random.integers(len(groups), size=len(groups))
         return statistic(table[drawn].ravel() if alike else np.concatenate([groups[k] for k in drawn]))
 
-    low, high = bootstrap(redraw)
     everything = np.concatenate(groups)
-    return Interval(float(statistic(everything)), float(low), float(high), len(everything))
+    return _figure(statistic(everything), bootstrap(redraw), len(everything))
 
 
 def paired_difference(
     ours: Mapping[tuple[int, int, str], float], theirs: Mapping[tuple[int, int, str], float]
-) -> Interval | None:
+) -> Figure | None:
     """Mean of theirs - ours over the trials that both have, clustered by plant and seed.
 
     Args:
@@ -114,7 +104,7 @@ def interquartile_mean(scores: Array) -> float:
     return float(np.sum(inside[counted] * x[counted]) / np.sum(inside))
 
 
-def with_bootstrap(scores: Sequence[Array], statistic: Statistic, resamples: int | None = None) -> Interval:
+def with_bootstrap(scores: Sequence[Array], statistic: Statistic, resamples: int | None = None) -> Figure:
     """A statistic of one or more sets of scores, and where a bootstrap stratified by column puts it.
 
     Runs are drawn with replacement in each column by itself; where every set has one run, the interval has no width.
@@ -125,8 +115,7 @@ def with_bootstrap(scores: Sequence[Array], statistic: Statistic, resamples: int
         drawn = [np.take_along_axis(one, row, axis=0) for one, row in zip(scores, rows, strict=True)]
         return float(statistic(*drawn))
 
-    low, high = bootstrap(redraw, resamples)
-    return Interval(float(statistic(*scores)), float(low), float(high), sum(map(len, scores)))
+    return _figure(statistic(*scores), bootstrap(redraw, resamples), sum(map(len, scores)))
 
 
 def probability_of_improvement(a: Array, b: Array, less_is_better: bool) -> float:
@@ -137,10 +126,3 @@ def probability_of_improvement(a: Array, b: Array, less_is_better: bool) -> floa
     left, right = a[:, None, :], b[None, :, :]
     wins = (left < right) if less_is_better else (left > right)
     return float(np.mean(wins + 0.5 * (left == right)))
-
-
-def better(interval: Interval) -> bool | None:
-    """Whether a probability of improvement says better (True), worse (False), or leaves it open (None)."""
-    if interval.low > 0.5:
-        return True
-    return False if interval.high < 0.5 else None

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import io
 import json
 import logging
 import os
 import socket
-import tarfile
 import tempfile
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -28,7 +26,7 @@ from finssim.experiments.campaign import Progress, keep_result, kept_result, spr
 from finssim.experiments.compare import MEASURES
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
-from finssim.experiments.tables import Table
+from finssim.experiments.tables import Table, cells
 from finssim.files import atomic_directory, plain_name
 from finssim.learning.train import train
 from finssim.provenance import provenance
@@ -246,31 +244,23 @@ def _placed(value: Any, folder: Path, key: Any = "") -> Any:
     return str(beside.resolve()) if beside is not None and beside.is_file() else value
 
 
-def play(job: Job) -> tuple[dict[str, Any], bytes]:
+def play(job: Job) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Train and evaluate, on whatever machine.
 
     Returns:
-        A row of the table (results by plant, time, machine) and the policy directory, packed.
+        A row of the table (results by plant, time, machine) and the files of the policy directory by name.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "policy"
-        quiet = Console(file=io.StringIO())
-        train(job.task, out=out, vehicle=job.vehicle, seed=job.seed, console=quiet, **job.options)
-        trained = time.perf_counter() - began
-        results = {
-            plant.name: evaluate_controller(
-                out, plant, task=job.task, vehicle=job.vehicle, trials=job.trials
-            ).result
-            for plant in map(load_plant, job.plants)
-        }
-        packed = io.BytesIO()
-        with tarfile.open(fileobj=packed, mode="w:gz") as archive:
-            for path in sorted(out.iterdir()):
-                archive.add(path, arcname=path.name)
-        row = {"training_s": trained, "machine": socket.gethostname(), "plants": results}
-        return row, packed.getvalue()
+        out, about = Path(folder) / "policy", {"task": job.task, "vehicle": job.vehicle}
+        train(out=out, seed=job.seed, console=Console(quiet=True), **about, **job.options)
+        row = {"training_s": time.perf_counter() - began, "machine": socket.gethostname()}
+        evaluations = (
+            evaluate_controller(out, load_plant(x), trials=job.trials, **about) for x in job.plants
+        )
+        row["plants"] = {one.result["plant"]["name"]: one.result for one in evaluations}
+        return row, {path.name: path.read_bytes() for path in out.iterdir()}
 
 
 def _here(jobs: Sequence[Job], processes: int | None) -> Generator[tuple[Job, Any], None, None]:
@@ -463,10 +453,10 @@ def _keep(job: Job, outcome: Any, runs: Path) -> dict[str, Any]:
     about = {"name": job.name, "seed": job.seed, "run": job.key, "options": dict(job.options)}
     if isinstance(outcome, BaseException):
         return {**about, "error": f"{type(outcome).__name__}: {outcome}"}
-    row, packed = {**about, **outcome[0]}, io.BytesIO(outcome[1])
+    row, files = {**about, **outcome[0]}, outcome[1]
     with atomic_directory(runs / job.key, replaces=ROW_FILE) as folder:
-        with tarfile.open(fileobj=packed, mode="r:gz") as archive:
-            archive.extractall(folder, filter="data")
+        for name, content in files.items():
+            (folder / plain_name(name, "file of a policy", SweepError)).write_bytes(content)
         keep_result(folder / ROW_FILE, row)
     return row
 
@@ -478,13 +468,15 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     measures = list(first.get("metrics", ())) or [
         name for name in MEASURES.get(str(first.get("task")), ()) if name in first
     ]
+    counted = "success" if "metrics" not in first else ""
+    columns = {name: (name, "" if name == counted else ".4g") for name in measures}
     rows = []
     for row in result["rows"]:
         if "error" in row:
             texts = [row["error"], *[""] * len(measures)][: len(measures)]
             rows.append([row["name"], str(row["seed"]), "–", "–", *texts])
         for plant, one in row.get("plants", {}).items():
-            texts = [_cell(one, measure) for measure in measures]
+            texts = cells(one.get("metrics", one), columns)
             rows.append([row["name"], str(row["seed"]), plant, f"{row['training_s']:.0f}", *texts])
     heads = ["run", "seed", "plant", "time [s]", *measures]
     tables = [Table(title="Sweep", heads=heads, rows=rows, left=(0, 2))]
@@ -493,10 +485,3 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         title = f"Best: {best['name']}, {best['measure']} {best['value']:.4g}"
         tables.append(Table(title=title, heads=["option", "value"], rows=rows, left=(0, 1)))
     return tables
-
-
-def _cell(result: Mapping[str, Any], measure: str) -> str:
-    if "metrics" not in result and measure == "success":
-        return f"{result['success']}/{result['trials']}"
-    value = result["metrics"][measure]["value"] if "metrics" in result else result[measure]
-    return "–" if value is None else f"{value:.4g}"

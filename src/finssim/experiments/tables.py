@@ -66,13 +66,6 @@ def markdown_table(heads: Sequence[str], rows: Rows, *, left: Sequence[int] = (0
     return "\n".join("| " + " | ".join(line) + " |" for line in (heads, rule, *rows) if line is not None)
 
 
-def html_row(cells: Sequence[str], kind: str | None = None) -> str:
-    """The same in a report: one row, of a class of its own if it is the paper's."""
-    kind = ("theirs" if paper(cells) else "") if kind is None else kind
-    attribute = f' class="{kind}"' if kind else ""
-    return f"<tr{attribute}>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
-
-
 @dataclass(frozen=True, kw_only=True)
 class Table:
     """What a person reads of an experiment: a table with the words around it, or the words alone."""
@@ -126,7 +119,10 @@ def html_of(tables: Sequence[Table], folder: Path) -> list[str]:
     parts = []
     for table in tables:
         parts += [f"<h2>{escape(table.title)}</h2>", f"<p>{escape(table.headline)}</p>"]
-        rows = [html_row(row) for row in table.rows if row is not None]
+        rows = []
+        for row in filter(None, table.rows):
+            kind = ' class="theirs"' if paper(row) else ""
+            rows.append(f"<tr{kind}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>")
         parts.append(html_table(table.heads, rows) if rows else "")
         sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in table.sentences)
         parts.append(f'<p class="note">{escape(table.note)}</p><ul>{sentences}</ul>')
@@ -138,9 +134,24 @@ def html_of(tables: Sequence[Table], folder: Path) -> list[str]:
     return parts
 
 
-def figure_text(figure: Mapping[str, Any] | None, form: str, factor: float = 1.0) -> str:
-    """A figure and its interval as text; – where there is none."""
-    if figure is None or figure["value"] is None:
+Columns = Mapping[str, tuple[str, str] | tuple[str, str, float]]
+"""Key of a result -> heading, format, and a factor where its unit is another; without a format it is a count of trials.
+"""
+
+
+def figure_text(figure: Mapping[str, Any] | float | None, form: str, factor: float = 1.0) -> str:
+    """A figure as text, with its interval in brackets where it has one; – where there is none."""
+    value = figure["value"] if isinstance(figure, Mapping) else figure
+    if value is None:
         return "–"
-    value, low, high = (factor * x for x in (figure["value"], *figure["ci95"]))
-    return f"{value:{form}} [{low:{form}}, {high:{form}}]"
+    bounds = figure["ci95"] if isinstance(figure, Mapping) else ()
+    numbers = ["–" if x is None else format(factor * x, form) for x in (value, *bounds)]
+    return f"{numbers[0]} [{numbers[1]}, {numbers[2]}]" if numbers[1:] else numbers[0]
+
+
+def cells(row: Mapping[str, Any], columns: Columns) -> list[str]:
+    """A row's figures as text, in the order of the columns."""
+    return [
+        figure_text(row.get(key), *form) if form[0] else f"{row[key]}/{row['trials']}" if key in row else ""
+        for key, (_, *form) in columns.items()
+    ]

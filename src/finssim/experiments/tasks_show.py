@@ -7,7 +7,9 @@ import inspect
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, fields, is_dataclass
+from itertools import pairwise
 from typing import Any
 
 from finssim.control.modes import AXES, action_mode
@@ -27,25 +29,17 @@ def attribute_docs(kind: type) -> dict[str, str]:
 
     Python does not keep the sentences under a dataclass' fields, their source does.
     """
-    found: dict[str, str] = {}
+    docs: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
-        try:
+        with suppress(OSError, TypeError, SyntaxError):
             (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        except (OSError, TypeError, SyntaxError):
-            continue
-        body = tree.body if isinstance(tree, ast.ClassDef) else []
-        for line, after in zip(body, body[1:], strict=False):
-            told = after.value if isinstance(after, ast.Expr) else None
-            if (
-                isinstance(line, ast.AnnAssign)
-                and isinstance(line.target, ast.Name)
-                and isinstance(told, ast.Constant)
-            ):
-                found[line.target.id] = " ".join(str(told.value).split())
-    return found
+            for line, below in pairwise(getattr(tree, "body", ())):
+                if isinstance(line, ast.AnnAssign) and isinstance(below, ast.Expr):
+                    docs[ast.unparse(line.target)] = " ".join(str(ast.literal_eval(below.value)).split())
+    return docs
 
 
-SEPARATE = ("name", "observation", "control_step", "substeps", "time_limit", "training_noise")
+SEPARATE = ("name", "observation", "control_step", "substeps", "time_limit", "training_noise", "reward")
 """Fields that are told by themselves."""
 
 
@@ -71,11 +65,15 @@ def describe_task(
     mode = action or the_task.action
     vehicles = crew(vehicle, the_task, mode)
     the_task = the_task.fitted(vehicles)
-    terms, parts, first = the_task.terms(), [], 0
-    for part in the_task.observation:
-        about = {name: getattr(part, name) for name in ("name", "size", "unit", "scale", "clip")}
-        parts.append({"first": first, **about, "told": _text(the_task, part.term)})
-        first += part.size
+    terms, entries = the_task.terms(), the_task.schema.entries
+    parts = [
+        {
+            "first": entry.indices[0],
+            **{name: getattr(part, name) for name in ("name", "size", "unit", "scale", "clip")},
+            "told": _text(the_task, part.term),
+        }
+        for entry, part in zip(entries, the_task.observation, strict=True)
+    ]
     return {
         "name": the_task.name,
         "title": the_task.title or (inspect.getdoc(type(the_task)) or "").partition("\n")[0].rstrip("."),
@@ -137,14 +135,9 @@ def _reward(task: Task) -> dict[str, Any]:
 
 def _settings(task: Task) -> list[dict[str, Any]]:
     """What can be changed, and what is drawn in every episode."""
-    docs, told = attribute_docs(type(task)), []
-    for field in fields(task):
-        value = getattr(task, field.name)
-        if field.name in SEPARATE or field.name == "reward":
-            continue
-        plain = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
-        told.append({"name": field.name, "value": _limited(plain), "told": docs.get(field.name, "")})
-    return told
+    docs, values = attribute_docs(type(task)), task.record()
+    names = (field.name for field in fields(task) if field.name not in SEPARATE)
+    return [{"name": name, "value": _limited(values[name]), "told": docs.get(name, "")} for name in names]
 
 
 def _limited(value: Any) -> Any:
@@ -193,26 +186,28 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         heads = ("task", "agents", "sees", "does", "every [s]", "for [s]", "baseline", "what is to be done")
         return [Table(title="", heads=heads, rows=rows, left=(0, 6, 7), whole=(0, 6))]
     parts = {
-        "Observation, of one agent: each over its scale, within ± clip": result["observation"]["parts"],
-        "Action: what -1 and 1 stand for": result["action"]["components"],
-        "Reward, in every step": result["reward"]["terms"],
-        "Ends": result["ends"],
-        "Counted": result["totals"],
-        "Settings": result["settings"],
+        "Observation, of one agent: each over its scale, within ± clip": (result["observation"]["parts"], ""),
+        "Action: what -1 and 1 stand for": (result["action"]["components"], ""),
+        "Reward, in every step": (result["reward"]["terms"], result["reward"]["told"]),
+        "Ends": (result["ends"], ""),
+        "Counted": (result["totals"], ""),
+        "Settings": (result["settings"], ""),
     }
-    notes = {"Reward, in every step": result["reward"]["told"]}
-    tables = [
-        Table(
-            title=title,
-            heads=[head.replace("told", "meaning") for head in rows[0]] if rows else (),
-            rows=[[_value(value) for value in row.values()] for row in rows],
-            left=range(9),
-            note=notes.get(title, ""),
-        )
-        for title, rows in parts.items()
-    ]
     first = Table(title=result["name"], headline="\n".join(_head(result)))
-    return [first, *(table for table in tables if table.rows or table.note)]
+    return [
+        first,
+        *(
+            Table(
+                title=title,
+                heads=[head.replace("told", "meaning") for head in (rows or ({},))[0]],
+                rows=[[_value(value) for value in row.values()] for row in rows],
+                left=range(9),
+                note=note,
+            )
+            for title, (rows, note) in parts.items()
+            if rows or note
+        ),
+    ]
 
 
 def _head(result: Mapping[str, Any]) -> list[str]:

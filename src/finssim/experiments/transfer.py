@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,22 +15,14 @@ from rich.console import Console
 from finssim.control.controllers import COSTLY
 from finssim.control.policy import Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.campaign import Progress, check_choices, run_jobs, write_json
-from finssim.experiments.evaluate import T1_COLUMNS, cells
+from finssim.experiments.campaign import Progress, Show, check_choices, write_json
+from finssim.experiments.evaluate import T1_COLUMNS
 from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row, paper_t2_row
 from finssim.experiments.on_robot import Attendant, OnRobot
-from finssim.experiments.pool_trial import (
-    FIRMWARES,
-    HARDWARE,
-    Job,
-    firmware_of,
-    play,
-    played_trial,
-    run_on_robot,
-)
-from finssim.experiments.statistics import Interval, Statistic, paired_difference, with_interval
-from finssim.experiments.tables import Table, figure_text
+from finssim.experiments.pool_trial import FIRMWARES, HARDWARE, Job, firmware_of, play_jobs, played_trial
+from finssim.experiments.statistics import Statistic, paired_difference, with_interval
+from finssim.experiments.tables import Columns, Table, cells
 from finssim.experiments.trials import T2_TRAJECTORIES
 from finssim.learning.train import train
 from finssim.provenance import provenance
@@ -47,28 +40,15 @@ DIFFERENCES_NOTE = (
 FORGETFUL = {"integral": False, "history": 0, "last_action": False}
 """Settings of the learner, for policies as the paper's."""
 
-MEASURES = {
-    "success_rate": ("held [points]", 100.0, ".0f"),
-    "e_p_m": ("e_p [cm]", 100.0, ".1f"),
-    "e_psi_deg": ("e_psi [°]", 1.0, ".1f"),
-    "horizontal_rmse_m": ("horizontal [cm]", 100.0, ".1f"),
-    "vertical_rmse_m": ("vertical [cm]", 100.0, ".1f"),
-    "p95_m": ("P95 [cm]", 100.0, ".1f"),
+MEASURES: Columns = {
+    "success_rate": ("held [points]", "+.0f", 100.0),
+    "e_p_m": ("e_p [cm]", "+.1f", 100.0),
+    "e_psi_deg": ("e_psi [°]", "+.1f"),
+    "horizontal_rmse_m": ("horizontal [cm]", "+.1f", 100.0),
+    "vertical_rmse_m": ("vertical [cm]", "+.1f", 100.0),
+    "p95_m": ("P95 [cm]", "+.1f", 100.0),
 }
-"""Key in which rows are compared -> heading, factor and format of a difference."""
-
-
-@dataclass(frozen=True)
-class Training:
-    """What a policy is trained in."""
-
-    name: str
-    task: str = "t1"
-    hydrodynamics: str = "calibrated"
-    randomize: str | None = None
-    """Name or file of ranges."""
-    remembers: bool = False
-    """Whether the policy has integrals of its errors and sees what it saw and did before; those of the paper do not."""
+"""Key in which rows are compared, for the table of differences."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,14 +56,16 @@ class Row:
     """One row of a table: who steers and what is taken from it; see `rows.yaml`."""
 
     title: str
-    training: Training | None
-    """None for a PID."""
+    training: Mapping[str, Any] | None = None
+    """What its policy is trained in, as `rows.yaml` has it; None for a PID."""
     controller: str = ""
     """Name of the PID."""
     paper: str | None = None
     """Row of the paper's table; None where it has none."""
     changes: dict[str, Any] = field(default_factory=dict)
     """Fields of its jobs."""
+    targets: Sequence[str] | None = None
+    """What is played, if not all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,8 +85,8 @@ class Spec:
     """What targets are, in the plural."""
     by_target: bool
     """Whether the table has a line for each target."""
-    columns: Mapping[str, tuple[str, str]]
-    """Key of a trial's result -> heading and format."""
+    columns: Columns
+    """Of a row."""
     note: str
     base: str
     """The row that the others are compared with."""
@@ -133,16 +115,12 @@ class Spec:
 
     def tables(self, result: Mapping[str, Any]) -> list[Table]:
         """The table of a result, and that of the differences from the reference row, where there are some."""
-        units = {key: MEASURES[key] for key in self.differences}
+        units: Columns = {key: MEASURES[key] for key in self.differences}
         rows = []
         for name, differences in result["differences"].items():
-            row, theirs = self.rows[name], self.paper_differences(self.rows[name])
-            texts = (figure_text(differences[key], f"+{form}", by) for key, (_, by, form) in units.items())
-            rows.append([row.title, *texts])
-            if theirs is not None:
-                rows.append(
-                    ["  paper", *(f"{by * theirs[key]:+{form}}" for key, (_, by, form) in units.items())]
-                )
+            rows.append([self.rows[name].title, *cells(differences, units)])
+            if theirs := self.paper_differences(self.rows[name]):
+                rows.append(["  paper", *cells(theirs, units)])
         differences = Table(
             title=f"{self.name.upper()}: differences from {self.rows[self.base].title}",
             heads=["", *(heading for heading, *_ in units.values())],
@@ -159,22 +137,19 @@ class Spec:
             title = f"{row.title}, hardware" if hardware else row.title
             for target, figures in (of_row["by_target"] if self.by_target else {"": of_row}).items():
                 names = [target] if self.by_target else []
-                texts = [figure_text(figures[key], form) for key, (_, form) in self.columns.items()]
-                rows.append([title, *names, f"{figures['success']}/{figures['trials']}", *texts])
-                theirs = self.paper(row.paper, target) if row.paper else None
-                if theirs is not None:
-                    success = f"{theirs['success']}/{theirs['trials']}" if "success" in theirs else ""
-                    rows.append([f"  paper: {row.paper}", *names, success, *cells(theirs, self.columns)])
+                rows.append([title, *names, *cells(figures, self.columns)])
+                if row.paper and (theirs := self.paper(row.paper, target)):
+                    rows.append([f"  paper: {row.paper}", *names, *cells(theirs, self.columns)])
         source, units = (
             ("hardware, by the robot's own estimate, whose error is not in it", "seeds")
             if hardware
             else ("a virtual pool whose vehicle, water and camera no training has seen", "plants and seeds")
         )
-        first = ["trajectory", "done"] if self.by_target else ["success"]
+        first = ["trajectory"] if self.by_target else []
         return Table(
             title=f"{self.title} ({self.name.upper()})",
             headline=f"{self.name.upper()} {played_in(result, self.kind)}",
-            heads=["", *first, *(heading for heading, _ in self.columns.values())],
+            heads=["", *first, *(heading for heading, *_ in self.columns.values())],
             rows=rows,
             note=f"ours: {source}; mean, in brackets 95 % from a bootstrap of {units}{self.note}",
             pictures=dict([self.picture]),
@@ -198,7 +173,10 @@ def transfer_experiment(
     processes: Annotated[int | None, (1, None)] = None,
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
+    pool_vehicle: Annotated[str | None, "python"] = None,
+    console: Console | None = None,
     progress: Progress = lambda part, what: None,
+    show: Show = lambda job, result: None,
 ) -> dict[str, Any]:
     """Train what the rows need, play every target in every plant with every seed, and write the table.
 
@@ -224,7 +202,10 @@ def transfer_experiment(
         processes: Trials at once; as many as processors if not given.
         robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
         attendant: The person beside that robot, instead of the terminal's keyboard.
+        pool_vehicle: Name or file of the vehicle around which the pools' own are drawn; `vehicle` if None.
+        console: Where a robot's state is told; standard error if None.
         progress: Told the share that is done and what comes next.
+        show: Given each trial of a pool and its result, as soon as there is one.
 
     Returns:
         What NAME.json holds.
@@ -247,14 +228,9 @@ def transfer_experiment(
     firmware = firmware_of(firmware, load_vehicle(vehicle), robot)
     action, site, sees = FIRMWARES[firmware]
     controllers = controllers_of(
-        chosen,
-        run_seeds,
-        folder,
-        vehicle,
-        steps,
+        spec.name, chosen, run_seeds, folder, vehicle, steps, action,
         lambda part, what: progress(TRAINING_SHARE * part, what),
-        action,
-    )
+    )  # fmt: skip
     if robot is not None:  # there is one plant, and nobody chose its severity
         pools, severity, camera = range(1), HARDWARE, HARDWARE
         site = robot.site if firmware == "ardusub" else site
@@ -262,18 +238,16 @@ def transfer_experiment(
         camera = sees
     jobs = [
         Job(
-            row=name, controller=controllers[name, s], target=target, vehicle=vehicle, pool_vehicle=vehicle,
-            plant=plant, severity=severity, seed=s, camera=camera, site=site, firmware=firmware, **row.changes,
+            row=name, controller=controllers[name, s], target=target, vehicle=vehicle,
+            pool_vehicle=pool_vehicle or vehicle, plant=plant, severity=severity, seed=s, site=site, firmware=firmware,
+            **{"camera": camera, **row.changes},
         )
-        for name, row in chosen.items() for plant in pools for s in run_seeds for target in targets
+        for name, row in chosen.items() for plant in pools for s in run_seeds for target in row.targets or targets
     ]  # fmt: skip
-    if robot is None:
-        results = run_jobs(
-            jobs, folder / "trials", play, processes=processes,
-            progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
-        )  # fmt: skip
-    else:
-        results = run_on_robot(jobs, folder / "trials", robot, attendant=attendant)
+    results = play_jobs(
+        jobs, folder / "trials", robot, attendant=attendant, console=console, processes=processes, show=show,
+        progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
+    )  # fmt: skip
     by_row = {name: [r for r in results if r["job"]["row"] == name] for name in chosen}
     by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
     body = load_vehicle(vehicle)
@@ -289,68 +263,47 @@ def transfer_experiment(
 
 
 def controllers_of(
+    task: str,
     rows: Mapping[str, Row],
     seeds: Sequence[int],
     folder: Path,
     vehicle: str,
-    steps: int | None,
-    progress: Progress,
-    action: str | None = None,
-) -> dict[tuple[str, int], str]:
-    """Who steers, by row and seed: a policy's directory in `policies` of the folder, or the name of a PID.
-
-    Args:
-        rows: Of a table.
-        seeds, vehicle, steps, progress, action: As of `trained`.
-        folder: Of the experiment.
-    """
-    trainings = list(dict.fromkeys(row.training for row in rows.values() if row.training))
-    policies = trained(
-        trainings, seeds, folder / "policies", vehicle=vehicle, steps=steps, action=action, progress=progress
-    )
-    return {
-        (name, seed): str(policies[row.training.name, seed]) if row.training else row.controller
-        for name, row in rows.items()
-        for seed in seeds
-    }
-
-
-def trained(
-    trainings: Iterable[Training],
-    seeds: Iterable[int],
-    folder: Path,
-    *,
-    vehicle: str,
     steps: int | None = None,
     action: str | None = None,
     progress: Progress = lambda part, what: None,
-) -> dict[tuple[str, int], Path]:
-    """Policy directories of every training and seed; what is finished in the folder is not trained again.
+) -> dict[tuple[str, int], str]:
+    """Who steers, by row and seed; policies that are not finished in the folder are trained.
 
     Args:
-        trainings: Each under a name of its own.
+        task: Of the policies.
+        rows: Of a table.
         seeds: Of the trainings.
-        folder: Where the directories are and come.
+        folder: Of the experiment, whose `policies` has the directories.
         vehicle: Name or file.
-        steps: Control steps of each; the task's own if None.
+        steps: Control steps of each training; the task's own if None.
         action: Mode; the task's own if None.
         progress: Told the share that is done and what comes next.
 
     Returns:
-        (name, seed) -> directory.
+        (row, seed) -> directory of a policy, or the name of a PID.
     """
-    plan = [(training, seed) for training in trainings for seed in seeds]
-    policies: dict[tuple[str, int], Path] = {}
-    for done, (training, seed) in enumerate(plan):
-        policies[training.name, seed] = place = folder / f"{training.name}-seed{seed}"
-        progress(done / len(plan), f"training {training.name}, seed {seed}")
-        if not finished(place):
+    controllers, body = {}, load_vehicle(vehicle)
+    plan = [(name, row, seed) for name, row in rows.items() for seed in seeds]
+    for done, (name, row, seed) in enumerate(plan):
+        controllers[name, seed] = row.controller
+        if row.training is None:
+            continue
+        options = {"name": name, "remembers": False, **row.training}
+        label, remembers = options.pop("name"), options.pop("remembers")
+        policy = folder / "policies" / f"{label}-seed{seed}"
+        controllers[name, seed] = str(policy)
+        progress(done / len(plan), f"training {label}, seed {seed}")
+        if not finished(policy, body):
             train(
-                training.task, out=place, vehicle=vehicle, action=action, hydrodynamics=training.hydrodynamics,
-                randomize=training.randomize, seed=seed, steps=steps, settings={} if training.remembers else FORGETFUL,
-                console=Console(stderr=True, quiet=True),
+                task, out=policy, vehicle=vehicle, action=action, seed=seed, steps=steps, **options,
+                settings={} if remembers else FORGETFUL, console=Console(stderr=True, quiet=True),
             )  # fmt: skip
-    return policies
+    return controllers
 
 
 def finished(place: Path, vehicle: Vehicle | None = None) -> bool:
@@ -370,29 +323,21 @@ def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
     """Figures of every row, all targets together and each alone; differences from the reference."""
     rows = {}
     for name, results in by_row.items():
-        by_target: dict[str, list[Mapping[str, Any]]] = {}
-        for result in results:
-            by_target.setdefault(result["job"]["target"], []).append(result)
-        each = {target: row_figures(of_target, spec.figures) for target, of_target in by_target.items()}
+        targets = dict.fromkeys(result["job"]["target"] for result in results)
+        each = {
+            target: row_figures([r for r in results if r["job"]["target"] == target], spec.figures)
+            for target in targets
+        }
         rows[name] = {**row_figures(results, spec.figures), "by_target": each}
+    paired = {
+        name: {key: _by_trial(results, key) for key in spec.differences} for name, results in by_row.items()
+    }
     differences = {
-        name: {key: _difference(by_row[spec.base], results, key) for key in spec.differences}
-        for name, results in by_row.items()
-        if spec.base in by_row and name != spec.base
+        name: {key: paired_difference(paired[spec.base][key], values) for key, values in of_row.items()}
+        for name, of_row in paired.items()
+        if spec.base in paired and name != spec.base
     }
-    return {
-        "rows": rows,
-        "base": spec.base,
-        "differences": {
-            name: {key: d and d.as_json() for key, d in of_row.items()}
-            for name, of_row in differences.items()
-        },
-    }
-
-
-def _cluster(result: Mapping[str, Any]) -> tuple[int, int]:
-    """Plant and seed, which trials share."""
-    return result["job"]["plant"], result["job"]["seed"]
+    return {"rows": rows, "base": spec.base, "differences": differences}
 
 
 def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Statistic]) -> dict[str, Any]:
@@ -406,53 +351,35 @@ def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Stat
         `trials`, `success` (count), `stopped` (trials that ended in a fault), `worst_success` (fewest successes of a
         plant and seed, of `per_cluster` trials each), and by key an interval, or None where no trial has a figure.
     """
-    clusters: dict[Hashable, list[Mapping[str, Any]]] = {}
-    for result in results:
-        clusters.setdefault(_cluster(result), []).append(result)
-    counts = [sum(bool(r["success"]) for r in group) for group in clusters.values()]
+    clusters = Counter((r["job"]["plant"], r["job"]["seed"]) for r in results)
+    held = Counter((r["job"]["plant"], r["job"]["seed"]) for r in results if r["success"])
     out: dict[str, Any] = {
         "trials": len(results),
-        "success": sum(counts),
+        "success": held.total(),
         "stopped": sum(bool(r["fault"]) for r in results),
-        "worst_success": min(counts),
-        "per_cluster": max(len(group) for group in clusters.values()),
+        "worst_success": min(held[cluster] for cluster in clusters),
+        "per_cluster": max(clusters.values()),
     }
     for key, statistic in figures.items():
-        values = {
-            cluster: [x for r in group if (x := _figure(r, key)) is not None]
-            for cluster, group in clusters.items()
-        }
-        interval = with_interval(values, statistic)
-        out[key] = interval and interval.as_json()
+        values: dict[Hashable, list[float]] = {}
+        for (plant, seed, _), x in _by_trial(results, key).items():
+            values.setdefault((plant, seed), []).append(x)
+        out[key] = with_interval(values, statistic)
     return out
 
 
-def _difference(
-    reference: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]], key: str
-) -> Interval | None:
-    """Mean of other - reference over the trials that both have a figure for, paired by plant, seed and target."""
-    ours, theirs = (
-        {(*_cluster(r), r["job"]["target"]): x for r in results if (x := _figure(r, key)) is not None}
-        for results in (reference, other)
-    )
-    return paired_difference(ours, theirs)
-
-
-def _figure(result: Mapping[str, Any], key: str) -> float | None:
-    value = result["success"] if key == "success_rate" else result[key]
-    return None if value is None else float(value)
+def _by_trial(results: Sequence[Mapping[str, Any]], key: str) -> dict[tuple[int, int, str], float]:
+    """Plant, seed and target -> the figure of that trial, where it has one."""
+    measure = "success" if key == "success_rate" else key
+    return {
+        (r["job"]["plant"], r["job"]["seed"], r["job"]["target"]): float(r[measure])
+        for r in results
+        if r[measure] is not None
+    }
 
 
 ROWS: Mapping[str, Mapping[str, Row]] = {
-    task: {
-        name: Row(
-            **{k: v for k, v in row.items() if k != "training"},
-            training=Training(**{"name": name, "task": task, **row["training"]})
-            if "training" in row
-            else None,
-        )
-        for name, row in rows.items()
-    }
+    task: {name: Row(**row) for name, row in rows.items()}
     for task, rows in yaml.safe_load(
         Path(__file__).with_name("rows.yaml").read_text(encoding="utf-8")
     ).items()
@@ -515,7 +442,7 @@ T1 = Spec(
     known_targets=tuple(T1_SETPOINTS),
     kind="setpoints",
     by_target=False,
-    columns={key: column for key, column in T1_COLUMNS.items() if key != "success"},
+    columns=T1_COLUMNS,
     note=". paper: its vehicle in its pool, one seed. errors: 40-60 s; e_y is vertical; "
     "success: 0.10 m on each axis and 10° for 10 s. t_s (median) and jitter are of successful trials.",
     base="calibrated",
@@ -538,6 +465,7 @@ T2 = Spec(
     kind="trajectories",
     by_target=True,
     columns={
+        "success": ("done", ""),
         "horizontal_rmse_m": ("horizontal RMSE [m]", ".3f"),
         "vertical_rmse_m": ("vertical RMSE [m]", ".3f"),
         "p95_m": ("3-D P95 [m]", ".3f"),

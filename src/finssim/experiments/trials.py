@@ -357,13 +357,13 @@ def summarize_episodes(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """One controller's row: means over the episodes, and where a bootstrap over them puts each mean.
 
     Returns:
-        `trials`, `valid` (episodes whose world did not break), `metrics` (name -> value, ci95) and `per_trial`.
+        `trials`, `valid` (episodes whose world did not break), `metrics` (name -> figure) and `per_trial`.
     """
     metrics: dict[str, Any] = {}
     for name in (name for name in trials[0] if name not in LABELS):
         values = [float(trial[name]) for trial in trials if trial[name] is not None]
-        mean = with_interval({i: [x] for i, x in enumerate(values)})
-        metrics[name] = {"value": mean and mean.value, "ci95": mean and [mean.low, mean.high]}
+        nothing = {"value": None, "ci95": [None, None], "count": 0}
+        metrics[name] = with_interval({i: [x] for i, x in enumerate(values)}) or nothing
     return {
         "trials": len(trials),
         "valid": sum(trial["return"] is not None for trial in trials),

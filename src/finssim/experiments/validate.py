@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from finssim.control.allocation import Allocator
 from finssim.engine import Simulator
@@ -28,54 +26,7 @@ class ValidationError(ValueError):
     """There is nothing published to compare with."""
 
 
-@dataclass(frozen=True)
-class Response:
-    """One published response, and ours."""
-
-    name: str
-    axis: str
-    command: float
-    """About the centre of gravity [N or N m]."""
-    applied: float
-    """The same axis of the wrench that the thrusters can give [N or N m]."""
-    simulated: float
-    """Steady speed [m/s or rad/s]."""
-    measured: tuple[float, float]
-    """Published, least and greatest [m/s or rad/s]."""
-    why: str = ""
-    """What is known of a disagreement."""
-
-    @property
-    def difference(self) -> float:
-        """(simulated - measured) / measured, from the nearer end of the measured range; 0 inside it."""
-        low, high = self.measured
-        speed = abs(self.simulated)
-        nearest = min(max(speed, low), high)
-        return (speed - nearest) / nearest
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the difference is at most `AGREES`."""
-        return abs(self.difference) <= AGREES
-
-
-def published(vehicle: Vehicle) -> dict[str, Any]:
-    """The responses published for a vehicle.
-
-    Raises:
-        ValidationError: none are, and it says for which vehicles some are.
-    """
-    path = PUBLISHED / f"{vehicle.name}.yaml"
-    if not path.is_file():
-        have = ", ".join(sorted(p.stem for p in PUBLISHED.glob("*.yaml")))
-        raise ValidationError(
-            f"no published responses of '{vehicle.name}' to compare with; available: {have}"
-        )
-    data: dict[str, Any] = yaml.safe_load(path.read_text())
-    return data
-
-
-def simulate_responses(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> list[Response]:
+def simulate_responses(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> dict[str, Any]:
     """Apply every published command to the vehicle at rest in deep water, all as worlds of one batch.
 
     Args:
@@ -83,51 +34,52 @@ def simulate_responses(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> l
         hydrodynamics: The model.
 
     Returns:
-        One response per published one, in that order; speeds are means over the last quarter of the run.
+        `source` of what is published, and `responses`, each with `name`, `axis`, `command` about the centre of gravity
+        and `applied`, the same axis of the wrench that the thrusters can give [N or N m]; `simulated`, mean speed over
+        the last quarter of the run, and `measured`, the least and greatest published [m/s or rad/s]; `difference`,
+        relative and from the nearer end of the measured range, 0 inside it; `agrees`; `why`, what is known of a
+        disagreement.
+
+    Raises:
+        ValidationError: Nothing is published of this vehicle, and it says for which vehicles something is.
     """
-    cases = published(vehicle)["responses"]
-    axis = [AXES.index(case["axis"]) for case in cases]
+    path = PUBLISHED / f"{vehicle.name}.yaml"
+    if not path.is_file():
+        have = ", ".join(sorted(p.stem for p in PUBLISHED.glob("*.yaml")))
+        raise ValidationError(
+            f"no published responses of '{vehicle.name}' to compare with; available: {have}"
+        )
+    data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    cases = data["responses"]
+    rows, axis = np.arange(len(cases)), [AXES.index(case["axis"]) for case in cases]
     tau = np.zeros((len(cases), 6))
-    tau[np.arange(len(cases)), axis] = [case["command"] for case in cases]
+    tau[rows, axis] = [case["command"] for case in cases]
     allocator = Allocator.from_vehicle(vehicle)
     thrust = allocator.allocate(tau)
-    speed = steady_speeds(vehicle, hydrodynamics, thrust)
-    given = allocator.achieved(thrust)
-    return [
-        Response(
-            name=case["name"],
-            axis=case["axis"],
-            command=case["command"],
-            applied=float(given[i, axis[i]]),
-            simulated=float(speed[i, axis[i]]),
-            measured=(case["measured"][0], case["measured"][1]),
-            why=case.get("why", "").strip(),
-        )
-        for i, case in enumerate(cases)
-    ]
-
-
-def steady_speeds(vehicle: Vehicle, hydrodynamics: str, thrust: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean nu over the last quarter of a run from rest under constant thrust.
-
-    Args:
-        vehicle: The vehicle.
-        hydrodynamics: The model.
-        thrust: Of each thruster, in the vehicle's order [N], (cases, n).
-
-    Returns:
-        Twist, body frame [m/s, rad/s], (cases, 6).
-    """
-    simulator = Simulator(vehicle, worlds=len(thrust), hydrodynamics=hydrodynamics, control_step=0.1)
+    simulator = Simulator(vehicle, worlds=len(cases), hydrodynamics=hydrodynamics, control_step=0.1)
     simulator.place(position=(0.0, 0.0, -100.0))
     simulator.set_thrust(thrust[:, None, :])
-    steps = round(DURATION / simulator.control_step)
-    total = np.zeros((len(thrust), 6))
-    for step in range(steps):
+    speeds = []
+    for _ in range(round(DURATION / simulator.control_step)):
         simulator.step()
-        if step >= 3 * steps // 4:
-            total += simulator.numpy("velocity")[:, 0]
-    return total / (steps - 3 * steps // 4)
+        speeds.append(simulator.numpy("velocity")[rows, 0, axis].astype(float))
+    simulated = np.mean(speeds[3 * len(speeds) // 4 :], axis=0)
+    low, high = np.transpose([case["measured"] for case in cases])
+    nearest = np.clip(np.abs(simulated), low, high)
+    difference = np.abs(simulated) / nearest - 1.0
+    numbers = {
+        "applied": allocator.achieved(thrust)[rows, axis],
+        "simulated": simulated,
+        "difference": difference,
+        "agrees": np.abs(difference) <= AGREES,
+    }
+    return {
+        "source": data["source"],
+        "responses": [
+            {"why": "", **case, **{name: values[i].item() for name, values in numbers.items()}}
+            for i, case in enumerate(cases)
+        ],
+    }
 
 
 def validate(name: str, *, hydrodynamics: str = "calibrated") -> dict[str, Any]:
@@ -143,13 +95,10 @@ def validate(name: str, *, hydrodynamics: str = "calibrated") -> dict[str, Any]:
         ValidationError: nothing is published of this vehicle.
     """
     vehicle = load_vehicle(name)
-    source = published(vehicle)["source"]
-    responses = simulate_responses(vehicle, hydrodynamics)
     return {
         "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
         "hydrodynamics": hydrodynamics,
-        "source": source,
-        "responses": [{**asdict(r), "difference": r.difference, "agrees": r.agrees} for r in responses],
+        **simulate_responses(vehicle, hydrodynamics),
         "provenance": provenance(),
     }
 
@@ -170,6 +119,8 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         rows=rows,
         left=(0, 5),
         note=f"measured: {result['source']}; agreement is within {100 * AGREES:.0f} %",
-        sentences=[f"{r['name']}: {r['why']}" for r in result["responses"] if r["why"] and not r["agrees"]],
+        sentences=[
+            f"{r['name']}: {r['why'].strip()}" for r in result["responses"] if r["why"] and not r["agrees"]
+        ],
     )
     return [table]

@@ -28,38 +28,16 @@ class Communication:
     """[m/s]"""
 
     def __post_init__(self) -> None:
-        for name in ("period", "speed_of_sound"):
-            if not 0.0 < getattr(self, name) < math.inf:
+        for name, good, expected in (
+            ("period", 0.0 < self.period < math.inf, "more than 0"),
+            ("speed_of_sound", 0.0 < self.speed_of_sound < math.inf, "more than 0"),
+            ("processing", 0.0 <= self.processing < math.inf, "0 s or more"),
+            ("loss", 0.0 <= self.loss <= 1.0, "a probability, 0 to 1"),
+        ):
+            if not good:
                 raise EnvironmentSetupError(
-                    f"communication: {name} is {getattr(self, name)}, expected more than 0"
+                    f"communication: {name} is {getattr(self, name)}, expected {expected}"
                 )
-        if not 0.0 <= self.processing < math.inf:
-            raise EnvironmentSetupError(
-                f"communication: processing is {self.processing} s, expected 0 or more"
-            )
-        if not 0.0 <= self.loss <= 1.0:
-            raise EnvironmentSetupError(f"communication: loss is {self.loss}, expected a probability, 0 to 1")
-
-
-def most_under_way(c: Communication, period: float, reach: float) -> int:
-    """Messages of one agent that can be under way at once.
-
-    Args:
-        c: How messages travel.
-        period: Between two of them [s].
-        reach: Longest way [m].
-
-    Raises:
-        EnvironmentSetupError: There is no room for as many.
-    """
-    longest = c.processing + reach / c.speed_of_sound
-    slots = math.ceil(longest / period) + 1
-    if slots > MOST_UNDER_WAY:
-        raise EnvironmentSetupError(
-            f"communication: a message takes up to {longest:.3g} s, one is sent every {period:g} s, "
-            f"expected at most {MOST_UNDER_WAY} under way: give a longer period or a shorter way"
-        )
-    return slots
 
 
 def message_table(
@@ -86,7 +64,13 @@ def message_table(
     if communication is None:
         return MessageTable()
     c, period = communication, max(1, round(communication.period / control_step))
-    slots = most_under_way(c, period * control_step, reach)
+    longest, every = c.processing + reach / c.speed_of_sound, period * control_step
+    slots = math.ceil(longest / every) + 1
+    if slots > MOST_UNDER_WAY:
+        raise EnvironmentSetupError(
+            f"communication: a message takes up to {longest:.3g} s, one is sent every {every:g} s, "
+            f"expected at most {MOST_UNDER_WAY} under way: give a longer period or a shorter way"
+        )
     sent, heard = agents * slots, agents**2
     table: MessageTable = allocated(
         MessageTable, worlds, device, sent_position=sent, sent_velocity=sent, sent_step=sent, arrival=(sent, agents),

@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
 from finssim.engine import Pool, Simulator, TetherLine, Water
-from finssim.engine.randomize import Randomization
+from finssim.engine.randomize import Draws, Randomization
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.drawing import Drawing
 from finssim.tasks.given import (
     GREATEST_SEED,
     EnvironmentSetupError,
@@ -26,6 +25,7 @@ from finssim.tasks.given import (
     refuse_other_thrusters,
 )
 from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
+from finssim.tasks.schedule import Schedule
 from finssim.tasks.sensing import Sensing, SensingBatch
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
@@ -67,7 +67,9 @@ class Environment:
         nominal: The vehicles as their controllers know them.
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
-        drawing: What randomisation draws, and how its ranges grow.
+        draws: What randomisation draws; None without it.
+        schedule: How its ranges grow; None where they do not.
+        privileged_names: Of the privileged numbers of an agent, in order; empty unless they were asked for.
     """
 
     def __init__(
@@ -174,19 +176,36 @@ class Environment:
                 self.seed,
                 drawn,
             )
-        self.drawing = Drawing(randomization, self.simulator, self.arrays, self._seen, task, privileged)
+        self._draw(randomization, privileged)
         self._build()
         self.reset(seed=self.seed)
+
+    def _draw(self, randomization: Randomization | None, privileged: bool) -> None:
+        """Set up what the randomisation needs, and the arrays of the privileged numbers."""
+        self.draws: Draws | None = None
+        self.schedule: Schedule | None = None
+        self.privileged_names: list[str] = []
+        if privileged and randomization is None:
+            raise EnvironmentSetupError(
+                "privileged numbers are what is drawn: give randomization, or leave privileged out"
+            )
+        if privileged and randomization is not None:
+            most = max(len(vehicle.thrusters) for vehicle in self.simulator.vehicles)
+            self.privileged_names = randomization.told(most)
+        shape, arrays = (self.worlds, self.agents * len(self.privileged_names)), self.arrays
+        for name in ("privileged", "final_privileged"):
+            setattr(arrays, name, wp.zeros(shape, dtype=wp.float32, device=self.device))
+        if randomization is None:
+            return
+        told = (arrays.privileged, arrays.final_privileged) if privileged else None
+        self.draws = randomization.draws(self.simulator, self._seen, agents=self.agents, privileged=told)
+        if randomization.ranges.curriculum is not None:
+            self.schedule = Schedule(randomization.ranges.curriculum, self.draws, self.task)
 
     @property
     def observation_size(self) -> int:
         """Numbers in the observation of an agent."""
         return self.task.observation_size
-
-    @property
-    def privileged_names(self) -> list[str]:
-        """Names of the privileged numbers of an agent, in order; empty unless they were asked for."""
-        return self.drawing.names
 
     def _build(self) -> None:
         self._step = self.simulator.pipeline()
@@ -200,11 +219,13 @@ class Environment:
         modes = mode_data(self.action_mode, self.nominal, scales, self.device)
         command = self.simulator.command.array
         self._step.add(act, [self.arrays, command, modes, self.agents], vehicles=len(self.nominal))
-        self.drawing.add_step(self._step, self.seed)
+        if self.draws is not None:
+            self.draws.add_step(self._step, self.seed)
         self.simulator.add_step(self._step)
         self._add_measure(self._step)
         self.task.add_evaluate(self._step, batch)
-        self.drawing.add_end(self._step)
+        if self.schedule is not None:
+            self.schedule.add(self._step, self.arrays)
         if self.auto_reset:
             self._add_start(self._step, self.arrays.done)
         self._start = self.simulator.pipeline()
@@ -220,7 +241,9 @@ class Environment:
 
     def _add_start(self, pipeline: Any, mask: wp.array) -> None:
         self.simulator.add_reset(pipeline, mask)
-        self.drawing.add_start(pipeline, mask, self.seed)
+        if self.draws is not None:
+            self.draws.add(pipeline, mask, self.seed)
+            self.simulator.add_refresh(pipeline, mask)
         self.task.add_spawn(pipeline, self._batch, mask)
         self._add_measure(pipeline, mask)
         self.task.add_observe(pipeline, self._batch, mask)
@@ -243,8 +266,8 @@ class Environment:
                 self.seed = self.simulator.seed = int(seed)
                 self._build()
             self.simulator.restart_episodes(mask)
-            if mask is None:
-                self.drawing.restart()
+            if mask is None and self.schedule is not None:
+                self.schedule.restart()
         where = np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
         self._mask.assign(where)
         self._start.run()
@@ -301,7 +324,8 @@ class Environment:
         """One control step with the actions that are in `arrays.action` already (no check, no copy)."""
         self._step.run()
         self._steps += 1
-        self.drawing.after_step()
+        if self.schedule is not None:
+            self.schedule.after_step()
         # On a GPU the look costs a copy, so frozen worlds wait there for a while, reported as terminated meanwhile.
         look = self.device.is_cpu or self._steps % GPU_FROZEN_CHECK == 0
         if look and self.simulator.state.frozen.numpy().any():
@@ -309,8 +333,8 @@ class Environment:
 
     def set_progress(self, done: float) -> None:
         """Take how much of the training is done, in [0, 1]: ranges may grow with it."""
-        if self.drawing.schedule is not None:
-            self.drawing.schedule.progress(done)
+        if self.schedule is not None:
+            self.schedule.progress(done)
 
     def _revive(self) -> None:
         """Report the worlds that froze, then start new episodes there; their step counts as terminated."""
@@ -342,8 +366,8 @@ class Environment:
         """
         saved = {name: np.array(array.numpy()) for name, array in self._members()}
         saved["counters.seed"], saved["counters.steps"] = np.array(self.seed), np.array(self._steps)
-        if self.drawing.schedule is not None:
-            saved["counters.schedule"] = np.array(self.drawing.schedule._steps)
+        if self.schedule is not None:
+            saved["counters.schedule"] = np.array(self.schedule._steps)
         reported = np.array(sorted(self.simulator._reported), dtype=np.int64)
         return {**saved, "counters.reported": reported.reshape(-1, 2)}
 
@@ -370,8 +394,8 @@ class Environment:
             array.assign(np.ascontiguousarray(state[name]))
         self.simulator.compare_worlds()
         self._steps = int(state["counters.steps"])
-        if self.drawing.schedule is not None:
-            self.drawing.schedule._steps = int(state["counters.schedule"])
+        if self.schedule is not None:
+            self.schedule._steps = int(state["counters.schedule"])
         self.simulator._reported = {(int(w), int(e)) for w, e in state["counters.reported"]}
 
     def _members(self) -> Iterator[tuple[str, wp.array]]:
@@ -379,7 +403,12 @@ class Environment:
         simulator = self.simulator
         for name, packed in (("plant", simulator.plant), ("command", simulator.command)):
             yield from ((f"{name}.{field}", array) for field, array in packed.fields.items())
-        yield from ((f"drawing.{name}", array) for name, array in self.drawing.arrays())
+        if self.draws is not None:
+            yield "drawing.values", self.draws.values
+            for name, packed in (("seen", self._seen), ("tether", simulator.tether)):
+                yield from ((f"drawing.{name}.{field}", array) for field, array in packed.fields.items())
+        if self.schedule is not None:
+            yield from ((f"drawing.schedule.{name}", array) for name, array in self.schedule.arrays())
         structs = {"state": simulator.state, "water": simulator.water, "task": self.arrays}
         for name, struct in {**structs, **(self.sensing.structs() if self.sensing else {})}.items():
             yield from _members(name, struct)

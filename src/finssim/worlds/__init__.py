@@ -6,7 +6,7 @@
 
 from finssim.worlds.description import World, WorldError, devices, load_device, load_world, sites
 from finssim.worlds.model import WorldBatch
-from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch
+from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of
 
 __all__ = [
     "CameraBatch",
@@ -19,5 +19,6 @@ __all__ = [
     "devices",
     "load_device",
     "load_world",
+    "poses_of",
     "sites",
 ]

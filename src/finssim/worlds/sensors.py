@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -50,6 +51,31 @@ def _place_views(
     depth = wp.max(-wp.transform_get_translation(views[v])[2], 0.0)
     K = optics.daylight_attenuation[world_of_view[v]]
     dimming[v] = wp.vec3(wp.exp(-K[0] * depth), wp.exp(-K[1] * depth), wp.exp(-K[2] * depth))
+
+
+@wp.kernel(enable_backward=False)
+def _join_poses(
+    position: wp.array2d(dtype=wp.vec3), quaternion: wp.array2d(dtype=wp.quat), poses: wp.array(dtype=wp.transform)
+):  # fmt: skip
+    w, v = wp.tid()
+    poses[w * position.shape[1] + v] = wp.transform(position[w, v], quaternion[w, v])
+
+
+def poses_of(state: Any, poses: wp.array | None = None) -> wp.array:
+    """Poses of all vehicles of a simulator, as sensors take them.
+
+    Args:
+        state: Its `state`: `position` and `quaternion` by (world, vehicle).
+        poses: Filled, where given.
+
+    Returns:
+        Body to world of each vehicle, in order of world; transform (worlds · vehicles,).
+    """
+    if poses is None:
+        poses = wp.zeros(state.position.size, dtype=wp.transform, device=state.position.device)
+    inputs = [state.position, state.quaternion, poses]
+    wp.launch(_join_poses, state.position.shape, inputs, device=poses.device)
+    return poses
 
 
 class RayBatch:

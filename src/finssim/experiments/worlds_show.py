@@ -1,0 +1,197 @@
+"""`finssim worlds`: the sites of the catalogue, one of them in numbers, and what a camera and a sonar make of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.experiments.figures import DPI, new_figure
+from finssim.experiments.tables import Table
+from finssim.files import atomic_write
+from finssim.worlds.description import (
+    CameraDevice,
+    SonarDevice,
+    World,
+    WorldError,
+    devices,
+    load_device,
+    load_world,
+    sites,
+)
+
+WIDTH = 800
+"""Of the camera's part of a picture [px], each the mean of 2 x 2 rays."""
+SETTLING = 10
+"""Pictures until automatic exposure has settled."""
+LAMPS = ((0.15, 0.30, -0.05), (0.15, -0.30, -0.05))
+"""Places of a vehicle's two lights, body axes [m]."""
+
+
+def worlds_list() -> dict[str, Any]:
+    """List the sites and the sensors of the catalogue.
+
+    Example: finssim worlds list
+    """
+    return {
+        "sites": {name: load_world(name).about for name in sites()},
+        "sensors": {name: load_device(name).about for name in devices()},
+    }
+
+
+def worlds_show(
+    site: str,
+    *,
+    camera: str = "low_light_camera",
+    sonar: str = "gemini_720is",
+    sonar_range: Annotated[float, (0.5, 200.0)] | None = None,
+    lamps: bool = False,
+    seed: int | None = None,
+    out: Path | None = None,
+) -> dict[str, Any]:
+    """Say what a site holds, and draw what a camera and a sonar see from its viewpoint.
+
+    Example: finssim worlds show dock --lamps --out dock.png
+
+    Args:
+        site (SITE|FILE): Site of the catalogue, or the path of a world file.
+        camera (NAME|FILE): Camera of the catalogue, or the path of its file.
+        sonar (NAME|FILE): Imaging sonar of the catalogue, or the path of its file.
+        sonar_range: Longest range of its picture, in place of the one in its file [m].
+        lamps: Two lights on the vehicle, beside the camera.
+        seed: Draw objects and water as a world of this seed has them; without it they stand as in the file.
+        out (FILE): Picture to write: what the camera sees, and the sonar's fan (.png).
+    """
+    world = load_world(site)
+    eye, ear = load_device(camera), load_device(sonar)
+    if not isinstance(eye, CameraDevice) or not isinstance(ear, SonarDevice):
+        raise WorldError(f"expected a camera and an imaging sonar, got {camera} and {sonar}: exchange them")
+    if sonar_range is not None:
+        ear = ear.model_copy(update={"range": sonar_range})
+    if out is not None:
+        if out.suffix != ".png":
+            raise WorldError(f"{out} ends in '{out.suffix}', expected .png")
+        with atomic_write(out) as temporary:
+            _draw(world, eye, ear, lamps, seed, temporary)
+    water = world.water
+    return {
+        "name": world.name,
+        "about": world.about,
+        "attenuation": water.attenuation.tolist(),
+        "visibility_m": [round(-math.log(0.02) / c, 2) if c > 0.0 else None for c in water.attenuation],
+        "sound_speed": water.sound_speed,
+        "sound_absorption_db_per_m": water.sound_absorption(ear.frequency),
+        "sonar_frequency": ear.frequency,
+        "objects": {
+            name: {
+                "shape": item.shape,
+                "count": len(item.positions),
+                "frame": item.frame,
+                "position": item.position.tolist(),
+                "varies": item.vary is not None,
+            }
+            for name, item in world.objects.items()
+        },
+        "viewpoint": world.viewpoint.values(),
+    }
+
+
+def fan_picture(levels: NDArray[Any], sector: float, side: int = 720) -> NDArray[Any]:
+    """A sonar's picture as a fan seen from above, the sonar at the bottom, ahead upwards; NaN outside.
+
+    Args:
+        levels: By beam, 0 at the left, and range cell, (beams, bins).
+        sector: Field of view [rad].
+        side: Rows of the result, one range long [-].
+
+    Returns:
+        (side, columns).
+    """
+    half = min(1.0, math.sin(min(0.5 * sector, 0.5 * math.pi)))
+    x = np.linspace(-half, half, round(2.0 * half * side))
+    y = np.linspace(1.0, 0.0, side)[:, None]
+    radius, azimuth = np.hypot(x, y), np.arctan2(-x, y)
+    beam = (0.5 - azimuth / sector) * levels.shape[0]
+    cell = radius * levels.shape[1]
+    inside = (beam >= 0.0) & (beam < levels.shape[0]) & (cell < levels.shape[1])
+    rows, columns = (np.where(inside, index, 0).astype(int) for index in (beam, cell))
+    return np.where(inside, levels[rows, columns], np.nan)
+
+
+def _draw(
+    world: World, eye: CameraDevice, ear: SonarDevice, lamps: bool, seed: int | None, path: Path
+) -> None:
+    import warp as wp
+
+    from finssim.worlds import CameraBatch, Headlight, SonarBatch, WorldBatch
+
+    batch = WorldBatch(world)
+    if seed is not None:
+        batch.draw(seed)
+    pose = wp.array(np.float32(world.viewpoint.pose[None]), dtype=wp.transform)
+    lights = (
+        tuple(Headlight(position=place, intensity=0.15, half_angle=0.6) for place in LAMPS) if lamps else ()
+    )
+    camera = CameraBatch(batch, eye, width=2 * WIDTH, lamps=lights)
+    for k in range(SETTLING):
+        fine = camera.update(pose, seed=0, time=float(k)).numpy()[0].astype(float)
+    rows, columns = fine.shape[0] // 2, fine.shape[1] // 2
+    picture = fine[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, 3).mean(axis=(1, 3)) / 255.0
+    levels = SonarBatch(batch, ear).update(pose, seed=0).numpy()[0]
+    shown = fan_picture(levels, ear.sector)
+    ratio = shown.shape[1] / shown.shape[0]
+    height = 5.2
+    figure = new_figure(height * (columns / rows + ratio), height)
+    figure.patch.set_facecolor("black")
+    left, right = figure.subplots(1, 2, width_ratios=[columns / rows, ratio])
+    left.imshow(picture, interpolation="none")
+    left.axis("off")
+    right.set_facecolor("black")
+    half = 0.5 * ratio * ear.range
+    right.imshow(shown, cmap="copper", vmin=0, vmax=255, extent=(-half, half, 0.0, ear.range))
+    turn = np.linspace(-0.5 * ear.sector, 0.5 * ear.sector, 181)
+    for r in np.linspace(0.0, ear.range, 6)[1:]:
+        right.plot(r * np.sin(turn), r * np.cos(turn), color="0.45", linewidth=0.5)
+        right.text(
+            r * math.sin(turn[-1]), r * math.cos(turn[-1]), f" {r:g} m", color="0.75", fontsize=8, va="top"
+        )
+    right.axis("off")
+    figure.savefig(path, dpi=DPI, facecolor="black", format="png")
+
+
+def tables_of(result: Mapping[str, Any]) -> Sequence[Table]:
+    """Names with what they are, or one site."""
+    if "sites" in result:
+        return [
+            Table(
+                title=title, heads=["", ""], rows=[list(item) for item in result[title].items()], left=(0, 1)
+            )
+            for title in ("sites", "sensors")
+        ]
+    rows = [
+        [
+            name,
+            f"{item['count']} x {item['shape']}" if item["count"] > 1 else item["shape"],
+            item["frame"] or "world",
+            ", ".join(f"{x:g}" for x in item["position"]),
+            "yes" if item["varies"] else "",
+        ]
+        for name, item in result["objects"].items()
+    ]
+    red, green, blue = (f"{x} m" if x is not None else "any distance" for x in result["visibility_m"])
+    return [
+        Table(
+            title=result["name"],
+            headline=f"{result['name']}: {result['about']}",
+            heads=["object", "shape", "in", "position [m]", "drawn"],
+            rows=rows,
+            left=(0, 1, 2, 3),
+            note=f"a beam of red, green, blue light keeps 2 % over {red}, {green}, {blue}; "
+            f"sound {result['sound_speed']:.0f} m/s, {result['sound_absorption_db_per_m']:.3f} dB/m "
+            f"at {result['sonar_frequency'] / 1e3:.0f} kHz",
+        )
+    ]
