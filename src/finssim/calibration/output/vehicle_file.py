@@ -349,7 +349,7 @@ def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
         CalibrationError: Another suffix.
         OutputError: The place cannot be written.
     """
-    target = check_vehicle_path(path)
+    target = yaml_path(path, "vehicle")
     tree, origins = file_tree(vehicle), number_origins(vehicle)
     tree, origins = _grouped(tree, origins)
     with atomic_write(target) as temporary:
@@ -360,8 +360,8 @@ def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
             raise RuntimeError(f"{path}: the file would not hold the same vehicle; nothing was written")
 
 
-def check_vehicle_path(path: str | os.PathLike[str]) -> Path:
-    """The path of a vehicle file to write.
+def yaml_path(path: str | os.PathLike[str], kind: str) -> Path:
+    """The path of a vehicle, ranges, pool or camera file to write.
 
     Raises:
         CalibrationError: It does not end in .yaml or .yml.
@@ -369,7 +369,7 @@ def check_vehicle_path(path: str | os.PathLike[str]) -> Path:
     target = Path(path)
     if target.suffix not in (".yaml", ".yml"):
         raise CalibrationError(
-            f"{path} ends in '{target.suffix}', expected .yaml: name a vehicle file to write"
+            f"{path} ends in '{target.suffix}', expected .yaml: name a {kind} file to write"
         )
     return target
 
