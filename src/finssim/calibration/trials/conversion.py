@@ -235,18 +235,23 @@ def sampled(
     Returns:
         Times, strictly increasing (m,), columns (m,), the row each came from (m,), and findings.
     """
-    kept = np.flatnonzero(np.concatenate([[True], np.diff(t) > 0.0]))
-    if len(kept) == len(t) or not columns:
-        return t[kept], {name: values[kept] for name, values in columns.items()}, kept, []
-    import pandas as pd  # here: most logs need none
-
-    rows = pd.DataFrame(dict(columns)).groupby(t)
-    conflicts = (rows.max() > rows.min()).any(axis=1).to_numpy()
-    said = finding("times_repeat", rows=len(t) - len(kept))
+    starts = np.concatenate([[True], np.diff(t) > 0.0])
+    kept = np.flatnonzero(starts)
+    if len(kept) == len(t):
+        return t, dict(columns), kept, []
+    row_of = np.cumsum(starts) - 1
+    merged_columns, conflicts = {}, np.zeros(len(kept), bool)
+    for name, values in columns.items():
+        good = np.flatnonzero(np.isfinite(values))
+        merged_columns[name] = np.full(len(kept), np.nan)
+        merged_columns[name][row_of[good]] = values[good]  # NumPy keeps the last of equal indices
+        conflicts[row_of[good][values[good] != merged_columns[name][row_of[good]]]] = True
+    findings = []
     if conflicts.any():
-        said = finding("times_conflict", times=conflicts.sum(), first=t[kept][conflicts][0])
-    laid = rows.last()
-    return t[kept], {name: laid[name].to_numpy() for name in columns}, kept, [said]
+        findings.append(finding("times_conflict", times=conflicts.sum(), first=t[kept][conflicts][0]))
+    elif len(columns):
+        findings.append(finding("times_repeat", rows=len(t) - len(kept)))
+    return t[kept], merged_columns, kept, findings
 
 
 Channels = dict[str, Array]
