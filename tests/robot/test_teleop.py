@@ -195,6 +195,8 @@ def test_an_unplugged_pad_disarms():
 class SlowAutopilot:
     """Arms when it is asked often enough, and never gives way."""
 
+    peer = "autopilot"
+
     def __init__(self, asks):
         self.asks = asks
 

@@ -59,6 +59,9 @@ def test_every_sensor_says_where_its_figures_are_from(name):
         ("frame: rig", "frame: rog", "objects.ball: frame is 'rog', did you mean 'rig'?"),
         ("shape: sphere", "shape: globe", "objects.ball: shape is 'globe', expected 'box', 'sphere'"),
         ("seabed:", "seabad:", "unknown key 'seabad', did you mean 'seabed'?"),
+        ("size: [20, 10]", "size: [20]", "seabed: size is [20], expected 2 numbers"),
+        ("size: [20, 10]", "size: [20, 0]", "seabed: size is [20.0, 0.0], expected 2 numbers > 0"),
+        ("slope: [0.1, 0.0]", "slope: [0.1, .inf]", "seabed: slope holds inf, expected 2 numbers"),
         ("depth: 3.0", "depth: 3.0, heights: ../x.csv", "has a separator of folders"),
         ("depth: 3.0", "depth: 3.0, heights: none.csv", "cannot read none.csv"),
         ("spacing: 1.0", "spacing: 0.001", "more than 1048576 heights"),
@@ -79,8 +82,21 @@ def test_a_sensor_of_no_kind_and_a_site_of_no_name_are_refused(tmp_path):
     """What there is stands in the message."""
     with pytest.raises(WorldError, match="kind is 'radar', expected one of camera, sonar, range"):
         load_device(written(tmp_path, "kind: radar\n"))
+    with pytest.raises(WorldError, match="kind is \\['camera'\\], expected one of"):
+        load_device(written(tmp_path, "kind: [camera]\n"))
     with pytest.raises(WorldError, match="unknown site 'dok', did you mean 'dock'?"):
         load_world("dok")
+
+
+def test_an_exposure_is_auto_or_a_number(tmp_path):
+    """One sentence, though there are two forms."""
+    camera = (
+        "kind: camera\nabout: x\nsource: y\nwidth: 64\nheight: 48\nfocal_length: 50\nrate: 10\nexposure: "
+    )
+    assert load_device(written(tmp_path, camera + "0.5\n")).sensor.gain == 0.5
+    for bad in ("-1", "bright", "[1]", ".nan"):
+        with pytest.raises(WorldError, match="exposure is .*, expected auto or a number > 0$"):
+            load_device(written(tmp_path, camera + bad + "\n"))
 
 
 def test_heights_are_slope_roughness_and_table(tmp_path):

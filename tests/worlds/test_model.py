@@ -22,6 +22,16 @@ def test_a_world_is_drawn_from_the_seed_and_its_number_alone(dock):
     assert not np.array_equal(first, single.optics.attenuation.numpy()[0])
 
 
+def test_worlds_outside_the_mask_stay(dock):
+    """Only the second of three docks is drawn anew, and back again as it was."""
+    before = dock.poses("back").copy()
+    dock.draw(7, mask=[False, True, False])
+    changed = np.any(dock.poses("back") != before, axis=1)
+    dock.draw(1, mask=[False, True, False])
+    np.testing.assert_array_equal(changed, [False, True, False])
+    np.testing.assert_array_equal(dock.poses("back"), before)
+
+
 def test_things_in_a_frame_move_with_it(dock):
     """The throat of the funnel stays 0.95 m before the plate, in the plate's axes, however the dock is drawn."""
     back, rail = dock.poses("back"), dock.poses("rails_upper")

@@ -134,7 +134,9 @@ def _draw(
         batch.draw(seed)
     pose = wp.array(np.float32(world.viewpoint.pose[None]), dtype=wp.transform)
     lights = (
-        tuple(Headlight(position=place, intensity=0.15, half_angle=0.6) for place in LAMPS) if lamps else ()
+        tuple(Headlight(position=position, intensity=0.15, half_angle=0.6) for position in LAMPS)
+        if lamps
+        else ()
     )
     camera = CameraBatch(batch, eye, width=2 * WIDTH, lamps=lights)
     for k in range(SETTLING):
@@ -142,8 +144,8 @@ def _draw(
     rows, columns = fine.shape[0] // 2, fine.shape[1] // 2
     picture = fine[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, 3).mean(axis=(1, 3)) / 255.0
     levels = SonarBatch(batch, ear).update(pose, seed=0).numpy()[0]
-    shown = fan_picture(levels, ear.sector)
-    ratio = shown.shape[1] / shown.shape[0]
+    fan = fan_picture(levels, ear.sector)
+    ratio = fan.shape[1] / fan.shape[0]
     height = 5.2
     figure = new_figure(height * (columns / rows + ratio), height)
     figure.patch.set_facecolor("black")
@@ -152,7 +154,7 @@ def _draw(
     left.axis("off")
     right.set_facecolor("black")
     half = 0.5 * ratio * ear.range
-    right.imshow(shown, cmap="copper", vmin=0, vmax=255, extent=(-half, half, 0.0, ear.range))
+    right.imshow(fan, cmap="copper", vmin=0, vmax=255, extent=(-half, half, 0.0, ear.range))
     turn = np.linspace(-0.5 * ear.sector, 0.5 * ear.sector, 181)
     for r in np.linspace(0.0, ear.range, 6)[1:]:
         right.plot(r * np.sin(turn), r * np.cos(turn), color="0.45", linewidth=0.5)

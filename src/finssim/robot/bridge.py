@@ -614,6 +614,8 @@ class Supervision:
 
     def __init__(self, vehicle: Vehicle, settings: BridgeSettings, outputs: int) -> None:
         self.settings = settings
+        self.peer = "motor controller"
+        """Who sends telemetry, in sentences."""
         self.commander = Commander(len(vehicle.thrusters), settings.command_timeout)
         self.telemetry = TelemetryWatch(outputs, settings.telemetry_timeout)
         self.echo, self.deaf = EchoWatch(), Lasting()
@@ -657,14 +659,14 @@ class Supervision:
         """What must stop the thrusters until somebody has looked."""
         limits = self.settings
         if self.telemetry.age(now) > limits.telemetry_timeout:
-            return f"no fresh telemetry from the motor controller for {limits.telemetry_timeout:g} s"
+            return f"no fresh telemetry from the {self.peer} for {limits.telemetry_timeout:g} s"
         frozen = self.telemetry.frozen(now, limits.frozen_limit)
         if frozen:
             return f"telemetry is frozen: the {frozen} has repeated its numbers for {limits.frozen_limit:g} s"
         if self.echo.rejected.longer(limits.reject_limit):
-            return f"the motor controller has refused every command for {limits.reject_limit:g} s"
+            return f"the {self.peer} has refused every command for {limits.reject_limit:g} s"
         if self.deaf.longer(limits.reject_limit):
-            return f"the motor controller has not followed any command for {limits.reject_limit:g} s"
+            return f"the {self.peer} has not followed any command for {limits.reject_limit:g} s"
         for source, tilt in self.tilts.items():
             if tilt.over(now):
                 degrees = math.degrees(limits.max_tilt)
@@ -714,7 +716,10 @@ RUNNING = ("armed", "hold")
 
 
 class Autopilot(Protocol):
-    """What stands between a bridge and the motors and has a will of its own (`robot.runtime.Link`)."""
+    """What stands between a bridge and the motors and may have a will of its own (`robot.runtime.Link`)."""
+
+    peer: str
+    """What it is, in sentences."""
 
     def prepare(self, now: float) -> str:
         """Called by `Bridge.arm` where nothing else stands against it: "" once commands count, else why not yet."""
@@ -732,8 +737,7 @@ class Bridge:
         self.motors = MotorMap.from_vehicle(vehicle)
         if len(self.settings.slew) != self.motors.thrusters:
             raise BridgeError(f"slew has {len(self.settings.slew)} rates, expected {self.motors.thrusters}")
-        self.autopilot: Autopilot | None = None
-        """Has to be ready before the bridge arms, and may end it; None: there is none."""
+        self._autopilot: Autopilot | None = None
         self.getting_ready = False
         """Whether arming was last refused by nothing but an autopilot that has yet to get ready."""
         self.state = "disarmed"
@@ -751,6 +755,15 @@ class Bridge:
         self._armed_at = self._held_at = math.nan
         self._passed_at: float | None = None
         self._operator = False
+
+    @property
+    def autopilot(self) -> Autopilot | None:
+        """Has to be ready before the bridge arms, and may end it; None: there is none."""
+        return self._autopilot
+
+    @autopilot.setter
+    def autopilot(self, autopilot: Autopilot) -> None:
+        self._autopilot, self._watchdogs.peer = autopilot, autopilot.peer
 
     # -- what the operator says -------------------------------------------------------------------------------
 
@@ -831,7 +844,7 @@ class Bridge:
         if why:
             self.log.repeat(now, "telemetry refused", why)
         elif self._watchdogs.take_telemetry(now, telemetry, self.state == "armed"):
-            self._alarm("restart", "the motor controller restarted: its clock went back")
+            self._alarm("restart", f"the {self._watchdogs.peer} restarted: its clock went back")
 
     def echo(self, now: float, echo: CommandEcho) -> None:
         """What the motor controller made of a command."""
@@ -839,10 +852,10 @@ class Bridge:
             return
         news = self._watchdogs.echo.accept(now, echo, self.state == "armed")
         if news == "restarted":
-            self._alarm("restart", "the motor controller restarted: its count of commands began again")
+            self._alarm("restart", f"the {self._watchdogs.peer} restarted: its count of commands began again")
         elif news == "rejected":
             flags = f"flags {echo.reject_flags:#x}"
-            self.log.repeat(now, "command rejected", f"the motor controller refused a command: {flags}")
+            self.log.repeat(now, "command rejected", f"the {self._watchdogs.peer} refused a command: {flags}")
 
     def reading(self, now: float, reading: Reading) -> None:
         """What the estimator knows."""

@@ -121,6 +121,9 @@ USED = ("accepted", "initialized", "reacquired")
 class Link(Protocol):
     """Who turns the bridge's commands into motion at the other end of the wire: a motor controller or an autopilot."""
 
+    peer: str
+    """Which of them it is, in sentences."""
+
     def feed(self, now: float, data: bytes) -> list[Message]:
         """Messages that bytes complete, which came at a time [s]; never raises, whatever they are."""
 

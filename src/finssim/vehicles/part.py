@@ -187,8 +187,14 @@ def identity_quaternion() -> NDArray[np.float64]:
     return _frozen(np.array([0.0, 0.0, 0.0, 1.0]))
 
 
-def sentence_of(detail: Any, shown: str) -> str:
-    """One pydantic complaint in the form `file: section: key value, expectation: what to do`."""
+def sentence_of(detail: Any, shown: str, missing: str = "add it, with its origin") -> str:
+    """One pydantic complaint in the form `file: section: key value, expectation: what to do`.
+
+    Args:
+        detail: One of `ValidationError.errors()`.
+        shown: What to call the file.
+        missing: What to do about a key that is not there.
+    """
     where = [str(item) for item in detail["loc"] if not str(item).startswith("<")]
     kind, given, context = detail["type"], detail.get("input"), detail.get("ctx", {})
     if kind == "section":
@@ -202,7 +208,7 @@ def sentence_of(detail: Any, shown: str) -> str:
     if kind == "value":
         problem = context["message"]
     elif kind == "missing":
-        problem = "is missing: add it, with its origin"
+        problem = f"is missing: {missing}"
     elif kind in bounds:
         key, sign = bounds[kind]
         problem = f"is {given}, expected {sign} {context[key]:g}"

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
 from finssim.files import plain_name
 from finssim.geometry.mesh import MeshError, load_stl
@@ -59,10 +59,31 @@ def _within(low: float, high: float) -> AfterValidator:
     return AfterValidator(check)
 
 
+def _numbers(count: int | None, expected: str) -> BeforeValidator:
+    """So many finite numbers, or any, in a list."""
+
+    def check(values: Any) -> Any:
+        if not isinstance(values, (list, tuple)) or count not in (None, len(values)):
+            raise refuse_value(f"is {values!r}, expected {expected}")
+        for value in values:
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
+                raise refuse_value(f"holds {value!r}, expected {expected}")
+        return tuple(map(float, values))
+
+    return BeforeValidator(check)
+
+
+def _exposure(value: Any) -> Any:
+    if value == "auto" or (type(value) in (int, float) and 0.0 < value < math.inf):
+        return value
+    raise refuse_value(f"is {value!r}, expected auto or a number > 0")
+
+
 Colour = Annotated[Vector3, _within(0.0, 1.0)]
 """Reflectance of red, green and blue, (3,)."""
 NonNegative3 = Annotated[Vector3, _within(0.0, math.inf)]
 Count = Annotated[int, Field(strict=True, ge=1, le=LARGEST)]
+Pair = Annotated[tuple[float, float], _numbers(2, "2 numbers")]
 Pixels = Annotated[int, Field(strict=True, ge=1, le=8192)]
 
 
@@ -151,11 +172,11 @@ class Object(Finish):
     @model_validator(mode="after")
     def _complete(self) -> Object:
         dimensions = {"size", "radius", "length", "file", "scale"}
-        given = {key for key in dimensions if getattr(self, key) is not None}
-        needed = SIZES[self.shape]
-        if needed - given:
-            raise refuse_section(f"a {self.shape} needs {', '.join(sorted(needed - given))}: add it")
-        if surplus := given - needed - ({"scale"} if self.shape == "mesh" else set()):
+        present = {key for key in dimensions if getattr(self, key) is not None}
+        required = SIZES[self.shape]
+        if required - present:
+            raise refuse_section(f"a {self.shape} needs {', '.join(sorted(required - present))}: add it")
+        if surplus := present - required - ({"scale"} if self.shape == "mesh" else set()):
             raise refuse_section(f"a {self.shape} has no {', '.join(sorted(surplus))}: remove it")
         if sum(x is not None for x in (self.orientation, self.axis, self.yaw)) > 1:
             raise refuse_section("more than one of orientation, axis and yaw: give one")
@@ -210,9 +231,9 @@ class Seabed(Finish):
 
     depth: Positive
     """Below the surface at x = y = 0, of the plane that the heights are added to [m]."""
-    slope: tuple[Number, Number] = (0.0, 0.0)
+    slope: Pair = (0.0, 0.0)
     """dz/dx, dz/dy of that plane."""
-    size: tuple[Positive, Positive] | None = None
+    size: Pair | None = None
     """Extent along x and y about the origin [m]; without it the bottom is a plane without end."""
     spacing: Positive = 0.5
     """Between heights [m]."""
@@ -223,6 +244,8 @@ class Seabed(Finish):
     @model_validator(mode="after")
     def _extent(self) -> Seabed:
         rough = self.roughness is not None or self.heights is not None
+        if self.size is not None and min(self.size) <= 0.0:
+            raise refuse_section(f"size is {list(self.size)}, expected 2 numbers > 0")
         if self.size is None and rough:
             raise refuse_section("roughness and heights need a size: add it, such as size: [40, 40]")
         if self.size is not None and self.size[0] / self.spacing * self.size[1] / self.spacing > FINEST:
@@ -340,14 +363,14 @@ class World(Part):
 
     @model_validator(mode="after")
     def _objects_fit(self) -> World:
-        before: list[str] = []
+        earlier: list[str] = []
         for name, item in self.objects.items():
-            if item.frame is not None and item.frame not in before:
+            if item.frame is not None and item.frame not in earlier:
                 raise refuse_section(
-                    f"objects.{name}: frame is '{item.frame}'{did_you_mean(item.frame, before)} expected an object "
-                    f"that stands before it: {', '.join(before) or 'there is none'}"
+                    f"objects.{name}: frame is '{item.frame}'{did_you_mean(item.frame, earlier)} expected an object "
+                    f"that stands before it: {', '.join(earlier) or 'there is none'}"
                 )
-            before.append(name)
+            earlier.append(name)
         if (count := sum(len(item.positions) for item in self.objects.values())) > LARGEST:
             raise refuse_section(f"objects: {count} shapes with their copies, expected at most {LARGEST}")
         return self
@@ -457,9 +480,9 @@ class CameraDevice(Part):
     focal_length: Positive
     """[px] of the full picture; behind a flat port that of the lens in air."""
     model: Literal["plumb_bob", "rational", "fisheye"] = "plumb_bob"
-    distortion: tuple[Number, ...] = ()
+    distortion: Annotated[tuple[float, ...], _numbers(None, "a list of numbers")] = ()
     port: Port | None = None
-    exposure: Positive | Literal["auto"] = "auto"
+    exposure: Annotated[Any, AfterValidator(_exposure)] = "auto"
     """Fraction of the full scale that radiance 1 reaches, or fitted to the last picture."""
     white_balance: Probability = 0.0
     """Share of the colour cast that automatic exposure takes out (gray world)."""
@@ -533,7 +556,7 @@ class SonarDevice(Part):
     """Noise in a range cell before gain, as echo strength at 1 m [dB]."""
     gain_spreading: NonNegative = 30.0
     """Time-varying gain [dB per decade of range]; 40 undoes the loss of a small target, 20 that of a wall."""
-    display: tuple[Number, Number] = (-80.0, -20.0)
+    display: Pair = (-80.0, -20.0)
     """Echo strengths after gain that are 0 and 255 in the picture [dB]."""
     rate: Positive
     """[Hz]"""
@@ -627,24 +650,24 @@ def load_device(name_or_path: str | os.PathLike[str]) -> Device:
     path, shown = _locate(name_or_path, DEVICES, devices(), "sensor")
     tree = _read(path, shown, such_as="kind: camera")
     kind = tree.pop("kind", None)
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise WorldError(f"{shown}: kind is {kind!r}, expected one of {', '.join(KINDS)}")
     return _checked(KINDS[kind], tree, shown)
 
 
 def _locate(
-    name_or_path: str | os.PathLike[str], catalogue: Path, names: list[str], what: str
+    name_or_path: str | os.PathLike[str], catalogue: Path, names: list[str], kind: str
 ) -> tuple[Path, str]:
     text = os.fspath(name_or_path)
     path = Path(text)
     if path.suffix in (".yaml", ".yml") or path.name != text:
         if not path.is_file():
             raise WorldError(
-                f"{text}: no such file: give the path of a {what}'s file, or one of {', '.join(names)}"
+                f"{text}: no such file: give the path of a {kind}'s file, or one of {', '.join(names)}"
             )
         return path, text
     if text not in names:
-        raise WorldError(f"unknown {what} '{text}'{did_you_mean(text, names)} available: {', '.join(names)}")
+        raise WorldError(f"unknown {kind} '{text}'{did_you_mean(text, names)} available: {', '.join(names)}")
     return catalogue / f"{text}.yaml", f"{catalogue.name}/{text}.yaml"
 
 
@@ -663,5 +686,5 @@ def _checked(kind: type[P], tree: dict[Any, Any], shown: str) -> P:
     try:
         return kind(**{str(key): value for key, value in tree.items()})
     except ValidationError as error:
-        kept = [e for e in error.errors() if e["type"] != "default_factory_not_called"]
-        raise WorldError("\n".join(sentence_of(e, shown) for e in kept)) from None
+        problems = [e for e in error.errors() if e["type"] != "default_factory_not_called"]
+        raise WorldError("\n".join(sentence_of(e, shown, "add it") for e in problems)) from None

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from finssim.geometry.rotations import quat_from_yaw, quat_multiply, quat_rotate
 from finssim.worlds.description import Finish, Object, World, load_world
@@ -97,21 +98,24 @@ class WorldBatch:
         self._pose = self.model.shape_transform.numpy().reshape(worlds, -1, 7)
         self.optics = self._optics()
         self.grain = wp.array(_grain(), dtype=float, device=self.device)
-        self._place(np.zeros((worlds, 1 + 4 * len(self._varied))))
+        self._drawn = np.zeros((worlds, 1 + 4 * len(self._varied)))
+        self._place()
 
-    def draw(self, seed: int) -> None:
-        """Draw every world's poses of objects and its water anew; world w depends on `seed` and w alone.
+    def draw(self, seed: int, mask: ArrayLike | None = None) -> None:
+        """Draw poses of objects, and the water, of worlds anew; world w depends on `seed` and w alone.
 
         Args:
             seed: Of the draw.
+            mask: Which worlds; all if None. (worlds,)
         """
-        size = 1 + 4 * len(self._varied)
-        generators = (np.random.default_rng([seed, world]) for world in range(self.worlds))
-        self._place(np.array([random.uniform(-1.0, 1.0, size) for random in generators]))
+        for world in range(self.worlds) if mask is None else np.flatnonzero(np.asarray(mask)):
+            random = np.random.default_rng([seed, int(world)])
+            self._drawn[world] = random.uniform(-1.0, 1.0, self._drawn.shape[1])
+        self._place()
 
-    def _place(self, drawn: np.ndarray) -> None:
-        """Set water and poses from numbers in [-1, 1]: one of the water, four of each varied object, (worlds, n)."""
-        water, n = self.world.water, self.worlds
+    def _place(self) -> None:
+        """Set water and poses from what is drawn: a number in [-1, 1] of the water, four of each varied object."""
+        water, n, drawn = self.world.water, self.worlds, self._drawn
         factor = np.exp(drawn[:, :1] * math.log(water.vary))
         self.optics.attenuation.assign(np.float32(factor * water.attenuation))
         self.optics.daylight_attenuation.assign(np.float32(factor * water.daylight_attenuation))

@@ -509,6 +509,8 @@ def _search(magics: Iterable[bytes]) -> re.Pattern[bytes]:
 class McuLink:
     """The motor controller at the other end of a wire, as `Runtime` sees it: frames of thrusts out, telemetry in."""
 
+    peer = "motor controller"
+
     def __init__(self, outputs: int) -> None:
         """Args:
         outputs: Motor outputs of the vehicle (`vehicle.mcu.outputs`).

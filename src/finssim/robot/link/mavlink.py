@@ -89,6 +89,8 @@ class MavlinkLink:
         says: Its newest sentence of a severity that matters.
     """
 
+    peer = "autopilot"
+
     def __init__(self, vehicle: Vehicle, *, key: bytes = b"") -> None:
         """
         Args:
