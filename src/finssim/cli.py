@@ -23,7 +23,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "worlds show": Experiment("finssim.experiments.worlds_show:worlds_show"),
     "doctor": "finssim.doctor:doctor",
     "train": "finssim.learning.train:train",
-    "evaluate": "finssim.experiments.evaluate:evaluate",
+    "evaluate": Experiment("finssim.experiments.evaluate:evaluate"),
     "tasks": Experiment("finssim.experiments.tasks_show:tasks_list"),
     "tasks show": Experiment("finssim.experiments.tasks_show:tasks_show"),
     "collect": Experiment("finssim.experiments.records:collect"),

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from rich.console import Console
 
+from finssim import boundary
+from finssim.cli import app
 from finssim.control.modes import MODES
-from finssim.experiments.evaluate import evaluate
 from finssim.experiments.plants import load_plant
 from finssim.experiments.trials import EpisodeError, run_episodes, summarize_episodes
 from finssim.tasks import TASKS, Environment, task_named
@@ -101,14 +101,13 @@ def test_means_have_intervals_and_what_is_missing_is_counted():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["t3", "team-pursuit"])
-def test_baselines_are_evaluated_by_name(name, tmp_path):
+def test_baselines_are_evaluated_by_name(name, tmp_path, capsys):
     """Table, JSON and figure; a row for each plant where there are two."""
     who = next(iter(BASELINES[name]))
     assert agent_for(who, FINSROV, task_named(name)).describe()["kind"] == "baseline"
-    with (tmp_path / "screen").open("w", encoding="utf-8") as file:
-        console = Console(file=file, width=100)
-        evaluate(who, task=name, plant=["nominal", "noise"], trials=2, out=tmp_path / "out", console=console)
+    words = ["evaluate", who, "--task", name, "--plant", "nominal", "--plant", "noise", "--trials", "2"]
+    assert boundary.run(app, [*words, "--out", str(tmp_path / "out")]) == 0
     document = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
     assert [plant["plant"]["name"] for plant in document["plants"]] == ["nominal", "noise"]
     assert document["plants"][0]["metrics"]["return"]["value"] is not None
-    assert "return" in (tmp_path / "screen").read_text(encoding="utf-8")
+    assert "return" in capsys.readouterr().out

@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from rich.console import Console
 from torch import nn
 
+from finssim import boundary
+from finssim.cli import app
 from finssim.control import ControlError
 from finssim.control.modes import action_mode
 from finssim.control.policy import PolicyDescription, PolicyError, VehicleIdentity
@@ -128,7 +129,7 @@ def test_seeds_decide_what_is_drawn(monkeypatch):
 
 def test_json_is_one_object_with_the_agreed_keys(capsys, policy):
     """Nothing else is on standard output, and every trial has its setpoint and measures."""
-    evaluate(policy, trials=9, as_json=True)
+    assert boundary.run(app, ["evaluate", str(policy), "--trials", "9", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed.keys() >= KEYS | {"provenance", "vehicle", "plant", "seed"}
     assert printed["trials"] == len(printed["per_trial"]) == 9
@@ -139,23 +140,23 @@ def test_json_is_one_object_with_the_agreed_keys(capsys, policy):
 
 
 def test_the_table_has_a_row_per_setpoint_all_and_the_papers(capsys):
-    evaluate("pid", console=Console(width=100))
+    assert boundary.run(app, ["evaluate", "pid"]) == 0
     out = capsys.readouterr().out
     assert all(f"{name} " in out for name in [*T1_SETPOINTS, "all", "paper, PID"])
     assert "8/8" in out and "44.08" in out and "its vehicle in its pool, PID, for orientation" in out
 
 
 @pytest.mark.slow
-def test_a_directory_holds_result_figure_and_trajectories(tmp_path, capsys):
+def test_a_directory_holds_result_figure_and_trajectories(tmp_path):
     """All open, agree with each other, and may be replaced by the next evaluation."""
     for _ in range(2):
-        (evaluation,) = evaluate("pid", out=tmp_path / "e", as_json=True)
+        result = evaluate("pid", out=tmp_path / "e")
     stored = json.loads((tmp_path / "e" / "evaluation.json").read_text(encoding="utf-8"))
-    assert stored == json.loads(capsys.readouterr().out.splitlines()[-1]) == evaluation.result
+    assert stored == json.loads(json.dumps(result))
     assert (tmp_path / "e" / "error_envelope.png").read_bytes().startswith(b"\x89PNG")
     table = read_run(tmp_path / "e" / "trajectories")
     path = table[table.world == 4].sort_values("t")
-    motion = evaluation.trials[4].motion
+    motion = evaluate_controller("pid", load_plant("nominal")).trials[4].motion
     np.testing.assert_allclose(path[["x", "y", "z"]], motion.position, atol=1e-6)
     np.testing.assert_allclose(path.t, motion.t, atol=1e-6)
 
@@ -164,7 +165,8 @@ def test_a_directory_holds_result_figure_and_trajectories(tmp_path, capsys):
 def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, capsys):
     """A row for each plant; under `plants` the object that each gives alone; trajectories in folders of their names."""
     plants = ["nominal", "simplified"]
-    evaluate("pid", plant=plants, console=Console(width=100), out=tmp_path / "e")
+    words = ["evaluate", "pid", *(word for name in plants for word in ("--plant", name))]
+    assert boundary.run(app, [*words, "--out", str(tmp_path / "e")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines if "8/8" in line] == plants
     assert any("paper, PID" in line for line in lines)
@@ -172,7 +174,7 @@ def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, cap
     assert len(read_run(tmp_path / "e" / "trajectories" / "simplified")) > 0
     assert (tmp_path / "e" / "error_envelope.png").stat().st_size > 0
 
-    evaluate("pid", plant=plants, as_json=True)
+    assert boundary.run(app, [*words, "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads((tmp_path / "e" / "evaluation.json").read_text(encoding="utf-8"))
     assert list(printed) == ["plants"]

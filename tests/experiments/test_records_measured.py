@@ -126,8 +126,7 @@ def test_evaluate_takes_a_record_and_prints_what_it_prints_of_a_simulation(held,
 def test_a_run_that_ended_early_counts_without_success(tmp_path):
     """Three seconds: no errors late in the hold."""
     record, _, _ = driven(tmp_path, Station((X, Y, Z), YAW), 5.0)
-    (done,) = evaluate([record], task="t1", as_json=True)
-    (trial,) = done.result["per_trial"]
+    (trial,) = evaluate([record], task="t1")["per_trial"]
     assert not trial["success"] and trial["e_p_m"] is None and trial["fault"] == "ended early"
 
 
@@ -139,8 +138,8 @@ def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):
     assert boundary.run(app, ["evaluate", str(record), "--task", "t2", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["complete"] == 1 and told["horizontal_rmse_m"] < 0.05 and told["energy"] > 0.0
-    (done,) = evaluate([record], task="t2", truth=truth, as_json=True)
-    assert done.result["per_trial"][0]["p95_m"] < 0.08 and done.result["per_trial"][0]["success"]
+    (trial,) = evaluate([record], task="t2", truth=truth)["per_trial"]
+    assert trial["p95_m"] < 0.08 and trial["success"]
     with pytest.raises(DriveError, match="its goal moves"):
         read_record(record, "t1", FINSROV)
     with pytest.raises(DriveError, match="'pursuit' has 2 vehicles and .* is of one"):
@@ -185,9 +184,9 @@ def test_an_episode_that_was_cut_short_counts_without_success(tmp_path, capsys):
     site_of("docking", "align-insert", [FINSROV], seed=3, record=tmp_path).run(duration=5.0)
     assert boundary.run(app, ["evaluate", str(tmp_path / "vehicle.mcap"), "--task", "docking"]) == 0
     assert "vehicle.mcap: ended early" in capsys.readouterr().out
-    (done,) = evaluate([tmp_path / "vehicle.mcap"], task="docking", as_json=True)
-    (trial,) = done.result["per_trial"]
-    assert trial["success"] == 0.0 and trial["return"] is None and done.result["valid"] == 0
+    done = evaluate([tmp_path / "vehicle.mcap"], task="docking")
+    (trial,) = done["per_trial"]
+    assert trial["success"] == 0.0 and trial["return"] is None and done["valid"] == 0
 
 
 def test_a_memory_that_was_drawn_is_not_in_a_record(held, tmp_path):

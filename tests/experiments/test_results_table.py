@@ -59,7 +59,7 @@ def printed(tables):
 @pytest.mark.parametrize("plants", [1, 2])
 def test_station_keeping_shows_every_unit_and_digit(plants):
     """Rich would take `[m]` for a style and leave it out."""
-    text = printed(tables_of([result(T1_FIGURES, setpoint="P01")] * plants))
+    text = printed(tables_of({"plants": [result(T1_FIGURES, setpoint="P01")] * plants}))
     units = [heading.split(" [")[1] for heading, _ in T1_COLUMNS.values() if " [" in heading]
     assert [text.count(f"[{unit}") >= units.count(unit) for unit in units] == [True] * len(units)
     assert "…" not in text and all(
@@ -69,7 +69,7 @@ def test_station_keeping_shows_every_unit_and_digit(plants):
 
 def test_tracking_shows_every_unit_and_digit():
     """The same of T2."""
-    text = printed(tables_of([result(T2_FIGURES, "t2", trajectory="lemniscate")]))
+    text = printed(tables_of(result(T2_FIGURES, "t2", trajectory="lemniscate")))
     assert all(word in text for heading, _ in T2_COLUMNS.values() for word in heading.split())
     assert "…" not in text and all(
         figure in text for figure in ("0.0681", "0.1293", "0.4052", "100%", "12.3")

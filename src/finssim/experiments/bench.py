@@ -153,36 +153,31 @@ def bench(*, device: str = "cpu", progress: Progress = lambda part, what: None) 
         device (DEVICE): Where to compute: cpu or cuda.
         progress: Told the share that is done and what is measured next.
     """
-    rates: dict[str, Callable[[], float | None]] = {
-        f"physics {model}/{worlds}": partial(physics_rate, model, worlds, device=device)
+    plan: dict[tuple[str, str], Callable[[], float | None]] = {
+        ("physics", f"{model}/{worlds}"): partial(physics_rate, model, worlds, device=device)
         for model in MODELS
         for worlds in WORLDS
     }
-    rates[f"physics calibrated/{WORLDS[-1]}/1 thread"] = partial(
-        physics_rate, "calibrated", WORLDS[-1], threads=1
-    )
+    one_core = f"calibrated/{WORLDS[-1]}/1 thread"
+    plan["physics", one_core] = partial(physics_rate, "calibrated", WORLDS[-1], threads=1)
     for action in ACTIONS:
         for worlds in WORLDS:
-            rates[f"T1 {action}/{worlds}"] = partial(environment_rate, action, worlds, device=device)
-    rates |= {"faces": faces_rate, "MuJoCo": mujoco_rate, "memory": partial(memory_mb, MEMORY_WORLDS)}
-    figures: dict[str, Any] = {}
-    for name, measure in rates.items():
-        progress(len(figures) / len(rates), name)
-        figures[name] = measure()
-    physics, steps = (
-        {name.removeprefix(kind): x for name, x in figures.items() if name.startswith(kind)}
-        for kind in ("physics ", "T1 ")
-    )
-    reference = figures["MuJoCo"]
+            plan["T1", f"{action}/{worlds}"] = partial(environment_rate, action, worlds, device=device)
+    plan["faces", ""], plan["MuJoCo", ""] = faces_rate, mujoco_rate
+    plan["memory", ""] = partial(memory_mb, MEMORY_WORLDS)
+    figures: dict[tuple[str, str], Any] = {}
+    for (kind, name), figure in plan.items():
+        progress(len(figures) / len(plan), f"{kind} {name}".strip())
+        figures[kind, name] = figure()
+    physics, reference = figures["physics", f"calibrated/{WORLDS[-1]}"], figures["MuJoCo", ""]
     return {
-        "physics_steps_per_s": physics,
-        "env_steps_per_s": steps,
-        "faces_per_s": figures["faces"],
-        "single_step_us": 1e6 / physics["calibrated/1"],
+        "physics_steps_per_s": {name: rate for (kind, name), rate in figures.items() if kind == "physics"},
+        "env_steps_per_s": {name: rate for (kind, name), rate in figures.items() if kind == "T1"},
+        "faces_per_s": figures["faces", ""],
+        "single_step_us": 1e6 / figures["physics", "calibrated/1"],
         "mujoco_steps_per_s": reference,
-        "physics_substeps_over_mujoco_steps": reference
-        and PHYSICS_SUBSTEPS * physics[f"calibrated/{WORLDS[-1]}"] / reference,
-        f"memory_mb/{MEMORY_WORLDS}": figures["memory"],
+        "physics_substeps_over_mujoco_steps": reference and PHYSICS_SUBSTEPS * physics / reference,
+        f"memory_mb/{MEMORY_WORLDS}": figures["memory", ""],
         "device": device,
         "machine": machine(),
     }

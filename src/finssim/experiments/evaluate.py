@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
-
-from rich.console import Console
 
 from finssim.experiments import campaign
 from finssim.experiments.campaign import progress_bar, write_json
@@ -29,7 +26,7 @@ from finssim.experiments.metrics import (
     summarize_tracking,
 )
 from finssim.experiments.plants import Plant, load_plant
-from finssim.experiments.tables import Columns, Table, cells, figure_text, print_tables
+from finssim.experiments.tables import Columns, Table, cells, figure_text
 from finssim.experiments.trials import (
     EPISODES,
     T2_TRAJECTORIES,
@@ -124,8 +121,9 @@ FORMS: Mapping[str, Form] = {
 """Every other task is measured in episodes as in training, by itself."""
 
 
-def tables_of(results: Sequence[Mapping[str, Any]]) -> list[Table]:
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
     """A row for each target and plant, of several plants in T1 for each plant alone; and the paper's."""
+    results: Sequence[Mapping[str, Any]] = result.get("plants", [result])
     first, several = results[0], len(results) > 1
     title = f"{first['task']} · {first['controller']['name']} · {first['vehicle']['name']}"
     if not several:
@@ -244,9 +242,7 @@ def evaluate(
     truth: Path | None = None,
     seed: int = 42,
     out: Path | None = None,
-    as_json: bool = False,
-    console: Console | None = None,
-) -> list[Evaluation]:
+) -> dict[str, Any]:
     """Try a controller: success, errors [m, deg], time to settle [s]; or errors along trajectories [m].
 
     Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
@@ -275,11 +271,9 @@ def evaluate(
             motion capture, t [s], x, y, z [m] and qx, qy, qz, qw or yaw [rad], or the truth file of finssim pool.
         seed: Seed of every random number; equal seeds give equal results.
         out: Directory for evaluation.json, trajectories and, of t1 and t2, a figure.
-        json: Print one JSON object instead of tables.
-        console: Where the table goes; standard output if None.
 
     Returns:
-        One evaluation for each plant, in their order.
+        The result of the evaluation; of several plants `plants`, one for each, in their order.
 
     Raises:
         EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
@@ -319,14 +313,7 @@ def evaluate(
                 form = FORMS[task]
                 figure = form.draw({e.label: e.trials for e in evaluations}, title)
                 save_figure(figure, folder / form.figure)
-    if as_json:
-        print(json.dumps(document, allow_nan=False))
-        return evaluations
-    console = console or Console()
-    print_tables(tables_of(results), console)
-    if out is not None:
-        console.print(f"written: {out}", highlight=False, soft_wrap=True)
-    return evaluations
+    return document
 
 
 def _recorded(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +20,7 @@ from finssim.control.allocation import Allocator
 from finssim.control.pid import axis_model
 from finssim.files import atomic_directory, atomic_write
 from finssim.quiet import start_warp
+from finssim.text_table import write_csv
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
@@ -503,12 +503,10 @@ def write_programme(programme: Programme, vehicle: Vehicle, folder: Path) -> Non
         OutputError: The system refused to write.
     """
     thrust = Allocator.from_vehicle(vehicle).allocate(programme.tau_desired)
-    with atomic_write(folder / "programme.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["t", *TAU, *(f"force_{name}" for name in vehicle.thruster_names), "phase"])
-        numbers = np.column_stack([programme.t, programme.tau_desired, thrust])
-        for row, phase in zip(numbers.round(6) + 0.0, programme.phase, strict=True):
-            writer.writerow([*(f"{x:g}" for x in row), phase])
+    numbers = np.column_stack([programme.t, programme.tau_desired, thrust]).round(6) + 0.0
+    rows = ([*(f"{x:g}" for x in row), word] for row, word in zip(numbers, programme.phase, strict=True))
+    names = ["t", *TAU, *(f"force_{name}" for name in vehicle.thruster_names), "phase"]
+    write_csv(folder / "programme.csv", names, rows)
     about: dict[str, Any] = {
         "name": programme.name,
         "vehicle": vehicle.name,

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import warp as wp
@@ -311,15 +311,16 @@ def measure(
     out |= dict(zip(("roll", "pitch", "yaw"), quat_to_euler(q_measured), strict=True))
     for i, name in enumerate("xyz"):
         out[name] = x_measured[..., i]
-    out |= _own_sensors(recording, vehicle, noise, every, seed)
-    if "depth" not in out:
+    rates, force, depth = _own_sensors(recording, vehicle, noise, every, seed)
+    if depth is None:
         at = vehicle.sensors.depth.position if vehicle.sensors.depth else np.zeros(3)
-        out["depth"] = -(x + quat_rotate(q, np.broadcast_to(at, x.shape)))[..., 2] + error(noise.depth_std)
-    if "p" not in out:
+        depth = -(x + quat_rotate(q, np.broadcast_to(at, x.shape)))[..., 2] + error(noise.depth_std)
+    if rates is None or force is None:
         rates = nu[..., 3:] + error(noise.gyro_std, 3)
         force = _specific_force(recording, vehicle, every) + error(noise.accel_std, 3)
-        out |= {name: rates[..., i] for i, name in enumerate("pqr")}
-        out |= {f"a{name}": force[..., i] for i, name in enumerate("xyz")}
+    out["depth"] = depth
+    out |= {name: rates[..., i] for i, name in enumerate("pqr")}
+    out |= {f"a{name}": force[..., i] for i, name in enumerate("xyz")}
     if noise.velocity_window is None:
         velocity = nu[..., :3] + error(noise.velocity_std, 3)
     else:
@@ -329,10 +330,11 @@ def measure(
 
 def _own_sensors(
     recording: Recording, vehicle: Vehicle, noise: NoiseProfile, every: int, seed: int
-) -> dict[str, Array]:
-    """IMU and depth through the vehicle's own sensors: at each row the newest sample since the last."""
+) -> tuple[Array | None, Array | None, Array | None]:
+    """Rates, specific force and depth by the vehicle's own sensors, the newest sample since the last row; None where
+    they do not measure."""
     if not noise.own_sensors:
-        return {}
+        return None, None, None
     steps, worlds = recording.velocity.shape[:2]
     state = _Recorded(worlds)
     suite = SensorSuite(vehicle, worlds=worlds, control_step=recording.step, seed=seed)
@@ -350,15 +352,11 @@ def _own_sensors(
         if suite.depth is not None:
             fresh = suite.depth.fresh.numpy()[:, 0]
             depth[row, fresh] = suite.depth.depth.numpy()[fresh, 0]
-    out: dict[str, Array] = {}
-    if vehicle.sensors.imu is not None:
-        q_bs = np.broadcast_to(vehicle.sensors.imu.orientation, (rows, worlds, 4))
-        gyro, accel = quat_rotate(q_bs, gyro), quat_rotate(q_bs, accel)
-        out |= {name: gyro[..., i] for i, name in enumerate("pqr")}
-        out |= {f"a{name}": accel[..., i] for i, name in enumerate("xyz")}
-    if vehicle.sensors.depth is not None:
-        out["depth"] = depth
-    return out
+    measured_depth = None if suite.depth is None else depth
+    if vehicle.sensors.imu is None:
+        return None, None, measured_depth
+    q_bs = np.broadcast_to(vehicle.sensors.imu.orientation, (rows, worlds, 4))
+    return quat_rotate(q_bs, gyro), quat_rotate(q_bs, accel), measured_depth
 
 
 def _specific_force(recording: Recording, vehicle: Vehicle, every: int) -> Array:
@@ -395,53 +393,33 @@ DEFAULT_COLUMNS = (
 )
 """Measured columns of a synthetic trial."""
 
-INPUTS = ("rpm", "force", "wrench", "pwm", "command")
-
 Input = Literal["rpm", "force", "wrench", "pwm", "command"]
 
 
 def simulate_programme(
-    programmes: Sequence[Programme],
-    vehicle: Vehicle,
-    *,
-    noise: NoiseProfile | str = "sensors",
-    seed: int = 0,
-    rate: float = 50.0,
-    columns: Sequence[str] | None = None,
-    inputs: Sequence[Input] = ("rpm", "wrench"),
-    sampling: Literal["instant", "held"] = "instant",
-    **plant: Any,
+    programmes: Sequence[Programme], vehicle: Vehicle, *, seed: int = 0, **how: Any
 ) -> list[Trial]:
     """Trials of a vehicle, one for each programme: `record` and then `trials_of`.
 
     Args:
         programmes: What to run.
         vehicle: The vehicle, whose file says what it believes of itself.
-        noise: A profile or the name of one.
         seed: Of initial conditions and noise; equal seeds give equal trials.
-        rate: Of the rows [Hz].
-        columns: Measured columns to log; `DEFAULT_COLUMNS` if None.
-        inputs: Which inputs to log.
-        sampling: See the module.
-        plant: As for `record`: hydrodynamics, plant, disturbance, water, pool, tether, depth, spread, threads.
+        how: Arguments of `trials_of` (noise, rate, columns, inputs, sampling) and of `record` (hydrodynamics, plant,
+            disturbance, water, pool, tether, depth, spread, threads).
 
     Raises:
         CalibrationError: An argument that cannot be.
     """
-    recording = record(programmes, vehicle, seed=seed, **plant)
-    water = plant.get("water")
-    return trials_of(
-        recording,
-        programmes,
-        vehicle,
-        noise=noise,
-        seed=seed,
-        rate=rate,
-        columns=columns,
-        inputs=inputs,
-        sampling=sampling,
-        current=tuple(water.current) if water is not None and any(water.current) else None,
-    )
+    measured = {name: how.pop(name) for name in MEASURED & how.keys()}
+    recording = record(programmes, vehicle, seed=seed, **how)
+    if (water := how.get("water")) is not None and any(water.current):
+        measured["current"] = tuple(water.current)
+    return trials_of(recording, programmes, vehicle, seed=seed, **measured)
+
+
+MEASURED = {"noise", "rate", "columns", "inputs", "sampling"}
+"""Arguments of `simulate_programme` that say how the motion is measured."""
 
 
 def trials_of(
@@ -457,11 +435,20 @@ def trials_of(
     sampling: Literal["instant", "held"] = "instant",
     current: tuple[float, float, float] | None = None,
 ) -> list[Trial]:
-    """Trials that measure a recording; arguments as for `simulate_programme`.
+    """Trials that measure a recording.
 
     Calling it again with another seed gives the same motion with other noise.
 
     Args:
+        recording: The true motion.
+        programmes: What was run.
+        vehicle: Whose sensors measure.
+        noise: A profile or the name of one.
+        seed: Of the noise.
+        rate: Of the rows [Hz].
+        columns: Measured columns to log; `DEFAULT_COLUMNS` if None.
+        inputs: Which inputs to log.
+        sampling: See the module.
         current: What the header says of the water's velocity, world frame [m/s].
 
     Raises:
@@ -521,8 +508,8 @@ def _inputs(
 ) -> dict[str, Array]:
     """Input columns, (rows, W) each."""
     for name in inputs:
-        if name not in INPUTS:
-            raise CalibrationError(f"unknown input '{name}'; available: {', '.join(INPUTS)}")
+        if name not in get_args(Input):
+            raise CalibrationError(f"unknown input '{name}'; available: {', '.join(get_args(Input))}")
     thrust = recording.thrust.astype(float)
     if sampling == "held":
         # Thrust is linear between states, to second order in the step: the mean is the trapezoid's.

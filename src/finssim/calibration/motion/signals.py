@@ -26,8 +26,8 @@ from finssim.geometry.rotations import (
 from finssim.vehicles import Vehicle
 
 __all__ = [
-    "AttitudeSignal", "Motion", "Offset", "attitude_samples", "attitude_signal", "holds_gravity", "motion", "offset",
-    "on_grid", "stream_offsets", "up_in_body",
+    "AttitudeSignal", "Motion", "Offset", "attitude_samples", "attitude_signal", "holds_gravity", "motion",
+    "offset", "on_grid", "phase_at", "stream_offsets", "up_in_body",
 ]  # fmt: skip
 
 
@@ -363,7 +363,7 @@ def motion(trial: Trial, vehicle: Vehicle) -> Motion:
         rate=rate,
         quaternion=attitude.quaternion,
         tau=tau,
-        phase=_phase(trial, t),
+        phase=phase_at(trial, t),
         valid=_valid(tau, found["nu"]),
         **found,
     )
@@ -380,7 +380,8 @@ def grid_rate(trial: Trial, inputs: Drive) -> float:
     return float(min(FASTEST, whole if whole >= 5 and abs(rate / whole - 1.0) < 0.01 else rate))
 
 
-def _phase(trial: Trial, t: Array) -> NDArray[np.str_]:
+def phase_at(trial: Trial, t: Array) -> NDArray[np.str_]:
+    """The phase that the log names at some times on the trial's clock [s], (n,); empty words where it names none."""
     if trial.phase is None:
         return np.full(len(t), "", dtype="<U10")
     return trial.phase[np.maximum(np.searchsorted(trial.t, t + 1e-9, side="right") - 1, 0)]

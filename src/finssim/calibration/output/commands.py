@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -18,6 +19,7 @@ from finssim.calibration.output.report import (
     progress_bar,
     publish,
     refuse_places,
+    write_report,
 )
 from finssim.calibration.output.vehicle_file import all_findings, calibrated, write_vehicle
 from finssim.calibration.trials.trial import Trial
@@ -51,17 +53,15 @@ def calibrate_thruster(
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
     """
+    options = dict(locals())
     refuse_places(out, report, "vehicle")
-    options = {"group": group, "voltage": voltage, "pool_voltages": pool_voltages}
-    given = {"vehicle": vehicle, "out": out, "report": report, "seed": seed, **options}
-    command = command_line("thruster", tables, given)
     body = load_vehicle(vehicle)
     from finssim.calibration.actuators.thruster import fit_thruster
 
     fit = fit_thruster(
         list(tables), body, group=group, voltage=voltage, pool_voltages=pool_voltages, seed=seed
     )
-    return _finish(fit, command, out, report, as_json)
+    return finish("thruster", fit, options)
 
 
 def calibrate_motor(
@@ -85,14 +85,13 @@ def calibrate_motor(
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
     """
+    options = dict(locals())
     refuse_places(out, report, "vehicle")
-    given = {"vehicle": vehicle, "out": out, "report": report, "seed": seed}
-    command = command_line("motor", trials, given)
     body = load_vehicle(vehicle)
     from finssim.calibration.actuators.motor import fit_motor
 
     fit = fit_motor(_trials(trials), body, seed=seed)
-    return _finish(fit, command, out, report, as_json)
+    return finish("motor", fit, options)
 
 
 def calibrate_hydrodynamics(
@@ -140,15 +139,13 @@ def calibrate_hydrodynamics(
         CalibrationError, VehicleError, OutputError: As they say; nothing is written then.
         KeyboardInterrupt: After Ctrl-C, when the best until then, if there is any, has been written.
     """
-    options = {name: value or None for name, value in locals().items() if name not in ("trials", "as_json")}
-    options["seed"] = seed
+    options = dict(locals())
     further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
     chosen = _axes(axes)
     known = _known(fix)
     refuse_places(out, report, "vehicle")
     if ranges is not None:
         refuse_places(ranges, None, "ranges")
-    command = command_line("hydrodynamics", trials, options)
     body = load_vehicle(vehicle)
     used = _trials(trials)
     from finssim.calibration.hydrodynamics import fit_hydrodynamics
@@ -166,7 +163,7 @@ def calibrate_hydrodynamics(
             seed=seed,
             progress=progress,
         )
-    return _finish(fit, command, out, report, as_json, ranges)
+    return finish("hydrodynamics", fit, options)
 
 
 def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:
@@ -223,23 +220,31 @@ def _known(words: str) -> dict[str, float]:
     return found
 
 
-def _finish(
-    fit: Fit, command: str, out: Path, report: Path | None, as_json: bool, ranges: Path | None = None
-) -> Vehicle:
-    """Write and show; ends with KeyboardInterrupt where the fit was interrupted."""
+def finish(kind: str, fit: Fit, options: Mapping[str, Any]) -> Vehicle:
+    """Write the calibrated vehicle, the report and the ranges, and show them.
+
+    Args:
+        kind: Of the command.
+        fit: The fit.
+        options: All arguments of the command by name, the inputs first.
+
+    Raises:
+        KeyboardInterrupt: The fit was interrupted.
+    """
+    (_, inputs), *rest = options.items()
+    out, report, ranges = options["out"], options["report"], options.get("ranges")
     vehicle = calibrated(fit)
     findings = all_findings(fit, vehicle)
     write_vehicle(vehicle, out)
     if report is not None:
-        from finssim.calibration.output.report import write_report
-
+        given = {name: value for name, value in rest if name != "as_json"}
+        command = command_line(kind, [inputs] if isinstance(inputs, Path) else inputs, given)
         write_report(fit, report, vehicle, command=command, findings=findings, out=out)
     if ranges is not None:
         from finssim.calibration.output.ranges import write_ranges
 
         write_ranges(fit, ranges, vehicle)
-
-    record = fit_json(fit, vehicle, out=out, findings=findings) if as_json else None
+    record = fit_json(fit, vehicle, out=out, findings=findings) if options["as_json"] else None
     publish(record, fit_report(fit, vehicle, findings).show, (out, report, ranges))
     if fit.interrupted:
         raise KeyboardInterrupt

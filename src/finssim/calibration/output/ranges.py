@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate, Fit
-from finssim.calibration.output.vehicle_file import calibrated, estimate_at
+from finssim.calibration.output.vehicle_file import calibrated, estimate_at, yaml_path
 from finssim.engine.ranges_file import load_ranges
 from finssim.files import atomic_write
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle
@@ -56,11 +55,7 @@ def write_ranges(fit: Fit, path: str | os.PathLike[str], vehicle: Vehicle | None
         CalibrationError: Another suffix, or a vehicle without a calibrated set.
         OutputError: The place cannot be written.
     """
-    target = Path(path)
-    if target.suffix not in (".yaml", ".yml"):
-        raise CalibrationError(
-            f"{path} ends in '{target.suffix}', expected .yaml: name a ranges file to write"
-        )
+    target = yaml_path(path, "ranges")
     vehicle = calibrated(fit) if vehicle is None else vehicle
     text = _text(fit, vehicle)
     with atomic_write(target) as temporary:

@@ -21,10 +21,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, plain, sentences
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
-from finssim.calibration.output.vehicle_file import kept, number_in
+from finssim.calibration.output.vehicle_file import kept, number_in, yaml_path
 from finssim.files import atomic_directory, atomic_write, refuse_unwritable
 from finssim.page import RECORD_FILE, Page, Pictures
 from finssim.provenance import provenance
@@ -40,11 +39,7 @@ if TYPE_CHECKING:
 
 def refuse_places(out: Path, report: Path | None, kind: str) -> None:
     """Refuse a file that is no YAML, or a place that cannot be written, before anything is computed."""
-    if Path(out).suffix not in (".yaml", ".yml"):
-        raise CalibrationError(
-            f"{out} ends in '{Path(out).suffix}', expected .yaml: name a {kind} file to write"
-        )
-    refuse_unwritable(atomic_write(out))
+    refuse_unwritable(atomic_write(yaml_path(out, kind)))
     if report is not None:
         refuse_unwritable(atomic_directory(report, replaces=RECORD_FILE))
 
@@ -70,7 +65,7 @@ def command_line(kind: str, inputs: Iterable[Path], options: Mapping[str, Any]) 
         for item in value if isinstance(value, (list, tuple)) else [value]:
             if item is True:
                 words.append(option)
-            elif item is not None and item is not False:
+            elif item is not None and item is not False and item != "":
                 words += [option, str(item)]
     return shlex.join(words)
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import textwrap
 from collections import Counter
@@ -25,7 +26,7 @@ from finssim.vehicles import CalibrationRecord, Provenance, Vehicle, VehicleErro
 from finssim.vehicles.terms import TERMS
 
 __all__ = [
-    "SCALED", "all_findings", "calibrated", "concerns", "estimate_at", "file_tree", "folded", "kept",
+    "SCALED", "all_findings", "calibrated", "estimate_at", "file_tree", "folded", "kept",
     "leaves", "number_in", "number_origins", "write_vehicle",
 ]  # fmt: skip
 
@@ -181,99 +182,66 @@ def vehicle_text(tree: Mapping[str, Any], origins: Mapping[Key, Provenance]) -> 
     lines = [f"title: {_word(tree['title'])}", *_prose(str(tree["description"]))]
     lines += [f"{key}: {_word(text)}" for key, text in _marks(common, None).items()]
     for key, node in body.items():
-        lines += ["", *_lines(key, node, (str(key),), common, origins, "")]
+        lines += ["", *_lines(key, _annotated(node, (key,), common, origins), (key,), "")]
+    text = "\n".join(lines) + "\n"
     if tree.get("calibrations"):
-        lines += ["", "# How numbers above were fitted, oldest first: trial -> SHA-256 of what it holds."]
-        lines += ["calibrations:", *(line for r in tree["calibrations"] for line in _record(r))]
-    return "\n".join(lines) + "\n"
+        text += "\n# How numbers above were fitted, oldest first: trial -> SHA-256 of what it holds.\n"
+        text += _yaml({"calibrations": tree["calibrations"]}, flow=False)
+    return text
 
 
-def _lines(
-    key: Any,
-    node: Any,
-    path: Key,
-    inherited: Provenance | None,
-    origins: Mapping[Key, Provenance],
-    pad: str,
-) -> Iterator[str]:
-    """Lines of `key: node`, block or flow."""
-    head = f"{pad}{_word(str(key))}:"
-    flow = f"{head} {_flow(node, path, inherited, origins)}"
+def _annotated(node: Any, path: Key, inherited: Provenance | None, origins: Mapping[Key, Provenance]) -> Any:
+    """A node with the marks that tell the origins of its numbers to a reader who inherits one."""
     if isinstance(node, Mapping):
-        if not node or (_on_one_line(path) and len(flow) <= LONG):
-            yield flow
-            return
         common = _common(node, path, origins, inherited)
-        yield head
-        for mark, text in _marks(common, inherited).items():
-            yield f"{pad}  {mark}: {_word(text)}"
-        for inner, value in node.items():
-            yield from _lines(inner, value, (*path, str(inner)), common, origins, pad + "  ")
-        return
+        inner = {key: _annotated(v, (*path, str(key)), common, origins) for key, v in node.items()}
+        return _marks(common, inherited) | inner
+    own, value = origins.get(path, inherited), node
+    if isinstance(node, list):
+        each = {origins.get(leaf) for leaf, _ in leaves(node, path)}
+        own = inherited if len(each) > 1 else next(iter(each), None)
+        value = [_annotated(item, (*path, str(i)), own, origins) for i, item in enumerate(node)]
+    marks = _marks(own, inherited)
+    return {"value": value} | marks if marks else value
+
+
+def _lines(key: Any, node: Any, path: Key, pad: str) -> Iterator[str]:
+    """Lines of `key: node`: sections in blocks, numbers and rows of them on one line each."""
+    head = f"{pad}{_word(key)}:"
+    flow = f"{head} {_word(node)}"
     unit = f"  # [{_unit(path)}]" if _unit(path) else ""
-    if isinstance(node, list) and not _uniform(node, path, origins):
+    short = not node or (_on_one_line(path) and len(flow) <= LONG)
+    if isinstance(node, Mapping) and not short and not ("value" in node and not _rows(node["value"])):
         yield head + unit
-        for i, item in enumerate(node):
-            yield from _item(item, (*path, str(i)), inherited, origins, pad + "  ")
-    elif isinstance(node, list) and node and isinstance(node[0], list):  # a matrix: one row on a line
-        common = origins.get(next(leaves(node, path))[0])
-        marks = _marks(common, inherited)
-        inner = pad
-        if marks:
-            yield head + unit
-            inner = pad + "  "
-            yield from (f"{inner}{mark}: {_word(text)}" for mark, text in marks.items())
-            yield f"{inner}value:"
-        else:
-            yield head + unit
-        for i, row in enumerate(node):
-            yield f"{inner}  - {_flow(row, (*path, str(i)), common, origins)}"
+        for inner, value in node.items():
+            yield from _lines(inner, value, (*path, str(inner)), pad + "  ")
+    elif _rows(node):
+        yield head + unit
+        yield from _items(node, pad + "  ")
     else:
         yield flow + unit
+
+
+def _items(rows: list[Any], pad: str) -> Iterator[str]:
+    """An item of a list on one line; a row whose entries have long notes on a line for each."""
+    for item in rows:
+        flow = f"{pad}- {_word(item)}"
+        if _rows(item) and len(flow) > LONG:
+            yield f"{pad}-"
+            yield from _items(item, pad + "  ")
+        else:
+            yield flow
+
+
+def _rows(node: Any) -> bool:
+    """Whether a node is a list of more than plain values."""
+    return isinstance(node, list) and any(isinstance(item, (list, Mapping)) for item in node)
 
 
 def _unit(path: Key) -> str:
     """Of the value at a path; empty where there is none to write."""
     term = TERMS.get(path[2]) if path[0] == "hydrodynamics" and len(path) > 2 else None
     return UNITS.get(path[-1], "") if term is None else term.units.get(path[-1], "")
-
-
-def _item(
-    node: Any,
-    path: Key,
-    inherited: Provenance | None,
-    origins: Mapping[Key, Provenance],
-    pad: str,
-) -> Iterator[str]:
-    """An item of a list on one line; a row whose entries have long notes on a line for each."""
-    flow = f"{pad}- {_flow(node, path, inherited, origins)}"
-    if isinstance(node, list) and len(flow) > LONG and not _uniform(node, path, origins):
-        yield f"{pad}-"
-        for i, item in enumerate(node):
-            yield from _item(item, (*path, str(i)), inherited, origins, pad + "  ")
-    else:
-        yield flow
-
-
-def _flow(node: Any, path: Key, inherited: Provenance | None, origins: Mapping[Key, Provenance]) -> str:
-    """A node on one line."""
-    if isinstance(node, Mapping):
-        common = _common(node, path, origins, inherited)
-        parts = [f"{mark}: {_word(text)}" for mark, text in _marks(common, inherited).items()]
-        parts += [
-            f"{_word(str(key))}: {_flow(v, (*path, str(key)), common, origins)}" for key, v in node.items()
-        ]
-        return "{" + ", ".join(parts) + "}"
-    if isinstance(node, list):
-        first = next((origins.get(leaf) for leaf, _ in leaves(node, path)), None)
-        common = first if _uniform(node, path, origins) else inherited
-        items = [_flow(item, (*path, str(i)), common, origins) for i, item in enumerate(node)]
-        value, marks = f"[{', '.join(items)}]", _marks(common, inherited)
-    else:
-        value, marks = _word(node), _marks(origins.get(path, inherited), inherited)
-    if not marks:
-        return value
-    return "{" + ", ".join([f"value: {value}", *(f"{k}: {_word(t)}" for k, t in marks.items())]) + "}"
 
 
 def _common(
@@ -313,10 +281,6 @@ def _shared(notes: list[str]) -> str:
     return note if several and notes.count(note) > 2 * notes.count("") else ""
 
 
-def _uniform(node: list[Any], path: Key, origins: Mapping[Key, Provenance]) -> bool:
-    return len({origins.get(leaf) for leaf, _ in leaves(node, path)}) <= 1
-
-
 def _marks(own: Provenance | None, inherited: Provenance | None) -> dict[str, str]:
     """What must be written so that a reader who inherits one origin finds the other."""
     if own is None or own == inherited:
@@ -337,23 +301,25 @@ def _on_one_line(path: Key) -> bool:
     )
 
 
-def _record(record: Mapping[str, Any]) -> Iterator[str]:
-    lead = "  - "
-    for key, value in record.items():
-        if key == "trials":
-            yield f"{lead}{key}:"
-            yield from (f"      {_word(name)}: {json.dumps(digest)}" for name, digest in value.items())
-        else:
-            yield f"{lead}{key}: {_word(value)}"
-        lead = "    "
-
-
 def _word(value: Any) -> str:
     """A value as YAML on one line, as it may stand inside a list or mapping."""
-    text = yaml.safe_dump(
-        [value], default_flow_style=True, sort_keys=False, allow_unicode=True, width=math.inf
+    return _yaml([value], flow=True).strip()[1:-1]
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes digests and other words that are numbers to our reader, as 1e5 is in YAML 1.2."""
+
+
+_Dumper.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+$"), list("-+0123456789.")
+)
+
+
+def _yaml(value: Any, *, flow: bool) -> str:
+    text = yaml.dump(
+        value, Dumper=_Dumper, default_flow_style=flow, sort_keys=False, allow_unicode=True, width=math.inf
     )
-    return str(text).strip()[1:-1]
+    return str(text)
 
 
 def _prose(text: str) -> list[str]:
@@ -383,7 +349,7 @@ def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
         CalibrationError: Another suffix.
         OutputError: The place cannot be written.
     """
-    target = check_vehicle_path(path)
+    target = yaml_path(path, "vehicle")
     tree, origins = file_tree(vehicle), number_origins(vehicle)
     tree, origins = _grouped(tree, origins)
     with atomic_write(target) as temporary:
@@ -394,8 +360,8 @@ def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
             raise RuntimeError(f"{path}: the file would not hold the same vehicle; nothing was written")
 
 
-def check_vehicle_path(path: str | os.PathLike[str]) -> Path:
-    """The path of a vehicle file to write.
+def yaml_path(path: str | os.PathLike[str], kind: str) -> Path:
+    """The path of a vehicle, ranges, pool or camera file to write.
 
     Raises:
         CalibrationError: It does not end in .yaml or .yml.
@@ -403,7 +369,7 @@ def check_vehicle_path(path: str | os.PathLike[str]) -> Path:
     target = Path(path)
     if target.suffix not in (".yaml", ".yml"):
         raise CalibrationError(
-            f"{path} ends in '{target.suffix}', expected .yaml: name a vehicle file to write"
+            f"{path} ends in '{target.suffix}', expected .yaml: name a {kind} file to write"
         )
     return target
 
@@ -542,24 +508,16 @@ def kept(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
 
 
 def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
-    """The findings of a fit and what speaks against its vehicle.
-
-    Args:
-        fit: The fit.
-        vehicle: `calibrated(fit)`.
-    """
-    return [*fit.findings, *concerns(fit, vehicle)]
-
-
-def concerns(fit: Fit, vehicle: Vehicle) -> list[Finding]:
-    """What speaks against the calibrated vehicle: checks that it fails and its parent did not, and fits without use.
+    """The findings of a fit, and what speaks against its vehicle: checks that it fails and its parent did not, and fits
+    without use.
 
     Args:
         fit: The fit.
         vehicle: `calibrated(fit)`.
     """
     passed = {check.name for check in check_vehicle(fit.vehicle) if check.passed}
-    found = [
+    found = [*fit.findings]
+    found += [
         finding("check_failed", check=check.name, sentence=check.sentence)
         for check in check_vehicle(vehicle)
         if not check.passed and check.name in passed

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
+from finssim.calibration.motion.signals import phase_at
 from finssim.calibration.motion.smoothing import white_noise
 from finssim.calibration.simulation.rollout import Response, Rollouts, Segment, Streams, segments, streams
 from finssim.calibration.trials.trial import NU, Array, Trial
@@ -487,10 +488,6 @@ def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
     clock = t + float(trial.t[0])
     tau = _shifted(resampled(m.t, m.tau, clock), vehicle.wrench_reference)
     axes = excited_axes(tau, np.asarray(vehicle.wrench_limits), trial.header.axis)
-    named = None
-    if trial.phase is not None:
-        rows = np.clip(np.searchsorted(trial.t, clock + 1e-9, side="right") - 1, 0, len(trial.t) - 1)
-        named = trial.phase[rows]
     nu, raw_nu = resampled(m.t, m.nu, clock), resampled(m.t, m.raw, clock)
     measured = {name: nu[:, k] for k, name in enumerate(NU)}
     raw = {name: raw_nu[:, k] for k, name in enumerate(NU)}
@@ -510,7 +507,7 @@ def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
         t0=float(trial.t[0]),
         rate=rate,
         axes=axes,
-        phase=find_phases(t, tau, axes, named),
+        phase=find_phases(t, tau, axes, phase_at(trial, clock)),
         tau=tau,
         measured={name: x for name, x in measured.items() if np.isfinite(x).any()},
         raw={name: x for name, x in raw.items() if np.isfinite(x).any()},

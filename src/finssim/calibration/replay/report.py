@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from finssim.calibration.findings import Finding, finding, plain, sentences
+from finssim.calibration.output.report import new_figure
 from finssim.calibration.replay.replay import (
     RESAMPLES,
     UNITS,
@@ -189,11 +190,7 @@ def _panels(
     count: int, rows: int, columns: int, size: tuple[float, float], **shared: Any
 ) -> tuple[Figure, Any]:
     """A figure of that size [inch] with `count` visible axes in a grid, (rows, columns)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(*size)
     axes_of = figure.subplots(rows, columns, squeeze=False, **shared)
     for axes in axes_of.flat[count:]:
         axes.set_visible(False)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.motion.signals import Motion, motion
+from finssim.calibration.motion.signals import EULER, Motion, attitude_samples, motion
 from finssim.calibration.trials.inputs import Drive, drive
 from finssim.calibration.trials.trial import Trial
 from finssim.engine.plant_arrays import NO_LIMIT, vehicle_parameters
@@ -112,13 +112,10 @@ class Streams:
 def streams(trial: Trial, vehicle: Vehicle) -> Streams:
     """Prepare a trial once, to cut it in several ways."""
     measured = {c: trial.series(c) for c in CHANNELS}
-    q = [trial.channels.get(f"q{c}") for c in "xyzw"]
-    if all(part is not None for part in q):
-        quaternion = np.stack([np.asarray(part) for part in q], axis=-1)
-        good = np.isfinite(quaternion).all(axis=1)
-        for name, angle in zip(("roll", "pitch", "yaw"), quat_to_euler(quaternion[good]), strict=True):
-            if not len(measured[name][0]):
-                measured[name] = (trial.t[good], angle)
+    t, q, given = attitude_samples(trial)
+    for name, angle in zip(EULER, quat_to_euler(q), strict=True):
+        if name in given and not len(measured[name][0]):
+            measured[name] = (t, angle)
     measured = {c: pair for c, pair in measured.items() if len(pair[0])}
     return Streams(trial=trial, drive=drive(trial, vehicle), motion=motion(trial, vehicle), measured=measured)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 import re
@@ -29,7 +28,7 @@ from finssim.calibration.trials.trial import (
     column_of,
 )
 from finssim.files import OutputError, atomic_directory
-from finssim.text_table import TextTable, number, read_text_table
+from finssim.text_table import TextTable, number, read_text_table, write_csv
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import read_mapping
 
@@ -104,10 +103,7 @@ def write_table(path: Path, numbers: dict[str, Array], phase: NDArray[np.str_] |
     if phase is not None:
         names.append("phase")
         cells.append(phase.tolist())
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(names)
-        writer.writerows(zip(*cells, strict=True))
+    write_csv(path, names, zip(*cells, strict=True))
 
 
 def _read_csv(path: Path, **how: Any) -> Table:

@@ -23,15 +23,8 @@ from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion.signals import RATE, offset
 from finssim.calibration.motion.smoothing import smooth
-from finssim.calibration.output.report import (
-    command_line,
-    fit_json,
-    fit_report,
-    publish,
-    refuse_places,
-    write_report,
-)
-from finssim.calibration.output.vehicle_file import all_findings, calibrated, write_vehicle
+from finssim.calibration.output.commands import finish
+from finssim.calibration.output.report import refuse_places
 from finssim.calibration.uncertainty import Covariance, intervals, trial_covariance
 from finssim.calibration.vision.least_squares import (
     Block,
@@ -1001,18 +994,8 @@ def run(
     Raises:
         CalibrationError, LocalizationError, VehicleError, OutputError: As they say; nothing is written then.
     """
+    options = dict(locals())
     refuse_places(out, report, "vehicle")
     where, body = load_pool(pool), load_vehicle(vehicle)
     recording = read_mount_log(log, where, body)
-    fit = calibrate_mounts(recording, where, body, name=Path(log).name, seed=seed)
-    after = calibrated(fit)
-    findings = all_findings(fit, after)
-    write_vehicle(after, out)
-    if report is not None:
-        options = {"pool": pool, "vehicle": vehicle, "out": out, "seed": seed}
-        command = command_line("mounts", [log], options)
-        write_report(fit, report, after, command=command, findings=findings, out=out)
-
-    record = fit_json(fit, after, out=out, findings=findings) if as_json else None
-    publish(record, fit_report(fit, after, findings).show, (out, report))
-    return after
+    return finish("mounts", calibrate_mounts(recording, where, body, name=Path(log).name, seed=seed), options)
