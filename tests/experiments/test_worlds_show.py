@@ -1,6 +1,7 @@
 """`finssim worlds`: sites are listed, described and drawn."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -55,3 +56,12 @@ def test_a_site_is_drawn(capsys, tmp_path, monkeypatch):
     assert finssim("worlds", "show", "dock", "--lamps", "--seed", 1, "--out", tmp_path / "dock.png") == 0
     assert (tmp_path / "dock.png").read_bytes().startswith(b"\x89PNG")
     assert "beacons_upper" in capsys.readouterr().out
+
+
+def test_without_newton_the_extra_is_named(capsys, tmp_path, monkeypatch):
+    """Worlds are read without it; to see them, the sentence says what to install."""
+    monkeypatch.setitem(sys.modules, "newton", None)
+    assert finssim("worlds", "show", "pool") == 0
+    assert finssim("worlds", "show", "pool", "--out", tmp_path / "pool.png") == 2
+    assert "newton is not installed: pip install 'finssim[perception]'" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
