@@ -24,14 +24,15 @@ __all__ = ["Array", "Header", "NU", "PHASES", "TAU", "Trial", "TrialWater", "col
 
 def _point(value: Any) -> Any:
     numbers = value if isinstance(value, (list, tuple)) else ()
-    if len(numbers) != 3 or not all(type(x) in (int, float) and math.isfinite(x) for x in numbers):
-        raise refuse_value(f"is {value!r}, expected 3 numbers [x, y, z] in m")
+    known = [isinstance(x, (int, float)) and not isinstance(x, bool) and math.isfinite(x) for x in numbers]
+    if len(known) != 3 or not all(known):
+        raise refuse_value(f"is {value!r}, expected 3 numbers [x, y, z]")
     return value
 
 
 def _moment_point(value: Any) -> Any:
     if isinstance(value, str) and value not in ("center_of_gravity", "origin"):
-        raise refuse_value(f"is {value!r}, expected 3 numbers [x, y, z] in m, center_of_gravity or origin")
+        raise refuse_value(f"is {value!r}, expected 3 numbers [x, y, z], center_of_gravity or origin")
     return value if value is None or isinstance(value, str) else _point(value)
 
 
