@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.integrate import quad
 
 from finssim.geometry.frames import TO_OPTICAL
 from finssim.geometry.optics import Camera, Interface, Layer, project
-from finssim.worlds import CameraBatch, Headlight, WorldBatch
+from finssim.worlds import CameraBatch, Headlight, RangeBatch, SonarBatch, WorldBatch, load_device
 from finssim.worlds.description import CameraDevice, Mount, Port
 
 pytestmark = pytest.mark.slow
@@ -147,6 +148,24 @@ def test_equal_seeds_give_equal_pictures(dock, poses):
     np.testing.assert_array_equal(
         CameraBatch(alone, device).update(poses(place), seed=4).numpy()[0], first[0]
     )
+
+
+def test_vehicles_outside_the_mask_keep_their_pictures(dock, poses):
+    """A camera, a sonar and an altimeter of the second of three: the others' readings stay, bit for bit."""
+    far, near = ((0.2, -0.7, -3.3), (0, 0, 0, 1)), ((0.9, -0.3, -3.0), (0, 0, 0, 1))
+    mask = wp.array([0, 1, 0], dtype=int)
+    for sensor in (
+        CameraBatch(dock, camera(width=32, height=24, focal_length=20.0, exposure="auto")),
+        SonarBatch(dock, load_device("gemini_720is"), beams=16, bins=32),
+        RangeBatch(dock, load_device("ping")),
+    ):
+        first = sensor.update(poses(far, far, far), seed=1).numpy().copy()
+        second = sensor.update(poses(near, near, near), seed=2, mask=mask).numpy().copy()
+        changed = [not np.array_equal(a, b) for a, b in zip(first, second, strict=True)]
+        assert changed == [False, True, False]
+        everyone = sensor.update(poses(near, near, near), seed=2).numpy()
+        if not isinstance(sensor, CameraBatch):  # whose exposure has moved since
+            np.testing.assert_array_equal(everyone[1], second[1])
 
 
 def test_exposure_settles_on_its_aim(dock, poses):

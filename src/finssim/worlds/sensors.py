@@ -29,6 +29,8 @@ from finssim.worlds.rays import WATER_INDEX, camera_rays, cones, fan, ray_elevat
 wp.set_module_options({"enable_backward": False})
 
 MISS = wp.constant(wp.uint32(0xFFFFFFFF))
+SKIPPED = wp.constant(-101)
+"""In place of a view's world: Newton leaves its outputs as they are (`WorldRenderFlag.DISABLE_PRESERVE`)."""
 LEVELS = 4096
 """Of the converter behind a camera's pixels (12 bits), before the numbers are encoded to 8."""
 LAMP_STEPS = wp.constant(8)
@@ -41,12 +43,19 @@ def _place_views(
     poses: wp.array(dtype=wp.transform),
     mount: wp.transform,
     world_of_view: wp.array(dtype=int),
+    mask: wp.array(dtype=int),
     optics: Optics,
     views: wp.array(dtype=wp.transform),
+    worlds: wp.array(dtype=int),
     dimming: wp.array(dtype=wp.vec3),
 ):
-    """Sensor poses in the world, and daylight at their depths as a share of that at the surface."""
+    """Sensor poses, their worlds or SKIPPED, and daylight at their depths as a share of that at the surface."""
     v = wp.tid()
+    worlds[v] = SKIPPED
+    if mask.shape[0] > 0:
+        if mask[v] == 0:
+            return
+    worlds[v] = world_of_view[v]
     views[v] = wp.transform_multiply(poses[v], mount)
     depth = wp.max(-wp.transform_get_translation(views[v])[2], 0.0)
     K = optics.daylight_attenuation[world_of_view[v]]
@@ -98,13 +107,25 @@ class RayBatch:
             self.world_of_view = wp.array(np.arange(self.count) // vehicles, dtype=int)
             self.views = wp.zeros(self.count, dtype=wp.transform)
             self.dimming = wp.zeros(self.count, dtype=wp.vec3)
+            self.worlds = wp.zeros(self.count, dtype=int)
+            self._all = wp.zeros(0, dtype=int)
         self._mount = wp.transform(wp.vec3(*mount.position), wp.quat(*map(float, mount.quaternion)))
 
-    def cast(self, poses: wp.array) -> None:
+    def _span(self, columns: int) -> int:
+        """Elements of a row for a thread: neighbours are other threads on a GPU, and its own next on a processor."""
+        return 1 if self.device.is_cuda else columns
+
+    def _blocks(self, array: wp.array) -> tuple[int, int, int]:
+        """Threads over an array of (views, rows, columns)."""
+        views, rows, columns = array.shape[:3]
+        return views, rows, columns // self._span(columns)
+
+    def cast(self, poses: wp.array, mask: wp.array | None = None) -> None:
         """Trace the rays: depth from where each enters the water [m], index of the shape, normal.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            mask: Which vehicles' sensors measure; the others' outputs stay. int (N,); all if None.
 
         Raises:
             WorldError: Another number of vehicles.
@@ -113,7 +134,14 @@ class RayBatch:
             raise WorldError(
                 f"{len(poses)} poses for {self.count} vehicles: give one for each, in order of world"
             )
-        inputs = [poses, self._mount, self.world_of_view, self.batch.optics, self.views, self.dimming]
+        inputs = [
+            poses,
+            self._mount,
+            self.world_of_view,
+            self._all if mask is None else mask,
+            self.batch.optics,
+        ]
+        inputs += [self.views, self.worlds, self.dimming]
         wp.launch(_place_views, self.count, inputs, device=self.device)
         self.batch.caster.update(
             self.batch.state,
@@ -122,7 +150,7 @@ class RayBatch:
             depth_image=self.depth,
             normal_image=self.normal,
             shape_index_image=self.shape_index,
-            world_indices=self.world_of_view,
+            world_indices=self.worlds,
             sync_deformables=False,
         )
 
@@ -307,7 +335,7 @@ def _take_picture(
     normal: wp.array3d(dtype=wp.vec3),
     views: wp.array(dtype=wp.transform),
     poses: wp.array(dtype=wp.transform),
-    world_of_view: wp.array(dtype=int),
+    worlds: wp.array(dtype=int),
     dimming: wp.array(dtype=wp.vec3),
     optics: Optics,
     surfaces: wp.array(dtype=Surface),
@@ -339,10 +367,13 @@ def _take_picture(
     be empty; without noise, which a negative key means, a number is that of the mean charge.
     """
     v, i, block = wp.tid()
+    w = worlds[v]
+    if w == SKIPPED:
+        return
     view = views[v]
     pose = poses[v]
-    c = optics.attenuation[world_of_view[v]]
-    K = optics.daylight_attenuation[world_of_view[v]]
+    c = optics.attenuation[w]
+    K = optics.daylight_attenuation[w]
     veil = optics.veil
     daylight = optics.daylight
     diffuse = optics.diffuse
@@ -412,6 +443,7 @@ def _take_picture(
 
 @wp.kernel(enable_backward=False)
 def _meter(
+    worlds: wp.array(dtype=int),
     picture: wp.array4d(dtype=wp.uint8),
     target: float,
     gamma: float,
@@ -423,6 +455,8 @@ def _meter(
     Of the differences between the channels' means, the share `balance` is taken out (gray world).
     """
     v = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
     total = wp.vec3(0.0)
     rows = wp.min(picture.shape[1], 16)
     columns = wp.min(picture.shape[2], 16)
@@ -480,8 +514,6 @@ class CameraBatch(RayBatch):
         self.camera, self.lens, sensor = camera, camera.lens(width), camera.sensor
         super().__init__(batch, camera_rays(self.lens, camera.port), camera.mount, vehicles)
         shape = self.depth.shape
-        # A pixel's neighbours are the next threads on a GPU, and the next of the same thread on a processor.
-        self._span = 1 if self.device.is_cuda else shape[2]
         code = 255.0 * np.linspace(0.0, 1.0, LEVELS) ** (1.0 / sensor.gamma) + 0.5
         with wp.ScopedDevice(self.device):
             self.picture = wp.zeros((*shape, 3), dtype=wp.uint8)
@@ -492,20 +524,23 @@ class CameraBatch(RayBatch):
             self._lamps = wp.array([_lamp(lamp) for lamp in lamps], dtype=Lamp)
         self._sensor = sensor
 
-    def update(self, poses: wp.array, *, seed: int | None = None, time: float = 0.0) -> wp.array:
+    def update(
+        self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
+    ) -> wp.array:
         """Take a picture of each world.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
             seed: Of the noise; None for none.
             time: Of the pictures [s]: pictures of other times have other noise.
+            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
 
         Returns:
             `picture`, which the next update overwrites.
         """
-        self.cast(poses)
+        self.cast(poses, mask)
         sensor, key = self._sensor, -1 if seed is None else noise_key(seed, time)
-        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, poses, self.world_of_view]
+        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, poses, self.worlds]
         inputs += [
             self.dimming,
             self.batch.optics,
@@ -514,12 +549,18 @@ class CameraBatch(RayBatch):
             self._lamps,
             self.gain,
         ]
-        inputs += [sensor.full_well, sensor.read_noise, self._code, self._normal, key, self._span]
-        inputs += [self.radiance, self.picture]
-        views, rows, columns = self.depth.shape
-        wp.launch(_take_picture, (views, rows, -(-columns // self._span)), inputs, device=self.device)
+        inputs += [sensor.full_well, sensor.read_noise, self._code, self._normal, key]
+        inputs += [self._span(self.depth.shape[2]), self.radiance, self.picture]
+        wp.launch(_take_picture, self._blocks(self.depth), inputs, device=self.device)
         if self.camera.exposure == "auto":
-            inputs = [self.picture, AUTO_MEAN, sensor.gamma, self.camera.white_balance, self.gain]
+            inputs = [
+                self.worlds,
+                self.picture,
+                AUTO_MEAN,
+                sensor.gamma,
+                self.camera.white_balance,
+                self.gain,
+            ]
             wp.launch(_meter, self.count, inputs, device=self.device)
         return self.picture
 
@@ -536,6 +577,7 @@ def _lamp(light: Headlight) -> Lamp:
 
 @wp.kernel(enable_backward=False)
 def _echo_rays(
+    worlds: wp.array(dtype=int),
     rays: wp.array4d(dtype=wp.vec3),
     depth: wp.array3d(dtype=float),
     shape_index: wp.array3d(dtype=wp.uint32),
@@ -545,6 +587,8 @@ def _echo_rays(
     weight: wp.array(dtype=float),
     absorption: float,
     steps: wp.vec2,
+    bins_per_metre: float,
+    span: int,
     energy: wp.array3d(dtype=float),
     spread: wp.array3d(dtype=wp.vec2),
 ):
@@ -556,97 +600,111 @@ def _echo_rays(
 
     relative to the source's level at 1 m. (Lambert's law: 10 log mu + 10 log k²; b² dW is `weight`.) It comes from the
     ranges of its footprint: half-way to the rays above and below where they strike the same shape, else as far as the
-    normal says; so that no gaps open between rays on a slanting floor.
+    normal says; so that no gaps open between rays on a slanting floor. `energy` is that of one range cell.
     """
-    v, i, j = wp.tid()
-    r = depth[v, i, j]
-    index = shape_index[v, i, j]
-    energy[v, i, j] = 0.0
-    if index != MISS and r > 0.0:
-        d = rays[i, j, 0, 1]
-        n = wp.quat_rotate_inv(wp.transform_get_rotation(views[v]), normal[v, i, j])
-        k = wp.max(wp.abs(wp.dot(n, d)), 1.0e-3)
-        flat = wp.sqrt(wp.max(d[0] * d[0] + d[1] * d[1], 1.0e-9))
-        up = wp.vec3(-d[2] * d[0] / flat, -d[2] * d[1] / flat, flat)
-        aside = wp.vec3(-d[1] / flat, d[0] / flat, 0.0)
-        # Half the footprint along elevation and azimuth, by dr/dangle = r (n · e)/(n · d).
-        half = 0.5 * r * steps[0] * wp.min(wp.abs(wp.dot(n, up)) / k, 20.0)
-        across = 0.5 * r * steps[1] * flat * wp.min(wp.abs(wp.dot(n, aside)) / k, 5.0)
-        low = r
-        high = r
-        count = int(0)
-        for side in range(2):
-            other = i + 2 * side - 1
-            if other >= 0 and other < depth.shape[1]:
-                if shape_index[v, other, j] == index:
-                    way = wp.clamp(0.5 * (depth[v, other, j] - r), -2.0 * half - 1.0e-3, 2.0 * half + 1.0e-3)
-                    low = wp.min(low, r + way)
-                    high = wp.max(high, r + way)
-                    count += 1
-        if count < 2:
-            # At an edge: as far to the other side as the footprint lets it, but no farther than to this one.
-            low = wp.min(low, r - wp.min(half, wp.where(count == 0, half, high - r)))
-            high = wp.max(high, r + wp.min(half, wp.where(count == 0, half, r - low)))
-        spread[v, i, j] = wp.vec2(low - across, high + across)
-        energy[v, i, j] = (
-            weight[i] * surfaces[int(index)].backscatter * k * wp.pow(10.0, -0.2 * absorption * r) / (r * r)
-        )
+    v, i, block = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
+    rotation = wp.transform_get_rotation(views[v])
+    decay = 0.2 * wp.log(10.0) * absorption
+    for j in range(block * span, wp.min(block * span + span, depth.shape[2])):
+        r = depth[v, i, j]
+        index = shape_index[v, i, j]
+        energy[v, i, j] = 0.0
+        if index != MISS and r > 0.0:
+            d = rays[i, j, 0, 1]
+            n = wp.quat_rotate_inv(rotation, normal[v, i, j])
+            k = wp.max(wp.abs(wp.dot(n, d)), 1.0e-3)
+            flat = wp.max(d[0] * d[0] + d[1] * d[1], 1.0e-9)
+            ahead = (n[0] * d[0] + n[1] * d[1]) / flat
+            beside = (n[1] * d[0] - n[0] * d[1]) / k
+            # Half the footprint along elevation and azimuth, by dr/dangle = r (n · e)/(n · d).
+            flat = wp.sqrt(flat)
+            half = 0.5 * r * steps[0] * wp.min(wp.abs(n[2] - d[2] * ahead) * flat / k, 20.0)
+            across = 0.5 * r * steps[1] * wp.min(wp.abs(beside), 5.0)
+            low = r
+            high = r
+            count = int(0)
+            for side in range(2):
+                other = i + 2 * side - 1
+                if other >= 0 and other < depth.shape[1]:
+                    if shape_index[v, other, j] == index:
+                        way = wp.clamp(
+                            0.5 * (depth[v, other, j] - r), -2.0 * half - 1.0e-3, 2.0 * half + 1.0e-3
+                        )
+                        low = wp.min(low, r + way)
+                        high = wp.max(high, r + way)
+                        count += 1
+            if count < 2:
+                # At an edge: as far to the other side as the footprint lets it, but no farther than to this one.
+                low = wp.min(low, r - wp.min(half, wp.where(count == 0, half, high - r)))
+                high = wp.max(high, r + wp.min(half, wp.where(count == 0, half, r - low)))
+            first = (low - across) * bins_per_metre
+            last = wp.max((high + across) * bins_per_metre, first + 1.0e-3)
+            echo = weight[i] * surfaces[int(index)].backscatter * k * wp.exp(-decay * r) / (r * r)
+            spread[v, i, j] = wp.vec2(first, last)
+            energy[v, i, j] = echo / (last - first)
 
 
 @wp.kernel(enable_backward=False)
 def _gather_echoes(
+    worlds: wp.array(dtype=int),
     energy: wp.array3d(dtype=float),
     spread: wp.array3d(dtype=wp.vec2),
     taps: wp.array(dtype=float),
-    bin_length: float,
     intensity: wp.array3d(dtype=float),
 ):
     """Echo by beam and range cell: rays of the beam's own and the neighbouring directions, by its pattern."""
     v, b = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
     bins = intensity.shape[2]
     reach = taps.shape[0] / 2
     for k in range(bins):
         intensity[v, b, k] = 0.0
-    for t in range(taps.shape[0]):
-        j = b + t - reach
-        if j >= 0 and j < energy.shape[2]:
-            for i in range(energy.shape[1]):
-                e = energy[v, i, j] * taps[t]
-                if e > 0.0:
-                    low = spread[v, i, j][0] / bin_length
-                    high = wp.max(spread[v, i, j][1] / bin_length, low + 1.0e-3)
-                    first = wp.max(int(wp.floor(low)), 0)
-                    last = wp.min(int(wp.floor(high)), bins - 1)
-                    for k in range(first, last + 1):
-                        overlap = wp.min(high, float(k + 1)) - wp.max(low, float(k))
-                        if overlap > 0.0:
-                            intensity[v, b, k] = intensity[v, b, k] + e * overlap / (high - low)
+    for j in range(wp.max(b - reach, 0), wp.min(b + reach + 1, energy.shape[2])):
+        tap = taps[j - b + reach]
+        for i in range(energy.shape[1]):
+            e = energy[v, i, j]
+            if e > 0.0:
+                low = spread[v, i, j][0]
+                high = spread[v, i, j][1]
+                for k in range(wp.max(int(wp.floor(low)), 0), wp.min(int(wp.floor(high)) + 1, bins)):
+                    overlap = wp.max(wp.min(high, float(k + 1)) - wp.max(low, float(k)), 0.0)
+                    intensity[v, b, k] = intensity[v, b, k] + tap * e * overlap
 
 
 @wp.kernel(enable_backward=False)
 def _receive(
+    worlds: wp.array(dtype=int),
     noise: float,
     gain: wp.array(dtype=float),
     floor_db: float,
     span_db: float,
+    quantiles: wp.array(dtype=float),
     key: int,
+    span: int,
     intensity: wp.array3d(dtype=float),
     picture: wp.array3d(dtype=wp.uint8),
 ):
-    """Noise and speckle, gain, and 8 bits of the level.
+    """Noise and speckle, gain, and 8 bits of the level; a thread takes `span` range cells of a beam.
 
     Echoes of many scatterers and noise add as complex normal numbers: power is (I + N) times a draw of the exponential
     distribution, amplitude Rayleigh. Without a seed (key < 0) it is I + N itself.
     """
-    v, b, k = wp.tid()
-    power = intensity[v, b, k] + noise
-    if key >= 0:
-        state = wp.rand_init(key, (v * intensity.shape[1] + b) * intensity.shape[2] + k)
-        power = -power * wp.log(1.0 - wp.randf(state))
-    power = power * gain[k]
-    intensity[v, b, k] = power
-    level = 4.3429448 * wp.log(wp.max(power, 1.0e-30))
-    picture[v, b, k] = wp.uint8(255.0 * wp.clamp((level - floor_db) / span_db, 0.0, 1.0) + 0.5)
+    v, b, block = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
+    bins = intensity.shape[2]
+    first = (v * intensity.shape[1] + b) * bins
+    scale = 255.0 / span_db
+    for k in range(block * span, wp.min(block * span + span, bins)):
+        power = (intensity[v, b, k] + noise) * gain[k]
+        if key >= 0:
+            power = power * quantiles[int(wp.rand_init(key, first + k) & wp.uint32(4095))]
+        intensity[v, b, k] = power
+        level = scale * (4.3429448 * wp.log(wp.max(power, 1.0e-30)) - floor_db)
+        picture[v, b, k] = wp.uint8(wp.clamp(level, 0.0, 255.0) + 0.5)
 
 
 class SonarBatch(RayBatch):
@@ -691,6 +749,7 @@ class SonarBatch(RayBatch):
             self._weight = wp.array(np.float32(two_way * solid), dtype=float)
             self._taps = wp.array(np.float32(beam_pattern(sonar.beam_width, spacing, count)), dtype=float)
             self._gain = wp.array(np.float32(gain), dtype=float)
+            self._exponential = wp.array(np.float32(-np.log1p(-(np.arange(4096) + 0.5) / 4096)), dtype=float)
             self._energy = wp.zeros(self.depth.shape, dtype=float)
             self._spread = wp.zeros(self.depth.shape, dtype=wp.vec2)
             self.intensity = wp.zeros((self.count, count, self.bins), dtype=float)
@@ -701,29 +760,49 @@ class SonarBatch(RayBatch):
         """Length of a range cell [m]."""
         return self.sonar.range / self.bins
 
-    def update(self, poses: wp.array, *, seed: int | None = None, time: float = 0.0) -> wp.array:
+    def update(
+        self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
+    ) -> wp.array:
         """One ping of each vehicle.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
             seed: Of speckle and noise; None for the mean power.
             time: Of the ping [s]: pings of other times have other speckle.
+            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
 
         Returns:
             `picture`, which the next update overwrites.
         """
-        self.cast(poses)
+        self.cast(poses, mask)
         sonar = self.sonar
-        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, self.batch.surfaces]
-        inputs += [self._weight, self.absorption, self._steps, self._energy, self._spread]
-        wp.launch(_echo_rays, self.depth.shape, inputs, device=self.device)
-        inputs = [self._energy, self._spread, self._taps, self.bin_length, self.intensity]
+        inputs = [
+            self.worlds,
+            self.rays,
+            self.depth,
+            self.shape_index,
+            self.normal,
+            self.views,
+            self.batch.surfaces,
+        ]
+        inputs += [self._weight, self.absorption, self._steps, 1.0 / self.bin_length]
+        inputs += [self._span(self.depth.shape[2]), self._energy, self._spread]
+        wp.launch(_echo_rays, self._blocks(self.depth), inputs, device=self.device)
+        inputs = [self.worlds, self._energy, self._spread, self._taps, self.intensity]
         wp.launch(_gather_echoes, self.intensity.shape[:2], inputs, device=self.device)
         low, high = sonar.display
         key = -1 if seed is None else noise_key(seed, time)
-        inputs = [10.0 ** (0.1 * sonar.noise_level_db), self._gain, low, high - low, key]
-        inputs += [self.intensity, self.picture]
-        wp.launch(_receive, self.intensity.shape, inputs, device=self.device)
+        inputs = [
+            self.worlds,
+            10.0 ** (0.1 * sonar.noise_level_db),
+            self._gain,
+            low,
+            high - low,
+            self._exponential,
+            key,
+        ]
+        inputs += [self._span(self.bins), self.intensity, self.picture]
+        wp.launch(_receive, self._blocks(self.intensity), inputs, device=self.device)
         return self.picture
 
 
@@ -745,6 +824,7 @@ def beam_pattern(width: float, spacing: float, beams: int) -> np.ndarray:
 
 @wp.kernel(enable_backward=False)
 def _take_ranges(
+    worlds: wp.array(dtype=int),
     rays: wp.array4d(dtype=wp.vec3),
     depth: wp.array3d(dtype=float),
     shape_index: wp.array3d(dtype=wp.uint32),
@@ -761,6 +841,8 @@ def _take_ranges(
 ):
     """Range of each beam: where the given share of its echo has come; infinite beyond the device's reach."""
     v, b = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
     rotation = wp.transform_get_rotation(views[v])
     total = float(0.0)
     for j in range(depth.shape[2]):
@@ -817,20 +899,31 @@ class RangeBatch(RayBatch):
         self._weight = wp.array(np.float32(weight), dtype=float, device=self.device)
         self.ranges = wp.zeros((self.count, ranger.beams), dtype=float, device=self.device)
 
-    def update(self, poses: wp.array, *, seed: int | None = None, time: float = 0.0) -> wp.array:
+    def update(
+        self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
+    ) -> wp.array:
         """Measure.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
             seed: Of the noise; None for none.
             time: Of the measurement [s]: others have other noise.
+            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
 
         Returns:
             `ranges`, which the next update overwrites.
         """
-        self.cast(poses)
+        self.cast(poses, mask)
         ranger, key = self.ranger, -1 if seed is None else noise_key(seed, time)
-        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, self.batch.surfaces]
+        inputs = [
+            self.worlds,
+            self.rays,
+            self.depth,
+            self.shape_index,
+            self.normal,
+            self.views,
+            self.batch.surfaces,
+        ]
         inputs += [self._weight, ranger.quantile, ranger.minimum_range, ranger.range, ranger.noise, key]
         wp.launch(_take_ranges, self.ranges.shape, [*inputs, self.ranges], device=self.device)
         return self.ranges
