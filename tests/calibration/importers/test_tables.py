@@ -299,7 +299,7 @@ def test_roles_of_single_trials(folder, tmp_path):
             "time: t\ncolumns: {u: vel_x}\nvehicle: bluerov",
             "unknown vehicle 'bluerov', did you mean 'bluerov2'?",
         ),
-        ("time: t\ncolumns: 3", "columns: is 3, expected {CANONICAL: COLUMN}"),
+        ("time: t\ncolumns: 3", "columns is 3, expected {CANONICAL: COLUMN}"),
         ("time: t\ncolumns: {u: vel_x}\nsplit: phase", "cannot be split by phase"),
         ("time: t\ncolumns: {u: vel_x}\nsplit: {windows: {a: [3, 2]}}", "window a"),
     ],

@@ -40,7 +40,7 @@ from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.autopilot import FRAMES
-from finssim.vehicles.part import Part, did_you_mean, refuse_section, refuse_value
+from finssim.vehicles.part import Part, did_you_mean, refuse_section, refuse_value, sentence_of
 from finssim.yaml_file import read_mapping
 
 
@@ -323,7 +323,7 @@ class ColumnMap(Part):
         try:
             return Header.model_validate(keys)
         except ValidationError as error:
-            raise CalibrationError(_sentence(error)) from None
+            raise CalibrationError(sentence_of(error.errors()[0], "", "add it")) from None
 
 
 def read_map(path: Path) -> ColumnMap:
@@ -337,7 +337,7 @@ def read_map(path: Path) -> ColumnMap:
         found = ColumnMap.model_validate(tree)
         found.header_of("", None)
     except ValidationError as error:
-        raise CalibrationError(f"{path}: {_sentence(error)}") from None
+        raise CalibrationError(sentence_of(error.errors()[0], str(path), "add it")) from None
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
     return found
@@ -358,16 +358,6 @@ def split_rule(text: str) -> SplitRule:
         raise CalibrationError(
             f"split is '{text}', expected phase, gaps, gaps=SECONDS, arming or column; time windows stand in a map file"
         ) from None
-
-
-def _sentence(error: ValidationError) -> str:
-    first = error.errors()[0]
-    where = ".".join(str(x) for x in first["loc"] if "[" not in str(x) or "*" in str(x))
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] in ("section", "value"):
-        return f"{where}: {message}" if where else message
-    given = "" if first["type"] == "missing" else f" is {first['input']!r},"
-    return f"{where}:{given} {message[0].lower()}{message[1:]}"
 
 
 # One table of a long log into several, one for each trial.

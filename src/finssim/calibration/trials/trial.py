@@ -4,26 +4,43 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding
+from finssim.vehicles.part import Part, refuse_section, refuse_value
 from finssim.vehicles.vehicle import Axis
 
 __all__ = ["Array", "Header", "NU", "PHASES", "TAU", "Trial", "TrialWater", "column_of"]
 
-Point = tuple[float, float, float]
+
+def _point(value: Any) -> Any:
+    numbers = value if isinstance(value, (list, tuple)) else ()
+    known = [isinstance(x, (int, float)) and not isinstance(x, bool) and math.isfinite(x) for x in numbers]
+    if len(known) != 3 or not all(known):
+        raise refuse_value(f"is {value!r}, expected 3 numbers [x, y, z]")
+    return value
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+def _moment_point(value: Any) -> Any:
+    if isinstance(value, str) and value not in ("center_of_gravity", "origin"):
+        raise refuse_value(f"is {value!r}, expected 3 numbers [x, y, z], center_of_gravity or origin")
+    return value if value is None or isinstance(value, str) else _point(value)
+
+
+Point = Annotated[tuple[float, float, float], BeforeValidator(_point)]
+
+
+class _Section(Part):
+    model_config = ConfigDict(allow_inf_nan=False)
 
 
 class TrialWater(_Section):
@@ -58,7 +75,10 @@ class Header(_Section):
     any other is unknown from one sample later on."""
     passive: bool = False
     """Thrusters off: no input columns are needed."""
-    wrench_at: Point | Literal["center_of_gravity", "origin"] | None = None
+    wrench_at: Annotated[
+        tuple[float, float, float] | Literal["center_of_gravity", "origin"] | None,
+        BeforeValidator(_moment_point),
+    ] = None
     """Body point about which tau_k, tau_m, tau_n are moments [m]; the vehicle's `wrench_reference` where not given."""
     velocity_at: Point = (0.0, 0.0, 0.0)
     """Body point whose velocity u, v, w are [m]."""
@@ -75,6 +95,18 @@ class Header(_Section):
     voltage: float | None = Field(default=None, gt=0.0)
     """Of the battery [V], for pulse widths; a column `voltage` comes first."""
     water: TrialWater = Field(default_factory=TrialWater)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_axis(cls, data: Any) -> Any:
+        """A single axis may stand without brackets."""
+        if isinstance(data, dict) and "convert" in data:
+            raise refuse_section(
+                "convert is gone: import the table with a map of its columns, units, frame and clocks (trials import)"
+            )
+        if isinstance(data, dict) and isinstance(data.get("axis"), str):
+            return {**data, "axis": [data["axis"]]}
+        return data
 
     def meaning(self) -> dict[str, Any]:
         """The parts that change what the numbers mean, as plain values: all but description, role and vehicle."""

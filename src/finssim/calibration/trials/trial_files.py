@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
@@ -24,12 +24,11 @@ from finssim.calibration.trials.trial import (
     PHASES,
     Header,
     Trial,
-    TrialWater,
     column_of,
 )
 from finssim.files import OutputError, atomic_directory
 from finssim.text_table import TextTable, number, read_text_table, write_csv
-from finssim.vehicles.part import did_you_mean
+from finssim.vehicles.part import did_you_mean, sentence_of
 from finssim.yaml_file import read_mapping
 
 __all__ = ["Table", "load_trial", "load_trials", "new_samples", "read_table", "trials_at", "write_trial"]
@@ -420,33 +419,6 @@ def _in_order(
 
 # Reading and writing `trial.yaml`.
 
-_POINT = "3 numbers [x, y, z] in m"
-
-EXPECTED = {
-    "vehicle": "the name or file of a vehicle",
-    "axis": "a list drawn from surge, sway, heave, roll, pitch, yaw",
-    "role": "fit or held-out",
-    "description": "words",
-    "inputs": "applied or commanded",
-    "inputs_between": "held or linear",
-    "passive": "true or false",
-    "wrench_at": f"{_POINT}, center_of_gravity or origin",
-    "velocity_at": _POINT,
-    "position_at": _POINT,
-    "acceleration_at": _POINT,
-    "depth_at": _POINT,
-    "acceleration": "specific_force, kinematic or auto",
-    "velocity": "ground or water",
-    "voltage": "a voltage > 0 in V",
-    "water": "a map such as {density: 1025.0}",
-    "water.density": "a density > 0 in kg/m³",
-    "water.depth": "a depth > 0 in m",
-    "water.current": "3 numbers [x, y, z] in m/s, world frame",
-}
-"""Key -> what may stand there."""
-
-SECTIONS: dict[str, type[BaseModel]] = {"": Header, "water": TrialWater}
-
 
 def read_header(path: Path) -> Header:
     """The header in a `trial.yaml`; an empty file is an empty header.
@@ -457,13 +429,10 @@ def read_header(path: Path) -> Header:
     if path.is_file() and path.stat().st_size < 65536 and not _content(path):
         return Header()
     tree = read_mapping(path, CalibrationError, such_as="vehicle: finsrov")
-    if isinstance(tree.get("axis"), str):
-        tree["axis"] = [tree["axis"]]
     try:
         return Header.model_validate(tree)
     except ValidationError as error:
-        sentences = dict.fromkeys(_sentence(detail, tree) for detail in error.errors())
-        raise CalibrationError("\n".join(f"{path}: {sentence}" for sentence in sentences)) from None
+        raise CalibrationError("\n".join(sentence_of(one, str(path)) for one in error.errors())) from None
 
 
 def header_text(header: Header) -> str:
@@ -476,24 +445,6 @@ def _content(path: Path) -> str:
     """What a file holds besides comments and blank lines."""
     lines = path.read_bytes().decode("utf-8", errors="replace").splitlines()
     return "".join(line for line in lines if line.strip() and not line.lstrip().startswith("#"))
-
-
-def _sentence(detail: Any, tree: dict[Any, Any]) -> str:
-    """One pydantic complaint as `key is value, expected ...`."""
-    where = [str(part) for part in detail["loc"]]
-    section = where[0] if where[0] in SECTIONS and len(where) > 1 else ""
-    name = ".".join(where[: 2 if section else 1])
-    if detail["type"] == "extra_forbidden" and name == "convert":
-        return "convert is gone: import the table with a map of its columns, units, frame and clocks (trials import)"
-    if detail["type"] == "extra_forbidden":
-        known = list(SECTIONS[section].model_fields)
-        return f"unknown key '{name}'{did_you_mean(where[-1], known)} known keys: {', '.join(known)}"
-    value: Any = tree
-    for part in name.split("."):
-        value = value.get(part) if isinstance(value, dict) else value
-    if detail["type"] == "finite_number" and isinstance(value, float):
-        return f"{name} is {value}, expected a finite number"
-    return f"{name} is {value!r}, expected {EXPECTED.get(name, detail['msg'])}"
 
 
 HEADER = "trial.yaml"
