@@ -443,7 +443,9 @@ def _values(trial: Trial, name: str) -> list[Finding]:
     found = []
     if name in ("z", "depth") and (above := float(np.percentile(y if name == "z" else -y, 99.0))) > FLYING:
         found.append(
-            finding("above_surface" if name == "z" else "depth_above_surface", height=above, column=name)
+            finding("above_surface", height=above)
+            if name == "z"
+            else finding("depth_above_surface", height=above)
         )
     begins = np.flatnonzero(np.concatenate([[True], np.diff(y) != 0.0]))
     lengths = np.diff(np.concatenate([begins, [len(y)]]))
@@ -456,11 +458,14 @@ def _values(trial: Trial, name: str) -> list[Finding]:
     if span > STUCK and lengths[longest] > 10.0 * usual:
         at = begins[longest]
         found.append(finding("stuck", value=y[at], span=span, start=t[at]))
-    for extreme, code in ((y.max(), "clipped_above"), (y.min(), "clipped_below")):
+    for extreme, highest in ((y.max(), True), (y.min(), False)):
         # A signal that passes through its extreme touches it once.
         runs = lengths[y[begins] == extreme]
         if runs.sum() >= max(10.0, 0.02 * len(y)) and runs.max() >= 4.0 * usual:
-            found.append(finding(code, value=extreme, samples=runs.sum()))
+            fields = {"value": extreme, "samples": runs.sum()}
+            found.append(
+                finding("clipped_above", **fields) if highest else finding("clipped_below", **fields)
+            )
     return found
 
 
@@ -500,16 +505,18 @@ def _wrench_beyond(vehicle: Vehicle, inputs: Drive) -> list[Finding]:
             continue
         beyond = float((tau > 1.05 * limit).sum() / (tau > 0.0).sum())
         if beyond > OFTEN:
+            fields: dict[str, Any] = {
+                "column": inputs.names[i],
+                "limit": float(limit),
+                "unit": "N" if i < 3 else "N m",
+                "vehicle": vehicle.name,
+                "share": beyond,
+                "axis": str(axis),
+            }
             found.append(
-                finding(
-                    "command_beyond" if inputs.commanded else "wrench_beyond",
-                    column=inputs.names[i],
-                    limit=float(limit),
-                    unit="N" if i < 3 else "N m",
-                    vehicle=vehicle.name,
-                    share=beyond,
-                    axis=str(axis),
-                )
+                finding("command_beyond", **fields)
+                if inputs.commanded
+                else finding("wrench_beyond", **fields)
             )
     return found
 
