@@ -94,7 +94,7 @@ def test_the_page_shows_the_same_figures(done):
     page = (out / "localization.md").read_text(encoding="utf-8")
     for methods in [*result["results"].values(), result["paper"]]:
         for figures in methods.values():
-            assert f"| {figures['rmse_cm']:.2f} |" in page
+            assert f"| {figures['rmse_cm']:.2f} " in page
     for name in re.findall(r"\]\((\w+\.png)\)", page):
         assert (out / name).is_file()
     assert "error_map.png" in page and "seeds [1]" in page
@@ -193,7 +193,7 @@ def test_a_method_that_locates_nothing_is_no_error(tmp_path, monkeypatch):
     figures = result["results"]["lifted"]["refractive"]
     assert figures["rmse_cm"] is None and figures["located"] == 0
     assert figures["reasons"] == {"tag not detected": figures["pictures"]}
-    assert "| none |" in (tmp_path / "out" / "localization.md").read_text(encoding="utf-8")
+    assert "| – |" in (tmp_path / "out" / "localization.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

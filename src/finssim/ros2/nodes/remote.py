@@ -98,6 +98,9 @@ class RemoteState:
 class RemoteBridge:
     """The bridge of another process: what it is told travels as messages, its state comes back as one."""
 
+    getting_ready = False
+    """Whether arming waits for an autopilot, which a state does not tell: press again when it has armed."""
+
     def __init__(self, node: RobotNode, source: Callable[[], str] | None = None) -> None:
         """
         Args:
