@@ -78,6 +78,10 @@ def test_a_plant_that_is_not_there_is_told_before_any_training(tmp_path):
         ({"search": SEARCH | {"options": {"stepz": {"choice": [1]}}}}, "'stepz' is no option of a training"),
         ({"search": SEARCH | {"options": {"a.b": {"choice": [1]}}}}, "one with a dot is settings.NAME"),
         (
+            {"search": SEARCH | {"options": {"steps": {"low": 1, "choice": [1]}}}},
+            "expected either 'low' and 'high', or",
+        ),
+        (
             {"search": SEARCH | {"options": {"steps": {"low": 1}}}},
             "expected either 'low' and 'high', or 'choice'",
         ),

@@ -48,6 +48,7 @@ from finssim.experiments.pool_trial import FIRMWARES, Job, firmware_of, played_t
 from finssim.experiments.tables import Table, cells, html_of, print_tables
 from finssim.experiments.transfer import T1, Spec, transfer_experiment
 from finssim.experiments.trials import Trial
+from finssim.files import atomic_write
 from finssim.page import html_page
 from finssim.pool import draw_plant
 from finssim.pool.draw_plant import site_of
@@ -541,7 +542,8 @@ class _Demonstration:
             "<h2>Provenance</h2>",
             f"<pre>{escape(json.dumps(origin, indent=2))}</pre>",
         ]
-        (self.out / REPORT_FILE).write_text(html_page(title, sections), encoding="utf-8")
+        with atomic_write(self.out / REPORT_FILE) as temporary:
+            temporary.write_text(html_page(title, sections), encoding="utf-8")
         return tables
 
     def _spec(self) -> Spec:

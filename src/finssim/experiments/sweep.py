@@ -99,7 +99,8 @@ class Span(BaseModel):
 
     @model_validator(mode="after")
     def _either(self) -> Span:
-        if bool(self.choice) == (self.low is not None and self.high is not None):
+        ends = [end for end in (self.low, self.high) if end is not None]
+        if len(ends) != (0 if self.choice else 2):
             raise ValueError("expected either 'low' and 'high', or 'choice'")
         if self.low is not None and self.high is not None and self.log and self.low <= 0:
             raise ValueError(f"'log' needs a 'low' above 0, and it is {self.low}")
