@@ -4,9 +4,17 @@
 (`pip install 'finssim[perception]'`).
 """
 
-from finssim.worlds.description import World, WorldError, devices, load_device, load_world, sites
+from finssim.worlds.description import (
+    World,
+    WorldError,
+    device_of,
+    devices,
+    load_device,
+    load_world,
+    sites,
+)
 from finssim.worlds.model import WorldBatch
-from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of
+from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of, sensor_of
 
 __all__ = [
     "CameraBatch",
@@ -16,9 +24,11 @@ __all__ = [
     "World",
     "WorldBatch",
     "WorldError",
+    "device_of",
     "devices",
     "load_device",
     "load_world",
     "poses_of",
+    "sensor_of",
     "sites",
 ]
