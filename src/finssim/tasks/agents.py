@@ -554,9 +554,11 @@ def known_in(environment: Environment) -> Known:
     arrays = environment.arrays
     observed: NDArray[np.float32] = arrays.observation.numpy()
     state = (arrays.position, arrays.quaternion, arrays.velocity)
+    sight = environment.sight
     return Known(
         observed.reshape(len(observed) * environment.agents, -1),
         *(np.asarray(array.numpy()[:, 0], dtype=float) for array in state),
+        pictures=None if sight is None else {name: x.numpy() for name, x in sight.pictures.items()},
     )
 
 
@@ -619,7 +621,7 @@ class PolicyAgent:
 
     def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions for the environment's observations, a row for each agent of each world."""
-        return self.policy.step(memory, known.observation)
+        return self.policy.step(memory, known.observation, known.pictures)
 
     def describe(self) -> dict[str, Any]:
         """Name, network, and what it was trained in."""

@@ -82,8 +82,8 @@ class CameraDocking(Docking):
         )  # fmt: skip
 
     def arena(self) -> Pool:
-        """Up to the quay and the bottom."""
-        return replace(super().arena(), length=24.0, width=7.8, depth=4.95)
+        """Up to the quay and the bottom; without the world, where the dock looks any way, as wide as long."""
+        return replace(super().arena(), length=24.0, width=7.8 if self.placed else 24.0, depth=4.95)
 
     @property
     def placed(self) -> bool:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from finssim.engine.simulator import Simulator
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
+from finssim.vehicles.equipment import RaySensor
 
 if TYPE_CHECKING:
     from finssim.tasks.task import Task
@@ -55,10 +56,10 @@ def _fill(
 class _Eye:
     """One camera of all worlds with its rate, latency and loss."""
 
-    def __init__(self, camera: Any, control_step: float, rate: float, latency: float, loss: float) -> None:
-        self.camera, self.loss = camera, loss
-        self.every = max(1, round(1.0 / (rate * control_step)))
-        self.slots = 1 + round(latency / control_step)
+    def __init__(self, camera: Any, control_step: float, entry: RaySensor) -> None:
+        self.camera, self.entry = camera, entry
+        self.every = max(1, round(1.0 / (entry.rate * control_step)))
+        self.slots = 1 + round(entry.latency / control_step)
         worlds, *shape = camera.picture.shape
         self._line = wp.zeros((self.slots * worlds, *shape), dtype=wp.uint8, device=camera.device)
         """Pictures of the last control steps, in turn."""
@@ -70,7 +71,7 @@ class _Eye:
         """A picture of each world where one is due, and what has arrived by now."""
         device, worlds = self.camera.device, len(poses)
         key = (seed + 7919 * tick) % (2**31)
-        wp.launch(_due, worlds, [steps, self.every, self.loss, key, self._due], device=device)
+        wp.launch(_due, worlds, [steps, self.every, self.entry.dropout, key, self._due], device=device)
         self.camera.update(poses, seed=seed, time=time, mask=self._due)
         slot, oldest = tick % self.slots, (tick + 1) % self.slots
         wp.copy(self._line[slot * worlds : (slot + 1) * worlds], self.camera.picture)
@@ -140,11 +141,15 @@ class Sight:
         self._tick = 0
 
     def _eye(self, picture: Picture, vehicle: Any) -> _Eye:
-        from finssim.worlds import CameraBatch, load_device
-        from finssim.worlds.description import Mount
+        from finssim.worlds import CameraBatch, device_of
+        from finssim.worlds.description import CameraDevice
 
-        device = load_device("low_light_camera").model_copy(update={"mount": Mount(position=np.array([0.2, 0.0, 0.0])), "rate": 10.0})
-        return _Eye(CameraBatch(self.batch, device, width=picture.width), self._task.control_step, device.rate, 0.0, 0.0)
+        device = device_of(vehicle, picture.name)
+        if not isinstance(device, CameraDevice):
+            raise EnvironmentSetupError(f"{vehicle.name}: perception.{picture.name} is no camera: name one")
+        entry = vehicle.perception[picture.name]
+        camera = CameraBatch(self.batch, device, width=picture.width)
+        return _Eye(camera, self._task.control_step, entry)
 
     def restart(self, mask: NDArray[np.bool_] | None = None) -> None:
         """Start the draws of some worlds over, of all if mask is None."""
@@ -179,6 +184,18 @@ class Sight:
         self._mask.assign(mask.astype(np.int32))
         for eye in self._eyes.values():
             eye.keep(self._mask)
+
+    def describe(self) -> dict[str, dict[str, Any]]:
+        """The pictures as a policy directory has them: shape (height, width, 3), rate [Hz], latency [s], by name."""
+        return {
+            name: {
+                "device": eye.entry.device,
+                "shape": list(eye.shown.shape[1:]),
+                "rate": eye.entry.rate,
+                "latency": eye.entry.latency,
+            }
+            for name, eye in self._eyes.items()
+        }
 
     @property
     def _time(self) -> float:
