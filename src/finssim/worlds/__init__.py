@@ -4,12 +4,14 @@
 (`pip install 'finssim[perception]'`).
 """
 
+from finssim.worlds.delivery import Delivery
 from finssim.worlds.description import World, WorldError, devices, load_device, load_world, sites
 from finssim.worlds.model import WorldBatch
 from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of
 
 __all__ = [
     "CameraBatch",
+    "Delivery",
     "Headlight",
     "RangeBatch",
     "SonarBatch",
