@@ -147,6 +147,11 @@ def show_vehicle(
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"{picture} ends in '{picture.suffix}', expected one of {' '.join(PICTURES)}")
     vehicle = load_vehicle(name)
+    if "perception" not in vehicle.defaults:
+        from finssim.worlds import device_of
+
+        for sensor in vehicle.perception:
+            device_of(vehicle, sensor)
     print_vehicle(vehicle, Console(), None)
     if picture is not None:
         from finssim.files import atomic_write

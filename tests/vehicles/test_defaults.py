@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from finssim.geometry.rotations import quat_to_matrix
 from finssim.pool.camera import camera_of
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.plant_spec import Basin, basin_of
-from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles import VehicleError, catalogue, load_vehicle
 from finssim.vehicles.defaults import DEFAULTS
 from finssim.vehicles.show import print_vehicle
 
@@ -52,7 +53,7 @@ def test_every_vehicle_that_hovers_has_a_pool(name):
 def test_the_published_vehicle_has_the_published_pool():
     """FinsROV gives everything itself and keeps its pool of 4 m x 2 m x 1 m."""
     vehicle = load_vehicle("finsrov")
-    assert vehicle.defaults == () and basin_of(vehicle) == Basin()
+    assert vehicle.defaults == ("perception",) and basin_of(vehicle) == Basin()
 
 
 def test_defaults_are_no_part_of_the_digest_or_the_file(tmp_path):
@@ -71,7 +72,7 @@ def test_one_number_of_a_default_can_be_changed():
     changed = vehicle.replace({"safety.max_tilt": 0.5, "tags.edge": 0.05})
     assert changed.safety.max_tilt == 0.5 and changed.safety.command_rate == vehicle.safety.command_rate
     assert changed.tags.mounts.keys() == vehicle.tags.mounts.keys() and changed.tags.edge == 0.05
-    assert changed.defaults == ("mcu",) and changed.file_tags is changed.tags
+    assert changed.defaults == ("perception", "mcu") and changed.file_tags is changed.tags
 
 
 def test_tags_can_be_taken_off(tmp_path):
@@ -82,9 +83,47 @@ def test_tags_can_be_taken_off(tmp_path):
 
 
 def test_show_says_which_sections_are_defaults():
-    """Each with what stands for it; of a vehicle that gives all of them, nothing."""
+    """Each with what stands for it, and only those."""
     for name, said in (("bluerov2_heavy", True), ("finsrov", False)):
         console = Console(record=True, width=200, file=io.StringIO())
         print_vehicle(load_vehicle(name), console)
         text = console.export_text()
-        assert ("Defaults" in text) is said and ("15 ahead" in text) is said
+        assert "Defaults" in text and ("15 ahead" in text) is said and "altimeter under the hull" in text
+
+
+def test_sensors_of_a_site_are_listed_once_a_file_gives_them(tmp_path):
+    """In place of the default's names; a sensor's own file lies beside the vehicle's and travels with it."""
+    device = "kind: range\nabout: a\nsource: s\nminimum_range: 0.1\nrange: 5.0\nrate: 4.0\n"
+    (tmp_path / "short.yaml").write_text(device, encoding="utf-8")
+    entry = (
+        "perception:\n  origin: guessed\n  down: {device: short.yaml, position: [0, 0, -0.1], rate: 5.0}\n"
+    )
+    (tmp_path / "mine.yaml").write_text("extends: bluerov2\n" + entry, encoding="utf-8")
+    vehicle = load_vehicle(tmp_path / "mine.yaml")
+    console = Console(record=True, width=200, file=io.StringIO())
+    print_vehicle(vehicle, console)
+    assert "short.yaml" in console.export_text() and list(vehicle.perception) == ["down"]
+    (tmp_path / "there").mkdir()
+    write_vehicle(vehicle, tmp_path / "there" / "copy.yaml")
+    copy = load_vehicle(tmp_path / "there" / "copy.yaml")
+    assert copy.sha256 == vehicle.sha256 != load_vehicle("bluerov2").sha256
+    assert Path(copy.perception["down"].device).parent == tmp_path / "there"
+    (tmp_path / "short.yaml").write_text(device.replace("5.0", "6.0"), encoding="utf-8")
+    assert load_vehicle(tmp_path / "mine.yaml").sha256 != vehicle.sha256
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("down: {device: other.yaml, position: [0, 0, 0], rate: 5.0}", "perception.down: no file other.yaml"),
+        ("down: {device: ping, position: [0, 0], rate: 5.0}", "perception.down: position has shape"),
+        ("down: {device: ping, rate: 5.0}", "perception.down: position is missing"),
+        ("Down: {device: ping, position: [0, 0, 0], rate: 5.0}", "'Down' is no name of a sensor"),
+    ],
+)
+def test_a_sensor_that_cannot_be_is_refused(tmp_path, entry, message):
+    """One sentence that names the entry."""
+    text = f"extends: bluerov2\nperception:\n  origin: guessed\n  {entry}\n"
+    (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(VehicleError, match=message):
+        load_vehicle(tmp_path / "mine.yaml")

@@ -1,4 +1,4 @@
-"""What stands for the sections `sensors`, `tags`, `mcu` and `safety` where a vehicle file leaves them out.
+"""What stands for the sections `sensors`, `perception`, `tags`, `mcu` and `safety` that a vehicle file leaves out.
 
 They make every vehicle fit for the virtual world. None of them is known of the real one: `finssim vehicles show` lists
 them as defaults, and what reads records of real water refuses tags that the file does not give.
@@ -12,7 +12,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from finssim.vehicles.equipment import Compass, DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensors, Tags
+from finssim.vehicles.equipment import (
+    Compass,
+    DepthSensor,
+    Dvl,
+    Imu,
+    Mcu,
+    Mount,
+    RaySensor,
+    Safety,
+    Sensors,
+    Tags,
+)
 from finssim.vehicles.errors import VehicleError
 
 if TYPE_CHECKING:
@@ -22,6 +33,7 @@ __all__ = [
     "DEFAULTS",
     "SITES",
     "default_mcu",
+    "default_perception",
     "default_safety",
     "default_sensors",
     "default_tags",
@@ -49,6 +61,8 @@ QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 
 DEFAULTS: Mapping[str, str] = {
     "sensors": "IMU and pressure gauge of a small MEMS unit, at the body origin",
+    "perception": "altimeter under the hull and imaging sonar at the nose (128 beams, 5 Hz), and a camera (64 px wide, "
+    "10 Hz) on a vehicle that hovers: devices of small ROVs, delays and losses guessed",
     "tags": "two tag25h9 (15 ahead, 16 astern) on the middle of the top, as large as it takes, as on FinsROV",
     "mcu": "an output for each thruster in the order of the file, positive forward; full scale is the fastest shaft",
     "safety": "silences of 0.5 s; 45 degrees of tilt, 60 for a vehicle that does not control its heave; the published "
@@ -78,6 +92,30 @@ def default_sensors() -> Sensors:
         ),
         depth=DepthSensor(rate=20.0, position=origin, noise_std=0.005, bias_initial=0.01, quantisation=0.002),
     )
+
+
+def default_perception(given: Mapping[str, Any]) -> dict[str, RaySensor]:
+    """Camera, sonar and altimeter on the envelope: what a small ROV carries; one that does not hover has no camera.
+
+    Devices are those of the catalogue; pictures are as coarse as policies take them, delays and losses are guesses.
+    """
+    middle = np.asarray(given["body"].center_of_buoyancy)
+    length, _, height = given["body"].size
+    nose, under = middle + [0.5 * length, 0.0, 0.0], middle - [0.0, 0.0, 0.5 * height]
+    camera = RaySensor(
+        device="low_light_camera", position=nose, width=64, rate=10.0, latency=0.1, dropout=0.01
+    )
+    sonar = RaySensor(
+        device="gemini_720is",
+        position=nose + [0.0, 0.0, 0.25 * height],
+        width=128,
+        bins=128,
+        rate=5.0,
+        latency=0.1,
+    )
+    altimeter = RaySensor(device="ping", position=under, rate=10.0, latency=0.05)
+    hovers = "heave" in given["controlled_axes"]
+    return {**({"front_camera": camera} if hovers else {}), "sonar": sonar, "altimeter": altimeter}
 
 
 def default_tags(given: Mapping[str, Any]) -> Tags:

@@ -1,4 +1,4 @@
-"""Sensors, tags, motor controller and safety limits of a vehicle file."""
+"""Sensors, cameras and sonars, tags, motor controller and safety limits of a vehicle file."""
 
 from __future__ import annotations
 
@@ -141,6 +141,19 @@ class Sensors(Part):
     depth: DepthSensor | None = None
     dvl: Dvl | None = None
     compass: Compass | None = None
+
+
+class RaySensor(Sensor):
+    """A camera, imaging sonar, altimeter, rangefinder or DVL's beams: what sees or hears the things at a site."""
+
+    device: str
+    """A sensor of `finssim worlds list`, or a file (`.yaml`) beside the vehicle file."""
+    orientation: Quaternion | None = None  # type: ignore[assignment]
+    """Sensor frame (x along its view, y left, z up) to body frame, xyzw, (4,); its device's own where not given."""
+    width: Annotated[int, Field(strict=True, ge=2, le=8192)] | None = None
+    """Columns of a camera's pictures [px], their height follows; beams of a sonar. The device's own where not given."""
+    bins: Annotated[int, Field(strict=True, ge=2, le=4096)] | None = None
+    """Range cells of a sonar's pictures; the device's own where not given."""
 
 
 class Tags(Part):

@@ -70,7 +70,13 @@ def with_changes(vehicle: Vehicle, changes: Mapping[str, Any], provenance: Prove
     for path, value in changes.items():
         section, inner, _ = path.partition(".")
         if inner and section in vehicle.defaults:  # what is changed in a part is kept as a whole
-            values.setdefault(section, getattr(vehicle, section).values())
+            part = getattr(vehicle, section)
+            plain = (
+                {name: entry.values() for name, entry in part.items()}
+                if isinstance(part, dict)
+                else part.values()
+            )
+            values.setdefault(section, plain)
         for full in _set(values, path.split("."), value, vehicle.name):
             for key in [key for key in origins if key == full or key.startswith(full + ".")]:
                 del origins[key]
@@ -112,6 +118,17 @@ def _with_parents(path: Path, shown: str, children: tuple[Path, ...]) -> tuple[T
     hull = values.get("hull")
     if isinstance(hull, dict) and isinstance(hull.get("file"), str):
         hull["file"] = path.parent.resolve() / hull["file"]
+    perception = values.get("perception")
+    for name, entry in perception.items() if isinstance(perception, dict) else ():
+        device = entry.get("device") if isinstance(entry, dict) else None
+        if isinstance(device, str) and device.endswith((".yaml", ".yml")):
+            file = path.parent.resolve() / device
+            if not file.is_file():
+                raise VehicleError(
+                    f"{shown}: perception.{name}: no file {device} beside it: give a sensor's file, or a name of "
+                    "'finssim worlds list'"
+                )
+            entry["device"] = str(file)
     parent = values.pop("extends", None)
     if parent is None:
         return values, origins

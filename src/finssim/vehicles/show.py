@@ -79,6 +79,8 @@ def print_vehicle(vehicle: Vehicle, console: Console, picture: Path | None = Non
         if isinstance(chosen, HydrodynamicSet) and chosen.terms:
             console.print(_terms(vehicle, name, chosen))
     console.print(_thrusters(vehicle))
+    if "perception" not in vehicle.defaults:
+        console.print(_perception(vehicle))
     console.print(_performance(vehicle))
     console.print(_sources(vehicle))
     if vehicle.defaults:
@@ -191,6 +193,16 @@ def _thrusters(vehicle: Vehicle) -> Table:
             thruster.domain,
             motor,
         )
+    return table
+
+
+def _perception(vehicle: Vehicle) -> Table:
+    table = _table(
+        "Cameras, sonars, altimeters", "", "device", "position [m]", "rate [Hz]", "latency [s]", "lost"
+    )
+    for name, sensor in vehicle.perception.items():
+        numbers = (f"{sensor.rate:g}", f"{sensor.latency:g}", f"{sensor.dropout:.1%}")
+        table.add_row(name, escape(Path(sensor.device).name), _rounded(sensor.position), *numbers)
     return table
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -16,8 +17,15 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from finssim.vehicles.autopilot import Autopilot, refuse_misfit
 from finssim.vehicles.body import Body, Hull, Water, moved_to_origin, skew
 from finssim.vehicles.calibration_record import CalibrationRecord
-from finssim.vehicles.defaults import DEFAULTS, default_mcu, default_safety, default_sensors, default_tags
-from finssim.vehicles.equipment import Mcu, Safety, Sensors, Tags
+from finssim.vehicles.defaults import (
+    DEFAULTS,
+    default_mcu,
+    default_perception,
+    default_safety,
+    default_sensors,
+    default_tags,
+)
+from finssim.vehicles.equipment import Mcu, RaySensor, Safety, Sensors, Tags
 from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.hydrodynamics import AnyHydrodynamicSet, HydrodynamicSet, MeshSet
 from finssim.vehicles.part import Part, Vector3, did_you_mean, refuse_section, refuse_value
@@ -59,6 +67,8 @@ class Vehicle(Part):
     wrench_reference: Vector3 = Field(default_factory=lambda given: given["body"].center_of_gravity)
     """Body point about which wrenches are commanded [m], (3,); the centre of gravity where the file gives none."""
     sensors: Sensors = Field(default_factory=default_sensors)
+    perception: dict[str, RaySensor] = Field(default_factory=default_perception)
+    """What sees and hears the site, by name; see `finssim.worlds.device_of`."""
     tags: Tags | None = Field(default_factory=default_tags)
     """None only where a file takes them off: `tags: null`."""
     mcu: Mcu = Field(default_factory=default_mcu)
@@ -80,6 +90,16 @@ class Vehicle(Part):
         if not isinstance(value, (list, tuple)) or not set(map(str, value)) <= set(AXES) or not value:
             raise refuse_value(f"is {value!r}, expected a list drawn from {', '.join(AXES)}")
         return tuple(axis for axis in AXES if axis in value)
+
+    @field_validator("perception")
+    @classmethod
+    def _plain_names(cls, value: dict[str, RaySensor]) -> dict[str, RaySensor]:
+        for name in value:
+            if not re.fullmatch("[a-z][a-z0-9_]*", name):
+                raise refuse_section(
+                    f"'{name}' is no name of a sensor: give lower-case letters, digits and _, such as front_camera"
+                )
+        return value
 
     @field_validator("hydrodynamics", "thrusters")
     @classmethod
@@ -219,6 +239,10 @@ class Vehicle(Part):
             values.pop(prose, None)
         if self.hull is not None and self.hull.file is not None:
             values["hull"]["file"] = hashlib.sha256(self.hull.file.read_bytes()).hexdigest()
+        for name, sensor in self.perception.items():
+            if "perception" in values and Path(sensor.device).is_absolute():
+                digest = hashlib.sha256(Path(sensor.device).read_bytes()).hexdigest()
+                values["perception"][name]["device"] = digest
         values["thruster_names"] = self.thruster_names  # their order is part of the meaning
         return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 

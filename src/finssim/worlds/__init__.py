@@ -5,9 +5,17 @@
 """
 
 from finssim.worlds.delivery import Delivery
-from finssim.worlds.description import World, WorldError, devices, load_device, load_world, sites
+from finssim.worlds.description import (
+    World,
+    WorldError,
+    device_of,
+    devices,
+    load_device,
+    load_world,
+    sites,
+)
 from finssim.worlds.model import WorldBatch
-from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of
+from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of, sensor_of
 
 __all__ = [
     "CameraBatch",
@@ -18,9 +26,11 @@ __all__ = [
     "World",
     "WorldBatch",
     "WorldError",
+    "device_of",
     "devices",
     "load_device",
     "load_world",
     "poses_of",
+    "sensor_of",
     "sites",
 ]

@@ -20,6 +20,7 @@ from finssim.geometry.mesh import MeshError, load_stl
 from finssim.geometry.optics import LENS_MODELS, Lens, OpticsError
 from finssim.geometry.rotations import quat_from_euler, quat_from_yaw
 from finssim.sensors.overhead_camera import Sensor, Water
+from finssim.vehicles import Vehicle
 from finssim.vehicles.part import (
     NonNegative,
     Number,
@@ -451,10 +452,14 @@ class Mount(Part):
     """Its x axis, along which it looks, turned down from the body's [rad]."""
     yaw: Number = 0.0
     """And to the left [rad]."""
+    orientation: Quaternion | None = None
+    """q_body<sensor> in place of both, xyzw, (4,)."""
 
     @property
     def quaternion(self) -> Array:
         """q_body<sensor>, xyzw, (4,)."""
+        if self.orientation is not None:
+            return self.orientation
         return quat_from_euler(0.0, self.pitch, self.yaw)
 
 
@@ -653,6 +658,45 @@ def load_device(name_or_path: str | os.PathLike[str]) -> Device:
     if not isinstance(kind, str) or kind not in KINDS:
         raise WorldError(f"{shown}: kind is {kind!r}, expected one of {', '.join(KINDS)}")
     return _checked(KINDS[kind], tree, shown)
+
+
+def device_of(vehicle: Vehicle, name: str) -> Device:
+    """A sensor of a vehicle: its device, with the mount, rate, width and range cells of the vehicle's entry.
+
+    Args:
+        vehicle: Its `perception` has the entry.
+        name: Of the entry, such as `front_camera`.
+
+    Raises:
+        WorldError: The vehicle has no such entry, or its device is refused.
+    """
+    where = f"{vehicle.name}: perception.{name}"
+    if name not in vehicle.perception:
+        known = list(vehicle.perception)
+        raise WorldError(
+            f"{vehicle.name} has no sensor '{name}'{did_you_mean(name, known)} its perception has "
+            f"{', '.join(known) or 'none'}"
+        )
+    entry = vehicle.perception[name]
+    try:
+        device = load_device(entry.device)
+    except WorldError as error:
+        raise WorldError(f"{where}: device: {error}") from None
+    orientation = device.mount.quaternion if entry.orientation is None else entry.orientation
+    changes: dict[str, Any] = {
+        "mount": Mount(position=entry.position, orientation=orientation),
+        "rate": entry.rate,
+    }
+    if isinstance(device, CameraDevice) and entry.width is not None:
+        scale = entry.width / device.width
+        changes["height"] = max(1, round(device.height * scale))
+        changes["width"], changes["focal_length"] = entry.width, device.focal_length * scale
+    elif isinstance(device, SonarDevice):
+        changes["beams"], changes["bins"] = entry.width or device.beams, entry.bins or device.bins
+    for key, kinds in {"width": (CameraDevice, SonarDevice), "bins": (SonarDevice,)}.items():
+        if getattr(entry, key) is not None and not isinstance(device, kinds):
+            raise WorldError(f"{where}: {entry.device} has no {key}: remove it")
+    return device.model_copy(update=changes)
 
 
 def _locate(

@@ -22,7 +22,15 @@ import warp as wp
 from scipy.special import ndtri
 
 from finssim.sensors.overhead_camera.photometry import fresnel, noise_key, refracted, through_water
-from finssim.worlds.description import CameraDevice, Mount, RangeDevice, SonarDevice, WorldError
+from finssim.vehicles import Vehicle
+from finssim.worlds.description import (
+    CameraDevice,
+    Mount,
+    RangeDevice,
+    SonarDevice,
+    WorldError,
+    device_of,
+)
 from finssim.worlds.model import Optics, Surface, WorldBatch
 from finssim.worlds.rays import WATER_INDEX, camera_rays, cones, fan, ray_elevations
 
@@ -930,3 +938,26 @@ class RangeBatch(RayBatch):
         inputs += [self._weight, ranger.quantile, ranger.minimum_range, ranger.range, ranger.noise, key]
         wp.launch(_take_ranges, self.ranges.shape, [*inputs, self.ranges], device=self.device)
         return self.ranges
+
+
+def sensor_of(
+    batch: WorldBatch, vehicle: Vehicle, name: str, *, vehicles: int = 1, lamps: tuple[Headlight, ...] = ()
+) -> CameraBatch | SonarBatch | RangeBatch:
+    """The sensor of an entry of a vehicle's `perception`, on every vehicle of a batch.
+
+    Args:
+        batch: The worlds.
+        vehicle: Its file has mount, rate, width and range cells.
+        name: Of the entry, such as `front_camera`.
+        vehicles: In each world.
+        lamps: Lights on each vehicle, for cameras.
+
+    Raises:
+        WorldError: The vehicle has no such entry, or its device is refused.
+    """
+    device = device_of(vehicle, name)
+    if isinstance(device, CameraDevice):
+        return CameraBatch(batch, device, vehicles=vehicles, lamps=lamps)
+    if isinstance(device, SonarDevice):
+        return SonarBatch(batch, device, vehicles=vehicles)
+    return RangeBatch(batch, device, vehicles=vehicles)

@@ -163,7 +163,7 @@ UNITS = {
 }
 """Key -> unit of its value, written behind it."""
 
-ONE_LINE = (("water",), ("hull",), ("thrusters", "*"), ("tags", "mounts", "*"))
+ONE_LINE = (("water",), ("hull",), ("thrusters", "*"), ("tags", "mounts", "*"), ("perception", "*"))
 """Sections that are written on one line where they fit."""
 
 
@@ -338,8 +338,9 @@ OWN = ("position", "axis", "group", "motor_index", "motor_sign")
 def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
     """Write a self-contained vehicle file: every number, its origin, and the calibrations behind it.
 
-    It reads back with the same `sha256` and the same origins. A hull mesh is copied beside it, under a name that ends
-    with a part of its digest, unless it lies there already; the notice of its licence, `NAME.NOTICE`, goes with it.
+    It reads back with the same `sha256` and the same origins. A hull mesh and sensors' files are copied beside it,
+    under names that end with a part of their digest, unless they lie there already; the notice of a mesh's licence,
+    `NAME.NOTICE`, goes with it.
 
     Args:
         vehicle: Any vehicle.
@@ -355,6 +356,9 @@ def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
     with atomic_write(target) as temporary:
         if vehicle.hull is not None and vehicle.hull.file is not None:
             tree["hull"]["file"] = _beside(vehicle.hull.file, target)
+        for entry in tree.get("perception", {}).values():
+            if Path(entry["device"]).is_absolute():
+                entry["device"] = _beside(Path(entry["device"]), target)
         temporary.write_text(vehicle_text(tree, origins), encoding="utf-8")
         if load_vehicle(temporary).sha256 != vehicle.sha256:
             raise RuntimeError(f"{path}: the file would not hold the same vehicle; nothing was written")
@@ -375,7 +379,7 @@ def yaml_path(path: str | os.PathLike[str], kind: str) -> Path:
 
 
 def _beside(mesh: Path, target: Path) -> str:
-    """Name of the mesh beside the target, copied there if need be; never over another file."""
+    """Name of a mesh, or of a sensor's file, beside the target, copied there if need be; never over another file."""
     folder = Path(os.path.realpath(target)).parent
     if mesh.resolve().parent == folder:
         return mesh.name
