@@ -4,6 +4,7 @@
 (`pip install 'finssim[perception]'`).
 """
 
+from finssim.worlds.delivery import Delivery
 from finssim.worlds.description import (
     World,
     WorldError,
@@ -18,6 +19,7 @@ from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatc
 
 __all__ = [
     "CameraBatch",
+    "Delivery",
     "Headlight",
     "RangeBatch",
     "SonarBatch",

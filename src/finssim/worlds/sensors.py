@@ -105,6 +105,9 @@ class RayBatch:
         vehicles: In each world.
     """
 
+    reading: wp.array
+    """What `update` returns; one row for each vehicle."""
+
     def __init__(self, batch: WorldBatch, rays: np.ndarray, mount: Mount, vehicles: int = 1) -> None:
         self.batch, self.device, self.count = batch, batch.device, batch.worlds * vehicles
         shape = (self.count, *rays.shape[:2])
@@ -524,7 +527,7 @@ class CameraBatch(RayBatch):
         shape = self.depth.shape
         code = 255.0 * np.linspace(0.0, 1.0, LEVELS) ** (1.0 / sensor.gamma) + 0.5
         with wp.ScopedDevice(self.device):
-            self.picture = wp.zeros((*shape, 3), dtype=wp.uint8)
+            self.reading = self.picture = wp.zeros((*shape, 3), dtype=wp.uint8)
             self.radiance = wp.zeros(shape if linear else (0, 0, 0), dtype=wp.vec3)
             self.gain = wp.full(self.count, wp.vec3(sensor.gain), dtype=wp.vec3)
             self._normal = wp.array(np.float32(ndtri((np.arange(1024) + 0.5) / 1024)), dtype=float)
@@ -761,7 +764,7 @@ class SonarBatch(RayBatch):
             self._energy = wp.zeros(self.depth.shape, dtype=float)
             self._spread = wp.zeros(self.depth.shape, dtype=wp.vec2)
             self.intensity = wp.zeros((self.count, count, self.bins), dtype=float)
-            self.picture = wp.zeros(self.intensity.shape, dtype=wp.uint8)
+            self.reading = self.picture = wp.zeros(self.intensity.shape, dtype=wp.uint8)
 
     @property
     def bin_length(self) -> float:
@@ -905,7 +908,7 @@ class RangeBatch(RayBatch):
         super().__init__(batch, rays, ranger.mount, vehicles)
         self.ranger = ranger
         self._weight = wp.array(np.float32(weight), dtype=float, device=self.device)
-        self.ranges = wp.zeros((self.count, ranger.beams), dtype=float, device=self.device)
+        self.reading = self.ranges = wp.zeros((self.count, ranger.beams), dtype=float, device=self.device)
 
     def update(
         self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
