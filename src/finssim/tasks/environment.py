@@ -274,8 +274,7 @@ class Environment:
                 self._build()
             self.simulator.restart_episodes(mask)
             if self.sight is not None:
-                self.sight.seed = self.seed
-                self.sight.restart(None if mask is None else np.asarray(mask, dtype=bool))
+                self.sight.restart(self.seed, None if mask is None else np.asarray(mask, dtype=bool))
             if mask is None and self.schedule is not None:
                 self.schedule.restart()
         where = np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)

@@ -133,10 +133,13 @@ class Task:
 
     def record(self) -> dict[str, Any]:
         """The settings as plain data: ranges, limits, reward weights."""
-        kept = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "observation"}
-        return {
-            name: asdict(v) if is_dataclass(v) and not isinstance(v, type) else v for name, v in kept.items()
-        }
+
+        def plain(v: Any) -> Any:
+            if isinstance(v, tuple):
+                return tuple(plain(item) for item in v)
+            return asdict(v) if is_dataclass(v) and not isinstance(v, type) else v
+
+        return {one.name: plain(getattr(self, one.name)) for one in fields(self) if one.name != "observation"}
 
     @property
     def vehicles(self) -> tuple[str, ...]:
