@@ -85,8 +85,8 @@ class PolicyDescription(_Record):
     task: str
     observation: ObservationSchema
     pictures: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """What it sees beside the observation, by the name of the entry of the vehicle's `perception`: device, shape (height,
-    width, 3), rate [Hz] and latency [s]."""
+    """What it sees beside the observation, by the name of the entry of the vehicle's `perception`: device, shape
+    (height, width, 3), rate [Hz] and latency [s]."""
     action: dict[str, Any]
     """The action mode, as its `describe()` gives it: at least `mode` (name), `size`, and its limits and scale."""
     control_period: float = Field(gt=0.0, le=10.0)
@@ -308,7 +308,9 @@ class Policy:
             expected_shape = (len(rows), *about["shape"])
             if picture is None or picture.shape != expected_shape or picture.dtype != np.uint8:
                 got = "nothing" if picture is None else f"{picture.dtype} {picture.shape}"
-                raise PolicyError(f"the policy sees {name}: it is given {got}, expected uint8 {expected_shape}")
+                raise PolicyError(
+                    f"the policy sees {name}: it is given {got}, expected uint8 {expected_shape}"
+                )
             given[name] = picture
         action, *after = self._session.run(OUTPUTS[: 1 + bool(k)], {"observation": rows, **given})
         return action.reshape(*x.shape[:-1], action.shape[-1]), after[0] if after else None
@@ -355,8 +357,8 @@ def _open_network(folder: Path, description: PolicyDescription) -> Any:
         reason = " ".join(str(error).split())
         raise PolicyError(f"{path}: not a network onnxruntime can run ({reason})") from error
     k = [description.memory] if description.memory else []
-    shapes = [tuple(one["shape"]) for one in description.pictures.values()]
-    described = [[description.observation.size, *k, *shapes], [description.action_size, *k]]
+    shapes: list[Any] = [tuple(one["shape"]) for one in description.pictures.values()]
+    described: list[list[Any]] = [[description.observation.size, *k, *shapes], [description.action_size, *k]]
     found = [
         [tensor.shape[-1] if len(tensor.shape) == 2 else tuple(tensor.shape[1:]) for tensor in side]
         for side in (session.get_inputs(), session.get_outputs())

@@ -491,9 +491,9 @@ class LightServo(DockingPid):
     """`DockingPid` towards a dock whose pose comes from the four guide lights in the picture.
 
     The upper two are white, the lower two red, in the corners of an upright square of known side. The height of each
-    pair in the picture gives its distance, their middle the bearing, the difference of the distances the dock's heading.
-    A picture counts where all four are in it; the estimate is the mean of the last dozen, and between them, and in the
-    funnel, the vehicle reckons by its velocity.
+    pair in the picture gives its distance, their middle the bearing, the difference of the distances the dock's
+    heading. A picture counts where all four are in it; the estimate is the mean of the last dozen, and between them,
+    and in the funnel, the vehicle dead-reckons by its velocity.
     """
 
     focal_share: float = 0.0
@@ -580,7 +580,9 @@ class LightServo(DockingPid):
                 corners.append([(own * grid).sum((1, 2)) / number for grid in (columns, rows)])
                 visible &= own.any((1, 2))
         focal = self.focal_share * red.shape[2]
-        x, y = np.moveaxis(np.array(corners), 1, 0)  # (4, n): upper left, upper right, lower left, lower right
+        x, y = np.moveaxis(
+            np.array(corners), 1, 0
+        )  # (4, n): upper left, upper right, lower left, lower right
         left, right = (focal * self.side / np.maximum(y[i + 2] - y[i], 0.5) for i in (0, 1))
         visible &= (y[2] - y[0] > 3.0) & (y[3] - y[1] > 3.0) & (x[1] - x[0] > 3.0)
         ahead = 0.5 * (left + right)

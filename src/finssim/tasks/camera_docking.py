@@ -69,8 +69,8 @@ class CameraDocking(Docking):
         fitted = replace(self, hull=docking.Hull.of(vehicles[0]))
         if fitted.hull.girth > 0.95 * THROAT:
             raise EnvironmentSetupError(
-                f"vehicle '{vehicles[0].name}' is {2.0 * fitted.hull.girth:.2f} m across its corners, and the dock of the "
-                f"site '{self.world or 'dock'}' takes {2.0 * 0.95 * THROAT:.2f} m: take a slimmer one, such as finsrov"
+                f"vehicle '{vehicles[0].name}' is {2.0 * fitted.hull.girth:.2f} m across its corners, and the dock of "
+                f"site 'dock' takes {2.0 * 0.95 * THROAT:.2f} m: take a slimmer one, such as finsrov"
             )
         return fitted
 

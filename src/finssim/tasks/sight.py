@@ -33,7 +33,9 @@ class Picture:
 
 
 @wp.kernel(enable_backward=False)
-def _copy_masked(mask: wp.array(dtype=int), source: wp.array4d(dtype=wp.uint8), out: wp.array4d(dtype=wp.uint8)):
+def _copy_masked(
+    mask: wp.array(dtype=int), source: wp.array4d(dtype=wp.uint8), out: wp.array4d(dtype=wp.uint8)
+):
     w, i = wp.tid()
     if mask[w] != 0:
         for j in range(source.shape[2]):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from typing import Any
 
@@ -162,7 +161,9 @@ class WorldBatch:
         frames[:, :, 6] = 1.0  # the last is the world's
         for i, (item, anchor, rest) in enumerate(self._varied):
             own = drawn[:, 1 + 4 * i : 5 + 4 * i]
-            shift = np.concatenate([own[:, :3] * item.vary.position, quat_from_yaw(own[:, 3] * item.vary.yaw)], 1)
+            shift = np.concatenate(
+                [own[:, :3] * item.vary.position, quat_from_yaw(own[:, 3] * item.vary.yaw)], 1
+            )
             frames[i] = _compose(_compose(frames[anchor], rest), shift)
         self._frames[:, rows] = frames
         self._pose[rows] = _compose(frames[self._anchor], self._rest[:, None]).swapaxes(0, 1)
@@ -275,7 +276,9 @@ class WorldBatch:
             else:
                 builder.add_shape_mesh(-1, xform=xform, mesh=mesh, **options)
             anchor, rest = self._objects[name]
-            turned = np.concatenate([quat_inverse_rotate(item.quaternion, position - item.position), [0, 0, 0, 1]])
+            turned = np.concatenate(
+                [quat_inverse_rotate(item.quaternion, position - item.position), [0, 0, 0, 1]]
+            )
             self._add_shape(name, item, anchor, _compose(rest, turned))
 
     def _optics(self) -> Optics:

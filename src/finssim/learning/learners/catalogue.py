@@ -167,7 +167,11 @@ LEARNERS: dict[str, LearnerKind] = {
         "imitation", "Dagger", "DAgger: an expert says what it would have done", extra="imitation"
     ),
     "distill": LearnerKind(
-        "distill", "Distill", "a teacher by PPO, who shows a student with a camera what to do", extra="learn", sees=True
+        "distill",
+        "Distill",
+        "a teacher by PPO, who shows a student with a camera what to do",
+        extra="learn",
+        sees=True,
     ),
     "gail": LearnerKind("gail", "Gail", "GAIL: PPO judged against demonstrations", extra="imitation,torchrl"),
 }

@@ -1,8 +1,8 @@
-"""Teacher and student: PPO on a row that tells all, then DAgger, in which a student with a camera is asked to do the same.
+"""Teacher and student: PPO on privileged numbers, then DAgger by a student that has the pictures alone.
 
-The teacher learns the task without its pictures, on `Task.teacher`, in worlds that nobody renders. The student then drives
-in worlds that it sees; at each step the teacher says what it would have done (Ross et al. 2011). Its encoder also learns
-to tell the teacher's row from the picture, which teaches it where to look.
+The teacher learns the task without its pictures, on `Task.teacher`, in worlds that nobody renders. The student then
+drives in worlds that it sees; each step is labelled with what the teacher would have done (Ross et al. 2011). The
+student's encoder also learns to predict the teacher's row, which takes fewer pictures than actions alone.
 """
 
 from __future__ import annotations
@@ -10,12 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 import warp as wp
 from torch import nn
 
-from finssim.learning.layers import one_thread
 from finssim.learning.learners.base import ActingLearner
 from finssim.learning.learners.ppo import Ppo
 from finssim.learning.network import Activation, Linear, Network
@@ -31,10 +29,10 @@ class DistillSettings:
 
     worlds: int = 64
     """Of the student."""
-    steps: int = 160_000
+    steps: int = 100_000
     """Control steps of the student, all worlds together."""
     teacher_worlds: int = 256
-    teacher_steps: int = 900_000
+    teacher_steps: int = 2_000_000
     """Control steps of the teacher, before the first of the student."""
     rollout: int = 25
     """Control steps of each world between two rounds of learning."""
@@ -48,7 +46,7 @@ class DistillSettings:
     learning_rate: float = 1.0e-3
     """At the start; falls linearly to zero."""
     auxiliary: float = 0.3
-    """Weight of the error of the teacher's row as the encoder tells it."""
+    """Weight of the squared error of the predicted teacher's row."""
     hidden: tuple[int, ...] = (128, 64)
     """Units of the layers behind the encoder, ELU."""
 
@@ -73,8 +71,8 @@ class Distill(ActingLearner):
         shapes = {name: tuple(x.shape[1:]) for name, x in self._pictures.items()}
         n, m, taught = environment.observation_size, environment.action_size, self._taught.shape[1]
         self.student = SeeingNetwork(n, shapes, m, hidden=settings.hidden).to(device)
-        self._guess = nn.Linear(self.student.layers[0].in_features - n, taught).to(device)
-        self._parameters = [*self.student.parameters(), *self._guess.parameters()]
+        self._predictor = nn.Linear(self.student.layers[0].in_features - n, taught).to(device)
+        self._parameters = [*self.student.parameters(), *self._predictor.parameters()]
         self.optimizer = torch.optim.Adam(self._parameters, lr=settings.learning_rate)
         columns = {"row": (n,), "taught": (taught,), "action": (m,)}
         self._kept = {
@@ -90,7 +88,7 @@ class Distill(ActingLearner):
         """Share of the teacher's last episodes that succeeded, while it was still trying."""
 
     def _train_teacher(self) -> None:
-        """PPO on what the task tells a teacher."""
+        """PPO on the task's `teacher` observation."""
         e, s = self.environment, self.settings
         environment = Environment(
             e.task.for_teacher(), e.simulator.vehicles, nominal=e.nominal, worlds=s.teacher_worlds,
@@ -113,8 +111,8 @@ class Distill(ActingLearner):
             self._roll_out()
         self._rounds += 1
         self.steps += fresh
-        loss, guess = self._fit(max(1, round(s.passes * fresh / s.batch)))
-        row = {"imitation_loss": loss, "guess_loss": guess, "teacher_held": self.teacher_held}
+        loss, prediction = self._fit(max(1, round(s.passes * fresh / s.batch)))
+        row = {"imitation_loss": loss, "prediction_loss": prediction, "teacher_held": self.teacher_held}
         return {**self.tally.row(), **row}
 
     def _roll_out(self) -> None:
@@ -151,11 +149,11 @@ class Distill(ActingLearner):
             features = self.student.encode(batch)
             action = self.student.layers(torch.cat([batch["row"], features], dim=1))
             loss = nn.functional.mse_loss(action, batch["action"])
-            guess = nn.functional.mse_loss(self._guess(features), batch["taught"])
+            prediction = nn.functional.mse_loss(self._predictor(features), batch["taught"])
             self.optimizer.zero_grad()
-            (loss + s.auxiliary * guess).backward()
+            (loss + s.auxiliary * prediction).backward()
             self.optimizer.step()
-            total += torch.stack([loss, guess]).detach()
+            total += torch.stack([loss, prediction]).detach()
         return tuple((total / batches).tolist())  # type: ignore[return-value]
 
     def network(self) -> nn.Module:
@@ -166,20 +164,22 @@ class Distill(ActingLearner):
         """Networks, optimiser, what is kept, and the teacher."""
         return {
             "student": self.student.state_dict(),
-            "guess": self._guess.state_dict(),
+            "predictor": self._predictor.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "kept": self._kept,
             "counts": [self._count, self._rounds],
             "teacher": [
                 [layer.weight, layer.bias] for layer in self.teacher.layers if isinstance(layer, Linear)
-            ] if self.teacher else None,
+            ]
+            if self.teacher
+            else None,
             "teacher_held": self.teacher_held,
         }
 
     def load_learned(self, state: dict[str, Any]) -> None:
         """Take what `learned` gave."""
         self.student.load_state_dict(state["student"])
-        self._guess.load_state_dict(state["guess"])
+        self._predictor.load_state_dict(state["predictor"])
         self.optimizer.load_state_dict(state["optimizer"])
         for name, values in state["kept"].items():
             self._kept[name].copy_(values)
