@@ -21,7 +21,7 @@ ARROWS = {
     "engine": {"sensors"},
     "control": {"physics"},
     "localization": {"physics"},
-    "tasks": {"engine", "control", "localization"},
+    "tasks": {"engine", "worlds", "control", "localization"},
     "learning": {"tasks"},
     "calibration": {"engine", "control", "localization"},
     "robot": {"tasks"},
