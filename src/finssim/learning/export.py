@@ -168,13 +168,17 @@ class _Graph:
         return outputs
 
     def modules(self, layers: Any, x: str) -> str:
-        """Torch's layers one after the other: convolutions, linear layers, ELU and flattening."""
+        """Torch's layers one after the other: instance norm, convolutions, linear layers, ELU and flattening."""
         for layer in layers:
             weights = [self.weight(w.detach().cpu().numpy()) for w in layer.parameters()]
             if hasattr(layer, "kernel_size"):
                 rows, columns = layer.padding
                 strides, pads = list(layer.stride), [rows, columns, rows, columns]
                 x = self.node("Conv", [x, *weights], strides=strides, pads=pads)
+            elif hasattr(layer, "num_features"):
+                ones = np.ones(layer.num_features, np.float32)
+                inputs = [x, self.weight(ones), self.weight(0.0 * ones)]
+                x = self.node("InstanceNormalization", inputs, epsilon=layer.eps)
             elif weights:
                 x = self.node("Gemm", [x, *weights], transB=1)
             else:
@@ -218,11 +222,11 @@ class _Graph:
 def write_seeing(network: Any, n: int, m: int) -> bytes:
     """The ONNX file of a `SeeingNetwork`: beside `observation` each picture, uint8 (N, height, width, 3), by name."""
     graph = _Graph()
-    level, scale = (graph.weight(np.full((), value, np.float32)) for value in (0.5, 1.0 / 255.0))
+    scale = graph.weight(np.full((), 1.0 / 255.0, np.float32))
     features = ["observation"]
     for name in network.shapes:
         x = graph.node("Mul", [graph.node("Cast", [name], to=TensorProto.FLOAT), scale])
-        x = graph.node("Transpose", [graph.node("Sub", [x, level])], perm=[0, 3, 1, 2])
+        x = graph.node("Transpose", [x], perm=[0, 3, 1, 2])
         features.append(graph.modules(network.encoders[name], x))
     x = graph.modules(network.layers, graph.node("Concat", features, axis=1))
     graph.stack((), x)

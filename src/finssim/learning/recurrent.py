@@ -61,7 +61,7 @@ class SeeingNetwork(nn.Module):
         self.shapes = {name: tuple(shape) for name, shape in shapes.items()}
         self.encoders = nn.ModuleDict()
         for name, (rows, columns, depth) in self.shapes.items():
-            layers: list[nn.Module] = []
+            layers: list[nn.Module] = [nn.InstanceNorm2d(depth)]  # what water does to a whole picture
             for a, b in zip([depth, *channels], channels, strict=False):
                 layers += [nn.Conv2d(a, b, 3, stride=2, padding=1), nn.ELU()]
                 rows, columns = (rows + 1) // 2, (columns + 1) // 2
@@ -70,15 +70,10 @@ class SeeingNetwork(nn.Module):
         self.layers = stack(inputs + len(self.shapes) * features, hidden, outputs, 0.01)
 
     def encode(self, pictures: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Features of pictures, uint8 (N, height, width, 3), side by side in the order of `shapes`."""
+        """Features of pictures, 0 to 255, (N, height, width, 3), side by side in the order of `shapes`."""
         kind = self.layers[0].weight.dtype
-        return torch.cat(
-            [
-                self.encoders[name]((pictures[name].to(kind) / 255.0 - 0.5).permute(0, 3, 1, 2))
-                for name in self.shapes
-            ],
-            dim=1,
-        )
+        scaled = {name: pictures[name].to(kind) / 255.0 for name in self.shapes}
+        return torch.cat([self.encoders[name](x.permute(0, 3, 1, 2)) for name, x in scaled.items()], dim=1)
 
     def forward(self, observation: torch.Tensor, **pictures: torch.Tensor) -> torch.Tensor:
         """Action (N, m) for rows (N, n) and pictures."""
