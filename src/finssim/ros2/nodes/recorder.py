@@ -30,9 +30,9 @@ class RecorderNode(RobotNode):
             self.get_logger().info("nothing is recorded: give a file by the parameter record")
             return
         files = {"pool.yaml": pool_file} if pool_file else {}
-        names = {key: self.resolve_topic_name(self.topic(key)) for key in self.topics}
+        names = {key: self.resolve_topic_name(self.topic(key)) for key in self.table}
         self.mcap = _WireRecord(Path(path), self.filed, {"command": "ros2 recorder"}, files, names)
-        for key, topic in self.topics.items():
+        for key, topic in self.table.items():
             if key not in LEFT_OUT and topic.type != RAW and (pictures or not key.endswith("picture")):
                 with suppress(ImportError):  # a ROS 2 without marine_acoustic_msgs
                     self.hears(key, self._taker(key), raw=True)
