@@ -40,7 +40,6 @@ SETTINGS: Table = {
         # A reference is close all the time: one second of foresight is enough, and learns faster than five.
         "ppo": {"discount": 0.9, "steps": 500_000},
         "on-policy": {"discount": 0.9},
-        "sb3-sac": {"discount": 0.9},
     },
     # So is a target that moves, once it has been reached.
     "t3": {"on-policy": {"discount": 0.95}, "ppo": {"steps": 600_000}},
@@ -72,7 +71,6 @@ RANDOMIZED: Table = {
     "*": {
         "ppo": {"steps": 1_000_000},
         "on-policy": {"steps": 3_000_000},
-        "sb3-sac": {"steps": 800_000, "memory": 800_000},
     },
     # What it saw and did in the last steps tells how this vehicle answers: thrust, lag, and how late the state comes.
     "t1": {"ppo": {"steps": 2_000_000, "history": 2, "last_action": True}},
