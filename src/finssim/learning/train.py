@@ -80,8 +80,9 @@ def train(
         until (SHARE): Share of successes, such as 0.95, at which the training is done before its steps are: of the held
             episodes, in two evaluations one after the other.
         init (NAME|DIR): Whom the policy imitates before it learns by itself: a baseline of the task, such as pid, a
-            policy directory, or none; pursuit, team-pursuit and formation have their baselines if not given. Of ppo;
-            --set taught=SHARE says for how much of the training.
+            policy directory, informed (a policy trained first that sees what --randomize has drawn), or none; pursuit,
+            team-pursuit and formation have their baselines if not given. Of ppo; --set taught=SHARE says for how much
+            of the training.
         settings (NAME=VALUE): Change of a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be
             given several times.
         resume: Go on from the last checkpoint of a training that was killed.
