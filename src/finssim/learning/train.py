@@ -64,7 +64,7 @@ def train(
         task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking,
             pursuit, team-pursuit or formation; or one's own, FILE.py:CLASS.
         out: Directory of the policy; an earlier policy there is replaced when done.
-        learner (NAME): Who learns: ppo (FinsSim's own), sb3-ppo, sb3-recurrent-ppo or rsl-rl; one agent also
+        learner (NAME): Who learns: ppo (FinsSim's own), sb3-ppo or rsl-rl; one agent also
             torchrl-ppo, several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; or one's own,
             FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.

@@ -20,9 +20,7 @@ IMITATING = ("bc", "dagger", "gail")
 REINFORCED = [name for name in LEARNERS if name not in IMITATING]
 ONE = [name for name in REINFORCED if LEARNERS[name].agents != "several"]
 SEVERAL = [name for name in REINFORCED if LEARNERS[name].agents != "one"]
-SHARED = [name for name in SEVERAL if name != "sb3-recurrent-ppo"]
-"""Those of a library whose sharing of one policy another of its learners shows."""
-PAIRS = [(name, Guess) for name in ONE] + [(name, GuessTogether) for name in SHARED]
+PAIRS = [(name, Guess) for name in ONE] + [(name, GuessTogether) for name in SEVERAL]
 TRAINED = [
     *((name, "t1") for name in ONE),
     *((name, "team-pursuit") for name in SEVERAL if name not in ONE),
@@ -39,7 +37,6 @@ def small(name, task, **changes):
     """Settings with which an update takes a fraction of a second."""
     kind = learner_named(name)
     few = {"worlds": 8, "rollout": 16, "hidden": (16, 16), "batch": 64, "epochs": 2, **changes}
-    few |= {"lstm": 16} if name == "sb3-recurrent-ppo" else {}
     return replace(kind.settings(task), **few)
 
 
@@ -136,9 +133,7 @@ def test_equal_seeds_are_equal_learners(name):
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(
-        LearningError, match="unknown learner 'sb3'; available: ppo, sb3-ppo, sb3-recurrent-ppo, rsl-rl"
-    ):
+    with pytest.raises(LearningError, match="unknown learner 'sb3'; available: ppo, sb3-ppo, rsl-rl"):
         learner_named("sb3")
     kind, task = learner_named("sb3-ppo"), Guess()
     with pytest.raises(LearningError, match="unknown setting 'gamma'; available: worlds, steps, rollout"):
@@ -168,17 +163,13 @@ def test_settings_that_nothing_can_be_learnt_with_are_refused(name, value, sente
     assert kind.settings(Guess(), changes={"entropy_weight": 0.0}).entropy_weight == 0.0
 
 
-@pytest.mark.parametrize(
-    ("name", "library", "extra"),
-    [("rsl-rl", "rsl_rl.algorithms", "rsl-rl"), ("sb3-recurrent-ppo", "sb3_contrib", "sb3-contrib")],
-)
-def test_a_library_that_is_missing_is_named(monkeypatch, name, library, extra):
+def test_a_library_that_is_missing_is_named(monkeypatch):
     """With what to install."""
-    kind = learner_named(name)
-    monkeypatch.setitem(sys.modules, library, None)
+    kind = learner_named("rsl-rl")
+    monkeypatch.setitem(sys.modules, "rsl_rl.algorithms", None)
     monkeypatch.delitem(sys.modules, f"finssim.learning.learners.{kind.module}", raising=False)
     with pytest.raises(
-        LearningError, match=rf"this learner needs {library}: pip install 'finssim\[learn,{extra}\]'$"
+        LearningError, match=r"this learner needs rsl_rl.algorithms: pip install 'finssim\[learn,rsl-rl\]'$"
     ):
         kind.settings(Guess())
 

@@ -18,7 +18,7 @@ from finssim.tasks.agents import expert_for
 # What a learner's settings are for a task, where they are not the defaults: the one place for them.
 
 
-ON_POLICY = ("sb3-ppo", "sb3-recurrent-ppo", "rsl-rl", "torchrl-ppo", "torchrl-ippo", "torchrl-mappo")
+ON_POLICY = ("sb3-ppo", "rsl-rl", "torchrl-ppo", "torchrl-ippo", "torchrl-mappo")
 """The learners that `on-policy` means below: those of outside libraries with `OnPolicySettings`."""
 
 Table = dict[str, dict[str, dict[str, Any]]]
