@@ -1,6 +1,6 @@
 """Worlds as data, and the sensors that see and hear them: cameras, imaging sonars, altimeters, DVL beams.
 
-`finssim.worlds.description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
+`WorldLayout`, `description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
 (`pip install 'finssim[perception]'`).
 """
 
@@ -14,6 +14,7 @@ from finssim.worlds.description import (
     load_world,
     sites,
 )
+from finssim.worlds.layout import WorldLayout
 from finssim.worlds.model import WorldBatch
 from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of, sensor_of
 
@@ -26,6 +27,7 @@ __all__ = [
     "World",
     "WorldBatch",
     "WorldError",
+    "WorldLayout",
     "device_of",
     "devices",
     "load_device",
