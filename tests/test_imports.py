@@ -18,7 +18,7 @@ ARROWS = {
     "physics": {"vehicles"},
     "sensors": {"physics"},
     "worlds": {"sensors"},
-    "engine": {"sensors"},
+    "engine": {"worlds"},
     "control": {"physics"},
     "localization": {"physics"},
     "tasks": {"engine", "control", "localization"},

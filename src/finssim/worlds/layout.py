@@ -133,7 +133,7 @@ class WorldLayout:
         """Set the poses of shapes in these worlds from what is drawn."""
         n, drawn = len(chosen), self._drawn[chosen]
         frames = {None: (np.zeros((n, 3)), np.tile(UPRIGHT, (n, 1)))}
-        rows = {name: (*frames[None], frames[None][1]) for name in ("basin", "seabed")}
+        rows = dict.fromkeys(("basin", "seabed"), (*frames[None], frames[None][1]))
         for name, item in self.world.objects.items():
             shift, turn = np.zeros((n, 3)), quat_from_yaw(np.zeros(n))
             if item.vary is not None:
