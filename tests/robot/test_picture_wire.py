@@ -20,6 +20,7 @@ from finssim.robot.pictures import (
     encode_picture,
     fragments,
     open_pictures,
+    resized,
 )
 
 RANDOM = np.random.default_rng(0)
@@ -56,6 +57,59 @@ def test_a_picture_comes_back_from_its_bytes():
     assert np.array_equal(posted.picture.image, NOISE)
     for a, b in zip(posted.picture.tags, TAGS, strict=True):
         assert a.tag_id == b.tag_id and np.array_equal(a.corners, b.corners)
+
+
+COLOURS = RANDOM.integers(0, 256, (9, 16, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "reading",
+    [
+        Picture(1.5, 3, COLOURS, source="front_camera"),
+        Picture(1.5, 3, NOISE, source="sonar"),
+        Picture(1.5, 3, source="altimeter", ranges=np.array([1.25, np.inf], np.float32)),
+    ],
+    ids=lambda reading: reading.source,
+)
+def test_readings_of_own_sensors_cross_udp_as_they_are(reading):
+    """Small pictures are not compressed: a policy sees the very numbers that it would see in training."""
+    sender, robot = udp_pair()
+    sender.send(reading, reading.time)
+    (there,) = until(robot.receive)
+    sender.close(), robot.close()
+    assert (there.source, there.sequence) == (reading.source, 3)
+    for a, b in ((there.image, reading.image), (there.ranges, reading.ranges)):
+        assert (a is None) == (b is None) and (a is None or np.array_equal(a, b))
+
+
+def test_a_large_picture_in_colour_is_compressed():
+    """JPEG keeps red red: within 12 levels of a smooth picture."""
+    image = np.zeros((40, 64, 3), np.uint8)
+    image[..., 0], image[..., 2] = 200, np.arange(64)
+    packed = encode_picture(Picture(0.0, 0, image, source="front_camera"), compress=True)
+    there = decode_picture(packed).picture.image
+    assert len(packed) < image.nbytes / 2 and np.abs(there.astype(int) - image).max() <= 12
+
+
+def test_a_reading_needs_a_name_and_ranges_numbers():
+    """Whoever sends a name that no sensor can have, or NaN, sends nothing."""
+    for spoilt in (
+        Picture(0.0, 0, COLOURS, source="Front camera"),
+        Picture(0.0, 0, source="altimeter", ranges=np.array([np.nan], np.float32)),
+    ):
+        assert decode_picture(encode_picture(spoilt)) is None
+
+
+def test_pictures_are_resized_by_area():
+    """The mean of the pixels that each covers; another kind is refused."""
+    image = np.zeros((4, 8, 3), np.uint8)
+    image[::2] = 100
+    np.testing.assert_array_equal(resized(image, (2, 4, 3)), np.full((2, 4, 3), 50, np.uint8))
+    assert resized(image, (4, 8, 3)) is image
+    with pytest.raises(LinkError, match="no picture came"):
+        resized(None, (2, 4, 3))
+    with pytest.raises(LinkError, match="a picture of shape \\(4, 8, 3\\) came"):
+        resized(image, (2, 4))
 
 
 def test_compression_takes_fewer_bytes_and_keeps_gray_to_a_few_levels():

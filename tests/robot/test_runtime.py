@@ -2,16 +2,19 @@
 
 import math
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from finssim.control import ControlError
 from finssim.control.guidance import Station
 from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import run_lockstep
-from finssim.robot.messages import Delivery
-from finssim.robot.pilots import make_pilot
+from finssim.robot.messages import Delivery, Picture
+from finssim.robot.pilots import AgentPilot, make_pilot
 from finssim.robot.runtime import Runtime
+from finssim.tasks.agents import PidAgent
 from finssim.vehicles import load_vehicle
 from reference.rounds import Rounds, overhead, without_latency
 
@@ -180,3 +183,61 @@ def test_any_bytes_are_survived():
         ]
         runtime.step(k / 60, [*delivery.frames, *noise, *cut], delivery.pictures)
     assert runtime.bridge.state == "armed"
+
+
+class Seeing(Constant):
+    """A pilot that sees the picture of a camera of the vehicle, and keeps those that it is shown."""
+
+    def __init__(self):
+        super().__init__()
+        self.pictures, self.took, self.shown = {"front_camera": (2, 3, 3)}, 0.004, []
+
+    def act(self, reading, guide, t):
+        self.shown.append(reading.pictures["front_camera"].sequence)
+        return super().act(reading, guide, t)
+
+
+class Filmed(Shown):
+    """The same world with readings of the vehicle's own sensors, a tenth of a second late, from 1 s to an end."""
+
+    def __init__(self, end):
+        super().__init__()
+        self.end, self.filmed = end, 10
+
+    def exchange(self, until, sent):
+        delivery, own = super().exchange(until, sent), []
+        while self.filmed / 10.0 + 0.1 <= min(until, self.end + 0.1):
+            image = np.full((2, 3, 3), self.filmed, np.uint8)
+            own.append(Picture(self.filmed / 10.0 + 0.1, self.filmed, image, source="front_camera"))
+            own.append(Picture(until, self.filmed, source="stranger"))
+            self.filmed += 1
+        return replace(delivery, pictures=(*delivery.pictures, *own))
+
+
+def test_a_pilot_that_sees_waits_for_pictures_and_stops_when_they_stop():
+    """Not armed before the first; none later than 0.5 s and the camera's 0.1 s after the last, and then no thrust."""
+    pilot, world = Seeing(), Filmed(end=3.0)
+    runtime = Runtime(VEHICLE, POOL, pilot, STATION, arm=True)
+    run_lockstep(runtime, world, 5.0)
+    assert runtime.started == pytest.approx(1.1, abs=0.02)
+    assert pilot.shown[0] == 10 and pilot.shown[-1] == 30 and len(pilot.shown) == pytest.approx(26, abs=2)
+    assert runtime.started + pilot.times[-1] == pytest.approx(3.55, abs=0.1)
+    assert runtime.reading.reason.startswith("the last picture of front_camera is")
+    assert runtime.bridge.state == "hold" or not any(world.commands()[-1][1].normalised)
+    assert dict(runtime.counters.onboard) == {"front_camera": 21}
+
+
+def test_the_age_of_pictures_at_the_command_is_measured():
+    """A camera of 10 Hz that is 0.1 s late: exposures are 0.1 to 0.2 s old, as the phase of decisions has it."""
+    pilot = Seeing()
+    runtime = Runtime(VEHICLE, POOL, pilot, STATION, arm=True)
+    run_lockstep(runtime, Filmed(end=9.0), 6.0)
+    told = runtime.counters.summary()
+    assert 0.1 <= told["exposure_to_command_s"]["p50"] <= 0.2 + 1 / 60
+    assert told["inference_s"]["p50"] == 0.004 and told["onboard"] == {"front_camera": 50}
+
+
+def test_a_vehicle_without_the_camera_is_refused():
+    """Before anything runs, with what there is."""
+    with pytest.raises(ControlError, match="pid sees periscope, which finsrov does not have: .*front_camera"):
+        AgentPilot(PidAgent("pid", VEHICLE), VEHICLE, pictures={"periscope": (4, 4, 3)})

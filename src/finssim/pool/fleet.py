@@ -102,10 +102,9 @@ class Fleet:
 
 def one_picture(pictures: Iterable[Picture]) -> list[Picture]:
     """Corners of each vehicle, of the same exposures, as the one camera has them: a picture with all tags."""
-    found: dict[int, Picture] = {}
+    found: dict[tuple[str, int], Picture] = {}
     for picture in pictures:
-        before = found.get(picture.sequence)
-        found[picture.sequence] = (
-            picture if before is None else replace(before, tags=before.tags + picture.tags)
-        )
-    return [found[sequence] for sequence in sorted(found)]
+        key = picture.source, picture.sequence
+        before = found.get(key)
+        found[key] = picture if before is None else replace(before, tags=before.tags + picture.tags)
+    return [found[key] for key in sorted(found)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import multiprocessing
 import os
 import queue
@@ -12,14 +13,15 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from itertools import count
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from finssim.localization.pool import Pool
 from finssim.pool.camera import CameraSettings, PoolCamera
 from finssim.pool.plant_spec import Basin
-from finssim.pool.positioning import Exposure, PoseAt
+from finssim.pool.positioning import Exposure, PoseAt, Shutter
 from finssim.quiet import start_warp
 from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import bound_socket
@@ -68,7 +70,11 @@ class UdpSender:
             picture: With its time on `time.monotonic` [s].
             now: `time.monotonic` [s].
         """
-        data = encode_picture(picture, late=max(now - picture.time, 0.0), compress=True)
+        # Small pictures of the vehicle's own sensors, which policies see, go as they are.
+        compress = not picture.source or (
+            picture.image is not None and picture.image.nbytes > LONGEST_FRAGMENT
+        )
+        data = encode_picture(picture, late=max(now - picture.time, 0.0), compress=compress)
         try:
             for datagram in fragments(data, self.sent + self.lost, self._fragment):
                 self._socket.sendto(datagram, self._peer)
@@ -84,7 +90,7 @@ class UdpSender:
 # Drawing pictures in a process of its own, so that telemetry never waits for one.
 
 
-UNDRAWN = 4
+UNDRAWN = 8
 """Exposures that wait to be drawn; more are dropped, as a camera does whose computer is too slow."""
 STARTING = 120.0
 """Time for the process to start and to compile the renderer, the first time on a machine [s]."""
@@ -109,15 +115,29 @@ class CameraPlan:
             self.vehicle, self.site, mode=self.mode, settings=self.settings, basin=self.basin, seed=self.seed
         )
 
+    def shutter(self) -> Shutter:
+        """When it exposes."""
+        return self.settings.shutter(self.seed)
+
+
+class Plan(Protocol):
+    """All that a camera, or the vehicle's own sensors, are made of."""
+
+    def camera(self) -> Any:
+        """Make it: `develop` gives the picture of an exposure."""
+
+    def shutter(self) -> Any:
+        """When it exposes: `advance` gives exposures."""
+
 
 class PictureProcess:
-    """The camera of a `VirtualPool` in real time: exposes here, draws and sends elsewhere; `advance` gives nothing."""
+    """The cameras of a `VirtualPool` in real time: expose here, draw and send elsewhere; `advance` gives nothing."""
 
-    def __init__(self, plan: CameraPlan, bind: Address, peer: Address) -> None:
+    def __init__(self, plans: Sequence[Plan], bind: Address, peer: Address) -> None:
         """Start the process and wait until it can draw.
 
         Args:
-            plan: What draws.
+            plans: What draws.
             bind: Address and port of the sending end.
             peer: Of the robot.
 
@@ -127,13 +147,13 @@ class PictureProcess:
         self.dropped = 0
         self.start = 0.0
         """When the pool's clock was 0, on `time.monotonic` [s]."""
-        self._shutter = plan.settings.shutter(plan.seed)
+        self._shutters = [plan.shutter() for plan in plans]
         context = multiprocessing.get_context("spawn")
         self._undrawn: Any = context.Queue(UNDRAWN)
         ready, theirs = context.Pipe(duplex=False)
         self._process = context.Process(
             target=_draw,
-            args=(plan, bind, peer, self._undrawn, theirs, os.getpid()),
+            args=(plans, bind, peer, self._undrawn, theirs, os.getpid()),
             name="pool camera",
             daemon=True,
         )
@@ -144,11 +164,12 @@ class PictureProcess:
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> Sequence[Picture]:
         """Expose; pictures go their own way."""
-        for exposure in self._shutter.advance(t0, t1, pose_at):
-            try:
-                self._undrawn.put_nowait((exposure, self.start + exposure.arrival))
-            except queue.Full:
-                self.dropped += 1
+        for i, shutter in enumerate(self._shutters):
+            for exposure in shutter.advance(t0, t1, pose_at):
+                try:
+                    self._undrawn.put_nowait((i, exposure, self.start + exposure.arrival))
+                except queue.Full:
+                    self.dropped += 1
         return ()
 
     @property
@@ -193,28 +214,38 @@ def _deaf() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _draw(plan: CameraPlan, bind: Address, peer: Address, undrawn: Any, ready: Any, parent: int) -> None:
-    """The process: draw each exposure, wait until it is to arrive, send it."""
+def _draw(plans: Sequence[Plan], bind: Address, peer: Address, undrawn: Any, ready: Any, parent: int) -> None:
+    """The process: draw each exposure as it comes, and send it when it is to arrive."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent says when to end
     start_warp()
     try:
-        sink, camera = UdpSender(bind, peer), plan.camera()
-        camera.develop(_first(plan))  # draws the background, and compiles the renderer where it is not
+        sink, cameras = UdpSender(bind, peer), [plan.camera() for plan in plans]
+        for plan, camera in zip(plans, cameras, strict=True):
+            if isinstance(plan, CameraPlan):
+                camera.develop(
+                    _first(plan)
+                )  # draws the background, and compiles the renderer where it is not
     except ValueError as problem:
         ready.send(str(problem))
         return
     ready.send("")
+    drawn: list[tuple[float, int, Picture]] = []
     try:
-        while True:
+        for order in count():
+            rest = drawn[0][0] - time.monotonic() if drawn else ORPHANED
             try:
-                item = undrawn.get(timeout=ORPHANED)
+                item = undrawn.get(timeout=min(max(rest, 0.0), ORPHANED))
             except queue.Empty:
                 if os.getppid() != parent:
                     return
-                continue
-            if item is None:
-                return
-            _send(camera, sink, *item)
+            else:
+                if item is None:
+                    return
+                i, exposure, arrival = item
+                picture = replace(cameras[i].develop(exposure), time=arrival)
+                heapq.heappush(drawn, (arrival, order, picture))
+            while drawn and drawn[0][0] <= time.monotonic():
+                sink.send(heapq.heappop(drawn)[2], time.monotonic())
     finally:
         sink.close()
 
@@ -223,9 +254,3 @@ def _first(plan: CameraPlan) -> Exposure:
     """A vehicle in the middle of the pool."""
     pose = np.array([0.0, 0.0, -0.5 * plan.basin.depth]), np.array([0.0, 0.0, 0.0, 1.0])
     return Exposure(0, 0.0, 0.0, pose, pose)
-
-
-def _send(camera: PoolCamera, sink: UdpSender, exposure: Exposure, arrival: float) -> None:
-    picture = replace(camera.develop(exposure), time=arrival)
-    time.sleep(max(arrival - time.monotonic(), 0.0))
-    sink.send(picture, time.monotonic())

@@ -41,6 +41,8 @@ class Exposure:
     """Pose when the shutter opened, as of `PoseAt`."""
     end: tuple[Array, Array]
     """Pose when it closed."""
+    source: str = ""
+    """Which sensor of the vehicle; the overhead camera if empty."""
 
 
 class Shutter:

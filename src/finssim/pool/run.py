@@ -21,7 +21,8 @@ from finssim.localization.pool import Pool, write_pool
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
 from finssim.pool.fleet import Fleet
-from finssim.pool.pictures import CameraPlan, PictureProcess, UdpSender
+from finssim.pool.onboard import Cameras, OnboardPlan, site_of_world
+from finssim.pool.pictures import CameraPlan, PictureProcess, Plan, UdpSender
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
 from finssim.pool.server import GroundLinks, LockstepServer, MediumServer, serve_realtime
 from finssim.pool.task_site import TaskSite
@@ -32,6 +33,7 @@ from finssim.robot.link.transports import UdpTransport, host_port
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
+from finssim.worlds import load_world
 
 __all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run", "swimming"]
 
@@ -56,6 +58,13 @@ class PoolPlan:
     """Name of the positioning system."""
     firmware: Literal["mcu", "ardusub"] = "mcu"
     """Of the vehicle."""
+    onboard: OnboardPlan | None = None
+    """The vehicle's own cameras, sonars and altimeters, in the world that they see; None: there is none."""
+
+    def eye(self) -> Any:
+        """All cameras as one, made here; None where there are none."""
+        cameras = [plan.camera() for plan in (self.camera, self.onboard) if plan is not None]
+        return Cameras(*cameras) if len(cameras) > 1 else cameras[0] if cameras else None
 
     def world(self, camera: Any, *, start: Station, seed: int, truth: Path | None) -> VirtualPool:
         """The living pool.
@@ -80,8 +89,7 @@ class PoolPlan:
 
     def standing(self, start: Station, *, seed: int, truth: Path | None = None) -> VirtualPool:
         """The living pool with its own camera, for lock-step; arguments as of `world`."""
-        eye = self.camera.camera() if self.camera is not None else None
-        return self.world(eye, start=start, seed=seed, truth=truth)
+        return self.world(self.eye(), start=start, seed=seed, truth=truth)
 
 
 def make_plan(
@@ -91,8 +99,9 @@ def make_plan(
     *,
     camera: Literal["pictures", "corners", "none"] = "pictures",
     seed: int = 0,
-    site: str = "pool",
+    site: str | None = None,
     firmware: Literal["mcu", "ardusub"] = "mcu",
+    world: str | None = None,
 ) -> PoolPlan:
     """Draw a plant and its camera, or read the plant from its file.
 
@@ -102,15 +111,19 @@ def make_plan(
         severity: Of a drawn plant.
         camera: What it sends.
         seed: Of ripples, noise, jitter and losses.
-        site: pool, tank or open-water; a camera hangs over the pool and the tank alone.
+        site: pool, tank or open-water; a camera hangs over the pool and the tank alone. If None the pool, or the
+            water of the world.
         firmware: mcu, or ardusub, with which the vehicle has a compass and a Doppler log.
+        world: What the vehicle's own sensors see: a site of the catalogue of worlds, or a path; None: nothing.
 
     Raises:
         PlantSpecError: The plant cannot be made, or there is no such severity or camera.
     """
     ours = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
-    spec, ours = site_of(site, spec), vehicle_at(site, ours, navigation=firmware == "ardusub")
+    spec = site_of(site or "pool", spec) if world is None or site is not None else site_of_world(world, spec)
+    site = site or ("pool" if world is None else "open-water")
+    ours = vehicle_at(site, ours, navigation=firmware == "ardusub")
     if site == "open-water" and camera != "none":
         raise PlantSpecError(
             "no camera hangs over open water: give --camera none, and a positioning if there is one"
@@ -119,11 +132,13 @@ def make_plan(
         raise PlantSpecError(f"unknown firmware '{firmware}'; available: mcu, ardusub")
     if camera not in ("pictures", "corners", "none"):
         raise PlantSpecError(f"unknown camera '{camera}'; available: pictures, corners, none")
+    onboard = None if world is None else OnboardPlan(vehicle=ours, world=world, seed=seed)
+    plan = PoolPlan(vehicle=ours, spec=spec, camera=None, calibrated=None, firmware=firmware, onboard=onboard)
     if camera == "none":
-        return PoolPlan(vehicle=ours, spec=spec, camera=None, calibrated=None, firmware=firmware)
-    site, calibrated, settings = camera_of(ours, spec.seed, spec.severity, basin=spec.basin)
-    plan = CameraPlan(vehicle=ours, site=site, settings=settings, basin=spec.basin, mode=camera, seed=seed)
-    return PoolPlan(vehicle=ours, spec=spec, camera=plan, calibrated=calibrated, firmware=firmware)
+        return plan
+    hung, calibrated, settings = camera_of(ours, spec.seed, spec.severity, basin=spec.basin)
+    eye = CameraPlan(vehicle=ours, site=hung, settings=settings, basin=spec.basin, mode=camera, seed=seed)
+    return replace(plan, camera=eye, calibrated=calibrated)
 
 
 def run(
@@ -141,7 +156,8 @@ def run(
     start: str | None = None,
     task: str | None = None,
     team: str | None = None,
-    site: str = "pool",
+    site: str | None = None,
+    world: str | None = None,
     positioning: str = "none",
     firmware: Literal["mcu", "ardusub"] = "mcu",
     ground: str = "127.0.0.1:14550",
@@ -160,21 +176,25 @@ def run(
         severity (NAME): How far a drawn plant and its camera are from what is known: nominal, realistic or hard.
         lockstep: Time goes as fast as one robot asks, instead of in real time.
         camera (KIND): What the camera sends: pictures, corners (of the tags) or none. If not given: pictures, over a
-            team or a tank corners, in open water, of a task and with ardusub none.
+            team or a tank corners, in open water, the water of a world, of a task and with ardusub none.
         port: UDP port of the motor controller; pictures leave from the next, lock-step (TCP) is the one after. With
             ardusub 0 takes a free one.
         bind (ADDRESS): Address of this end: this machine alone unless given.
         robot (HOST:PORT): The only robot that may command in real time; its pictures go to the port after this.
         pool_file (FILE): Pool file to write: the camera as its calibration has it (.yaml).
         truth (FILE): File to write what truly happened into, for scoring; of a team a folder.
-        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; in the middle if not given.
+        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; in the middle, or at the
+            viewpoint of a world, if not given.
         task (TASK): The site of a task in open water, in real time, with ports as of --team; messages between the
             robots go to the port five after --port. What the task commands is commanded here; the task scores what is
             true.
         team (NAME,NAME): Several vehicles in one water, in real time: names or files with commas between, the agents of
             --task, or side by side without. Each has a motor controller, at --port, ten ports on, and so on, for a
             robot at --robot, ten ports on, and so on. A camera sees them all; each has tags of its own ids.
-        site (NAME): Where: pool, tank or open-water (current, waves, 20 m of water).
+        site (NAME): Where: pool, tank or open-water (current, waves, 20 m of water). If not given: pool; of a world its
+            basin, or open water as deep as its seabed.
+        world (SITE|FILE): What the vehicle's own cameras, sonars and altimeters see, drawn from --seed: a site of
+            finssim worlds list, or a world file. Their readings go the way of the pictures.
         positioning (NAME): Fixes on the robot's wire: none, motion-capture or usbl.
         firmware (NAME): What steers the motors: mcu, the motor controller of `finssim run`, or ardusub, an autopilot
             that answers as ArduSub 4.5 does, over MAVLink, with a compass and a Doppler log.
@@ -194,11 +214,12 @@ def run(
         if ardusub:
             raise PlantSpecError("--firmware ardusub is for one vehicle: leave --team and --task out")
         files = task is not None and (pool_file is not None or truth is not None)
-        if not plant.isdecimal() or lockstep or start is not None or files:
+        if not plant.isdecimal() or lockstep or start is not None or files or world is not None:
             raise PlantSpecError(
                 "--team and --task draw their plants, their time is real and their starts are their own: give a seed "
-                "for --plant, leave --lockstep and --start out, and of a task --pool-file and --truth"
+                "for --plant, leave --lockstep, --start and --world out, and of a task --pool-file and --truth"
             )
+        site = site or "pool"
         bodies = [load_vehicle(name.strip()) for name in (team or vehicle).split(",")]
         calibrated = None
         if task is None:
@@ -210,10 +231,17 @@ def run(
             made = _playing(task, bodies, int(plant), severity, positioning, seed)
         _serve_team(made, calibrated, (bind, port), host_port(robot, "--robot"), pool_file, duration)
         return
-    usual: Any = {"pool": "pictures", "tank": "corners"}.get(site, "none")
+    usual: Any = {"pool": "pictures", "tank": "corners"}.get(
+        site or ("pool" if world is None else ""), "none"
+    )
     camera = camera or ("none" if ardusub else usual)
-    plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed, site=site, firmware=firmware)
+    plan = make_plan(
+        vehicle, plant, severity, camera=camera, seed=seed, site=site, firmware=firmware, world=world
+    )
     plan = replace(plan, positioning=positioning)
+    if start is None and world is not None and site is None:
+        view = load_world(world).viewpoint
+        start = ",".join(f"{x:g}" for x in (*view.position, math.degrees(view.yaw)))
     start = start or f"0,0,{-0.5 * plan.spec.basin.depth:g},0"
     begin = station_of(start)
     _check_start(begin, plan.spec.basin, start)
@@ -415,7 +443,7 @@ def _lockstep(
     with ExitStack() as stack:
         server = LockstepServer(address)
         stack.callback(server.close)
-        world = make_world(plan.camera.camera() if plan.camera is not None else None)
+        world = make_world(plan.eye())
         stack.callback(world.close)
         why = "stopped"
         _say(f"lock-step: {_name(server.address)}")
@@ -460,11 +488,12 @@ def _camera(
     plan: PoolPlan, bind: tuple[str, int], peer: tuple[str, int]
 ) -> tuple[PictureProcess | None, UdpSender | None, Any]:
     """The process that draws, or the sink for what is computed here, and the camera for the world."""
-    if plan.camera is None:
+    plans: list[Plan] = [one for one in (plan.camera, plan.onboard) if one is not None]
+    if not plans:
         return None, None, None
-    if plan.camera.mode == "corners":
+    if plan.onboard is None and plan.camera is not None and plan.camera.mode == "corners":
         return None, UdpSender(bind, peer), plan.camera.camera()
-    drawn = PictureProcess(plan.camera, bind, peer)
+    drawn = PictureProcess(plans, bind, peer)
     return drawn, None, drawn
 
 
@@ -503,6 +532,9 @@ def _tell_plant(plan: PoolPlan, pool_file: Path | None, truth: Path | None) -> N
             f"camera: {plan.camera.mode}, {s.rate:g} Hz, {plan.camera.site.camera.lens.width} x "
             f"{plan.camera.site.camera.lens.height}, ripples of slope {s.ripples:g}"
         )
+    if plan.onboard is not None:
+        rates = (f"{name} {sensor.rate:g} Hz" for name, sensor in plan.vehicle.perception.items())
+        _say(f"world: {plan.onboard.world}, seed {plan.onboard.seed}; {', '.join(rates)}")
     for name, path in (("pool file", pool_file), ("truth", truth)):
         if path is not None:
             _say(f"{name}: {path}")

@@ -96,14 +96,20 @@ class TagCorners:
 
 @dataclass(frozen=True)
 class Picture:
-    """One exposure of the overhead camera: grey values, or the tags already found in them."""
+    """One exposure of the overhead camera, grey values or the tags already found in them; or one reading of a camera,
+    sonar or altimeter of the vehicle."""
 
     time: float
-    """When it came, robot's clock [s]; the middle of the exposure is `Pool.latency` earlier."""
+    """When it came, robot's clock [s]; the exposure is `Pool.latency`, or that of the sensor, earlier."""
     sequence: int
     image: npt.NDArray[np.uint8] | None = None
-    """(rows, columns); None where only tags are sent."""
+    """Grey (rows, columns), red green blue (rows, columns, 3), or of a sonar (beams, range cells), beam 0 at the left;
+    None where only tags or ranges are sent."""
     tags: tuple[TagCorners, ...] = ()
+    source: str = ""
+    """Name in the vehicle's `perception`; the overhead camera if empty."""
+    ranges: npt.NDArray[np.float32] | None = None
+    """Of an altimeter, a rangefinder or a DVL's beams [m], infinite where nothing is in reach, (beams,)."""
 
 
 @dataclass(frozen=True)

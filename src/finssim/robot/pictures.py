@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import struct
 import threading
 import time
 import zlib
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -21,6 +22,7 @@ from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import UdpTransport, host_port
 from finssim.robot.messages import Picture, TagCorners
 from finssim.vehicles import Vehicle
+from finssim.vehicles.equipment import SENSOR_NAME
 
 # Pictures of a record, in JPEG.
 
@@ -43,24 +45,48 @@ def jpeg(image: Image) -> bytes | None:
     return packed.tobytes() if well else None
 
 
-def picture_of(data: Image | bytes) -> Image | None:
-    """The gray picture, (h, w); None where the data are none."""
+def picture_of(data: Image | bytes, *, colour: bool = False) -> Image | None:
+    """The gray picture, (h, w), or in red, green and blue, (h, w, 3); None where the data are none."""
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if len(data) else None
-    return None if image is None else np.asarray(image, np.uint8)
+    kind = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), kind) if len(data) else None
+    return None if image is None else np.asarray(image[..., ::-1] if colour else image, np.uint8)
 
 
-# A picture as bytes: a head, the tags, and the image as it is or as JPEG.
+def resized(image: Image | None, shape: Sequence[int]) -> Image:
+    """A picture in another size, each pixel the mean of those that it covers.
+
+    Args:
+        image: In colour or gray.
+        shape: Rows, columns, and 3 of one in colour.
+
+    Raises:
+        LinkError: It is none, or of another kind.
+    """
+    if image is None or image.shape[2:] != tuple(shape[2:]):
+        kind = "no picture" if image is None else f"a picture of shape {image.shape}"
+        raise LinkError(f"{kind} came where one of shape {tuple(shape)} is seen: name a camera of that kind")
+    if image.shape == tuple(shape):
+        return image
+    import cv2
+
+    return np.asarray(cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+# A picture as bytes: a head, the sensor's name, the tags, and the image as it is or as JPEG.
 #
 # magic "FSPC", version u8, format u8, tags u16, time f64, late f64, sequence u32, rows u32, columns u32,
-# length of the image u32; per tag: id i32, corners 8 x f64; the image. All little endian.
+# length of the image u32; of version 2, for the vehicle's own sensors, its name in 32 bytes, filled up with 0;
+# per tag: id i32, corners 8 x f64; the image, or ranges as f32. All little endian.
 
 
 _HEAD = struct.Struct("<4sBBHddIIII")
 _TAG = struct.Struct("<i8d")
-_MAGIC, _VERSION = b"FSPC", 1
-NO_IMAGE, RAW, JPEG = 0, 1, 2
+_NAME = struct.Struct("<32s")
+_MAGIC, _VERSION, _NAMED = b"FSPC", 1, 2
+NO_IMAGE, RAW, JPEG, COLOUR, COLOUR_JPEG, RANGES = range(6)
+"""Formats: none, gray, red green blue with 3 bytes a pixel, or ranges in one row."""
 MOST_TAGS = 256
 LARGEST = 64 * 2**20
 """Pixels; a larger picture is none."""
@@ -80,19 +106,24 @@ def encode_picture(picture: Picture, *, late: float = 0.0, compress: bool = Fals
     """A picture as bytes.
 
     Args:
-        picture: Gray, or tags alone.
+        picture: Gray or in colour, tags alone, or ranges.
         late: Time of sending minus `picture.time` [s].
         compress: As JPEG of quality 90, which moves corners by 0.004 px and takes an eighth of the bytes.
     """
-    rows, columns = (0, 0) if picture.image is None else picture.image.shape
-    kind, data = NO_IMAGE, b""
-    if picture.image is not None:
-        packed = jpeg(picture.image) if compress else None
-        kind, data = (JPEG, packed) if packed else (RAW, np.ascontiguousarray(picture.image).tobytes())
+    image, (rows, columns), kind, data = picture.image, (0, 0), NO_IMAGE, b""
+    if picture.ranges is not None:
+        rows, columns, kind = 1, len(picture.ranges), RANGES
+        data = np.asarray(picture.ranges, "<f4").tobytes()
+    elif image is not None:
+        (rows, columns), colour = image.shape[:2], image.ndim == 3
+        packed = jpeg(image[..., ::-1] if colour else image) if compress else None
+        kind = (COLOUR_JPEG if packed else COLOUR) if colour else (JPEG if packed else RAW)
+        data = packed or np.ascontiguousarray(image).tobytes()
     counts = len(picture.tags), picture.time, late, picture.sequence % 2**32, rows, columns, len(data)
-    head = _HEAD.pack(_MAGIC, _VERSION, kind, *counts)
+    head = _HEAD.pack(_MAGIC, _NAMED if picture.source else _VERSION, kind, *counts)
+    name = _NAME.pack(picture.source.encode()) if picture.source else b""
     tags = [_TAG.pack(tag.tag_id, *np.ravel(tag.corners)) for tag in picture.tags]
-    return b"".join([head, *tags, data])
+    return b"".join([head, name, *tags, data])
 
 
 def decode_picture(data: bytes) -> Posted | None:
@@ -100,22 +131,33 @@ def decode_picture(data: bytes) -> Posted | None:
     if len(data) < _HEAD.size:
         return None
     magic, version, kind, n, time, late, sequence, rows, columns, size = _HEAD.unpack_from(data)
-    start = _HEAD.size + n * _TAG.size
-    if magic != _MAGIC or version != _VERSION or n > MOST_TAGS or len(data) != start + size:
+    first = _HEAD.size + (_NAME.size if version == _NAMED else 0)
+    start = first + n * _TAG.size
+    if magic != _MAGIC or version not in (_VERSION, _NAMED) or n > MOST_TAGS or len(data) != start + size:
         return None
     if not (math.isfinite(time) and math.isfinite(late)) or rows * columns > LARGEST:
         return None
-    tags = _tags(data, n)
-    image = _image(kind, data[start:], rows, columns)
-    if tags is None or (image is None) != (kind == NO_IMAGE):
+    source = data[_HEAD.size : first].rstrip(b"\0").decode(errors="replace")
+    tags = _tags(data[first:start], n)
+    image, ranges = _image(kind, data[start:], rows, columns), None
+    if kind == RANGES and rows == 1 and len(data) == start + 4 * columns:
+        ranges = np.frombuffer(data, "<f4", offset=start)
+    named = re.fullmatch(SENSOR_NAME, source) is not None
+    if (
+        tags is None
+        or (image is None and ranges is None) != (kind == NO_IMAGE)
+        or named != (version == _NAMED)
+    ):
         return None
-    return Posted(Picture(time, sequence, image, tags), late)
+    if ranges is not None and np.isnan(ranges).any():
+        return None
+    return Posted(Picture(time, sequence, image, tags, source, ranges), late)
 
 
 def _tags(data: bytes, n: int) -> tuple[TagCorners, ...] | None:
     found = []
     for i in range(n):
-        tag, *corners = _TAG.unpack_from(data, _HEAD.size + i * _TAG.size)
+        tag, *corners = _TAG.unpack_from(data, i * _TAG.size)
         if not all(map(math.isfinite, corners)):
             return None
         found.append(TagCorners(tag, np.array(corners).reshape(4, 2)))
@@ -126,11 +168,13 @@ def _image(
     kind: int, data: bytes, rows: int, columns: int
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None:
     """Pixels, None where they are not those that the head announces."""
-    if kind == RAW and len(data) == rows * columns > 0:
-        return np.frombuffer(data, np.uint8).reshape(rows, columns)
-    if kind == JPEG and data[:2] == b"\xff\xd8" and _announced(data) == (rows, columns):
-        image = picture_of(data)
-        return image if image is not None and image.shape == (rows, columns) else None
+    colour = kind in (COLOUR, COLOUR_JPEG)
+    shape = (rows, columns, 3) if colour else (rows, columns)
+    if kind in (RAW, COLOUR) and len(data) == math.prod(shape) > 0:
+        return np.frombuffer(data, np.uint8).reshape(shape)
+    if kind in (JPEG, COLOUR_JPEG) and data[:2] == b"\xff\xd8" and _announced(data) == (rows, columns):
+        image = picture_of(data, colour=colour)
+        return image if image is not None and image.shape == shape else None
     return None
 
 
@@ -231,8 +275,8 @@ class Assembler:
 # Pictures over UDP from one peer alone, received by a thread of its own so that none waits for the control loop.
 
 
-_WAITING = 4
-"""Pictures that wait for the loop; the oldest is forgotten."""
+_WAITING = 16
+"""Pictures and readings that wait for the loop; the oldest is forgotten."""
 _BUFFER = 4 * 2**20
 """Asked of the system for what has not been read yet [bytes]."""
 _LATEST = 10.0
@@ -360,12 +404,15 @@ def open_pictures(address: str, bind: str = DEFAULT_PICTURES) -> PictureSource:
 _TAGS_LOG = logging.getLogger(__name__)
 POLL = 0.002
 """Time between two looks for a new picture [s]."""
-WAITING = 8
-"""Pictures that wait for the loop."""
+WAITING = 16
+"""Pictures and readings that wait for the loop."""
 
 
 class TagFinder:
-    """Pictures in, pictures with their tags out; one without tags comes out without its image."""
+    """Pictures in, pictures with their tags out; one without tags comes out without its image.
+
+    Readings of the vehicle's own sensors pass as they are.
+    """
 
     def __init__(
         self,
@@ -415,7 +462,9 @@ class TagFinder:
 
     def _look(self) -> None:
         while not self._over.wait(POLL):
-            pictures = self._source.receive(self._clock())
+            arrived = self._source.receive(self._clock())
+            self._found.extend(picture for picture in arrived if picture.source)
+            pictures = [picture for picture in arrived if not picture.source]
             if pictures:
                 self.skipped += len(pictures) - 1
                 self._found.append(self._with_tags(pictures[-1]))

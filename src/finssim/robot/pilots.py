@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -17,11 +18,13 @@ from finssim.control.guidance import Goal, Guide, Known, Measured, Track, goal_a
 from finssim.control.modes import action_mode, mode_from_dict
 from finssim.control.policy import PolicyError, read_description
 from finssim.geometry.rotations import quat_from_yaw, quat_multiply
+from finssim.robot.pictures import resized
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:
     from finssim.tasks.agents import Agent
     from finssim.tasks.observer import Observer
+    from finssim.tasks.task import Task
 
 
 Array = npt.NDArray[np.float64]
@@ -72,17 +75,36 @@ class AgentPilot:
         period: Time between two decisions [s].
         observation: What was seen at the last decision; empty before the first.
         action: What was done, in [-1, 1]; empty before the first.
+        pictures: Shape of the pictures that the agent sees, by name.
+        took: What the last decision of the agent took [s]; NaN before the first.
     """
 
     needs_state = True
 
-    def __init__(self, agent: Agent, vehicle: Vehicle, observer: Observer | None = None) -> None:
+    def __init__(
+        self,
+        agent: Agent,
+        vehicle: Vehicle,
+        observer: Observer | None = None,
+        pictures: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
         """
         Args:
             agent: Made for the vehicle.
             vehicle: Its thrusters are commanded.
             observer: Of the task that the agent does; None where it sees no observation.
+            pictures: Shape (height, width, 3) of the pictures that it sees, by the name of the vehicle's sensor.
+
+        Raises:
+            ControlError: The vehicle has no such sensor.
         """
+        self.pictures = {name: tuple(shape) for name, shape in (pictures or {}).items()}
+        for name in self.pictures:
+            if name not in vehicle.perception:
+                raise ControlError(
+                    f"{agent.name} sees {name}, which {vehicle.name} does not have: its perception has "
+                    f"{', '.join(vehicle.perception) or 'nothing'}"
+                )
         self.agent, self.observer, self.period, self.name = agent, observer, agent.period, agent.name
         self.mode = action_mode(agent.action, vehicle, agent.wrench_scale)
         task = None if observer is None else observer.task
@@ -92,6 +114,7 @@ class AgentPilot:
         self.turn = TURN if self.mode.pilot and math.isfinite(reach) else math.inf
         """Headings farther away than this are shown so far round on the way to them [rad]."""
         self._input_noise: dict[str, float] = {}
+        self.took = math.nan
         self.reset()
 
     def describe(self) -> dict[str, Any]:
@@ -130,6 +153,10 @@ class AgentPilot:
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
         """Wanted thrusts in canonical order [N], (n,)."""
+        seen = {
+            name: resized(reading.pictures[name].image, shape)[None]  # type: ignore[attr-defined]
+            for name, shape in self.pictures.items()
+        }
         if self._input_noise:
             moved = reading.position + self._random.normal(0.0, self._input_noise["position_std_m"], 3)
             turn = quat_from_yaw(self._random.normal(0.0, self._input_noise["yaw_std_rad"]))
@@ -137,12 +164,15 @@ class AgentPilot:
         if self.observer is not None:
             previous = self.action if self.action.size else None
             self.observation = self.observer.observe(reading, guide, t, previous, self.reach, self.turn)
-        known = Known(self.observation[None], *(np.asarray(x, float)[None] for x in _state(reading)))
+        rows = [self.observation[None], *(np.asarray(x, float)[None] for x in _state(reading))]
+        known = Known(*rows, **({"pictures": seen} if seen else {}))
         goal = goal_at(guide, t)
-        rows = (goal.position, goal.quaternion, goal.velocity, goal.acceleration)
+        aims = (goal.position, goal.quaternion, goal.velocity, goal.acceleration)
+        began = time.perf_counter()
         action, self._memory = self.agent.act(
-            self._memory, known, Goal(*(np.asarray(x, float)[None] for x in rows))
+            self._memory, known, Goal(*(np.asarray(x, float)[None] for x in aims))
         )
+        self.took = time.perf_counter() - began
         self.action = np.clip(action[0], -1.0, 1.0)
         return self.mode.to_thrusters(self.action)
 
@@ -231,6 +261,11 @@ class ModeSwitch:
         """Whether the pilot that steers may only decide on a reading that is ready."""
         return self.pilot.needs_state
 
+    @property
+    def pictures(self) -> Mapping[str, Sequence[int]]:
+        """Pictures that the pilot that steers sees."""
+        return getattr(self.pilot, "pictures", {})
+
     def describe(self) -> dict[str, Any]:
         """The mode and its pilot."""
         return {"mode": self.mode, **self.pilot.describe()}
@@ -279,11 +314,23 @@ def make_pilot(
                 f"{who}: neither {' nor '.join(names)} nor a policy directory: give one of these"
             )
         seen = Observer(str(task), vehicle, agent=agent)
-        return AgentPilot(BaselineAgent(who, vehicle, seen.task), vehicle, seen)
+        return AgentPilot(BaselineAgent(who, vehicle, seen.task), vehicle, seen, _shapes(seen.task, vehicle))
     trained = read_description(Path(who))
     mode = mode_from_dict(trained.action, vehicle)
     seen = Observer(task or trained.task, vehicle, agent=agent, action=mode.name)
-    return AgentPilot(PolicyAgent(who, vehicle, seen.task, period=period), vehicle, seen)
+    shapes = {name: about["shape"] for name, about in getattr(trained, "pictures", {}).items()}
+    return AgentPilot(PolicyAgent(who, vehicle, seen.task, period=period), vehicle, seen, shapes)
+
+
+def _shapes(task: Task, vehicle: Vehicle) -> dict[str, tuple[int, int, int]]:
+    """Shapes of the pictures that a task observes, by name."""
+    shapes = {}
+    for picture in getattr(task, "pictures", ()):
+        from finssim.worlds import device_of
+
+        lens = device_of(vehicle, picture.name).lens(picture.width)
+        shapes[picture.name] = lens.height, lens.width, 3
+    return shapes
 
 
 def _state(reading: Measured) -> tuple[Any, Any, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control.guidance import Track
+from finssim.robot.messages import Picture
 
 Array = npt.NDArray[np.float64]
 
@@ -35,3 +36,5 @@ class Reading:
     """Standard deviations of position [m], velocity [m/s] and yaw [rad], (7,)."""
     tracks: Mapping[str, Track] = field(default_factory=dict)
     """What is known of other vehicles, by name."""
+    pictures: Mapping[str, Picture] = field(default_factory=dict)
+    """The latest reading of each of the vehicle's own cameras, sonars and altimeters, by name."""

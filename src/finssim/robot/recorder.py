@@ -372,6 +372,8 @@ class Recorder:
 
     def picture(self, now: float, picture: Picture) -> None:
         """A picture of the camera, or the tags its own processor found."""
+        if picture.source:
+            return
         at, stamp = self._ns(now), self._ns(picture.time)
         if picture.tags:
             self._put("tags", at, self._messages.tags(picture))

@@ -153,6 +153,12 @@ def show(told: dict[str, Any], console: Console) -> None:
         else f"{1e3 * latency['p50']:.0f} ms, 99 % within {1e3 * latency['p99']:.0f} ms",
         "faults": "; ".join(told["faults"]) or "none",
     }
+    if "onboard" in told:
+        rows["own sensors"] = ", ".join(f"{name} {count}" for name, count in told["onboard"].items())
+    if "exposure_to_command_s" in told:
+        seen, decided = told["exposure_to_command_s"], told["inference_s"]
+        rows["exposure to command"] = f"{1e3 * seen['p50']:.0f} ms, 99 % within {1e3 * seen['p99']:.0f} ms"
+        rows["inference"] = f"{1e3 * decided['p50']:.1f} ms, 99 % within {1e3 * decided['p99']:.1f} ms"
     for name, value in rows.items():
         table.add_row(name, Text(value))
     console.print(table)
@@ -374,14 +380,15 @@ def run(
     guide = _GO if wiring.team and goal is None and trajectory is None else guide_of(goal, trajectory)
     if guide is not _GO:
         check_reachable(guide, ours)
-    if ours.defaults:
+    pilot = _pilot(policy, filed, task, agent=agent, follows=trajectory is not None)
+    sees = getattr(pilot, "pictures", {})
+    if defaults := [name for name in ours.defaults if sees or name != "perception"]:
         console.print(
-            f"{ours.name}: {', '.join(ours.defaults)} are defaults, fit for the virtual world; give a real vehicle "
+            f"{ours.name}: {', '.join(defaults)} are defaults, fit for the virtual world; give a real vehicle "
             "its own in the file",
             highlight=False,
             markup=False,
         )
-    pilot = _pilot(policy, filed, task, agent=agent, follows=trajectory is not None)
     pool = None if file is None else load_pool(file)
     mode = mode or ("constant-velocity" if let_in is None else "error-state")
     perception = Perception(ours, pool, mode=mode, let_in=None if let_in is None else place_of(let_in))

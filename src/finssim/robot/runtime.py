@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -34,6 +34,8 @@ __all__ = ["Counters", "Intake", "Link", "Runtime", "Ticks"]
 
 EARLY = 0.002
 """A decision may come this much before its time [s], so that a loop that jitters misses no turn."""
+MISSES = 3.0
+"""Periods of a camera after which its last picture is too old to act on, if they are longer than `state_timeout`."""
 REMEMBERED = 20_000
 """Latencies that are kept: half an hour at ten a second."""
 
@@ -84,8 +86,15 @@ class Counters:
     """From the arrival of the newest picture in the state to the command that is decided on it [s]."""
     events: deque[Any] = field(default_factory=lambda: deque(maxlen=200))
     """The latest events of the bridge."""
+    onboard: Counter[str] = field(default_factory=Counter)
+    """Readings of the vehicle's own cameras, sonars and altimeters, by name."""
+    sight: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    """From the exposure of the oldest picture that a decision is made on to its command [s]."""
+    inference: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    """What deciding took, of a pilot that sees pictures [s]."""
     _newest: float = math.nan
     _pending: float = math.nan
+    _exposed: float = math.nan
 
     def picture(self, arrival: float, used: bool) -> None:
         """A picture came [s]."""
@@ -94,22 +103,42 @@ class Counters:
             self.fixes += 1
             self._newest = arrival
 
-    def decided(self) -> None:
-        """A decision was made on what is known now."""
+    def decided(self, exposed: float = math.nan, took: float = math.nan) -> None:
+        """A decision was made on what is known now.
+
+        Args:
+            exposed: When the oldest picture that it is made on was taken [s]; NaN without pictures.
+            took: What it took [s].
+        """
         self._pending, self._newest = self._newest, math.nan
+        self._exposed = exposed
+        if not math.isnan(exposed):
+            self.inference.append(took)
 
     def sent(self, now: float) -> None:
         """What was decided has gone out [s]."""
         if not math.isnan(self._pending):
             self.latencies.append(now - self._pending)
             self._pending = math.nan
+        if not math.isnan(self._exposed):
+            self.sight.append(now - self._exposed)
+            self._exposed = math.nan
 
     def summary(self) -> dict[str, Any]:
         """Totals as plain data; percentiles of the latency [s], None where there was none."""
-        kept = np.array(self.latencies)
-        percentiles = {f"p{p}": float(np.percentile(kept, p)) if kept.size else None for p in (50, 95, 99)}
         names = ("steps", "telemetry", "pictures", "fixes", "decisions", "missed", "overruns")
-        return {**{name: getattr(self, name) for name in names}, "latency_s": percentiles}
+        told = {name: getattr(self, name) for name in names} | {"latency_s": _percentiles(self.latencies)}
+        if self.onboard:
+            told["onboard"] = dict(self.onboard)
+        if self.sight:
+            told["exposure_to_command_s"] = _percentiles(self.sight)
+            told["inference_s"] = _percentiles(self.inference)
+        return told
+
+
+def _percentiles(times: deque[float]) -> dict[str, float | None]:
+    kept = np.array(times)
+    return {f"p{p}": float(np.percentile(kept, p)) if kept.size else None for p in (50, 95, 99)}
 
 
 # Everything that arrives: decoded, put on the robot's clock, and given to perception, bridge and record.
@@ -158,6 +187,8 @@ class Intake:
         """
         self.link: Link = link or McuLink(perception.vehicle.mcu.outputs)
         self.clock = ClockMap()
+        self.pictures: dict[str, Picture] = {}
+        """The latest reading of each of the vehicle's own cameras, sonars and altimeters, by name."""
         self._perception, self._bridge = perception, bridge
         self._counters, self.recorder = counters, recorder
 
@@ -180,8 +211,12 @@ class Intake:
                 elif isinstance(message, NavigationAid):
                     self._aid(arrival, message)
         for picture in pictures:
-            verdict = self._perception.picture(now, picture)
-            self._counters.picture(picture.time, verdict in USED)
+            if not picture.source:
+                verdict = self._perception.picture(now, picture)
+                self._counters.picture(picture.time, verdict in USED)
+            elif picture.source in self._perception.vehicle.perception:
+                self.pictures[picture.source] = picture
+                self._counters.onboard[picture.source] += 1
             if self.recorder is not None:
                 self.recorder.picture(now, picture)
 
@@ -287,6 +322,10 @@ class Runtime:
             self.told = self.team.tell(now, reading)
             self.team.hear(now, heard)
             reading = self.team.known(reading)
+        if self.intake.pictures:
+            reading = replace(reading, pictures=dict(self.intake.pictures))
+        if reading.ready and (reason := self._unseen(now)):
+            reading = replace(reading, ready=False, reason=reason)
         self.reading = reading
         self.bridge.reading(now, reading)
         self._begin(now, reading)
@@ -349,6 +388,22 @@ class Runtime:
             self._arm = False
         self.start(now)
 
+    def _unseen(self, now: float) -> str:
+        """Which picture the pilot needs and the robot does not have, or only one that is too old; empty for none."""
+        for name in getattr(self.pilot, "pictures", ()):
+            if name not in self.intake.pictures:
+                return f"no picture of {name} yet"
+            age = now - self._exposed(name)
+            if age > max(self.vehicle.safety.state_timeout, MISSES / self.vehicle.perception[name].rate) + (
+                self.vehicle.perception[name].latency
+            ):
+                return f"the last picture of {name} is {age:.1f} s old"
+        return ""
+
+    def _exposed(self, name: str) -> float:
+        """When the latest picture of a sensor was taken, robot's clock [s]."""
+        return self.intake.pictures[name].time - self.vehicle.perception[name].latency
+
     def _decide(self, now: float, reading: Reading) -> None:
         """Ask the pilot when it is its turn and it knows enough."""
         if math.isnan(self.started):
@@ -361,7 +416,8 @@ class Runtime:
         if force is None:
             return
         self.counters.decisions += 1
-        self.counters.decided()
+        seen = [self._exposed(name) for name in getattr(self.pilot, "pictures", ())]
+        self.counters.decided(min(seen, default=math.nan), getattr(self.pilot, "took", math.nan))
         self.force = self.bridge.command(now, force, self.pilot.name, stamp=reading.time)
         if self.recorder is not None:
             goal = self.guide.at(now - self.started)

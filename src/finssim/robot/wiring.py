@@ -214,7 +214,7 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[D
             return
         transport = open_transport(POOL_ADDRESS if wiring.robot == "pool" else wiring.robot, wiring.bind)
         stack.callback(transport.close)
-        camera = open_camera(wiring, vehicle, pool) if pool is not None else NoPictures()
+        camera = open_camera(wiring, vehicle, pool)
         stack.callback(camera.close)
         mates = None
         if wiring.team:
@@ -231,8 +231,8 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[D
         yield run
 
 
-def open_camera(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> PictureSource:
-    """The camera's wire, with tags found beside the loop.
+def open_camera(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> PictureSource:
+    """The wire of pictures, with tags found beside the loop where a camera hangs over the pool.
 
     Raises:
         LinkError: It names no source, or the source cannot be opened.
@@ -240,7 +240,7 @@ def open_camera(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> PictureSource:
     default = f"udp://{DEFAULT_CAMERA}" if wiring.robot == "pool" else "none"
     host, port = host_port(wiring.bind, "--bind")
     source = open_pictures(wiring.pictures or default, f"{host}:{port + 1 if port else 0}")
-    if isinstance(source, NoPictures):
+    if isinstance(source, NoPictures) or pool is None:
         return source
     lens = pool.camera.lens
     return TagFinder(source, vehicle, size=(lens.height, lens.width))

@@ -143,6 +143,14 @@ class Sensors(Part):
     compass: Compass | None = None
 
 
+SENSOR_NAME = "[a-z][a-z0-9_]{0,31}"
+"""Of a `RaySensor`, as a regular expression."""
+
+
+RESERVED = (*Sensors.model_fields, "pressure", "base", "camera")
+"""Names that frames and topics of a robot have already."""
+
+
 class RaySensor(Sensor):
     """A camera, imaging sonar, altimeter, rangefinder or DVL's beams: what sees or hears the things at a site."""
 

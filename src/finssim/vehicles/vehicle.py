@@ -25,7 +25,7 @@ from finssim.vehicles.defaults import (
     default_sensors,
     default_tags,
 )
-from finssim.vehicles.equipment import Mcu, RaySensor, Safety, Sensors, Tags
+from finssim.vehicles.equipment import RESERVED, SENSOR_NAME, Mcu, RaySensor, Safety, Sensors, Tags
 from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.hydrodynamics import AnyHydrodynamicSet, HydrodynamicSet, MeshSet
 from finssim.vehicles.part import Part, Vector3, did_you_mean, refuse_section, refuse_value
@@ -93,12 +93,14 @@ class Vehicle(Part):
 
     @field_validator("perception")
     @classmethod
-    def _plain_names(cls, value: dict[str, RaySensor]) -> dict[str, RaySensor]:
+    def _plain_names(cls, value: dict[str, RaySensor], info: ValidationInfo) -> dict[str, RaySensor]:
         for name in value:
-            if not re.fullmatch("[a-z][a-z0-9_]*", name):
+            if not re.fullmatch(SENSOR_NAME, name):
                 raise refuse_section(
-                    f"'{name}' is no name of a sensor: give lower-case letters, digits and _, such as front_camera"
+                    f"'{name}' is no name of a sensor: give up to 32 small letters, digits and _, as in front_camera"
                 )
+            if name in RESERVED or name in info.data.get("thrusters", ()):
+                raise refuse_section(f"'{name}' is the name of something else of a robot: take another")
         return value
 
     @field_validator("hydrodynamics", "thrusters")
