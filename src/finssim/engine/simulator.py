@@ -123,11 +123,13 @@ class Simulator:
         n = len(self.vehicles)
         self.dock = dock
         self.funnel = dock.struct(worlds, n, self.device) if dock else Funnel()
-        lightest = min(np.diag(v.mass_matrix(hydrodynamics))[:3].min() for v in self.vehicles)
-        solids = WorldSolids(self.world, n, float(lightest)) if self.world is not None else None
-        self._solids = solids if solids is not None and solids.count else None
-        self.solids = self._solids.struct if self._solids is not None else Solids()
         self.plant = build_plant(self.vehicles, hydrodynamics, worlds, self._hull_index, self.device)
+        self._solids = None
+        if self.world is not None:
+            lightest = min(float(np.diag(v.mass_matrix(hydrodynamics))[:3].min()) for v in self.vehicles)
+            solids = WorldSolids(self.world, n, lightest)
+            self._solids = solids if solids.count else None
+        self.solids = self._solids.struct if self._solids is not None else Solids()
         self.command = Packed(VehicleCommand, (worlds, n), self.device)
         longest = 2.0 * float(self.plant.delay.numpy().max()) if max_delay is None else max_delay
         slots = math.ceil(longest / control_step) + 2
