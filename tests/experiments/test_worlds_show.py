@@ -8,8 +8,8 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.experiments.worlds_show import fan_picture
 from finssim.worlds.description import devices, sites
+from finssim.worlds.rays import fan_picture
 
 
 def finssim(*words):

@@ -19,6 +19,7 @@ from finssim.robot.messages import (
     TagCorners,
     Telemetry,
 )
+from finssim.robot.pictures import picture_of
 from finssim.robot.reading import Reading
 from finssim.robot.record_messages import TOPICS
 from finssim.vehicles import load_vehicle
@@ -250,3 +251,30 @@ def test_a_vehicle_changed_by_a_program_is_kept_as_it_is(tmp_path):
         pass
     with open_record(tmp_path / "run.mcap") as record:
         assert json.loads(record.files["finsrov.json"])["body"]["mass"] == 13.0
+
+
+def test_own_sensors_are_in_the_record(tmp_path):
+    """Pictures as JPEG with their lens, pings with a fan to look at, ranges; stamped with their exposures."""
+    path, image = tmp_path / "run.mcap", np.zeros((36, 64, 3), np.uint8)
+    image[..., 0] = 200
+    echoes = np.zeros((128, 128), np.uint8)
+    echoes[:, 64] = 255
+    with Recorder(path, VEHICLE, {}) as recorder:
+        recorder.picture(1.1, Picture(1.1, 1, image, source="front_camera"))
+        recorder.picture(1.1, Picture(1.1, 1, echoes, source="sonar"))
+        recorder.picture(1.1, Picture(1.05, 1, source="altimeter", ranges=np.array([2.5], np.float32)))
+        recorder.picture(1.1, Picture(1.05, 1, image, source="stranger"))
+    assert recorder.dropped == 0
+    found = {topic.removeprefix("/finsrov/"): rows[0][1] for topic, rows in messages(path).items()}
+    assert set(found) == {
+        "front_camera/image/compressed", "front_camera/camera_info", "sonar/sonar_image", "sonar/image/compressed",
+        "altimeter/range",
+    }  # fmt: skip
+    picture = found["front_camera/image/compressed"]
+    assert (picture.header.stamp.sec, picture.header.frame_id) == (1, "front_camera_optical")
+    assert np.abs(picture_of(picture.data, colour=True).astype(int) - image).max() < 6
+    fan = picture_of(found["sonar/image/compressed"].data)
+    assert fan[200 - 2 : 200 + 2, fan.shape[1] // 2].max() > 200  # half the range ahead, from above
+    assert found["altimeter/range"].range == 2.5 and found["sonar/sonar_image"].image.beam_count == 128
+    with open_record(path) as record:
+        assert describe_record(record)["topics"]["/finsrov/altimeter/range"]["messages"] == 1

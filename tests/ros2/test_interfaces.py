@@ -15,10 +15,11 @@ import yaml
 from finssim.ros2.codec import INTERFACES
 from finssim.ros2.graphs import NODES as GRAPH_NODES
 from finssim.ros2.shim.arguments import overrides_for, parse_arguments
-from finssim.ros2.topics import SERVICES, TOPICS
+from finssim.ros2.topics import OWN_TOPICS, SERVICES, TOPICS
 from finssim.vehicles.loader import catalogue
 
-MESSAGES = sorted(INTERFACES.glob("*/msg/*.msg"))
+MESSAGES = sorted(INTERFACES.glob("finssim_msgs/msg/*.msg"))
+"""Ours; those of sonars are marine_msgs', which a ROS 2 has of its own."""
 WORKSPACE = Path(__file__).resolve().parents[2] / "ros2_ws" / "src"
 NODES = WORKSPACE / "finssim_ros"
 
@@ -96,7 +97,8 @@ def test_messages_depend_on_every_package_they_use():
 def test_nodes_depend_on_every_package_whose_types_they_use():
     """Topics, services and what nodes import."""
     root = ElementTree.parse(NODES / "package.xml").getroot()
-    used = {kind.type.split("/")[0] for kind in (*TOPICS.values(), *SERVICES.values())}
+    own = [topic for topics in OWN_TOPICS.values() for topic in topics.values()]
+    used = {kind.type.split("/")[0] for kind in (*TOPICS.values(), *SERVICES.values(), *own)}
     assert used | {"rclpy", "rcl_interfaces"} <= {e.text for e in root.findall("exec_depend")}
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from finssim.ros2.codec import codec_of
-from finssim.ros2.topics import FRAMES, QUALITIES, SERVICES, TOPICS
+from finssim.ros2.topics import FRAMES, OWN_TOPICS, QUALITIES, SERVICES, TOPICS
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "ros2_topics.md").read_text()
 
@@ -15,10 +15,12 @@ def row(*cells):
     return "| " + " | ".join(cells) + " |"
 
 
-@pytest.mark.parametrize("key", TOPICS)
-def test_each_topic_is_known_and_on_the_page(key):
+ALL = [*TOPICS.values(), *(topic for topics in OWN_TOPICS.values() for topic in topics.values())]
+
+
+@pytest.mark.parametrize("topic", ALL, ids=lambda topic: topic.name)
+def test_each_topic_is_known_and_on_the_page(topic):
     """Its type exists for Humble and Jazzy, its quality and frame are explained, and the page has its line."""
-    topic = TOPICS[key]
     for distro in ("humble", "jazzy"):
         assert codec_of(distro).message(topic.type)
     assert topic.quality in QUALITIES and (not topic.frame or topic.frame in FRAMES)

@@ -31,7 +31,7 @@ def layout_of(world: Any, worlds: int, device: wp.Device) -> WorldLayout:
     Raises:
         SimulatorError: It has another number of worlds, or is on another device.
     """
-    from finssim.worlds import WorldLayout  # its sensors are slow to import
+    from finssim.worlds import WorldLayout
 
     if not isinstance(world, WorldLayout):
         return WorldLayout(world, worlds, str(device))

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from finssim.experiments.figures import DPI, new_figure
 from finssim.experiments.tables import Table
@@ -23,6 +22,7 @@ from finssim.worlds.description import (
     load_world,
     sites,
 )
+from finssim.worlds.rays import fan_picture
 
 WIDTH = 800
 """Of the camera's part of a picture [px], each the mean of 2 x 2 rays."""
@@ -98,28 +98,6 @@ def worlds_show(
         },
         "viewpoint": world.viewpoint.values(),
     }
-
-
-def fan_picture(levels: NDArray[Any], sector: float, side: int = 720) -> NDArray[Any]:
-    """A sonar's picture as a fan seen from above, the sonar at the bottom, ahead upwards; NaN outside.
-
-    Args:
-        levels: By beam, 0 at the left, and range cell, (beams, bins).
-        sector: Field of view [rad].
-        side: Rows of the result, one range long [-].
-
-    Returns:
-        (side, columns).
-    """
-    half = min(1.0, math.sin(min(0.5 * sector, 0.5 * math.pi)))
-    x = np.linspace(-half, half, round(2.0 * half * side))
-    y = np.linspace(1.0, 0.0, side)[:, None]
-    radius, azimuth = np.hypot(x, y), np.arctan2(-x, y)
-    beam = (0.5 - azimuth / sector) * levels.shape[0]
-    cell = radius * levels.shape[1]
-    inside = (beam >= 0.0) & (beam < levels.shape[0]) & (cell < levels.shape[1])
-    rows, columns = (np.where(inside, index, 0).astype(int) for index in (beam, cell))
-    return np.where(inside, levels[rows, columns], np.nan)
 
 
 def _draw(

@@ -8,14 +8,15 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from importlib import resources
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from finssim.geometry.optics import Lens
 from finssim.geometry.rotations import quat_conjugate, quat_from_yaw, quat_multiply, quat_to_matrix
 from finssim.robot.messages import (
     HEADING,
@@ -29,9 +30,12 @@ from finssim.robot.messages import (
     Picture,
     Telemetry,
 )
+from finssim.robot.pictures import jpeg
 from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import with_navigation
+from finssim.worlds.description import CameraDevice, Device, RangeDevice, SonarDevice, device_of
+from finssim.worlds.rays import fan_picture
 
 # Names, types, frames and policies of all that FinsSim says of a robot: one table, for topics, records and page.
 
@@ -176,6 +180,55 @@ TOPICS = {
     "clock": Topic("/clock", "rosgraph_msgs/msg/Clock", SENSOR, "", "sim", "simulated time"),
 }  # fmt: skip
 """Key -> topic."""
+OWN_TOPICS = {
+    "camera": {
+        "image": Topic("NAME/image", "sensor_msgs/msg/Image", SENSOR, "NAME_optical", "camera",
+            "picture of a camera of the vehicle, rgb8"),
+        "picture": Topic("NAME/image/compressed", "sensor_msgs/msg/CompressedImage", SENSOR, "NAME_optical", "camera",
+            "the same as JPEG; of a sonar its fan from above, ahead upwards"),
+        "camera_info": Topic("NAME/camera_info", "sensor_msgs/msg/CameraInfo", SENSOR, "NAME_optical", "camera",
+            "its lens, with each picture; behind a flat port the lens in air"),
+    },
+    "sonar": {
+        "sonar": Topic("NAME/sonar_image", "marine_acoustic_msgs/msg/ProjectedSonarImage", SENSOR, "NAME_acoustic",
+            "camera", "ping of an imaging sonar, 8 bits, all beams of a range together"),
+        "picture": Topic("NAME/image/compressed", "sensor_msgs/msg/CompressedImage", SENSOR, "NAME_link", "camera",
+            "the same as JPEG; of a sonar its fan from above, ahead upwards"),
+    },
+    "range": {
+        "range": Topic("NAME/range", "sensor_msgs/msg/Range", SENSOR, "NAME_link", "camera",
+            "of an altimeter or rangefinder along x, inf where nothing is in reach; of several beams the shortest"),
+    },
+    "beams": {
+        "beams": Topic("NAME/beams", "marine_acoustic_msgs/msg/Dvl", SENSOR, "NAME_acoustic", "camera",
+            "ranges of the four beams of a Doppler log; velocities are not known (NaN)"),
+    },
+}  # fmt: skip
+"""Kind of a sensor of the vehicle -> key -> topic, for NAME in its `perception`."""
+FAN_ROWS = 400
+"""Of a sonar's fan [px]."""
+
+
+def own_kind(device: Device) -> str:
+    """Which of `OWN_TOPICS` a device has."""
+    if isinstance(device, CameraDevice):
+        return "camera"
+    return "sonar" if isinstance(device, SonarDevice) else "beams" if device.beams == 4 else "range"
+
+
+def own_topics(vehicle: Vehicle) -> dict[str, Topic]:
+    """Topics of the cameras, sonars and altimeters of a vehicle, by key: `front_camera/image`.
+
+    Raises:
+        WorldError: The device of one of them is refused.
+    """
+    return {
+        f"{name}/{key}": replace(
+            topic, name=topic.name.replace("NAME", name), frame=topic.frame.replace("NAME", name)
+        )
+        for name in vehicle.perception
+        for key, topic in OWN_TOPICS[own_kind(device_of(vehicle, name))].items()
+    }
 
 
 # The ROS 2 types of a record's messages: definitions, constructors and CDR through rosbags.
@@ -191,14 +244,14 @@ METADATA = "finssim"
 
 @cache
 def types() -> Any:
-    """A rosbags type store of ROS 2 Humble's messages and ours."""
+    """A rosbags type store of ROS 2 Humble's messages, of those for sonars, and ours."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    folder = resources.files("finssim") / "ros2" / "interfaces" / "finssim_msgs" / "msg"
-    for file in sorted(folder.iterdir(), key=lambda file: file.name):
-        name = f"finssim_msgs/msg/{file.name.removesuffix('.msg')}"
-        store.register(get_types_from_msg(file.read_text(encoding="utf-8"), name))
+    for package in (resources.files("finssim") / "ros2" / "interfaces").iterdir():
+        for file in sorted((package / "msg").iterdir(), key=lambda file: file.name):
+            name = f"{package.name}/msg/{file.name.removesuffix('.msg')}"
+            store.register(get_types_from_msg(file.read_text(encoding="utf-8"), name))
     return store
 
 
@@ -207,6 +260,9 @@ def definition(kind: str) -> str:
     text, _ = types().generate_msgdef(kind, ros_version=2)
     return str(text)
 
+
+LENS_MODELS = {"plumb_bob": "plumb_bob", "rational": "rational_polynomial", "fisheye": "equidistant"}
+"""Our name of a lens model -> that of ROS, with the same coefficients in the same order."""
 
 MAP, BASE, IMU, LOG = "map", "base_link", "imu_link", "dvl_link"
 SHARED = ("", MAP, "camera", "camera_link", "camera_optical")
@@ -262,6 +318,12 @@ class Messages:
         self._outputs = [t.motor_index for t in thrusters if t.motor_index is not None]
         signs = np.array([float(t.motor_sign or 1) for t in thrusters])
         self._rad_per_s = signs * (2.0 * math.pi / 60.0)
+        self._vehicle = vehicle
+
+    @cached_property
+    def own(self) -> dict[str, Device]:
+        """Devices of the vehicle's cameras, sonars and altimeters, by name."""
+        return {name: device_of(self._vehicle, name) for name in self._vehicle.perception}
 
     def cdr(self, message: Any, kind: str) -> bytes:
         """A message's bytes."""
@@ -418,10 +480,104 @@ class Messages:
         """What the motor controller made of a command."""
         return self.filled("CommandEcho", stamp, BASE, vars(echo))
 
-    def picture(self, stamp: int, jpeg: bytes) -> Any:
-        """A picture in JPEG."""
-        data = np.frombuffer(jpeg, np.uint8)
-        return self._of["sensor_msgs/msg/CompressedImage"](self.header(stamp, "camera"), "jpeg", data)
+    def picture(self, stamp: int, packed: bytes | None, frame: str = "camera") -> Any | None:
+        """A picture in JPEG; None where it could not be packed."""
+        if packed is None:
+            return None
+        data = np.frombuffer(packed, np.uint8)
+        return self._of["sensor_msgs/msg/CompressedImage"](self.header(stamp, frame), "jpeg", data)
+
+    def image(self, stamp: int, image: npt.NDArray[np.uint8], frame: str = "camera_optical") -> Any:
+        """A picture, gray or in red, green and blue."""
+        rows, columns, *channels = image.shape
+        return self._of["sensor_msgs/msg/Image"](
+            header=self.header(stamp, frame), height=rows, width=columns, encoding="rgb8" if channels else "mono8",
+            is_bigendian=0, step=image[0].size, data=image.ravel(),
+        )  # fmt: skip
+
+    def camera_info(self, stamp: int, lens: Lens, frame: str = "camera_optical") -> Any:
+        """A camera's calibration."""
+        K = [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0]
+        P = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
+        whole = self._of["sensor_msgs/msg/RegionOfInterest"](
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        return self._of["sensor_msgs/msg/CameraInfo"](
+            header=self.header(stamp, frame), height=lens.height, width=lens.width,
+            distortion_model=LENS_MODELS[lens.model], d=floats(lens.distortion or (0.0,) * 5), k=floats(K),
+            r=np.eye(3).ravel(), p=floats(P), binning_x=0, binning_y=0, roi=whole,
+        )  # fmt: skip
+
+    def of_own(self, stamp: int, picture: Picture) -> dict[str, Callable[[], Any]]:
+        """What makes the messages of a reading of the vehicle's own sensors, by key of its topic; empty for a stranger.
+
+        Args:
+            stamp: Of its exposure [ns].
+            picture: The reading.
+        """
+        name, device, image = picture.source, self.own.get(picture.source), picture.image
+        if isinstance(device, CameraDevice) and image is not None and image.ndim == 3:
+            optical, lens = f"{name}_optical", device.lens(image.shape[1])
+            return {
+                f"{name}/image": lambda: self.image(stamp, image, optical),
+                f"{name}/picture": lambda: self.picture(stamp, jpeg(image[..., ::-1]), optical),
+                f"{name}/camera_info": lambda: self.camera_info(stamp, lens, optical),
+            }
+        if isinstance(device, SonarDevice) and image is not None and image.ndim == 2:
+
+            def fan() -> Any:
+                seen = np.nan_to_num(fan_picture(image, device.sector, FAN_ROWS)).astype(np.uint8)
+                return self.picture(stamp, jpeg(seen), f"{name}_link")
+
+            return {f"{name}/sonar": lambda: self._sonar(stamp, device, picture), f"{name}/picture": fan}
+        if isinstance(device, RangeDevice) and picture.ranges is not None:
+            ranges = np.asarray(picture.ranges, float)
+            if own_kind(device) == "beams" and len(ranges) == 4:
+                return {f"{name}/beams": lambda: self._beams(stamp, device, name, ranges)}
+            return {f"{name}/range": lambda: self._range(stamp, device, name, float(ranges.min()))}
+        return {}
+
+    def _sonar(self, stamp: int, device: SonarDevice, picture: Picture) -> Any:
+        """A ping; the frame has z forward, x up, hence beams to the left at negative y."""
+        assert picture.image is not None
+        of, (beams, bins) = self._of, picture.image.shape
+        azimuth = device.sector * (0.5 - (np.arange(beams) + 0.5) / beams)
+        about = of["marine_acoustic_msgs/msg/PingInfo"](
+            frequency=device.frequency, sound_speed=0.0,
+            tx_beamwidths=np.full(beams, device.vertical_beam_width, np.float32),
+            rx_beamwidths=np.full(beams, device.beam_width, np.float32),
+        )  # fmt: skip
+        pixels = of["marine_acoustic_msgs/msg/SonarImageData"](
+            is_bigendian=False, dtype=0, beam_count=beams, data=np.ascontiguousarray(picture.image.T).ravel()
+        )
+        return of["marine_acoustic_msgs/msg/ProjectedSonarImage"](
+            header=self.header(stamp, f"{picture.source}_acoustic"), ping_info=about,
+            beam_directions=[self.vector((0.0, -math.sin(a), math.cos(a))) for a in azimuth],
+            ranges=np.float32((np.arange(bins) + 0.5) * device.range / bins), image=pixels,
+        )  # fmt: skip
+
+    def _range(self, stamp: int, device: RangeDevice, name: str, distance: float) -> Any:
+        return self._of["sensor_msgs/msg/Range"](
+            header=self.header(stamp, f"{name}_link"), radiation_type=0, field_of_view=device.beam_width,
+            min_range=device.minimum_range, max_range=device.range, range=distance,
+        )  # fmt: skip
+
+    def _beams(self, stamp: int, device: RangeDevice, name: str, ranges: npt.NDArray[np.float64]) -> Any:
+        """Ranges of four beams; beam k is turned from y (left) towards the log's x."""
+        turn = 2.0 * math.pi * (np.arange(4) + 0.5) / 4.0
+        c, s, reached = math.cos(device.beam_angle), math.sin(device.beam_angle), np.isfinite(ranges)
+        unknown = np.full(4, -1.0, np.float32)
+        return self._of["marine_acoustic_msgs/msg/Dvl"](
+            header=self.header(stamp, f"{name}_acoustic"), velocity_mode=1, dvl_type=0,
+            velocity=self.vector([math.nan] * 3), velocity_covar=np.full(9, -1.0),
+            altitude=float(c * ranges[reached].mean()) if reached.any() else math.inf,
+            course_gnd=math.nan, speed_gnd=math.nan, num_good_beams=int(reached.sum()), sound_speed=0.0,
+            beam_ranges_valid=bool(reached.any()), beam_velocities_valid=False,
+            beam_unit_vec=[self.vector((s * math.sin(a), -s * math.cos(a), c)) for a in turn], range=ranges,
+            range_covar=np.float32(np.square(device.noise * np.where(reached, ranges, 0.0))),
+            beam_quality=np.zeros(4, np.float32), beam_velocity=np.full(4, np.nan, np.float32),
+            beam_velocity_covar=unknown,
+        )  # fmt: skip
 
     def tags(self, picture: Picture) -> Any:
         """Corners of the tags that came with a picture [px], as JSON."""

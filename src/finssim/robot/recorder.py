@@ -11,6 +11,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -24,7 +25,7 @@ from finssim.provenance import provenance
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry
 from finssim.robot.pictures import jpeg
 from finssim.robot.reading import Reading
-from finssim.robot.record_messages import METADATA, TOPICS, Messages, definition, offered_qos
+from finssim.robot.record_messages import METADATA, TOPICS, Messages, definition, offered_qos, own_topics
 from finssim.vehicles import Vehicle, load_vehicle
 
 
@@ -246,10 +247,11 @@ class Recorder:
         """
         texts = {name: Path(file).read_bytes() for name, file in (files or {}).items()}
         texts |= _vehicle_file(vehicle)
-        self._name, self._messages = vehicle.name, Messages(vehicle)
+        self._name, self._vehicle, self._messages = vehicle.name, vehicle, Messages(vehicle)
+        self._topics = TOPICS | own_topics(vehicle)
         self._schemas: dict[str, int] = {}
         # Compiles what packs a type: the first message of each must not wait for it.
-        for topic in TOPICS.values():
+        for topic in self._topics.values():
             self._messages.types.get_msgdef(topic.type)
         self._pictures, self._epoch = pictures, round(epoch * 1e9)
         self._sink = RecordSink(Path(path), self._announce, chunk_seconds=chunk_seconds)
@@ -371,8 +373,9 @@ class Recorder:
         self._put("diagnostics", at, self._messages.diagnostics(at, name, level, message, values or {}))
 
     def picture(self, now: float, picture: Picture) -> None:
-        """A picture of the camera, or the tags its own processor found."""
+        """A picture of the camera, the tags its own processor found, or a reading of the vehicle's own sensors."""
         if picture.source:
+            self._own(now, picture)
             return
         at, stamp = self._ns(now), self._ns(picture.time)
         if picture.tags:
@@ -380,6 +383,21 @@ class Recorder:
         if picture.image is not None and self._pictures == "jpeg":
             image = picture.image
             self._sink.put("picture", at, lambda: self._compressed(stamp, image), image.nbytes)
+
+    def _own(self, now: float, picture: Picture) -> None:
+        """Its messages but for raw pictures, made on the writing thread."""
+        if picture.source not in self._vehicle.perception:
+            return
+        stamp = self._ns(picture.time - self._vehicle.perception[picture.source].latency)
+        size = 0 if picture.image is None else picture.image.nbytes
+        for key, make in self._messages.of_own(stamp, picture).items():
+            if not key.endswith("/image") and (picture.image is None or self._pictures == "jpeg"):
+                self._sink.put(key, self._ns(now), partial(self._made, key, make), size)
+
+    def _made(self, key: str, make: Callable[[], Any]) -> bytes | None:
+        """Runs on the writing thread."""
+        message = make()
+        return None if message is None else self._messages.cdr(message, self._topics[key].type)
 
     def close(self) -> None:
         """Finish the file; returns when it is on disk."""
@@ -394,25 +412,22 @@ class Recorder:
         self.close()
 
     def _announce(self, writer: Any, key: str) -> int:
-        kind = TOPICS[key].type
+        kind = self._topics[key].type
         if kind not in self._schemas:
             self._schemas[kind] = writer.register_schema(kind, "ros2msg", definition(kind).encode())
-        quality = {"offered_qos_profiles": offered_qos(TOPICS[key].quality)}
+        quality = {"offered_qos_profiles": offered_qos(self._topics[key].quality)}
         return int(writer.register_channel(self._topic_name(key), "cdr", self._schemas[kind], quality))
 
     def _topic_name(self, key: str) -> str:
-        return TOPICS[key].under(self._name)
+        return self._topics[key].under(self._name)
 
     def _put(self, key: str, at: int, message: Any) -> None:
-        data = self._messages.cdr(message, TOPICS[key].type)
+        data = self._messages.cdr(message, self._topics[key].type)
         self._sink.put(key, at, data, len(data))
 
     def _compressed(self, stamp: int, image: npt.NDArray[np.uint8]) -> bytes | None:
         """Runs on the writing thread."""
-        packed = jpeg(image)
-        if packed is None:
-            return None
-        return self._messages.cdr(self._messages.picture(stamp, packed), TOPICS["picture"].type)
+        return self._made("picture", lambda: self._messages.picture(stamp, jpeg(image)))
 
     def _ns(self, seconds: float) -> int:
         # An MCAP has no time before 0: a clock that was set back further is recorded as standing there.

@@ -50,6 +50,8 @@ class Plan:
     """Nodes besides those of the graph: recorder, teleop."""
     blind: bool = False
     """Whether no camera looks, so that nothing is localized by it."""
+    sees: bool = False
+    """Whether pictures of the vehicle's own sensors come all the same."""
 
     def __post_init__(self) -> None:
         if self.graph not in GRAPHS:
@@ -63,7 +65,7 @@ class Plan:
     @property
     def nodes(self) -> tuple[str, ...]:
         """In the order of their start."""
-        left_out = ("camera", "localizer") if self.blind else ()
+        left_out = (("localizer",) if self.sees else ("camera", "localizer")) if self.blind else ()
         return (*(name for name in GRAPHS[self.graph] if name not in left_out), *self.extra)
 
     def set(self, node: str, **values: Any) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from finssim.robot.record_messages import (
     COMMAND,
     LATCHED,
+    OWN_TOPICS,
     QUALITIES,
     SENSOR,
     STREAM,
@@ -15,12 +16,14 @@ from finssim.robot.record_messages import (
     depth_of,
     is_latched,
     is_reliable,
+    own_topics,
 )
 
 __all__ = [
     "COMMAND",
     "FRAMES",
     "LATCHED",
+    "OWN_TOPICS",
     "QUALITIES",
     "SENSOR",
     "SERVICES",
@@ -28,6 +31,7 @@ __all__ = [
     "TOPICS",
     "ServiceName",
     "Topic",
+    "own_topics",
     "quality_profile",
 ]
 
@@ -48,6 +52,9 @@ FRAMES = {
     "base_link": "the vehicle's body origin: x forward, y left, z up (REP-103)",
     "imu_link": "the inertial sensor as it is mounted; likewise pressure_link, each tag and each thruster",
     "dvl_link": "the Doppler log as it is mounted",
+    "NAME_link": "a camera, sonar or altimeter of the vehicle's `perception`: x along its view, y left, z up",
+    "NAME_optical": "the same camera's picture: z along the view, x right, y down (REP-103)",
+    "NAME_acoustic": "the same sonar or Doppler log, as marine_acoustic_msgs has it: z along the view, x up, y right",
     "camera_link": "the overhead camera's body, x along the view",
     "camera_optical": "the overhead camera's picture: z along the view, x right, y down (REP-103)",
 }

@@ -131,6 +131,9 @@ class Options:
     several vehicles in a graph. The vehicle's name, and no prefix, if not given."""
     site: str = "pool"
     """(NAME) Where: pool, tank or open-water, where no camera looks and Doppler log and compass are aboard."""
+    world: str | None = None
+    """(SITE|FILE) What the own cameras, sonars and altimeters of a vehicle in a virtual pool measure; in open water the
+    water is that of the world. The node camera makes topics of them."""
     positioning: str = "none"
     """(NAME) Fixes on the wire of a virtual pool: none, motion-capture or usbl."""
     let_in: str | None = None
@@ -195,7 +198,8 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
         check_reachable(guide_of(o.goal, o.trajectory), vehicle)
     extra = (*(("recorder",) if o.record else ()), *(("teleop",) if o.teleop else ()))
     namespace = o.namespace or vehicle.name.replace("-", "_")
-    plan = Plan(graph, o.vehicle, namespace, extra=extra, blind=blind)
+    sees = o.world is not None or o.pictures is not None
+    plan = Plan(graph, o.vehicle, namespace, extra=extra, blind=blind, sees=sees)
     if graph == "robot" and o.pool_file is None and not blind:
         raise Ros2Error("a robot needs its pool file: give --pool-file, or none where no camera looks")
     plan.set("/**", site=o.site, frame_prefix=f"{o.namespace}/" if o.namespace else None)
@@ -220,6 +224,7 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
             port=o.port,
             seed=o.seed,
             positioning=o.positioning,
+            world=o.world,
         )
         plan.set("virtual_pool", bind=o.bind, pool_file=None if blind else str(pool_file), start=o.start)
         plan.set("virtual_pool", truth=None if o.truth is None else str(o.truth))

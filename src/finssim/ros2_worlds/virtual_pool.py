@@ -29,6 +29,7 @@ class VirtualPoolNode(RobotNode):
             "start": self.parameter("start", "") or None,
             "positioning": self.parameter("positioning", "none"),
             "seed": self.parameter("seed", 0),
+            "world": self.parameter("world", "") or None,
         }
         self._vehicle_name = self.get_parameter("vehicle").value
         self._site = self.get_parameter("site").value
@@ -36,7 +37,8 @@ class VirtualPoolNode(RobotNode):
 
     def spin(self) -> None:
         """Be the pool until SIGINT or SIGTERM."""
-        where = {"bind": "127.0.0.1", "site": self._site, **self.plan}
+        own = self.plan["world"] is not None and self._site == "open-water"  # as deep as the world
+        where = {"bind": "127.0.0.1", "site": None if own else self._site, **self.plan}
         serve(vehicle=self._vehicle_name, **where)
 
 

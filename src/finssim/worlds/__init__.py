@@ -1,10 +1,13 @@
 """Worlds as data, and the sensors that see and hear them: cameras, imaging sonars, altimeters, DVL beams.
 
-`WorldLayout`, `description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
-(`pip install 'finssim[perception]'`).
+`WorldLayout`, `finssim.worlds.description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
+(`pip install 'finssim[perception]'`). What computes is imported when it is first named: a robot that
+reads what its devices are starts without Warp.
 """
 
-from finssim.worlds.delivery import Delivery
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from finssim.worlds.description import (
     World,
     WorldError,
@@ -14,9 +17,12 @@ from finssim.worlds.description import (
     load_world,
     sites,
 )
-from finssim.worlds.layout import WorldLayout
-from finssim.worlds.model import WorldBatch
-from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of, sensor_of
+
+if TYPE_CHECKING:
+    from finssim.worlds.delivery import Delivery
+    from finssim.worlds.layout import WorldLayout
+    from finssim.worlds.model import WorldBatch
+    from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of, sensor_of
 
 __all__ = [
     "CameraBatch",
@@ -36,3 +42,10 @@ __all__ = [
     "sensor_of",
     "sites",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = {"Delivery": "delivery", "WorldBatch": "model", "WorldLayout": "layout"}.get(name, "sensors")
+    return getattr(import_module(f"finssim.worlds.{home}"), name)

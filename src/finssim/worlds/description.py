@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from finssim.files import plain_name
 from finssim.geometry.mesh import MeshError, load_stl
 from finssim.geometry.optics import LENS_MODELS, Lens, OpticsError
 from finssim.geometry.rotations import quat_from_euler, quat_from_yaw
-from finssim.sensors.overhead_camera import Sensor, Water
 from finssim.vehicles import Vehicle
 from finssim.vehicles.part import (
     NonNegative,
@@ -37,6 +36,9 @@ from finssim.vehicles.part import (
     zeros,
 )
 from finssim.yaml_file import read_mapping
+
+if TYPE_CHECKING:
+    from finssim.sensors.overhead_camera import Sensor, Water
 
 Array = NDArray[np.float64]
 
@@ -283,6 +285,8 @@ class WorldWater(Part):
     @property
     def optical(self) -> Water:
         """As the overhead camera has it."""
+        from finssim.sensors.overhead_camera import Water  # which imports Warp
+
         return Water(attenuation=_triple(self.attenuation), veil=_triple(self.veil))
 
     @property
@@ -537,6 +541,8 @@ class CameraDevice(Part):
     @property
     def sensor(self) -> Sensor:
         """From light to numbers, as the overhead camera has it."""
+        from finssim.sensors.overhead_camera import Sensor
+
         gain = 1.0 if self.exposure == "auto" else self.exposure
         return Sensor(
             gain=gain,

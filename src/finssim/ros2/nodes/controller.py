@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,11 @@ from finssim.control.guidance import Guide, Measured, Station
 from finssim.control.policy import NETWORK_FILE
 from finssim.geometry.rotations import quat_yaw
 from finssim.robot.goals import GoalError, check_reachable, guide_of
+from finssim.robot.messages import Picture
 from finssim.robot.pilots import AgentPilot, ModeSwitch, WrenchPilot, make_pilot
 from finssim.robot.reading import Reading
 from finssim.robot.runtime import Runtime
-from finssim.ros2.nodes.conversions import station_of_pose, trajectory_of, wrench_of
+from finssim.ros2.nodes.conversions import image_of, station_of_pose, trajectory_of, wrench_of
 from finssim.ros2.nodes.remote import RemoteBridge, RemoteState
 from finssim.ros2.nodes.robot_node import RobotNode
 
@@ -118,6 +120,8 @@ class _Timed:
 STATE_TIMEOUT = 0.5
 """Oldest reading to act on, where the vehicle file does not say [s]."""
 PATH_POINTS = 200
+MOST_PICTURES = 16
+"""That wait while the bridge is not armed; the oldest is forgotten."""
 
 
 class Controller(RobotNode):
@@ -144,6 +148,9 @@ class Controller(RobotNode):
         self.hears("follow", lambda message: self._take(trajectory_of(message)))
         self.hears("trajectory", self._on_trajectory)
         self.hears("mode", self._on_mode)
+        self._seen: list[Picture] = []
+        for name in self.modes.switch.pictures:
+            self.hears(f"{name}/image", partial(self._on_image, name))
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
         self.create_timer(1.0, self._tell)
 
@@ -159,11 +166,20 @@ class Controller(RobotNode):
         if math.isnan(self.runtime.started):
             self.runtime.guide = self.guide or _here(self.state.reading(now))
         before, began = self.runtime.counters.decisions, self.runtime.started
-        self.runtime.step(now, ())
+        seen, self._seen = self._seen, []
+        self.runtime.step(now, (), seen)
         if self.runtime.started != began and not math.isnan(self.runtime.started):
             self._show(self.runtime.guide, self.runtime.started)
         if self.runtime.counters.decisions > before:
             self.send("policy", self.modes.told(self.ns(now), self.runtime))
+
+    def _on_image(self, name: str, message: Any) -> None:
+        """A picture of the vehicle's own camera, for a policy that sees it; what is none is left out."""
+        image = image_of(message, colour=True)
+        if image is not None:
+            late = self.vehicle.perception[name].latency
+            self._seen.append(Picture(self.seconds(message.header.stamp) + late, 0, image, source=name))
+            del self._seen[:-MOST_PICTURES]
 
     def _follow(self, guide: Guide) -> None:
         """From now on, if the vehicle may go there.

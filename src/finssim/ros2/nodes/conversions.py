@@ -16,7 +16,6 @@ from finssim.control import ControlError
 from finssim.control.guidance import Station
 from finssim.control.trajectories import Trajectory, through_points
 from finssim.geometry.rotations import quat_yaw
-from finssim.localization.pool import Pool
 from finssim.robot.messages import (
     HEADING,
     POSE,
@@ -29,7 +28,7 @@ from finssim.robot.messages import (
 )
 from finssim.robot.pictures import jpeg, picture_of
 from finssim.robot.reading import Reading
-from finssim.robot.record_messages import FIRST_TIME, LAST_TIME, MAP, UNKNOWN, Messages, floats
+from finssim.robot.record_messages import FIRST_TIME, LAST_TIME, MAP, UNKNOWN, Messages
 from finssim.vehicles import Vehicle
 
 Array = npt.NDArray[np.float64]
@@ -173,8 +172,13 @@ def reading_of(status: Any, odometry: Any | None, time: float) -> Reading:
     return Reading(time, place, q, nu, bool(status.ready) and whole, str(status.mode), reason, std)
 
 
-def image_of(message: Any) -> npt.NDArray[np.uint8] | None:
-    """The gray picture in an Image of encoding mono8, rgb8 or bgr8, (rows, columns); None where it is none."""
+def image_of(message: Any, *, colour: bool = False) -> npt.NDArray[np.uint8] | None:
+    """The picture in an Image of encoding mono8, rgb8 or bgr8; None where it is none.
+
+    Args:
+        message: As it came.
+        colour: Leave one in colour as it is, red green blue, (rows, columns, 3); else all are gray, (rows, columns).
+    """
     channels = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3}.get(message.encoding, 0)
     rows, columns, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(memoryview(message.data), np.uint8)
@@ -183,8 +187,11 @@ def image_of(message: Any) -> npt.NDArray[np.uint8] | None:
     pixels = data.reshape(rows, step)[:, : channels * columns]
     if channels == 1:
         return np.ascontiguousarray(pixels)
+    pixels = pixels.reshape(rows, columns, 3)
+    if colour:
+        return np.ascontiguousarray(pixels if message.encoding == "rgb8" else pixels[..., ::-1])
     weights = np.array(GRAY[message.encoding])
-    return np.round(pixels.reshape(rows, columns, 3) @ weights).astype(np.uint8)
+    return np.round(pixels @ weights).astype(np.uint8)
 
 
 def compressed_of(message: Any) -> npt.NDArray[np.uint8] | None:
@@ -216,8 +223,6 @@ def _tag(told: Any) -> TagCorners:
 
 
 OPTICAL = "camera_optical"
-LENS_MODELS = {"plumb_bob": "plumb_bob", "rational": "rational_polynomial", "fisheye": "equidistant"}
-"""Our name of a lens model -> that of ROS, with the same coefficients in the same order."""
 
 
 def ros_type(name: str) -> Any:
@@ -241,48 +246,14 @@ class RosMessages(Messages):
         )
         return of["geometry_msgs/msg/PoseWithCovarianceStamped"](self.header(stamp, MAP), pose)
 
-    def image(self, stamp: int, image: npt.NDArray[np.uint8]) -> Any:
-        """A gray picture."""
-        rows, columns = image.shape
-        return self._of["sensor_msgs/msg/Image"](
-            header=self.header(stamp, OPTICAL),
-            height=rows,
-            width=columns,
-            encoding="mono8",
-            is_bigendian=0,
-            step=columns,
-            data=image.ravel(),
-        )
-
     def compressed(self, stamp: int, image: npt.NDArray[np.uint8]) -> Any | None:
         """The same as JPEG; None where it cannot be packed."""
-        packed = jpeg(image)
-        if packed is None:
-            return None
-        message = self.picture(stamp, packed)
-        message.header.frame_id = OPTICAL
-        return message
+        return self.picture(stamp, jpeg(image), OPTICAL)
 
     def found_tags(self, stamp: int, picture: Picture, finder: str) -> Any:
         """Corners of tags as JSON: with the time of exposure [ns] and who found them."""
         values = json.loads(self.tags(picture).data)
         return self.words({"stamp_ns": stamp, "finder": finder, **values})
-
-    def camera_info(self, stamp: int, pool: Pool) -> Any:
-        """The camera's calibration."""
-        lens = pool.camera.lens
-        K = [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0]
-        P = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
-        return self._of["sensor_msgs/msg/CameraInfo"](
-            header=self.header(stamp, OPTICAL),
-            height=lens.height,
-            width=lens.width,
-            distortion_model=LENS_MODELS[lens.model],
-            d=floats(lens.distortion or (0.0,) * 5),
-            k=floats(K),
-            r=np.eye(3).ravel(),
-            p=floats(P),
-        )
 
     def transforms(self, stamp: int, parts: Any) -> Any:
         """Frames in frames: parent, child, and position [m] with quaternion."""
@@ -331,6 +302,7 @@ def _converter(kind: str) -> Callable[[Any], Any]:
         return lambda value: bytes([value]) if isinstance(value, int) else value
     if kind == "sequence<uint8>":
         return lambda value: array.array("B", np.ascontiguousarray(value, np.uint8).tobytes())
-    if kind == "sequence<double>":
-        return lambda value: array.array("d", np.asarray(value, np.float64).tobytes())
+    if kind in ("sequence<double>", "sequence<float>"):
+        code = kind[9]
+        return lambda value: array.array(code, np.asarray(value, code).tobytes())
     return lambda value: value

@@ -23,17 +23,25 @@ from finssim.localization.fusion.streams import VisionSample
 from finssim.localization.pool import Pool
 from finssim.localization.poses import axes_of_up
 from finssim.robot.reading import Reading
+from finssim.robot.record_messages import own_kind
 from finssim.ros2.nodes.conversions import ros_type, xyz, xyzw
 from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.vehicles import Vehicle
+from finssim.worlds import device_of
 
 Array = npt.NDArray[np.float64]
 
 BASE = "base_link"
+OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
+"""NAME_optical in NAME_link, xyzw: z along the view, x right, y down (REP-103)."""
+ACOUSTIC = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
+"""NAME_acoustic in NAME_link, xyzw: z along the view, x up, y right."""
 
 
 def mounts(vehicle: Vehicle) -> Iterator[tuple[str, Array, Array]]:
     """Frame, position [m] (3,) and orientation xyzw (4,) in base_link of sensors, tags and thrusters.
+
+    Cameras have their optical frame beside their own, sonars and Doppler logs that of marine_acoustic_msgs.
 
     A thruster's x axis is the direction of its positive thrust.
     """
@@ -41,6 +49,12 @@ def mounts(vehicle: Vehicle) -> Iterator[tuple[str, Array, Array]]:
     for name, mount in (("imu", sensors.imu), ("pressure", sensors.depth), ("dvl", sensors.dvl)):
         if mount is not None:
             yield f"{name}_link", np.asarray(mount.position), np.asarray(mount.orientation)
+    for name, device in {name: device_of(vehicle, name) for name in vehicle.perception}.items():
+        position, q = np.asarray(device.mount.position), np.asarray(device.mount.quaternion)
+        yield f"{name}_link", position, q
+        turned = {"camera": ("optical", OPTICAL), "range": None}.get(own_kind(device), ("acoustic", ACOUSTIC))
+        if turned is not None:
+            yield f"{name}_{turned[0]}", position, np.asarray(quat_multiply(q, turned[1]))
     for tag, mount in (vehicle.tags.mounts if vehicle.tags else {}).items():
         yield f"tag_{tag}_link", np.asarray(mount.position), np.asarray(mount.orientation)
     for name, thruster in vehicle.thrusters.items():
@@ -157,8 +171,6 @@ class FixFrame:
 
 GAP = 0.5
 """After a longer silence the way between two readings is not known, and odom stands still over it [s]."""
-OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
-"""camera_optical in camera_link, xyzw: z along the view, x right, y down (REP-103)."""
 
 
 class Pose(NamedTuple):

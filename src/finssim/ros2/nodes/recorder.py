@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from finssim.robot.recorder import Recorder
 from finssim.ros2.nodes.robot_node import RobotNode
-from finssim.ros2.topics import TOPICS
 from finssim.vehicles import Vehicle
 
-LEFT_OUT = ("image", "clock")
+LEFT_OUT, RAW = ("clock",), "sensor_msgs/msg/Image"
 """Raw pictures fill disks, and their compressed ones are kept; simulated time is in every stamp."""
 
 
@@ -30,11 +30,12 @@ class RecorderNode(RobotNode):
             self.get_logger().info("nothing is recorded: give a file by the parameter record")
             return
         files = {"pool.yaml": pool_file} if pool_file else {}
-        names = {key: self.resolve_topic_name(self.topic(key)) for key in TOPICS}
+        names = {key: self.resolve_topic_name(self.topic(key)) for key in self.table}
         self.mcap = _WireRecord(Path(path), self.filed, {"command": "ros2 recorder"}, files, names)
-        for key in TOPICS:
-            if key not in LEFT_OUT and (pictures or key != "picture"):
-                self.hears(key, self._taker(key), raw=True)
+        for key, topic in self.table.items():
+            if key not in LEFT_OUT and topic.type != RAW and (pictures or not key.endswith("picture")):
+                with suppress(ImportError):  # a ROS 2 without marine_acoustic_msgs
+                    self.hears(key, self._taker(key), raw=True)
         self.create_timer(1.0, self._tell)
 
     def _taker(self, key: str) -> Any:

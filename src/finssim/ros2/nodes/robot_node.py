@@ -17,7 +17,7 @@ from rclpy.node import Node
 
 from finssim.robot.interrupt import follow_parent
 from finssim.ros2.nodes.conversions import RosMessages, nanoseconds, ros_type
-from finssim.ros2.topics import TOPICS, quality_profile
+from finssim.ros2.topics import TOPICS, own_topics, quality_profile
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
@@ -67,6 +67,8 @@ class RobotNode(Node):
         )
         self.vehicle = numbered(equipped, self.parameter("number", 0))
         """The same as it is equipped for the site, with the tags of its number among several."""
+        self.table = TOPICS | own_topics(self.vehicle)
+        """Those of every robot, and of this vehicle's own cameras, sonars and altimeters."""
         self.make = RosMessages(self.vehicle, self.parameter("frame_prefix", ""))
         self._below = "" if self.get_namespace() != "/" else f"{self.vehicle.name.replace('-', '_')}/"
         simulated = self.get_parameter("use_sim_time").value
@@ -115,7 +117,7 @@ class RobotNode(Node):
 
     def topic(self, key: str) -> str:
         """Name of a topic."""
-        return self.below(TOPICS[key].name)
+        return self.below(self.table[key].name)
 
     def below(self, name: str) -> str:
         """A name below the vehicle's, unless it begins with a slash."""
@@ -124,7 +126,7 @@ class RobotNode(Node):
     def sends(self, *keys: str) -> None:
         """Make publishers, before there is something to say: peers need time to find them."""
         for key in keys:
-            kind, quality = ros_type(TOPICS[key].type), quality_profile(TOPICS[key].quality)
+            kind, quality = ros_type(self.table[key].type), quality_profile(self.table[key].quality)
             self._out[key] = self.create_publisher(kind, self.topic(key), quality)
 
     def send(self, key: str, message: Any) -> None:
@@ -134,11 +136,11 @@ class RobotNode(Node):
 
     def heard(self, key: str) -> bool:
         """Whether somebody listens to what we publish."""
-        return bool(self._out[key].get_subscription_count())
+        return key in self._out and bool(self._out[key].get_subscription_count())
 
     def hears(self, key: str, take: Callable[[Any], None], **options: Any) -> Any:
         """Listen to a topic; the subscription. Commands are taken from publishers of any durability, as they come."""
-        kind, quality = ros_type(TOPICS[key].type), quality_profile(TOPICS[key].quality)
+        kind, quality = ros_type(self.table[key].type), quality_profile(self.table[key].quality)
         return self.create_subscription(kind, self.topic(key), take, quality, **options)
 
     # -- what every node says of itself ---------------------------------------------------------------------------
