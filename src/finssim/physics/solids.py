@@ -4,7 +4,8 @@ The hull is the eight corners of its envelope box, as a pool's walls meet them, 
 least half extent inside its faces: flat solids meet the corners alone, and thin ones do not pass between them.
 """
 
-# mypy: disable-error-code="arg-type,attr-defined,call-overload,index,no-any-return,no-untyped-call,operator,return-value,valid-type"
+# mypy: disable-error-code="arg-type,attr-defined,call-overload,index,no-any-return"
+# mypy: disable-error-code="no-untyped-call,operator,return-value,valid-type"
 
 import warp as wp
 
