@@ -60,6 +60,7 @@ HOMES = {
         "learning/export.py",
         "learning/layers.py",
         "learning/learners/catalogue.py",
+        "learning/learners/distill.py",
         "learning/learners/gail.py",
         "learning/learners/imitation.py",
         "learning/learners/rsl_rl_ppo.py",

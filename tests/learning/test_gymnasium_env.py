@@ -13,6 +13,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from finssim.learning.gymnasium_env import Env, VectorEnv
 from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping
+from finssim.tasks.camera_docking import CameraDocking
 
 SHORT = StationKeeping(time_limit=0.5)
 ALONE = [name for name, kind in TASKS.items() if len(kind.agents) == 1]
@@ -203,3 +204,21 @@ def test_a_world_that_breaks_has_started_over_when_step_returns(tmp_path):
     assert (reward, terminated, truncated, info["episode"]["l"]) == (0.0, True, False, 2)
     assert env.environment.simulator.state.steps.numpy().tolist() == [0]
     assert env.step(still)[2] is False
+
+
+@pytest.mark.slow
+@UNBOUNDED
+def test_a_task_that_sees_has_a_dictionary_of_observations():
+    pytest.importorskip("newton")
+    env = gymnasium.make("finssim/CameraDocking-v0")
+    check_env(env.unwrapped, skip_render_check=True)
+    assert env.observation_space["front_camera"].shape == (27, 48, 3)
+    for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
+        batch = VectorEnv(2, CameraDocking(time_limit=0.2), autoreset_mode=mode)
+        first, _ = batch.reset(seed=3)
+        second = batch.step(np.zeros((2, 6)))[0]
+        third, _, _, ended, info = batch.step(np.zeros((2, 6)))
+        assert ended.all() and all(one in batch.observation_space for one in (first, second, third))
+        if mode is AutoresetMode.SAME_STEP:
+            assert info["final_obs"][0] in batch.single_observation_space
+            assert np.any(info["final_obs"][0]["front_camera"] != third["front_camera"][0])

@@ -11,6 +11,7 @@ from finssim.engine import Pool
 from finssim.learning.gymnasium_env import Env
 from finssim.learning.sb3 import Sb3VecEnv
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, StationKeeping
+from finssim.tasks.camera_docking import CameraDocking
 from reference.pair import Pair
 
 SHORT = StationKeeping(time_limit=0.5)
@@ -145,3 +146,14 @@ def test_a_seed_given_to_sb3_is_the_environments():
 def test_an_environment_that_does_not_reset_itself_is_refused():
     with pytest.raises(EnvironmentSetupError, match="needs auto_reset=True"):
         Sb3VecEnv(Environment(SHORT, auto_reset=False))
+
+
+@pytest.mark.slow
+def test_a_task_that_sees_gives_dictionaries():
+    pytest.importorskip("newton")
+    env = Sb3VecEnv(CameraDocking(time_limit=0.2), worlds=2, seed=1)
+    assert env.reset()["front_camera"].shape == (2, 27, 48, 3)
+    env.step(np.zeros((2, 6)))
+    observation, _, done, infos = env.step(np.zeros((2, 6)))
+    assert done.all() and infos[0]["terminal_observation"]["state"].shape == (10,)
+    assert observation["front_camera"].dtype == np.uint8

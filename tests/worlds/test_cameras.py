@@ -118,12 +118,12 @@ def test_noise_is_that_of_photons_and_reading(scenes, poses):
     """Over water of even radiance: variance = charge + read², in numbers, quantisation's 1/12 included."""
     device = camera(exposure=2.0, gamma=1.0, full_well=800.0, read_noise=6.0, width=200, height=200)
     sensor = CameraBatch(scenes("floor"), device)
-    sensor.batch.optics.veil, old = (0.1, 0.2, 0.3), sensor.batch.optics.veil
+    sensor.batch.optics.veil.fill_(wp.vec3(0.1, 0.2, 0.3))
     try:
         sensor.batch.optics.attenuation.fill_(5.0)
         picture = sensor.update(poses(((0, 0, -5), (0, 0, 0, 1))), seed=1).numpy()[0, :90].astype(float)
     finally:
-        sensor.batch.optics.veil = old
+        sensor.batch.optics.veil.fill_(wp.vec3(*sensor.batch.world.water.veil))
         sensor.batch.optics.attenuation.fill_(0.0)
     for k, veil in enumerate((0.1, 0.2, 0.3)):
         charge = 2.0 * veil * 800.0

@@ -64,6 +64,8 @@ class Known:
     position: Any = None
     quaternion: Any = None
     nu: Any = None
+    pictures: Any = None
+    """What is seen, by name: uint8 (n, height, width, 3)."""
 
 
 @dataclass(frozen=True)

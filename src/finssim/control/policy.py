@@ -84,6 +84,9 @@ class PolicyDescription(_Record):
     format: int = FORMAT
     task: str
     observation: ObservationSchema
+    pictures: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """What it sees beside the observation, by the name of the entry of the vehicle's `perception`: device, shape
+    (height, width, 3), rate [Hz] and latency [s]."""
     action: dict[str, Any]
     """The action mode, as its `describe()` gives it: at least `mode` (name), `size`, and its limits and scale."""
     control_period: float = Field(gt=0.0, le=10.0)
@@ -271,19 +274,24 @@ class Policy:
         return np.zeros((n, k), dtype=np.float32) if k else None
 
     def step(
-        self, memory: NDArray[Any] | None, observation: ArrayLike
+        self,
+        memory: NDArray[Any] | None,
+        observation: ArrayLike,
+        pictures: Mapping[str, NDArray[np.uint8]] | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Actions, and the memory to give with the next observations.
 
         Args:
             memory: From `reset`, or from the step before, with a row for each observation.
             observation: As `act` takes it.
+            pictures: What it sees by name, uint8 (rows, height, width, 3), a row for each observation; None where it
+                sees nothing.
 
         Returns:
             Actions as of `act`, and the memory after.
 
         Raises:
-            PolicyError: As of `act`; or the memory is not this policy's.
+            PolicyError: As of `act`; or memory or pictures are not this policy's.
         """
         x = self._checked(observation)
         rows, k = x.reshape(-1, self._size), self.description.memory
@@ -294,7 +302,16 @@ class Policy:
             raise PolicyError(
                 f"the policy is given {said[0]}, expected {said[1]}: begin with what reset gives"
             )
-        given = {"memory": np.asarray(memory, dtype=np.float32)} if k else {}
+        given: dict[str, Any] = {"memory": np.asarray(memory, dtype=np.float32)} if k else {}
+        for name, about in self.description.pictures.items():
+            picture = (pictures or {}).get(name)
+            expected_shape = (len(rows), *about["shape"])
+            if picture is None or picture.shape != expected_shape or picture.dtype != np.uint8:
+                got = "nothing" if picture is None else f"{picture.dtype} {picture.shape}"
+                raise PolicyError(
+                    f"the policy sees {name}: it is given {got}, expected uint8 {expected_shape}"
+                )
+            given[name] = picture
         action, *after = self._session.run(OUTPUTS[: 1 + bool(k)], {"observation": rows, **given})
         return action.reshape(*x.shape[:-1], action.shape[-1]), after[0] if after else None
 
@@ -340,8 +357,12 @@ def _open_network(folder: Path, description: PolicyDescription) -> Any:
         reason = " ".join(str(error).split())
         raise PolicyError(f"{path}: not a network onnxruntime can run ({reason})") from error
     k = [description.memory] if description.memory else []
-    described = [[description.observation.size, *k], [description.action_size, *k]]
-    found = [[tensor.shape[-1] for tensor in side] for side in (session.get_inputs(), session.get_outputs())]
+    shapes: list[Any] = [tuple(one["shape"]) for one in description.pictures.values()]
+    described: list[list[Any]] = [[description.observation.size, *k, *shapes], [description.action_size, *k]]
+    found = [
+        [tensor.shape[-1] if len(tensor.shape) == 2 else tuple(tensor.shape[1:]) for tensor in side]
+        for side in (session.get_inputs(), session.get_outputs())
+    ]
     if found != described:
         told = [[" and ".join(map(str, side)) for side in sides] for sides in (found, described)]
         raise PolicyError(

@@ -260,8 +260,8 @@ def evaluate(
             vehicle.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), current, lag, mesh, noise, randomised,
-            sensors, simplified, waves, or a file. May be given several times.
+        plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), current, held_out, lag, mesh, noise,
+            randomised, sensors, simplified, waves, or a file. May be given several times.
         observe (FILE|NAME): What is seen in every plant: truth, estimator, sensors or a file of fixes; what the plant
             says if not given.
         trajectories (FILE|NAME): What t2 follows: straight, broken, ellipse, lemniscate (all four if not given),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,8 @@ class Plant(BaseModel):
     """Added to every thruster's [s]."""
     extra_delay: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
     """Added to every thruster's [s]."""
+    held_out: bool = False
+    """Of a task that sees: the looks of its site that are held out of training."""
     vehicle: dict[str, Any] = Field(default_factory=dict)
     """Dotted path in the vehicle file -> another value, such as body.mass: 12.5."""
 
@@ -118,8 +121,12 @@ class Plant(BaseModel):
             hydrodynamics: Model, unless the plant names one.
             options: Of the `Environment`: worlds, seed, ...
         """
+        if self.held_out and not task.world:
+            raise PlantError(
+                f"plant '{self.name}' changes how a site looks, and task '{task.name}' sees none: take another plant"
+            )
         return Environment(
-            task,
+            replace(task, held_out=True) if self.held_out else task,
             self.changed(vehicle),
             nominal=vehicle,
             hydrodynamics=self.hydrodynamics or hydrodynamics,

@@ -14,7 +14,7 @@ from typing import Any
 
 from finssim.control.modes import AXES, action_mode
 from finssim.experiments.tables import Table
-from finssim.tasks import TASKS
+from finssim.tasks import SEEING, TASKS
 from finssim.tasks import terms as library
 from finssim.tasks.agents import BASELINES
 from finssim.tasks.given import crew
@@ -154,7 +154,7 @@ def tasks_list() -> dict[str, Any]:
 
     Example: finssim tasks
     """
-    return {name: describe_task(name) for name in TASKS}
+    return {name: describe_task(name) for name in (*TASKS, *SEEING)}
 
 
 def tasks_show(task: str, *, vehicle: str = "finsrov", action: str | None = None) -> dict[str, Any]:

@@ -187,11 +187,12 @@ class HeldEvaluation:
         rows = e.worlds * e.agents
         observation = arrays.view(e.arrays.observation).reshape(rows, -1)
         action = arrays.view(e.arrays.action).reshape(rows, -1)
+        pictures = {} if e.sight is None else {name: arrays.view(x) for name, x in e.sight.pictures.items()}
         memory = first_memory(network, rows, None if plain else self.device)
         ends = EpisodeEnds(e, arrays)
         for _ in range(self._limit):
             with arrays.plain():
-                answer, memory = asked(network, observation, memory)
+                answer, memory = asked(network, observation, memory, pictures)
             action[:] = answer
             e.advance()
             ends.look(ends.done() & ~ends.ended)

@@ -167,6 +167,24 @@ class _Graph:
         )
         return outputs
 
+    def modules(self, layers: Any, x: str) -> str:
+        """Torch's layers one after the other: instance norm, convolutions, linear layers, ELU and flattening."""
+        for layer in layers:
+            weights = [self.weight(w.detach().cpu().numpy()) for w in layer.parameters()]
+            if hasattr(layer, "kernel_size"):
+                rows, columns = layer.padding
+                strides, pads = list(layer.stride), [rows, columns, rows, columns]
+                x = self.node("Conv", [x, *weights], strides=strides, pads=pads)
+            elif hasattr(layer, "num_features"):
+                ones = np.ones(layer.num_features, np.float32)
+                inputs = [x, self.weight(ones), self.weight(0.0 * ones)]
+                x = self.node("InstanceNormalization", inputs, epsilon=layer.eps)
+            elif weights:
+                x = self.node("Gemm", [x, *weights], transB=1)
+            else:
+                x = self.node("Elu" if hasattr(layer, "alpha") else "Flatten", [x])
+        return x
+
     def stack(self, layers: Sequence[Linear | Activation], x: str) -> None:
         """Layers one after the other, and the limits of the action."""
         for layer in layers:
@@ -179,17 +197,40 @@ class _Graph:
         low, high = (self.weight(np.full((), value, np.float32)) for value in (-1.0, 1.0))
         self.node("Clip", [x, low, high], "action")
 
-    def file(self, inputs: Sequence[tuple[str, int]], outputs: Sequence[tuple[str, int]]) -> bytes:
+    def file(
+        self,
+        inputs: Sequence[tuple[str, int]],
+        outputs: Sequence[tuple[str, int]],
+        pictures: Mapping[str, Sequence[int]] | None = None,
+    ) -> bytes:
         """The graph as an ONNX file."""
         rows = [
             [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", size]) for name, size in side]
             for side in (inputs, outputs)
+        ]
+        rows[0] += [
+            helper.make_tensor_value_info(name, TensorProto.UINT8, ["N", *shape])
+            for name, shape in (pictures or {}).items()
         ]
         graph = helper.make_graph(self._nodes, "policy", *rows, self._weights)
         opsets = [helper.make_opsetid("", OPSET)]
         model = helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="finssim")
         onnx.checker.check_model(model)
         return bytes(model.SerializeToString())
+
+
+def write_seeing(network: Any, n: int, m: int) -> bytes:
+    """The ONNX file of a `SeeingNetwork`: beside `observation` each picture, uint8 (N, height, width, 3), by name."""
+    graph = _Graph()
+    scale = graph.weight(np.full((), 1.0 / 255.0, np.float32))
+    features = ["observation"]
+    for name in network.shapes:
+        x = graph.node("Mul", [graph.node("Cast", [name], to=TensorProto.FLOAT), scale])
+        x = graph.node("Transpose", [x], perm=[0, 3, 1, 2])
+        features.append(graph.modules(network.encoders[name], x))
+    x = graph.modules(network.layers, graph.node("Concat", features, axis=1))
+    graph.stack((), x)
+    return graph.file([("observation", n)], [("action", m)], network.shapes)
 
 
 CURVES_FILE = "curves.csv"
@@ -244,8 +285,9 @@ def export_policy(
     )
     with atomic_directory(directory, replaces=DESCRIPTION_FILE) as folder:
         (folder / NETWORK_FILE).write_bytes(content)
+        record = complete.model_dump(mode="json", exclude=None if complete.pictures else {"pictures"})
         text = yaml.safe_dump(
-            complete.model_dump(mode="json"),
+            record,
             sort_keys=False,
             default_flow_style=None,
             allow_unicode=True,
@@ -277,6 +319,7 @@ def description_of(environment: Environment, **training: Any) -> PolicyDescripti
     return PolicyDescription(
         task=task.name,
         observation=task.schema,
+        pictures={} if environment.sight is None else environment.sight.describe(),
         action=action_mode(environment.action_mode, vehicle, scale).describe(),
         control_period=task.control_step,
         vehicle=VehicleIdentity(name=vehicle.name, sha256=vehicle.sha256),
@@ -356,7 +399,11 @@ def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> 
     """
     n, m = description.observation.size, description.action_size
     try:
-        shape = _answer(network, np.zeros((2, n)), _memory(network, 2), np.float32, limited=False).shape
+        pictures = {
+            name: np.zeros((2, *one["shape"]), np.uint8) for name, one in description.pictures.items()
+        }
+        memory = _memory(network, 2)
+        shape = _answer(network, np.zeros((2, n)), memory, np.float32, pictures, limited=False).shape
     except (
         RuntimeError,
         ValueError,
@@ -369,8 +416,10 @@ def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> 
         )
     if isinstance(network, Network):
         return write_graph(network, n, m)
-    from finssim.learning.recurrent import plain_network
+    from finssim.learning.recurrent import SeeingNetwork, plain_network
 
+    if isinstance(network, SeeingNetwork):
+        return write_seeing(network, n, m)
     plain = plain_network(network)
     if plain is not None:
         return write_graph(plain, n, m)
@@ -418,9 +467,14 @@ def _check_agreement(network: nn.Module | Network, policy: Policy, tolerance: fl
     observation = rng.normal(size=(512, policy.description.observation.size))
     k = policy.description.memory
     memory = rng.uniform(-1.0, 1.0, size=(512, k)) if k else None
-    single = _answer(network, observation, memory, np.float32)
-    double = _answer(network, observation, memory, np.float64)
-    answer = np.concatenate([part for part in policy.step(memory, observation) if part is not None], axis=1)
+    pictures = {
+        name: rng.integers(0, 256, (512, *one["shape"]), dtype=np.uint8)
+        for name, one in policy.description.pictures.items()
+    }
+    single = _answer(network, observation, memory, np.float32, pictures)
+    double = _answer(network, observation, memory, np.float64, pictures)
+    parts = policy.step(memory, observation, pictures)
+    answer = np.concatenate([part for part in parts if part is not None], axis=1)
     allowed = tolerance + 4.0 * float(np.max(np.abs(single - double)))
     error = float(np.max(np.abs(answer - double)))
     if not error <= allowed:
@@ -440,6 +494,7 @@ def _answer(
     observation: NDArray[Any],
     memory: NDArray[Any] | None,
     kind: type[np.floating[Any]],
+    pictures: Mapping[str, NDArray[np.uint8]],
     limited: bool = True,
 ) -> NDArray[Any]:
     """Action, in [-1, 1] if `limited`, and, beside it, the memory after, (N, m + k), computed with that type."""
@@ -451,7 +506,8 @@ def _answer(
 
         copy = deepcopy(network).cpu().eval().to(torch.float64 if kind is np.float64 else torch.float32)
         with torch.no_grad():
-            parts = asked(copy, *(None if x is None else torch.from_numpy(x) for x in given))
+            seen = {name: torch.from_numpy(x) for name, x in pictures.items()}
+            parts = asked(copy, *(None if x is None else torch.from_numpy(x) for x in given), seen)
         action, after = (None if x is None else x.numpy() for x in parts)
     action = np.clip(action, -1.0, 1.0) if limited else action
     return action if after is None else np.concatenate([action, after], axis=1)

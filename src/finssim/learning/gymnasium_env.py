@@ -16,17 +16,22 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from finssim.learning.served import one_agent, served
-from finssim.tasks import TASKS, Environment, EnvironmentSetupError, Task
+from finssim.learning.served import copied, one_agent, served
+from finssim.tasks import SEEING, TASKS, Environment, EnvironmentSetupError, Task
 
 # Gymnasium's spaces of an environment's observations and actions.
 
 
-def observation_space(environment: Environment) -> spaces.Box:
-    """Bounds of one world's observation: each part's clip, or none."""
+def observation_space(environment: Environment) -> spaces.Box | spaces.Dict:
+    """Bounds of one world's observation: each part's clip, or none; of a task that sees, `state` and the pictures."""
     parts = environment.task.observation
     high = np.concatenate([np.full(part.size, np.inf if part.clip is None else part.clip) for part in parts])
-    return spaces.Box(-high.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+    state = spaces.Box(-high.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+    if environment.sight is None:
+        return state
+    shapes = {name: one["shape"] for name, one in environment.sight.describe().items()}
+    pictures = {name: spaces.Box(0, 255, tuple(shape), np.uint8) for name, shape in shapes.items()}
+    return spaces.Dict({"state": state, **pictures})
 
 
 def action_space(environment: Environment) -> spaces.Box:
@@ -34,7 +39,8 @@ def action_space(environment: Environment) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, shape=(environment.action_size,), dtype=np.float32)
 
 
-Observation = NDArray[np.float32]
+Observation = Any
+"""float32 (size,); of a task that sees a dictionary of that and uint8 pictures."""
 
 
 class Env(gymnasium.Env[Any, Any]):
@@ -61,7 +67,7 @@ class Env(gymnasium.Env[Any, Any]):
             EnvironmentSetupError: As `finssim.make`; or the task has several agents, or there are several worlds.
         """
         self.render_mode = options.pop("render_mode", None)
-        self.environment = one_agent(served(task, options, auto_reset=False), "Gymnasium")
+        self.environment = one_agent(served(task, options, auto_reset=False, pictures=True), "Gymnasium")
         if self.environment.worlds != 1:
             raise EnvironmentSetupError(
                 f"worlds is {self.environment.worlds}, expected 1: several are a VectorEnv"
@@ -74,7 +80,7 @@ class Env(gymnasium.Env[Any, Any]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode; with a seed the random streams start over."""
         super().reset(seed=seed)
-        return self.environment.reset(seed=seed)[0].copy(), self._info()
+        return copied(self.environment.reset(seed=seed), 0), self._info()
 
     def step(self, action: Observation) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for one control step; action (size,), each in [-1, 1]."""
@@ -85,8 +91,8 @@ class Env(gymnasium.Env[Any, Any]):
             a = self.environment.arrays
             metrics = {key: float(value[0]) for key, value in self.environment.task.metrics(a).items()}
             info["episode"] = {"r": metrics.pop("return"), "l": int(metrics.pop("length")), **metrics}
-            return step.final_observation[0].copy(), float(step.reward[0]), terminated, truncated, info
-        return step.observation[0].copy(), float(step.reward[0]), terminated, truncated, info
+            return copied(step.final_observation, 0), float(step.reward[0]), terminated, truncated, info
+        return copied(step.observation, 0), float(step.reward[0]), terminated, truncated, info
 
     def _info(self) -> dict[str, Any]:
         a, state = self.environment.arrays, self.environment.simulator.state
@@ -136,7 +142,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         self._same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
         if num_envs is not None:
             options["worlds"] = num_envs
-        environment = served(task, options, auto_reset=self._same_step)
+        environment = served(task, options, auto_reset=self._same_step, pictures=True)
         self.environment = one_agent(environment, "Gymnasium")
         self.num_envs = self.environment.worlds
         self._ended = np.zeros(self.num_envs, bool)
@@ -152,23 +158,23 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
         self._ended &= False if mask is None else ~np.asarray(mask, bool)
-        return self.environment.reset(mask=mask, seed=seed).copy(), {}
+        return copied(self.environment.reset(mask=mask, seed=seed)), {}
 
     def step(
         self, actions: Observation
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Act for one control step; actions (worlds, size), each in [-1, 1]."""
         before, step = self._ended, self.environment.step(actions)
-        observation, reward = step.observation.copy(), step.reward.copy()
+        observation, reward = copied(step.observation), step.reward.copy()
         terminated, truncated = step.terminated & ~before, step.truncated & ~before
         ended = terminated | truncated
         if self._same_step:
             info = self._final(step.final_observation, ended) if ended.any() else {}
             return observation, reward, terminated, truncated, info
-        observation[ended] = step.final_observation[ended]
+        _replace(observation, step.final_observation, ended)
         info = self._metrics(ended) if ended.any() else {}
         if before.any():
-            observation[before] = self.environment.reset(mask=before)[before]
+            _replace(observation, self.environment.reset(mask=before), before)
             reward[before] = 0.0
         self._ended = ended
         return observation, reward, terminated, truncated, info
@@ -184,7 +190,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
     def _final(self, observation: Observation, ended: NDArray[np.bool_]) -> dict[str, Any]:
         final = np.full(self.num_envs, None, dtype=object)
         for w in np.flatnonzero(ended):
-            final[w] = observation[w].copy()
+            final[w] = copied(observation, w)
         return {
             "final_obs": final,
             "_final_obs": ended.copy(),
@@ -193,7 +199,15 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         }
 
 
-for _name, _kind in TASKS.items():
+def _replace(observation: Observation, other: Observation, rows: NDArray[np.bool_]) -> None:
+    """Put rows of other observations in the place of these."""
+    if not isinstance(observation, dict):
+        observation, other = {"": observation}, {"": other}
+    for name, array in observation.items():
+        array[rows] = other[name][rows]
+
+
+for _name, _kind in (*TASKS.items(), *SEEING.items()):
     if len(_kind.agents) == 1:
         gymnasium.register(
             id=f"finssim/{_kind.__name__}-v0",

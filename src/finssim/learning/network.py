@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -213,12 +213,14 @@ def first_memory(network: Any, rows: int, device: str | None = None) -> Array | 
     return torch.zeros(rows, size, device=device)
 
 
-def asked(network: Any, observation: Array, memory: Array | None) -> tuple[Array, Array | None]:
-    """Action (N, m) and the memory after, of a `Network` or a torch module."""
+def asked(
+    network: Any, observation: Array, memory: Array | None, pictures: Mapping[str, Array] | None = None
+) -> tuple[Array, Array | None]:
+    """Action (N, m) and the memory after, of a `Network` or a torch module; one that sees takes pictures by name."""
     if isinstance(network, Network):
         return network.step(observation, memory)
     if memory is None:
-        return network(observation), None
+        return network(observation, **(pictures or {})), None
     action, memory = network(observation, memory)
     return action, memory
 

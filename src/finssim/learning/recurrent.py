@@ -1,9 +1,9 @@
-"""Torch's networks: as learners begin with them, one that remembers, and any of them as a plain `Network`."""
+"""Torch's networks: as learners begin with them, one that remembers, one that sees, and any as a plain `Network`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 from torch import nn
@@ -32,6 +32,53 @@ class RecurrentNetwork(nn.Module):
         said, cells = (part.unsqueeze(0).contiguous() for part in memory.chunk(2, dim=1))
         answer, (said, cells) = self.lstm(observation.unsqueeze(0), (said, cells))
         return self.layers(answer[0]), torch.cat([said[0], cells[0]], dim=1)
+
+
+class SeeingNetwork(nn.Module):
+    """A convolutional encoder for each picture, and layers on what they give beside the row: to the mean action."""
+
+    def __init__(
+        self,
+        inputs: int,
+        shapes: Mapping[str, Sequence[int]],
+        outputs: int,
+        *,
+        channels: Sequence[int] = (16, 32, 32),
+        features: int = 96,
+        hidden: Sequence[int] = (128, 64),
+    ) -> None:
+        """Draw the first weights.
+
+        Args:
+            inputs: Numbers in the row.
+            shapes: Of the pictures by name: height, width, 3.
+            outputs: Numbers in the action.
+            channels: Of the convolutions, 3x3 with stride 2 and ELU.
+            features: Numbers that an encoder gives.
+            hidden: Units of the layers behind them.
+        """
+        super().__init__()
+        self.shapes = {name: tuple(shape) for name, shape in shapes.items()}
+        self.encoders = nn.ModuleDict()
+        for name, (rows, columns, depth) in self.shapes.items():
+            layers: list[nn.Module] = [nn.InstanceNorm2d(depth)]  # what water does to a whole picture
+            for a, b in zip([depth, *channels], channels, strict=False):
+                layers += [nn.Conv2d(a, b, 3, stride=2, padding=1), nn.ELU()]
+                rows, columns = (rows + 1) // 2, (columns + 1) // 2
+            layers += [nn.Flatten(), nn.Linear(channels[-1] * rows * columns, features), nn.ELU()]
+            self.encoders[name] = nn.Sequential(*layers)
+        self.layers = stack(inputs + len(self.shapes) * features, hidden, outputs, 0.01)
+
+    def encode(self, pictures: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Features of pictures, 0 to 255, (N, height, width, 3), side by side in the order of `shapes`."""
+        kind = self.layers[0].weight.dtype
+        scaled = {name: pictures[name].to(kind) / 255.0 for name in self.shapes}
+        return torch.cat([self.encoders[name](x.permute(0, 3, 1, 2)) for name, x in scaled.items()], dim=1)
+
+    def forward(self, observation: torch.Tensor, **pictures: torch.Tensor) -> torch.Tensor:
+        """Action (N, m) for rows (N, n) and pictures."""
+        answer: torch.Tensor = self.layers(torch.cat([observation, self.encode(pictures)], dim=1))
+        return answer
 
 
 def plain_network(network: nn.Module) -> Network | None:

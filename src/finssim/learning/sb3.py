@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from finssim.learning.gymnasium_env import action_space, observation_space
-from finssim.learning.served import age_episodes, served
+from finssim.learning.served import age_episodes, copied, served
 from finssim.tasks import Environment, Task
 
 
@@ -32,21 +32,21 @@ class Sb3VecEnv(VecEnv):
                 from all stages of an episode at once is steadier. A shortened episode has no `episode` in its info.
             options: The other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, ...
         """
-        self.environment = environment = served(task, options)
+        self.environment = environment = served(task, options, pictures=True)
         rows = environment.worlds * environment.agents
         super().__init__(rows, observation_space(environment), action_space(environment))
         self._actions: NDArray[np.float32] | None = None
         self._stagger = stagger
         self._whole = np.ones(environment.worlds, dtype=np.bool_)
 
-    def reset(self) -> NDArray[np.float32]:
+    def reset(self) -> Any:
         """Start new episodes everywhere; with the seed given to `seed`, if any.
 
         Returns:
-            Observations, (rows, size).
+            Observations, (rows, size); of a task that sees a dictionary of `state` and uint8 pictures.
         """
         first = self._seeds[0]
-        observation = self._rows(self.environment.reset(seed=first)).copy()
+        observation = copied(self._rows(self.environment.reset(seed=first)))
         self._whole[:] = not self._stagger
         if self._stagger:
             age_episodes(self.environment)
@@ -61,7 +61,7 @@ class Sb3VecEnv(VecEnv):
 
     def step_wait(
         self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    ) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Observations, rewards, ends and infos; new arrays, which SB3 keeps and changes."""
         assert self._actions is not None, "step_wait without step_async"
         agents = self.environment.agents
@@ -77,22 +77,22 @@ class Sb3VecEnv(VecEnv):
             for w in ended:
                 for row in range(w * agents, (w + 1) * agents):
                     infos[row] = {
-                        "terminal_observation": last[row].copy(),
+                        "terminal_observation": copied(last, row),
                         "TimeLimit.truncated": bool(step.truncated[w] and not step.terminated[w]),
                     }
                     if w in episodes:
                         infos[row]["episode"] = episodes[w]
             self._whole[ended] = True
         return (
-            self._rows(step.observation).copy(),
+            copied(self._rows(step.observation)),
             step.reward.reshape(-1).copy(),
             np.repeat(done, agents),
             infos,
         )
 
-    def _rows(self, array: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(worlds, size) or (worlds, agents, size) as rows; a view."""
-        return array.reshape(self.num_envs, -1)
+    def _rows(self, observation: Any) -> Any:
+        """(worlds, size) or (worlds, agents, size) as rows; a view. Who sees is alone in its world."""
+        return observation if isinstance(observation, dict) else observation.reshape(self.num_envs, -1)
 
     def _episodes(self, ended: NDArray[np.intp]) -> dict[int, dict[str, float]]:
         """World to what SB3 notes of an episode, where one ended that was not shortened."""

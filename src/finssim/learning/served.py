@@ -6,11 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from finssim.tasks import Environment, EnvironmentSetupError, Task, make
+from finssim.tasks import Environment, EnvironmentSetupError, Task, make, task_named
 
 
 def served(
-    task: str | Task | Environment, options: dict[str, Any], *, auto_reset: bool = True
+    task: str | Task | Environment,
+    options: dict[str, Any],
+    *,
+    auto_reset: bool = True,
+    pictures: bool = False,
 ) -> Environment:
     """The environment that an adapter serves.
 
@@ -18,10 +22,18 @@ def served(
         task: A task or its name; or an environment that is there already.
         options: The other arguments of `finssim.make`; none beside an environment.
         auto_reset: Whether the adapter needs episodes to start by themselves.
+        pictures: Whether it passes on observations that are dictionaries with pictures.
 
     Raises:
-        EnvironmentSetupError: As `finssim.make`; or an environment that comes with options or resets otherwise.
+        EnvironmentSetupError: As `finssim.make`; or an environment that comes with options or resets otherwise, or
+            that sees where the adapter passes no pictures on.
     """
+    seeing = task.task if isinstance(task, Environment) else task_named(task)
+    if seeing.pictures and not pictures:
+        raise EnvironmentSetupError(
+            f"task '{seeing.name}' observes pictures, which this adapter does not pass on: use that of Gymnasium or "
+            "Stable-Baselines3"
+        )
     if not isinstance(task, Environment):
         if "auto_reset" in options:
             raise EnvironmentSetupError(
@@ -37,6 +49,13 @@ def served(
             f"the environment has auto_reset={task.auto_reset}, this adapter needs auto_reset={auto_reset}"
         )
     return task
+
+
+def copied(observation: Any, rows: Any = ...) -> Any:
+    """A copy of some rows of observations, of all if not given: arrays, or a dictionary of them."""
+    if isinstance(observation, dict):
+        return {name: array[rows].copy() for name, array in observation.items()}
+    return observation[rows].copy()
 
 
 def one_agent(environment: Environment, library: str) -> Environment:

@@ -30,7 +30,7 @@ def train(
     task: str | Task,
     *,
     out: Path,
-    learner: str = "ppo",
+    learner: str | None = None,
     vehicle: str | Vehicle = "finsrov",
     hydrodynamics: str = "calibrated",
     action: str | None = None,
@@ -62,11 +62,11 @@ def train(
 
     Args:
         task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking,
-            pursuit, team-pursuit or formation; or one's own, FILE.py:CLASS.
+            pursuit, team-pursuit, formation or, with a camera, camera-docking; or one's own, FILE.py:CLASS.
         out: Directory of the policy; an earlier policy there is replaced when done.
-        learner (NAME): Who learns: ppo (FinsSim's own), sb3-ppo, sb3-sac, sb3-recurrent-ppo or rsl-rl; one agent also
-            torchrl-ppo, several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; or one's own,
-            FILE.py:CLASS.
+        learner (NAME): Who learns: ppo (FinsSim's own, the default), sb3-ppo, sb3-sac, sb3-recurrent-ppo or rsl-rl; one
+            agent also torchrl-ppo, several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; tasks
+            with pictures distill, their default; or one's own, FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         action (MODE): What the policy commands: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
@@ -111,7 +111,9 @@ def train(
         raise TrainingError(f"until is {until}, expected a share of successes above 0, at most 1")
     if wandb is not None:
         import_module("wandb")  # where it is missing it is missed before anything is made
-    kind, the_task = learner_named(learner), task_named(task)
+    the_task = task_named(task)
+    learner = learner or ("distill" if the_task.pictures else "ppo")
+    kind = learner_named(learner)
     kind.check(the_task)
     chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     randomization = Randomization(randomize) if randomize is not None else None

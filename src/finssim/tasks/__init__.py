@@ -2,7 +2,7 @@
 
 from finssim.tasks.docking import Docking
 from finssim.tasks.environment import Environment, EnvironmentSetupError, Step
-from finssim.tasks.make import TASKS, make, task_named
+from finssim.tasks.make import SEEING, TASKS, make, task_named
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.moving_target import MovingTarget
 from finssim.tasks.reference import follow
@@ -13,6 +13,7 @@ from finssim.tasks.terms import ObservationPart
 from finssim.tasks.trajectory_tracking import TrajectoryTracking
 
 __all__ = [
+    "SEEING",
     "TASKS",
     "Docking",
     "Environment",

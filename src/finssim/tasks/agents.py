@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +24,10 @@ from finssim.geometry.rotations import (
     quat_conjugate,
     quat_from_euler,
     quat_from_yaw,
+    quat_multiply,
     quat_rotate,
 )
+from finssim.tasks.camera_docking import DEPTH_SCALE, CameraDocking
 from finssim.tasks.docking import DISTANCE_SCALE as DOCK_SCALE
 from finssim.tasks.docking import Docking
 from finssim.tasks.environment import Environment
@@ -41,6 +43,7 @@ from finssim.tasks.task import Task
 from finssim.tasks.trajectory_tracking import DISTANCE_SCALE as TRACKING_SCALE
 from finssim.tasks.trajectory_tracking import LOOK_AHEAD
 from finssim.vehicles import Vehicle, load_vehicle
+from finssim.worlds.description import device_of
 
 Array = NDArray[np.float64]
 
@@ -436,13 +439,24 @@ class DockingPid(WrenchPid):
     ) -> tuple[NDArray[np.float32], PidMemory]:
         """Actions for observations of docking."""
         o = np.asarray(observation, float)
-        q = turned_from(o)
-        nose = DOCK_SCALE * o[..., 15:18]
+        return self.steer(memory, DOCK_SCALE * o[..., 15:18], turned_from(o), o[..., 9:15])
+
+    def steer(
+        self, memory: PidMemory, nose: Array, q: Array, nu: Array
+    ) -> tuple[NDArray[np.float32], PidMemory]:
+        """Actions for where the nose is.
+
+        Args:
+            memory: Of the PID.
+            nose: From the throat, dock axes [m], (n, 3).
+            q: Body to dock axes, xyzw, (n, 4).
+            nu: Twist, body frame [m/s, rad/s], (n, 6).
+        """
         arm = np.array([self.nose, 0.0, 0.0])
         place = np.zeros_like(nose)
         place[..., 0] = self._ahead(nose, quat_rotate(q, [1.0, 0.0, 0.0]))
         level = np.broadcast_to(LEVEL, q.shape)
-        seen = Track(nose - quat_rotate(q, arm), q, o[..., 9:15])
+        seen = Track(nose - quat_rotate(q, arm), q, nu)
         return self.command(memory, seen, Goal(place - arm, level))
 
     def _ahead(self, nose: Array, forward: Array) -> Array:
@@ -455,6 +469,129 @@ class DockingPid(WrenchPid):
         return np.asarray(self.wait + right * (np.maximum(onward, self.wait) - self.wait))
 
 
+# Docking by camera the classical way: find the guide lights by their colours, measure the dock by them, and go in.
+
+
+class SightMemory(NamedTuple):
+    """What `LightServo` remembers; the axes are level, at the start, x where the vehicle pointed then."""
+
+    position: Array
+    """Of the body origin, by its velocity and depth [m], (n, 3)."""
+    heading: Array
+    """[rad], (n,)."""
+    dock: Array
+    """Its throat [m] and heading [rad] as far as known, (n, 4)."""
+    looks: Array
+    """Pictures that it is the mean of, (n,)."""
+    pid: PidMemory
+
+
+@dataclass(frozen=True)
+class LightServo(DockingPid):
+    """`DockingPid` towards a dock whose pose comes from the four guide lights in the picture.
+
+    The upper two are white, the lower two red, in the corners of an upright square of known side. The height of each
+    pair in the picture gives its distance, their middle the bearing, the difference of the distances the dock's
+    heading. A picture counts where all four are in it; the estimate is the mean of the last dozen, and between them,
+    and in the funnel, the vehicle dead-reckons by its velocity.
+    """
+
+    focal_share: float = 0.0
+    """Focal length as a share of the picture's width."""
+    eye: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the camera, body axes [m]."""
+    side: float = 1.16
+    """Of the square of lights [m]."""
+    before: float = 0.78
+    """How far it stands before the throat [m]."""
+    first: float = 2.8
+    """How far ahead the dock is taken to be until it has been found [m]."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> LightServo:
+        """For a vehicle with a `front_camera`, the dock of the site `dock`, and the time between two actions [s]."""
+        task = CameraDocking().fitted([vehicle])
+        dock, hull = task.dock(), task.hull
+        device = device_of(vehicle, task.pictures[0].name)
+        return cls(
+            WrenchPid.for_vehicle(vehicle, period).pid,
+            nose=0.5 * hull.length,
+            berth=task.berth * dock.tube_length,
+            wait=-dock.cone_length - 0.5 * hull.length,
+            gap=dock.throat_radius - hull.girth,
+            slope=0.5 * np.tan(task.cone),
+            lead=0.4 * hull.length,
+            focal_share=device.focal_length / device.width,
+            eye=tuple(device.mount.position.tolist()),
+        )
+
+    def reset(self, n: int) -> SightMemory:
+        """A dock straight ahead, unseen."""
+        dock = np.tile([self.first, 0.0, 0.0, 0.0], (n, 1))
+        return SightMemory(np.zeros((n, 3)), np.zeros(n), dock, np.zeros(n), self.pid.reset(n))
+
+    def act(  # type: ignore[override]
+        self, memory: SightMemory, observation: NDArray[np.float32], pictures: Mapping[str, NDArray[np.uint8]]
+    ) -> tuple[NDArray[np.float32], SightMemory]:
+        """Actions for observations and pictures of docking by camera."""
+        o = np.asarray(observation, float)
+        up, nu, depth = o[:, :3], o[:, 3:9], DEPTH_SCALE * o[:, 9]
+        q, position = attitude_from(up, memory.heading), memory.position.copy()
+        position[:, 2] = -depth
+        fresh = memory.looks == 0.0
+        dock = memory.dock.copy()
+        dock[fresh, 2] = position[fresh, 2]
+        bearing, heading, visible = self.measure(next(iter(pictures.values())), up)
+        found = np.column_stack([position + quat_rotate(q, bearing + self.eye), memory.heading + heading])
+        looks = memory.looks + visible
+        share = np.where(visible, 1.0 / np.clip(looks, 1.0, 12.0), 0.0)[:, None]
+        dock += share * np.where(visible[:, None], found - dock, 0.0)
+        q_dock = quat_from_yaw(dock[:, 3])
+        throat = dock[:, :3] + quat_rotate(q_dock, [self.before, 0.0, 0.0]) * (looks > 0.0)[:, None]
+        nose = position + quat_rotate(q, [self.nose, 0.0, 0.0]) - throat
+        own = quat_multiply(quat_conjugate(q_dock), q)
+        action, pid = self.steer(memory.pid, quat_rotate(quat_conjugate(q_dock), nose), own, nu)
+        moved = position + self.period * quat_rotate(q, nu[:, :3])
+        turned = memory.heading + self.period * heading_rate(up, nu)
+        return action, SightMemory(moved, turned, dock, looks, pid)
+
+    def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """The square of lights in pictures.
+
+        Args:
+            picture: uint8 (n, height, width, 3).
+            up: World's up in the body [-], (n, 3).
+
+        Returns:
+            Its middle from the camera, body frame [m], (n, 3); its heading from the vehicle's [rad], (n,); where all
+            four lights are in the picture, (n,).
+        """
+        red, green, blue = np.moveaxis(picture.astype(float), -1, 0)
+        rows, columns = np.mgrid[: red.shape[1], : red.shape[2]]
+        lamps = {"white": np.minimum(np.minimum(red, green), blue) > 235.0}
+        lamps["red"] = (red > 200.0) & (red - np.maximum(green, blue) > 50.0)
+        corners, visible = [], np.ones(len(red), bool)
+        for lit in lamps.values():
+            count = np.maximum(lit.sum((1, 2)), 1)
+            middle = (lit * columns).sum((1, 2)) / count
+            for side in (columns < middle[:, None, None], columns > middle[:, None, None]):
+                own = lit & side
+                number = np.maximum(own.sum((1, 2)), 1)
+                corners.append([(own * grid).sum((1, 2)) / number for grid in (columns, rows)])
+                visible &= own.any((1, 2))
+        focal = self.focal_share * red.shape[2]
+        x, y = np.moveaxis(
+            np.array(corners), 1, 0
+        )  # (4, n): upper left, upper right, lower left, lower right
+        left, right = (focal * self.side / np.maximum(y[i + 2] - y[i], 0.5) for i in (0, 1))
+        visible &= (y[2] - y[0] > 3.0) & (y[3] - y[1] > 3.0) & (x[1] - x[0] > 3.0)
+        ahead = 0.5 * (left + right)
+        aside = (0.5 * (red.shape[2] - 1) - x.mean(0)) / focal
+        above = (0.5 * (red.shape[1] - 1) - y.mean(0)) / focal
+        heading = np.arcsin(np.clip((right - left) / self.side, -0.7, 0.7))
+        return ahead[:, None] * np.column_stack([np.ones_like(aside), aside, above]), heading, visible
+
+
 class BaselineError(ValueError):
     """A baseline that does not exist."""
 
@@ -464,6 +601,7 @@ BASELINES: dict[str, dict[str, Callable[..., Baseline]]] = {
     "t2": {"pid": TrackingPid.for_vehicle},
     "t3": {"pid": TargetPid.for_vehicle},
     "docking": {"align-insert": DockingPid.for_vehicle},
+    "camera-docking": {"light-servo": LightServo.for_vehicle},
     "pursuit": {"lead": LeadPursuit.for_vehicle},
     "team-pursuit": {"formation": FormationPursuit.for_vehicle},
     "formation": {"consensus": ConsensusFormation.for_vehicle},
@@ -554,9 +692,11 @@ def known_in(environment: Environment) -> Known:
     arrays = environment.arrays
     observed: NDArray[np.float32] = arrays.observation.numpy()
     state = (arrays.position, arrays.quaternion, arrays.velocity)
+    sight = environment.sight
     return Known(
         observed.reshape(len(observed) * environment.agents, -1),
         *(np.asarray(array.numpy()[:, 0], dtype=float) for array in state),
+        pictures=None if sight is None else {name: x.numpy() for name, x in sight.pictures.items()},
     )
 
 
@@ -619,7 +759,7 @@ class PolicyAgent:
 
     def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions for the environment's observations, a row for each agent of each world."""
-        return self.policy.step(memory, known.observation)
+        return self.policy.step(memory, known.observation, known.pictures)
 
     def describe(self) -> dict[str, Any]:
         """Name, network, and what it was trained in."""
@@ -676,7 +816,8 @@ class BaselineAgent(PidAgent):
 
     def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions, a row for each agent of each world."""
-        action, memory = self.controller.act(memory, known.observation)
+        seen = () if known.pictures is None else (known.pictures,)
+        action, memory = self.controller.act(memory, known.observation, *seen)
         return np.clip(action / self.scale, -1.0, 1.0).astype(np.float32), memory
 
 

@@ -92,6 +92,9 @@ class TaskArrays:
     time: wp.array(dtype=float)  # in the episode [s]
     scripted: wp.array2d(dtype=float)  # (worlds, others * size): actions of the vehicles that do not learn
     observation: wp.array2d(dtype=float)  # (worlds, agents * size)
+    taught: wp.array2d(
+        dtype=float
+    )  # (worlds, agents * size): the task's `teacher` parts, for who may know more
     final_observation: wp.array2d(dtype=float)  # last observation of the episode that ended in this step
     reward: wp.array(dtype=float)  # of all agents together: their mean
     agent_reward: wp.array2d(dtype=float)  # (worlds, agents); of a single agent the same memory as `reward`

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
 from finssim.engine import Pool, Simulator, TetherLine, Water
+from finssim.engine.launch import Pipeline
 from finssim.engine.randomize import Draws, Randomization
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
@@ -27,6 +28,7 @@ from finssim.tasks.given import (
 from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
 from finssim.tasks.schedule import Schedule
 from finssim.tasks.sensing import Sensing, SensingBatch
+from finssim.tasks.sight import Sight
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
@@ -177,6 +179,8 @@ class Environment:
                 drawn,
             )
         self._draw(randomization, privileged)
+        self.sight = Sight(task, self.simulator, self.arrays, self.seed) if task.pictures else None
+        """The world that the vehicle sees, and its pictures; None of a task that does not see."""
         self._build()
         self.reset(seed=self.seed)
 
@@ -226,8 +230,11 @@ class Environment:
         self.task.add_evaluate(self._step, batch)
         if self.schedule is not None:
             self.schedule.add(self._step, self.arrays)
-        if self.auto_reset:
+        if self.auto_reset and self.sight is None:
             self._add_start(self._step, self.arrays.done)
+        self._restart = self.simulator.pipeline()
+        if self.auto_reset and self.sight is not None:
+            self._add_start(self._restart, self.arrays.done)
         self._start = self.simulator.pipeline()
         self._add_start(self._start, self._mask)
 
@@ -248,7 +255,7 @@ class Environment:
         self._add_measure(pipeline, mask)
         self.task.add_observe(pipeline, self._batch, mask)
 
-    def reset(self, mask: ArrayLike | None = None, seed: int | None = None) -> NDArray[np.float32]:
+    def reset(self, mask: ArrayLike | None = None, seed: int | None = None) -> Any:
         """Start new episodes.
 
         Args:
@@ -256,7 +263,7 @@ class Environment:
             seed: Start the random streams over with this seed, as if the environment had just been made.
 
         Returns:
-            Observations, (worlds, size), or (worlds, agents, size) of several agents.
+            Observations, as `Step` has them.
 
         Raises:
             EnvironmentSetupError: the seed is out of range.
@@ -266,12 +273,30 @@ class Environment:
                 self.seed = self.simulator.seed = int(seed)
                 self._build()
             self.simulator.restart_episodes(mask)
+            if self.sight is not None:
+                self.sight.restart(self.seed, None if mask is None else np.asarray(mask, dtype=bool))
             if mask is None and self.schedule is not None:
                 self.schedule.restart()
         where = np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
         self._mask.assign(where)
-        self._start.run()
-        return self._by_agent(self.arrays.observation.numpy())
+        self._begin(self._start, where != 0)
+        return self._observed("")
+
+    def _begin(self, pipeline: Pipeline, mask: NDArray[np.bool_]) -> None:
+        """Start episodes in the worlds of the pipeline's mask."""
+        if self.sight is not None:
+            self.sight.draw(mask)
+        pipeline.run()
+        if self.sight is not None:
+            self.sight.begin(mask)
+
+    def _observed(self, which: str) -> Any:
+        """Observations, or with which = `final_` the last of the episodes that ended last; views."""
+        rows = self._by_agent(getattr(self.arrays, f"{which}observation").numpy())
+        if self.sight is None:
+            return rows
+        pictures: dict[str, wp.array] = getattr(self.sight, f"{which}pictures")
+        return {"state": rows, **{name: picture.numpy() for name, picture in pictures.items()}}
 
     def _by_agent(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
         """Rows of a world as rows of its agents, where there are several; a view."""
@@ -326,6 +351,13 @@ class Environment:
         self._steps += 1
         if self.schedule is not None:
             self.schedule.after_step()
+        if self.sight is not None:
+            self.sight.take()
+            ended = self.arrays.done.numpy() != 0
+            if ended.any():
+                self.sight.keep(ended)
+                if self.auto_reset:
+                    self._begin(self._restart, ended)
         # On a GPU the look costs a copy, so frozen worlds wait there for a while, reported as terminated meanwhile.
         look = self.device.is_cpu or self._steps % GPU_FROZEN_CHECK == 0
         if look and self.simulator.state.frozen.numpy().any():
@@ -352,8 +384,8 @@ class Environment:
         a = self.arrays
         reward = a.reward if self.agents == 1 else a.agent_reward
         return Step(
-            self._by_agent(a.observation.numpy()), reward.numpy(), a.terminated.numpy() != 0,
-            a.truncated.numpy() != 0, self._by_agent(a.final_observation.numpy()),
+            self._observed(""), reward.numpy(), a.terminated.numpy() != 0, a.truncated.numpy() != 0,
+            self._observed("final_"),
         )  # fmt: skip
 
     # All that decides what comes next, as NumPy arrays: a run that goes on from them is the same run.
@@ -368,6 +400,8 @@ class Environment:
         saved["counters.seed"], saved["counters.steps"] = np.array(self.seed), np.array(self._steps)
         if self.schedule is not None:
             saved["counters.schedule"] = np.array(self.schedule._steps)
+        if self.sight is not None:
+            saved |= {f"counters.sight.{name}": value for name, value in self.sight.counters().items()}
         reported = np.array(sorted(self.simulator._reported), dtype=np.int64)
         return {**saved, "counters.reported": reported.reshape(-1, 2)}
 
@@ -396,6 +430,9 @@ class Environment:
         self._steps = int(state["counters.steps"])
         if self.schedule is not None:
             self.schedule._steps = int(state["counters.schedule"])
+        if self.sight is not None:
+            mine = {name.removeprefix("counters.sight."): value for name, value in state.items()}
+            self.sight.load_counters(mine)
         self.simulator._reported = {(int(w), int(e)) for w, e in state["counters.reported"]}
 
     def _members(self) -> Iterator[tuple[str, wp.array]]:
@@ -409,6 +446,8 @@ class Environment:
                 yield from ((f"drawing.{name}.{field}", array) for field, array in packed.fields.items())
         if self.schedule is not None:
             yield from ((f"drawing.schedule.{name}", array) for name, array in self.schedule.arrays())
+        if self.sight is not None:
+            yield from self.sight.arrays()
         structs = {"state": simulator.state, "water": simulator.water, "task": self.arrays}
         for name, struct in {**structs, **(self.sensing.structs() if self.sensing else {})}.items():
             yield from _members(name, struct)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,15 +24,16 @@ class EnvironmentSetupError(ValueError):
 class Step:
     """What one step gave; NumPy views of the environment's own arrays, valid until the next step."""
 
-    observation: NDArray[np.float32]
-    """(worlds, size), or (worlds, agents, size) of several agents; the first of the new episode where one ended."""
+    observation: Any
+    """(worlds, size), or (worlds, agents, size) of several agents; the first of the new episode where one ended. Of a
+    task that sees a dictionary: `state`, which is that, and uint8 (worlds, height, width, 3) by each picture's name."""
     reward: NDArray[np.float32]
     """(worlds,), or (worlds, agents)."""
     terminated: NDArray[np.bool_]
     """Ended by the task, (worlds,)."""
     truncated: NDArray[np.bool_]
     """Ended by the time limit, (worlds,)."""
-    final_observation: NDArray[np.float32]
+    final_observation: Any
     """Last observation of the episodes that ended in this step; older rows elsewhere."""
 
 

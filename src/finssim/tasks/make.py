@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from finssim.engine.randomize import Randomization
+from finssim.tasks.camera_docking import CameraDocking
 from finssim.tasks.docking import Docking
 from finssim.tasks.environment import Environment, EnvironmentSetupError
 from finssim.tasks.formation import Formation
@@ -37,7 +38,7 @@ TASKS: dict[str, type[Task]] = {
     "team-pursuit": TeamPursuit,
     "formation": Formation,
 }
-"""Every task by the name that commands take; call it for the task with its default settings."""
+"""Every task of numbers alone by the name that commands take; call it for the task with its default settings."""
 
 
 # Tasks of one's own by name: `path/to/file.py:ClassName`, or `package.module:ClassName` of what Python can import.
@@ -122,6 +123,10 @@ def _of_import(name: str) -> ModuleType:
         raise EnvironmentSetupError(f"module '{name}' cannot be imported: {error}") from error
 
 
+SEEING: dict[str, type[Task]] = {"camera-docking": CameraDocking}
+"""Every task that observes pictures, which needs `finssim[perception]`; otherwise as `TASKS`."""
+
+
 OBSERVED: dict[str, MeasurementNoise | Sensing] = {
     "truth": MeasurementNoise(),
     "estimator": ESTIMATOR,
@@ -154,13 +159,14 @@ def task_named(task: str | Task, **settings: Any) -> Task:
     """
     if isinstance(task, Task):
         return task
-    if task not in TASKS and ":" in task:
+    tasks = {**SEEING, **TASKS}
+    if task not in tasks and ":" in task:
         return own_task(task, **settings)
-    if task not in TASKS:
+    if task not in tasks:
         raise EnvironmentSetupError(
-            f"unknown task '{task}'; available: {', '.join(TASKS)}; or one's own: FILE.py:CLASS"
+            f"unknown task '{task}'; available: {', '.join((*TASKS, *SEEING))}; or one's own: FILE.py:CLASS"
         )
-    made: Task = TASKS[task](**settings)
+    made: Task = tasks[task](**settings)
     return made
 
 

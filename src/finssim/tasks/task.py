@@ -6,7 +6,7 @@ import inspect
 import itertools
 import linecache
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from types import UnionType
 from typing import Any, ClassVar, NamedTuple, Union, get_args, get_origin, get_type_hints
@@ -23,6 +23,7 @@ from finssim.tasks import terms as library
 from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.sight import Picture
 from finssim.tasks.terms import ObservationPart, Terms
 from finssim.vehicles import Vehicle
 
@@ -53,6 +54,16 @@ class Task:
     """Walls and floor, unless others are asked for; None is open water."""
     moving: ClassVar[bool] = False
     """Whether what it goes to moves: a robot is then given a trajectory, otherwise a pose."""
+    world: ClassVar[str] = ""
+    """Site that its vehicle sees, of the catalogue or a file; empty: nothing."""
+    pictures: ClassVar[tuple[Picture, ...]] = ()
+    """What is observed beside the row of numbers."""
+    landmark: ClassVar[str] = ""
+    """Object of the world whose pose is the goal's."""
+    held_out: ClassVar[bool] = False
+    """Whether the looks of the world are drawn that are held out of training."""
+    teacher: ClassVar[tuple[ObservationPart, ...]] = ()
+    """What a teacher observes in training in place of the row and the pictures."""
     succeeds: ClassVar[str] = ""
     """When an episode is a success: `held`, for `hold` seconds at its end; `once`, for `hold` seconds at any time; or
     the name of an end. Empty: nothing is."""
@@ -94,6 +105,11 @@ class Task:
         """Numbers in the observation of an agent."""
         return sum(part.size for part in self.observation)
 
+    def for_teacher(self) -> "Task":
+        """The same task for a teacher, who observes the `teacher` parts and no picture."""
+        blind: dict[str, Any] = {"observation": self.teacher, "world": "", "pictures": ()}
+        return replace(self, **blind)
+
     @property
     def errors(self) -> tuple[int, ...]:
         """Elements of an agent's observation that are 0 where the task wants it, by the parts' `errors`."""
@@ -117,10 +133,13 @@ class Task:
 
     def record(self) -> dict[str, Any]:
         """The settings as plain data: ranges, limits, reward weights."""
-        kept = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "observation"}
-        return {
-            name: asdict(v) if is_dataclass(v) and not isinstance(v, type) else v for name, v in kept.items()
-        }
+
+        def plain(v: Any) -> Any:
+            if isinstance(v, tuple):
+                return tuple(plain(item) for item in v)
+            return asdict(v) if is_dataclass(v) and not isinstance(v, type) else v
+
+        return {one.name: plain(getattr(self, one.name)) for one in fields(self) if one.name != "observation"}
 
     @property
     def vehicles(self) -> tuple[str, ...]:
@@ -152,8 +171,9 @@ class Task:
         """
         agents, totals, earned = len(self.agents), len(self.totals), len(self.earnings)
         observation, action = agents * self.observation_size, agents * action_size
+        taught = agents * sum(part.size for part in self.teacher)
         out: TaskArrays = allocated(
-            TaskArrays, worlds, device, action=action, previous_action=action, observation=observation,
+            TaskArrays, worlds, device, action=action, previous_action=action, observation=observation, taught=taught,
             final_observation=observation, scripted=len(self.others) * action_size, agent_reward=agents, totals=totals,
             final_totals=totals, earned=earned, final_earned=earned,
         )  # fmt: skip
@@ -343,9 +363,13 @@ class _Writer:
 
     def _look(self) -> list[str]:
         """The observation of every agent."""
-        writes, first, size = [], 0, self.task.observation_size
         values, seen = self._shared(self.terms.seen, {})
-        for i, part in enumerate(self.task.observation if self.terms.shown else ()):
+        writes: list[str] = []
+        rows = {"observation": self.task.observation if self.terms.shown else (), "taught": self.task.teacher}
+        parts = [(row, part) for row, own in rows.items() for part in own]
+        sizes = {row: sum(part.size for part in own) for row, own in rows.items()}
+        first = dict.fromkeys(rows, 0)
+        for i, (row, part) in enumerate(parts):
             value = self._value(part.term, f"observation '{part.name}'", **seen, k=str(part.index))
             number = f"x{i}" if part.size == 1 else f"x{i}[i]"
             if part.scale != 1.0:
@@ -354,8 +378,8 @@ class _Writer:
                 number = f"wp.clamp({number}, {-float(part.clip)!r}, {float(part.clip)!r})"
             values.append(f"x{i} = {value}")
             loop = f"for i in range({part.size}):"
-            writes += [loop, f"    arrays.observation[w, a * {size} + {first} + i] = {number}"]
-            first += part.size
+            writes += [loop, f"    arrays.{row}[w, a * {sizes[row]} + {first[row]} + i] = {number}"]
+            first[row] += part.size
         return [self._agents, *_indented([*values, *writes] or ["pass"])]
 
     def _evaluate(self) -> list[str]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import warp as wp
@@ -136,7 +137,8 @@ class Delivery:
         self.sampling = new_sampling(
             [rate] * vehicles, [latency] * vehicles, worlds, control_step, self.device
         )
-        self._updates = 0
+        self.updates = 0
+        """So far: noise differs from one to the next."""
         source, slots = sensor.reading, self.sampling.sent.shape[2]
         width = source.size * source.strides[-1] // sensor.count
         self.reading = wp.zeros_like(source)
@@ -164,13 +166,25 @@ class Delivery:
         inputs = [steps, episode, self._begun, self.sampling, self.loss, self.seed]
         inputs += [self._due, self._stored, self._arrived, self.age]
         wp.launch(_schedule, self.age.shape, inputs, device=self.device)
-        self._updates += 1
-        self.sensor.update(poses, seed=self.seed, time=float(self._updates), mask=self._due)
+        self.updates += 1
+        self.sensor.update(poses, seed=self.seed, time=float(self.updates), mask=self._due)
         source, reading = self._bytes
         span = 16 if self.device.is_cuda else source.shape[1]
         inputs = [source, self._stored, self._arrived, span, self._ring, reading]
         wp.launch(_pass_on, (len(source), -(-source.shape[1] // span)), inputs, device=self.device)
         return self.reading
+
+    def restart(self, seed: int) -> None:
+        """Start noise and losses over with a seed; the next update is the first of an episode in every world."""
+        self.seed, self.updates = seed, 0
+        self._begun.fill_(-1)
+
+    def arrays(self) -> Iterator[tuple[str, wp.array]]:
+        """The arrays that decide what arrives next, by name; with `updates`, and the sensor's own, they are all."""
+        yield from (("measured", self.sensor.reading), ("reading", self.reading), ("age", self.age))
+        yield from (("begun", self._begun), ("ring", self._ring))
+        fields = ((name, getattr(self.sampling, name)) for name in self.sampling._cls.vars)
+        yield from ((name, x) for name, x in fields if isinstance(x, wp.array) and name != "timing")
 
     def numpy(self) -> np.ndarray:
         """A copy of `reading`."""

@@ -365,6 +365,17 @@ class Viewpoint(Part):
         return np.concatenate([self.position, quat_from_euler(0.0, self.pitch, self.yaw)])
 
 
+class Look(Part):
+    """Another look of a site, which a draw may give a world: water and surfaces in place of the file's own."""
+
+    water: WorldWater | None = None
+    """For light alone: sound keeps the file's temperature and salinity."""
+    surfaces: dict[str, Finish] = Field(default_factory=dict)
+    """By the name of an object, or `seabed` or `basin`; echoes are those of these finishes too."""
+    held_out: Annotated[bool, Field(strict=True)] = False
+    """Never drawn in training: what is learnt can be tried there."""
+
+
 class World(Part):
     """A site: what light, sound and hulls meet there. `name` and `path` come from the file's own path."""
 
@@ -377,6 +388,10 @@ class World(Part):
     objects: dict[str, Object] = Field(default_factory=dict)
     contact: Contact = Field(default_factory=lambda: Contact())
     viewpoint: Viewpoint
+    looks: dict[str, Look] = Field(default_factory=dict)
+    """By name; a draw takes the file's own look or one of these, each as often."""
+    colour_vary: Annotated[float, Field(strict=True, ge=1.0, le=4.0)] = 1.0
+    """Largest factor by which colour and glow of each object are drawn darker or brighter, log-uniformly."""
     name: str = Field(exclude=True)
     path: Path = Field(exclude=True)
 
@@ -392,6 +407,13 @@ class World(Part):
             earlier.append(name)
         if (count := sum(len(item.positions) for item in self.objects.values())) > LARGEST:
             raise refuse_section(f"objects: {count} shapes with their copies, expected at most {LARGEST}")
+        surfaces = [*earlier, *(name for name in ("basin", "seabed") if getattr(self, name) is not None)]
+        for look, name in ((look, name) for look, one in self.looks.items() for name in one.surfaces):
+            if name not in surfaces:
+                raise refuse_section(
+                    f"looks.{look}.surfaces: '{name}' is no object of this world{did_you_mean(name, surfaces)} "
+                    f"expected of: {', '.join(surfaces)}"
+                )
         return self
 
     def beside(self, file: str, key: str) -> Path:

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike
 
 from finssim.geometry.rotations import quat_rotate
-from finssim.worlds.description import World
+from finssim.worlds.description import Look, World
 from finssim.worlds.layout import WorldLayout
 
 TEXTURES = {None: 0, "checker": 1, "stripes": 2, "tiles": 3, "mottled": 4}
@@ -37,7 +36,7 @@ class Optics:
 
     attenuation: wp.array(dtype=wp.vec3)  # c [1/m]
     daylight_attenuation: wp.array(dtype=wp.vec3)  # K_d [1/m]
-    veil: wp.vec3  # B just below the surface
+    veil: wp.array(dtype=wp.vec3)  # B just below the surface
     daylight: wp.vec3  # irradiance there
     sun: wp.vec3  # unit vector towards it
     diffuse: float  # share of the irradiance from everywhere above
@@ -82,26 +81,36 @@ class WorldBatch(WorldLayout):
         )
         self.optics = self._optics()
         self.grain = wp.array(_grain(), dtype=float, device=self.device)
-        self._show()
+        self._tables = np.stack([self._surfaces(look) for look in self.looks])
+        self._table = np.tile(self._tables[0], (worlds, 1))
+        self._place(np.arange(worlds))
 
-    def draw(self, seed: int, mask: ArrayLike | None = None) -> None:
-        """Draw poses of objects, and the water, of worlds anew; world w depends on `seed` and w alone.
-
-        Args:
-            seed: Of the draw.
-            mask: Which worlds; all if None. (worlds,)
-        """
-        super().draw(seed, mask)
-        self._show()
-
-    def _show(self) -> None:
-        """Give the ray caster the poses, and light the water."""
-        water, factor = self.world.water, self.water_factor[:, None]
-        self.optics.attenuation.assign(np.float32(factor * water.attenuation))
-        self.optics.daylight_attenuation.assign(np.float32(factor * water.daylight_attenuation))
+    def _place(self, rows: np.ndarray) -> None:
+        """Set water, surfaces and poses of some worlds, (k,), from what is drawn of them; see `WorldLayout`."""
+        super()._place(rows)
+        drawn, look = self._drawn[rows], self._look[rows]
+        waters = [self.world.water if one is None or one.water is None else one.water for one in self.looks]
+        factor = np.exp(drawn[:, :1] * np.log([[water.vary] for water in waters])[look])
+        for array, name, scale in (
+            (self.optics.attenuation, "attenuation", factor),
+            (self.optics.daylight_attenuation, "daylight_attenuation", factor),
+            (self.optics.veil, "veil", 1.0),
+        ):
+            values = array.numpy().copy()
+            values[rows] = scale * np.array([getattr(water, name) for water in waters])[look]
+            array.assign(values)
         self.model.shape_transform.assign(self.transforms.flatten())
         self.model.bvh_refit_shapes(self.state)
-        self._set_surfaces()
+        table = self._tables[look]
+        level = np.exp(drawn[:, 1 + 4 * len(self._varied) :] * np.log(self.world.colour_vary))
+        level = level[:, [self._owners.index(shape.owner) for shape in self.shapes], None]
+        for name in ("colour", "second", "glow"):
+            table[name] *= level
+        back = self._pose[rows] * [1, 1, 1, -1, -1, -1, 1]
+        back[..., :3] = -quat_rotate(back[..., 3:], back[..., :3])
+        table["inverse"] = back
+        self._table[rows] = table
+        self.surfaces = wp.array(self._table.reshape(-1), dtype=Surface, device=self.device)
 
     # ---- set-up
 
@@ -141,27 +150,25 @@ class WorldBatch(WorldLayout):
         optics.daylight_attenuation = wp.full(
             self.worlds, wp.vec3(*water.daylight_attenuation), wp.vec3, self.device
         )
-        optics.veil, optics.daylight = wp.vec3(*water.veil), wp.vec3(*light.daylight)
+        optics.veil = wp.full(self.worlds, wp.vec3(*water.veil), wp.vec3, self.device)
+        optics.daylight = wp.vec3(*light.daylight)
         optics.sun = wp.normalize(wp.vec3(*light.sun))
         optics.diffuse, optics.sky = light.diffuse, wp.vec3(*light.sky)
         return optics
 
-    def _set_surfaces(self) -> None:
-        """The table of surfaces by shape, over all worlds."""
-        one = np.zeros(len(self.shapes), Surface.numpy_dtype())
-        for row, shape in zip(one, self.shapes, strict=True):
-            finish = shape.finish
+    def _surfaces(self, look: Look | None) -> np.ndarray:
+        """The surfaces of one world's shapes in a look, poses left out."""
+        table = np.zeros(len(self.shapes), Surface.numpy_dtype())
+        for row, shape in zip(table, self.shapes, strict=True):
+            other = look.surfaces.get(shape.owner) if look is not None else None
+            finish = shape.finish if other is None else other
             row["colour"] = row["second"] = finish.colour
             row["glow"] = finish.glow
             row["backscatter"] = 10.0 ** (0.1 * finish.backscatter_strength_db)
             if (texture := finish.texture) is not None:
                 row["texture"], row["size"] = TEXTURES[texture.kind], texture.size
                 row["contrast"], row["second"] = texture.contrast, texture.colour
-        table = np.tile(one, self.worlds)
-        back = self._pose.reshape(-1, 7) * [1, 1, 1, -1, -1, -1, 1]
-        back[:, :3] = -quat_rotate(back[:, 3:], back[:, :3])
-        table["inverse"] = back
-        self.surfaces = wp.array(table, dtype=Surface, device=self.device)
+        return table
 
 
 def _grain(side: int = 256, patches: int = 16) -> np.ndarray:

@@ -385,7 +385,7 @@ def _take_picture(
     pose = poses[v]
     c = optics.attenuation[w]
     K = optics.daylight_attenuation[w]
-    veil = optics.veil
+    veil = optics.veil[w]
     daylight = optics.daylight
     diffuse = optics.diffuse
     sun = (1.0 - diffuse) / optics.sun[2] * optics.sun

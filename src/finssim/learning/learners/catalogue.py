@@ -62,6 +62,8 @@ class LearnerKind:
     """What of FinsSim must be installed, as pip takes it."""
     agents: str = "any"
     """How many agents of a task it can train: one, several, or any."""
+    sees: bool = False
+    """Whether it trains tasks that observe pictures, and these alone."""
     own: type | None = None
     """The class itself, of a learner from outside the package."""
 
@@ -105,6 +107,10 @@ class LearnerKind:
         Raises:
             LearningError: It cannot.
         """
+        if bool(task.pictures) != self.sees and self.own is None:
+            able = [name for name, kind in LEARNERS.items() if kind.sees == bool(task.pictures)]
+            observes = "pictures" if task.pictures else "no pictures"
+            raise LearningError(f"task '{task.name}' observes {observes}: take {', '.join(able)}")
         n = len(task.agents)
         if (self.agents == "one" and n > 1) or (self.agents == "several" and n == 1):
             able = [
@@ -159,6 +165,14 @@ LEARNERS: dict[str, LearnerKind] = {
     "bc": LearnerKind("imitation", "Bc", "behaviour cloning of demonstrations", extra="imitation"),
     "dagger": LearnerKind(
         "imitation", "Dagger", "DAgger: an expert says what it would have done", extra="imitation"
+    ),
+    "distill": LearnerKind(
+        "distill",
+        "Distill",
+        "a teacher by PPO, who shows a student with a camera what to do",
+        extra="perception",
+        agents="one",
+        sees=True,
     ),
     "gail": LearnerKind("gail", "Gail", "GAIL: PPO judged against demonstrations", extra="imitation,torchrl"),
 }

@@ -1,0 +1,99 @@
+"""A teacher and a student with a camera: training, its policy directory, and who runs it."""
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+pytest.importorskip("newton")
+
+from finssim.control.policy import Policy, PolicyError
+from finssim.experiments.plants import load_plant
+from finssim.experiments.trials import run_episodes
+from finssim.learning.export import write_seeing
+from finssim.learning.learners import LearningError, learner_named
+from finssim.learning.recurrent import SeeingNetwork
+from finssim.learning.train import train
+from finssim.tasks import Environment
+from finssim.tasks.agents import agent_for
+from finssim.tasks.camera_docking import CameraDocking
+from finssim.vehicles import load_vehicle
+
+pytestmark = pytest.mark.slow
+TINY = {"worlds": 8, "teacher_worlds": 64, "teacher_steps": 2048, "steps": 400, "batch": 64, "kept": 300}
+TASK = CameraDocking(time_limit=2.0)
+
+
+def test_a_network_that_sees_is_the_same_in_onnx():
+    torch.manual_seed(0)
+    network = SeeingNetwork(5, {"left": (9, 14, 3), "right": (6, 6, 3)}, 4)
+    torch.nn.init.normal_(network.layers[-1].weight, std=0.2)
+    random = np.random.default_rng(1)
+    row = random.normal(size=(7, 5)).astype(np.float32)
+    pictures = {
+        name: random.integers(0, 256, (7, *shape), np.uint8) for name, shape in network.shapes.items()
+    }
+    session = onnxruntime.InferenceSession(write_seeing(network, 5, 4))
+    (action,) = session.run(["action"], {"observation": row, **pictures})
+    expected = network(torch.from_numpy(row), **{k: torch.from_numpy(p) for k, p in pictures.items()})
+    np.testing.assert_allclose(action, expected.detach().clamp(-1.0, 1.0), atol=1e-5)
+    assert action.std() > 0.01
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    return train(TASK, out=tmp_path_factory.mktemp("seen") / "policy", seed=1, settings=TINY)
+
+
+def test_a_policy_directory_says_what_it_sees_and_runs_in_episodes(trained):
+    policy = Policy.load(trained)
+    ((name, about),) = policy.description.pictures.items()
+    assert name == "front_camera" and about["shape"] == [27, 48, 3] and about["rate"] == 10.0
+    assert policy.description.training["learner"] == "distill"
+    vehicle = load_vehicle("finsrov")
+    agent = agent_for(trained, vehicle, TASK)
+    rows = run_episodes(agent, TASK, vehicle, load_plant("nominal"), trials=3, seed=5)
+    assert all(row["return"] is not None for row in rows)
+
+
+def test_a_policy_refuses_to_act_blind(trained):
+    policy, row = Policy.load(trained), np.zeros((2, 10))
+    with pytest.raises(PolicyError, match="sees front_camera: it is given nothing"):
+        policy.step(None, row)
+    with pytest.raises(PolicyError, match="expected uint8"):
+        policy.step(None, row, {"front_camera": np.zeros((2, 36, 64, 3), np.uint8)})
+
+
+def test_learners_of_rows_refuse_tasks_that_see_and_the_other_way_round():
+    with pytest.raises(LearningError, match="observes pictures: take distill"):
+        learner_named("ppo").check(CameraDocking())
+    with pytest.raises(LearningError, match="observes no pictures"):
+        learner_named("distill").check(CameraDocking().for_teacher())
+
+
+def test_a_training_goes_on_from_its_state_bit_for_bit():
+    kind = learner_named("distill")
+    learners = []
+    for _ in range(2):
+        environment = Environment(TASK, worlds=8, seed=3)
+        learners.append(kind(environment, kind.settings(TASK, changes=TINY), seed=3))
+    one, other = learners
+    one.update()
+    state = one.state()
+    row = one.update()
+    other.load(state)
+    assert other.update() == row
+    for a, b in zip(one.student.parameters(), other.student.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_the_student_learns_what_the_teacher_does():
+    """The teacher goes straight ahead: after a few rounds the student does too, and its buffer is no larger."""
+    kind = learner_named("distill")
+    changes = {**TINY, "expert_rounds": 1, "steps": 2000, "learning_rate": 3e-3}
+    learner = kind(Environment(TASK, worlds=8, seed=3), kind.settings(TASK, changes=changes), seed=3)
+    learner.update()
+    learner._labels = lambda: torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]).repeat(8, 1)
+    for _ in range(8):
+        row = learner.update()
+    assert row["imitation_loss"] < 0.02 and len(learner._kept["action"]) == 300
