@@ -58,10 +58,11 @@ class Motion:
 
 @wp.struct
 class Touch:
-    """What walls and a dock do to a vehicle."""
+    """What walls, a dock and the solids of a world do to a vehicle."""
 
     tau: vec6  # wrench about the body origin, body frame [N, N m]
     push: float  # size of the dock's force [N]
+    strike: float  # size of the force of the world's solids [N]
 
 
 @wp.func

@@ -16,6 +16,7 @@ from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
 from finssim.engine.plant_arrays import SimulatorError, build_plant
 from finssim.engine.post_mortem import write_post_mortem
+from finssim.engine.solids import WorldSolids, layout_of, look_around, pool_of
 from finssim.engine.state import VehicleState, clear_actuators, new_state
 from finssim.engine.step import physics_kernel, tick
 from finssim.engine.surroundings import Pool, TetherLine, Water
@@ -24,6 +25,7 @@ from finssim.physics.funnel import Funnel
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh
 from finssim.physics.plant import VehicleCommand, refresh_plant
+from finssim.physics.solids import Solids
 from finssim.physics.tether import Tether
 from finssim.physics.water import advance_drift
 from finssim.vehicles import Vehicle, load_vehicle
@@ -40,6 +42,9 @@ class Simulator:
         plant: Parameters by (world, vehicle); after writing any of them call `refresh`.
         water: Water by world.
         funnel: Poses of the docks, and how hard vehicles touched them, by world.
+        world: `finssim.worlds.WorldLayout` of the described world, whose `draw` moves its solids; None without one.
+        solids: Of that world; `solids.force` is the greatest force on each vehicle in the last control step [N],
+            float (worlds, vehicles).
         tether: Lines by (world, vehicle).
     """
 
@@ -56,6 +61,7 @@ class Simulator:
         pool: Pool | None = None,
         tether: TetherLine | None = None,
         dock: Dock | None = None,
+        world: Any = None,
         device: str = "cpu",
         threads: int | None = None,
         seed: int = 0,
@@ -77,6 +83,8 @@ class Simulator:
             pool: Walls and floor; open water if None.
             tether: On every vehicle; none if None.
             dock: One in every world, which touches every vehicle; none if None.
+            world: Site that vehicles collide with, and start in: a name of `finssim worlds list`, a path, or a
+                `finssim.worlds` `World`, `WorldLayout` or `WorldBatch` of as many worlds. Its basin is the pool.
             device: Warp device, `cpu` or `cuda`.
             threads: Threads on a CPU; all processors if None.
             seed: Of everything random in the worlds.
@@ -103,12 +111,25 @@ class Simulator:
         self.worlds, self.control_step, self.substeps, self.seed = worlds, control_step, substeps, seed
         self.device = find_device(device)
         self._drifts = water_drifts or (water is not None and water.drifting)
+        self.world = None if world is None else layout_of(world, worlds, self.device)
+        if self.world is not None:
+            if pool is not None:
+                raise SimulatorError(
+                    "pool and world are given: leave pool out, the world's basin is the pool"
+                )
+            pool = pool_of(self.world.world)
         self._surround(water or Water(), pool, tether, max_waves, water_moves or water_drifts)
         self._hulls()
         n = len(self.vehicles)
         self.dock = dock
         self.funnel = dock.struct(worlds, n, self.device) if dock else Funnel()
         self.plant = build_plant(self.vehicles, hydrodynamics, worlds, self._hull_index, self.device)
+        self._solids = None
+        if self.world is not None:
+            lightest = min(float(np.diag(v.mass_matrix(hydrodynamics))[:3].min()) for v in self.vehicles)
+            solids = WorldSolids(self.world, n, lightest)
+            self._solids = solids if solids.count else None
+        self.solids = self._solids.struct if self._solids is not None else Solids()
         self.command = Packed(VehicleCommand, (worlds, n), self.device)
         longest = 2.0 * float(self.plant.delay.numpy().max()) if max_delay is None else max_delay
         slots = math.ceil(longest / control_step) + 2
@@ -126,7 +147,8 @@ class Simulator:
         self.add_step(self._step)
         self._reported: set[tuple[int, int]] = set()
         self.refresh()
-        self.place(position=(0.0, 0.0, -0.5 * (pool.depth if pool else 1.0)))
+        start: Any = (0.0, 0.0, -0.5 * (pool.depth if pool else 1.0))
+        self.place(position=start if self.world is None else self.world.world.viewpoint.position)
 
     def _surround(
         self, water: Water, pool: Pool | None, tether: TetherLine | None, max_waves: int, moves: bool
@@ -157,6 +179,9 @@ class Simulator:
         if self._drifts:
             s = self.state
             pipeline.add(advance_drift, [self.water, s.steps, self.control_step, self.seed, s.episode])
+        if self._solids is not None:
+            inputs = [self.state, self.solids, self.plant.array, self.control_step]
+            pipeline.add(look_around, inputs, len(self.vehicles))
         # One world at a time on a processor, what is not there costs less than another kernel takes to compile.
         general = self.device.is_cpu and not self.in_lanes
         kernel = physics_kernel(
@@ -168,9 +193,10 @@ class Simulator:
             speed_lag=general or bool(self.plant.speed_lag.numpy().any()),
             terms=self.plant.terms,
             funnel_present=self.dock is not None,
+            solids_present=self._solids is not None,
             lanes=self.in_lanes,
         )
-        around = [self.hull, self.water, self.walls, self.tether.array, self.funnel]
+        around = [self.hull, self.water, self.walls, self.tether.array, self.funnel, self.solids]
         s = self.state
         clocks = [s.commands, s.history, s.steps, s.broken, s.frozen]
         inputs = [

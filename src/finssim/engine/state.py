@@ -25,13 +25,14 @@ class VehicleState:
     pressed: vec6  # mean nu_dot of the last substep by contacts
     actuator: vec8  # lagged force [N] or propeller speed [rad/s]
     thrust: vec8  # delivered by each thruster [N]
+    clearing: wp.vec4  # a ball without solids of the world: centre, world frame, and radius [m]
 
 
 @wp.struct
 class State:
     """Views of the vehicles' states by (world, vehicle); clocks and status by world; delay line and history."""
 
-    vehicle: wp.array2d(dtype=VehicleState)  # the memory behind the eight views that follow
+    vehicle: wp.array2d(dtype=VehicleState)  # the memory behind the nine views that follow
     position: wp.array2d(dtype=wp.vec3)  # body origin, world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)  # body to world, xyzw
     velocity: wp.array2d(dtype=vec6)  # nu, body frame [m/s, rad/s]
@@ -40,6 +41,7 @@ class State:
     pressed: wp.array2d(dtype=vec6)  # mean nu_dot of the last substep by contacts
     actuator: wp.array2d(dtype=vec8)  # lagged force [N] or propeller speed [rad/s]
     thrust: wp.array2d(dtype=vec8)  # delivered by each thruster [N]
+    clearing: wp.array2d(dtype=wp.vec4)  # a ball without solids: centre, world frame, and radius [m]
     commands: wp.array3d(dtype=vec8)  # delay line: past commands, a ring over control steps
     steps: wp.array(dtype=int)  # control steps since the world's reset
     episode: wp.array(dtype=int)  # resets so far

@@ -43,6 +43,7 @@ from finssim.physics.inertia import (
 from finssim.physics.kinematics import position_rate, quaternion_rate, rotate_by, up_in_body
 from finssim.physics.motors import admissible, first_order
 from finssim.physics.plant import VehicleCommand, VehicleParameters, mass_matrix
+from finssim.physics.solids import Solids, solids_within, solids_wrench
 from finssim.physics.terms.composed import composed, row_length
 from finssim.physics.tether import Tether, tether_wrench
 from finssim.physics.types import angular, join, linear, symmetric_times, vec6, vec8
@@ -70,6 +71,8 @@ class Course:
     pressed: vec6  # mean acceleration by contacts in the last substep
     greatest: float  # force of the dock so far [N]
     impulse: float  # of the dock so far [N s]
+    clearing: wp.vec4  # as in the state
+    struck: float  # greatest force of the world's solids so far [N]
 
 
 @cache
@@ -82,6 +85,7 @@ def physics_kernel(
     speed_lag: bool = True,
     terms: tuple[Term, ...] = (),
     funnel_present: bool = False,
+    solids_present: bool = False,
     lanes: bool = False,
 ) -> wp.Kernel:
     """The kernel for one hydrodynamic model and one integrator, without the code that a simulation does not need.
@@ -95,6 +99,7 @@ def physics_kernel(
         speed_lag: Whether some vehicle's motors lag in speed rather than in force.
         terms: Those that some vehicle has, in the order of the rows of their parameters.
         funnel_present: Whether there is a dock to enter.
+        solids_present: Whether there is a world with solids to bump into.
         lanes: Whether worlds go in blocks of `LANES`, on a processor; see `finssim.engine.lanes`.
 
     Returns:
@@ -105,7 +110,7 @@ def physics_kernel(
     term_wrench, term_slope = composed(terms, "wrench"), composed(terms, "slope")
     runge_kutta = integrator == "rk4"
     added_mass = model != "simplified"
-    contacts = walls_present or funnel_present
+    contacts = walls_present or funnel_present or solids_present
     contact_step = DOCK_STEP if funnel_present else WALL_STEP
 
     @wp.func
@@ -219,19 +224,25 @@ def physics_kernel(
         plant: wp.array2d(dtype=VehicleParameters),
         walls: PoolWalls,
         funnel: Funnel,
+        solids: Solids,
+        clearing: wp.vec4,
         w: int,
         v: int,
         position: wp.vec3,
         q: wp.quat,
         nu: vec6,
     ) -> Touch:
-        """Wrench of walls and dock, and the size of the dock's force."""
+        """Wrench of walls, dock and solids, and the sizes of the forces of the latter two."""
         out = Touch()
         if wp.static(walls_present):
             out.tau = contact_wrench(walls, position, q, nu, plant[w, v].half_size)
         if wp.static(funnel_present):
             tau = funnel_wrench(funnel, w, position, q, nu, plant[w, v].half_size)
             out.push = wp.length(linear(tau))
+            out.tau += tau
+        if wp.static(solids_present):
+            tau = solids_wrench(solids, clearing, w, v, position, q, nu, plant[w, v].half_size)
+            out.strike = wp.length(linear(tau))
             out.tau += tau
         return out
 
@@ -264,6 +275,8 @@ def physics_kernel(
         out.coasting = state[w, v].coasting
         out.pressed = state[w, v].pressed
         out.x_dot = position_rate(out.quaternion, out.velocity)
+        if wp.static(solids_present):
+            out.clearing = state[w, v].clearing
         return out
 
     @wp.func
@@ -277,6 +290,7 @@ def physics_kernel(
         walls: PoolWalls,
         tether: wp.array2d(dtype=Tether),
         funnel: Funnel,
+        solids: Solids,
         w: int,
         v: int,
         head: int,
@@ -298,6 +312,7 @@ def physics_kernel(
         pressed = course.pressed
         greatest = course.greatest
         impulse = course.impulse
+        struck = course.struck
         other = command[w, v].disturbance
         max_change = h * plant[w, v].slew
         rate = 1.0 / control_step
@@ -314,9 +329,10 @@ def physics_kernel(
             outer = other
             actuator = after
             if wp.static(contacts):
-                touch = contact_at(plant, walls, funnel, w, v, position, q, nu)
+                touch = contact_at(plant, walls, funnel, solids, course.clearing, w, v, position, q, nu)
                 greatest = wp.max(greatest, touch.push)
                 impulse += h * touch.push
+                struck = wp.max(struck, touch.strike)
                 outer = other + touch.tau
             q1 = quaternion_rate(q, angular(nu))
             n1 = motion_at(
@@ -344,7 +360,9 @@ def physics_kernel(
             x2 = position_rate(qm, nu2)
             q2 = quaternion_rate(qm, angular(nu2))
             if wp.static(contacts):
-                outer = other + contact_at(plant, walls, funnel, w, v, xm, qm, nu2).tau
+                outer = (
+                    other + contact_at(plant, walls, funnel, solids, course.clearing, w, v, xm, qm, nu2).tau
+                )
             n2 = motion_at(
                 plant, extra, hull, water, tether, w, v, xm, qm, nu2, nu2, thrust, pushed, outer, t + 0.5 * h,
                 elapsed + 0.5 * h, 0.0,
@@ -355,7 +373,9 @@ def physics_kernel(
             x3 = position_rate(qn, nu3)
             q3 = quaternion_rate(qn, angular(nu3))
             if wp.static(contacts):
-                outer = other + contact_at(plant, walls, funnel, w, v, xn, qn, nu3).tau
+                outer = (
+                    other + contact_at(plant, walls, funnel, solids, course.clearing, w, v, xn, qn, nu3).tau
+                )
             n3 = motion_at(
                 plant, extra, hull, water, tether, w, v, xn, qn, nu3, nu3, thrust, pushed, outer, t + 0.5 * h,
                 elapsed + 0.5 * h, 0.0,
@@ -366,7 +386,9 @@ def physics_kernel(
             x4 = position_rate(qe, nu4)
             q4 = quaternion_rate(qe, angular(nu4))
             if wp.static(contacts):
-                outer = other + contact_at(plant, walls, funnel, w, v, xe, qe, nu4).tau
+                outer = (
+                    other + contact_at(plant, walls, funnel, solids, course.clearing, w, v, xe, qe, nu4).tau
+                )
             n4 = motion_at(
                 plant,
                 extra,
@@ -402,6 +424,8 @@ def physics_kernel(
                     near = walls_within(walls, position, q, half_size, h * slack)
                 if wp.static(funnel_present):
                     near = near or funnel_within(funnel, w, position, half_size, h * slack)
+                if wp.static(solids_present):
+                    near = near or solids_within(course.clearing, position, half_size, h * slack)
             # What leans on a wall does not fall through it, and the water must not feel that it did. A wall's push is
             # expected to stop a vehicle at most: expected to throw it back, it would feed on itself. A dock's is short.
             lead = h * lead_of(nu, h)
@@ -434,13 +458,18 @@ def physics_kernel(
             else:
                 if wp.static(contacts):
                     parts = int(wp.ceil(h / wp.static(contact_step) - 1.0e-4))
+                    if wp.static(solids_present):
+                        parts = wp.max(parts, int(wp.ceil(h / solids.step - 1.0e-4)))
                     d = h / float(parts)
                     for _ in range(parts):
                         position = position + 0.5 * d * x_dot
                         q = rotate_by(q, angular(nu), 0.5 * d)
-                        touch = contact_at(plant, walls, funnel, w, v, position, q, nu)
+                        touch = contact_at(
+                            plant, walls, funnel, solids, course.clearing, w, v, position, q, nu
+                        )
                         greatest = wp.max(greatest, touch.push)
                         impulse += d * touch.push
+                        struck = wp.max(struck, touch.strike)
                         push = yielding(plant, w, v, motion.wet, touch.tau)
                         pressed += push / float(parts)
                         nu = nu + d * (nu_dot + push)
@@ -457,6 +486,8 @@ def physics_kernel(
         out.pressed = pressed
         out.greatest = greatest
         out.impulse = impulse
+        out.clearing = course.clearing
+        out.struck = struck
         return out
 
     @wp.func
@@ -507,6 +538,7 @@ def physics_kernel(
         walls: PoolWalls,
         tether: wp.array2d(dtype=Tether),
         funnel: Funnel,
+        solids: Solids,
         control_step: float,
         substeps: int,
         w: int,
@@ -540,6 +572,7 @@ def physics_kernel(
                 walls,
                 tether,
                 funnel,
+                solids,
                 w,
                 v,
                 head,
@@ -550,6 +583,8 @@ def physics_kernel(
                 course,
             )
         arrive(state, history, broken, plant, funnel, w, v, step % wp.static(HISTORY), course)
+        if wp.static(solids_present):
+            solids.force[w, v] = course.struck
 
     @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
     def physics_step(
@@ -567,6 +602,7 @@ def physics_kernel(
         walls: PoolWalls,
         tether: wp.array2d(dtype=Tether),
         funnel: Funnel,
+        solids: Solids,
         control_step: float,
         substeps: int,
         world_offset: int,
@@ -577,7 +613,7 @@ def physics_kernel(
             return
         step_vehicle(
             state, command, commands, history, steps, broken, plant, extra, hull, water, walls, tether, funnel,
-            control_step, substeps, w, v,
+            solids, control_step, substeps, w, v,
         )  # fmt: skip
 
     if not lanes:
@@ -601,6 +637,7 @@ def physics_kernel(
         walls: PoolWalls,
         tether: wp.array2d(dtype=Tether),
         funnel: Funnel,
+        solids: Solids,
         control_step: float,
         substeps: int,
         shared: wp.array(dtype=int),
@@ -618,14 +655,18 @@ def physics_kernel(
             if ((done >> k) & 1) == 0 and frozen[w + k] == 0:
                 step_vehicle(
                     state, command, commands, history, steps, broken, plant, extra, hull, water, walls, tether, funnel,
-                    control_step, substeps, w + k, v,
+                    solids, control_step, substeps, w + k, v,
                 )  # fmt: skip
 
     return physics_blocks
 
 
-SUBMERGED = {"position": (0.0, 0.0, -5.0), "quaternion": (0.0, 0.0, 0.0, 1.0)}
-"""Example of a state, in which the vehicle is under water."""
+SUBMERGED = {
+    "position": (0.0, 0.0, -5.0),
+    "quaternion": (0.0, 0.0, 0.0, 1.0),
+    "clearing": (0.0, 0.0, -5.0, 1e3),
+}
+"""Example of a state, in which the vehicle is under water, far from everything."""
 WIDE = {"half_length": 1e3, "half_width": 1e3, "depth": 1e3}
 """Example of a pool, whose walls are far away."""
 
@@ -667,6 +708,7 @@ def lane_block(set_out: Any, substep: Any, arrive: Any, term_numbers: int) -> An
             water,
             walls,
             tether,
+            None,
             None,
             0,
             0,

@@ -1,6 +1,6 @@
 """Worlds as data, and the sensors that see and hear them: cameras, imaging sonars, altimeters, DVL beams.
 
-`finssim.worlds.description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
+`WorldLayout`, `finssim.worlds.description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
 (`pip install 'finssim[perception]'`). What computes is imported when it is first named: a robot that
 reads what its devices are starts without Warp.
 """
@@ -20,6 +20,7 @@ from finssim.worlds.description import (
 
 if TYPE_CHECKING:
     from finssim.worlds.delivery import Delivery
+    from finssim.worlds.layout import WorldLayout
     from finssim.worlds.model import WorldBatch
     from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of, sensor_of
 
@@ -32,6 +33,7 @@ __all__ = [
     "World",
     "WorldBatch",
     "WorldError",
+    "WorldLayout",
     "device_of",
     "devices",
     "load_device",
@@ -45,5 +47,5 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = {"Delivery": "delivery", "WorldBatch": "model"}.get(name, "sensors")
+    home = {"Delivery": "delivery", "WorldBatch": "model", "WorldLayout": "layout"}.get(name, "sensors")
     return getattr(import_module(f"finssim.worlds.{home}"), name)

@@ -171,6 +171,8 @@ class Object(Finish):
     """Factor on the file's coordinates."""
     vary: Variation | None = None
     repeat: Repeat | None = None
+    solid: bool = True
+    """Whether vehicles collide with it; of a group, nothing."""
 
     @model_validator(mode="after")
     def _complete(self) -> Object:
@@ -336,6 +338,17 @@ class Light(Part):
         return self
 
 
+class Contact(Part):
+    """How hard basin, seabed and objects are where a hull touches them: spring, damper and friction at each point."""
+
+    stiffness: Positive = 4000.0
+    """Per corner, or sphere, of the hull [N/m]."""
+    damping: NonNegative = 100.0
+    """Against approach [N s/m]."""
+    friction: NonNegative = 0.2
+    """Coulomb coefficient."""
+
+
 class Viewpoint(Part):
     """Where a vehicle looks from: what `finssim worlds show` draws, and where one may start."""
 
@@ -373,6 +386,7 @@ class World(Part):
     basin: Basin | None = None
     seabed: Seabed | None = None
     objects: dict[str, Object] = Field(default_factory=dict)
+    contact: Contact = Field(default_factory=lambda: Contact())
     viewpoint: Viewpoint
     looks: dict[str, Look] = Field(default_factory=dict)
     """By name; a draw takes the file's own look or one of these, each as often."""

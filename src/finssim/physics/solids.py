@@ -1,0 +1,334 @@
+"""Solids that stand in the water, as a penalty on points and spheres of the vehicle's hull.
+
+The hull is the eight corners of its envelope box, as a pool's walls meet them, and spheres within it, a tenth of the
+least half extent inside its faces: flat solids meet the corners alone, and thin ones do not pass between them.
+"""
+
+# mypy: disable-error-code="arg-type,attr-defined,call-overload,index,no-any-return"
+# mypy: disable-error-code="no-untyped-call,operator,return-value,valid-type"
+
+import warp as wp
+
+from finssim.physics.contact import penalty_force
+from finssim.physics.types import angular, join, linear, vec6
+
+BOX, SPHERE, CAPSULE, CYLINDER, PLANE, MESH, HEIGHTFIELD = (wp.constant(k) for k in range(7))
+FARTHEST = wp.constant(1.0e3)
+"""Free water is not looked for beyond [m]."""
+NEIGHBOURS = 32
+"""Solids near a vehicle that are remembered; where there are more, all of the world are looked at."""
+
+
+@wp.struct
+class Solids:
+    """Solids of one kind and size each in every world, whose poses differ."""
+
+    kind: wp.array(dtype=int)  # BOX ... HEIGHTFIELD
+    size: wp.array(dtype=wp.vec3)  # half extents; radius and half length; of a mesh: 1 if closed
+    bound: wp.array(dtype=float)  # radius of the ball around its origin that holds it [m]
+    mesh: wp.array(dtype=wp.uint64)  # of meshes
+    heights: wp.array2d(dtype=float)  # of the heightfield: z by (y, x) [m]
+    gentle: float  # cosine of the heightfield's steepest slope
+    shape: wp.array(dtype=int)  # index of each among the poses
+    pose: wp.array2d(dtype=wp.transform)  # to world, by (world, shape)
+    draws: wp.array(dtype=int)  # changes with the poses of a world
+    drawn: wp.array2d(dtype=int)  # at the last look around, by (world, vehicle)
+    near: wp.array3d(dtype=int)  # which solids were near at that look, by (world, vehicle, NEIGHBOURS)
+    count: wp.array2d(dtype=int)  # how many there were
+    reach: wp.array2d(dtype=float)  # how far the vehicle may have come from there without meeting others [m]
+    stiffness: float  # per point or sphere of the hull [N/m]
+    damping: float  # per point, against approach only [N s/m]
+    friction: float  # Coulomb coefficient
+    step: float  # longest step in which contacts are integrated [s]
+    force: wp.array2d(dtype=float)  # greatest contact force on a vehicle in the last control step [N]
+
+
+@wp.func
+def box_distance(x: wp.vec3, half: wp.vec3) -> wp.vec4:
+    """Normal and signed distance of a box.
+
+    Args:
+        x: A point, box axes [m].
+        half: Half extents [m].
+
+    Returns:
+        Gradient of the distance, box axes, and the distance, negative inside [m].
+    """
+    q = wp.abs(x) - half
+    sign = wp.vec3(wp.sign(x[0]), wp.sign(x[1]), wp.sign(x[2]))
+    out = wp.vec3(wp.max(q[0], 0.0), wp.max(q[1], 0.0), wp.max(q[2], 0.0))
+    d = wp.length(out)
+    if d > 0.0:
+        n = wp.cw_mul(sign, out) / d
+        return wp.vec4(n[0], n[1], n[2], d)
+    if q[0] > q[1] and q[0] > q[2]:
+        return wp.vec4(sign[0], 0.0, 0.0, q[0])
+    if q[1] > q[2]:
+        return wp.vec4(0.0, sign[1], 0.0, q[1])
+    return wp.vec4(0.0, 0.0, sign[2], q[2])
+
+
+@wp.func
+def ball_distance(x: wp.vec3, radius: float) -> wp.vec4:
+    """Normal and signed distance of a sphere about the origin; see `box_distance`.
+
+    Args:
+        x: A point [m].
+        radius: [m].
+    """
+    r = wp.length(x)
+    n = x / wp.max(r, 1.0e-9)
+    return wp.vec4(n[0], n[1], n[2], r - radius)
+
+
+@wp.func
+def cylinder_distance(x: wp.vec3, radius: float, half: float) -> wp.vec4:
+    """Normal and signed distance of a cylinder along z; see `box_distance`.
+
+    Args:
+        x: A point, cylinder axes [m].
+        radius: [m].
+        half: Half its length [m].
+    """
+    r = wp.length(wp.vec2(x[0], x[1]))
+    radial = wp.vec3(x[0], x[1], 0.0) / wp.max(r, 1.0e-9)
+    # In the half plane of its axis and the point, it is a box.
+    flat = box_distance(wp.vec3(r, 0.0, x[2]), wp.vec3(radius, 1.0e6, half))
+    n = flat[0] * radial + wp.vec3(0.0, 0.0, flat[2])
+    return wp.vec4(n[0], n[1], n[2], flat[3])
+
+
+@wp.func
+def heightfield_depth(solids: Solids, size: wp.vec3, x: wp.vec3, radius: float) -> wp.vec4:
+    """Normal of a heightfield and how far a sphere is in it: h - z of its lowest point, over the normal's z.
+
+    The spring ½ k (h - z)² then has the force k depth n exactly: it gives back what it takes on any slope.
+
+    Args:
+        solids: Its heights.
+        size: Half extents along x and y [m].
+        x: Centre of the sphere, heightfield axes [m].
+        radius: [m].
+
+    Returns:
+        Normal, and the depth [m]; above the heights less than the distance, and negative.
+    """
+    columns = solids.heights.shape[1]
+    rows = solids.heights.shape[0]
+    if wp.abs(x[0]) > size[0] or wp.abs(x[1]) > size[1]:
+        # Nobody touches it from the side; it begins at its edge.
+        beyond = wp.max(wp.abs(x[0]) - size[0], wp.abs(x[1]) - size[1])
+        return wp.vec4(0.0, 0.0, 1.0, -wp.max(beyond, 1.0e-6))
+    per_x = float(columns - 1) / (2.0 * size[0])
+    per_y = float(rows - 1) / (2.0 * size[1])
+    u = (x[0] + size[0]) * per_x
+    v = (x[1] + size[1]) * per_y
+    i = wp.min(int(u), columns - 2)
+    j = wp.min(int(v), rows - 2)
+    fx = u - float(i)
+    fy = v - float(j)
+    # Triangles as the ray caster has them: the diagonal goes from the least x and y to the greatest.
+    low = solids.heights[j, i]
+    high = solids.heights[j + 1, i + 1]
+    side = solids.heights[j, i + 1]
+    along = side - low
+    beside = high - side
+    if fx < fy:
+        side = solids.heights[j + 1, i]
+        beside = side - low
+        along = high - side
+    deep = low + fx * along + fy * beside + radius - x[2]
+    slope = wp.vec3(-along * per_x, -beside * per_y, 1.0)
+    steep = wp.length(slope)
+    n = slope / steep
+    return wp.vec4(n[0], n[1], n[2], wp.where(deep > 0.0, deep * steep, deep * solids.gentle))
+
+
+@wp.func
+def solid_depth(solids: Solids, k: int, x: wp.vec3, radius: float, reach: float) -> wp.vec4:
+    """Normal of a solid and how far a sphere is in it.
+
+    Args:
+        solids: Their sizes.
+        k: Which.
+        x: Centre of the sphere, axes of the solid [m].
+        radius: Of the sphere; 0 for a point [m].
+        reach: How far from its surface a mesh is looked for [m].
+
+    Returns:
+        Normal out of the solid, axes of the solid, and the depth of the sphere's deepest point [m]: outside minus the
+        distance or less.
+    """
+    kind = solids.kind[k]
+    size = solids.size[k]
+    face = wp.vec4(0.0, 0.0, 1.0, x[2])
+    if kind == HEIGHTFIELD:
+        return heightfield_depth(solids, size, x, radius)
+    if kind == BOX:
+        face = box_distance(x, size)
+    elif kind == SPHERE:
+        face = ball_distance(x, size[0])
+    elif kind == CAPSULE:
+        face = ball_distance(x - wp.vec3(0.0, 0.0, wp.clamp(x[2], -size[1], size[1])), size[0])
+    elif kind == CYLINDER:
+        face = cylinder_distance(x, size[0], size[1])
+    elif kind == MESH:
+        face = wp.vec4(0.0, 0.0, 1.0, reach)
+        query = wp.mesh_query_point_no_sign(solids.mesh[k], x, reach)
+        if query.result:
+            nearest = wp.mesh_eval_position(solids.mesh[k], query.face, query.u, query.v)
+            outside = float(1.0)
+            if size[0] > 0.0:
+                signed = wp.mesh_query_point_sign_normal(solids.mesh[k], x, reach)
+                outside = signed.sign
+            way = x - nearest
+            d = wp.length(way)
+            n = outside * way / wp.max(d, 1.0e-9)
+            face = wp.vec4(n[0], n[1], n[2], outside * d)
+    return wp.vec4(face[0], face[1], face[2], radius - face[3])
+
+
+@wp.func
+def spheres_along(half: float, least: float) -> int:
+    """Spheres of a row within the hull, at most 1.4 radii apart.
+
+    Args:
+        half: Half extent of the envelope along the row [m].
+        least: Its least half extent [m].
+    """
+    return wp.min(1 + int(wp.ceil(2.0 * (half - least) / (1.26 * least) - 1.0e-3)), 8)
+
+
+@wp.func
+def hull_sphere(i: int, half_size: wp.vec3) -> wp.vec4:
+    """Centre, body frame, and radius of part i of the hull [m]: 0 to 7 the corners, of radius 0, then spheres.
+
+    Args:
+        i: Which, below 8 and the product of `spheres_along` of the three axes.
+        half_size: Half extents of the envelope about the body origin, body axes [m].
+    """
+    if i < 8:
+        sign = wp.vec3(
+            1.0 - 2.0 * float(i & 1), 1.0 - 2.0 * float((i >> 1) & 1), 1.0 - 2.0 * float((i >> 2) & 1)
+        )
+        corner = wp.cw_mul(sign, half_size)
+        return wp.vec4(corner[0], corner[1], corner[2], 0.0)
+    least = wp.min(half_size)
+    k = i - 8
+    r = wp.vec3(0.0)
+    for axis in range(3):
+        n = spheres_along(half_size[axis], least)
+        if n > 1:
+            r[axis] = (2.0 * float(k % n) / float(n - 1) - 1.0) * (half_size[axis] - least)
+        k = k // n
+    return wp.vec4(r[0], r[1], r[2], 0.9 * least)
+
+
+@wp.func
+def solids_within(clearing: wp.vec4, position: wp.vec3, half_size: wp.vec3, reach: float) -> bool:
+    """Whether a solid may be nearer to the vehicle's envelope than `reach`.
+
+    Args:
+        clearing: A ball of free water: its centre, world frame, and its radius [m].
+        position: Body origin, world frame [m].
+        half_size: Half extents of the envelope about the body origin, body axes [m].
+        reach: [m].
+    """
+    away = position - wp.vec3(clearing[0], clearing[1], clearing[2])
+    return wp.length(away) + wp.length(half_size) + reach > clearing[3]
+
+
+@wp.func
+def free_water(solids: Solids, w: int, v: int, position: wp.vec3, around: float) -> float:
+    """Radius of a ball of free water about a vehicle [m]: no solid of the world begins within it. Notes the near ones.
+
+    Args:
+        solids: All solids.
+        w: Which world.
+        v: Which vehicle.
+        position: Body origin, world frame [m].
+        around: Radius within which near ones are noted [m].
+    """
+    free = float(FARTHEST)
+    count = int(0)
+    for k in range(solids.kind.shape[0]):
+        pose = solids.pose[w, solids.shape[k]]
+        horizon = wp.max(free, around)
+        if wp.length(position - wp.transform_get_translation(pose)) - solids.bound[k] < horizon:
+            x = wp.transform_point(wp.transform_inverse(pose), position)
+            distance = -solid_depth(solids, k, x, 0.0, horizon)[3]
+            free = wp.min(free, distance)
+            if distance < around:
+                if count < wp.static(NEIGHBOURS):
+                    solids.near[w, v, count] = k
+                count += 1
+    solids.count[w, v] = count
+    return free
+
+
+@wp.func
+def solids_wrench(
+    solids: Solids,
+    clearing: wp.vec4,
+    w: int,
+    v: int,
+    position: wp.vec3,
+    q: wp.quat,
+    nu: vec6,
+    half_size: wp.vec3,
+) -> vec6:
+    """Wrench of the solids of a world on a vehicle's hull.
+
+    Args:
+        solids: All solids.
+        clearing: A ball of free water; see `solids_within`.
+        w: Which world.
+        v: Which vehicle.
+        position: Body origin, world frame [m].
+        q: Attitude, body to world.
+        nu: Twist, body frame [m/s, rad/s].
+        half_size: Half extents of the envelope about the body origin, body axes [m].
+
+    Returns:
+        Wrench about the body origin, body frame [N, N m].
+    """
+    if not solids_within(clearing, position, half_size, 0.0):
+        return vec6()
+    velocity = linear(nu)
+    omega = angular(nu)
+    force = wp.vec3(0.0)
+    moment = wp.vec3(0.0)
+    around = wp.length(half_size)
+    least = wp.min(half_size)
+    parts = 8 + spheres_along(half_size[0], least) * spheres_along(half_size[1], least) * spheres_along(
+        half_size[2], least
+    )
+    count = solids.count[w, v]
+    away = wp.length(position - wp.vec3(clearing[0], clearing[1], clearing[2]))
+    listed = count <= wp.static(NEIGHBOURS) and away <= solids.reach[w, v]
+    if not listed:
+        count = solids.kind.shape[0]
+    for j in range(count):
+        k = int(j)
+        if listed:
+            k = solids.near[w, v, j]
+        pose = solids.pose[w, solids.shape[k]]
+        if wp.length(position - wp.transform_get_translation(pose)) < solids.bound[k] + around:
+            to_solid = wp.transform_inverse(pose)
+            origin = wp.transform_point(to_solid, position)
+            R = wp.quat_to_matrix(wp.transform_get_rotation(to_solid) * q)
+            if solid_depth(solids, k, origin, 0.0, 2.0 * around)[3] > -around:
+                for i in range(parts):
+                    part = hull_sphere(i, half_size)
+                    r = wp.vec3(part[0], part[1], part[2])
+                    face = solid_depth(solids, k, origin + R * r, part[3], 2.0 * around)
+                    if face[3] > 0.0:
+                        n = wp.vec3(face[0], face[1], face[2])
+                        r = r - part[3] * (wp.transpose(R) * n)  # where the sphere touches
+                        v_s = R * (velocity + wp.cross(omega, r))
+                        f = wp.transpose(R) * penalty_force(
+                            face[3], v_s, n, solids.stiffness, solids.damping, solids.friction, 0.01
+                        )
+                        force += f
+                        moment += wp.cross(r, f)
+    return join(force, moment)
