@@ -656,9 +656,7 @@ class LineFollower(DriveBaseline):
         )
         return self.drive.action(o[:, [3, 4, 5, 8]], wanted), line
 
-    def line(
-        self, picture: NDArray[np.uint8], up: Array, above: Array
-    ) -> tuple[Array, NDArray[np.bool_]]:
+    def line(self, picture: NDArray[np.uint8], up: Array, above: Array) -> tuple[Array, NDArray[np.bool_]]:
         """The pipe in pictures.
 
         Args:

@@ -55,7 +55,9 @@ def beside(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec4:
         if distance < best:
             best = distance
             left = (d[0] * r[1] - d[1] * r[0]) / length
-            found = wp.vec4(before + t * length, wp.where(left < 0.0, -distance, distance), r[2], wp.atan2(d[1], d[0]))
+            found = wp.vec4(
+                before + t * length, wp.where(left < 0.0, -distance, distance), r[2], wp.atan2(d[1], d[0])
+            )
         before += length
     return found
 
@@ -150,7 +152,14 @@ class Pipeline(Task):
     landmark: ClassVar[str] = "line"
     teacher: ClassVar[tuple[ObservationPart, ...]] = (
         *(
-            ObservationPart(f"way to the line above the pipe {x:g} m ahead, body frame", 3, "m", scale=2.0, term=way_ahead, index=k)
+            ObservationPart(
+                f"way to the line above the pipe {x:g} m ahead, body frame",
+                3,
+                "m",
+                scale=2.0,
+                term=way_ahead,
+                index=k,
+            )
             for k, x in enumerate(AHEAD)
         ),
         ObservationPart("up, body frame", 3, "1", term=up),
@@ -215,7 +224,9 @@ class Pipeline(Task):
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """The pipe's axis as a line of points, from the objects `pipe_...` of the site."""
         pipes = [item for name, item in load_world("pipeline").objects.items() if name.startswith("pipe_")]
-        halves = [0.5 * (one.length or 0.0) * np.asarray(one.axis) / np.linalg.norm(one.axis) for one in pipes]
+        halves = [
+            0.5 * (one.length or 0.0) * np.asarray(one.axis) / np.linalg.norm(one.axis) for one in pipes
+        ]
         knots = [one.position - half for one, half in zip(pipes, halves, strict=True)]
         points = np.float32([*knots, pipes[-1].position + halves[-1]])
         arrays.reference.position = wp.array(np.tile(points, (worlds, 1, 1)), dtype=wp.vec3, device=device)
@@ -253,7 +264,9 @@ class Pipeline(Task):
                 RewardTerm("rate", "turning", -r.rate),
             ),
             ends=(
-                End("lost", "wp.abs(place[1]) > p.lost[0] or wp.abs(place[2] - p.height) > p.lost[1]", -r.loss),
+                End(
+                    "lost", "wp.abs(place[1]) > p.lost[0] or wp.abs(place[2] - p.height) > p.lost[1]", -r.loss
+                ),
             ),
             inside="place[0] - begun >= p.distance",
             totals=(Total("begun", "was", first="place[0]"), Total("worst", "wp.max(was, e)")),
