@@ -20,10 +20,11 @@ FINSROV = load_vehicle("finsrov")
 
 
 def test_the_plants_of_the_protocol_ship():
-    """Nominal, randomised, foreign, current, waves, noise, sensors, lag, and the other two models."""
+    """Nominal, randomised, foreign, held out, current, waves, noise, sensors, lag, and the other two models."""
     expected = [
         "current",
         "foreign",
+        "held_out",
         "lag",
         "mesh",
         "noise",

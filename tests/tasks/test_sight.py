@@ -4,16 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("newton")
 
 from finssim.experiments.plants import PlantError, load_plant
-from finssim.tasks import Environment, EnvironmentSetupError, make
+from finssim.tasks import Environment, EnvironmentSetupError, make, sight
 from finssim.tasks.agents import LightServo, LineFollower, agent_for
 from finssim.tasks.camera_docking import CameraDocking
 from finssim.tasks.check import check_task
 from finssim.tasks.pipeline import Pipeline
+from finssim.tasks.task import kernels_of
 from finssim.vehicles import load_vehicle
 from finssim.worlds import load_world
 
@@ -199,3 +201,14 @@ def test_the_line_follower_finds_the_pipe_in_the_picture():
     assert plain.sum() > 3
     assert np.median(np.abs(line[plain, 0] - aside[plain])) < 0.4
     assert np.degrees(np.median(np.abs(np.arctan(line[plain, 1]) - np.arctan(slope[plain])))) < 12.0
+
+
+@pytest.mark.parametrize("task", [CameraDocking(), Pipeline()], ids=lambda task: task.name)
+def test_the_kernels_of_tasks_that_see_compile_for_cuda(task, tmp_path):
+    """NVRTC, which needs no device, makes a binary for a compute capability of 7.5."""
+    wp.init()
+    if wp.get_cuda_toolkit_version() is None:
+        pytest.skip("this Warp has no CUDA compiler")
+    for i, module in enumerate((kernels_of(task).evaluate.module, wp.get_module(sight.__name__))):
+        wp.compile_aot_module(module, arch=75, module_dir=tmp_path / str(i))
+        assert [file.stat().st_size > 0 for file in (tmp_path / str(i)).glob("*.cubin")] == [True]
