@@ -576,11 +576,13 @@ class CameraDevice(Part):
 
 
 class SonarDevice(Part):
-    """A multibeam imaging sonar: its picture is echo strength by beam and range."""
+    """A sonar whose picture is echo strength by beam and range: imaging, profiling or side-scan."""
 
     about: str
     source: str
     """Where the figures are from."""
+    mode: Literal["imaging", "profiling", "side_scan"] = "imaging"
+    """Profiling: ranges of the first strong returns too. Side-scan: two beams square to the sensor's x axis."""
     frequency: Positive
     """[Hz]"""
     beams: Count
@@ -591,6 +593,8 @@ class SonarDevice(Part):
     """Of one beam across, between its half-power points on reception [rad]."""
     vertical_beam_width: Annotated[float, Field(strict=True, gt=0.0, le=math.pi)]
     """Between half-power points, one way [rad]."""
+    depression: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
+    """How far the middles of the beams point below the sensor's x-y plane [rad]."""
     range: Positive
     """[m]"""
     minimum_range: NonNegative = 0.0
@@ -605,9 +609,17 @@ class SonarDevice(Part):
     """Time-varying gain [dB per decade of range]; 40 undoes the loss of a small target, 20 that of a wall."""
     display: Pair = (-80.0, -20.0)
     """Echo strengths after gain that are 0 and 255 in the picture [dB]."""
+    detection_db: Number = -60.0
+    """Level after gain that a profiling sonar takes for a return [dB]."""
     rate: Positive
     """[Hz]"""
     mount: Mount = Field(default_factory=lambda: Mount())
+
+    @model_validator(mode="after")
+    def _two_sides(self) -> SonarDevice:
+        if self.mode == "side_scan" and self.beams != 2:
+            raise refuse_section(f"a side-scan sonar has {self.beams} beams, expected 2: left and right")
+        return self
 
     @model_validator(mode="after")
     def _display_rises(self) -> SonarDevice:
@@ -638,6 +650,8 @@ class RangeDevice(Part):
     """[m]"""
     noise: NonNegative = 0.0
     """Standard deviation, as a share of the range."""
+    velocity_noise: NonNegative = 0.0
+    """Standard deviation of a DVL's velocity along a beam [m/s]."""
     rate: Positive
     """[Hz]"""
     mount: Mount = Field(default_factory=lambda: Mount())

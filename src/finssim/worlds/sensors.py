@@ -21,6 +21,8 @@ import numpy as np
 import warp as wp
 from scipy.special import ndtri
 
+from finssim.physics.types import vec6
+from finssim.sensors.dvl import sensed_velocity
 from finssim.sensors.overhead_camera.photometry import fresnel, noise_key, refracted, through_water
 from finssim.vehicles import Vehicle
 from finssim.worlds.description import (
@@ -718,8 +720,30 @@ def _receive(
         picture[v, b, k] = wp.uint8(wp.clamp(level, 0.0, 255.0) + 0.5)
 
 
+@wp.kernel(enable_backward=False)
+def _detect(
+    worlds: wp.array(dtype=int),
+    intensity: wp.array3d(dtype=float),
+    threshold: float,
+    bin_length: float,
+    ranges: wp.array2d(dtype=float),
+):
+    """Range of the first cell of each beam that is loud enough and within 6 dB of its loudest: the cell's middle."""
+    v, b = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
+    ranges[v, b] = float(wp.inf)
+    enough = float(threshold)
+    for k in range(intensity.shape[2]):
+        enough = wp.max(enough, 0.25 * intensity[v, b, k])
+    for k in range(intensity.shape[2]):
+        if intensity[v, b, k] >= enough:
+            ranges[v, b] = (float(k) + 0.5) * bin_length
+            return
+
+
 class SonarBatch(RayBatch):
-    """An imaging sonar on each of N vehicles.
+    """An imaging, profiling or side-scan sonar on each of N vehicles.
 
     Args:
         batch: The worlds; their water's temperature and salinity give the absorption of sound.
@@ -733,6 +757,9 @@ class SonarBatch(RayBatch):
     """Power after gain, relative to the source's level at 1 m; float (N, beams, bins), beam 0 at the left."""
     picture: wp.array
     """Its level between the device's `display` levels; uint8 (N, beams, bins)."""
+    ranges: wp.array
+    """Of a profiling sonar: first range with a level of `detection_db` and within 6 dB of the beam's loudest [m],
+    infinite where there is none; float (N, beams)."""
 
     def __init__(
         self,
@@ -750,21 +777,27 @@ class SonarBatch(RayBatch):
         """[dB/m]"""
         count = rays.shape[1]
         elevation, spacing = ray_elevations(sonar), sonar.sector / count
+        if sonar.mode == "side_scan":
+            spacing = sonar.beam_width / 0.8859  # the integral of its pattern sinc²
         self._steps = wp.vec2(float(elevation[1] - elevation[0]) if len(elevation) > 1 else 0.0, spacing)
-        two_way = np.exp(-8.0 * math.log(2.0) * (elevation / sonar.vertical_beam_width) ** 2)
+        two_way = np.exp(
+            -8.0 * math.log(2.0) * ((elevation + sonar.depression) / sonar.vertical_beam_width) ** 2
+        )
         solid = max(self._steps[0], 1e-6) * spacing * np.cos(elevation) / math.pi
         ranges = (np.arange(self.bins) + 0.5) * self.bin_length
         loss = sonar.gain_spreading * np.log10(ranges) + 2.0 * self.absorption * ranges
         gain = np.where(ranges >= sonar.minimum_range, 10.0 ** (0.1 * loss), 0.0)
         with wp.ScopedDevice(self.device):
             self._weight = wp.array(np.float32(two_way * solid), dtype=float)
-            self._taps = wp.array(np.float32(beam_pattern(sonar.beam_width, spacing, count)), dtype=float)
+            taps = np.ones(1) if sonar.mode == "side_scan" else beam_pattern(sonar.beam_width, spacing, count)
+            self._taps = wp.array(np.float32(taps), dtype=float)
             self._gain = wp.array(np.float32(gain), dtype=float)
             self._exponential = wp.array(np.float32(-np.log1p(-(np.arange(4096) + 0.5) / 4096)), dtype=float)
             self._energy = wp.zeros(self.depth.shape, dtype=float)
             self._spread = wp.zeros(self.depth.shape, dtype=wp.vec2)
             self.intensity = wp.zeros((self.count, count, self.bins), dtype=float)
             self.reading = self.picture = wp.zeros(self.intensity.shape, dtype=wp.uint8)
+            self.ranges = wp.zeros(self.intensity.shape[:2], dtype=float)
 
     @property
     def bin_length(self) -> float:
@@ -814,6 +847,10 @@ class SonarBatch(RayBatch):
         ]
         inputs += [self._span(self.bins), self.intensity, self.picture]
         wp.launch(_receive, self._blocks(self.intensity), inputs, device=self.device)
+        if sonar.mode == "profiling":
+            threshold = 10.0 ** (0.1 * sonar.detection_db)
+            inputs = [self.worlds, self.intensity, threshold, self.bin_length, self.ranges]
+            wp.launch(_detect, self.ranges.shape, inputs, device=self.device)
         return self.picture
 
 
@@ -938,6 +975,106 @@ class RangeBatch(RayBatch):
         inputs += [self._weight, ranger.quantile, ranger.minimum_range, ranger.range, ranger.noise, key]
         wp.launch(_take_ranges, self.ranges.shape, [*inputs, self.ranges], device=self.device)
         return self.ranges
+
+
+@wp.kernel(enable_backward=False)
+def _take_velocities(
+    worlds: wp.array(dtype=int),
+    rays: wp.array4d(dtype=wp.vec3),
+    views: wp.array(dtype=wp.transform),
+    twists: wp.array2d(dtype=vec6),
+    mount: wp.transform,
+    ranges: wp.array2d(dtype=float),
+    noise: float,
+    key: int,
+    speeds: wp.array2d(dtype=float),
+    velocity: wp.array2d(dtype=float),
+    lock: wp.array2d(dtype=int),
+):
+    """Speed along each beam that finds the bottom, and the velocity that fits them best.
+
+    s_b = d_b . v + noise;  v = (sum d d^T)^-1 sum d s  over the beams with an echo, of which there must be three
+    """
+    i = wp.tid()
+    if worlds[i] == SKIPPED:
+        return
+    w = i // twists.shape[1]
+    v = i % twists.shape[1]
+    turn = wp.transform_get_rotation(mount)
+    nu = twists[w, v]
+    exact = sensed_velocity(nu, wp.quat_identity(), wp.vec3(0.0), wp.transform_get_translation(mount), turn)
+    state = wp.rand_init(wp.max(key, 0), i)
+    normal = wp.mat33(0.0)
+    right = wp.vec3(0.0)
+    count = int(0)
+    for b in range(ranges.shape[1]):
+        d = rays[b, 0, 0, 1]
+        speeds[i, b] = float(wp.nan)
+        drawn = wp.randn(state)
+        if wp.isfinite(ranges[i, b]):
+            s = wp.dot(d, exact)
+            if key >= 0:
+                s += noise * drawn
+            speeds[i, b] = s
+            normal += wp.outer(d, d)
+            right += s * d
+            count += 1
+    lock[w, v] = wp.where(count >= 3, 1, 0)
+    solution = wp.vec3(float(wp.nan))
+    if count >= 3:
+        solution = wp.inverse(normal) * right
+    for k in range(3):
+        velocity[i, k] = solution[k]
+
+
+class DopplerBatch(RangeBatch):
+    """A DVL on each of N vehicles: bottom track by the ranges and speeds of its beams.
+
+    Args:
+        batch: The worlds.
+        device: At least three beams; the speeds are those along the beams' middles.
+        twists: nu of the vehicles, body frame [m/s, rad/s], read in each update, as a simulator's `state.velocity`;
+            vec6 (worlds, vehicles).
+        lock: Filled in place of its own; that of a `finssim.sensors.DvlBatch` makes that one lose the bottom too.
+
+    Raises:
+        WorldError: The device has fewer beams.
+    """
+
+    speeds: wp.array
+    """Of the sensor along each beam, positive away from it [m/s], NaN without an echo; float (N, beams)."""
+    velocity: wp.array
+    """Of the sensor, in its own axes [m/s], NaN without lock; float (N, 3)."""
+    lock: wp.array
+    """Whether at least three beams find the bottom; int (worlds, vehicles)."""
+
+    def __init__(
+        self, batch: WorldBatch, device: RangeDevice, twists: wp.array, *, lock: wp.array | None = None
+    ) -> None:
+        if device.beams < 3:
+            raise WorldError(f"a DVL of {device.beams} beams: give at least 3 for a velocity")
+        super().__init__(batch, device, vehicles=twists.shape[1])
+        beams, self.twists = device.beams, twists
+        # One row for each vehicle, so that all of it arrives together: velocity, speeds, ranges.
+        self.reading = wp.zeros((self.count, 3 + 2 * beams), dtype=float, device=self.device)
+        self.velocity, self.speeds = self.reading[:, :3], self.reading[:, 3 : 3 + beams]
+        self.ranges = self.reading[:, 3 + beams :]
+        self.lock = wp.zeros(twists.shape, dtype=int, device=self.device) if lock is None else lock
+
+    def update(
+        self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
+    ) -> wp.array:
+        """Measure; arguments as those of `RangeBatch.update`.
+
+        Returns:
+            `reading`: velocity, speeds and ranges in a row; float (N, 3 + 2 beams).
+        """
+        super().update(poses, seed=seed, time=time, mask=mask)
+        key = -1 if seed is None else noise_key(seed + 1, time)
+        inputs = [self.worlds, self.rays, self.views, self.twists, self._mount, self.ranges]
+        inputs += [self.ranger.velocity_noise, key, self.speeds, self.velocity, self.lock]
+        wp.launch(_take_velocities, self.count, inputs, device=self.device)
+        return self.reading
 
 
 def sensor_of(
