@@ -131,6 +131,7 @@ HOMES = {
         "calibration/vision/pool_fit.py",
         "localization/detection/pictures.py",
         "robot/pictures.py",
+        "worlds/pictures.py",
     },
     "pupil_apriltags": {"localization/detection/families.py"},
     "serial": {"robot/link/transports.py"},
