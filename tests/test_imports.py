@@ -65,7 +65,6 @@ HOMES = {
         "learning/learners/imitation.py",
         "learning/learners/rsl_rl_ppo.py",
         "learning/learners/sb3.py",
-        "learning/learners/sb3_recurrent_ppo.py",
         "learning/learners/torchrl_ppo.py",
         "learning/network.py",
         "learning/recurrent.py",
@@ -87,7 +86,6 @@ HOMES = {
         "learning/pettingzoo_env.py",
         "learning/skrl_env.py",
     },
-    "sb3_contrib": {"learning/learners/sb3_recurrent_ppo.py"},
     "torchrl": {"learning/learners/torchrl_ppo.py", "learning/torchrl_env.py"},
     "tensordict": {
         "learning/learners/rsl_rl_ppo.py",

@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
+import yaml
 
-from finssim.yaml_file import DEEPEST, json_value, read_json, read_mapping
+from finssim.yaml_file import DEEPEST, json_value, read_json, read_mapping, yaml_text
 
 BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
@@ -16,6 +17,30 @@ def read(folder, text):
     path = folder / "file.yaml"
     path.write_text(text, encoding="utf-8")
     return read_mapping(path, KeyError, such_as="mass: 11.2")
+
+
+def test_what_is_written_reads_back_as_it_was(tmp_path):
+    """Words that look like numbers to a YAML 1.2 or 1.1 reader, such as digests, and numbers."""
+    words = [
+        "12e34",
+        "1e5",
+        "0123",
+        "42",
+        ".5",
+        "on",
+        "yes",
+        "null",
+        "~",
+        "true",
+        "2001-01-01",
+        "1:30",
+        "é",
+        "=",
+        ".inf",
+    ]
+    tree = {"words": words, "numbers": [12e34, 1e-5, 42, 0.1, float("inf"), True, None]}
+    assert read(tmp_path, yaml_text(tree)) == tree
+    assert yaml.safe_load(yaml_text(tree)) == tree
 
 
 @pytest.mark.parametrize(

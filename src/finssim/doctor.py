@@ -48,7 +48,6 @@ EXTRAS = {
     "pettingzoo": Extra(
         {"pettingzoo": "pettingzoo"}, "use tasks of several agents as PettingZoo environments"
     ),
-    "sb3-contrib": Extra({"sb3-contrib": "sb3_contrib"}, "learn with recurrent PPO of SB3-Contrib"),
     "imitation": Extra({"minari": "minari"}, "collect demonstrations and learn from them"),
     "sweep": Extra(
         {"ray": "ray", "optuna": "optuna"},

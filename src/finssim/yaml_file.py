@@ -1,4 +1,5 @@
-"""The one reader of YAML and JSON from outside: values of bounded size, or one sentence that says what is wrong."""
+"""The one reader of YAML and JSON from outside: values of bounded size, or one sentence that says what is wrong; and
+the one writer of YAML."""
 
 import json
 import re
@@ -63,6 +64,28 @@ _Loader.add_implicit_resolver(
     ),
     list("-+0123456789."),
 )
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes the words that the reader takes for numbers, such as the digest 12e34, besides those that PyYAML does."""
+
+    yaml_implicit_resolvers = {
+        first: yaml.SafeDumper.yaml_implicit_resolvers.get(first, [])
+        + _Loader.yaml_implicit_resolvers.get(first, [])
+        for first in {*yaml.SafeDumper.yaml_implicit_resolvers, *_Loader.yaml_implicit_resolvers}
+    }
+
+
+def yaml_text(tree: Any, **options: Any) -> str:
+    """Plain data as YAML, keys in their order, that `read_mapping` reads back as they are.
+
+    Args:
+        tree: Dictionaries, lists, texts, numbers.
+        options: Of `yaml.dump`, such as width.
+    """
+    return str(yaml.dump(tree, Dumper=_Dumper, **{"sort_keys": False, "allow_unicode": True, **options}))
+
+
 INTEGER = "tag:yaml.org,2002:int"
 for _kind in ("bool", "int", "float"):
     _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.construct_scalar_of)

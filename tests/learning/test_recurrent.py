@@ -15,14 +15,12 @@ from finssim.control.modes import action_mode
 from finssim.control.policy import Policy, PolicyError
 from finssim.learning.episodes import HeldEvaluation
 from finssim.learning.export import ExportError
-from finssim.learning.learners import learner_named
 from finssim.learning.recurrent import RecurrentNetwork
 from finssim.robot.pilots import make_pilot
 from finssim.robot.reading import Reading
 from finssim.tasks import StationKeeping
 from finssim.tasks.agents import NOWHERE, agent_for, expert_for, known_in, restarted
 from finssim.tasks.observer import Observer
-from reference.guess import Guess
 from reference.policies import FINSROV, written
 
 STATION = Station((1.0, -0.3, -0.5), 0.6)
@@ -46,23 +44,23 @@ def policy(tmp_path_factory):
     return written(network, tmp_path_factory.mktemp("policies") / "remembers", StationKeeping(), 6)
 
 
-def test_it_acts_as_sb3_contrib_predicts(tmp_path):
+def test_it_acts_as_torch_steps_its_lstm(policy):
     """Step by step with memory, each in its own row, and through the start of an episode in some rows."""
-    kind, task = learner_named("sb3-recurrent-ppo"), Guess()
-    settings = replace(kind.settings(task), worlds=4, rollout=4, batch=8, epochs=1, hidden=(8,), lstm=8)
-    learner = kind(finssim.make(task, worlds=4, seed=1), settings, seed=1)
-    large(learner.model.policy)
-    size = learner.environment.action_size
-    run = Policy.load(written(learner.network(), tmp_path / "p", task, size))
-    rng, state, memory = np.random.default_rng(2), None, run.reset(5)
+    lstm, layers = nn.LSTM(16, 8), nn.Sequential(nn.Linear(8, 8), nn.ELU(), nn.Linear(8, 6))
+    large(nn.ModuleList([lstm, layers]))
+    run = Policy.load(policy)
+    rng, state, memory = np.random.default_rng(2), (torch.zeros(1, 5, 8), torch.zeros(1, 5, 8)), run.reset(5)
     distinct = set()
     for k in range(12):
         starts = np.array([k == 0, k == 0, k in (0, 4), k in (0, 4, 5), k in (0, 11)])
-        observation = rng.uniform(-1.0, 1.0, (5, 1)).astype(np.float32)
-        expected, state = learner.model.predict(observation, state, starts, deterministic=True)
+        observation = rng.uniform(-1.0, 1.0, (5, 16)).astype(np.float32)
+        with torch.no_grad():
+            state = tuple(part * torch.from_numpy(~starts)[None, :, None] for part in state)
+            answer, state = lstm(torch.from_numpy(observation)[None], state)
+            expected = layers(answer[0]).clamp(-1.0, 1.0).numpy()
         action, memory = run.step(restarted(memory, run.reset(5), starts), observation)
         np.testing.assert_allclose(action, expected, rtol=0, atol=2e-6)
-        np.testing.assert_allclose(memory, np.concatenate([s[0] for s in state], axis=1), rtol=0, atol=2e-6)
+        np.testing.assert_allclose(memory, torch.cat([*state], dim=2)[0].numpy(), rtol=0, atol=2e-6)
         distinct |= {round(float(value), 4) for value in action[:, 0]}
     assert len(distinct) > 30
 

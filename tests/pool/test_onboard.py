@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from finssim.pool.plant_spec import PlantSpecError
 from finssim.pool.run import make_plan, run
 from finssim.pool.server import LockstepServer
 from finssim.robot.goals import station_of
+from finssim.robot.link.frames import encode_command
 from finssim.robot.lockstep import LockstepClient
+from finssim.robot.messages import ThrusterCommand
 from finssim.vehicles import load_vehicle
 
 WALL = """
@@ -113,6 +116,22 @@ def test_own_sensors_and_the_overhead_camera_go_one_way(wall):
                 assert p.ranges is None or np.array_equal(p.ranges, q.ranges)
     serving.join(timeout=10.0)
     here.close(), there.close()
+
+
+def test_the_hull_meets_the_things_of_the_world(wall):
+    """Ahead for 5 s: the nose ends at the wall 3 m ahead, within the penalty's 5 cm; unsolid, it goes on."""
+    plan = make_plan("finsrov", "1", "nominal", camera="none", world=wall)
+    nose = 0.5 * VEHICLE.body.size[0]
+    ends = []
+    for solid in (True, False):
+        made = replace(plan, onboard=replace(plan.onboard, solid=solid))
+        pool = made.world(None, start=station_of("2.6,0,-2,0"), seed=0, truth=None)
+        for k in range(1, 301):
+            sent = [encode_command(ThrusterCommand(True, (-0.6, -0.6, 0.0, 0.0, 0.0, -0.6, 0.6, 0.0)))]
+            pool.exchange(k / 60, sent)
+        ends.append(float(pool.plant.position[0]) + nose)
+        pool.close()
+    assert 2.8 < ends[0] < 3.05 < 3.3 < ends[1]
 
 
 def test_a_team_has_no_world():

@@ -8,12 +8,17 @@ import pytest
 
 from finssim.engine import Simulator
 from finssim.engine.recorder import Recorder
+from finssim.robot.messages import Picture as Seen
+from finssim.robot.reading import Reading
+from finssim.robot.recorder import Recorder as RecordWriter
 from finssim.vehicles import VehicleError, load_vehicle
+from finssim.viewer.app import draw_own
 from finssim.viewer.frame import ViewError
 from finssim.viewer.run import Choice, open_source
 from finssim.viewer.sources.pool import PoolSource
 from finssim.viewer.sources.run import RunSource
 from finssim.viewer.sources.simulator import SimulatorSource
+from finssim.worlds import WorldLayout
 
 
 def test_the_pool_lives_and_the_robot_in_it_goes_to_the_goal():
@@ -61,7 +66,7 @@ def test_a_run_of_the_engine_is_a_source(tmp_path):
         for _ in range(30):
             simulator.step()
             recorder.record()
-    source = open_source(Choice(source=str(tmp_path / "run"), world=1))
+    source = open_source(Choice(source=str(tmp_path / "run"), world="1"))
     assert isinstance(source, RunSource) and source.duration == pytest.approx(2.9)
     assert source.frame(2.9).truth.position == pytest.approx(simulator.numpy("position")[1, 0], abs=1e-6)
     assert source.frame(2.9).force == pytest.approx(simulator.numpy("thrust")[1, 0], abs=1e-5)
@@ -114,3 +119,48 @@ def test_a_record_may_be_shown_with_another_vehicle(trial):
     assert open_source(Choice(source=str(trial.record))).stage.vehicle.name == "finsrov"
     other = open_source(Choice(source=str(trial.record), vehicle="bluerov2_heavy"))
     assert other.stage.vehicle.name == load_vehicle("bluerov2_heavy").name
+
+
+def test_a_world_is_seen_heard_and_drawn():
+    """The pool with a world: its things stand where they were drawn, pictures and a fan come, ranges are told."""
+    pytest.importorskip("newton", reason="finssim[perception] is not installed")
+    source = open_source(Choice(source="pool", world="dock", seed=3))
+    layout = WorldLayout("dock")
+    layout.draw(3)
+    back = next(body for body in source.stage.bodies if body.name == "back")
+    assert back.vertices.mean(axis=0) == pytest.approx(layout.poses("back")[0, :3], abs=1e-5)
+    rails = next(body for body in source.stage.bodies if body.name == "rails_upper")
+    assert np.ptp(rails.vertices, axis=0).max() > 0.9 and len(rails.faces) > 150  # two of them
+    frame = source.frame(2.0)
+    assert frame.status["bridge"] == "armed" and frame.status["altimeter"].endswith(" m")
+    assert frame.pictures["front_camera"].shape[2] == 3 and frame.pictures["sonar"].shape[0] == 400
+    assert list(source.stage.eyes) == ["front_camera", "sonar"]
+    for image in frame.pictures.values():
+        drawn = draw_own(image)
+        assert drawn.shape[1] >= 480 and drawn.shape[2] == 3
+    source.close()
+
+
+def test_a_record_shows_own_sensors_and_the_world_that_is_named(tmp_path):
+    """Pictures in colour, fans, ranges; nothing of them once they are old."""
+    vehicle, path = load_vehicle("finsrov"), tmp_path / "run.mcap"
+    image = np.zeros((36, 64, 3), np.uint8)
+    image[..., 0] = 200
+    with RecordWriter(path, vehicle, {}) as recorder:
+        for k in range(40):
+            t = 0.1 * k
+            place = np.array([0.0, 0.0, -2.0])
+            recorder.reading(t, Reading(t, place, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6), True))
+            if k < 10:
+                recorder.picture(t, Seen(t, k, image, source="front_camera"))
+                recorder.picture(t, Seen(t, k, image[..., 0], source="sonar"))
+                recorder.picture(t, Seen(t, k, source="altimeter", ranges=np.array([2.5], np.float32)))
+    source = open_source(Choice(source=str(path), world="gate", seed=1))
+    frame = source.frame(0.8)
+    assert np.abs(frame.pictures["front_camera"].astype(int) - image).max() < 6
+    assert frame.pictures["sonar"].ndim == 2 and frame.status["altimeter"] == "2.50 m"
+    assert not source.frame(3.5).pictures and "altimeter" not in source.frame(3.5).status
+    assert {body.name for body in source.stage.bodies} >= {"near_left", "buoy_0"}
+    assert source.stage.lower.tolist() == [-8.0, -5.0, -3.2]
+    with pytest.raises(ViewError, match="--world dock: expected the number of a world"):
+        open_source(Choice(source=str(tmp_path), world="dock"))

@@ -24,7 +24,7 @@ def test_an_entry_scales_its_camera_and_its_sonar():
     """Width and what follows from it: the field of view stays that of the device."""
     vehicle, full = load_vehicle("finsrov"), load_device("low_light_camera")
     camera = device_of(vehicle, "front_camera")
-    assert (camera.width, camera.height) == (64, 36) and camera.lens().width == 64
+    assert (camera.width, camera.height) == (48, 27) and camera.lens().width == 48
     assert camera.focal_length / camera.width == pytest.approx(full.focal_length / full.width)
     sonar = device_of(vehicle, "sonar")
     assert (sonar.beams, sonar.bins, sonar.sector) == (128, 128, load_device("gemini_720is").sector)
@@ -57,4 +57,4 @@ def test_sensors_stand_where_the_vehicle_carries_them(scenes, poses):
     assert altimeter.update(here).numpy()[0, 0] == pytest.approx(expected, rel=0.01)
     assert isinstance(sensor_of(batch, vehicle, "sonar"), SonarBatch)
     camera = sensor_of(batch, vehicle, "front_camera")
-    assert isinstance(camera, CameraBatch) and camera.update(here).shape == (1, 36, 64, 3)
+    assert isinstance(camera, CameraBatch) and camera.update(here).shape == (1, 27, 48, 3)

@@ -304,7 +304,7 @@ def compare(
 ) -> dict[str, Any]:
     """Compare trainings over seeds: interquartile means with intervals, who is likely better, learning curves.
 
-    Example: finssim compare runs/hold-seed1 runs/hold-seed2 runs/hold-seed3 sac=runs/sac-1 --out compared
+    Example: finssim compare runs/hold-seed1 runs/hold-seed2 runs/hold-seed3 cloned=runs/bc-1 --out compared
 
     Args:
         runs (RUN...): Policy directories, each DIR or NAME=DIR; those of one name differ in the seed alone.

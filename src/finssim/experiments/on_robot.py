@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
-import yaml
 from rich.console import Console
 from rich.status import Status
 
@@ -33,6 +32,7 @@ from finssim.robot.teleop import Keyboard
 from finssim.robot.wiring import Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import vehicle_at
+from finssim.yaml_file import yaml_text
 
 GETTING_READY = 10.0
 """Longest time until the estimator knows where the vehicle is, and it is armed [s]."""
@@ -550,7 +550,7 @@ def take_folder(file: Path, about: Mapping[str, Any]) -> None:
     Raises:
         RobotError: It holds somebody's files, or is of other settings.
     """
-    text, out = yaml.safe_dump(dict(about), sort_keys=False), file.parent
+    text, out = yaml_text(dict(about)), file.parent
     if not out.exists() or not any(out.iterdir()):
         with atomic_write(file) as temporary:
             temporary.write_text(text, encoding="utf-8")

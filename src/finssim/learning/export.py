@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import onnx
-import yaml
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
@@ -35,6 +34,7 @@ from finssim.learning.network import (
 from finssim.provenance import provenance
 from finssim.tasks.environment import Environment
 from finssim.tasks.sensing import seen_with
+from finssim.yaml_file import yaml_text
 
 if TYPE_CHECKING:
     from torch import nn
@@ -286,13 +286,7 @@ def export_policy(
     with atomic_directory(directory, replaces=DESCRIPTION_FILE) as folder:
         (folder / NETWORK_FILE).write_bytes(content)
         record = complete.model_dump(mode="json", exclude=None if complete.pictures else {"pictures"})
-        text = yaml.safe_dump(
-            record,
-            sort_keys=False,
-            default_flow_style=None,
-            allow_unicode=True,
-            width=120,
-        )
+        text = yaml_text(record, default_flow_style=None, width=120)
         (folder / DESCRIPTION_FILE).write_text(text, encoding="utf-8")
         _write_curves(folder / CURVES_FILE, curves)
         if evaluation is not None:

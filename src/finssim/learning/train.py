@@ -64,9 +64,9 @@ def train(
         task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking,
             pursuit, team-pursuit, formation or, with a camera, camera-docking; or one's own, FILE.py:CLASS.
         out: Directory of the policy; an earlier policy there is replaced when done.
-        learner (NAME): Who learns: ppo (FinsSim's own, the default), sb3-ppo, sb3-sac, sb3-recurrent-ppo or rsl-rl; one
-            agent also torchrl-ppo, several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; tasks
-            with pictures distill, their default; or one's own, FILE.py:CLASS.
+        learner (NAME): Who learns: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; one agent also torchrl-ppo,
+            several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; tasks with pictures distill,
+            their default; or one's own, FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         action (MODE): What the policy commands: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
@@ -80,8 +80,9 @@ def train(
         until (SHARE): Share of successes, such as 0.95, at which the training is done before its steps are: of the held
             episodes, in two evaluations one after the other.
         init (NAME|DIR): Whom the policy imitates before it learns by itself: a baseline of the task, such as pid, a
-            policy directory, or none; pursuit, team-pursuit and formation have their baselines if not given. Of ppo;
-            --set taught=SHARE says for how much of the training.
+            policy directory, informed (a policy trained first that sees what --randomize has drawn), or none; pursuit,
+            team-pursuit and formation have their baselines if not given. Of ppo; --set taught=SHARE says for how much
+            of the training.
         settings (NAME=VALUE): Change of a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be
             given several times.
         resume: Go on from the last checkpoint of a training that was killed.

@@ -9,12 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from finssim.files import atomic_write
 from finssim.geometry.optics import Lens, OpticsError
 from finssim.localization import LocalizationError
-from finssim.yaml_file import read_mapping
+from finssim.yaml_file import read_mapping, yaml_text
 
 # Reading typed values out of a YAML mapping, each refusal one sentence with the place.
 
@@ -173,9 +171,7 @@ def write_camera(path: str | Path, lens: Lens, record: Mapping[str, Any]) -> Non
         OutputError: The file cannot be written.
     """
     head = "# Camera. Pixels: integer coordinates are pixel centres, u to the right, v down; lengths in pixels.\n"
-    body = yaml.safe_dump(
-        {"lens": lens_values(lens), "calibration": dict(record)}, sort_keys=False, width=110
-    )
+    body = yaml_text({"lens": lens_values(lens), "calibration": dict(record)}, width=110)
     with atomic_write(path) as temporary:
         temporary.write_text(head + body, encoding="utf-8")
 

@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from finssim.files import atomic_write
 from finssim.geometry.optics import Camera, Interface, Layer, OpticsError
 from finssim.geometry.rotations import quat_to_matrix
 from finssim.localization import LocalizationError
 from finssim.localization.camera_file import Fields, lens_from, lens_values, load_camera
-from finssim.yaml_file import read_mapping
+from finssim.yaml_file import read_mapping, yaml_text
 
 Array = npt.NDArray[np.float64]
 
@@ -117,7 +116,7 @@ def write_pool(pool: Pool, path: str | Path) -> None:
         "# camera.orientation: optical axes (x right, y down, z along the view) to pool axes, xyzw.\n"
         "# interface: n . X + b = 0 with n into the camera's side; index_near on that side, index_far beyond.\n"
     )
-    body = yaml.safe_dump({**_values(pool), "calibration": dict(pool.record)}, sort_keys=False, width=110)
+    body = yaml_text({**_values(pool), "calibration": dict(pool.record)}, width=110)
     with atomic_write(path) as temporary:
         temporary.write_text(head + body, encoding="utf-8")
 

@@ -15,9 +15,13 @@ from finssim.pool.plant_spec import Basin, PlantSpec
 from finssim.pool.positioning import Exposure, Mail, PoseAt, Shutter
 from finssim.robot.messages import Picture
 from finssim.vehicles import Vehicle
-from finssim.worlds import RangeBatch, WorldBatch, load_world, sensor_of
+from finssim.worlds import RangeBatch, WorldBatch, WorldLayout, load_world, sensor_of
 
 __all__ = ["Cameras", "OnboardPlan", "OnboardSensors", "site_of_world"]
+
+
+SETTLING = 3
+"""Pictures of automatic exposure before time begins."""
 
 
 class Shutters:
@@ -83,7 +87,7 @@ class OnboardSensors:
         self._shutters, self._mail = Shutters(vehicle, names, seed), Mail()
         # Kernels are compiled before time begins, and automatic exposure begins with a picture of the site.
         here = world.world.viewpoint.pose
-        for name in names:
+        for name in [*names] * SETTLING:
             self.develop(Exposure(0, 0.0, 0.0, (here[:3], here[3:]), (here[:3], here[3:]), name))
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Picture]:
@@ -126,6 +130,16 @@ class OnboardPlan:
     world: str
     """Site of the catalogue, or a path."""
     seed: int
+    solid: bool = True
+    """Whether the hull meets the world's things: not where the water is that of another site."""
+
+    def layout(self) -> WorldLayout | None:
+        """What the hull meets, drawn as the sensors see it."""
+        if not self.solid:
+            return None
+        layout = WorldLayout(self.world)
+        layout.draw(self.seed)
+        return layout
 
     def camera(self) -> OnboardSensors:
         """Make them."""

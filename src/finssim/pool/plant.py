@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.engine import Pool, Simulator, TetherLine, Water, Wave
+from finssim.engine import Dock, Pool, Simulator, TetherLine, Water, Wave
 from finssim.engine.plant_arrays import NO_LIMIT
 from finssim.physics.hydrostatics import submerged_fraction
 from finssim.physics.kinematics import up_in_body
@@ -19,6 +19,7 @@ from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
 from finssim.pool.plant_spec import HEADROOM, Basin, Circulation, PlantSpec, PlantSpecError, SlackTether
 from finssim.vehicles import Vehicle
 from finssim.vehicles.hydrodynamics import MeshSet
+from finssim.worlds.layout import WorldLayout
 
 # The pool's own circulation: eddies in a box, still at the walls, that come and go slowly.
 
@@ -543,6 +544,8 @@ class Plant:
         position: ArrayLike = (0.0, 0.0, -0.5),
         quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0),
         speed_loop: bool = True,
+        world: WorldLayout | None = None,
+        dock: Dock | None = None,
     ) -> None:
         """Put the vehicle into the water, at rest.
 
@@ -554,6 +557,8 @@ class Plant:
             position: Start, world frame [m].
             quaternion: Start, body to world, xyzw.
             speed_loop: Whether the firmware holds shaft speeds; if not, `target` is what it expects at full voltage.
+            world: One copy of a world, whose things the hull meets; with its basin in place of that of `spec`.
+            dock: A funnel in the water, at `simulator.funnel`.
 
         Raises:
             PlantSpecError: The plant is not of this vehicle.
@@ -568,7 +573,7 @@ class Plant:
         self.step = period / self.steps_per_period
         """Physics step [s]."""
         motor_steps = math.ceil(self.step / MOTOR_STEP - 1e-9)
-        self.simulator = self._simulator(position, quaternion)
+        self.simulator = self._simulator(position, quaternion, world, dock)
         self.motors = motor_bank(vehicle, spec, self.step / motor_steps, speed_loop=speed_loop)
         self._views()
         s = self.simulator
@@ -585,8 +590,11 @@ class Plant:
         self._step = captured(pipeline.run)
         self.steps = 0
 
-    def _simulator(self, position: ArrayLike, quaternion: ArrayLike) -> Simulator:
+    def _simulator(
+        self, position: ArrayLike, quaternion: ArrayLike, world: WorldLayout | None, dock: Dock | None
+    ) -> Simulator:
         spec, hull = self.spec, self.spec.hull
+        basin = Pool(length=spec.basin.length, width=spec.basin.width, depth=spec.basin.depth)
         meshed = hull.form_drag > 0.0 or hull.skin_drag > 0.0
         vehicle = self.vehicle
         if meshed:
@@ -601,7 +609,9 @@ class Plant:
                 depth=spec.basin.depth,
                 waves=[Wave(**wave.model_dump()) for wave in spec.circulation.waves],
             ),
-            pool=Pool(length=spec.basin.length, width=spec.basin.width, depth=spec.basin.depth),
+            pool=basin if world is None else None,
+            world=world,
+            dock=dock,
             tether=dragged_line(spec.tether),
             threads=1,
             water_moves=bool(spec.circulation.eddies or any(spec.circulation.stream)),

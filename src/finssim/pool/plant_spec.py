@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -16,7 +15,7 @@ from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import POOL, room
-from finssim.yaml_file import read_mapping
+from finssim.yaml_file import read_mapping, yaml_text
 
 __all__ = [
     "HEADROOM",
@@ -399,7 +398,7 @@ class PlantSpec(Section):
 
     def write(self, path: Path) -> None:
         """Write the plant file, whole or not at all."""
-        text = yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, width=118)
+        text = yaml_text(self.model_dump(mode="json"), width=118)
         with atomic_write(path) as temporary:
             temporary.write_text(
                 f"# A plant of FinsSim's virtual pool: finssim pool --plant {Path(path).name}\n"

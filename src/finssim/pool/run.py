@@ -85,6 +85,7 @@ class PoolPlan:
             seed=seed,
             truth=truth,
             firmware=self.firmware,
+            world=None if self.onboard is None else self.onboard.layout(),
         )
 
     def standing(self, start: Station, *, seed: int, truth: Path | None = None) -> VirtualPool:
@@ -121,7 +122,8 @@ def make_plan(
     """
     ours = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
-    spec = site_of(site or "pool", spec) if world is None or site is not None else site_of_world(world, spec)
+    own = world is not None and site is None
+    spec = site_of_world(world, spec) if own and world is not None else site_of(site or "pool", spec)
     site = site or ("pool" if world is None else "open-water")
     ours = vehicle_at(site, ours, navigation=firmware == "ardusub")
     if site == "open-water" and camera != "none":
@@ -132,7 +134,7 @@ def make_plan(
         raise PlantSpecError(f"unknown firmware '{firmware}'; available: mcu, ardusub")
     if camera not in ("pictures", "corners", "none"):
         raise PlantSpecError(f"unknown camera '{camera}'; available: pictures, corners, none")
-    onboard = None if world is None else OnboardPlan(vehicle=ours, world=world, seed=seed)
+    onboard = None if world is None else OnboardPlan(vehicle=ours, world=world, seed=seed, solid=own)
     plan = PoolPlan(vehicle=ours, spec=spec, camera=None, calibrated=None, firmware=firmware, onboard=onboard)
     if camera == "none":
         return plan

@@ -26,6 +26,7 @@ from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_
 from finssim.localization.pool import Pool
 from finssim.pool.draw_plant import positioning_of
 from finssim.pool.fleet import Fleet, Medium
+from finssim.pool.onboard import OnboardSensors
 from finssim.pool.plant_spec import Basin, PlantSpec
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.bridge import Bridge, BridgeSettings
@@ -40,9 +41,11 @@ from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task, one_world, unscored
 from finssim.tasks.reference import fill_table
+from finssim.tasks.sight import first_draw
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.terms import Terms
 from finssim.vehicles import Vehicle
+from finssim.worlds import WorldBatch
 
 __all__ = ["Referee", "ScriptedPilot", "TaskSite", "TrueState"]
 
@@ -215,9 +218,17 @@ class Referee:
         if guide is not None and (start is None or self.arrays.reference.position is not None):
             fill_table(self.arrays.reference, [guide])
         self._guide = guide if start is not None else None
+        self.world: WorldBatch | None = None
+        """What a vehicle that sees has around it, drawn as in training."""
         if start is not None:
             self._put({task.vehicles[0]: start})
             self._aim(0.0)
+        elif task.world:
+            self.world = WorldBatch(task.world)
+            self.world.draw(first_draw(seed), held_out=task.held_out)
+            pose = self.world.poses(task.landmark)[0]
+            self.arrays.goal_position.numpy()[0] = pose[:3]
+            self.arrays.goal_quaternion.numpy()[0] = pose[3:]
         batch, mask = Batch(self._state, self.arrays, seed), wp.ones(1, dtype=wp.int32, device=device)
         self._evaluate, opening = Pipeline(1, device), Pipeline(1, device)
         task.add_spawn(opening, batch, mask)
@@ -367,14 +378,20 @@ class TaskSite(Fleet):
             name: VirtualPool(
                 vehicle,
                 spec(vehicle),
-                camera=camera(vehicle) if camera else None,
+                camera=camera(vehicle) if camera else self._eyes(vehicle, seed),
                 positioning=positioning_of(positioning, seed + i) if name in self.task.agents else None,
                 start=place,
                 seed=seed + i,
                 truth=record / f"{name}.truth" if record is not None and name in steering else None,
+                dock=self.task.dock(),
             )
             for i, (name, vehicle, place) in enumerate(zip(names, vehicles, referee.places(), strict=True))
         }
+        if self.task.dock() is not None:
+            for world in worlds.values():
+                funnel = world.plant.simulator.funnel
+                funnel.position.assign(referee.arrays.goal_position)
+                funnel.quaternion.assign(referee.arrays.goal_quaternion)
         self._goal_is_told = pilots is None and self.task.moving and len(names) == 1
         site = (SITE,) if self._target() is not None else ()
         super().__init__(worlds)
@@ -408,6 +425,13 @@ class TaskSite(Fleet):
                 if record is not None and agent
                 else None,
             )
+
+    def _eyes(self, vehicle: Vehicle, seed: int) -> OnboardSensors | None:
+        """The vehicle's own cameras that the task observes, in the world of its episode."""
+        if self.referee.world is None:
+            return None
+        names = [picture.name for picture in self.task.pictures]
+        return OnboardSensors(vehicle, self.referee.world, names=names, seed=seed)
 
     def run(self, duration: float | None = None) -> dict[str, float]:
         """Play until the task ends, or for a time from the start of the last robot [s]; its time limit if None.

@@ -28,7 +28,9 @@ from finssim.vehicles import Vehicle
 from finssim.yaml_file import json_value
 
 if TYPE_CHECKING:
+    from finssim.engine import Dock
     from finssim.pool.ardusub import ArduSub
+    from finssim.worlds import WorldLayout
 
 __all__ = [
     "Camera",
@@ -332,6 +334,8 @@ class VirtualPool:
         truth: str | Path | None = None,
         truth_period: float = 0.01,
         firmware: Literal["mcu", "ardusub"] = "mcu",
+        world: WorldLayout | None = None,
+        dock: Dock | None = None,
     ) -> None:
         """Put the vehicle into the pool, at rest, with its motor controller running.
 
@@ -346,6 +350,8 @@ class VirtualPool:
             truth_period: Between its records [s], taken to whole physics steps.
             firmware: mcu: a motor controller that takes shaft speeds; ardusub: an autopilot that takes axes over
                 MAVLink, and turns the motors by pulses alone.
+            world: One copy of a world, whose things the hull meets; with its basin in place of that of `spec`.
+            dock: A funnel in the water, at `plant.simulator.funnel`.
 
         Raises:
             PlantSpecError: The plant is not of this vehicle.
@@ -358,7 +364,7 @@ class VirtualPool:
         self.firmware = self._firmware(firmware)
         self.plant = Plant(
             vehicle, spec, seed=seed, period=period, position=position, quaternion=quaternion,
-            speed_loop=firmware == "mcu",
+            speed_loop=firmware == "mcu", world=world, dock=dock,
         )  # fmt: skip
         self.sensors = PoolSensors(self.plant, seed)
         self.faults = Faults(seed)

@@ -165,7 +165,7 @@ class AgentPilot:
             previous = self.action if self.action.size else None
             self.observation = self.observer.observe(reading, guide, t, previous, self.reach, self.turn)
         rows = [self.observation[None], *(np.asarray(x, float)[None] for x in _state(reading))]
-        known = Known(*rows, **({"pictures": seen} if seen else {}))
+        known = Known(*rows, pictures=seen or None)
         goal = goal_at(guide, t)
         aims = (goal.position, goal.quaternion, goal.velocity, goal.acceleration)
         began = time.perf_counter()
@@ -318,16 +318,16 @@ def make_pilot(
     trained = read_description(Path(who))
     mode = mode_from_dict(trained.action, vehicle)
     seen = Observer(task or trained.task, vehicle, agent=agent, action=mode.name)
-    shapes = {name: about["shape"] for name, about in getattr(trained, "pictures", {}).items()}
+    shapes = {name: about["shape"] for name, about in trained.pictures.items()}
     return AgentPilot(PolicyAgent(who, vehicle, seen.task, period=period), vehicle, seen, shapes)
 
 
 def _shapes(task: Task, vehicle: Vehicle) -> dict[str, tuple[int, int, int]]:
     """Shapes of the pictures that a task observes, by name."""
-    shapes = {}
-    for picture in getattr(task, "pictures", ()):
-        from finssim.worlds import device_of
+    from finssim.worlds import device_of
 
+    shapes = {}
+    for picture in task.pictures:
         lens = device_of(vehicle, picture.name).lens(picture.width)
         shapes[picture.name] = lens.height, lens.width, 3
     return shapes

@@ -82,7 +82,8 @@ class _Monitor:
         if reading is None:
             return
         now = reading.time
-        if not math.isnan(runtime.started) and reading.ready and now >= self._next:
+        known = not math.isnan(runtime.started) and reading.ready and runtime.guide is not _SEEN
+        if known and now >= self._next:
             self._next = now + EVERY - 1e-6
             goal = runtime.guide.at(runtime.t)
             turn = float(wrap_angle(quat_yaw(reading.quaternion) - goal.yaw))
@@ -107,7 +108,7 @@ class _Monitor:
     def _newest(self) -> str:
         """The latest error in words."""
         if not self._errors:
-            return "position not known"
+            return "no error to a goal is known"
         distance, turn = self._errors[-1]
         return f"{100.0 * distance:.1f} cm and {math.degrees(turn):+.1f} deg off"
 
@@ -140,7 +141,7 @@ def show(told: dict[str, Any], console: Console) -> None:
     table = Table(show_header=False, box=None)
     latency = told["latency_s"]
     position, yaw = told["position_rms_m"], told["yaw_rms_deg"]
-    off = "position not known" if position is None else f"{100.0 * position:.1f} cm, {yaw:.2f} deg"
+    off = "no error to a goal is known" if position is None else f"{100.0 * position:.1f} cm, {yaw:.2f} deg"
     rows = {
         "state": told["state"] + (f": {told['reason']}" if told["reason"] else ""),
         "time": f"{told['duration_s']:.1f} s",
@@ -273,6 +274,8 @@ UNHEARD = 4
 """Exit status of a run in which the vehicle said nothing."""
 _GO = Station((0.0, 0.0, 0.0), 0.0, name="team")
 """The guide of a vehicle that goes by the others alone."""
+_SEEN = Station((0.0, 0.0, 0.0), 0.0, name="sight")
+"""The guide of a vehicle that goes by its pictures alone."""
 
 
 def run(
@@ -377,11 +380,12 @@ def run(
     file = None if pool_file == "none" else Path(pool_file or "pool.yaml")
     filed = load_vehicle(vehicle)
     ours = numbered(vehicle_at(site, filed, navigation=robot.startswith("mavlink")), number)
-    guide = _GO if wiring.team and goal is None and trajectory is None else guide_of(goal, trajectory)
-    if guide is not _GO:
-        check_reachable(guide, ours)
     pilot = _pilot(policy, filed, task, agent=agent, follows=trajectory is not None)
     sees = getattr(pilot, "pictures", {})
+    free = goal is None and trajectory is None
+    guide = _GO if wiring.team and free else _SEEN if sees and free else guide_of(goal, trajectory)
+    if guide not in (_GO, _SEEN):
+        check_reachable(guide, ours)
     if defaults := [name for name in ours.defaults if sees or name != "perception"]:
         console.print(
             f"{ours.name}: {', '.join(defaults)} are defaults, fit for the virtual world; give a real vehicle "

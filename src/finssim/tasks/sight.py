@@ -18,8 +18,15 @@ from finssim.vehicles import Vehicle
 if TYPE_CHECKING:
     from finssim.tasks.task import Task
 
+DRAWS = 1_000_003
+"""Between the seeds of a world's draws from episode to episode."""
 SETTLING = 3
 """Pictures that automatic exposure has taken before the first of an episode."""
+
+
+def first_draw(seed: int) -> int:
+    """Seed of the draw of the first episode's worlds, from that of the environment."""
+    return seed + DRAWS
 
 
 @dataclass(frozen=True)
@@ -111,7 +118,8 @@ class Sight:
     def draw(self, mask: NDArray[np.bool_]) -> None:
         """Draw worlds for the episodes that begin where mask is true, (worlds,); the goal is the task's `landmark`."""
         self._episodes[mask] += 1
-        self.batch.draw(self.seed + 1_000_003 * self._episodes, mask, held_out=self._task.held_out)
+        seeds = first_draw(self.seed) + DRAWS * (self._episodes - 1)
+        self.batch.draw(seeds, mask, held_out=self._task.held_out)
         pose = self.batch.poses(self._task.landmark).astype(np.float32)
         self._arrays.goal_position.assign(np.ascontiguousarray(pose[:, :3]))
         self._arrays.goal_quaternion.assign(np.ascontiguousarray(pose[:, 3:]))

@@ -61,7 +61,7 @@ QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 
 DEFAULTS: Mapping[str, str] = {
     "sensors": "IMU and pressure gauge of a small MEMS unit, at the body origin",
-    "perception": "altimeter under the hull and imaging sonar at the nose (128 beams, 5 Hz), and a camera (64 px wide, "
+    "perception": "altimeter under the hull and imaging sonar at the nose (128 beams, 5 Hz), and a camera (48 px wide, "
     "10 Hz) on a vehicle that hovers: devices of small ROVs, delays and losses guessed",
     "tags": "two tag25h9 (15 ahead, 16 astern) on the middle of the top, as large as it takes, as on FinsROV",
     "mcu": "an output for each thruster in the order of the file, positive forward; full scale is the fastest shaft",
@@ -103,7 +103,7 @@ def default_perception(given: Mapping[str, Any]) -> dict[str, RaySensor]:
     length, _, height = given["body"].size
     nose, under = middle + [0.5 * length, 0.0, 0.0], middle - [0.0, 0.0, 0.5 * height]
     camera = RaySensor(
-        device="low_light_camera", position=nose, width=64, rate=10.0, latency=0.1, dropout=0.01
+        device="low_light_camera", position=nose, width=48, rate=10.0, latency=0.1, dropout=0.01
     )
     sonar = RaySensor(
         device="gemini_720is",

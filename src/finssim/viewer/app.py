@@ -19,7 +19,7 @@ from finssim.localization.pool import Pool
 from finssim.viewer.frame import Curve, Frame, Picture, Pose, Source, Stage, ViewError
 from finssim.viewer.shapes import box_edges, force_arrows, hull_of, line_of, tag_plates, wall_mesh, wxyz
 
-__all__ = ["LONGEST_TURN", "Playback", "View", "blank", "draw_picture", "legend_of", "plots_of"]
+__all__ = ["LONGEST_TURN", "Playback", "View", "blank", "draw_own", "draw_picture", "legend_of", "plots_of"]
 
 # The three-dimensional part of a view: the stage is built once, and every frame moves what moves.
 
@@ -79,6 +79,11 @@ class Scene:
             self._line("/path", path, "goal", 2.0)
         if stage.site is not None:
             self._camera(stage.site)
+        for thing in stage.bodies:
+            self._scene.add_mesh_simple(
+                f"/world/{thing.name}", thing.vertices, thing.faces, color=thing.colour, flat_shading=True,
+                side="double", cast_shadow=False,
+            )  # fmt: skip
         self._look(server)
 
     def draw(self, frame: Frame) -> None:
@@ -297,6 +302,8 @@ WIDTH = 480
 """Of the drawn picture, at least, if the camera has so many [px]."""
 DARK, LINE, FIRST = (30, 45, 58), (40, 230, 90), (255, 70, 60)
 """Ground without a picture, the outline of a tag, and its first edge."""
+COPPER = np.array([1.25, 0.78, 0.5])
+"""Shades of a sonar's fan, by red, green, blue."""
 INSET = 70
 """Half the edge of the part that is enlarged [px of the camera]."""
 ENLARGED = 1.5
@@ -323,6 +330,14 @@ def draw_picture(picture: Picture) -> Image:
     if outlines:
         _inset(shown, full, outlines)
     return shown
+
+
+def draw_own(image: Image) -> Image:
+    """A picture of an own camera, or a sonar's fan in copper, larger by a whole number, (h, w, 3)."""
+    if image.ndim == 2:
+        image = np.clip(image[..., None] * COPPER, 0, 255).astype(np.uint8)
+    times = max(1, -(-WIDTH // image.shape[1]))
+    return np.ascontiguousarray(image.repeat(times, axis=0).repeat(times, axis=1))
 
 
 def _inset(shown: Image, full: Image, outlines: list[Array]) -> None:
@@ -385,6 +400,11 @@ class Panel:
             with self._gui.add_folder("camera"):
                 self._image = self._gui.add_image(blank(), jpeg_quality=70)
         self._seen: Picture | None = None
+        self._eyes = {}
+        for name in stage.eyes:
+            with self._gui.add_folder(name):
+                self._eyes[name] = self._gui.add_image(blank(), jpeg_quality=80)
+        self._own: dict[str, Image] = {}
         with self._gui.add_folder("errors") as self._figures:
             self._named = self._gui.add_markdown("")
         self._plots: dict[tuple[str, ...], Any] = {}
@@ -417,6 +437,11 @@ class Panel:
         if self._image is not None and frame.picture is not self._seen:
             self._seen = frame.picture
             self._image.image = blank() if frame.picture is None else draw_picture(frame.picture)
+        for name, eye in self._eyes.items():
+            image = frame.pictures.get(name)
+            if image is not None and image is not self._own.get(name):
+                self._own[name] = image
+                eye.image = draw_own(image)
         events = tuple(frame.events)
         if events != self._last_events:
             self._last_events = events

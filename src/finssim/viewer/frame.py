@@ -20,6 +20,18 @@ class ViewError(ValueError):
     """Something that cannot be shown."""
 
 
+class Body(NamedTuple):
+    """A thing of a world that stands still."""
+
+    name: str
+    vertices: Array
+    """World frame [m], (v, 3)."""
+    faces: npt.NDArray[np.int64]
+    """(f, 3)"""
+    colour: tuple[int, int, int]
+    """Red, green, blue, 0 to 255."""
+
+
 class Pose(NamedTuple):
     """Where the body is."""
 
@@ -50,6 +62,10 @@ class Stage:
     """Camera, if one looks on."""
     path: Array = field(default_factory=nowhere)
     """Trajectory to follow, world frame [m], (k, 3)."""
+    bodies: Sequence[Body] = ()
+    """Of the world around the vehicle."""
+    eyes: Sequence[str] = ()
+    """Names of the vehicle's own cameras and sonars, whose pictures frames have."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +93,8 @@ class Frame:
     trail: Array = field(default_factory=nowhere)
     """Where the vehicle was lately, world frame [m], (k, 3)."""
     picture: Picture | None = None
+    pictures: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
+    """What the vehicle's own cameras saw last, (rows, columns, 3), and its sonars as fans from above, gray; by name."""
     status: Mapping[str, str] = field(default_factory=dict)
     """Name -> a few words or a number with its unit."""
     events: Sequence[str] = ()

@@ -12,14 +12,16 @@ from typing import Annotated, Any
 
 from finssim.robot.interrupt import interruptible
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.defaults import vehicle_at
 from finssim.viewer.frame import Source, ViewError
 from finssim.viewer.sources.guides import guide_for
+from finssim.worlds import load_world
 
 _DRIVEN = {"policy", "task", "goal", "trajectory", "seed"}
 HEEDED = {
-    "pool": _DRIVEN | {"plant", "severity", "camera"},
+    "pool": _DRIVEN | {"plant", "severity", "camera", "world"},
     "sim": _DRIVEN | {"hydrodynamics"},
-    "record": {"truth", "truth_offset", "basin"},
+    "record": {"truth", "truth_offset", "basin", "world", "seed"},
     "folder": {"world"},
 }
 """Kind of source -> the options, besides the vehicle, that it heeds."""
@@ -58,8 +60,10 @@ class Choice:
     """Robot's clock when the pool's showed 0 [s]; found by comparing both motions if not given."""
     basin: str | None = None
     """(L,W,D) Pool to draw around a record: length,width,depth [m]; the vehicle's workspace if not given."""
-    world: Annotated[int | None, (0, None)] = None
-    """World of a folder's run; the first that it has if not given."""
+    world: str | None = None
+    """(SITE|FILE|NUMBER) Of the pool what the vehicle's own cameras and sonars see, a site of finssim worlds list or a
+    file, where motion capture locates it; of a record the world to draw around it, as --seed drew it; of a folder the
+    number of the run's world, the first that it has if not given."""
     seed: int = 0
     """Seed of every random number; equal seeds give equal results."""
 
@@ -80,7 +84,10 @@ def open_source(choice: Choice) -> Source:
     if path.is_dir():
         from finssim.viewer.sources.run import RunSource
 
-        return RunSource(path, world=choice.world, vehicle=choice.vehicle)
+        if choice.world is not None and not choice.world.isdecimal():
+            raise ViewError(f"--world {choice.world}: expected the number of a world of the folder's run")
+        number = None if choice.world is None else int(choice.world)
+        return RunSource(path, world=number, vehicle=choice.vehicle)
     if not path.is_file():
         raise ViewError(
             f"{choice.source}: no such file or folder; give pool, sim, a record (.mcap) or a run's folder"
@@ -93,6 +100,8 @@ def open_source(choice: Choice) -> Source:
         offset=choice.truth_offset,
         basin=None if choice.basin is None else _size(choice.basin),
         vehicle=choice.vehicle,
+        world=choice.world,
+        seed=choice.seed,
     )
 
 
@@ -149,7 +158,12 @@ def _pool(choice: Choice) -> Source:
     from finssim.viewer.sources.pool import PoolSource
 
     name = choice.vehicle or "finsrov"
-    guide = guide_for(choice.goal, choice.trajectory, choice.task, load_vehicle(name))
+    goal = choice.goal
+    if choice.world is not None and goal is None and choice.trajectory is None:
+        view = load_world(choice.world).viewpoint
+        goal = ",".join(f"{x:g}" for x in (*view.position, math.degrees(view.yaw)))
+    room = load_vehicle(name) if choice.world is None else vehicle_at("open-water", load_vehicle(name))
+    guide = guide_for(goal, choice.trajectory, choice.task, room)
     kinds: Any = {"severity": choice.severity, "camera": choice.camera}  # checked where they are used
     return PoolSource(
         guide,
@@ -158,6 +172,7 @@ def _pool(choice: Choice) -> Source:
         task=choice.task,
         plant=choice.plant,
         seed=choice.seed,
+        world=choice.world,
         **kinds,
     )
 

@@ -8,8 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.rotations import quat_to_matrix
+from finssim.robot.messages import Picture
+from finssim.robot.record_messages import FAN_ROWS
 from finssim.vehicles import Vehicle, VehicleError
-from finssim.viewer.frame import Pose
+from finssim.viewer.frame import Body, Pose
+from finssim.worlds import device_of
+from finssim.worlds.description import SonarDevice
+from finssim.worlds.layout import Shape, WorldLayout
+from finssim.worlds.rays import fan_picture
 
 Array = npt.NDArray[np.float64]
 
@@ -33,6 +39,10 @@ BOX_FACES = np.array(
     + [[1, 3, 5], [3, 7, 5]]
 )
 """Of the corners in the order z, y, x: outwards; -z, +z, -y, +y, -x, +x."""
+
+
+FAR, GAMMA = 15.0, 2.2
+"""Half the edge of a plane that is drawn [m]; reflectances are shown to this power."""
 
 
 class Mesh(NamedTuple):
@@ -111,6 +121,67 @@ def box_edges(lower: Array, upper: Array) -> Array:
     corners = _box(lower, upper).vertices
     pairs = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
     return np.array([[corners[a], corners[b]] for a, b in pairs])
+
+
+def shown_of(vehicle: Vehicle, picture: Picture) -> npt.NDArray[np.uint8] | str:
+    """What a person sees of a reading of the vehicle's own sensors: a picture, a sonar's fan, or ranges in words."""
+    if picture.image is None:
+        ranges = [] if picture.ranges is None else picture.ranges.tolist()
+        return ", ".join(f"{x:.2f} m" if np.isfinite(x) else "nothing in reach" for x in ranges)
+    device = device_of(vehicle, picture.source)
+    if not isinstance(device, SonarDevice):
+        return picture.image
+    return np.nan_to_num(fan_picture(picture.image, device.sector, FAN_ROWS)).astype(np.uint8)
+
+
+def world_bodies(layout: WorldLayout) -> list[Body]:
+    """The things of the first world of a layout, where they stand; the copies in a row are one thing.
+
+    Planes end 15 m from their middle, and basins have no walls: the stage has.
+    """
+    parts: dict[str, list[Mesh]] = {}
+    colours = {}
+    for shape, pose in zip(layout.shapes, layout.transforms.numpy()[0].astype(float), strict=True):
+        if shape.owner != "basin":
+            mesh = _mesh_of(shape)
+            turned = Mesh(mesh.vertices @ quat_to_matrix(pose[3:]).T + pose[:3], mesh.faces)
+            parts.setdefault(shape.owner, []).append(turned)
+            colours[shape.owner] = tuple((255.0 * shape.finish.colour ** (1.0 / GAMMA)).astype(int).tolist())
+    bodies = []
+    for name, meshes in parts.items():
+        first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+        faces = np.concatenate([mesh.faces + i for mesh, i in zip(meshes, first, strict=False)])
+        bodies.append(Body(name, np.concatenate([mesh.vertices for mesh in meshes]), faces, colours[name]))
+    return bodies
+
+
+def _mesh_of(shape: Shape) -> Mesh:
+    """Triangles of a shape, in its axes."""
+    size = shape.size
+    if shape.kind == "mesh":
+        return Mesh(np.asarray(shape.vertices, float), np.asarray(shape.faces))
+    if shape.kind in ("heightfield", "plane"):
+        heights = np.zeros((2, 2)) if shape.heights is None else shape.heights
+        x, y = (size[i] or FAR for i in (0, 1))
+        rows, columns = heights.shape
+        grid = np.meshgrid(np.linspace(-x, x, columns), np.linspace(-y, y, rows))
+        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+        lower = np.stack([corner, corner + 1, corner + columns + 1], axis=1)
+        upper = np.stack([corner, corner + columns + 1, corner + columns], axis=1)
+        return Mesh(np.stack([*grid, heights], axis=-1).reshape(-1, 3), np.concatenate([lower, upper]))
+    import trimesh.creation as made
+
+    if shape.kind == "box":
+        solid = made.box(extents=2.0 * np.asarray(size))
+    elif shape.kind == "sphere":
+        solid = made.icosphere(subdivisions=2, radius=size[0])
+    elif shape.kind == "cylinder":
+        solid = made.cylinder(radius=size[0], height=2.0 * size[1], sections=24)
+    else:
+        solid = made.capsule(height=2.0 * size[1], radius=size[0], count=[16, 16])
+        middle = 0.5 * (solid.vertices.min(axis=0) + solid.vertices.max(axis=0))
+        return Mesh(solid.vertices - middle, np.asarray(solid.faces))
+    return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces))
 
 
 def _box(lower: Array, upper: Array) -> Mesh:

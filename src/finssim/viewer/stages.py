@@ -6,9 +6,12 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.vehicles import Vehicle
+from finssim.worlds import World
 
 Array = npt.NDArray[np.float64]
 
+AROUND = 4.0
+"""The viewpoint of a world, to each side [m]."""
 MARGIN = 0.5
 """Around a motion that nothing bounds [m]."""
 
@@ -36,3 +39,13 @@ def box_of(
     lower, upper = known.min(axis=0) - MARGIN, known.max(axis=0) + MARGIN
     upper[2] = 0.0
     return lower, upper
+
+
+def box_of_world(world: World) -> tuple[Array, Array]:
+    """Lower and upper corner of a world: its basin, or about its viewpoint down to the seabed [m], (3,)."""
+    if world.basin is not None:
+        length, width, depth = world.basin.size
+        return np.array([-0.5 * length, -0.5 * width, -depth]), np.array([0.5 * length, 0.5 * width, 0.0])
+    x, y, z = world.viewpoint.position
+    depth = 2.0 * abs(z) if world.seabed is None else world.seabed.depth
+    return np.array([x - AROUND, y - AROUND, -depth]), np.array([x + AROUND, y + AROUND, 0.0])

@@ -51,7 +51,7 @@ def returns(name, learner, value):
 @pytest.mark.parametrize(
     ("name", "task"),
     [
-        *((name, Steady) for name in ("sb3-ppo", "sb3-recurrent-ppo", "rsl-rl", "torchrl-ppo")),
+        *((name, Steady) for name in ("sb3-ppo", "rsl-rl", "torchrl-ppo")),
         *((name, SteadyTogether) for name in ("torchrl-ippo", "torchrl-mappo")),
     ],
 )

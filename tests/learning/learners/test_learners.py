@@ -20,9 +20,7 @@ IMITATING = ("bc", "dagger", "gail", "distill")
 REINFORCED = [name for name in LEARNERS if name not in IMITATING]
 ONE = [name for name in REINFORCED if LEARNERS[name].agents != "several"]
 SEVERAL = [name for name in REINFORCED if LEARNERS[name].agents != "one"]
-SHARED = [name for name in SEVERAL if name not in ("sb3-sac", "sb3-recurrent-ppo")]
-"""Those of a library whose sharing of one policy another of its learners shows."""
-PAIRS = [(name, Guess) for name in ONE] + [(name, GuessTogether) for name in SHARED]
+PAIRS = [(name, Guess) for name in ONE] + [(name, GuessTogether) for name in SEVERAL]
 TRAINED = [
     *((name, "t1") for name in ONE),
     *((name, "team-pursuit") for name in SEVERAL if name not in ONE),
@@ -38,12 +36,7 @@ TRAINED = [
 def small(name, task, **changes):
     """Settings with which an update takes a fraction of a second."""
     kind = learner_named(name)
-    few = {"worlds": 8, "rollout": 16, "hidden": (16, 16), **changes}
-    if name == "sb3-sac":
-        few = {"warm_up": 100, "memory": 4000, "gradient_steps": 4, "batch": 64, **few}
-    else:
-        few = {"batch": 64, "epochs": 2, **few}
-    few |= {"lstm": 16} if name == "sb3-recurrent-ppo" else {}
+    few = {"worlds": 8, "rollout": 16, "hidden": (16, 16), "batch": 64, "epochs": 2, **changes}
     return replace(kind.settings(task), **few)
 
 
@@ -81,16 +74,8 @@ def same(first, second):
 @pytest.mark.parametrize(("name", "task"), PAIRS)
 def test_it_finds_the_best_action(name, task):
     """Of a task of one step: c where +1 is seen and -c where -1, by every agent; the held evaluation says success."""
-    steps = 6000 if name == "sb3-sac" else 10_000
+    steps = 10_000
     changes = {"worlds": 32, "learning_rate": 1e-2, "steps": steps, "discount": 0.5}
-    if name == "sb3-sac":  # what PPO gets from many rollouts, it gets from learning much from few
-        changes |= {
-            "gradient_steps": 80,
-            "learning_rate": 5e-3,
-            "warm_up": 1500,
-            "hidden": (32, 32),
-            "batch": 128,
-        }
     learner = made(name, task(), **changes)
     before = learner.update()
     while learner.steps < steps:
@@ -148,9 +133,7 @@ def test_equal_seeds_are_equal_learners(name):
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(
-        LearningError, match="unknown learner 'sb3'; available: ppo, sb3-ppo, sb3-sac, sb3-recurrent-ppo"
-    ):
+    with pytest.raises(LearningError, match="unknown learner 'sb3'; available: ppo, sb3-ppo, rsl-rl"):
         learner_named("sb3")
     kind, task = learner_named("sb3-ppo"), Guess()
     with pytest.raises(LearningError, match="unknown setting 'gamma'; available: worlds, steps, rollout"):
@@ -174,23 +157,19 @@ def test_unknown_names_are_refused():
 )
 def test_settings_that_nothing_can_be_learnt_with_are_refused(name, value, sentence):
     """Else they end in a division by zero, or after the first update; what may be left out may be 0."""
-    kind = learner_named("sb3-sac")
+    kind = learner_named("sb3-ppo")
     with pytest.raises(LearningError, match=sentence):
         kind.settings(Guess(), changes={name: value})
-    assert kind.settings(Guess(), changes={"warm_up": 0}).warm_up == 0
+    assert kind.settings(Guess(), changes={"entropy_weight": 0.0}).entropy_weight == 0.0
 
 
-@pytest.mark.parametrize(
-    ("name", "library", "extra"),
-    [("rsl-rl", "rsl_rl.algorithms", "rsl-rl"), ("sb3-recurrent-ppo", "sb3_contrib", "sb3-contrib")],
-)
-def test_a_library_that_is_missing_is_named(monkeypatch, name, library, extra):
+def test_a_library_that_is_missing_is_named(monkeypatch):
     """With what to install."""
-    kind = learner_named(name)
-    monkeypatch.setitem(sys.modules, library, None)
+    kind = learner_named("rsl-rl")
+    monkeypatch.setitem(sys.modules, "rsl_rl.algorithms", None)
     monkeypatch.delitem(sys.modules, f"finssim.learning.learners.{kind.module}", raising=False)
     with pytest.raises(
-        LearningError, match=rf"this learner needs {library}: pip install 'finssim\[learn,{extra}\]'$"
+        LearningError, match=r"this learner needs rsl_rl.algorithms: pip install 'finssim\[learn,rsl-rl\]'$"
     ):
         kind.settings(Guess())
 
@@ -203,17 +182,6 @@ def test_settings_are_changed_by_name():
     assert (settings.learning_rate, settings.hidden, settings.epochs) == (1e-3, (32, 16), 3)
     assert (settings.worlds, settings.steps, settings.rollout) == (64, 5, 128)
     assert learner_named("rsl-rl").settings(task_named("t2")).discount == 0.9
-
-
-def test_a_memory_smaller_than_the_warm_up_is_refused():
-    with pytest.raises(LearningError, match="warm_up is 5000, expected less than the memory of 100 steps"):
-        made("sb3-sac", Guess(), memory=100, warm_up=5000)
-
-
-def test_entropy_without_weight_is_refused():
-    """It adapts by factors, and 0 would stay 0."""
-    with pytest.raises(LearningError, match="entropy_weight is 0.0, expected more than 0"):
-        made("sb3-sac", Guess(), entropy_weight=0.0)
 
 
 @pytest.mark.parametrize("asymmetric", [True, False])

@@ -16,7 +16,7 @@ def test_the_tasks_own_lines_outrank_the_others(monkeypatch):
     drawn = {"*": {"on-policy": {"a": 4, "b": 4}}, "t1": {"on-policy": {"d": 5}}}
     monkeypatch.setattr(base, "SETTINGS", plain)
     monkeypatch.setattr(base, "RANDOMIZED", drawn)
-    assert own_settings("other", "sb3-sac", True) == {}
+    assert own_settings("other", "bc", True) == {}
     assert own_settings("other", "sb3-ppo", False) == {"a": 1, "b": 1}
     assert own_settings("other", "sb3-ppo", True) == {"a": 4, "b": 4}
     assert own_settings("t1", "sb3-ppo", False) == {"a": 1, "b": 2, "c": 2}

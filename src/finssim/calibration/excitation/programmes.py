@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
@@ -25,6 +24,7 @@ from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.vehicle import Axis
+from finssim.yaml_file import yaml_text
 
 __all__ = ["Programme", "RATE", "programmes", "travel", "which_axes"]
 
@@ -484,7 +484,7 @@ def excite(
         }
         if simulate:
             about["noise"] = noise
-        (folder / "programmes.yaml").write_text(yaml.safe_dump(about, sort_keys=False), encoding="utf-8")
+        (folder / "programmes.yaml").write_text(yaml_text(about), encoding="utf-8")
     return names
 
 
@@ -519,7 +519,7 @@ def write_programme(programme: Programme, vehicle: Vehicle, folder: Path) -> Non
     if programme.ascent_speed is not None:
         about["end_coast_early"] = {"ascent_speed": programme.ascent_speed, "after": programme.ascent_time}
     with atomic_write(folder / "programme.yaml") as path:
-        path.write_text(yaml.safe_dump(about, sort_keys=False), encoding="utf-8")
+        path.write_text(yaml_text(about), encoding="utf-8")
 
 
 def _peak(programme: Programme, i: int) -> float:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
@@ -29,7 +28,7 @@ from finssim.calibration.trials.trial import (
 from finssim.files import OutputError, atomic_directory
 from finssim.text_table import TextTable, number, read_text_table, write_csv
 from finssim.vehicles.part import did_you_mean, sentence_of
-from finssim.yaml_file import read_mapping
+from finssim.yaml_file import read_mapping, yaml_text
 
 __all__ = ["Table", "load_trial", "load_trials", "new_samples", "read_table", "trials_at", "write_trial"]
 
@@ -438,7 +437,7 @@ def read_header(path: Path) -> Header:
 def header_text(header: Header) -> str:
     """`trial.yaml` of a header: what differs from the defaults."""
     tree = header.model_dump(mode="json", exclude_defaults=True)
-    return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True) if tree else "{}\n"
+    return yaml_text(tree) if tree else "{}\n"
 
 
 def _content(path: Path) -> str:

@@ -18,7 +18,7 @@ from finssim.tasks.agents import expert_for
 # What a learner's settings are for a task, where they are not the defaults: the one place for them.
 
 
-ON_POLICY = ("sb3-ppo", "sb3-recurrent-ppo", "rsl-rl", "torchrl-ppo", "torchrl-ippo", "torchrl-mappo")
+ON_POLICY = ("sb3-ppo", "rsl-rl", "torchrl-ppo", "torchrl-ippo", "torchrl-mappo")
 """The learners that `on-policy` means below: those of outside libraries with `OnPolicySettings`."""
 
 Table = dict[str, dict[str, dict[str, Any]]]
@@ -40,7 +40,6 @@ SETTINGS: Table = {
         # A reference is close all the time: one second of foresight is enough, and learns faster than five.
         "ppo": {"discount": 0.9, "steps": 500_000},
         "on-policy": {"discount": 0.9},
-        "sb3-sac": {"discount": 0.9},
     },
     # So is a target that moves, once it has been reached.
     "t3": {"on-policy": {"discount": 0.95}, "ppo": {"steps": 600_000}},
@@ -72,7 +71,6 @@ RANDOMIZED: Table = {
     "*": {
         "ppo": {"steps": 1_000_000},
         "on-policy": {"steps": 3_000_000},
-        "sb3-sac": {"steps": 800_000, "memory": 800_000},
     },
     # What it saw and did in the last steps tells how this vehicle answers: thrust, lag, and how late the state comes.
     "t1": {"ppo": {"steps": 2_000_000, "history": 2, "last_action": True}},

@@ -139,13 +139,6 @@ class LearnerKind:
 LEARNERS: dict[str, LearnerKind] = {
     "ppo": LearnerKind("ppo", "Ppo", "PPO of our own, NumPy on a processor and torch on a GPU"),
     "sb3-ppo": LearnerKind("sb3", "Sb3Ppo", "PPO of Stable-Baselines3"),
-    "sb3-sac": LearnerKind("sb3", "Sb3Sac", "SAC of Stable-Baselines3"),
-    "sb3-recurrent-ppo": LearnerKind(
-        "sb3_recurrent_ppo",
-        "Sb3RecurrentPpo",
-        "recurrent PPO of SB3-Contrib: the policy remembers with an LSTM",
-        extra="sb3-contrib",
-    ),
     "rsl-rl": LearnerKind("rsl_rl_ppo", "RslRlPpo", "PPO of RSL-RL", extra="rsl-rl"),
     "torchrl-ppo": LearnerKind("torchrl_ppo", "TorchRlPpo", "PPO of TorchRL", extra="torchrl", agents="one"),
     "torchrl-ippo": LearnerKind(

@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from finssim.control.guidance import Guide
+from finssim.control.guidance import Guide, Station
+from finssim.pool.onboard import OnboardSensors
 from finssim.pool.plant_spec import PlantSpecError, Severity
 from finssim.pool.run import make_plan
 from finssim.robot.bridge import Bridge
@@ -17,10 +18,12 @@ from finssim.robot.messages import Picture as Seen
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.viewer.frame import Curve, Frame, Picture, Pose, Stage
+from finssim.viewer.shapes import shown_of, world_bodies
 from finssim.viewer.sources.guides import goal_pose, path_of, start_of
 from finssim.viewer.sources.series import Errors
-from finssim.viewer.stages import box_of
+from finssim.viewer.stages import box_of, box_of_world
 from finssim.viewer.tags import TagLook
+from finssim.worlds import RangeBatch
 
 RATE = 60.0
 """Steps of the robot's loop [Hz]."""
@@ -44,6 +47,7 @@ class PoolSource:
         severity: Severity = "realistic",
         camera: Literal["pictures", "corners"] = "corners",
         seed: int = 0,
+        world: str | None = None,
     ) -> None:
         """
         Args:
@@ -54,26 +58,40 @@ class PoolSource:
             plant: Seed or file.
             severity: Of a drawn plant.
             camera: What it sends; pictures cost more.
-            seed: Of noises.
+            seed: Of noises, and of the world.
+            world: That the vehicle's own cameras and sonars see; it begins at its viewpoint, located by motion capture.
 
         Raises:
             PlantSpecError, PolicyError, ControlError, VehicleError: What cannot be made.
         """
-        plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed)
-        if plan.camera is None or plan.calibrated is None:
+        plan = make_plan(vehicle, plant, severity, camera="none" if world else camera, seed=seed, world=world)
+        if world is not None:
+            plan = replace(plan, positioning="motion-capture")
+        elif plan.camera is None or plan.calibrated is None:
             raise PlantSpecError("a robot in the pool needs a camera: give corners or pictures")
-        ours, basin = plan.vehicle, plan.spec.basin
-        begin = start_of(guide)
-        self._world = plan.world(plan.camera.camera(), start=begin, seed=seed, truth=None)
+        ours, basin, eye = plan.vehicle, plan.spec.basin, plan.eye()
+        begin, self._own = start_of(guide), dict[str, Any]()
+        if isinstance(eye, OnboardSensors):
+            view = eye.batch.world.viewpoint
+            begin = Station(tuple(view.position.tolist()), view.yaw)
+        self._world = plan.world(eye, start=begin, seed=seed, truth=None)
         pilot = make_pilot(policy, ours, task=task)
         self._runtime = Runtime(ours, plan.calibrated, pilot, guide, arm=True, bridge=Bridge(ours))
         self._guide, self._look = guide, TagLook(ours)
         self._errors, self._sent, self._steps = Errors(), list[bytes](), 0
         self._picture: Picture | None = None
-        lens = plan.calibrated.camera.lens
-        self._size = (lens.height, lens.width)
+        lens = None if plan.calibrated is None else plan.calibrated.camera.lens
+        self._size = (0, 0) if lens is None else (lens.height, lens.width)
         size = (basin.length, basin.width, basin.depth)
-        lower, upper = box_of(ours, size, np.zeros((0, 3)))
+        around: dict[str, Any] = {}
+        if isinstance(eye, OnboardSensors):
+            lower, upper = box_of_world(eye.batch.world)
+            names = [name for name, sensor in eye.sensors.items() if not isinstance(sensor, RangeBatch)]
+            around = {
+                "bodies": world_bodies(eye.batch), "eyes": names, "walls": eye.batch.world.basin is not None
+            }  # fmt: skip
+        else:
+            lower, upper = box_of(ours, size, np.zeros((0, 3)))
         self.stage = Stage(
             vehicle=ours,
             title=f"virtual pool, {plan.spec.title}: {pilot.name}, {guide.name}",
@@ -81,6 +99,7 @@ class PoolSource:
             upper=upper,
             site=plan.calibrated,
             path=path_of(guide),
+            **around,
         )
 
     def frame(self, time: float) -> Frame:
@@ -96,6 +115,7 @@ class PoolSource:
             force=np.array(plant.thrust, float),
             trail=self._errors.trail,
             picture=self._picture,
+            pictures={name: image for name, image in self._own.items() if isinstance(image, np.ndarray)},
             status=self._status(runtime),
             events=[f"{e.time:.1f} s  {e.kind}: {e.text}" for e in list(runtime.counters.events)[-EVENTS:]],
         )
@@ -119,7 +139,10 @@ class PoolSource:
         self._errors.add(delivery.time, self._truth(), self._estimate(), self._goal())
 
     def _seen(self, picture: Seen) -> Seen:
-        """Keep what the camera sees, with its tags; found here, they need not be sought again by the robot."""
+        """Keep what cameras see, with its tags; found here, they need not be sought again by the robot."""
+        if picture.source:
+            self._own[picture.source] = shown_of(self._world.vehicle, picture)
+            return picture
         if picture.image is not None and not picture.tags:
             picture = replace(picture, tags=self._look.find(picture.image, picture.time))
         self._picture = Picture(picture.image, picture.tags, self._size)
@@ -146,6 +169,7 @@ class PoolSource:
         if reading is not None:
             status["vision"] = reading.mode
             status["state"] = "ready" if reading.ready else f"not ready: {reading.reason}"
+        status |= {name: text for name, text in self._own.items() if isinstance(text, str)}
         status["to the goal"] = self._errors.to_goal
         status["estimate error"] = self._errors.of_estimate
         status["battery"] = f"{float(plant.electric[0]):.2f} V"

@@ -22,10 +22,12 @@ from finssim.robot.record_messages import STATES
 from finssim.robot.record_reader import Record, open_record
 from finssim.vehicles import Vehicle, VehicleError, catalogue_vehicle, load_vehicle
 from finssim.viewer.frame import Curve, Frame, Picture, Stage, ViewError
+from finssim.viewer.shapes import world_bodies
 from finssim.viewer.sources.alignment import offset_between
 from finssim.viewer.sources.series import HEADING, POSITION, PoseSeries, Series, errors_between
-from finssim.viewer.stages import box_of
+from finssim.viewer.stages import box_of, box_of_world
 from finssim.viewer.tags import TagLook
+from finssim.worlds.layout import WorldLayout
 from finssim.yaml_file import json_value, read_mapping
 
 Array = npt.NDArray[np.float64]
@@ -59,6 +61,8 @@ class RecordSource:
         offset: float | None = None,
         basin: tuple[float, float, float] | None = None,
         vehicle: str | None = None,
+        world: str | None = None,
+        seed: int = 0,
     ) -> None:
         """
         Args:
@@ -67,6 +71,8 @@ class RecordSource:
             offset: The robot's clock when the pool's showed 0 [s]; found by laying the motions over each other if None.
             basin: Length, width and depth of the pool [m]; the vehicle's workspace is drawn if None.
             vehicle: Name or file; as the record has it if None.
+            world: Site of the catalogue of worlds, or a path, that is drawn around it; none if None.
+            seed: That the world was drawn with.
 
         Raises:
             RecordError, TruthError, VehicleError: A file that cannot be read.
@@ -81,9 +87,13 @@ class RecordSource:
         self._truth: PoseSeries | None = None
         if truth is not None:
             self._add_truth(read_truth(truth), offset)
-        lower, upper = box_of(
-            self._vehicle, basin, np.concatenate([self._odom.position, self._goal.position])
-        )
+        positions, around = np.concatenate([self._odom.position, self._goal.position]), {}
+        lower, upper = box_of(self._vehicle, basin, positions)
+        if world is not None:
+            layout = WorldLayout(world)
+            layout.draw(seed)
+            lower, upper = box_of_world(layout.world)
+            around["bodies"] = world_bodies(layout)
         self.stage = Stage(
             vehicle=self._vehicle,
             title=f"{Path(path).name}: {self._vehicle.name}",
@@ -92,10 +102,13 @@ class RecordSource:
             walls=basin is not None,
             site=site,
             path=_thinned(self._goal.position),
+            eyes=list(self._eyes),
+            **around,
         )
         self._size = (site.camera.lens.height, site.camera.lens.width) if site is not None else (720, 1280)
         self._look = TagLook(self._vehicle)
         self._shown: tuple[int, Picture] | None = None
+        self._developed_own: dict[str, tuple[Any, Any]] = {}
         self._curves = self._all_curves()
 
     def frame(self, time: float) -> Frame:
@@ -112,6 +125,7 @@ class RecordSource:
             force=force,
             trail=shown.trail(at),
             picture=self._picture(at),
+            pictures={name: image for name in self._eyes if (image := self._own(name, at)) is not None},
             status=self._status(at, thrusters),
             events=[
                 f"{t - self.begin:.1f} s  {text}"
@@ -129,7 +143,10 @@ class RecordSource:
 
     def _read(self, record: Record) -> None:
         """Sort the record's messages by what they are."""
-        known = {record.topic(name): name for name in TOPICS if record.topic(name) in record.topics}
+        own = [
+            f"{name}/{kind}" for name in self._vehicle.perception for kind in ("image/compressed", "range")
+        ]
+        known = {record.topic(name): name for name in (*TOPICS, *own) if record.topic(name) in record.topics}
         if not known:
             raise ViewError(f"{record.path}: no topic to show; one of {', '.join(TOPICS)} is needed")
         times: defaultdict[str, list[float]] = defaultdict(list)
@@ -146,6 +163,14 @@ class RecordSource:
         self._shafts = Series(times["joint_states"], found["joint_states"])
         self._pictures = Series(times["camera/image/compressed"], found["camera/image/compressed"])
         self._tags = Series(times["camera/tags"], found["camera/tags"])
+        self._eyes, self._ranges = (
+            {
+                name.removesuffix(kind): Series(times[name], found[name])
+                for name in own
+                if name.endswith(kind) and found[name]
+            }
+            for kind in ("/image/compressed", "/range")
+        )
         self._events = Series(times["events"], [_event(m.data) for m in found["events"]])
 
     def _add_truth(self, truth: Truth, offset: float | None) -> None:
@@ -163,6 +188,16 @@ class RecordSource:
         if self._shown is None or self._shown[0] != i:
             self._shown = i, self._developed(i, at, found)
         return self._shown[1]
+
+    def _own(self, name: str, at: float) -> Any:
+        """The latest picture of an own camera or sonar; None where it is old or none."""
+        message = self._eyes[name].at(at) if _age(self._eyes[name], at) < FRESH else None
+        if message is None:
+            return None
+        if self._developed_own.get(name, (None,))[0] is not message:
+            colour = message.header.frame_id.endswith("_optical")
+            self._developed_own[name] = message, picture_of(message.data, colour=colour)
+        return self._developed_own[name][1]
 
     def _developed(self, i: int, at: float, found: tuple[TagCorners, ...]) -> Picture:
         image = picture_of(self._pictures.values[i].data)
@@ -186,6 +221,9 @@ class RecordSource:
         if shafts is not None:
             rpm = np.asarray(shafts.velocity) * 60.0 / (2.0 * math.pi)
             status["shafts [rpm]"] = " ".join(f"{r:.0f}" for r in rpm)
+        for name, series in self._ranges.items():
+            if _age(series, at) < FRESH:
+                status[name] = f"{series.at(at).range:.2f} m"
         return status
 
     def _all_curves(self) -> list[Curve]:
@@ -267,7 +305,10 @@ def _vehicle_of(record: Record) -> Vehicle:
 
 @contextmanager
 def _kept_file(record: Record, name: str, *references: tuple[str, ...]) -> Iterator[Path]:
-    """A file that the record keeps, in a folder of its own; `references` are its keys that may name other files."""
+    """A file that the record keeps, in a folder of its own; `references` are its keys that may name other files.
+
+    So may the devices of a vehicle's `perception`.
+    """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / name
         file.write_text(record.files[name], encoding="utf-8")
@@ -278,4 +319,8 @@ def _kept_file(record: Record, name: str, *references: tuple[str, ...]) -> Itera
                 value = value.get(key) if isinstance(value, dict) else None
             if isinstance(value, str):
                 plain_name(value, f"{record.path}: {name}: {': '.join(keys)}", ViewError)
+        entries = tree.get("perception")
+        for entry in entries.values() if isinstance(entries, dict) else ():
+            if isinstance(entry, dict) and isinstance(entry.get("device"), str):
+                plain_name(entry["device"], f"{record.path}: {name}: perception: device", ViewError)
         yield file
