@@ -264,7 +264,7 @@ def painted(
         pictures: All of them, row 0 at the top.
         index: Which.
         local: The point, shape axes, in widths of the picture.
-        normal: Of the face, shape axes.
+        normal: Of the face, shape axes, unit [-].
         aspect: Height of the picture over its width.
         base: Reflectance beside it.
     """
@@ -1245,7 +1245,13 @@ class DopplerBatch(RangeBatch):
     def update(
         self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
     ) -> wp.array:
-        """Measure; arguments as those of `RangeBatch.update`.
+        """Measure.
+
+        Args:
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            seed: Of the noise; None for none.
+            time: Of the measurement [s]: others have other noise.
+            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
 
         Returns:
             `reading`: velocity, speeds and ranges in a row; float (N, 3 + 2 beams).
