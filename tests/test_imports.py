@@ -130,6 +130,7 @@ HOMES = {
         "localization/detection/pictures.py",
         "robot/pictures.py",
         "worlds/pictures.py",
+        "tasks/onlooker.py",
     },
     "pupil_apriltags": {"localization/detection/families.py"},
     "serial": {"robot/link/transports.py"},

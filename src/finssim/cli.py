@@ -58,7 +58,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "backproject": "finssim.localization.points:run_backproject",
     "record info": "finssim.robot.record_reader:info",
     "record repair": "finssim.robot.record_reader:repair",
-    "play": "finssim.robot.record_reader:play_record",
+    "play": "finssim.experiments.playback:play",
     "teleop": "finssim.robot.teleop:run",
     "run": "finssim.robot.run:run",
     "pool": "finssim.pool.run:run",

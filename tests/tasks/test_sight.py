@@ -10,9 +10,10 @@ pytest.importorskip("newton")
 
 from finssim.experiments.plants import PlantError, load_plant
 from finssim.tasks import Environment, EnvironmentSetupError, make
-from finssim.tasks.agents import LightServo, agent_for
+from finssim.tasks.agents import LightServo, LineFollower, agent_for
 from finssim.tasks.camera_docking import CameraDocking
 from finssim.tasks.check import check_task
+from finssim.tasks.pipeline import Pipeline
 from finssim.vehicles import load_vehicle
 from finssim.worlds import load_world
 
@@ -153,3 +154,48 @@ def test_the_plant_of_held_out_looks_is_for_tasks_that_see():
     assert set(env.sight.batch.drawn[:, -1]) <= {3.0, 4.0}
     with pytest.raises(PlantError, match="task 't1' sees none"):
         plant.environment(agent_for("pid", vehicle, make("t1").task), make("t1").task, vehicle)
+
+
+def test_the_line_of_the_pipeline_is_where_its_pipes_are():
+    """At the start a vehicle is over a pipe of the world, as its own objects say, and the teacher's way ends there."""
+    env = make("pipeline", worlds=16, seed=4)
+    world, x = env.sight.batch.world, env.simulator.state.position.numpy()[:, 0]
+    line = env.sight.batch.poses("line")
+    local = Rotation.from_quat(line[:, 3:]).inv().apply(x - line[:, :3])
+    knots = np.array([world.objects[f"pipe_{i}"].position for i in range(12)])
+    distance = np.abs(np.interp(local[:, 0], knots[:, 0], knots[:, 1]) - local[:, 1])
+    assert distance.max() < 0.65 and distance.max() > 0.2
+    np.testing.assert_allclose(local[:, 2], 0.9, atol=0.21)
+    way = 2.0 * env.arrays.taught.numpy()[:, :3]  # to the line above the pipe, beside the vehicle
+    body = Rotation.from_quat(env.simulator.state.quaternion.numpy()[:, 0]).apply(way)
+    end = Rotation.from_quat(line[:, 3:]).inv().apply(x + body - line[:, :3])
+    np.testing.assert_allclose(np.interp(end[:, 0], knots[:, 0], knots[:, 1]), end[:, 1], atol=0.12)
+    np.testing.assert_allclose(end[:, 2], 0.9, atol=1e-4)
+
+
+def test_who_stays_behind_has_not_followed_the_pipeline_and_who_drifts_off_has_lost_it():
+    check_task(Pipeline().for_teacher())
+    env = Environment(Pipeline(time_limit=20.0).for_teacher(), worlds=8, seed=4, auto_reset=False)
+    action = np.zeros((8, 4))
+    action[4:, 1] = 1.0  # to the left
+    for _ in range(200):
+        step = env.step(action)
+    measured = env.task.metrics(env.arrays)
+    assert not measured["success"].any() and step.truncated[:4].all()
+    np.testing.assert_array_equal(measured["lost"], [0, 0, 0, 0, 1, 1, 1, 1])
+
+
+def test_the_line_follower_finds_the_pipe_in_the_picture():
+    """In the file's own water the pipe's side and slope are right to 0.4 m and 12° in the median."""
+    env = Environment(Pipeline(), worlds=24, seed=5)
+    observation = env.reset()
+    follower = LineFollower.for_vehicle(env.nominal[0])
+    row = observation["state"]
+    line, enough = follower.line(observation["front_camera"], row[:, :3], follower.charted - 5.0 * row[:, 9])
+    way = 2.0 * env.arrays.taught.numpy()[:, :9].reshape(-1, 3, 3)  # beside, 1.2 and 2.5 m ahead
+    slope = (way[:, 2, 1] - way[:, 0, 1]) / (way[:, 2, 0] - way[:, 0, 0])
+    aside = way[:, 0, 1] - slope * way[:, 0, 0]
+    plain = enough & (env.sight.batch.drawn[:, -1] == 0)
+    assert plain.sum() > 3
+    assert np.median(np.abs(line[plain, 0] - aside[plain])) < 0.4
+    assert np.degrees(np.median(np.abs(np.arctan(line[plain, 1]) - np.arctan(slope[plain])))) < 12.0

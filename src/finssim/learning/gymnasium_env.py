@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from finssim.learning.served import copied, one_agent, served
 from finssim.tasks import SEEING, TASKS, Environment, EnvironmentSetupError, Task
+from finssim.tasks.onlooker import Onlooker
 
 # Gymnasium's spaces of an environment's observations and actions.
 
@@ -54,7 +55,7 @@ class Env(gymnasium.Env[Any, Any]):
     tolerance without a break [s]) and, at the end, `episode` with return `r`, length `l` and the task's other metrics.
     """
 
-    metadata = {"render_modes": []}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(self, task: str | Task | Environment = "t1", **options: Any) -> None:
         """Set up one world.
@@ -74,6 +75,15 @@ class Env(gymnasium.Env[Any, Any]):
             )
         self.observation_space = observation_space(self.environment)
         self.action_space = action_space(self.environment)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.environment.task.control_step)}
+        self._onlooker: Onlooker | None = None
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """With `render_mode="rgb_array"` the vehicle from behind, uint8 (360, 640, 3); otherwise nothing."""
+        if self.render_mode != "rgb_array":
+            return None
+        self._onlooker = self._onlooker or Onlooker(self.environment)
+        return self._onlooker.picture()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

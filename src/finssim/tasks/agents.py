@@ -36,6 +36,7 @@ from finssim.tasks.formation import NEAR, Formation
 from finssim.tasks.given import Step
 from finssim.tasks.moving_target import DISTANCE_SCALE as TARGET_DISTANCE_SCALE
 from finssim.tasks.moving_target import TARGET_SCALE
+from finssim.tasks.pipeline import Pipeline
 from finssim.tasks.pursuit import DISTANCE_SCALE as CHASE_SCALE
 from finssim.tasks.pursuit import PI, DriveNumbers
 from finssim.tasks.station_keeping import DISTANCE_SCALE as STATION_SCALE
@@ -592,6 +593,101 @@ class LightServo(DockingPid):
         return ahead[:, None] * np.column_stack([np.ones_like(aside), aside, above]), heading, visible
 
 
+# Following a pipeline the classical way: a line through what is yellower than its surroundings, and steer along it.
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineFollower(DriveBaseline):
+    """Fits a line over the bottom to the yellow pixels of the picture, and steers to it and along it.
+
+    Yellow is (red + green)/2 - blue above the median of a picture's row. A row below the horizon looks at the bottom at
+    one distance, which the pipe's charted depth tells; a straight line is fitted to all rows, weighted by the square of
+    the yellow, and its estimate is followed where a picture shows too little.
+    """
+
+    cruise: float
+    """[m/s]"""
+    charted: float
+    """Depth of the pipe's axis [m]."""
+    height: float
+    """Above it [m]."""
+    focal_share: float
+    """Focal length as a share of the picture's width."""
+    eye: tuple[float, float, float]
+    """Of the camera, body axes [m]."""
+    least: float = 60.0
+    """Squared numbers of yellow, summed over a picture, below which it shows too little."""
+    gain: float = 0.5
+    """Speed to the side and down per distance [1/s]."""
+    memory_share: float = 0.8
+    """Of the line before, in the next estimate."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> LineFollower:
+        """For a vehicle with a `front_camera`, and the site `pipeline`."""
+        task = Pipeline().fitted([vehicle])
+        device = device_of(vehicle, task.pictures[0].name)
+        return cls(
+            drive=DriveNumbers.of(vehicle), cruise=task.cruise, charted=-task.bottom, height=task.height,
+            focal_share=device.focal_length / device.width, eye=tuple(device.mount.position.tolist()),
+        )  # fmt: skip
+
+    def reset(self, n: int) -> Array:  # type: ignore[override]
+        """The line straight below and ahead, (n, 2)."""
+        return np.zeros((n, 2))
+
+    def act(  # type: ignore[override]
+        self, memory: Array, observation: NDArray[np.float32], pictures: Mapping[str, NDArray[np.uint8]]
+    ) -> tuple[NDArray[np.float32], Array]:
+        """Actions for observations and pictures of following a pipeline."""
+        o = np.asarray(observation, float)
+        depth = DEPTH_SCALE * o[:, 9]
+        line, enough = self.line(next(iter(pictures.values())), o[:, :3], self.charted - depth)
+        share = np.where(enough, 1.0 - self.memory_share, 0.0)[:, None]
+        line = memory + share * (line - memory)
+        turn = np.arctan(line[:, 1] + 0.5 * line[:, 0])
+        wanted = np.column_stack(
+            [
+                self.cruise * np.clip(1.5 - 1.5 * np.abs(turn), 0.2, 1.0),
+                np.clip(self.gain * line[:, 0], -0.1, 0.1),
+                np.clip(self.gain * (depth - self.charted + self.height), -0.1, 0.1),
+                self.drive.turned(turn),
+            ]
+        )
+        return self.drive.action(o[:, [3, 4, 5, 8]], wanted), line
+
+    def line(self, picture: NDArray[np.uint8], up: Array, above: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """The pipe in pictures.
+
+        Args:
+            picture: uint8 (n, height, width, 3).
+            up: World's up in the body [-], (n, 3).
+            above: Height of the body origin above the pipe's axis [m], (n,).
+
+        Returns:
+            How far it lies to the left below the vehicle [m], and its slope to the left, (n, 2); where there is enough
+            of it in the picture, (n,).
+        """
+        red, green, blue = np.moveaxis(picture.astype(float), -1, 0)
+        yellow = 0.5 * (red + green) - blue
+        yellow -= np.median(yellow, axis=2, keepdims=True)
+        height, width = yellow.shape[1:]
+        focal = self.focal_share * width
+        down = (np.arange(height) - 0.5 * (height - 1)) / focal
+        fall = down + up[:, :1]  # of a row's rays per metre ahead, pitched by the vehicle
+        ahead = np.where(fall > 0.15, (above + self.eye[2])[:, None] / np.maximum(fall, 0.15), 0.0)
+        aside = ahead[:, :, None] * (0.5 * (width - 1) - np.arange(width)) / focal
+        noise = 1.5 * np.median(np.abs(yellow), axis=(1, 2), keepdims=True)
+        weight = np.maximum(yellow - noise, 0.0) ** 2 * ((ahead > 0.0) & (ahead < 5.0))[:, :, None]
+        total = np.maximum(weight.sum((1, 2)), 1e-9)
+        x = np.broadcast_to(ahead[:, :, None] + self.eye[0], weight.shape)
+        mean_x, mean_y = (weight * x).sum((1, 2)) / total, (weight * aside).sum((1, 2)) / total
+        dx = x - mean_x[:, None, None]
+        slope = (weight * dx * aside).sum((1, 2)) / np.maximum((weight * dx * dx).sum((1, 2)), 1e-9)
+        slope = np.clip(slope, -1.0, 1.0)
+        return np.column_stack([mean_y - slope * mean_x, slope]), total > self.least
+
+
 class BaselineError(ValueError):
     """A baseline that does not exist."""
 
@@ -602,6 +698,7 @@ BASELINES: dict[str, dict[str, Callable[..., Baseline]]] = {
     "t3": {"pid": TargetPid.for_vehicle},
     "docking": {"align-insert": DockingPid.for_vehicle},
     "camera-docking": {"light-servo": LightServo.for_vehicle},
+    "pipeline": {"line-follower": LineFollower.for_vehicle},
     "pursuit": {"lead": LeadPursuit.for_vehicle},
     "team-pursuit": {"formation": FormationPursuit.for_vehicle},
     "formation": {"consensus": ConsensusFormation.for_vehicle},

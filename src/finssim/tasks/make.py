@@ -18,6 +18,7 @@ from finssim.tasks.environment import Environment, EnvironmentSetupError
 from finssim.tasks.formation import Formation
 from finssim.tasks.measurement import ESTIMATOR, MeasurementNoise
 from finssim.tasks.moving_target import MovingTarget
+from finssim.tasks.pipeline import Pipeline
 from finssim.tasks.pursuit import Pursuit
 from finssim.tasks.sensing import Sensing, load_sensing
 from finssim.tasks.station_keeping import StationKeeping
@@ -123,7 +124,7 @@ def _of_import(name: str) -> ModuleType:
         raise EnvironmentSetupError(f"module '{name}' cannot be imported: {error}") from error
 
 
-SEEING: dict[str, type[Task]] = {"camera-docking": CameraDocking}
+SEEING: dict[str, type[Task]] = {"camera-docking": CameraDocking, "pipeline": Pipeline}
 """Every task that observes pictures, which needs `finssim[perception]`; otherwise as `TASKS`."""
 
 

@@ -59,6 +59,8 @@ class WorldLayout:
         self.worlds, self.device = worlds, wp.get_device(device)
         self._varied: list[tuple[Object, int, np.ndarray]] = []
         """Each object that draws move, the one before it that it moves with, and its pose in the axes of that."""
+        self._moved: dict[int, np.ndarray] = {}
+        """Poses of varied objects that were put elsewhere, (worlds, 7)."""
         self._objects = self._placed()
         self.shapes = [*self._fixed_shapes(), *self._object_shapes()]
         self._anchor = np.array([shape.anchor for shape in self.shapes], int)
@@ -108,6 +110,26 @@ class WorldLayout:
         self._drawn[:], self._look[:] = values[:, :-1], values[:, -1].astype(int)
         self._place(np.arange(self.worlds))
 
+    def copy_draw(self, other: WorldLayout, world: int) -> None:
+        """Draw all worlds as one of another layout is drawn, whose world has the first of this one's objects."""
+        varied, owners = len(other._varied), len(other._owners)
+        row = other._drawn[world]
+        self._drawn[:], self._look[:] = 0.0, other._look[world]
+        self._drawn[:, : 1 + 4 * varied] = row[: 1 + 4 * varied]
+        colours = 1 + 4 * len(self._varied)
+        self._drawn[:, colours : colours + owners] = row[1 + 4 * varied :]
+        self._place(np.arange(self.worlds))
+
+    def move(self, name: str, poses: ArrayLike) -> None:
+        """Put an object that varies elsewhere, with all that stands in its frame, whatever is drawn.
+
+        Args:
+            name: Of the object.
+            poses: Position [m] and attitude xyzw, world frame, (7,) or (worlds, 7).
+        """
+        self._moved[self._objects[name][0]] = np.broadcast_to(np.asarray(poses, float), (self.worlds, 7))
+        self._place(np.arange(self.worlds))
+
     def _place(self, rows: np.ndarray) -> None:
         """Set the poses of some worlds, (k,), from what is drawn of them.
 
@@ -122,6 +144,8 @@ class WorldLayout:
                 [own[:, :3] * item.vary.position, quat_from_yaw(own[:, 3] * item.vary.yaw)], 1
             )
             frames[i] = _compose(_compose(frames[anchor], rest), shift)
+            if i in self._moved:
+                frames[i] = self._moved[i][rows]
         self._frames[:, rows] = frames
         self._pose[rows] = _compose(frames[self._anchor], self._rest[:, None]).swapaxes(0, 1)
         self.transforms.assign(np.float32(self._pose))

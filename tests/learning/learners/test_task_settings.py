@@ -6,7 +6,7 @@ import pytest
 
 from finssim.learning.learners import LEARNERS, base, learner_named
 from finssim.learning.learners.base import ON_POLICY, RANDOMIZED, SETTINGS, own_settings
-from finssim.tasks import TASKS, task_named
+from finssim.tasks import SEEING, TASKS, task_named
 from reference.guess import Guess
 
 
@@ -45,7 +45,7 @@ def test_a_training_begins_with_its_tasks_settings(name, randomized):
 def test_every_line_is_of_something_that_exists():
     assert set(ON_POLICY) <= set(LEARNERS)
     for table in (SETTINGS, RANDOMIZED):
-        assert set(table) <= {"*", *TASKS}
+        assert set(table) <= {"*", *TASKS, *SEEING}
         assert {learner for rows in table.values() for learner in rows} <= {"on-policy", *LEARNERS}
 
 

@@ -44,6 +44,8 @@ SETTINGS: Table = {
     # So is a target that moves, once it has been reached.
     "t3": {"on-policy": {"discount": 0.95}, "ppo": {"steps": 600_000}},
     "docking": {"ppo": {"steps": 900_000}},
+    # Its teacher succeeds in all episodes after a quarter of these steps, and its student after half of them.
+    "pipeline": {"distill": {"teacher_steps": 600_000, "steps": 60_000}},
     "pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "teacher": "lead"}},
     # With 1.5 million, half of the seeds have only begun to capture.
     "team-pursuit": {

@@ -1,0 +1,285 @@
+"""Following a pipeline by camera: along it, at a height above it, whatever bends come."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from finssim.engine import Pool
+from finssim.engine.state import State
+from finssim.physics.types import vec6
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.camera_docking import OWN, up
+from finssim.tasks.docking import Hull
+from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.sight import Picture
+from finssim.tasks.task import Task
+from finssim.tasks.terms import (
+    End,
+    ObservationPart,
+    RewardTerm,
+    Terms,
+    Total,
+    own_velocity,
+    tilted,
+    world_velocity,
+)
+from finssim.vehicles import Vehicle
+from finssim.worlds.description import load_world
+
+AHEAD = (0.0, 1.2, 2.5)
+"""The teacher sees where the pipe is so far ahead along it [m]."""
+
+
+@wp.func
+def beside(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec4:
+    """Where a point is by the pipe: along it, to the left of it, above its axis [m], and the pipe's heading [rad].
+
+    In the axes of the pipeline, whose pose is the goal's.
+    """
+    local = wp.quat_rotate_inv(arrays.goal_quaternion[w], x - arrays.goal_position[w])
+    best = float(1.0e9)
+    before = float(0.0)
+    found = wp.vec4(0.0)
+    for k in range(arrays.reference.position.shape[1] - 1):
+        a = arrays.reference.position[w, k]
+        d = arrays.reference.position[w, k + 1] - a
+        length = wp.length(d)
+        t = wp.clamp(wp.dot(local - a, d) / (length * length), 0.0, 1.0)
+        r = local - a - t * d
+        distance = wp.length(wp.vec2(r[0], r[1]))
+        if distance < best:
+            best = distance
+            left = (d[0] * r[1] - d[1] * r[0]) / length
+            found = wp.vec4(
+                before + t * length, wp.where(left < 0.0, -distance, distance), r[2], wp.atan2(d[1], d[0])
+            )
+        before += length
+    return found
+
+
+@wp.func
+def along_pipe(arrays: TaskArrays, w: int, way: float) -> wp.vec3:
+    """The point of the pipe's axis so far along it [m], in the axes of the pipeline."""
+    rest = float(way)
+    last = arrays.reference.position.shape[1] - 1
+    out = arrays.reference.position[w, last]
+    for k in range(last):
+        a = arrays.reference.position[w, k]
+        d = arrays.reference.position[w, k + 1] - a
+        length = wp.length(d)
+        if rest >= 0.0 and rest < length:
+            out = a + (rest / length) * d
+        rest -= length
+    return out
+
+
+@wp.func
+def way_ahead(arrays: TaskArrays, p: Any, w: int, k: int, place: wp.vec4) -> wp.vec3:
+    """To the point above the pipe that is `ahead` [k] farther along it than the vehicle, body frame [m]."""
+    point = along_pipe(arrays, w, place[0] + p.ahead[k]) + wp.vec3(0.0, 0.0, p.height)
+    world = arrays.goal_position[w] + wp.quat_rotate(arrays.goal_quaternion[w], point)
+    return wp.quat_rotate_inv(arrays.quaternion[w, 0], world - arrays.position[w, 0])
+
+
+@wp.func
+def heading_off(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> float:
+    """How far the vehicle is turned from the pipe [rad], in [0, π]."""
+    q = wp.quat_inverse(arrays.goal_quaternion[w]) * state.quaternion[w, 0]
+    nose = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
+    off = wp.atan2(nose[1], nose[0]) - place[3]
+    return wp.abs(wp.atan2(wp.sin(off), wp.cos(off)))
+
+
+@wp.func
+def progress(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec4) -> float:
+    """Speed along the pipe as a part of `cruise`, at most 1."""
+    v = wp.quat_rotate_inv(arrays.goal_quaternion[w], world_velocity(state, w, 0))
+    return wp.clamp((v[0] * wp.cos(place[3]) + v[1] * wp.sin(place[3])) / p.cruise, -1.0, 1.0)
+
+
+@wp.func
+def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """At rest above the pipe, not quite over it, and turned a little; without a world its heading is drawn."""
+    rng = wp.rand_init(key, w)
+    yaw = wp.randf(rng, -3.14159265, 3.14159265)
+    if not p.placed:
+        arrays.goal_position[w] = wp.vec3(0.0, 0.0, p.bottom)
+        arrays.goal_quaternion[w] = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
+    q = arrays.goal_quaternion[w]
+    point = along_pipe(arrays, w, wp.randf(rng, p.begin[0], p.begin[1]))
+    here = beside(arrays, w, arrays.goal_position[w] + wp.quat_rotate(q, point))
+    off = wp.vec3(0.0, wp.randf(rng, -p.aside, p.aside), p.height + wp.randf(rng, -p.over, p.over))
+    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), here[3])
+    state.position[w, 0] = arrays.goal_position[w] + wp.quat_rotate(q, point + wp.quat_rotate(turn, off))
+    roll = wp.randf(rng, -p.tilt, p.tilt)
+    pitch = wp.randf(rng, -p.tilt, p.tilt)
+    state.quaternion[w, 0] = q * turn * tilted(roll, pitch, wp.randf(rng, -p.turn, p.turn))
+    state.velocity[w, 0] = vec6()
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelineReward:
+    """Weights of the reward, with e the distance from the line above the pipe [m] and θ the heading error [rad].
+
+    r = progress · min(speed along / cruise, 1) + near · exp(-e / near_scale) - distance · e - turn · θ
+        - action · mean(a²) - change · mean(Δa²) - rate · min(|ω|², 4) - loss, once, where the pipe is lost
+    """
+
+    progress: float = 1.0
+    near: float = 0.5
+    near_scale: float = 0.25
+    distance: float = 0.5
+    turn: float = 0.3
+    action: float = 0.02
+    change: float = 0.05
+    rate: float = 0.02
+    loss: float = 20.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pipeline(Task):
+    """Follow the pipeline of the site `pipeline`, which lies, looks and is lit otherwise in each episode."""
+
+    succeeds: ClassVar[str] = "once"
+    title: ClassVar[str] = "follow a pipeline by camera"
+    needs: ClassVar[tuple[str, ...]] = ("surge", "heave", "yaw")
+    action: ClassVar[str] = "wrench4"
+    landmark: ClassVar[str] = "line"
+    teacher: ClassVar[tuple[ObservationPart, ...]] = (
+        *(
+            ObservationPart(
+                f"way to the line above the pipe {x:g} m ahead, body frame",
+                3,
+                "m",
+                scale=2.0,
+                term=way_ahead,
+                index=k,
+            )
+            for k, x in enumerate(AHEAD)
+        ),
+        ObservationPart("up, body frame", 3, "1", term=up),
+        *own_velocity(clip=2.0),
+    )
+    name: str = "pipeline"
+    observation: tuple[ObservationPart, ...] = OWN
+    world: str = "pipeline"
+    pictures: tuple[Picture, ...] = (Picture("front_camera", 48),)
+    held_out: bool = False
+    """Draw the looks of the site that are held out of training."""
+    time_limit: float = 45.0
+    hull: Hull = Hull()
+    """Of the vehicle; the environment sets it."""
+    height: float = 0.9
+    """Of the body origin above the pipe's axis [m]."""
+    distance: float = 8.0
+    """Success: so far along the pipe from where the episode began [m], without having lost it."""
+    hold: float = 0.1
+    """For so long [s]."""
+    lost: tuple[float, float] = (1.2, 0.7)
+    """The pipe is lost so far to a side, or above or below the line [m]."""
+    begin: tuple[float, float] = (2.0, 18.0)
+    """Along the pipe at the start [m], ..."""
+    aside: float = 0.5
+    """... beside it, ..."""
+    over: float = 0.2
+    """... above or below the line [m] at most, ..."""
+    turn: float = math.radians(20.0)
+    """... turned from it by this at most [rad]."""
+    tilt: float = math.radians(4.0)
+    """Largest roll and pitch at the start [rad]."""
+    ahead: tuple[float, float, float] = AHEAD
+    reward: PipelineReward = field(default_factory=PipelineReward)
+    training_noise: MeasurementNoise = MeasurementNoise(
+        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
+    )
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "Pipeline":
+        """With the speed of the vehicle."""
+        return replace(self, hull=Hull.of(vehicles[0]))
+
+    @property
+    def cruise(self) -> float:
+        """Speed along the pipe that is worth all of its reward [m/s]."""
+        return 0.6 * self.hull.speed
+
+    @property
+    def placed(self) -> bool:
+        """Whether a world says where the pipe is."""
+        return bool(self.world)
+
+    @property
+    def bottom(self) -> float:
+        """z of the pipe without a world [m]."""
+        return -11.86
+
+    def arena(self) -> Pool | None:
+        """Open water."""
+        return None
+
+    def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
+        """The pipe's axis as a line of points, from the objects `pipe_...` of the site."""
+        pipes = [item for name, item in load_world("pipeline").objects.items() if name.startswith("pipe_")]
+        halves = [
+            0.5 * (one.length or 0.0) * np.asarray(one.axis) / np.linalg.norm(one.axis) for one in pipes
+        ]
+        knots = [one.position - half for one, half in zip(pipes, halves, strict=True)]
+        points = np.float32([*knots, pipes[-1].position + halves[-1]])
+        arrays.reference.position = wp.array(np.tile(points, (worlds, 1, 1)), dtype=wp.vec3, device=device)
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"{self.distance:g} m along the pipe without losing it"
+
+    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
+        """As every task's; success, its time [s], worst (distance from the line [m]), lost 0 or 1."""
+        measured = super().metrics(arrays)
+        del measured["begun"]
+        measured["success"] *= 1.0 - measured["lost"]
+        measured["success_time"][measured["success"] == 0.0] = np.nan
+        return measured
+
+    def terms(self) -> Terms:
+        """See `PipelineReward`."""
+        r = self.reward
+        return Terms(
+            start=start,
+            shared={
+                "place": place_now,
+                "e": "wp.length(wp.vec2(place[1], place[2] - p.height))",
+                "theta": heading_off,
+            },
+            seen={"place": place_seen},
+            rewards=(
+                RewardTerm("progress", progress, r.progress),
+                RewardTerm("near", "wp.exp(-e / p.reward.near_scale)", r.near),
+                RewardTerm("distance", "e", -r.distance),
+                RewardTerm("turn", "theta", -r.turn),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
+                RewardTerm("rate", "turning", -r.rate),
+            ),
+            ends=(
+                End(
+                    "lost", "wp.abs(place[1]) > p.lost[0] or wp.abs(place[2] - p.height) > p.lost[1]", -r.loss
+                ),
+            ),
+            inside="place[0] - begun >= p.distance",
+            totals=(Total("begun", "was", first="place[0]"), Total("worst", "wp.max(was, e)")),
+        )
+
+
+@wp.func
+def place_now(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
+    """`beside` of the vehicle."""
+    return beside(arrays, w, state.position[w, 0])
+
+
+@wp.func
+def place_seen(arrays: TaskArrays, w: int) -> wp.vec4:
+    """`beside` of the vehicle, as measured."""
+    return beside(arrays, w, arrays.position[w, 0])
