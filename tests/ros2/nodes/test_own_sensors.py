@@ -20,6 +20,7 @@ from finssim.geometry.rotations import quat_conjugate, quat_rotate
 from finssim.pool.pictures import UdpSender
 from finssim.robot.messages import Picture
 from finssim.ros2.nodes.camera import Camera
+from finssim.ros2.nodes.controller import MOST_PICTURES, Controller
 from finssim.ros2.nodes.conversions import RosMessages, image_of, nanoseconds, ros_type, xyz
 from finssim.ros2.nodes.frames import mounts
 from finssim.ros2.topics import own_topics, quality_profile
@@ -27,6 +28,7 @@ from finssim.vehicles import load_vehicle
 from finssim.vehicles.equipment import RaySensor
 from finssim.worlds import device_of, load_device
 from finssim.worlds.rays import cones, fan
+from reference.policies import seeing
 
 VEHICLE = load_vehicle("finsrov")
 LOG = RaySensor(device="dvl_a50", position=np.array([-0.1, 0.0, -0.1]), rate=5.0)
@@ -133,5 +135,29 @@ def test_the_camera_node_sends_what_comes_over_the_wire(tmp_path):
         assert 0.1 <= 1e-9 * age < 5.0
         assert np.array_equal(image_of(heard["front_camera/image"][-1], colour=True), COLOURS)
         sender.close(), camera.close()
+    finally:
+        rclpy.try_shutdown()
+
+
+@pytest.mark.slow
+def test_a_controller_hears_the_pictures_that_its_policy_sees(tmp_path):
+    """In colour, with the time of their exposure; none while nobody arms it, but the latest few."""
+    rclpy.init(args=["--ros-args", "-r", "__ns:=/finsrov", "-p", f"policy:={seeing(tmp_path / 'policy')}"])
+    try:
+        controller, peer, end = Controller(), Node("peer"), time.monotonic() + 30.0
+        topic = own_topics(load_vehicle("finsrov"))["front_camera/image"]
+        out = peer.create_publisher(ros_type(topic.type), topic.name, quality_profile(topic.quality))
+        message = MAKE.image(controller.ns(1.5), COLOURS, topic.frame)
+        while len(controller._seen) < MOST_PICTURES and time.monotonic() < end:
+            out.publish(message)
+            for _ in range(4):
+                rclpy.spin_once(controller, timeout_sec=0.005)
+        for _ in range(8):
+            out.publish(message)
+            rclpy.spin_once(controller, timeout_sec=0.05)
+        assert len(controller._seen) == MOST_PICTURES
+        seen = controller._seen[-1]
+        assert seen.source == "front_camera" and np.array_equal(seen.image, COLOURS)
+        assert seen.time == pytest.approx(1.5 + VEHICLE.perception["front_camera"].latency, abs=1e-6)
     finally:
         rclpy.try_shutdown()
