@@ -129,6 +129,7 @@ HOMES = {
         "calibration/vision/pool_fit.py",
         "localization/detection/pictures.py",
         "robot/pictures.py",
+        "worlds/pictures.py",
         "tasks/onlooker.py",
     },
     "pupil_apriltags": {"localization/detection/families.py"},

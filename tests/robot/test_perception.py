@@ -89,7 +89,7 @@ def test_a_latency_that_the_pool_file_does_not_tell_shows():
     world = Rounds(late, VEHICLE)
     told = errors(world, run(world, Perception(VEHICLE, late), 4.0)[90:])[0]
     untold = errors(world, run(world, Perception(VEHICLE, overhead(latency=0.0)), 4.0)[90:])[0]
-    assert told < 0.005 < 0.007 < untold
+    assert told < 0.004 < 0.006 < untold
 
 
 def test_the_mcus_own_heading_does_not_enter():

@@ -95,3 +95,16 @@ def test_without_an_echo_the_last_reading_stays(vehicle: Any, rest: Any, ideal: 
         state.advance()
         suite.update(state.put(position=[0.0, 0.0, z], quaternion=q))
         assert suite.dvl.fresh.numpy()[0, 0] == fresh, (z, q)
+
+
+def test_without_lock_on_a_described_bottom_there_is_no_sample(vehicle: Any, rest: Any, ideal: Any) -> None:
+    """`lock`, which the beams of a `finssim.worlds.DopplerBatch` write, holds and frees the reading."""
+    suite = SensorSuite(vehicle, worlds=1, control_step=0.2)
+    ideal(suite.dvl)
+    state = rest(1)
+    suite.reset(state)
+    for lock in (1, 0, 1):
+        suite.dvl.lock.fill_(lock)
+        state.advance()
+        suite.update(state)
+        assert suite.dvl.fresh.numpy()[0, 0] == bool(lock)

@@ -4,10 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.integrate import quad
 
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
-from finssim.worlds import RangeBatch, SonarBatch
+from finssim.physics.types import vec6
+from finssim.worlds import DopplerBatch, RangeBatch, SonarBatch, WorldError, load_device
 from finssim.worlds.description import Mount, RangeDevice, SonarDevice
 
 pytestmark = pytest.mark.slow
@@ -146,3 +148,95 @@ def test_out_of_reach_is_infinite(scenes, poses):
     assert RangeBatch(batch, ranger()).update(poses(((0, 0, -4), up))).numpy()[0, 0] == np.inf
     near = RangeBatch(batch, ranger(range=5.0)).update(poses(((0, 0, -4), (0, 0, 0, 1))))
     assert near.numpy()[0, 0] == np.inf
+
+
+def test_a_side_scan_hears_a_ball_abeam(scenes, poses):
+    """A ball of 0.25 m 4 m to the left: in the left beam alone, at its near side, as loud as it is within 1 dB."""
+    turned = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))  # its left is world x
+    device = sonar(mode="side_scan", beams=2, elevations=96, vertical_beam_width=math.radians(50.0))
+    sensor, intensity = echo(scenes("ball"), device, poses(((-4.0, 0, -5), turned)))
+    assert intensity[1].sum() < 1e-9 * intensity[0].sum()  # the noise
+    first = np.flatnonzero(intensity[0] > 0.01 * intensity[0].max())[0]
+    assert abs(first * sensor.bin_length - 3.75) <= sensor.bin_length
+    # Its beam is narrower than the ball: mu times its width times the integral over elevation.
+    width = math.radians(1.0) / 0.8859
+    angle = math.asin(0.25 / 4.0)
+
+    def slice_of(e):
+        r = 4.0 * math.cos(e) - math.sqrt(0.25**2 - (4.0 * math.sin(e)) ** 2)
+        k = math.sqrt(1.0 - (4.0 * math.sin(e) / 0.25) ** 2)
+        return MU / math.pi * k * math.cos(e) / r**2
+
+    expected = width * quad(slice_of, -angle, angle)[0]
+    assert abs(10.0 * math.log10(intensity[0].sum() / expected)) < 1.0
+
+
+def test_a_side_scan_looks_down_to_both_sides(scenes, level):
+    """30° below the horizon over a floor 5 m below: the first echo comes from 5 m / sin 67.5°."""
+    device = load_device("side_scan").model_copy(update={"noise_level_db": -200.0})
+    sensor, intensity = echo(scenes("floor"), device, level(0, 0, -5))
+    np.testing.assert_allclose(intensity[0], intensity[1], rtol=1e-3, atol=1e-12)
+    first = np.flatnonzero(intensity[0] > 1e-3 * intensity[0].max())[0] * sensor.bin_length
+    assert 5.0 < first < 5.6  # where its rays end
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.3])
+def test_a_profiler_draws_the_floor(roll, scenes, poses):
+    """Ranges h / cos(angle) of a flat floor, to a cell and most of a beam's footprint."""
+    device = load_device("profiler")
+    sensor = SonarBatch(scenes("floor"), device)
+    sensor.update(poses(((0, 0, -4), quat_from_euler(roll, 0.0, 0.0))))
+    angle = device.sector * (0.5 - (np.arange(device.beams) + 0.5) / device.beams)
+    expected = 6.0 / np.cos(angle + roll)
+    ranges = sensor.ranges.numpy()[0]
+    near = np.abs(angle + roll) < math.radians(60.0)
+    # The first cell within 6 dB of the beam's loudest lies before the middle of its footprint.
+    footprint = expected * np.tan(np.abs(angle + roll)) * math.radians(1.0)
+    early = (expected - ranges)[near]
+    assert np.all(early > -sensor.bin_length) and np.all(early < sensor.bin_length + 0.8 * footprint[near])
+
+
+def dvl(**changes):
+    values = {"about": "-", "source": "-", "beams": 4, "beam_angle": math.radians(22.5), "minimum_range": 0.1}
+    values |= {
+        "range": 8.0,
+        "rate": 1.0,
+        "mount": Mount(position=np.array([0.3, 0.0, -0.1]), pitch=0.5 * math.pi),
+    }
+    return RangeDevice(**{**values, **changes})
+
+
+def test_a_dvl_has_the_velocity_of_its_point_from_its_beams(scenes, poses):
+    """Along each beam d . v, together v + omega x r in its own axes; noise spreads it as the beams' fit does."""
+    attitude = quat_from_euler(0.05, -0.1, 0.4)
+    nu = np.array([0.6, -0.2, 0.1, 0.05, 0.1, -0.2], np.float32)
+    twists = wp.array(nu[None, None], dtype=vec6)
+    sensor = DopplerBatch(scenes("floor"), dvl(velocity_noise=0.01), twists)
+    pose = poses(((0, 0, -5), attitude))
+    sensor.update(pose)
+    point = nu[:3] + np.cross(nu[3:], [0.3, 0.0, -0.1])
+    expected = np.array([-point[2], point[1], point[0]])  # its x axis points down, its z axis forward
+    np.testing.assert_allclose(sensor.velocity.numpy()[0], expected, atol=1e-6)
+    along = sensor.rays.numpy()[:, 0, 0, 1]
+    np.testing.assert_allclose(sensor.speeds.numpy()[0], along @ expected, atol=1e-6)
+    np.testing.assert_allclose(sensor.reading.numpy()[0, -4:], sensor.ranges.numpy()[0])
+    assert sensor.lock.numpy().tolist() == [[1]]
+    noisy = np.array([sensor.update(pose, seed=1, time=float(k)).numpy()[0, :3].copy() for k in range(400)])
+    spread = 0.01 * np.sqrt(np.diag(np.linalg.inv(along.T @ along)))
+    np.testing.assert_allclose(noisy.std(axis=0), spread, rtol=0.15)
+    np.testing.assert_allclose(noisy.mean(axis=0), expected, atol=4.0 * spread.max() / 20.0)
+
+
+def test_a_dvl_locks_on_the_bottom_while_three_beams_reach_it(scenes, level):
+    """9 m over the floor no beam does; the lock is what another DVL may read, and a mask leaves it."""
+    twists = wp.array(np.float32([[[0.5, 0, 0, 0, 0, 0]]]), dtype=vec6)
+    lock = wp.full((1, 1), 1, dtype=int)
+    sensor = DopplerBatch(scenes("floor"), dvl(), twists, lock=lock)
+    sensor.update(level(0, 0, -1.0))
+    assert lock.numpy()[0, 0] == 0 and np.isnan(sensor.reading.numpy()[0, :7]).all()
+    sensor.update(level(0, 0, -5.0))
+    assert lock.numpy()[0, 0] == 1 and np.isfinite(sensor.reading.numpy()).all()
+    sensor.update(level(0, 0, -1.0), mask=wp.zeros(1, dtype=int))
+    assert lock.numpy()[0, 0] == 1
+    with pytest.raises(WorldError, match="a DVL of 2 beams"):
+        DopplerBatch(scenes("floor"), dvl(beams=2), twists)

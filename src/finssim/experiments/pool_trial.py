@@ -122,6 +122,8 @@ class Job(PoolJob):
     """Added to what the controller sees, per axis [m]."""
     yaw_noise: float = 0.0
     """Added to what the controller sees [rad]."""
+    estimator: str = "error-state"
+    """Model of the filter: error-state, with the IMU's accelerations, or constant-velocity, the paper's."""
     duration: float = 60.0
     """[s]; of T2 the trajectory's own."""
 
@@ -244,7 +246,14 @@ def play(job: Job, path: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "truth"
         outcome = play_in_pool(
-            trial, start, job.equipped(), job.plan(seed), seed=seed, truth=file, fusion=job.fusion
+            trial,
+            start,
+            job.equipped(),
+            job.plan(seed),
+            seed=seed,
+            truth=file,
+            fusion=job.fusion,
+            mode=job.estimator,
         )
         truth = read_truth(file)
     t = truth.time - outcome.runtime.started
@@ -352,13 +361,12 @@ def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | No
     """One job; PATH.mcap takes the record, PATH.npz the estimate of the motion. None if it was skipped."""
     began, vehicle, record = time.perf_counter(), opened.vehicle, path.with_name(f"{path.name}.mcap")
     trial, start = job_trial(job, vehicle, seed=job.seed)
-    mode = "constant-velocity" if opened.site is not None else "error-state"  # which takes all of slow fixes
     outcome = opened.trial(
         lambda: job_trial(job, vehicle, seed=job.seed)[0],
         start,
         record,
         counts=True,
-        perception=lambda: Perception(opened.equipped, opened.site, mode=mode, fusion=job.fusion),
+        perception=lambda: Perception(opened.equipped, opened.site, mode=job.estimator, fusion=job.fusion),
         about={"command": f"finssim experiment {job.task}", "row": job.row},
     )
     if outcome is None:

@@ -25,6 +25,7 @@ from finssim.experiments.statistics import Statistic, paired_difference, with_in
 from finssim.experiments.tables import Columns, Table, cells
 from finssim.experiments.trials import T2_TRAJECTORIES
 from finssim.learning.train import train
+from finssim.localization.fusion.estimator import MODELS
 from finssim.provenance import provenance
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -166,6 +167,7 @@ def transfer_experiment(
     severity: str = "realistic",
     camera: str = "corners",
     firmware: str = "mcu",
+    estimator: str = "error-state",
     rows: Annotated[Sequence[str] | None, ","] = None,
     targets: Annotated[Sequence[str] | None, "python"] = None,
     vehicle: str = "finsrov",
@@ -195,6 +197,8 @@ def transfer_experiment(
         firmware (NAME): What steers the motors: mcu, or ardusub, an autopilot: commands then go by MAVLink, policies
             act by its axes, and a tank, a Doppler log, a compass and setpoints three times as far take the place of
             the pool and its camera.
+        estimator (MODE): Filter that locates: error-state, with the IMU's accelerations, or constant-velocity, the
+            paper's.
         rows (NAMES): Rows of the table, separated by commas; all but nmpc, which takes an extra, if not given.
         targets: What is played; the published ones if None.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
@@ -221,6 +225,7 @@ def transfer_experiment(
     check_choices(targets, spec.known_targets, "target", ValueError)
     check_choices([severity], ("nominal", "realistic", "hard"), "severity", ValueError)
     check_choices([camera], ("corners", "pictures"), "camera", ValueError)
+    check_choices([estimator], MODELS, "estimator", ValueError)
     if plants < 1 or seeds < 1:
         raise ValueError(f"plants is {plants}, seeds {seeds}: expected at least 1 of each")
     chosen = {name: spec.rows[name] for name in rows}
@@ -240,7 +245,7 @@ def transfer_experiment(
         Job(
             row=name, controller=controllers[name, s], target=target, vehicle=vehicle,
             pool_vehicle=pool_vehicle or vehicle, plant=plant, severity=severity, seed=s, site=site, firmware=firmware,
-            **{"camera": camera, **row.changes},
+            estimator=estimator, **{"camera": camera, **row.changes},
         )
         for name, row in chosen.items() for plant in pools for s in run_seeds for target in row.targets or targets
     ]  # fmt: skip
@@ -252,7 +257,7 @@ def transfer_experiment(
     by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
     body = load_vehicle(vehicle)
     result = {
-        "experiment": spec.name, "severity": severity, "camera": camera, "plants": list(pools),
+        "experiment": spec.name, "severity": severity, "camera": camera, "estimator": estimator, "plants": list(pools),
         "seeds": list(run_seeds), "targets": targets, "robot": robot and robot.title,
         "vehicle": {"name": body.name, "sha256": body.sha256},
         **scores(spec, by_row), "trials": results, "provenance": provenance(),
@@ -398,7 +403,8 @@ def played_in(result: Mapping[str, Any], what: str) -> str:
     of = f"{what}: {len(result['targets'])}; {result['vehicle']['name']} {result['vehicle']['sha256'][:12]}"
     if result.get("robot"):
         return f"on hardware, robot {result['robot']}, by its own estimate; seeds: {seeds}, {of}"
-    pool = f"severity {result['severity']}, camera {result['camera']}; plants: {plants}"
+    filtered = result.get("estimator", "constant-velocity")
+    pool = f"severity {result['severity']}, camera {result['camera']}, estimator {filtered}; plants: {plants}"
     return f"in the virtual pool, {pool}, seeds: {seeds}, {of}"
 
 

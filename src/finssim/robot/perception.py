@@ -342,7 +342,7 @@ class Perception:
         pool: Pool | None,
         *,
         method: str = "refractive",
-        mode: str = "constant-velocity",
+        mode: str | None = None,
         fusion: bool = True,
         settings: Settings | None = None,
         let_in: Sequence[float] | None = None,
@@ -352,7 +352,8 @@ class Perception:
             vehicle: Its tags and sensors.
             pool: Camera, water and frames; None where no camera looks: the pool frame is then the world's.
             method: How tags become fixes, a name of `localization.poses.methods.METHODS`.
-            mode: Of the estimator: constant-velocity or error-state.
+            mode: Of the estimator: constant-velocity or error-state. None: error-state, which takes the accelerations
+                of an IMU, on a vehicle that has one.
             fusion: False: no filter, for the ablation "without EKF" (`Unfused`).
             settings: Of the estimator; the vehicle file's noises if None.
             let_in: x, y of where the vehicle begins, world frame [m]: the one fix that dead reckoning starts from.
@@ -367,6 +368,7 @@ class Perception:
             if pool is None
             else Fixes(TagLocator(pool, vehicle.tags, method=method, pixel_std=pool.pixel_std))
         )
+        mode = mode or ("constant-velocity" if vehicle.sensors.imu is None else "error-state")
         self.estimator = Estimator(settings or settings_of(vehicle), site_of(pool, vehicle), mode=mode)
         self.unfused = None if fusion else Unfused()
         self._aboard = Aboard(vehicle)

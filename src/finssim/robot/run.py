@@ -340,8 +340,8 @@ def run(
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         let_in (X,Y): Where the vehicle begins, world frame [m], known to 5 cm: for dead reckoning by Doppler log and
             compass, where no camera and no position fix tells.
-        mode (MODE): Estimator: constant-velocity or error-state. If not given: with --let-in error-state, else
-            constant-velocity.
+        mode (MODE): Estimator: error-state, which takes the IMU's accelerations, or constant-velocity. If not given:
+            error-state on a vehicle with an IMU.
         record (FILE): Record everything into this file (.mcap); of --team a folder with a file for each.
         duration: End after this time [s]; at the end of the trajectory, or with Ctrl-C, if not given.
         lockstep: Take turns with finssim pool --lockstep, as fast as both compute.
@@ -366,7 +366,7 @@ def run(
             "--site": site or "open-water",
             "--pool-file": pool_file or "none",
             "--goal": goal,
-            "--mode": mode or "constant-velocity",
+            "--mode": mode,
             "--duration": duration,
         }
         words = [word for name, x in options.items() if x is not None for word in (name, str(x))]
@@ -394,7 +394,6 @@ def run(
             markup=False,
         )
     pool = None if file is None else load_pool(file)
-    mode = mode or ("constant-velocity" if let_in is None else "error-state")
     perception = Perception(ours, pool, mode=mode, let_in=None if let_in is None else place_of(let_in))
     team = _team(pilot, wiring)
     heard = HeardGoal(team.tracks) if team is not None and guide is _GO and _alone(pilot) else None

@@ -33,6 +33,7 @@ class DvlArrays:
     velocity: wp.array2d(dtype=wp.vec3)  # sensor frame [m/s]
     bias: wp.array2d(dtype=wp.vec3)  # true bias, sensor frame [m/s]
     scale_error: wp.array2d(dtype=float)  # true scale error
+    lock: wp.array2d(dtype=int)  # whether the beams find the bottom of a described world
     ring: wp.array3d(dtype=wp.vec3)  # samples on their way
 
 
@@ -85,7 +86,7 @@ def measure_velocity(
     reading = (1.0 + dvl.scale_error[w, v]) * exact + bias + p.noise_std * normal3(key, WHITE)
     dvl.ring[w, v, slot] = digitised3(reading, p.quantisation, p.velocity_range)
     dvl.bias[w, v] = bias
-    return truth.water_known or has_echo(truth.position, truth.quaternion, p)
+    return truth.water_known or (dvl.lock[w, v] != 0 and has_echo(truth.position, truth.quaternion, p))
 
 
 @wp.func
@@ -109,6 +110,13 @@ class DvlBatch(SensorBatch):
     """Truth: the bias in it, sensor frame [m/s]; vec3 (W, V)."""
     scale_error: "wp.array[Any]"
     """Truth: the scale error in it; float (W, V)."""
+    lock: "wp.array[Any]"
+    """Whether the beams find the bottom, int (W, V): 1, where no `finssim.worlds.DopplerBatch` writes it."""
+
+    def _new_arrays(self) -> Any:
+        arrays = super()._new_arrays()
+        arrays.lock.fill_(1)
+        return arrays
 
     def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
         """Reach of the beams; without a known floor it is always near."""

@@ -22,11 +22,20 @@ if TYPE_CHECKING:
     from finssim.worlds.delivery import Delivery
     from finssim.worlds.layout import WorldLayout
     from finssim.worlds.model import WorldBatch
-    from finssim.worlds.sensors import CameraBatch, Headlight, RangeBatch, SonarBatch, poses_of, sensor_of
+    from finssim.worlds.sensors import (
+        CameraBatch,
+        DopplerBatch,
+        Headlight,
+        RangeBatch,
+        SonarBatch,
+        poses_of,
+        sensor_of,
+    )
 
 __all__ = [
     "CameraBatch",
     "Delivery",
+    "DopplerBatch",
     "Headlight",
     "RangeBatch",
     "SonarBatch",

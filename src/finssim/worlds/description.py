@@ -93,14 +93,28 @@ Pixels = Annotated[int, Field(strict=True, ge=1, le=8192)]
 class Texture(Part):
     """A pattern on a shape, drawn in the shape's own axes; a seabed's and a plane's lies in x and y."""
 
-    kind: Literal["checker", "stripes", "tiles", "mottled"]
-    """Squares of two colours; bands along z; tiles with joints; patches of random brightness, as sand has."""
+    kind: Literal["checker", "stripes", "tiles", "mottled", "picture", "tag"]
+    """Squares of two colours; bands along z; tiles with joints; patches of random brightness, as sand has; a picture or
+    a printed tag in the middle of each face, upright along z, on faces across z along y."""
     size: Positive
-    """Of a square, a pair of bands, a tile, a patch [m]."""
+    """Of a square, a pair of bands, a tile, a patch; width of a picture; edge of a tag's black border [m]."""
+    file: str | None = None
+    """Of a picture: PNG or JPEG beside the world file."""
+    tag: Annotated[int, Field(strict=True, ge=0)] | None = None
+    """Number of a tag in its family."""
+    family: str = "apriltag_36h11"
+    """Of a tag: one of OpenCV's dictionaries, such as `apriltag_36h11` or `4x4_50`."""
     colour: Colour = Field(default_factory=lambda: zeros(3))
     """Of every other square or band, and of joints, which are 6 % of a tile wide."""
     contrast: Probability = 0.3
     """Of patches: largest change of brightness as a share of it; of tiles: from tile to tile."""
+
+    @model_validator(mode="after")
+    def _complete(self) -> Texture:
+        for kind, key in (("picture", "file"), ("tag", "tag")):
+            if (self.kind == kind) != (getattr(self, key) is not None):
+                raise refuse_section(f"{key} is for kind: {kind}, which needs it; kind is {self.kind}")
+        return self
 
 
 class Finish(Part):
@@ -258,9 +272,40 @@ class Seabed(Finish):
         return self
 
 
+JERLOV = {
+    "I": (0.235, 0.063, 0.018),
+    "IA": (0.240, 0.067, 0.025),
+    "IB": (0.245, 0.072, 0.033),
+    "II": (0.260, 0.089, 0.062),
+    "III": (0.295, 0.120, 0.116),
+    "1C": (0.300, 0.120, 0.170),
+    "3C": (0.330, 0.190, 0.290),
+    "5C": (0.400, 0.300, 0.430),
+    "7C": (0.480, 0.460, 0.710),
+    "9C": (0.600, 0.630, 1.230),
+}
+"""Attenuation of downward daylight K_d at 600, 550 and 475 nm [1/m] (Jerlov, Marine Optics, 1976, table XXVII, as two
+public programs have it, which agree), for red, green and blue."""
+BEAM_OVER_DAYLIGHT = 1.5
+"""What stands for the beam attenuation over K_d where only a water type is given. A choice: the table has none, and
+most light that scatters forwards still arrives near its pixel, so a picture fades by less than a + b."""
+
+
+class Snow(Part):
+    """Marine snow: particles that stand in the water, lit by daylight and lamps; cameras see those near them."""
+
+    density: Annotated[float, Field(strict=True, gt=0.0, le=1e5)]
+    """[1/m³]"""
+    size: Annotated[float, Field(strict=True, gt=0.0, le=0.05)] = 0.001
+    """Diameter [m]."""
+
+
 class WorldWater(Part):
     """Water as light and sound meet it, the same everywhere in a world."""
 
+    jerlov: Literal["I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"] | None = None
+    """Jerlov's water type: gives daylight_attenuation, and 1.5 times that as attenuation, where they are not given."""
+    snow: Snow | None = None
     attenuation: NonNegative3
     """Beam attenuation c of red, green, blue [1/m], (3,)."""
     veil: NonNegative3
@@ -273,6 +318,15 @@ class WorldWater(Part):
     """[g/kg], for the same."""
     vary: Annotated[float, Field(strict=True, ge=1.0, le=10.0)] = 1.0
     """Largest factor by which c and K_d of a world are drawn greater or smaller, log-uniformly."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _typed(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("jerlov") in JERLOV:
+            K_d = np.array(JERLOV[values["jerlov"]])
+            values = {"daylight_attenuation": K_d.tolist(), **values}
+            values = {"attenuation": (BEAM_OVER_DAYLIGHT * K_d).tolist(), **values}
+        return values
 
     @model_validator(mode="after")
     def _ordered(self) -> WorldWater:
@@ -537,6 +591,8 @@ class CameraDevice(Part):
     """[electrons]"""
     gamma: Positive = 2.2
     """Numbers are (charge)^(1/gamma)."""
+    exposure_time: NonNegative = 0.0
+    """During which a picture that knows the vehicle's motion blurs [s]."""
     rate: Positive
     """[Hz]"""
     mount: Mount = Field(default_factory=lambda: Mount())
@@ -576,11 +632,13 @@ class CameraDevice(Part):
 
 
 class SonarDevice(Part):
-    """A multibeam imaging sonar: its picture is echo strength by beam and range."""
+    """A sonar whose picture is echo strength by beam and range: imaging, profiling or side-scan."""
 
     about: str
     source: str
     """Where the figures are from."""
+    mode: Literal["imaging", "profiling", "side_scan"] = "imaging"
+    """Profiling: ranges of the first strong returns too. Side-scan: two beams square to the sensor's x axis."""
     frequency: Positive
     """[Hz]"""
     beams: Count
@@ -591,6 +649,8 @@ class SonarDevice(Part):
     """Of one beam across, between its half-power points on reception [rad]."""
     vertical_beam_width: Annotated[float, Field(strict=True, gt=0.0, le=math.pi)]
     """Between half-power points, one way [rad]."""
+    depression: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
+    """How far the middles of the beams point below the sensor's x-y plane [rad]."""
     range: Positive
     """[m]"""
     minimum_range: NonNegative = 0.0
@@ -605,9 +665,17 @@ class SonarDevice(Part):
     """Time-varying gain [dB per decade of range]; 40 undoes the loss of a small target, 20 that of a wall."""
     display: Pair = (-80.0, -20.0)
     """Echo strengths after gain that are 0 and 255 in the picture [dB]."""
+    detection_db: Number = -60.0
+    """Level after gain that a profiling sonar takes for a return [dB]."""
     rate: Positive
     """[Hz]"""
     mount: Mount = Field(default_factory=lambda: Mount())
+
+    @model_validator(mode="after")
+    def _two_sides(self) -> SonarDevice:
+        if self.mode == "side_scan" and self.beams != 2:
+            raise refuse_section(f"a side-scan sonar has {self.beams} beams, expected 2: left and right")
+        return self
 
     @model_validator(mode="after")
     def _display_rises(self) -> SonarDevice:
@@ -638,6 +706,8 @@ class RangeDevice(Part):
     """[m]"""
     noise: NonNegative = 0.0
     """Standard deviation, as a share of the range."""
+    velocity_noise: NonNegative = 0.0
+    """Standard deviation of a DVL's velocity along a beam [m/s]."""
     rate: Positive
     """[Hz]"""
     mount: Mount = Field(default_factory=lambda: Mount())

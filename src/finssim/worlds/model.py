@@ -12,8 +12,9 @@ import warp as wp
 from finssim.geometry.rotations import quat_rotate
 from finssim.worlds.description import Look, World
 from finssim.worlds.layout import WorldLayout
+from finssim.worlds.pictures import picture_of
 
-TEXTURES = {None: 0, "checker": 1, "stripes": 2, "tiles": 3, "mottled": 4}
+TEXTURES = {None: 0, "checker": 1, "stripes": 2, "tiles": 3, "mottled": 4, "picture": 5, "tag": 5}
 
 
 @wp.struct
@@ -24,7 +25,8 @@ class Surface:
     second: wp.vec3  # of every other square or band, and of joints
     texture: int  # a value of TEXTURES
     size: float  # of the pattern [m]
-    contrast: float
+    contrast: float  # of a picture: its height over its width
+    picture: int  # which
     backscatter: float  # Lambert's parameter mu
     glow: wp.vec3  # radiance of its own
     inverse: wp.transform  # from world axes to the shape's
@@ -41,6 +43,8 @@ class Optics:
     sun: wp.vec3  # unit vector towards it
     diffuse: float  # share of the irradiance from everywhere above
     sky: wp.vec3  # radiance through the surface
+    snow: float  # particles per volume [1/m³]
+    snow_size: float  # their diameter [m]
 
 
 class WorldBatch(WorldLayout):
@@ -81,7 +85,10 @@ class WorldBatch(WorldLayout):
         )
         self.optics = self._optics()
         self.grain = wp.array(_grain(), dtype=float, device=self.device)
+        self._pictures: list[np.ndarray] = []
         self._tables = np.stack([self._surfaces(look) for look in self.looks])
+        pictures = np.float32(self._pictures or np.zeros((1, 1, 1, 3)))
+        self.pictures = wp.array(pictures, dtype=wp.vec3, device=self.device)
         self._table = np.tile(self._tables[0], (worlds, 1))
         self._place(np.arange(worlds))
 
@@ -154,6 +161,8 @@ class WorldBatch(WorldLayout):
         optics.daylight = wp.vec3(*light.daylight)
         optics.sun = wp.normalize(wp.vec3(*light.sun))
         optics.diffuse, optics.sky = light.diffuse, wp.vec3(*light.sky)
+        if water.snow is not None:
+            optics.snow, optics.snow_size = water.snow.density, water.snow.size
         return optics
 
     def _surfaces(self, look: Look | None) -> np.ndarray:
@@ -168,6 +177,10 @@ class WorldBatch(WorldLayout):
             if (texture := finish.texture) is not None:
                 row["texture"], row["size"] = TEXTURES[texture.kind], texture.size
                 row["contrast"], row["second"] = texture.contrast, texture.colour
+                if texture.kind in ("picture", "tag"):
+                    row["picture"] = len(self._pictures)
+                    picture, row["size"], row["contrast"] = picture_of(self.world, texture)
+                    self._pictures.append(picture)
         return table
 
 

@@ -60,6 +60,8 @@ def fan(device: SonarDevice, beams: int | None = None) -> Array:
     """
     count = beams or device.beams
     azimuth = device.sector * (0.5 - (np.arange(count) + 0.5) / count)
+    if device.mode == "side_scan":
+        azimuth = np.array([0.5, -0.5]) * math.pi
     elevation = ray_elevations(device)[:, None]
     directions = np.stack(
         np.broadcast_arrays(
@@ -101,10 +103,8 @@ def _fan_cells(beams: int, bins: int, sector: float, side: int) -> tuple[NDArray
 
 def ray_elevations(device: SonarDevice) -> Array:
     """Of the rays of a beam above the sonar's x-y plane [rad], (elevations,)."""
-    return (
-        ELEVATION_SPAN
-        * device.vertical_beam_width
-        * ((np.arange(device.elevations) + 0.5) / device.elevations - 0.5)
+    return -device.depression + ELEVATION_SPAN * device.vertical_beam_width * (
+        (np.arange(device.elevations) + 0.5) / device.elevations - 0.5
     )
 
 

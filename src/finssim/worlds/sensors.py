@@ -21,6 +21,8 @@ import numpy as np
 import warp as wp
 from scipy.special import ndtri
 
+from finssim.physics.types import angular, linear, vec6
+from finssim.sensors.dvl import sensed_velocity
 from finssim.sensors.overhead_camera.photometry import fresnel, noise_key, refracted, through_water
 from finssim.vehicles import Vehicle
 from finssim.worlds.description import (
@@ -42,6 +44,11 @@ SKIPPED = wp.constant(-101)
 LEVELS = 4096
 """Of the converter behind a camera's pixels (12 bits), before the numbers are encoded to 8."""
 LAMP_STEPS = wp.constant(8)
+SNOW_STEPS = wp.constant(40)
+SNOW_SHARE = wp.constant(0.7)
+"""Of the cells of the lattice that marine snow stands in, twenty of which a ray is followed through."""
+BLUR = 5
+"""Moments of an exposure that a blurred picture is the mean of."""
 AUTO_MEAN = 0.42
 """Mean of a picture that automatic exposure aims at, as a share of the full scale after gamma."""
 
@@ -248,6 +255,46 @@ def patterned(kind: int, local: wp.vec3, colour: wp.vec3, second: wp.vec3, contr
 
 
 @wp.func
+def painted(
+    pictures: wp.array3d(dtype=wp.vec3), index: int, local: wp.vec3, normal: wp.vec3, aspect: float, base: wp.vec3
+) -> wp.vec3:  # fmt: skip
+    """Reflectance at a point of a face with a picture in its middle.
+
+    Args:
+        pictures: All of them, row 0 at the top.
+        index: Which.
+        local: The point, shape axes, in widths of the picture.
+        normal: Of the face, shape axes, unit [-].
+        aspect: Height of the picture over its width.
+        base: Reflectance beside it.
+    """
+    n = wp.vec3(wp.abs(normal[0]), wp.abs(normal[1]), wp.abs(normal[2]))
+    u = wp.sign(normal[2]) * local[0]
+    v = local[1]
+    if n[0] > n[1] and n[0] > n[2]:
+        u = wp.sign(normal[0]) * local[1]
+        v = local[2]
+    elif n[1] > n[2]:
+        u = -wp.sign(normal[1]) * local[0]
+        v = local[2]
+    x = u + 0.5
+    y = 0.5 - v / aspect
+    if x < 0.0 or x > 1.0 or y < 0.0 or y > 1.0:
+        return base
+    rows = pictures.shape[1]
+    columns = pictures.shape[2]
+    x = wp.clamp(x * float(columns) - 0.5, 0.0, float(columns - 1))
+    y = wp.clamp(y * float(rows) - 0.5, 0.0, float(rows - 1))
+    j = wp.min(int(x), wp.max(columns - 2, 0))
+    i = wp.min(int(y), wp.max(rows - 2, 0))
+    fx = x - float(j)
+    fy = y - float(i)
+    above = (1.0 - fx) * pictures[index, i, j] + fx * pictures[index, i, j + 1]
+    below = (1.0 - fx) * pictures[index, i + 1, j] + fx * pictures[index, i + 1, j + 1]
+    return (1.0 - fy) * above + fy * below
+
+
+@wp.func
 def below_surface(ray: wp.vec3, veil: wp.vec3, sky: wp.vec3) -> wp.vec3:
     """Radiance that comes down through the still water surface, or is thrown back by it (Fresnel, Snell's window).
 
@@ -338,6 +385,63 @@ def lamps_seen(
     return radiance
 
 
+@wp.func
+def snow_seen(
+    origin: wp.vec3, ray: wp.vec3, path: float, c: wp.vec3, daylight: wp.vec3, density: float, size: float,
+    pixel: float, lamps: wp.array(dtype=Lamp), pose: wp.transform,
+) -> wp.vec4:  # fmt: skip
+    """What particles in the water add to a ray, and in the fourth number how much of it they cover.
+
+    Each cell of a lattice holds a particle or none, by a hash of the cell; it covers a²/s² e^(-(x/s)²) of a pixel that
+    it passes at x, a its radius and s² = a² + w² with the pixel's half width w there. Snow reflects 0.4 of its light.
+
+    Args:
+        origin: Where the ray enters the water, world frame [m].
+        ray: Unit direction, world frame.
+        path: To the surface or the end of the water [m].
+        c: Beam attenuation [1/m].
+        daylight: At the eye's depth.
+        density: Particles per volume [1/m³].
+        size: Their diameter [m].
+        pixel: Angle from pixel to pixel [rad].
+        lamps: On the vehicle.
+        pose: Of the vehicle, body to world.
+    """
+    cell = wp.pow(SNOW_SHARE / density, 1.0 / 3.0)
+    light = wp.vec3(0.0)
+    clear = float(1.0)
+    t = float(0.05)
+    for _ in range(SNOW_STEPS):
+        t += 0.5 * cell
+        if t > path:
+            break
+        at = (origin + t * ray) / cell
+        corner = wp.vec3(wp.floor(at[0]), wp.floor(at[1]), wp.floor(at[2]))
+        mixed = (int(corner[0]) * 73856093) ^ (int(corner[1]) * 19349663) ^ (int(corner[2]) * 83492791)
+        state = wp.rand_init(17, mixed)
+        if wp.randf(state) < SNOW_SHARE:
+            inset = wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
+            particle = cell * (corner + wp.vec3(0.1) + 0.8 * inset)
+            way = wp.dot(particle - origin, ray)
+            # Half a cell's steps meet most cells twice: the step nearest to the particle counts.
+            if wp.abs(way - t) <= 0.25 * cell and way > 0.05:
+                a = 0.5 * size
+                w = 0.5 * pixel * way
+                s = a * a + w * w
+                off = wp.length_sq(particle - origin - way * ray)
+                cover = a * a / s * wp.exp(-off / s)
+                if cover > 1.0e-4:
+                    lit = daylight
+                    for k in range(lamps.shape[0]):
+                        lamp = lamps[k]
+                        place = wp.transform_point(pose, lamp.position)
+                        axis = wp.transform_vector(pose, lamp.axis)
+                        lit += rgb(lamp_light(particle, lamp, place, axis, c))
+                    light += (0.4 * clear * cover) * through_water(lit, c, wp.vec3(0.0), way)
+                    clear = clear * (1.0 - cover)
+    return wp.vec4(light[0], light[1], light[2], 1.0 - clear)
+
+
 @wp.kernel(enable_backward=False)
 def _take_picture(
     rays: wp.array4d(dtype=wp.vec3),
@@ -351,7 +455,11 @@ def _take_picture(
     optics: Optics,
     surfaces: wp.array(dtype=Surface),
     grain: wp.array2d(dtype=float),
+    pictures: wp.array3d(dtype=wp.vec3),
     lamps: wp.array(dtype=Lamp),
+    pixel: float,
+    share: float,
+    last: int,
     gain: wp.array(dtype=wp.vec3),
     full_well: float,
     read_noise: float,
@@ -418,6 +526,10 @@ def _take_picture(
                 contrast = surfaces[shape].contrast
                 if kind == 4:
                     reflectance = (1.0 + contrast * mottled(local, grain)) * reflectance
+                elif kind == 5:
+                    face = wp.transform_vector(surfaces[shape].inverse, n)
+                    which = surfaces[shape].picture
+                    reflectance = painted(pictures, which, local, face, contrast, reflectance)
                 else:
                     reflectance = patterned(kind, local, reflectance, surfaces[shape].second, contrast)
             above = 0.5 * (1.0 + n[2])
@@ -434,10 +546,28 @@ def _take_picture(
             colour += through_water(glow, c, wp.vec3(0.0), path)
         if lit:
             colour += lamps_seen(origin, ray, path, n, reflectance, c, veil, lamps, pose)
+        if optics.snow > 0.0:
+            flakes = snow_seen(
+                origin,
+                ray,
+                path,
+                c,
+                wp.cw_mul(dim, daylight),
+                optics.snow,
+                optics.snow_size,
+                pixel,
+                lamps,
+                pose,
+            )
+            colour = (1.0 - flakes[3]) * colour + rgb(flakes)
         if wp.length_sq(ray) < 0.5:
             colour = wp.vec3(0.0)  # the lens has no ray here
         if keep:
+            if share < 1.0:
+                colour = linear[v, i, j] + share * colour
             linear[v, i, j] = colour
+        if last == 0:
+            continue
         bits = wp.uint32(0)
         if key >= 0:
             # Numbers of the normal distribution by their quantiles, 10 bits each, from one hash of the pixel.
@@ -493,6 +623,34 @@ def _meter(
     gain[v] = new
 
 
+@wp.kernel(enable_backward=False)
+def _move(
+    poses: wp.array(dtype=wp.transform),
+    twists: wp.array2d(dtype=vec6),
+    time: float,
+    moved: wp.array(dtype=wp.transform),
+):
+    """Poses a time [s] on, at the twists that the vehicles have."""
+    i = wp.tid()
+    nu = twists[i // twists.shape[1], i % twists.shape[1]]
+    q = wp.transform_get_rotation(poses[i])
+    angle = time * wp.length(angular(nu))
+    turned = q
+    if wp.abs(angle) > 1.0e-9:
+        turned = q * wp.quat_from_axis_angle(wp.normalize(angular(nu)), angle)
+    moved[i] = wp.transform(
+        wp.transform_get_translation(poses[i]) + time * wp.quat_rotate(q, linear(nu)), turned
+    )
+
+
+@wp.kernel(enable_backward=False)
+def _clear(worlds: wp.array(dtype=int), linear: wp.array3d(dtype=wp.vec3)):
+    """Begin an exposure."""
+    v, i, j = wp.tid()
+    if worlds[v] != SKIPPED:
+        linear[v, i, j] = wp.vec3(0.0)
+
+
 class CameraBatch(RayBatch):
     """A camera on each of N vehicles.
 
@@ -503,6 +661,8 @@ class CameraBatch(RayBatch):
         vehicles: In each world.
         lamps: Lights on each vehicle.
         linear: Keep the radiance too.
+        twists: nu of the vehicles, body frame [m/s, rad/s], read in each update, as a simulator's `state.velocity`:
+            with the camera's exposure time, pictures blur; vec6 (worlds, vehicles).
     """
 
     picture: wp.array
@@ -521,14 +681,18 @@ class CameraBatch(RayBatch):
         vehicles: int = 1,
         lamps: tuple[Headlight, ...] = (),
         linear: bool = False,
+        twists: wp.array | None = None,
     ) -> None:
         self.camera, self.lens, sensor = camera, camera.lens(width), camera.sensor
         super().__init__(batch, camera_rays(self.lens, camera.port), camera.mount, vehicles)
         shape = self.depth.shape
+        self.twists = twists if camera.exposure_time > 0.0 else None
+        keep = linear or self.twists is not None
         code = 255.0 * np.linspace(0.0, 1.0, LEVELS) ** (1.0 / sensor.gamma) + 0.5
         with wp.ScopedDevice(self.device):
             self.reading = self.picture = wp.zeros((*shape, 3), dtype=wp.uint8)
-            self.radiance = wp.zeros(shape if linear else (0, 0, 0), dtype=wp.vec3)
+            self.radiance = wp.zeros(shape if keep else (0, 0, 0), dtype=wp.vec3)
+            self._moved = wp.zeros(self.count, dtype=wp.transform)
             self.gain = wp.full(self.count, wp.vec3(sensor.gain), dtype=wp.vec3)
             self._normal = wp.array(np.float32(ndtri((np.arange(1024) + 0.5) / 1024)), dtype=float)
             self._code = wp.array(np.uint8(code), dtype=wp.uint8)
@@ -549,21 +713,15 @@ class CameraBatch(RayBatch):
         Returns:
             `picture`, which the next update overwrites.
         """
-        self.cast(poses, mask)
-        sensor, key = self._sensor, -1 if seed is None else noise_key(seed, time)
-        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, poses, self.worlds]
-        inputs += [
-            self.dimming,
-            self.batch.optics,
-            self.batch.surfaces,
-            self.batch.grain,
-            self._lamps,
-            self.gain,
-        ]
-        inputs += [sensor.full_well, sensor.read_noise, self._code, self._normal, key]
-        inputs += [self._span(self.depth.shape[2]), self.radiance, self.picture]
-        wp.launch(_take_picture, self._blocks(self.depth), inputs, device=self.device)
+        moments = 1 if self.twists is None else BLUR
+        for k in range(moments):
+            if moments > 1:
+                before = self.camera.exposure_time * ((k + 0.5) / moments - 1.0)
+                inputs = [poses, self.twists, before, self._moved]
+                wp.launch(_move, self.count, inputs, device=self.device)
+            self._expose(self._moved if moments > 1 else poses, seed, time, mask, k, moments)
         if self.camera.exposure == "auto":
+            sensor = self._sensor
             inputs = [
                 self.worlds,
                 self.picture,
@@ -574,6 +732,31 @@ class CameraBatch(RayBatch):
             ]
             wp.launch(_meter, self.count, inputs, device=self.device)
         return self.picture
+
+    def _expose(
+        self, poses: wp.array, seed: int | None, time: float, mask: wp.array | None, k: int, moments: int
+    ) -> None:
+        """Add moment k of an exposure; after the last, encode it."""
+        self.cast(poses, mask)
+        if moments > 1 and k == 0:
+            wp.launch(_clear, self.radiance.shape, [self.worlds, self.radiance], device=self.device)
+        sensor, key = self._sensor, -1 if seed is None else noise_key(seed, time)
+        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, poses, self.worlds]
+        inputs += [
+            self.dimming,
+            self.batch.optics,
+            self.batch.surfaces,
+            self.batch.grain,
+            self.batch.pictures,
+            self._lamps,
+            1.0 / self.lens.fx,
+            1.0 / moments,
+            int(k == moments - 1),
+            self.gain,
+        ]
+        inputs += [sensor.full_well, sensor.read_noise, self._code, self._normal, key]
+        inputs += [self._span(self.depth.shape[2]), self.radiance, self.picture]
+        wp.launch(_take_picture, self._blocks(self.depth), inputs, device=self.device)
 
 
 def _lamp(light: Headlight) -> Lamp:
@@ -718,8 +901,30 @@ def _receive(
         picture[v, b, k] = wp.uint8(wp.clamp(level, 0.0, 255.0) + 0.5)
 
 
+@wp.kernel(enable_backward=False)
+def _detect(
+    worlds: wp.array(dtype=int),
+    intensity: wp.array3d(dtype=float),
+    threshold: float,
+    bin_length: float,
+    ranges: wp.array2d(dtype=float),
+):
+    """Range of the first cell of each beam that is loud enough and within 6 dB of its loudest: the cell's middle."""
+    v, b = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
+    ranges[v, b] = float(wp.inf)
+    enough = float(threshold)
+    for k in range(intensity.shape[2]):
+        enough = wp.max(enough, 0.25 * intensity[v, b, k])
+    for k in range(intensity.shape[2]):
+        if intensity[v, b, k] >= enough:
+            ranges[v, b] = (float(k) + 0.5) * bin_length
+            return
+
+
 class SonarBatch(RayBatch):
-    """An imaging sonar on each of N vehicles.
+    """An imaging, profiling or side-scan sonar on each of N vehicles.
 
     Args:
         batch: The worlds; their water's temperature and salinity give the absorption of sound.
@@ -733,6 +938,9 @@ class SonarBatch(RayBatch):
     """Power after gain, relative to the source's level at 1 m; float (N, beams, bins), beam 0 at the left."""
     picture: wp.array
     """Its level between the device's `display` levels; uint8 (N, beams, bins)."""
+    ranges: wp.array
+    """Of a profiling sonar: first range with a level of `detection_db` and within 6 dB of the beam's loudest [m],
+    infinite where there is none; float (N, beams)."""
 
     def __init__(
         self,
@@ -750,21 +958,27 @@ class SonarBatch(RayBatch):
         """[dB/m]"""
         count = rays.shape[1]
         elevation, spacing = ray_elevations(sonar), sonar.sector / count
+        if sonar.mode == "side_scan":
+            spacing = sonar.beam_width / 0.8859  # the integral of its pattern sinc²
         self._steps = wp.vec2(float(elevation[1] - elevation[0]) if len(elevation) > 1 else 0.0, spacing)
-        two_way = np.exp(-8.0 * math.log(2.0) * (elevation / sonar.vertical_beam_width) ** 2)
+        two_way = np.exp(
+            -8.0 * math.log(2.0) * ((elevation + sonar.depression) / sonar.vertical_beam_width) ** 2
+        )
         solid = max(self._steps[0], 1e-6) * spacing * np.cos(elevation) / math.pi
         ranges = (np.arange(self.bins) + 0.5) * self.bin_length
         loss = sonar.gain_spreading * np.log10(ranges) + 2.0 * self.absorption * ranges
         gain = np.where(ranges >= sonar.minimum_range, 10.0 ** (0.1 * loss), 0.0)
         with wp.ScopedDevice(self.device):
             self._weight = wp.array(np.float32(two_way * solid), dtype=float)
-            self._taps = wp.array(np.float32(beam_pattern(sonar.beam_width, spacing, count)), dtype=float)
+            taps = np.ones(1) if sonar.mode == "side_scan" else beam_pattern(sonar.beam_width, spacing, count)
+            self._taps = wp.array(np.float32(taps), dtype=float)
             self._gain = wp.array(np.float32(gain), dtype=float)
             self._exponential = wp.array(np.float32(-np.log1p(-(np.arange(4096) + 0.5) / 4096)), dtype=float)
             self._energy = wp.zeros(self.depth.shape, dtype=float)
             self._spread = wp.zeros(self.depth.shape, dtype=wp.vec2)
             self.intensity = wp.zeros((self.count, count, self.bins), dtype=float)
             self.reading = self.picture = wp.zeros(self.intensity.shape, dtype=wp.uint8)
+            self.ranges = wp.zeros(self.intensity.shape[:2], dtype=float)
 
     @property
     def bin_length(self) -> float:
@@ -814,6 +1028,10 @@ class SonarBatch(RayBatch):
         ]
         inputs += [self._span(self.bins), self.intensity, self.picture]
         wp.launch(_receive, self._blocks(self.intensity), inputs, device=self.device)
+        if sonar.mode == "profiling":
+            threshold = 10.0 ** (0.1 * sonar.detection_db)
+            inputs = [self.worlds, self.intensity, threshold, self.bin_length, self.ranges]
+            wp.launch(_detect, self.ranges.shape, inputs, device=self.device)
         return self.picture
 
 
@@ -938,6 +1156,112 @@ class RangeBatch(RayBatch):
         inputs += [self._weight, ranger.quantile, ranger.minimum_range, ranger.range, ranger.noise, key]
         wp.launch(_take_ranges, self.ranges.shape, [*inputs, self.ranges], device=self.device)
         return self.ranges
+
+
+@wp.kernel(enable_backward=False)
+def _take_velocities(
+    worlds: wp.array(dtype=int),
+    rays: wp.array4d(dtype=wp.vec3),
+    views: wp.array(dtype=wp.transform),
+    twists: wp.array2d(dtype=vec6),
+    mount: wp.transform,
+    ranges: wp.array2d(dtype=float),
+    noise: float,
+    key: int,
+    speeds: wp.array2d(dtype=float),
+    velocity: wp.array2d(dtype=float),
+    lock: wp.array2d(dtype=int),
+):
+    """Speed along each beam that finds the bottom, and the velocity that fits them best.
+
+    s_b = d_b . v + noise;  v = (sum d d^T)^-1 sum d s  over the beams with an echo, of which there must be three
+    """
+    i = wp.tid()
+    if worlds[i] == SKIPPED:
+        return
+    w = i // twists.shape[1]
+    v = i % twists.shape[1]
+    turn = wp.transform_get_rotation(mount)
+    nu = twists[w, v]
+    exact = sensed_velocity(nu, wp.quat_identity(), wp.vec3(0.0), wp.transform_get_translation(mount), turn)
+    state = wp.rand_init(wp.max(key, 0), i)
+    normal = wp.mat33(0.0)
+    right = wp.vec3(0.0)
+    count = int(0)
+    for b in range(ranges.shape[1]):
+        d = rays[b, 0, 0, 1]
+        speeds[i, b] = float(wp.nan)
+        drawn = wp.randn(state)
+        if wp.isfinite(ranges[i, b]):
+            s = wp.dot(d, exact)
+            if key >= 0:
+                s += noise * drawn
+            speeds[i, b] = s
+            normal += wp.outer(d, d)
+            right += s * d
+            count += 1
+    lock[w, v] = wp.where(count >= 3, 1, 0)
+    solution = wp.vec3(float(wp.nan))
+    if count >= 3:
+        solution = wp.inverse(normal) * right
+    for k in range(3):
+        velocity[i, k] = solution[k]
+
+
+class DopplerBatch(RangeBatch):
+    """A DVL on each of N vehicles: bottom track by the ranges and speeds of its beams.
+
+    Args:
+        batch: The worlds.
+        device: At least three beams; the speeds are those along the beams' middles.
+        twists: nu of the vehicles, body frame [m/s, rad/s], read in each update, as a simulator's `state.velocity`;
+            vec6 (worlds, vehicles).
+        lock: Filled in place of its own; that of a `finssim.sensors.DvlBatch` makes that one lose the bottom too.
+
+    Raises:
+        WorldError: The device has fewer beams.
+    """
+
+    speeds: wp.array
+    """Of the sensor along each beam, positive away from it [m/s], NaN without an echo; float (N, beams)."""
+    velocity: wp.array
+    """Of the sensor, in its own axes [m/s], NaN without lock; float (N, 3)."""
+    lock: wp.array
+    """Whether at least three beams find the bottom; int (worlds, vehicles)."""
+
+    def __init__(
+        self, batch: WorldBatch, device: RangeDevice, twists: wp.array, *, lock: wp.array | None = None
+    ) -> None:
+        if device.beams < 3:
+            raise WorldError(f"a DVL of {device.beams} beams: give at least 3 for a velocity")
+        super().__init__(batch, device, vehicles=twists.shape[1])
+        beams, self.twists = device.beams, twists
+        # One row for each vehicle, so that all of it arrives together: velocity, speeds, ranges.
+        self.reading = wp.zeros((self.count, 3 + 2 * beams), dtype=float, device=self.device)
+        self.velocity, self.speeds = self.reading[:, :3], self.reading[:, 3 : 3 + beams]
+        self.ranges = self.reading[:, 3 + beams :]
+        self.lock = wp.zeros(twists.shape, dtype=int, device=self.device) if lock is None else lock
+
+    def update(
+        self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
+    ) -> wp.array:
+        """Measure.
+
+        Args:
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            seed: Of the noise; None for none.
+            time: Of the measurement [s]: others have other noise.
+            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
+
+        Returns:
+            `reading`: velocity, speeds and ranges in a row; float (N, 3 + 2 beams).
+        """
+        super().update(poses, seed=seed, time=time, mask=mask)
+        key = -1 if seed is None else noise_key(seed + 1, time)
+        inputs = [self.worlds, self.rays, self.views, self.twists, self._mount, self.ranges]
+        inputs += [self.ranger.velocity_noise, key, self.speeds, self.velocity, self.lock]
+        wp.launch(_take_velocities, self.count, inputs, device=self.device)
+        return self.reading
 
 
 def sensor_of(

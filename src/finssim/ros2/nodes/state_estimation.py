@@ -26,7 +26,7 @@ class StateEstimation(RobotNode):
         super().__init__("state_estimation")
         file = self.parameter("pool_file", "pool.yaml")
         pool = None if file == "none" else load_pool(file)
-        mode = self.parameter("mode", "constant-velocity")
+        mode = self.parameter("mode", "error-state" if self.vehicle.sensors.imu else "constant-velocity")
         place = self.parameter("let_in", "")
         self.perception = Perception(self.vehicle, pool, mode=mode, let_in=place_of(place) if place else None)
         self.sends("odometry", "estimator", "diagnostics", "event")
