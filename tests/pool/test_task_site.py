@@ -16,7 +16,7 @@ from finssim.experiments.stack import site_of
 from finssim.pool.fleet import Medium
 from finssim.pool.positioning import Exposure
 from finssim.robot.pilots import AgentPilot
-from finssim.tasks import TASKS, Environment, task_named
+from finssim.tasks import SEEING, TASKS, Environment, task_named
 from finssim.tasks.agents import BASELINES
 from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
@@ -26,12 +26,12 @@ FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SHORT = {"t1": 14.0, "t2": 14.0, "t3": 12.0, "docking": 25.0}
 """Time limits that are long enough for a success of the baseline [s]."""
-SEEDS = {"camera-docking": 4}
-"""Of an episode in which the baseline succeeds; light-servo does in two of three."""
+SEEDS = {"camera-docking": 4, "pipeline": 2}
+"""Of an episode in which the baseline succeeds; that of a task that sees does not in all."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", [*TASKS, *SEEING])
 def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
     """Scored by the task itself on the true state; nobody is stopped, everybody decides at the task's rate."""
     (who, *_), task = BASELINES[name], task_named(name)

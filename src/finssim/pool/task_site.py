@@ -367,7 +367,7 @@ class TaskSite(Fleet):
         modes = [pilot.mode for pilot in steering.values() if isinstance(pilot, AgentPilot)]
         size = len(modes[0].labels) if modes else None
         self.referee = referee = Referee(task, vehicles, seed=seed, guide=guide, action_size=size)
-        if guide is None and referee.arrays.reference.position is not None:
+        if guide is None and referee.arrays.reference.position is not None and not referee.task.world:
             raise ControlError(
                 f"task '{referee.task.name}' follows a reference that is known ahead: give a trajectory, in a pool "
                 "without --task"

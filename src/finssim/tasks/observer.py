@@ -176,7 +176,7 @@ class Observer:
 
     def _aim(self, guide: Guide) -> None:
         """What of a guide is looked at ahead of time."""
-        if self._arrays.reference.position is None:
+        if self._arrays.reference.position is None or self.task.world:
             return
         if math.isfinite(guide.duration) and guide.duration > self.task.time_limit:
             self.task = replace(self.task, time_limit=guide.duration)
