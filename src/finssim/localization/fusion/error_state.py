@@ -615,24 +615,26 @@ def predict(
         gravity: Pool frame [m/s²], (3,): downwards.
     """
     turn = (omega - state.gyro_bias) * dt
-    R = quat_to_matrix(quat_multiply(state.q, quat_from_rotvec(0.5 * turn)))
+    half = quat_from_rotvec(0.5 * turn)
+    middle = quat_multiply(state.q, half)
+    q = quat_multiply(middle, half)
+    R = quat_to_matrix(middle)
     pushed = (R @ (force - state.accel_bias)[..., None])[..., 0]
     a = pushed + gravity
-    q = quat_multiply(state.q, quat_from_rotvec(turn))
     n = state.covariance.shape[-1]
-    F = np.broadcast_to(_I[n], (*turn.shape[:-1], n, n)).copy()
+    F = _I[n].copy() if turn.ndim == 1 else np.tile(_I[n], (*turn.shape[:-1], 1, 1))
     F[..., P, V] = dt * _I[15][:3, :3]
-    swing, turned = dt * skew(pushed), dt * R
-    F[..., V, A], F[..., P, A] = -swing, (-0.5 * dt) * swing
-    F[..., V, B], F[..., P, B] = -turned, (-0.5 * dt) * turned
-    F[..., A, G] = -turned
-    covariance = F @ state.covariance @ np.swapaxes(F, -1, -2) + _noise(dt, noise, n)
+    swing, turned = -dt * skew(pushed), -dt * R
+    F[..., V, A], F[..., P, A] = swing, (0.5 * dt) * swing
+    F[..., V, B], F[..., P, B] = turned, (0.5 * dt) * turned
+    F[..., A, G] = turned
+    covariance = F @ state.covariance @ F.swapaxes(-1, -2) + _noise(dt, noise, n)
     return changed(
         state,
         p=state.p + dt * state.v + 0.5 * dt**2 * a,
         v=state.v + dt * a,
-        q=q / np.linalg.norm(q, axis=-1, keepdims=True),
-        covariance=0.5 * (covariance + np.swapaxes(covariance, -1, -2)),
+        q=q / np.sqrt((q * q).sum(axis=-1, keepdims=True)),
+        covariance=0.5 * (covariance + covariance.swapaxes(-1, -2)),
     )
 
 
@@ -869,11 +871,17 @@ def capped(state: InertialState, variance: float, tilt: float) -> InertialState:
         tilt: Largest standard deviation of roll and pitch [rad].
     """
     d = np.diagonal(state.covariance)
-    limit = np.array([variance] * 3 + [np.inf] * 3 + [tilt**2] * 2 + [10.0] + [np.inf] * (len(d) - 9))
-    if np.all(d <= limit):
+    limit = _caps(variance, tilt, len(d))
+    if (d <= limit).all():
         return state
     scale = np.sqrt(np.minimum(1.0, limit / np.maximum(d, 1e-300)))
     return changed(state, covariance=state.covariance * scale[:, None] * scale[None, :])
+
+
+@lru_cache(maxsize=8)
+def _caps(variance: float, tilt: float, n: int) -> Array:
+    """The largest variance of each error, (n,)."""
+    return np.array([variance] * 3 + [np.inf] * 3 + [tilt**2] * 2 + [10.0] + [np.inf] * (n - 9))
 
 
 # Fusion with the IMU's acceleration: the error-state filter behind the same gates, states and timings.
