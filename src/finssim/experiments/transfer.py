@@ -45,9 +45,11 @@ MEASURES: Columns = {
     "success_rate": ("held [points]", "+.0f", 100.0),
     "e_p_m": ("e_p [cm]", "+.1f", 100.0),
     "e_psi_deg": ("e_psi [°]", "+.1f"),
+    "t_s_s": ("t_s [s]", "+.1f"),
     "horizontal_rmse_m": ("horizontal [cm]", "+.1f", 100.0),
     "vertical_rmse_m": ("vertical [cm]", "+.1f", 100.0),
     "p95_m": ("P95 [cm]", "+.1f", 100.0),
+    "energy": ("energy [N^1.5 s]", "+.0f"),
 }
 """Key in which rows are compared, for the table of differences."""
 
@@ -89,8 +91,8 @@ class Spec:
     columns: Columns
     """Of a row."""
     note: str
-    base: str
-    """The row that the others are compared with."""
+    bases: Sequence[str]
+    """The rows that the others are compared with, a table for each that was played."""
     figures: Mapping[str, Statistic]
     """Key of a trial's result -> how the trials that have it become one figure."""
     differences: Sequence[str]
@@ -102,33 +104,39 @@ class Spec:
     picture: tuple[str, str]
     """File of that figure, and what it shows."""
 
-    def paper_differences(self, row: Row) -> dict[str, float] | None:
-        """Key of `differences` -> the paper's row less its reference; None where it has not both."""
-        base = self.rows[self.base].paper
-        if row.paper is None or base is None:
+    def paper_differences(self, row: Row, base: str) -> dict[str, float] | None:
+        """Key of `differences` -> the paper's row less that of a base; None where it has not both."""
+        if row.paper is None or self.rows[base].paper is None:
             return None
         targets = self.targets if self.by_target else [""]
-        theirs, reference = ([self.paper(name, t) or {} for t in targets] for name in (row.paper, base))
+        pairs = [
+            (self.paper(row.paper, t) or {}, self.paper(self.rows[base].paper, t) or {}) for t in targets
+        ]
         return {
-            key: float(np.mean([a[key] - b[key] for a, b in zip(theirs, reference, strict=True)]))
+            key: float(np.mean([a[key] - b[key] for a, b in pairs]))
             for key in self.differences
+            if all(one.get(key) is not None for pair in pairs for one in pair)
         }
 
     def tables(self, result: Mapping[str, Any]) -> list[Table]:
-        """The table of a result, and that of the differences from the reference row, where there are some."""
+        """The table of a result, and those of the differences from the bases, where there are some."""
         units: Columns = {key: MEASURES[key] for key in self.differences}
-        rows = []
-        for name, differences in result["differences"].items():
-            rows.append([self.rows[name].title, *cells(differences, units)])
-            if theirs := self.paper_differences(self.rows[name]):
-                rows.append(["  paper", *cells(theirs, units)])
-        differences = Table(
-            title=f"{self.name.upper()}: differences from {self.rows[self.base].title}",
-            heads=["", *(heading for heading, *_ in units.values())],
-            rows=rows,
-            note=DIFFERENCES_NOTE,
-        )
-        return [self._table(result), *([differences] if rows else [])]
+        tables = [self._table(result)]
+        for base, of_base in result["differences"].items():
+            rows = []
+            for name, differences in of_base.items():
+                rows.append([self.rows[name].title, *cells(differences, units)])
+                if theirs := self.paper_differences(self.rows[name], base):
+                    rows.append(["  paper", *cells(theirs, units)])
+            tables.append(
+                Table(
+                    title=f"{self.name.upper()}: differences from {self.rows[base].title}",
+                    heads=["", *(heading for heading, *_ in units.values())],
+                    rows=rows,
+                    note=DIFFERENCES_NOTE,
+                )
+            )
+        return tables
 
     def _table(self, result: Mapping[str, Any]) -> Table:
         """The table of a result; on hardware its rows say so."""
@@ -338,11 +346,15 @@ def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
         name: {key: _by_trial(results, key) for key in spec.differences} for name, results in by_row.items()
     }
     differences = {
-        name: {key: paired_difference(paired[spec.base][key], values) for key, values in of_row.items()}
-        for name, of_row in paired.items()
-        if spec.base in paired and name != spec.base
+        base: {
+            name: {key: paired_difference(paired[base][key], values) for key, values in of_row.items()}
+            for name, of_row in paired.items()
+            if name != base
+        }
+        for base in spec.bases
+        if base in paired and len(paired) > 1
     }
-    return {"rows": rows, "base": spec.base, "differences": differences}
+    return {"rows": rows, "differences": differences}
 
 
 def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Statistic]) -> dict[str, Any]:
@@ -379,7 +391,7 @@ def _by_trial(results: Sequence[Mapping[str, Any]], key: str) -> dict[tuple[int,
     return {
         (r["job"]["plant"], r["job"]["seed"], r["job"]["target"]): float(r[measure])
         for r in results
-        if r[measure] is not None
+        if r.get(measure) is not None
     }
 
 
@@ -451,12 +463,14 @@ T1 = Spec(
     columns=T1_COLUMNS,
     note=". paper: its vehicle in its pool, one seed. errors: 40-60 s; e_y is vertical; "
     "success: 0.10 m on each axis and 10° for 10 s. t_s (median) and jitter are of successful trials.",
-    base="calibrated",
+    bases=("calibrated", "pid"),
     figures={
-        **dict.fromkeys(("success_rate", "e_p_m", "e_y_m", "e_psi_deg", "J_p_m", "J_psi_deg"), np.mean),
+        **dict.fromkeys(
+            ("success_rate", "e_p_m", "e_y_m", "e_psi_deg", "J_p_m", "J_psi_deg", "energy"), np.mean
+        ),
         "t_s_s": np.median,
     },
-    differences=("success_rate", "e_p_m", "e_psi_deg"),
+    differences=("success_rate", "e_p_m", "e_psi_deg", "t_s_s", "energy"),
     paper=_paper_t1,
     draw=_draw_t1,
     picture=("t1_envelopes.png", "Station keeping: error against time"),
@@ -477,9 +491,11 @@ T2 = Spec(
         "p95_m": ("3-D P95 [m]", ".3f"),
     },
     note="; done: trials that reached the end. paper: its vehicle in its pool.",
-    base="calibrated-dr",
-    figures=dict.fromkeys(("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "cross_track_rmse_m"), np.mean),
-    differences=("horizontal_rmse_m", "vertical_rmse_m", "p95_m"),
+    bases=("calibrated-dr", "pid"),
+    figures=dict.fromkeys(
+        ("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "cross_track_rmse_m", "energy"), np.mean
+    ),
+    differences=("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "energy"),
     paper=paper_t2_row,
     draw=_draw_t2,
     picture=("t2_paths.png", "Trajectory tracking: paths from above"),
