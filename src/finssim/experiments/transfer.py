@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,9 +16,9 @@ import yaml
 from rich.console import Console
 
 from finssim.control.controllers import COSTLY
-from finssim.control.policy import Policy, PolicyError
+from finssim.control.policy import DESCRIPTION_FILE, Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.campaign import Progress, Show, check_choices, write_json
+from finssim.experiments.campaign import Progress, Show, check_choices, spread, write_json
 from finssim.experiments.evaluate import T1_COLUMNS
 from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row, paper_t2_row
@@ -24,6 +27,7 @@ from finssim.experiments.pool_trial import FIRMWARES, HARDWARE, Job, firmware_of
 from finssim.experiments.statistics import Statistic, paired_difference, with_interval
 from finssim.experiments.tables import Columns, Table, cells
 from finssim.experiments.trials import T2_TRAJECTORIES
+from finssim.files import atomic_directory, plain_name
 from finssim.learning.train import train
 from finssim.localization.fusion.estimator import MODELS
 from finssim.provenance import provenance
@@ -181,6 +185,7 @@ def transfer_experiment(
     vehicle: str = "finsrov",
     steps: Annotated[int | None, (1, None)] = None,
     processes: Annotated[int | None, (1, None)] = None,
+    address: str | None = None,
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
     pool_vehicle: Annotated[str | None, "python"] = None,
@@ -211,7 +216,8 @@ def transfer_experiment(
         targets: What is played; the published ones if None.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         steps: Control steps to learn from, all worlds together; what the task needs if not given.
-        processes: Trials at once; as many as processors if not given.
+        processes: Trainings or trials at once; as many as processors if not given.
+        address (ADDRESS): Of a Ray cluster that does the work in their place, HOST:PORT or auto.
         robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
         attendant: The person beside that robot, instead of the terminal's keyboard.
         pool_vehicle: Name or file of the vehicle around which the pools' own are drawn; `vehicle` if None.
@@ -242,7 +248,7 @@ def transfer_experiment(
     action, site, sees = FIRMWARES[firmware]
     controllers = controllers_of(
         spec.name, chosen, run_seeds, folder, vehicle, steps, action,
-        lambda part, what: progress(TRAINING_SHARE * part, what),
+        lambda part, what: progress(TRAINING_SHARE * part, what), processes=processes, address=address,
     )  # fmt: skip
     if robot is not None:  # there is one plant, and nobody chose its severity
         pools, severity, camera = range(1), HARDWARE, HARDWARE
@@ -258,8 +264,8 @@ def transfer_experiment(
         for name, row in chosen.items() for plant in pools for s in run_seeds for target in row.targets or targets
     ]  # fmt: skip
     results = play_jobs(
-        jobs, folder / "trials", robot, attendant=attendant, console=console, processes=processes, show=show,
-        progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
+        jobs, folder / "trials", robot, attendant=attendant, console=console, processes=processes, address=address,
+        show=show, progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
     )  # fmt: skip
     by_row = {name: [r for r in results if r["job"]["row"] == name] for name in chosen}
     by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
@@ -284,6 +290,9 @@ def controllers_of(
     steps: int | None = None,
     action: str | None = None,
     progress: Progress = lambda part, what: None,
+    *,
+    processes: int | None = None,
+    address: str | None = None,
 ) -> dict[tuple[str, int], str]:
     """Who steers, by row and seed; policies that are not finished in the folder are trained.
 
@@ -295,14 +304,14 @@ def controllers_of(
         vehicle: Name or file.
         steps: Control steps of each training; the task's own if None.
         action: Mode; the task's own if None.
-        progress: Told the share that is done and what comes next.
+        progress: Told the share that is done and what is left.
+        processes, address: Where and how many at once, as of `campaign.spread`.
 
     Returns:
         (row, seed) -> directory of a policy, or the name of a PID.
     """
-    controllers, body = {}, load_vehicle(vehicle)
-    plan = [(name, row, seed) for name, row in rows.items() for seed in seeds]
-    for done, (name, row, seed) in enumerate(plan):
+    controllers, body, missing = {}, load_vehicle(vehicle), {}
+    for (name, row), seed in product(rows.items(), seeds):
         controllers[name, seed] = row.controller
         if row.training is None:
             continue
@@ -310,13 +319,26 @@ def controllers_of(
         label, remembers = options.pop("name"), options.pop("remembers")
         policy = folder / "policies" / f"{label}-seed{seed}"
         controllers[name, seed] = str(policy)
-        progress(done / len(plan), f"training {label}, seed {seed}")
         if not finished(policy, body):
-            train(
-                task, out=policy, vehicle=vehicle, action=action, seed=seed, steps=steps, **options,
-                settings={} if remembers else FORGETFUL, console=Console(stderr=True, quiet=True),
-            )  # fmt: skip
+            options |= {"vehicle": vehicle, "action": action, "seed": seed, "steps": steps}
+            missing[policy] = {"task": task, **options, "settings": {} if remembers else FORGETFUL}
+    with closing(
+        spread(_trained, list(missing.items()), 1 if len(missing) == 1 else processes, address)
+    ) as done:
+        for left, ((policy, _), outcome) in zip(reversed(range(len(missing))), done, strict=True):
+            with atomic_directory(policy, replaces=DESCRIPTION_FILE) as place:
+                for name, content in outcome.result().items():
+                    (place / plain_name(name, "file of a policy", PolicyError)).write_bytes(content)
+            progress(1.0 - left / len(missing), f"{left} trainings left")
     return controllers
+
+
+def _trained(policy: tuple[Path, Mapping[str, Any]]) -> dict[str, bytes]:
+    """Train, on whatever machine: the files of the policy directory by name."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "policy"
+        train(out=out, **policy[1], console=Console(stderr=True, quiet=True))
+        return {path.name: path.read_bytes() for path in out.iterdir()}
 
 
 def finished(place: Path, vehicle: Vehicle | None = None) -> bool:
