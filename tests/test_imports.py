@@ -106,8 +106,8 @@ HOMES = {
     "pandas": {"engine/recorder.py"},
     "pyarrow": {"calibration/trials/trial_files.py", "engine/recorder.py"},
     "matplotlib": {
-        "calibration/output/report.py",
-        "calibration/replay/report.py",
+        "calibration/report.py",
+        "calibration/replay.py",
         "calibration/vision/camera.py",
         "calibration/vision/pool_fit.py",
         "experiments/figures.py",

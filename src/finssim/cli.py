@@ -33,13 +33,13 @@ COMMANDS: dict[str, str | Experiment] = {
     "trials check": "finssim.calibration.check:check",
     "trials import": "finssim.calibration.importers.dispatch:import_trials",
     "excite": "finssim.experiments.excitation:excite",
-    "calibrate thruster": "finssim.calibration.output.commands:calibrate_thruster",
-    "calibrate motor": "finssim.calibration.output.commands:calibrate_motor",
-    "calibrate hydrodynamics": "finssim.calibration.output.commands:calibrate_hydrodynamics",
+    "calibrate thruster": "finssim.calibration.actuators.thruster:calibrate_thruster",
+    "calibrate motor": "finssim.calibration.actuators.motor:calibrate_motor",
+    "calibrate hydrodynamics": "finssim.calibration.hydrodynamics:calibrate_hydrodynamics",
     "calibrate camera": "finssim.calibration.vision.camera:run",
     "calibrate pool": "finssim.calibration.vision.pool_fit:run",
     "calibrate mounts": "finssim.calibration.vision.mounts:run",
-    "replay": "finssim.calibration.replay.replay:run_replay",
+    "replay": "finssim.calibration.replay:run_replay",
     "experiment replay": Experiment("finssim.experiments.replay_experiment:replay_experiment"),
     "experiment localization": Experiment(
         "finssim.experiments.localization_experiment:localization_experiment"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.vehicle_file import write_vehicle
 from finssim.engine import Simulator
 from finssim.engine.ranges_file import RangesError, load_ranges
 from finssim.physics.terms import Term, add_term
@@ -282,9 +282,8 @@ def believed(lift):
 @pytest.mark.slow
 def test_a_calibration_estimates_its_parameter(trials, tmp_path):
     """40 N s²/m² from trials of a vehicle whose file says 0: within the interval, which is narrower than a tenth."""
-    from finssim.calibration.output.ranges import write_ranges
-    from finssim.calibration.output.vehicle_file import calibrated
     from finssim.calibration.simulation.fit import fit_by_simulation
+    from finssim.calibration.vehicle_file import calibrated, write_ranges
 
     fit = fit_by_simulation(trials, believed(0.0), axes=("surge", "heave"), estimate=("wing.lift",))
     found = fit.estimates["wing.lift"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.moving_body import MovingBody
-from finssim.calibration.motion.signals import holds_gravity, motion
+from finssim.calibration.motion import holds_gravity, motion
 from finssim.calibration.trials.conversion import merged
 from finssim.calibration.trials.trial import Header, Trial, TrialWater
 from finssim.geometry.rotations import quat_inverse_rotate, quat_to_euler

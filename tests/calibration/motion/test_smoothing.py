@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.motion.smoothing import longest_step, smooth, stretches, without_spikes
+from finssim.calibration.motion import longest_step, smooth, stretches, without_spikes
 
 
 def times(rate, seconds=15.0, jitter=0.2, seed=0):

@@ -5,7 +5,7 @@ import pytest
 
 from calibration.moving_body import MovingBody
 from finssim.calibration.importers.assemble import Stream, merge, moved_in_time
-from finssim.calibration.motion.signals import stream_offsets, up_in_body
+from finssim.calibration.motion import stream_offsets, up_in_body
 from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 

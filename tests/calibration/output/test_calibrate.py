@@ -11,8 +11,8 @@ from rich.console import Console
 
 from calibration.made_fits import SET, made_fit
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.output.report import fit_json, fit_report, state_text
-from finssim.calibration.output.vehicle_file import (
+from finssim.calibration.report import fit_json, fit_report, state_text
+from finssim.calibration.vehicle_file import (
     all_findings,
     calibrated,
     kept,

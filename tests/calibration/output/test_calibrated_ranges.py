@@ -9,8 +9,7 @@ import pytest
 from calibration.made_fits import SET, made_fit
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate
-from finssim.calibration.output.ranges import range_factors, write_ranges
-from finssim.calibration.output.vehicle_file import calibrated
+from finssim.calibration.vehicle_file import calibrated, range_factors, write_ranges
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import load_ranges
 from finssim.tasks import TASKS, Environment

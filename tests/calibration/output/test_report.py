@@ -10,8 +10,8 @@ import pytest
 from calibration.made_fits import made_fit
 from finssim.calibration.findings import finding
 from finssim.calibration.fit import Curve
-from finssim.calibration.output.report import write_report
-from finssim.calibration.output.vehicle_file import calibrated
+from finssim.calibration.report import write_report
+from finssim.calibration.vehicle_file import calibrated
 from finssim.files import OutputError
 
 WEAK = [finding("unusable", reason="surge <alone> is weak")]

@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.calibration.replay.replay import Pair, error_ahead, find_phases
-from finssim.calibration.replay.report import draw_ahead, draw_overlay, draw_response_envelopes, normalised
+from finssim.calibration.replay import (
+    Pair,
+    draw_ahead,
+    draw_overlay,
+    draw_response_envelopes,
+    error_ahead,
+    find_phases,
+    normalised,
+)
 
 T = np.arange(501) / 50.0
 MODELS = (("calibrated", 0.8), ("mesh", 1.5))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.calibration.replay.replay import (
+from finssim.calibration.replay import (
     Pair,
     aggregate,
     error_ahead,

@@ -13,7 +13,7 @@ from rich.console import Console
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
-from finssim.calibration.replay.replay import replay, run_replay
+from finssim.calibration.replay import replay, run_replay
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.vehicles import CalibrationRecord, load_vehicle
 
@@ -135,7 +135,7 @@ def test_a_velocity_from_position_is_labelled_as_derived(surge):
     result = replay(derived, FINSROV)
     assert result.as_json()["trials"][surge[0].name]["source"]["u"] == "derived from position"
     console = Console(width=140, record=True, file=io.StringIO())
-    from finssim.calibration.replay.report import print_replay
+    from finssim.calibration.replay import print_replay
 
     print_replay(result, console)
     assert "not measured but derived from position" in console.export_text()

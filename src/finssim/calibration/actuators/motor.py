@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,11 @@ from finssim.calibration.actuators.thruster import jackknife
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.motion.smoothing import without_spikes
+from finssim.calibration.motion import without_spikes
+from finssim.calibration.report import finish, refuse_places, usable_trials
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
-from finssim.vehicles import Vehicle
+from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.thruster import Thruster
 
 __all__ = ["cut_steps", "fit_motor", "fit_response"]
@@ -658,3 +660,31 @@ def _untested(
         elif name not in tested:
             findings.append(finding("file_response", name))
     return out
+
+
+def calibrate_motor(
+    trials: Sequence[Path],
+    *,
+    vehicle: str,
+    out: Path,
+    report: Path | None = None,
+    seed: int = 0,
+    as_json: bool = False,
+) -> Vehicle:
+    """Fit the motors' response to steps: delay and lag [s], dead zone.
+
+    Example: finssim calibrate motor steps --vehicle mine.yaml --out mine.yaml
+
+    Args:
+        trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Vehicle file to write (.yaml).
+        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
+    """
+    options = dict(locals())
+    refuse_places(out, report, "vehicle")
+    body = load_vehicle(vehicle)
+    fit = fit_motor(usable_trials(trials), body, seed=seed)
+    return finish("motor", fit, options)

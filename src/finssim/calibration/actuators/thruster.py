@@ -18,10 +18,11 @@ from finssim.calibration.actuators.thrust_table import STANDING, ThrustTable, re
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Curve, Estimate, Fit
+from finssim.calibration.report import finish, refuse_places
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
-from finssim.vehicles import Esc, Vehicle
+from finssim.vehicles import Esc, Vehicle, load_vehicle
 from finssim.vehicles.thruster import Thruster
 
 __all__ = ["dead_zone", "fit_esc", "fit_side", "fit_thruster", "jackknife"]
@@ -967,3 +968,39 @@ def _refuse_duplicates(tables: Sequence[ThrustTable]) -> None:
         if sum((t.sha256, t.thruster) == (table.sha256, table.thruster) for t in tables) > 1:
             names = table.name if first == table.name else f"{first} and {table.name}"
             raise CalibrationError(f"{names}: the same numbers are given twice: give every table once")
+
+
+def calibrate_thruster(
+    tables: Sequence[Path],
+    *,
+    vehicle: str,
+    out: Path,
+    group: str | None = None,
+    voltage: float | None = None,
+    pool_voltages: bool = False,
+    report: Path | None = None,
+    seed: int = 0,
+    as_json: bool = False,
+) -> Vehicle:
+    """Fit thrust curves: c+ and c- [N s²/rad²], dead zones [rpm], limits [N], pulse width to speed.
+
+    Example: finssim calibrate thruster T200-16V.csv --vehicle bluerov2 --out mine.yaml
+
+    Args:
+        tables (TABLE): Tables of force against rpm or pulse width (.csv), or trials.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Vehicle file to write (.yaml).
+        group (NAME): Propeller group that all tables speak about.
+        voltage: Battery voltage at which the numbers shall hold [V], where tables have several.
+        pool_voltages: Fit all voltages together instead of checking one on the others.
+        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
+    """
+    options = dict(locals())
+    refuse_places(out, report, "vehicle")
+    body = load_vehicle(vehicle)
+    fit = fit_thruster(
+        list(tables), body, group=group, voltage=voltage, pool_voltages=pool_voltages, seed=seed
+    )
+    return finish("thruster", fit, options)

@@ -30,8 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.motion.signals import Motion
-from finssim.calibration.motion.smoothing import spans_of, without_spikes
+from finssim.calibration.motion import Motion, spans_of, without_spikes
 from finssim.calibration.regression.plant_terms import Matrices, known_wrench
 from finssim.calibration.uncertainty import (
     Covariance,

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
-from finssim.calibration.motion.signals import Motion, attitude_samples, motion
-from finssim.calibration.motion.smoothing import white_noise
+from finssim.calibration.motion import Motion, attitude_samples, motion, white_noise
 from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
     curves_of,

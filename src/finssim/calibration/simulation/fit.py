@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.motion.signals import Motion
-from finssim.calibration.output.vehicle_file import SCALED
+from finssim.calibration.motion import Motion
 from finssim.calibration.regression.axis_estimates import (
     CERTAIN,
     AxisResult,
@@ -38,6 +37,7 @@ from finssim.calibration.simulation.shooting import (
 from finssim.calibration.trials.inputs import require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.uncertainty import Covariance, Evidence, degeneracy, intervals, trial_covariance
+from finssim.calibration.vehicle_file import SCALED
 from finssim.engine.plant_arrays import twist_shift
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
 from finssim.vehicles.terms import unit_of

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.motion.signals import EULER, Motion, attitude_samples, motion
+from finssim.calibration.motion import EULER, Motion, attitude_samples, motion
 from finssim.calibration.trials.inputs import Drive, drive
 from finssim.calibration.trials.trial import Trial
 from finssim.engine.plant_arrays import NO_LIMIT, vehicle_parameters

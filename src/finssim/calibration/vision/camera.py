@@ -15,7 +15,7 @@ from rich.console import Console
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, plain
 from finssim.calibration.fit import Correlation, Estimate
-from finssim.calibration.output.report import (
+from finssim.calibration.report import (
     BLUE,
     GRAY,
     HEADS,

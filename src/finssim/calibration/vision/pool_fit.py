@@ -18,7 +18,7 @@ from scipy.stats import t as student
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, plain
 from finssim.calibration.fit import Correlation, Estimate
-from finssim.calibration.output.report import (
+from finssim.calibration.report import (
     AS_GIVEN,
     HEADS,
     Report,

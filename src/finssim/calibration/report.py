@@ -21,9 +21,20 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from finssim.calibration.findings import Finding, plain, sentences
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding, plain, sentences
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
-from finssim.calibration.output.vehicle_file import kept, number_in, yaml_path
+from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial_files import load_trials
+from finssim.calibration.vehicle_file import (
+    all_findings,
+    calibrated,
+    kept,
+    number_in,
+    write_ranges,
+    write_vehicle,
+    yaml_path,
+)
 from finssim.files import atomic_directory, atomic_write, refuse_unwritable
 from finssim.page import RECORD_FILE, Page, Pictures
 from finssim.provenance import provenance
@@ -557,3 +568,58 @@ def write_report(
     ]
     as_object = fit_json(fit, vehicle, out=out, findings=findings)
     fit_report(fit, vehicle, findings).write(folder, as_object, fit_pictures(fit), repeat, tables)
+
+
+# What every `finssim calibrate` that ends in a vehicle file begins and ends with.
+
+
+def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:
+    """The trials that a fit may use, and a finding on each of the others.
+
+    Raises:
+        CalibrationError: None is left.
+    """
+    used = [trial for trial in trials if trial.header.role != "held-out"]
+    left = [finding("held_out", trial.name) for trial in trials if trial.header.role == "held-out"]
+    if not used:
+        raise CalibrationError("every trial is marked held-out: a fit needs trials of role 'fit' or of none")
+    return used, left
+
+
+def usable_trials(paths: Sequence[Path]) -> list[Trial]:
+    """Load, and say on standard error what is left out of each trial and why."""
+    used, left = usable(load_trials(paths))
+    screen = Console(stderr=True)
+    left += [one.about(trial.name) for trial in used for one in trial.findings]
+    for sentence in sentences(left):
+        screen.print(sentence, highlight=False, markup=False, soft_wrap=True)
+    return used
+
+
+def finish(kind: str, fit: Fit, options: Mapping[str, Any]) -> Vehicle:
+    """Write the calibrated vehicle, the report and the ranges, and show them.
+
+    Args:
+        kind: Of the command.
+        fit: The fit.
+        options: All arguments of the command by name, the inputs first.
+
+    Raises:
+        KeyboardInterrupt: The fit was interrupted.
+    """
+    (_, inputs), *rest = options.items()
+    out, report, ranges = options["out"], options["report"], options.get("ranges")
+    vehicle = calibrated(fit)
+    findings = all_findings(fit, vehicle)
+    write_vehicle(vehicle, out)
+    if report is not None:
+        given = {name: value for name, value in rest if name != "as_json"}
+        command = command_line(kind, [inputs] if isinstance(inputs, Path) else inputs, given)
+        write_report(fit, report, vehicle, command=command, findings=findings, out=out)
+    if ranges is not None:
+        write_ranges(fit, ranges, vehicle)
+    record = fit_json(fit, vehicle, out=out, findings=findings) if options["as_json"] else None
+    publish(record, fit_report(fit, vehicle, findings).show, (out, report, ranges))
+    if fit.interrupted:
+        raise KeyboardInterrupt
+    return vehicle
