@@ -34,7 +34,7 @@ from finssim.calibration.regression.regress import regress
 from finssim.calibration.simulation.fit import fit_by_simulation
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
-from finssim.vehicles.body import moved_to_origin
+from finssim.vehicles.vehicle import moved_to_origin
 
 FOUR = "surge,sway,heave,yaw"
 

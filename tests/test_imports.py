@@ -111,7 +111,7 @@ HOMES = {
         "calibration/vision/camera.py",
         "calibration/vision/pool_fit.py",
         "experiments/figures.py",
-        "vehicles/picture.py",
+        "vehicles/show.py",
     },
     "pymavlink": {
         "calibration/importers/ardusub.py",

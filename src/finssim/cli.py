@@ -155,7 +155,7 @@ def show_vehicle(
     print_vehicle(vehicle, Console(), None)
     if picture is not None:
         from finssim.files import atomic_write
-        from finssim.vehicles.picture import draw_vehicle
+        from finssim.vehicles.show import draw_vehicle
 
         with atomic_write(picture) as temporary:
             draw_vehicle(vehicle, temporary)

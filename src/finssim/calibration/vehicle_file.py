@@ -1,4 +1,4 @@
-"""A calibration as files: the changes of a fit on a vehicle, its file with origins and comments, and ranges to draw from."""
+"""A calibration as files: the vehicle with a fit's changes, origins and comments, and ranges to draw from."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from finssim.engine.plant_arrays import SimulatorError
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle
-from finssim.vehicles.body import Water as Fluid
+from finssim.vehicles.vehicle import Water as Fluid
 
 
 def one_of(value: str, available: Sequence[str], what: str) -> str:

@@ -9,9 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.esc import Esc
-from finssim.vehicles.part import Axis, Negative, NonNegative, NonPositive, Part, Positive, Vector3
+from finssim.vehicles.part import (
+    Axis,
+    Negative,
+    NonNegative,
+    NonPositive,
+    Part,
+    Positive,
+    Vector3,
+    VehicleError,
+)
 
 Array = NDArray[np.float64]
 
