@@ -34,8 +34,7 @@ ARROWS = {
 FOUNDATION = {
     "",
     "files",
-    "mcap_metadata",
-    "mcap_repair",
+    "mcap_files",
     "page",
     "provenance",
     "quiet",

@@ -33,8 +33,8 @@ COMMANDS: dict[str, str | Experiment] = {
     "trials check": "finssim.calibration.check:check",
     "trials import": "finssim.calibration.importers.dispatch:import_trials",
     "excite": "finssim.experiments.excitation:excite",
-    "calibrate thruster": "finssim.calibration.actuators.thruster:calibrate_thruster",
-    "calibrate motor": "finssim.calibration.actuators.motor:calibrate_motor",
+    "calibrate thruster": "finssim.calibration.thruster:calibrate_thruster",
+    "calibrate motor": "finssim.calibration.motor:calibrate_motor",
     "calibrate hydrodynamics": "finssim.calibration.hydrodynamics:calibrate_hydrodynamics",
     "calibrate camera": "finssim.calibration.vision.camera:run",
     "calibrate pool": "finssim.calibration.vision.pool_fit:run",
@@ -64,7 +64,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "pool": "finssim.pool.run:run",
     "ardusub-sitl": "finssim.pool.ardusub_sitl:run",
     "view": "finssim.viewer.run:run",
-    "ros2 node": "finssim.ros2.graphs:run_node",
+    "ros2 node": "finssim.ros2.up:run_node",
     "ros2 up": "finssim.ros2.up:up",
 }
 """Words -> what they do."""

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.calibration import replay
 from finssim.calibration.check import check_trials
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import programmes
-from finssim.calibration.excitation.synthetic import simulate_programme
 from finssim.calibration.fit import Estimate
 from finssim.calibration.hydrodynamics import fit_hydrodynamics
 from finssim.calibration.importers.dispatch import read_trials
+from finssim.calibration.programmes import programmes
 from finssim.calibration.regression.axis_estimates import trim
+from finssim.calibration.replay import replay
+from finssim.calibration.synthetic import simulate_programme
 from finssim.calibration.vehicle_file import calibrated
 from finssim.vehicles import load_vehicle
 

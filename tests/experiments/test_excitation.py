@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from finssim import boundary
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import Programme, programmes
+from finssim.calibration.programmes import Programme, programmes
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.trials.trial_files import load_trials
 from finssim.cli import app

@@ -140,7 +140,7 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     write_vehicle(small, tmp_path / "small.yaml")
     with pytest.raises(CalibrationError, match="to go along surge"):
         box = box_of(small)
-        from finssim.calibration.excitation.programmes import programmes
+        from finssim.calibration.programmes import programmes
         from finssim.experiments.excitation import place_of
 
         place_of(programmes("surge", small)[0], small, box)

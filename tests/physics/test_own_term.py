@@ -265,8 +265,8 @@ def test_a_term_that_cannot_be_is_refused():
 @pytest.fixture(scope="module")
 def trials():
     """A multisine on surge and heave together of the vehicle with the wing, with noise of its sensors."""
-    from finssim.calibration.excitation.programmes import programmes
-    from finssim.calibration.excitation.synthetic import simulate_programme
+    from finssim.calibration.programmes import programmes
+    from finssim.calibration.synthetic import simulate_programme
 
     vehicle = load_vehicle("bluerov2").replace(
         {"hydrodynamics.calibrated.wing": {"lift": 40.0, "moment": 1.5}}

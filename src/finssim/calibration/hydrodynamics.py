@@ -174,7 +174,7 @@ def _mean(scores: Mapping[str, float], axes: set[str]) -> float:
 
 def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
     """NRMSE of the replay by axis, the median over the trials; none where nothing can be replayed."""
-    from finssim.calibration import replay
+    from finssim.calibration.replay import replay
 
     try:
         rows = replay(trials, vehicle).scores["calibrated"]

@@ -10,7 +10,6 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.engine.arguments import find_device, one_of, placed_at, shared_water, thrust_table
-from finssim.engine.dock import Dock
 from finssim.engine.lanes import LANES
 from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
@@ -19,7 +18,7 @@ from finssim.engine.post_mortem import write_post_mortem
 from finssim.engine.solids import WorldSolids, layout_of, look_around, pool_of
 from finssim.engine.state import VehicleState, clear_actuators, new_state
 from finssim.engine.step import physics_kernel, tick
-from finssim.engine.surroundings import Pool, TetherLine, Water
+from finssim.engine.surroundings import Dock, Pool, TetherLine, Water
 from finssim.physics.contact import PoolWalls
 from finssim.physics.funnel import Funnel
 from finssim.physics.hydrodynamics import HYDRODYNAMICS

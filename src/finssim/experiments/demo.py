@@ -20,9 +20,9 @@ from typing import Annotated, Any
 import numpy as np
 from rich.console import Console
 
-from finssim.calibration.excitation.programmes import RATE, STEADY, Programme, programmes, which_axes
 from finssim.calibration.findings import Finding, sentences
 from finssim.calibration.fit import Fit
+from finssim.calibration.programmes import RATE, STEADY, Programme, programmes, which_axes
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.replay import Replay, draw_response_envelopes, replay
 from finssim.calibration.report import interval_text, number_text, state_text, write_report

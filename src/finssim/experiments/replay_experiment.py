@@ -13,11 +13,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from finssim.calibration.excitation.programmes import Programme, programmes
-from finssim.calibration.excitation.synthetic import Recording, record, trials_of
 from finssim.calibration.fit import Fit
+from finssim.calibration.programmes import Programme, programmes
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.replay import DEFINITION, MODEL_LABELS, Replay, draw_response_envelopes, replay
+from finssim.calibration.synthetic import Recording, record, trials_of
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.vehicle_file import calibrated, write_vehicle
 from finssim.engine import Simulator, TetherLine

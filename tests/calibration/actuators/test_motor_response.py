@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from calibration.made_steps import RPM, held, lagged, sampled, step_log
-from finssim.calibration.actuators.motor import cut_steps, fit_motor, fit_response
-from finssim.calibration.actuators.thrust_table import find_steps, levels
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import programmes
-from finssim.calibration.excitation.synthetic import simulate_programme
+from finssim.calibration.motor import cut_steps, fit_motor, fit_response
+from finssim.calibration.programmes import programmes
+from finssim.calibration.synthetic import simulate_programme
+from finssim.calibration.thrust_table import find_steps, levels
 from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 

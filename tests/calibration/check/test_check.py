@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from finssim.calibration.check import check, check_trials, print_reports, together
-from finssim.calibration.excitation.programmes import programmes
-from finssim.calibration.excitation.synthetic import simulate_programme
+from finssim.calibration.programmes import programmes
+from finssim.calibration.synthetic import simulate_programme
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.vehicles import load_vehicle
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import yaml
 
-from finssim.calibration.excitation.programmes import excite, programmes
-from finssim.calibration.excitation.synthetic import simulate_programme
+from finssim.calibration.programmes import excite, programmes
+from finssim.calibration.synthetic import simulate_programme
 from finssim.calibration.trials.trial_files import load_trial
 from finssim.files import OutputError
 from finssim.vehicles import load_vehicle

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import programmes, which_axes
-from finssim.calibration.excitation.synthetic import record
+from finssim.calibration.programmes import programmes, which_axes
+from finssim.calibration.synthetic import record
 from finssim.calibration.trials.trial import PHASES
 from finssim.control.allocation import Allocator
 from finssim.vehicles import AXES, load_vehicle

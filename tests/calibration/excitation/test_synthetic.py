@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import programmes
-from finssim.calibration.excitation.synthetic import (
+from finssim.calibration.programmes import programmes
+from finssim.calibration.synthetic import (
     NOISE_PROFILES,
     NoiseProfile,
     record,

@@ -11,9 +11,9 @@ import pytest
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import programmes
-from finssim.calibration.excitation.synthetic import simulate_programme
+from finssim.calibration.programmes import programmes
 from finssim.calibration.replay import replay, run_replay
+from finssim.calibration.synthetic import simulate_programme
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.vehicles import CalibrationRecord, load_vehicle
 

@@ -23,7 +23,7 @@ from finssim.calibration.trials.conversion import GRAVITY
 from finssim.calibration.trials.trial import Array
 from finssim.control.ardusub import FULL, NEUTRAL
 from finssim.geometry.rotations import wrap_angle
-from finssim.mcap_repair import whole_mcap
+from finssim.mcap_files import whole_mcap
 from finssim.vehicles import Vehicle
 from finssim.vehicles.autopilot import DEMANDS, FRAMES
 

@@ -34,8 +34,7 @@ from finssim.calibration.trials.conversion import TIME_UNITS, factor
 from finssim.calibration.trials.trial import Array, Trial, column_of
 from finssim.calibration.trials.trial_files import Table, read_table, write_trial
 from finssim.files import plain_name
-from finssim.mcap_metadata import mcap_metadata
-from finssim.mcap_repair import MAGIC, whole_mcap
+from finssim.mcap_files import MAGIC, mcap_metadata, whole_mcap
 from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import json_value

@@ -21,7 +21,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import Programme
+from finssim.calibration.programmes import Programme
 from finssim.calibration.trials.trial import TAU, Header, Trial, TrialWater
 from finssim.control.allocation import Allocator
 from finssim.engine import Pool, Simulator, TetherLine, Water
@@ -38,6 +38,7 @@ from finssim.sensors import SensorSuite
 from finssim.vehicles import Vehicle
 
 __all__ = ["NoiseProfile", "Recording", "record", "simulate_programme", "trials_of"]
+
 
 Array = NDArray[np.float64]
 

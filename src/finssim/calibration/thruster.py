@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.thrust_table import STANDING, ThrustTable, read_table, tables_of_trial
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.report import finish, refuse_places
+from finssim.calibration.thrust_table import STANDING, ThrustTable, read_table, tables_of_trial
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
@@ -26,6 +26,7 @@ from finssim.vehicles import Esc, Vehicle, load_vehicle
 from finssim.vehicles.thruster import Thruster
 
 __all__ = ["dead_zone", "fit_esc", "fit_side", "fit_thruster", "jackknife"]
+
 
 Array = NDArray[np.float64]
 

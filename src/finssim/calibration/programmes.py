@@ -468,7 +468,7 @@ def excite(
     names = [out / programme.name for programme in played]
     with atomic_directory(out, replaces="programmes.yaml") as folder:
         if simulate:
-            from finssim.calibration.excitation.synthetic import simulate_programme
+            from finssim.calibration.synthetic import simulate_programme
 
             for trial in simulate_programme(played, chosen, noise=noise, seed=seed, **(simulation or {})):
                 write_trial(trial, folder / trial.name)

@@ -14,19 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.thrust_table import find_steps
-from finssim.calibration.actuators.thruster import jackknife
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion import without_spikes
 from finssim.calibration.report import finish, refuse_places, usable_trials
+from finssim.calibration.thrust_table import find_steps
+from finssim.calibration.thruster import jackknife
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.thruster import Thruster
 
 __all__ = ["cut_steps", "fit_motor", "fit_response"]
+
 
 Array = NDArray[np.float64]
 
