@@ -545,19 +545,12 @@ def findings_of(found: Study) -> list[Finding]:
 
 def curve_of(found: Study) -> Curve:
     """Steps used, one after the other, with the common response at each step's own levels."""
-    x, measured, fitted, start = [], [], [], 0.0
-    parameters = np.array([found.response.delay, math.log(found.response.time_constant)])
+    parameters, parts = np.array([found.response.delay, math.log(found.response.time_constant)]), []
     for record in np.array(found.records, dtype=object)[found.response.used]:
         level, rows = _levels(record, parameters)
-        x.append(start + record.t - record.t[0])
-        measured.append(record.y)
-        fitted.append(rows @ level)
-        start = float(x[-1][-1]) + found.response.sample
-    return Curve(
-        title=f"{found.name}: steps", x_label="time, steps one after the other [s]",
-        y_label="thrust [N]" if found.domain == "force" else "shaft speed [rad/s]",
-        x=np.concatenate(x), measured=np.concatenate(measured), fitted=np.concatenate(fitted),
-    )  # fmt: skip
+        parts.append((record.t, record.y, rows @ level))
+    unit = "thrust [N]" if found.domain == "force" else "shaft speed [rad/s]"
+    return Curve.joined(f"{found.name}: steps", unit, parts)
 
 
 def fit_motor(

@@ -30,6 +30,8 @@ SHORTEST = 0.5
 """Shortest level that can settle [s]."""
 LEAST_COVERED = 0.5
 """Share of the time that levels must cover for a log to be one of levels; a slower sweep is used as it is."""
+SHORTEST_HELD = 0.2
+"""Levels of a command shorter than this are no steps [s]."""
 SETTLING = 50
 """Samples of a run after which its median no longer moves, so that a slow ramp is not one run."""
 TOLERANCE = 0.02
@@ -111,13 +113,12 @@ def _mean(values: Array) -> float:
     return float(np.mean(good)) if good.size else float("nan")
 
 
-def find_steps(t: Array, command: Array, *, shortest: float = 0.2) -> list[Step]:
+def find_steps(t: Array, command: Array) -> list[Step]:
     """Every change of a held command that lasts.
 
     Args:
         t: Times [s], (n,).
         command: Its values, finite, (n,).
-        shortest: Levels shorter than this are passed over [s].
 
     Returns:
         Steps in order of time; none where the command never holds still.
@@ -126,7 +127,7 @@ def find_steps(t: Array, command: Array, *, shortest: float = 0.2) -> list[Step]
     if span == 0.0:
         return []
     runs = levels(command, 0.01 * span)
-    held = [(a, b) for a, b in runs if t[b - 1] - t[a] >= shortest]
+    held = [(a, b) for a, b in runs if t[b - 1] - t[a] >= SHORTEST_HELD]
     if len(runs) > 4 * len(held):  # a command that moves all the time
         return []
     return [

@@ -350,13 +350,11 @@ def speeds(motions: Sequence[Motion], axis: str) -> tuple[float, float]:
     )
 
 
-def horizon(
-    vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str], hydrodynamics: str = "calibrated"
-) -> float:
+def horizon(vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str]) -> float:
     """Length of segments that shows steady motion and yet forgets what no model knows [s]: five of the slowest time
     constant, at least forty samples, between 5 and 12 s."""
-    chosen = vehicle.hydrodynamic_set(hydrodynamics)
-    M = np.diag(vehicle.mass_matrix(hydrodynamics))
+    chosen = vehicle.hydrodynamic_set("calibrated")
+    M = np.diag(vehicle.mass_matrix("calibrated"))
     slowest = 0.5
     if isinstance(chosen, HydrodynamicSet):
         for axis in axes:
@@ -432,20 +430,15 @@ def pictures(problem: Shooting, solution: Solution, axes: Sequence[str]) -> tupl
     clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
     for axis in axes:
         name, rows, trial, spans = _shown_by(problem, axis)
-        x, y, p, offset = [], [], [], 0.0
+        parts = []
         for g in sorted(sorted(spans, key=lambda g: -spans[g])[:SHOWN]):
             those = rows[trial == g]
             those = those[np.argsort(clock[those], kind="stable")]
-            t = clock[those] - clock[those[0]] + offset
-            x += [t, [np.nan]]
-            y += [m.value[those], [np.nan]]
-            p += [m.value[those] - solution.linear.residual[those], [np.nan]]
-            offset = float(t[-1]) + 1.0
+            value = m.value[those]
+            parts.append((clock[those], value, value - solution.linear.residual[those]))
         if name:
             title = f"{axis}: {name}, simulated from the inputs alone"
-            columns = dict(zip(("x", "measured", "fitted"), map(np.concatenate, (x, y, p)), strict=True))
-            labels = {"x_label": "time, trial after trial [s]", "y_label": f"{name} [{_unit(name)}]"}
-            out.append(Curve(title=title, **labels, **columns))
+            out.append(Curve.joined(title, f"{name} [{_unit(name)}]", parts))
     return tuple(out)
 
 
