@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.check import check_trials
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.fit import Estimate
 from finssim.calibration.hydrodynamics import fit_hydrodynamics
 from finssim.calibration.importers.dispatch import read_trials

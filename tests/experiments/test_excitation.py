@@ -8,7 +8,7 @@ import yaml
 from typer.testing import CliRunner
 
 from finssim import boundary
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.programmes import Programme, programmes
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.trials.trial_files import load_trials

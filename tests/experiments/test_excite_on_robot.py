@@ -121,7 +121,7 @@ def test_by_hand_nothing_is_armed_before_the_vehicle_is_at_its_start(tmp_path, r
 
 def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     """Not armed, by hand with nobody there, another plan's folder, no workspace, a start outside it."""
-    from finssim.calibration.errors import CalibrationError
+    from finssim.calibration.findings import CalibrationError
     from finssim.calibration.vehicle_file import write_vehicle
     from finssim.robot.wiring import Wiring
 

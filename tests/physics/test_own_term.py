@@ -313,7 +313,7 @@ def test_a_known_wing_does_not_bias_what_is_fitted(trials):
 
 @pytest.mark.slow
 def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials):
-    from finssim.calibration.errors import CalibrationError
+    from finssim.calibration.findings import CalibrationError
     from finssim.calibration.simulation.fit import fit_by_simulation
 
     for vehicle, name in ((load_vehicle("bluerov2"), "wing.lift"), (believed(1.0), "wing.lft")):

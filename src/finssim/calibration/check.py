@@ -13,8 +13,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import SEVERITIES, Finding, finding, plain
+from finssim.calibration.findings import SEVERITIES, CalibrationError, Finding, finding, plain
 from finssim.calibration.motion import (
     AttitudeSignal,
     Motion,

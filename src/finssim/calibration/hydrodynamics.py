@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.fit import Estimate, Fit
 from finssim.calibration.regression.axis_estimates import CERTAIN
 from finssim.calibration.regression.plant_terms import matrices

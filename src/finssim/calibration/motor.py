@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion import without_spikes
 from finssim.calibration.report import finish, refuse_places, usable_trials

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.trials.trial import TAU
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.control.allocation import Allocator

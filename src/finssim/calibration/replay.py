@@ -17,8 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding, plain, sentences
+from finssim.calibration.findings import CalibrationError, Finding, finding, plain, sentences
 from finssim.calibration.motion import phase_at, white_noise
 from finssim.calibration.report import new_figure
 from finssim.calibration.simulation.rollout import Response, Rollouts, Segment, Streams, segments, streams

@@ -21,8 +21,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding, plain, sentences
+from finssim.calibration.findings import CalibrationError, Finding, finding, plain, sentences
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trials

@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.programmes import Programme
 from finssim.calibration.trials.trial import TAU, Header, Trial, TrialWater
 from finssim.control.allocation import Allocator

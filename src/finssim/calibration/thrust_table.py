@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.trials.conversion import TIME_UNITS, UNITS
 from finssim.calibration.trials.trial import Trial
 from finssim.text_table import TextTable, read_text_table

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding, sentences
+from finssim.calibration.findings import CalibrationError, Finding, finding, sentences
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.report import finish, refuse_places
 from finssim.calibration.thrust_table import STANDING, ThrustTable, read_table, tables_of_trial

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.fit import Estimate, Fit
 from finssim.files import atomic_write
 from finssim.provenance import provenance

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers.dispatch import print_folders, read_trials
 from finssim.calibration.programmes import Programme, programmes
 from finssim.calibration.programmes import excite as write_programmes

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.thruster import fit_esc
 from finssim.vehicles import Esc, load_vehicle
 

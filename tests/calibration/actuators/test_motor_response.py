@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.made_steps import RPM, held, lagged, sampled, step_log
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.motor import cut_steps, fit_motor, fit_response
 from finssim.calibration.programmes import programmes
 from finssim.calibration.synthetic import simulate_programme

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.thrust_table import read_table
 from finssim.calibration.thruster import dead_zone, fit_side, fit_thruster
 from finssim.calibration.trials.trial import Trial

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.programmes import programmes, which_axes
 from finssim.calibration.synthetic import record
 from finssim.calibration.trials.trial import PHASES

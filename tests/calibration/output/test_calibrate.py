@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from calibration.made_fits import SET, made_fit
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.report import fit_json, fit_report, state_text
 from finssim.calibration.vehicle_file import (
     all_findings,

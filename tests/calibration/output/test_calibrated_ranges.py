@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.made_fits import SET, made_fit
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.fit import Estimate
 from finssim.calibration.vehicle_file import calibrated, range_factors, write_ranges
 from finssim.engine.randomize import Randomization

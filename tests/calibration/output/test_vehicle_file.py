@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vehicle_file import file_tree, folded, leaves, number_origins, write_vehicle
 from finssim.vehicles import CalibrationRecord, Provenance, VehicleError, catalogue, load_vehicle
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.known_trials import NOISE, trials, truth
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.synthetic import NoiseProfile
 

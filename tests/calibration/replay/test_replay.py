@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.programmes import programmes
 from finssim.calibration.replay import replay, run_replay
 from finssim.calibration.synthetic import simulate_programme

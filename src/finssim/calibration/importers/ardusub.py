@@ -15,8 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import finding
+from finssim.calibration.findings import CalibrationError, finding
 from finssim.calibration.importers.ardusub_outputs import mixed_pulses, outputs_of
 from finssim.calibration.importers.assemble import ArduSubMap, Frame, Stream, in_our_axes
 from finssim.calibration.trials.conversion import GRAVITY

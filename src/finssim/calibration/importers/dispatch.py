@@ -13,8 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.importers.assemble import (
     ColumnMap,
     ColumnSource,

@@ -29,7 +29,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.motion import Motion, spans_of, without_spikes
 from finssim.calibration.regression.plant_terms import Matrices, known_wrench
 from finssim.calibration.uncertainty import (

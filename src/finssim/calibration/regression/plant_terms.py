@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.engine.plant_arrays import twist_shift
 from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.vehicles import HydrodynamicSet, Vehicle

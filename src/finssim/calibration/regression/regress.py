@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding, sentences
+from finssim.calibration.findings import CalibrationError, Finding, finding, sentences
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
 from finssim.calibration.motion import Motion, attitude_samples, motion, white_noise
 from finssim.calibration.regression.axis_estimates import (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.motion import EULER, Motion, attitude_samples, motion
 from finssim.calibration.trials.inputs import Drive, drive
 from finssim.calibration.trials.trial import Trial

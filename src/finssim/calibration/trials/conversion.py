@@ -8,8 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.trials.trial import column_of
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import (

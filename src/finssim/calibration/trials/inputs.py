@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.trials.trial import INPUT_PREFIXES, TAU, Header, Trial
 from finssim.geometry.rotations import skew
 from finssim.physics.types import MAX_THRUSTERS

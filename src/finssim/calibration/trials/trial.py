@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding
+from finssim.calibration.findings import CalibrationError, Finding
 from finssim.vehicles.part import Part, refuse_section, refuse_value
 from finssim.vehicles.vehicle import Axis
 

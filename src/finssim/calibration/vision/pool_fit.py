@@ -15,8 +15,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding, plain
+from finssim.calibration.findings import CalibrationError, Finding, finding, plain
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.report import (
     AS_GIVEN,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.least_squares import descent
 from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Camera, Interface, Layer, Lens, Status, project, projection_jacobians
