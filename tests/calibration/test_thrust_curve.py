@@ -15,7 +15,7 @@ from finssim.calibration.thruster import dead_zone, fit_side, fit_thruster
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import check_vehicle, load_vehicle
 
-T200 = Path(__file__).parents[2] / "data" / "t200"
+T200 = Path(__file__).parents[1] / "data" / "t200"
 AT_16_V = T200 / "t200_16V_bluerobotics_2019.csv"
 ALL_VOLTAGES = T200 / "t200-thrust-2019.csv"
 FINSROV, BLUEROV2 = load_vehicle("finsrov"), load_vehicle("bluerov2")
