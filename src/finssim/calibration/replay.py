@@ -404,9 +404,6 @@ def error_ahead(
     return Ahead(wanted, rmse, rms(theirs), rms(ours / scale), rms(theirs / scale), count)
 
 
-# Replay: how well do hydrodynamic models reproduce recorded trials, above all trials they were not fitted on.
-
-
 # Drive models with the recorded inputs of trials, from their recorded initial states.
 
 RATE = 50.0

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
     from finssim.geometry.optics import Lens
 
+Array = NDArray[np.float64]
+
 
 def refuse_places(out: Path, report: Path | None, kind: str) -> None:
     """Refuse a file that is no YAML, or a place that cannot be written, before anything is computed."""
@@ -91,8 +93,6 @@ def progress_bar() -> Iterator[Callable[..., None]]:
         bar = bars.add_task("fit", total=1.0)
         yield lambda part, words="fit": bars.update(bar, completed=part, description=words)
 
-
-Array = NDArray[np.float64]
 
 BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
 PER_FIGURE = 6

@@ -172,6 +172,9 @@ def jitter_commands(
     plant[w, v].delay = drawn_delay(values, w, v, nominal.plant[0, v].delay) + late
 
 
+# What a simulation is given to draw with.
+
+
 class Randomization:
     """Draws a new vehicle and new water for every episode."""
 

@@ -29,6 +29,8 @@ __all__ = [
     "paper_lens", "true_site",
 ]  # fmt: skip
 
+Array = npt.NDArray[np.float64]
+
 
 # Tag corners as a detector reports them, computed from the optics without drawing a picture.
 
@@ -375,8 +377,6 @@ def _reported(corners: Array, bend: float, pixel_noise: float, noise: Array) -> 
 
 # The overhead camera of a virtual pool as it truly hangs, as its calibration has it, and how good its pictures are.
 
-
-Array = npt.NDArray[np.float64]
 
 HEIGHT = 1.4
 """Of the camera above the water, for a pool of 4 m x 2 m [m]. The paper's hung at 1.21 m, from where its lens does not

@@ -368,6 +368,8 @@ def serve_realtime(
     return pace
 
 
+# A virtual pool before it lives, and the command that makes it and serves it.
+
 MCU_PORT = 58766
 """Of the motor controller; pictures come from the next port, lock-step is the one after."""
 MESSAGES = 5

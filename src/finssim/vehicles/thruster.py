@@ -21,6 +21,8 @@ from finssim.vehicles.part import (
     refuse_section,
 )
 
+Array = NDArray[np.float64]
+
 
 class Esc(Part):
     """Electronic speed controller and motor, at rest in the water (bollard pull).
@@ -172,9 +174,6 @@ def _root(emf: float, load: float, volts: Array) -> Array:
     """Positive root ω of volts = emf ω + load ω², in the form that loses no digits [rad/s]."""
     denominator = emf + np.sqrt(emf**2 + 4.0 * load * volts)
     return np.divide(2.0 * volts, denominator, out=np.zeros_like(denominator), where=denominator != 0.0)
-
-
-Array = NDArray[np.float64]
 
 
 class Thruster(Part):

@@ -38,6 +38,8 @@ from finssim.vehicles.part import (
 )
 from finssim.vehicles.thruster import Thruster
 
+Array = NDArray[np.float64]
+
 
 class Water(Part):
     """The water the numbers of the file were given for."""
@@ -132,8 +134,6 @@ AXES: tuple[Axis, ...] = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 Origin = Literal["measured", "published", "derived", "guessed"]
 ORIGINS: tuple[Origin, ...] = ("measured", "published", "derived", "guessed")
-
-Array = NDArray[np.float64]
 
 
 class Provenance(NamedTuple):

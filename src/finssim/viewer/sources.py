@@ -52,6 +52,8 @@ from finssim.worlds import RangeBatch
 from finssim.worlds.layout import WorldLayout
 from finssim.yaml_file import json_value, read_mapping
 
+Array = npt.NDArray[np.float64]
+
 # The virtual pool with a robot in it: both in this process, in lock-step.
 
 RATE = 60.0
@@ -319,7 +321,6 @@ def _basin(way: np.ndarray, length: float) -> tuple[float, float, float]:
 
 # Frames of a record (.mcap), with the truth beside it where its file is at hand.
 
-Array = npt.NDArray[np.float64]
 
 TOPICS = (
     "odom",

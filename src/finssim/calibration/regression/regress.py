@@ -42,6 +42,8 @@ from finssim.vehicles import AXES, Vehicle
 
 __all__ = ["axis_data", "prepare", "regress"]
 
+Array = NDArray[np.float64]
+
 USEFUL = 0.5
 """Half width of the interval, as a part of the excess, up to which it is written to the vehicle file."""
 
@@ -263,8 +265,6 @@ def _level(found: list[Signals], keep: bool) -> tuple[list[Signals], float, list
     cut = [replace(s, usable=s.usable & flat) for s, flat in zip(found, level, strict=True)]
     return cut, beyond / total, [finding("tilted_left_out", percent=percent, tilt=LARGEST_TILT)]
 
-
-Array = NDArray[np.float64]
 
 PASSES = 3
 """Rounds in which the couplings between axes are formed with the latest estimates."""

@@ -58,6 +58,8 @@ from finssim.vehicles.terms import TERMS, unit_of
 
 __all__ = ["ESTIMATE", "fit_by_simulation"]
 
+Array = NDArray[np.float64]
+
 
 # The fit of simulations to segments; finite differences are worlds.
 
@@ -1037,9 +1039,7 @@ class Shooting:
         return np.asarray(self.measured.noise(residual, self._floor)[self.measured.channel])
 
 
-Array = NDArray[np.float64]
-
-# What each trial, or each block of a few trials, says about the parameters of a simulation-error fit.
+# The fit of a vehicle with them: first, what each trial, or each block of a few trials, says about its parameters.
 
 FEWEST_TRIALS = 4
 """With fewer, trials are cut into blocks to estimate the spread."""

@@ -20,6 +20,8 @@ from finssim.geometry.rotations import (
 )
 from finssim.vehicles.part import did_you_mean
 
+Array = NDArray[np.float64]
+
 GRAVITY = 9.80665
 """Standard gravity, of the units g and kgf [m/s²]."""
 
@@ -128,8 +130,6 @@ def factor(unit: str | None, canonical: str) -> float:
 def _like(target: str) -> str:
     return f"one of {', '.join(UNITS[_DIMENSION[target]])}"
 
-
-Array = NDArray[np.float64]
 
 SAME_ROW = 1.0e-6
 """Samples closer than this share a row [s]."""

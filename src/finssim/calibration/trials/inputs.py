@@ -18,6 +18,8 @@ from finssim.vehicles.capability import terminal_speeds
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.part import did_you_mean
 
+Array = NDArray[np.float64]
+
 # What every fit asks of the trials and axes that it is given.
 
 
@@ -314,8 +316,6 @@ def _what_is_missing(present: dict[str, list[str]], vehicle: Vehicle) -> str:
         "vehicle, or write 'passive: true' in trial.yaml if the thrusters were off"
     )
 
-
-Array = NDArray[np.float64]
 
 ACTED = ("rpm_", "force_", "tau")
 """Inputs that are what acted, unless the header says otherwise."""

@@ -20,6 +20,8 @@ from finssim.vehicles.vehicle import Axis
 
 __all__ = ["Array", "Header", "NU", "PHASES", "TAU", "Trial", "TrialWater", "column_of"]
 
+Array = NDArray[np.float64]
+
 
 def _point(value: Any) -> Any:
     numbers = value if isinstance(value, (list, tuple)) else ()
@@ -173,8 +175,6 @@ def column_of(name: str) -> Column | None:
             return column
     return None
 
-
-Array = NDArray[np.float64]
 
 PHASES = ("baseline", "excitation", "coast", "rest")
 """Words of the `phase` column; an empty word is none of them."""
