@@ -46,6 +46,8 @@ SETTINGS: Table = {
     "docking": {"ppo": {"steps": 900_000}},
     # Its teacher succeeds in all episodes after a quarter of these steps, and its student after half of them.
     "pipeline": {"distill": {"teacher_steps": 600_000, "steps": 60_000}},
+    "gate": {"distill": {"teacher_steps": 600_000}},
+    "net": {"distill": {"teacher_steps": 600_000, "steps": 40_000}},
     "pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "teacher": "lead"}},
     # With 1.5 million, half of the seeds have only begun to capture.
     "team-pursuit": {
