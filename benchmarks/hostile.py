@@ -176,7 +176,12 @@ def kinds() -> list[Kind]:
         Kind("table of a way", "way.csv", ("evaluate pid --task t2 --trajectory {} --trials 1",)),
         Kind("parameters of ROS", "parameters.yaml", (f"{PARAMETERS} {{}}",)),
         Kind("sweep", "sweep.yaml", ("sweep {} --out OUT/swept",)),
-        Kind("fit", "fit/fit.json", ("randomize fit {} --vehicle finsrov --out OUT/ranges.yaml",)),
+        Kind("world", "world.yaml", (
+            "worlds show {}", "worlds show {} --seed 3 --json", "worlds show {} --out OUT/seen.png",
+        ), weight=2),
+        Kind("mesh of a world", "wreck/wreck.stl", ("worlds show IN/wreck/wreck.yaml --out OUT/seen.png",), folder=1),
+        Kind("camera of a world", "camera-device.yaml", ("worlds show pool --camera {} --out OUT/seen.png",)),
+        Kind("sonar of a world", "sonar-device.yaml", ("worlds show pool --sonar {} --out OUT/seen.png",)),
         Kind("result of a comparison", "compared/compare.json", ("compare SEEDS/policy --trials 1 --out {}",), folder=1, inside=True),  # noqa: E501
         Kind("number", "goal.yaml", (
             "simulate --vehicle finsrov --command surge=NUMBER --duration 0.2 --out OUT/run.csv",
@@ -368,7 +373,7 @@ def column(text: str, rng: random.Random) -> str:
 
 BYTES = (flipped, written_over, cut_out, doubled, cut_off, nothing, length_field)
 TEXT = (number, number, name, value, value, line)
-BINARY = {".mcap", ".BIN", ".tlog", ".db3", ".bag", ".onnx", ".fst", ".parquet"}
+BINARY = {".stl", ".mcap", ".BIN", ".tlog", ".db3", ".bag", ".onnx", ".fst", ".parquet"}
 
 
 def changed(data: bytes, suffix: str, rng: random.Random) -> tuple[bytes, str]:
@@ -402,10 +407,16 @@ def make(folder: Path, run: Callable[..., None]) -> None:
     source = ROOT / "src" / "finssim"
     (folder / "log").mkdir()
     (folder / "logs").mkdir()
+    (folder / "wreck").mkdir()
     for file, made in (
         (FINSROV, "vehicle.yaml"),
         (source / "engine" / "ranges" / "pool.yaml", "ranges.yaml"),
         (source / "experiments" / "plants" / "current.yaml", "plant.yaml"),
+        (source / "worlds" / "catalogue" / "dock.yaml", "world.yaml"),
+        (source / "worlds" / "catalogue" / "wreck.yaml", "wreck/wreck.yaml"),
+        (source / "worlds" / "catalogue" / "wreck.stl", "wreck/wreck.stl"),
+        (source / "worlds" / "devices" / "low_light_camera.yaml", "camera-device.yaml"),
+        (source / "worlds" / "devices" / "gemini_720is.yaml", "sonar-device.yaml"),
         (DATA / "opencv_chessboards" / "left_intrinsics.yml", "left_intrinsics.yml"),
         (DATA / "t200" / "t200_16V_bluerobotics_2019.csv", "thrust.csv"),
         (DATA / "hinsdale" / "traj026-0_imu.csv", "logs/small_imu.csv"),
@@ -422,8 +433,6 @@ def make(folder: Path, run: Callable[..., None]) -> None:
     run(*excite, "steps", "--inputs", "command,rpm")
     steps = folder / "steps" / "surge_plus_9" / "data.csv"
     steps.write_text("".join(steps.read_text().splitlines(keepends=True)[:700]))
-    fit = ("--vehicle", "finsrov", "--method", "regression", "--report", "fit", "--out", "fitted.yaml")
-    run("calibrate", "hydrodynamics", "trials", *fit)
     run("train", "t1", "--steps", "1024", "--worlds", "16", "--out", "policy")
     run("compare", "policy", "--trials", "1", "--out", "compared")
     run("experiment", "stack", "t1", "--policy", "policy", "--episodes", "1", "--records", "--out", "stack")
@@ -730,7 +739,7 @@ def words_of(
     command: str, file: Path, scratch: Path, seeds: Path, rng: random.Random | None = None
 ) -> list[str]:
     """A command's words for an input; numbers are drawn where there is a generator."""
-    places = {"{}": str(file), "OUT": str(scratch / "out"), "SEEDS": str(seeds)}
+    places = {"{}": str(file), "OUT": str(scratch / "out"), "IN/": f"{scratch / 'in'}/", "SEEDS": str(seeds)}
     words = [functools.reduce(lambda w, m: w.replace(m, places[m]), places, word) for word in command.split()]
     return [re.sub("NUMBER", lambda _: rng.choice(NUMBERS) if rng else "1", word) for word in words]
 

@@ -97,7 +97,7 @@ HOMES = {
     "skrl": {"learning/skrl_env.py"},
     "pettingzoo": {"learning/pettingzoo_env.py"},
     "minari": {"learning/demonstrations.py"},
-    "ray": {"experiments/sweep.py"},
+    "ray": {"experiments/campaign.py"},
     "casadi": {"control/nmpc.py"},
     "newton": {"worlds/model.py"},
     "onnx": {"learning/export.py"},

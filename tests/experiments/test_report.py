@@ -64,7 +64,7 @@ def test_a_block_is_filled_and_the_rest_stays(tmp_path):
 @pytest.mark.parametrize(
     ("what", "message"),
     [
-        ("t1", "no result of 't1' was given"),
+        ("t1", "no result 't1.json' was given"),
         ("anatomy table=3", "table 3: the result has 2"),
         ("anatomy rows=Row C", "no row 'Row C'; there are: slower by"),
         ("anatomy columns=0,7", "no column 7: the table has 0 to 2"),

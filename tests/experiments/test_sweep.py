@@ -14,7 +14,9 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.control.policy import Policy
 from finssim.experiments import sweep as command
-from finssim.experiments.sweep import SweepError, load_sweep
+from finssim.experiments import transfer
+from finssim.experiments.campaign import ClusterError
+from finssim.experiments.sweep import load_sweep
 
 ray = pytest.importorskip("ray")
 
@@ -179,12 +181,29 @@ def test_a_machine_that_is_lost_half_way_is_made_up_for(tmp_path, sweep_file, tw
     assert len(list((tmp_path / "out" / "runs").glob("*/policy.onnx"))) == 4
 
 
+@pytest.mark.slow
+def test_an_experiment_trains_and_plays_on_a_cluster(tmp_path, two_machines, monkeypatch):
+    """Policies, results and motions come back: nothing is left to do here, and the table is that of one machine."""
+    cluster, _ = two_machines
+    how = {"rows": ["calibrated", "pid"], "setpoints": ["P01"], "plants": 1, "seeds": 1, "steps": 4096}
+    away = transfer.t1(out=tmp_path, address=cluster.address, **how)
+    assert (tmp_path / "policies" / "calibrated-seed1" / "policy.onnx").is_file()
+    assert len(list((tmp_path / "trials").glob("*.npz"))) == 2
+
+    def played_here(*_):
+        raise AssertionError("was played already")
+
+    monkeypatch.setattr("finssim.experiments.pool_trial.play", played_here)
+    again = transfer.t1(out=tmp_path, processes=1, **how)
+    assert again["rows"] == away["rows"] and away["rows"]["pid"]["success"] == 1
+
+
 @pytest.mark.parametrize(
     ("address", "sentence"),
     [("127.0.0.1:9", "no Ray cluster answers at 127.0.0.1:9"), ("here", "expected HOST:PORT or auto")],
 )
 def test_where_nobody_answers_is_told(tmp_path, sweep_file, address, sentence):
     """One sentence at once, and nothing is written."""
-    with pytest.raises(SweepError, match=sentence):
+    with pytest.raises(ClusterError, match=sentence):
         command.sweep(sweep_file, out=tmp_path / "out", address=address)
     assert not (tmp_path / "out").exists()

@@ -101,6 +101,7 @@ def anatomy(
     vehicle: str = "finsrov",
     steps: Annotated[int | None, (1, None)] = None,
     processes: Annotated[int | None, (1, None)] = None,
+    address: str | None = None,
     progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """How wrong may one thing be? Controllers of T1 in plants where it is wrong by growing amounts, and all at once.
@@ -117,6 +118,7 @@ def anatomy(
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         steps: Control steps to learn from, all worlds together; what the task needs if not given.
         processes: Plants at once; as many as processors if not given.
+        address (ADDRESS): Of a Ray cluster that does the work in their place, HOST:PORT or auto.
         progress: Told the share that is done and what comes next.
 
     Returns:
@@ -128,7 +130,7 @@ def anatomy(
     folder, run_seeds = Path(out), range(seed, seed + seeds)
     controllers = controllers_of(
         "t1", {name: T1.rows[name] for name in names}, run_seeds, folder, vehicle, steps,
-        progress=lambda part, what: progress(TRAINING_SHARE * part, what),
+        progress=lambda part, what: progress(TRAINING_SHARE * part, what), processes=processes, address=address,
     )  # fmt: skip
     plants = {
         (name, k): Plant(name=f"{name}-{k}", **CAUSES[name].plant(amount))
@@ -144,7 +146,7 @@ def anatomy(
         for (name, k), water in plants.items() for row in names for s in run_seeds
     ]  # fmt: skip
     results = run_jobs(
-        jobs, folder / "trials", play, processes=processes,
+        jobs, folder / "trials", play, processes=processes, address=address,
         progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
     )  # fmt: skip
 

@@ -6,10 +6,13 @@ import dataclasses
 import hashlib
 import inspect
 import json
+import logging
 import multiprocessing
 import os
 import re
 import signal
+import socket
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -26,7 +29,7 @@ from rich.progress import Progress as Bar
 from finssim.control.controllers import CONTROLLERS
 from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
 from finssim.experiments.tables import Table, markdown_of, print_tables
-from finssim.files import atomic_write
+from finssim.files import atomic_write, plain_name
 from finssim.quiet import start_warp
 from finssim.vehicles import load_vehicle
 from finssim.yaml_file import json_value, read_json
@@ -36,6 +39,14 @@ Progress = Callable[..., None]
 
 WATCH = 1.0
 """Time between two looks of a worker at its parent [s]."""
+PATIENCE = 10.0
+"""For a cluster's answer to a first knock [s]."""
+RETRIES = 3
+"""How often work on a cluster is begun anew after its worker was lost."""
+
+
+class ClusterError(ValueError):
+    """A Ray cluster that is not there, or lost what it was given."""
 
 
 def run_experiment(
@@ -186,6 +197,7 @@ def run_jobs(
     play: Play,
     *,
     processes: int | None = None,
+    address: str | None = None,
     progress: Progress = lambda part, what: None,
     show: Show = lambda job, result: None,
 ) -> list[dict[str, Any]]:
@@ -196,6 +208,8 @@ def run_jobs(
         folder: Takes KEY.json of each, made if missing.
         play: A function of a module, as it is called in other processes; any function with `processes=1`.
         processes: As many as there are processors if None; 1: in this process, one after the other.
+        address: Of a Ray cluster on which they are played instead, as of `spread`. Policies go there and files come
+            back; vehicle files must be at the same place on each machine.
         progress: Told the share that is done and what is left.
         show: Called with each trial that is played now and its result, as soon as there is one.
 
@@ -205,28 +219,43 @@ def run_jobs(
     folder.mkdir(parents=True, exist_ok=True)
     files = {job.key(): folder / f"{job.key()}.json" for job in jobs}
     missing = {job.key(): job for job in jobs if not files[job.key()].is_file()}
-    work = partial(_play_one, folder=folder, play=play)
-    with closing(spread(work, list(missing.items()), processes)) as played:
-        for left, ((_, job), outcome) in zip(reversed(range(len(missing))), played, strict=True):
-            if (result := outcome.result()) is not None:
+    if address is None:
+        work, items = partial(_play_one, folder=folder, play=play), list(missing.items())
+    else:
+        work, items = partial(_play_away, play=play), [(k, j, _policy_files(j)) for k, j in missing.items()]
+    with closing(spread(work, items, processes, address)) as played:
+        for left, ((key, job, *_), outcome) in zip(reversed(range(len(missing))), played, strict=True):
+            result = outcome.result()
+            if address is not None:
+                result = _come_back(job, folder / key, *result)
+            if result is not None:
                 show(job, result)
             progress(1.0 - left / len(files), f"{left} trials left")
     return [kept_result(files[job.key()]) for job in jobs if files[job.key()].is_file()]
 
 
 def spread(
-    work: Callable[[Any], Any], items: Sequence[Any], processes: int | None = None
+    work: Callable[[Any], Any], items: Sequence[Any], processes: int | None = None, address: str | None = None
 ) -> Generator[tuple[Any, Future[Any]], None, None]:
     """Work on items in processes of their own, as many at once as there are processors if None; in this one if 1.
+
+    On a cluster work whose process or machine is lost begins anew elsewhere, `RETRIES` times.
 
     Args:
         work: A function of a module, as it is called in other processes.
         items: What it is called with, each by itself.
         processes: At once. A process of one's own takes some 3 s to start, which a single one does not make up for.
+        address: HOST:PORT of a Ray cluster on which it is done instead, or auto.
 
     Yields:
         An item and its outcome, as each ends. Whoever stops iterating, by Ctrl-C or by closing this, ends them all.
+
+    Raises:
+        ClusterError: Ray is not installed, or nothing answers at the address.
     """
+    if address is not None:
+        yield from _on_cluster(work, items, address)
+        return
     processes = processes or os.cpu_count() or 1
     if processes == 1:
         for item in items:
@@ -260,6 +289,58 @@ def spread(
     executor.shutdown()
 
 
+def _on_cluster(
+    work: Callable[[Any], Any], items: Sequence[Any], address: str
+) -> Generator[tuple[Any, Future[Any]], None, None]:
+    if not items:
+        return
+    try:
+        import ray
+    except ImportError as error:
+        raise ClusterError("a cluster needs Ray: pip install 'finssim[sweep]'") from error
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    _knock(address)
+    try:
+        environment = {"env_vars": {"OMP_NUM_THREADS": "1"}}
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise ClusterError(f"no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
+    try:
+        task = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
+        waiting = {task.remote(work, item): item for item in items}
+        while waiting:
+            (reference,), _ = ray.wait(list(waiting), num_returns=1)
+            outcome: Future[Any] = Future()
+            try:
+                outcome.set_result(ray.get(reference))
+            except ray.exceptions.RayTaskError as error:  # the work itself raised
+                outcome.set_exception(error.cause or error)
+            except ray.exceptions.RayError as error:
+                outcome.set_exception(ClusterError(f"lost {RETRIES + 1} times: {str(error).splitlines()[0]}"))
+            yield waiting.pop(reference), outcome
+    finally:
+        ray.shutdown()
+
+
+def _call(work: Callable[[Any], Any], item: Any) -> Any:
+    """Of a worker: Ray takes plain functions alone."""
+    return work(item)
+
+
+def _knock(address: str) -> None:
+    """Refuse an address where nothing listens at once: Ray itself tries for minutes."""
+    if address == "auto":
+        return
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdigit():
+        raise ClusterError(f"address is '{address}', expected HOST:PORT or auto")
+    try:
+        socket.create_connection((host, int(port)), timeout=PATIENCE).close()
+    except (OSError, OverflowError) as error:
+        raise ClusterError(f"no Ray cluster answers at {address}: {error}") from error
+
+
 def _prepare(parent: int) -> None:
     """Of a worker: one thread, since there are as many workers as processors; no life without its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears Ctrl-C and ends its workers
@@ -277,9 +358,49 @@ def _end_with(parent: int) -> None:
 def _play_one(keyed: tuple[str, Job], folder: Path, play: Play) -> dict[str, Any] | None:
     """Play a job and write KEY.json of its result, with its job."""
     key, job = keyed
-    played = play(job, folder / key)
+    return _kept(job, folder / key, play(job, folder / key))
+
+
+def _kept(job: Job, path: Path, played: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The result with its job, written to PATH.json; None where there is none."""
     if played is None:
         return None
+    key = path.name
     result = {"key": key, "job": {**job.described(), "row": job.row, "target": job.target}, **played}
-    keep_result(folder / f"{key}.json", result)
+    keep_result(path.with_name(f"{key}.json"), result)
     return result
+
+
+def _policy_files(job: Job) -> dict[str, bytes]:
+    """Content of the policy that steers, by file name; nothing where a name of ours does."""
+    controller = getattr(job, "controller", None)
+    if controller is None or controller in CONTROLLERS:
+        return {}
+    return {name: (Path(controller) / name).read_bytes() for name in (DESCRIPTION_FILE, NETWORK_FILE)}
+
+
+def _play_away(
+    sent: tuple[str, Job, Mapping[str, bytes]], play: Play
+) -> tuple[dict[str, Any] | None, dict[str, bytes]]:
+    """Play a job on another machine: its result, and the files that it left by name."""
+    key, job, policy = sent
+    with tempfile.TemporaryDirectory() as place:
+        out, controller = Path(place) / "out", Path(place) / "policy"
+        for folder in (out, controller):
+            folder.mkdir()
+        for name, content in policy.items():
+            (controller / name).write_bytes(content)
+        if policy:
+            job = dataclasses.replace(job, controller=str(controller))  # type: ignore[call-arg]
+        played = play(job, out / key)
+        return played, {path.name: path.read_bytes() for path in out.iterdir()}
+
+
+def _come_back(
+    job: Job, path: Path, played: dict[str, Any] | None, files: Mapping[str, bytes]
+) -> dict[str, Any] | None:
+    """Write what a job left elsewhere beside PATH.json of its result."""
+    for name, content in files.items():
+        with atomic_write(path.with_name(plain_name(name, "file of a trial", ClusterError))) as temporary:
+            temporary.write_bytes(content)
+    return _kept(job, path, played)

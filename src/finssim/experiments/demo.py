@@ -554,7 +554,7 @@ class _Demonstration:
             title, changes = "The same, by pictures", {"duration": self.scope.duration, "camera": "pictures"}
             seen = replace(rows[POLICY], title=title, changes=changes, targets=self.scope.pictures)
             rows = {WITH_PICTURES: seen, **rows}
-        return replace(T1, rows=rows, targets=self.scope.setpoints, base=POLICY)
+        return replace(T1, rows=rows, targets=self.scope.setpoints, bases=(POLICY,))
 
     @property
     def site(self) -> str:

@@ -1045,6 +1045,7 @@ def faults_experiment(
     vehicle: str | None = None,
     firmware: Literal["mcu", "ardusub"] = "mcu",
     processes: Annotated[int | None, (1, None)] = None,
+    address: str | None = None,
     progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Break one thing after another while a vehicle drives: time until thrust is gone [s], place in the workspace [m].
@@ -1064,6 +1065,7 @@ def faults_experiment(
         firmware (NAME): What steers the motors: mcu, the motor controller of finssim run, or ardusub, an autopilot, in
             the tank, with a Doppler log in place of the camera.
         processes: Trials at once; as many as processors if not given.
+        address (ADDRESS): Of a Ray cluster that does the work in their place, HOST:PORT or auto; kills stay here.
         progress: Told the share that is done and what comes next.
 
     Returns:
@@ -1095,7 +1097,7 @@ def faults_experiment(
         progress=lambda part, what: progress(share * part, f"kills in real time: {what}"),
     )  # fmt: skip
     results += run_jobs(
-        jobs, folder / "trials", play, processes=processes,
+        jobs, folder / "trials", play, processes=processes, address=address,
         progress=lambda part, what: progress(share + (1.0 - share) * part, what),
     )  # fmt: skip
     rows = {name: [r for r in results if r["job"]["row"] == name] for name in names}

@@ -34,8 +34,9 @@ def report(
 ) -> int:
     """Fill the tables of Markdown pages with what experiments have measured.
 
-    A page has a table where it says <!-- finssim report: t1 --> and <!-- end -->; after the name may stand table=2 (the
-    second of the result), columns=0,1,3, and rows=calibrated;paper: calibrated (names as the table has them).
+    A page has a table where it says <!-- finssim report: t1 --> and <!-- end -->, for the result in t1.json; after the
+    name may stand table=2 (the second of the result), columns=0,1,3, and rows=calibrated;paper: calibrated (names as
+    the table has them).
 
     Example: finssim report results/t1.json results/anatomy.json --into docs/experiments.md --into README.md
 
@@ -47,7 +48,7 @@ def report(
     Raises:
         ReportError: A file is no result of such an experiment, or a page asks for what there is not.
     """
-    known = dict(map(_read, results))
+    known = {path.stem: _read(path) for path in results}
     stale = []
     for page in into:
         text = page.read_text(encoding="utf-8")
@@ -63,16 +64,16 @@ def report(
     return int(check and bool(stale))
 
 
-def _read(path: Path) -> tuple[str, Mapping[str, Any]]:
-    """The experiment of a result file, and the result."""
+def _read(path: Path) -> Mapping[str, Any]:
+    """The result of an experiment."""
     try:
-        result = json.loads(path.read_text(encoding="utf-8"))
+        result: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         name = result["experiment"]
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise ReportError(f"{path}: is no result of an experiment ({error})") from None
     if name not in TABLES:
         raise ReportError(f"{path}: is of experiment '{name}', expected one of {', '.join(TABLES)}")
-    return name, result
+    return result
 
 
 def filled(page: str, results: Mapping[str, Mapping[str, Any]], name: str) -> str:
@@ -80,7 +81,7 @@ def filled(page: str, results: Mapping[str, Mapping[str, Any]], name: str) -> st
 
     Args:
         page: Its text.
-        results: Experiment -> result.
+        results: Name of its file, without the ending -> result.
         name: Of the page, for what is refused.
 
     Raises:
@@ -88,11 +89,12 @@ def filled(page: str, results: Mapping[str, Mapping[str, Any]], name: str) -> st
     """
 
     def made(found: re.Match[str]) -> str:
-        experiment, *options = found["what"].split(" ", 1)
+        wanted, *options = found["what"].split(" ", 1)
         try:
-            if experiment not in results:
-                raise ReportError(f"no result of '{experiment}' was given")
-            text = _table(TABLES[experiment](results[experiment]), options[0] if options else "")
+            if wanted not in results:
+                raise ReportError(f"no result '{wanted}.json' was given")
+            result = results[wanted]
+            text = _table(TABLES[result["experiment"]](result), options[0] if options else "")
         except ReportError as error:
             raise ReportError(f"{name}: <!-- finssim report: {found['what']} -->: {error}") from None
         return f"<!-- finssim report: {found['what']} -->\n{text}\n<!-- end -->"

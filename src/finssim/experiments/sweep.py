@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-import logging
 import os
 import socket
 import tempfile
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,10 +34,6 @@ from finssim.yaml_file import first_problem, read_mapping
 
 RESULT_FILE = "sweep.json"
 ROW_FILE = "sweep-row.json"
-PATIENCE = 10.0
-"""For an answer to a first knock [s]."""
-RETRIES = 3
-"""How often a job is begun anew after its worker was lost."""
 SAME_FOR_ALL = ("task", "out", "seed", "console", "shown", "interrupted", "resume", "device", "vehicle")
 """Arguments of a training that a sweep sets itself."""
 FILES = ("vehicle", "plants", "randomize")
@@ -264,60 +259,6 @@ def play(job: Job) -> tuple[dict[str, Any], dict[str, bytes]]:
         return row, {path.name: path.read_bytes() for path in out.iterdir()}
 
 
-def _here(jobs: Sequence[Job], processes: int | None) -> Generator[tuple[Job, Any], None, None]:
-    """Each job with its outcome or its error, from processes of this machine."""
-    with closing(spread(play, jobs, processes)) as played:
-        for job, future in played:
-            yield job, future.exception() or future.result()
-
-
-def _on_cluster(jobs: Sequence[Job], address: str) -> Generator[tuple[Job, Any], None, None]:
-    """The same from a Ray cluster; a job whose worker or machine is lost begins anew elsewhere, `RETRIES` times.
-
-    Raises:
-        SweepError: Ray is not installed, or nothing answers at the address.
-    """
-    try:
-        import ray
-    except ImportError as error:
-        raise SweepError("a cluster needs Ray: pip install 'finssim[sweep]'") from error
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    _knock(address)
-    try:
-        environment = {"env_vars": {"OMP_NUM_THREADS": "1"}}
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise SweepError(f"no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
-    try:
-        task = ray.remote(num_cpus=1, max_retries=RETRIES)(play)
-        waiting = {task.remote(job): job for job in jobs}
-        while waiting:
-            (reference,), _ = ray.wait(list(waiting), num_returns=1)
-            job = waiting.pop(reference)
-            try:
-                yield job, ray.get(reference)
-            except ray.exceptions.RayTaskError as error:  # the job itself raised
-                yield job, error.cause or error
-            except ray.exceptions.RayError as error:
-                yield job, SweepError(f"lost {RETRIES + 1} times: {str(error).splitlines()[0]}")
-    finally:
-        ray.shutdown()
-
-
-def _knock(address: str) -> None:
-    """Refuse an address where nothing listens at once: Ray itself tries for minutes."""
-    if address == "auto":
-        return
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdigit():
-        raise SweepError(f"address is '{address}', expected HOST:PORT or auto")
-    try:
-        socket.create_connection((host, int(port)), timeout=PATIENCE).close()
-    except (OSError, OverflowError) as error:
-        raise SweepError(f"no Ray cluster answers at {address}: {error}") from error
-
-
 def sweep(
     file: Path,
     *,
@@ -343,7 +284,8 @@ def sweep(
         What `sweep.json` has: `rows` (name, seed, run, training_s, machine, plants; or `error`), `ok`, provenance.
 
     Raises:
-        SweepError: The file says what cannot be, or no cluster answers.
+        SweepError: The file says what cannot be.
+        ClusterError: No cluster answers.
         KeyboardInterrupt: After Ctrl-C; what was finished stays.
     """
     plan, runs, began = load_sweep(file), out / "runs", time.perf_counter()
@@ -358,10 +300,9 @@ def sweep(
                 rows[job.key] = kept_result(path)
         missing = [job for job in jobs if job.key not in rows]
         if missing:
-            outcomes = _here(missing, processes) if address is None else _on_cluster(missing, address)
-            with closing(outcomes):
+            with closing(spread(play, missing, processes, address)) as outcomes:
                 for job, outcome in outcomes:
-                    rows[job.key] = row = _keep(job, outcome, runs)
+                    rows[job.key] = row = _keep(job, outcome.exception() or outcome.result(), runs)
                     progress(len(rows) / total, f"{len(rows)} of {total} trainings")
                     if not screen.is_terminal:
                         error = f": {row['error']}" if "error" in row else ""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,9 +16,9 @@ import yaml
 from rich.console import Console
 
 from finssim.control.controllers import COSTLY
-from finssim.control.policy import Policy, PolicyError
+from finssim.control.policy import DESCRIPTION_FILE, Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.campaign import Progress, Show, check_choices, write_json
+from finssim.experiments.campaign import Progress, Show, check_choices, spread, write_json
 from finssim.experiments.evaluate import T1_COLUMNS
 from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row, paper_t2_row
@@ -24,6 +27,7 @@ from finssim.experiments.pool_trial import FIRMWARES, HARDWARE, Job, firmware_of
 from finssim.experiments.statistics import Statistic, paired_difference, with_interval
 from finssim.experiments.tables import Columns, Table, cells
 from finssim.experiments.trials import T2_TRAJECTORIES
+from finssim.files import atomic_directory, plain_name
 from finssim.learning.train import train
 from finssim.localization.fusion.estimator import MODELS
 from finssim.provenance import provenance
@@ -45,9 +49,11 @@ MEASURES: Columns = {
     "success_rate": ("held [points]", "+.0f", 100.0),
     "e_p_m": ("e_p [cm]", "+.1f", 100.0),
     "e_psi_deg": ("e_psi [°]", "+.1f"),
+    "t_s_s": ("t_s [s]", "+.1f"),
     "horizontal_rmse_m": ("horizontal [cm]", "+.1f", 100.0),
     "vertical_rmse_m": ("vertical [cm]", "+.1f", 100.0),
     "p95_m": ("P95 [cm]", "+.1f", 100.0),
+    "energy": ("energy [N^1.5 s]", "+.0f"),
 }
 """Key in which rows are compared, for the table of differences."""
 
@@ -89,8 +95,8 @@ class Spec:
     columns: Columns
     """Of a row."""
     note: str
-    base: str
-    """The row that the others are compared with."""
+    bases: Sequence[str]
+    """The rows that the others are compared with, a table for each that was played."""
     figures: Mapping[str, Statistic]
     """Key of a trial's result -> how the trials that have it become one figure."""
     differences: Sequence[str]
@@ -102,33 +108,39 @@ class Spec:
     picture: tuple[str, str]
     """File of that figure, and what it shows."""
 
-    def paper_differences(self, row: Row) -> dict[str, float] | None:
-        """Key of `differences` -> the paper's row less its reference; None where it has not both."""
-        base = self.rows[self.base].paper
-        if row.paper is None or base is None:
+    def paper_differences(self, row: Row, base: str) -> dict[str, float] | None:
+        """Key of `differences` -> the paper's row less that of a base; None where it has not both."""
+        if row.paper is None or self.rows[base].paper is None:
             return None
         targets = self.targets if self.by_target else [""]
-        theirs, reference = ([self.paper(name, t) or {} for t in targets] for name in (row.paper, base))
+        pairs = [
+            (self.paper(row.paper, t) or {}, self.paper(self.rows[base].paper, t) or {}) for t in targets
+        ]
         return {
-            key: float(np.mean([a[key] - b[key] for a, b in zip(theirs, reference, strict=True)]))
+            key: float(np.mean([a[key] - b[key] for a, b in pairs]))
             for key in self.differences
+            if all(one.get(key) is not None for pair in pairs for one in pair)
         }
 
     def tables(self, result: Mapping[str, Any]) -> list[Table]:
-        """The table of a result, and that of the differences from the reference row, where there are some."""
+        """The table of a result, and those of the differences from the bases, where there are some."""
         units: Columns = {key: MEASURES[key] for key in self.differences}
-        rows = []
-        for name, differences in result["differences"].items():
-            rows.append([self.rows[name].title, *cells(differences, units)])
-            if theirs := self.paper_differences(self.rows[name]):
-                rows.append(["  paper", *cells(theirs, units)])
-        differences = Table(
-            title=f"{self.name.upper()}: differences from {self.rows[self.base].title}",
-            heads=["", *(heading for heading, *_ in units.values())],
-            rows=rows,
-            note=DIFFERENCES_NOTE,
-        )
-        return [self._table(result), *([differences] if rows else [])]
+        tables = [self._table(result)]
+        for base, of_base in result["differences"].items():
+            rows = []
+            for name, differences in of_base.items():
+                rows.append([self.rows[name].title, *cells(differences, units)])
+                if theirs := self.paper_differences(self.rows[name], base):
+                    rows.append(["  paper", *cells(theirs, units)])
+            tables.append(
+                Table(
+                    title=f"{self.name.upper()}: differences from {self.rows[base].title}",
+                    heads=["", *(heading for heading, *_ in units.values())],
+                    rows=rows,
+                    note=DIFFERENCES_NOTE,
+                )
+            )
+        return tables
 
     def _table(self, result: Mapping[str, Any]) -> Table:
         """The table of a result; on hardware its rows say so."""
@@ -173,6 +185,7 @@ def transfer_experiment(
     vehicle: str = "finsrov",
     steps: Annotated[int | None, (1, None)] = None,
     processes: Annotated[int | None, (1, None)] = None,
+    address: str | None = None,
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
     pool_vehicle: Annotated[str | None, "python"] = None,
@@ -203,7 +216,8 @@ def transfer_experiment(
         targets: What is played; the published ones if None.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         steps: Control steps to learn from, all worlds together; what the task needs if not given.
-        processes: Trials at once; as many as processors if not given.
+        processes: Trainings or trials at once; as many as processors if not given.
+        address (ADDRESS): Of a Ray cluster that does the work in their place, HOST:PORT or auto.
         robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
         attendant: The person beside that robot, instead of the terminal's keyboard.
         pool_vehicle: Name or file of the vehicle around which the pools' own are drawn; `vehicle` if None.
@@ -234,7 +248,7 @@ def transfer_experiment(
     action, site, sees = FIRMWARES[firmware]
     controllers = controllers_of(
         spec.name, chosen, run_seeds, folder, vehicle, steps, action,
-        lambda part, what: progress(TRAINING_SHARE * part, what),
+        lambda part, what: progress(TRAINING_SHARE * part, what), processes=processes, address=address,
     )  # fmt: skip
     if robot is not None:  # there is one plant, and nobody chose its severity
         pools, severity, camera = range(1), HARDWARE, HARDWARE
@@ -250,8 +264,8 @@ def transfer_experiment(
         for name, row in chosen.items() for plant in pools for s in run_seeds for target in row.targets or targets
     ]  # fmt: skip
     results = play_jobs(
-        jobs, folder / "trials", robot, attendant=attendant, console=console, processes=processes, show=show,
-        progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
+        jobs, folder / "trials", robot, attendant=attendant, console=console, processes=processes, address=address,
+        show=show, progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
     )  # fmt: skip
     by_row = {name: [r for r in results if r["job"]["row"] == name] for name in chosen}
     by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
@@ -276,6 +290,9 @@ def controllers_of(
     steps: int | None = None,
     action: str | None = None,
     progress: Progress = lambda part, what: None,
+    *,
+    processes: int | None = None,
+    address: str | None = None,
 ) -> dict[tuple[str, int], str]:
     """Who steers, by row and seed; policies that are not finished in the folder are trained.
 
@@ -287,14 +304,14 @@ def controllers_of(
         vehicle: Name or file.
         steps: Control steps of each training; the task's own if None.
         action: Mode; the task's own if None.
-        progress: Told the share that is done and what comes next.
+        progress: Told the share that is done and what is left.
+        processes, address: Where and how many at once, as of `campaign.spread`.
 
     Returns:
         (row, seed) -> directory of a policy, or the name of a PID.
     """
-    controllers, body = {}, load_vehicle(vehicle)
-    plan = [(name, row, seed) for name, row in rows.items() for seed in seeds]
-    for done, (name, row, seed) in enumerate(plan):
+    controllers, body, missing = {}, load_vehicle(vehicle), {}
+    for (name, row), seed in product(rows.items(), seeds):
         controllers[name, seed] = row.controller
         if row.training is None:
             continue
@@ -302,13 +319,26 @@ def controllers_of(
         label, remembers = options.pop("name"), options.pop("remembers")
         policy = folder / "policies" / f"{label}-seed{seed}"
         controllers[name, seed] = str(policy)
-        progress(done / len(plan), f"training {label}, seed {seed}")
         if not finished(policy, body):
-            train(
-                task, out=policy, vehicle=vehicle, action=action, seed=seed, steps=steps, **options,
-                settings={} if remembers else FORGETFUL, console=Console(stderr=True, quiet=True),
-            )  # fmt: skip
+            options |= {"vehicle": vehicle, "action": action, "seed": seed, "steps": steps}
+            missing[policy] = {"task": task, **options, "settings": {} if remembers else FORGETFUL}
+    with closing(
+        spread(_trained, list(missing.items()), 1 if len(missing) == 1 else processes, address)
+    ) as done:
+        for left, ((policy, _), outcome) in zip(reversed(range(len(missing))), done, strict=True):
+            with atomic_directory(policy, replaces=DESCRIPTION_FILE) as place:
+                for name, content in outcome.result().items():
+                    (place / plain_name(name, "file of a policy", PolicyError)).write_bytes(content)
+            progress(1.0 - left / len(missing), f"{left} trainings left")
     return controllers
+
+
+def _trained(policy: tuple[Path, Mapping[str, Any]]) -> dict[str, bytes]:
+    """Train, on whatever machine: the files of the policy directory by name."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "policy"
+        train(out=out, **policy[1], console=Console(stderr=True, quiet=True))
+        return {path.name: path.read_bytes() for path in out.iterdir()}
 
 
 def finished(place: Path, vehicle: Vehicle | None = None) -> bool:
@@ -338,11 +368,15 @@ def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
         name: {key: _by_trial(results, key) for key in spec.differences} for name, results in by_row.items()
     }
     differences = {
-        name: {key: paired_difference(paired[spec.base][key], values) for key, values in of_row.items()}
-        for name, of_row in paired.items()
-        if spec.base in paired and name != spec.base
+        base: {
+            name: {key: paired_difference(paired[base][key], values) for key, values in of_row.items()}
+            for name, of_row in paired.items()
+            if name != base
+        }
+        for base in spec.bases
+        if base in paired and len(paired) > 1
     }
-    return {"rows": rows, "base": spec.base, "differences": differences}
+    return {"rows": rows, "differences": differences}
 
 
 def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Statistic]) -> dict[str, Any]:
@@ -379,7 +413,7 @@ def _by_trial(results: Sequence[Mapping[str, Any]], key: str) -> dict[tuple[int,
     return {
         (r["job"]["plant"], r["job"]["seed"], r["job"]["target"]): float(r[measure])
         for r in results
-        if r[measure] is not None
+        if r.get(measure) is not None
     }
 
 
@@ -451,12 +485,14 @@ T1 = Spec(
     columns=T1_COLUMNS,
     note=". paper: its vehicle in its pool, one seed. errors: 40-60 s; e_y is vertical; "
     "success: 0.10 m on each axis and 10° for 10 s. t_s (median) and jitter are of successful trials.",
-    base="calibrated",
+    bases=("calibrated", "pid"),
     figures={
-        **dict.fromkeys(("success_rate", "e_p_m", "e_y_m", "e_psi_deg", "J_p_m", "J_psi_deg"), np.mean),
+        **dict.fromkeys(
+            ("success_rate", "e_p_m", "e_y_m", "e_psi_deg", "J_p_m", "J_psi_deg", "energy"), np.mean
+        ),
         "t_s_s": np.median,
     },
-    differences=("success_rate", "e_p_m", "e_psi_deg"),
+    differences=("success_rate", "e_p_m", "e_psi_deg", "t_s_s", "energy"),
     paper=_paper_t1,
     draw=_draw_t1,
     picture=("t1_envelopes.png", "Station keeping: error against time"),
@@ -477,9 +513,11 @@ T2 = Spec(
         "p95_m": ("3-D P95 [m]", ".3f"),
     },
     note="; done: trials that reached the end. paper: its vehicle in its pool.",
-    base="calibrated-dr",
-    figures=dict.fromkeys(("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "cross_track_rmse_m"), np.mean),
-    differences=("horizontal_rmse_m", "vertical_rmse_m", "p95_m"),
+    bases=("calibrated-dr", "pid"),
+    figures=dict.fromkeys(
+        ("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "cross_track_rmse_m", "energy"), np.mean
+    ),
+    differences=("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "energy"),
     paper=paper_t2_row,
     draw=_draw_t2,
     picture=("t2_paths.png", "Trajectory tracking: paths from above"),

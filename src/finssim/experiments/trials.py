@@ -22,6 +22,7 @@ from finssim.experiments.metrics import (
     SITE_SIZES,
     T1_SETPOINTS,
     T1_START,
+    effort_measures,
     in_room,
     measure_tracking,
     measure_trial,
@@ -165,7 +166,8 @@ class Trial:
     def measures(
         self, task: str, limits: tuple[ArrayLike, ArrayLike], *, stopped: bool = False
     ) -> dict[str, Any]:
-        """What `measure_trial` gives for T1, with its goal, or `measure_tracking` for T2, with `success`.
+        """What `measure_trial` gives for T1, with its goal and `effort_measures` where thrusts are known; or what
+        `measure_tracking` gives for T2, with `success`.
 
         Args:
             task: t1 or t2.
@@ -176,6 +178,10 @@ class Trial:
         if task == "t1":
             *place, yaw = self.goal.tolist()
             measures = measure_trial(motion.t, motion.position, motion.yaw, self.goal)
+            if motion.thrust is not None and not stopped:
+                known = np.isfinite(motion.thrust).all(axis=1)
+                if known.sum() > 1:
+                    measures |= effort_measures(motion.t[known], motion.thrust[known], limits)
             return {"goal": [*place, math.degrees(yaw)], **measures}
         attitude = None if motion.heading_only else motion.quaternion
         measures = measure_tracking(

@@ -25,6 +25,8 @@ def _components(a: npt.ArrayLike) -> tuple[Any, ...]:
 
 def _vector(*components: Any) -> Array:
     """The vector, or the batch of vectors, of its components."""
+    if type(components[-1]) is float and all(type(c) is float for c in components):
+        return np.array(components)
     shape = np.broadcast(*components).shape
     if not shape:
         return np.array(components)
@@ -154,9 +156,13 @@ def quat_yaw(q: npt.ArrayLike) -> Array:
 def quat_from_rotvec(rotvec: npt.ArrayLike) -> Array:
     """Quaternion of a rotation vector (axis times angle) [rad], (..., 3) -> (..., 4)."""
     x, y, z = _components(rotvec)
-    half = 0.5 * np.sqrt(x * x + y * y + z * z)
-    # sinc(x) = sin(pi x)/(pi x) stays exact through zero.
-    ratio = 0.5 * (np.sinc(half / np.pi) if np.ndim(half) else math.sin(half) / half if half else 1.0)
+    square = x * x + y * y + z * z
+    if type(square) is float:
+        half = 0.5 * math.sqrt(square)
+        ratio = 0.5 * math.sin(half) / half if half else 0.5
+        return np.array((ratio * x, ratio * y, ratio * z, math.cos(half)))
+    half = 0.5 * np.sqrt(square)
+    ratio = 0.5 * np.sinc(half / np.pi)  # sinc(x) = sin(pi x)/(pi x) stays exact through zero
     return _vector(ratio * x, ratio * y, ratio * z, np.cos(half))
 
 

@@ -459,6 +459,10 @@ class ConstantVelocity:
         track = changed(track, yaw=yaw, yaw_seen=then, gates=gates)
         return track, Outcome("yaw", verdict, found.mahalanobis, 1)
 
+    def tilt(self, track: Track) -> tuple[float, float]:
+        """Roll and pitch of a state [rad]."""
+        return track.roll, track.pitch
+
     def _tilted(self, track: Track, sample: ImuSample, dt: float) -> tuple[float, float, Tilt | None]:
         """Roll and pitch after a sample, the unit's own, else those of gyro and accelerometer; and their filter."""
         if sample.tilt is not None:
@@ -615,24 +619,26 @@ def predict(
         gravity: Pool frame [m/s²], (3,): downwards.
     """
     turn = (omega - state.gyro_bias) * dt
-    R = quat_to_matrix(quat_multiply(state.q, quat_from_rotvec(0.5 * turn)))
+    half = quat_from_rotvec(0.5 * turn)
+    middle = quat_multiply(state.q, half)
+    q = quat_multiply(middle, half)
+    R = quat_to_matrix(middle)
     pushed = (R @ (force - state.accel_bias)[..., None])[..., 0]
     a = pushed + gravity
-    q = quat_multiply(state.q, quat_from_rotvec(turn))
     n = state.covariance.shape[-1]
-    F = np.broadcast_to(_I[n], (*turn.shape[:-1], n, n)).copy()
+    F = _I[n].copy() if turn.ndim == 1 else np.tile(_I[n], (*turn.shape[:-1], 1, 1))
     F[..., P, V] = dt * _I[15][:3, :3]
-    swing, turned = dt * skew(pushed), dt * R
-    F[..., V, A], F[..., P, A] = -swing, (-0.5 * dt) * swing
-    F[..., V, B], F[..., P, B] = -turned, (-0.5 * dt) * turned
-    F[..., A, G] = -turned
-    covariance = F @ state.covariance @ np.swapaxes(F, -1, -2) + _noise(dt, noise, n)
+    swing, turned = -dt * skew(pushed), -dt * R
+    F[..., V, A], F[..., P, A] = swing, (0.5 * dt) * swing
+    F[..., V, B], F[..., P, B] = turned, (0.5 * dt) * turned
+    F[..., A, G] = turned
+    covariance = F @ state.covariance @ F.swapaxes(-1, -2) + _noise(dt, noise, n)
     return changed(
         state,
         p=state.p + dt * state.v + 0.5 * dt**2 * a,
         v=state.v + dt * a,
-        q=q / np.linalg.norm(q, axis=-1, keepdims=True),
-        covariance=0.5 * (covariance + np.swapaxes(covariance, -1, -2)),
+        q=q / np.sqrt((q * q).sum(axis=-1, keepdims=True)),
+        covariance=0.5 * (covariance + covariance.swapaxes(-1, -2)),
     )
 
 
@@ -869,11 +875,17 @@ def capped(state: InertialState, variance: float, tilt: float) -> InertialState:
         tilt: Largest standard deviation of roll and pitch [rad].
     """
     d = np.diagonal(state.covariance)
-    limit = np.array([variance] * 3 + [np.inf] * 3 + [tilt**2] * 2 + [10.0] + [np.inf] * (len(d) - 9))
-    if np.all(d <= limit):
+    limit = _caps(variance, tilt, len(d))
+    if (d <= limit).all():
         return state
     scale = np.sqrt(np.minimum(1.0, limit / np.maximum(d, 1e-300)))
     return changed(state, covariance=state.covariance * scale[:, None] * scale[None, :])
+
+
+@lru_cache(maxsize=8)
+def _caps(variance: float, tilt: float, n: int) -> Array:
+    """The largest variance of each error, (n,)."""
+    return np.array([variance] * 3 + [np.inf] * 3 + [tilt**2] * 2 + [10.0] + [np.inf] * (n - 9))
 
 
 # Fusion with the IMU's acceleration: the error-state filter behind the same gates, states and timings.
@@ -906,8 +918,6 @@ class InertialTrack:
     velocity_time: float | None = None
     gates: tuple[GateMemory, ...] = (GateMemory(),) * 5
     """Their memories, in the order of `GATES`."""
-    roll: float = 0.0
-    pitch: float = 0.0
 
 
 class ErrorState:
@@ -950,8 +960,6 @@ class ErrorState:
                 omega=sample.omega,
                 force=sample.force,
                 imu_time=sample.time,
-                roll=before.roll,
-                pitch=before.pitch,
             )
             return self._begun(track, sample.time), outcomes
         heard = track.imu_time is not None and sample.time - track.imu_time <= GYRO_HOLD
@@ -977,7 +985,7 @@ class ErrorState:
             return restarted(state, [2], state.p[2:] + residual / self._up[2], R, speed)
 
         track, outcome = self._measured(track, "depth", sample.time, residual, H, R, residual, speed, restart)
-        return self._kept(track), (outcome,)
+        return track, (outcome,)
 
     def vision(self, track: InertialTrack, sample: VisionSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
         """Take in a fix of the camera."""
@@ -995,7 +1003,7 @@ class ErrorState:
 
         track, seen = self._measured(track, "vision", sample.time, off, H[:2], R_xy, fix, speed, restart)
         if sample.yaw is None or track.inertial is None:
-            return self._kept(track), (seen,)
+            return track, (seen,)
         yaw, H = yaw_model(track.inertial)
         residual, R_yaw = wrap_angle(np.array([sample.yaw]) - yaw), R[2:, 2:]
         # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
@@ -1007,7 +1015,7 @@ class ErrorState:
         track, turn_outcome = self._measured(
             track, "yaw", sample.time, residual, H, R_yaw, residual, 0.05, turn, carried=carried
         )
-        return self._kept(track), (seen, turn_outcome)
+        return track, (seen, turn_outcome)
 
     def velocity(
         self, track: InertialTrack, sample: VelocitySample
@@ -1021,7 +1029,7 @@ class ErrorState:
         expected, H = velocity_model(state, np.array(track.omega), self._log)
         seen, R = np.array(sample.velocity), aids.velocity_std**2 * np.eye(3)
         track, outcome = self._measured(track, "velocity", sample.time, seen - expected, H, R, seen, 1.0)
-        return self._kept(track), (outcome,)
+        return track, (outcome,)
 
     def heading(
         self, track: InertialTrack, sample: HeadingSample
@@ -1035,7 +1043,7 @@ class ErrorState:
         expected, H = heading_model(state)
         residual, R = wrap_angle(np.array([sample.yaw]) - expected), np.array([[aids.heading_std**2]])
         track, outcome = self._measured(track, "heading", sample.time, residual, H, R, residual, 0.05)
-        return self._kept(track), (outcome,)
+        return track, (outcome,)
 
     def _measured(
         self,
@@ -1070,6 +1078,13 @@ class ErrorState:
         track = changed(track, inertial=state, gates=gates, **believed)
         return track, Outcome(stream, verdict, distance, len(residual))
 
+    def tilt(self, track: InertialTrack) -> tuple[float, float]:
+        """Roll and pitch of a state [rad]."""
+        if track.inertial is None:
+            return track.before.roll, track.before.pitch
+        roll, pitch = roll_pitch(self._up @ quat_to_matrix(track.inertial.q))
+        return float(roll), float(pitch)
+
     def _at(self, track: InertialTrack, time: float) -> tuple[InertialTrack, InertialState]:
         """The track at a time, and what its filter knows then."""
         track = self._until(track, time)
@@ -1088,6 +1103,7 @@ class ErrorState:
             x[3:5] = 0.0
         yaw, H = yaw_model(state)
         rates = quat_to_matrix(state.q) @ (np.array(track.omega) - state.gyro_bias)
+        roll, pitch = self.tilt(track)
         return Estimate(
             time=time,
             x=x,
@@ -1095,8 +1111,8 @@ class ErrorState:
             yaw=float(yaw[0]),
             yaw_variance=float((H @ state.covariance @ H.T)[0, 0]) + track.gates[1].doubt,
             yaw_rate=float(H[0, 6:9] @ rates),
-            roll=track.roll,
-            pitch=track.pitch,
+            roll=roll,
+            pitch=pitch,
             vision_time=track.vision_time,
             depth_time=track.depth_time,
             imu_time=track.imu_time,
@@ -1147,7 +1163,7 @@ class ErrorState:
         )
         gates = (*before.gates, GateMemory(1), GateMemory(1))
         track = changed(track, inertial=state, time=time, vision_time=before.vision_time, gates=gates)
-        return self._kept(changed(track, depth_time=before.depth_time))
+        return changed(track, depth_time=before.depth_time)
 
     def _until(self, track: InertialTrack, time: float) -> InertialTrack:
         """The track at a time; velocity without news is drawn to rest, and then the position stands still."""
@@ -1165,7 +1181,7 @@ class ErrorState:
             age = math.inf if aided is None else middle - aided
             state = self._step(state, track, until - then, blind=middle > heard, age=age)
             then = until
-        return self._kept(changed(track, inertial=capped(state, s.largest_variance, TILT_CAP), time=time))
+        return changed(track, inertial=capped(state, s.largest_variance, TILT_CAP), time=time)
 
     def _step(
         self, state: InertialState, track: InertialTrack, dt: float, *, blind: bool, age: float
@@ -1189,12 +1205,6 @@ class ErrorState:
         residual = -after.v[:2]
         gain = error_innovation(after, residual, H, R)[1]
         return correct(after, residual, H, R, gain)
-
-    def _kept(self, track: InertialTrack) -> InertialTrack:
-        """The track with roll and pitch read from its attitude."""
-        assert track.inertial is not None
-        roll, pitch = roll_pitch(self._up @ quat_to_matrix(track.inertial.q))
-        return changed(track, roll=float(roll), pitch=float(pitch))
 
 
 def _aided(track: InertialTrack) -> float | None:

@@ -378,7 +378,7 @@ class Estimator:
         line, else from one within the freshness of its stream.
         """
         s = self.settings
-        roll, pitch = self._timeline.tilt_at(time, s.imu_fresh, lambda track: (track.roll, track.pitch))
+        roll, pitch = self._timeline.tilt_at(time, s.imu_fresh, self._model.tilt)
         return Surroundings(roll, pitch, self._timeline.depth_at(time, s.depth_fresh))
 
     @property
