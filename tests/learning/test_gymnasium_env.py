@@ -213,6 +213,9 @@ def test_a_task_that_sees_has_a_dictionary_of_observations():
     env = gymnasium.make("finssim/CameraDocking-v0")
     check_env(env.unwrapped, skip_render_check=True)
     assert env.observation_space["front_camera"].shape == (27, 48, 3)
+    net = gymnasium.make("finssim/Net-v0")
+    assert net.observation_space["sonar"].shape == (128, 48, 1)
+    assert net.reset(seed=1)[0] in net.observation_space
     for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
         batch = VectorEnv(2, CameraDocking(time_limit=0.2), autoreset_mode=mode)
         first, _ = batch.reset(seed=3)

@@ -12,6 +12,7 @@ from finssim.learning.gymnasium_env import Env
 from finssim.learning.sb3 import Sb3VecEnv
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, StationKeeping
 from finssim.tasks.camera_docking import CameraDocking
+from finssim.tasks.net import Net
 from reference.pair import Pair
 
 SHORT = StationKeeping(time_limit=0.5)
@@ -149,11 +150,19 @@ def test_an_environment_that_does_not_reset_itself_is_refused():
 
 
 @pytest.mark.slow
-def test_a_task_that_sees_gives_dictionaries():
+@pytest.mark.parametrize(
+    ("task", "name", "shape"),
+    [
+        (CameraDocking(time_limit=0.2), "front_camera", (27, 48, 3)),
+        (Net(time_limit=0.2), "sonar", (128, 48, 1)),
+    ],
+)
+def test_a_task_that_sees_gives_dictionaries(task, name, shape):
     pytest.importorskip("newton")
-    env = Sb3VecEnv(CameraDocking(time_limit=0.2), worlds=2, seed=1)
-    assert env.reset()["front_camera"].shape == (2, 27, 48, 3)
-    env.step(np.zeros((2, 6)))
-    observation, _, done, infos = env.step(np.zeros((2, 6)))
+    env = Sb3VecEnv(task, worlds=2, seed=1)
+    assert env.reset()[name].shape == (2, *shape)
+    still = np.zeros((2, env.action_space.shape[0]))
+    env.step(still)
+    observation, _, done, infos = env.step(still)
     assert done.all() and infos[0]["terminal_observation"]["state"].shape == (10,)
-    assert observation["front_camera"].dtype == np.uint8
+    assert observation[name].dtype == np.uint8

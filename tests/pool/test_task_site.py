@@ -26,7 +26,7 @@ FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SHORT = {"t1": 14.0, "t2": 14.0, "t3": 12.0, "docking": 25.0}
 """Time limits that are long enough for a success of the baseline [s]."""
-SEEDS = {"camera-docking": 4, "pipeline": 2}
+SEEDS = {"camera-docking": 4, "pipeline": 2, "gate": 4}
 """Of an episode in which the baseline succeeds; that of a task that sees does not in all."""
 
 

@@ -112,6 +112,15 @@ def test_pictures_are_resized_by_area():
         resized(image, (2, 4))
 
 
+def test_a_sonars_picture_is_cut_to_the_range_that_is_seen():
+    """The nearest range cells of every beam as they are; other beams are refused, and too few cells."""
+    echoes = np.arange(6 * 10, dtype=np.uint8).reshape(6, 10)
+    np.testing.assert_array_equal(resized(echoes, (6, 4, 1))[..., 0], echoes[:, :4])
+    for shape in ((3, 4, 1), (6, 11, 1), (6, 10, 3)):
+        with pytest.raises(LinkError, match="a picture of shape \\(6, 10\\) came"):
+            resized(echoes, shape)
+
+
 def test_compression_takes_fewer_bytes_and_keeps_gray_to_a_few_levels():
     """JPEG of a smooth picture: below half the bytes, within 4 levels."""
     raw, packed = (encode_picture(Picture(0.0, 0, SMOOTH), compress=c) for c in (False, True))

@@ -10,10 +10,12 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("newton")
 
 from finssim.experiments.plants import PlantError, load_plant
-from finssim.tasks import Environment, EnvironmentSetupError, make, sight
-from finssim.tasks.agents import LightServo, LineFollower, agent_for
+from finssim.tasks import SEEING, Environment, EnvironmentSetupError, make, sight
+from finssim.tasks.agents import LightServo, LineFollower, PostServo, WallFollower, agent_for
 from finssim.tasks.camera_docking import CameraDocking
 from finssim.tasks.check import check_task
+from finssim.tasks.gate import Gate, from_bar
+from finssim.tasks.net import Net
 from finssim.tasks.pipeline import Pipeline
 from finssim.tasks.task import kernels_of
 from finssim.vehicles import load_vehicle
@@ -115,6 +117,15 @@ def test_looks_that_are_held_out_are_drawn_only_there():
 def test_what_cannot_be_is_refused():
     with pytest.raises(EnvironmentSetupError, match="takes 0.61 m"):
         make("camera-docking", vehicle="bluerov2_heavy")
+    with pytest.raises(
+        EnvironmentSetupError, match="perception.altimeter measures ranges, expected a camera or"
+    ):
+        Environment(Pipeline(pictures=(sight.Picture("altimeter"),)), worlds=1)
+    four = load_vehicle("finsrov").replace({"perception.altimeter.device": "dvl_a50"})
+    with pytest.raises(
+        EnvironmentSetupError, match="perception.altimeter has no single beam, which task 'net'"
+    ):
+        make("net", vehicle=four)
     blind = load_vehicle("finsrov").replace({"perception": {}})
     with pytest.raises(ValueError, match="has no sensor 'front_camera'"):
         make("camera-docking", vehicle=blind)
@@ -203,7 +214,132 @@ def test_the_line_follower_finds_the_pipe_in_the_picture():
     assert np.degrees(np.median(np.abs(np.arctan(line[plain, 1]) - np.arctan(slope[plain])))) < 12.0
 
 
-@pytest.mark.parametrize("task", [CameraDocking(), Pipeline()], ids=lambda task: task.name)
+def stepped(task, position, yaw=0.0):
+    """Metrics and steps after one control step from rest at places in the goal's axes [m], (worlds, 3)."""
+    worlds = len(position)
+    env = Environment(task, worlds=worlds, seed=1, auto_reset=False)
+    goal, q = env.arrays.goal_position.numpy().copy(), env.arrays.goal_quaternion.numpy().copy()
+    world = Rotation.from_quat(q)
+    turned = (world * Rotation.from_euler("z", yaw)).as_quat()
+    env.start(goal + world.apply(position), turned, goal, q)
+    step = env.step(np.zeros((worlds, env.action_size)))
+    return env.task.metrics(env.arrays), step
+
+
+def test_a_gate_is_passed_between_its_posts_and_a_bar_is_touched_where_the_envelope_meets_it():
+    """Behind it in the middle, beside a post, at a post, turned into one, in front of it, below the posts' ends."""
+    task = Gate().for_teacher()
+    check_task(task)
+    half = 0.5 * load_vehicle("finsrov").body.size
+    reach = 0.75 - 0.045 - half[1]  # of the origin beside the axis, level and square to the gate
+    places = [
+        [0.3, 0, 0],
+        [0.02, 1.5, 0],
+        [0, reach + 0.01, 0],
+        [0, reach - 0.02, 0],
+        [-2, 0, 0],
+        [0.01, 0, -1.2],
+    ]
+    measured, step = stepped(task, places)
+    for name, ends in (
+        ("passed", [1, 0, 0, 0, 0, 0]),
+        ("missed", [0, 1, 0, 0, 0, 1]),
+        ("touched", [0, 0, 1, 0, 0, 0]),
+    ):
+        np.testing.assert_array_equal(np.where(step.terminated, measured[name], 0.0), ends, err_msg=name)
+    np.testing.assert_array_equal(step.terminated, [True, True, True, False, False, True])
+    turned, step = stepped(task, [[0, reach - 0.02, 0]], yaw=np.pi / 4)
+    assert turned["touched"][0] == 1.0  # its corners stand out farther
+
+
+def test_the_distance_of_a_bar_from_a_box_is_the_least_of_its_points():
+    """Against ten thousand points of each of 50 bars about a box, to what a cylinder's radius leaves of it."""
+    random, half = np.random.default_rng(2), np.array([0.28, 0.19, 0.15])
+    for a, b in random.uniform(-1.0, 1.0, (50, 2, 3)):
+        points = a + np.linspace(0.0, 1.0, 10_000)[:, None] * (b - a)
+        beyond = np.abs(points) - half
+        distance = np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
+        found = from_bar(wp.vec3(*a), wp.vec3(*b), wp.vec3(*half))
+        assert found == pytest.approx(distance.min() - 0.045, abs=1e-3)
+
+
+def test_the_post_servo_finds_the_gate_in_the_picture():
+    """Where it sees both posts, their middle is right to 10 % of the distance in the median, and the heading to 15°."""
+    env = Environment(Gate(), worlds=32, seed=6)
+    observation = env.reset()
+    servo = PostServo.for_vehicle(env.nominal[0])
+    middle, heading, visible = servo.measure(observation["front_camera"], observation["state"][:, :3])
+    q, x = env.simulator.state.quaternion.numpy()[:, 0], env.simulator.state.position.numpy()[:, 0]
+    body, gate = Rotation.from_quat(q), Rotation.from_quat(env.arrays.goal_quaternion.numpy())
+    truth = body.inv().apply(env.arrays.goal_position.numpy() - x) - servo.eye
+    error = np.linalg.norm(middle - truth, axis=1) / np.linalg.norm(truth, axis=1)
+    turned = (body.inv() * gate).as_euler("ZYX")[:, 0] - heading
+    assert visible.mean() > 0.5
+    assert np.median(error[visible]) < 0.1 and np.degrees(np.median(np.abs(turned[visible]))) < 15.0
+
+
+def test_along_a_net_the_row_has_the_range_below_and_the_picture_the_echoes_of_the_net():
+    """The range is the slant way to the tube at the net's foot, to 0.3 m; the line through the echoes is the net.
+
+    Both are those of now, at the start of an episode and after steps, of a sensor without latency; the last row of an
+    episode is kept with its range.
+    """
+    now = load_vehicle("finsrov").replace({"perception.altimeter.latency": 0.0})
+    env = Environment(Net(time_limit=0.5), now, worlds=12, seed=6)
+    follower = WallFollower.for_vehicle(env.nominal[0])
+    observation = env.reset()
+    for k in range(6):
+        x, net = env.simulator.state.position.numpy()[:, 0], env.arrays.goal_quaternion.numpy()
+        place = Rotation.from_quat(net).inv().apply(x - env.arrays.goal_position.numpy())
+        assert observation["sonar"].shape == (12, 128, 48, 1) and observation["sonar"].dtype == np.uint8
+        below = 5.0 * observation["state"][:, 9]
+        assert np.median(np.abs(below - np.hypot(place[:, 2] + 6.9, place[:, 0]) + 0.14)) < 0.3
+        np.testing.assert_allclose(below, np.minimum(env.arrays.ranges.numpy()[:, 0], 10.0), rtol=1e-6)
+        line, enough = follower.line(observation["sonar"])
+        away = line[:, 0] * np.cos(np.arctan(line[:, 1]))
+        assert enough.all() and np.median(np.abs(away + place[:, 0])) < 0.05
+        step = env.step(np.zeros((12, 4)))
+        observation = step.observation
+        if k == 4:
+            assert step.truncated.all() and step.final_observation["sonar"].any()
+            assert np.all(step.final_observation["state"][:, 9] != observation["state"][:, 9])
+
+
+def test_a_net_is_touched_with_the_nose_and_lost_beside_the_line():
+    """0.12 m before the net, where growth is; 0.8 m off the line; on it neither."""
+    task = Net().for_teacher()
+    check_task(task)
+    nose, level = 0.5 * load_vehicle("finsrov").body.size[0], task.level
+    places = [
+        [-nose - 0.13, 0, level],
+        [-nose - 0.11, 0, level],
+        [-1.5, 0, level],
+        [-2.32, 0, level],
+        [-1.5, 0, level + 0.82],
+    ]
+    measured, step = stepped(replace(task, lost=1.5), places[:3])
+    np.testing.assert_array_equal(step.terminated, [False, True, False])
+    assert measured["touched"][1] == 1.0
+    measured, step = stepped(task, places[2:])
+    np.testing.assert_array_equal(step.terminated, [False, True, True])
+    np.testing.assert_array_equal(measured["lost"][1:], 1.0)
+
+
+def test_who_follows_the_net_at_the_wrong_distance_has_not_inspected_it():
+    """The baseline that holds 1.5 m succeeds; the same one that holds 1.8 m covers the way, and does not."""
+    for distance, success in ((1.5, 1.0), (1.8, 0.0)):
+        env = Environment(Net(), worlds=4, seed=3, auto_reset=False)
+        follower = replace(WallFollower.for_vehicle(env.nominal[0]), distance=distance)
+        memory, observation = follower.reset(4), env.reset()
+        for _ in range(360):
+            action, memory = follower.act(memory, observation["state"], {"sonar": observation["sonar"]})
+            observation = env.step(action).observation
+        measured = env.task.metrics(env.arrays)
+        assert (measured["success"] == success).all() and not measured["lost"].any()
+        assert (measured["error"] < 0.1).all() == (success == 1.0)
+
+
+@pytest.mark.parametrize("task", [kind() for kind in SEEING.values()], ids=lambda task: task.name)
 def test_the_kernels_of_tasks_that_see_compile_for_cuda(task, tmp_path):
     """NVRTC, which needs no device, makes a binary for a compute capability of 7.5."""
     wp.init()

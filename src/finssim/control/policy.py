@@ -284,8 +284,8 @@ class Policy:
         Args:
             memory: From `reset`, or from the step before, with a row for each observation.
             observation: As `act` takes it.
-            pictures: What it sees by name, uint8 (rows, height, width, 3), a row for each observation; None where it
-                sees nothing.
+            pictures: What it sees by name, uint8 (rows, height, width, channels), a row for each observation; None
+                where it sees nothing.
 
         Returns:
             Actions as of `act`, and the memory after.

@@ -98,8 +98,7 @@ def _with_observed(picture: NDArray[np.uint8], environment: Environment) -> NDAr
     if environment.sight is None:
         return picture
     corner = 0
-    for observed in environment.sight.pictures.values():
-        small = observed.numpy()[0]
+    for small in environment.sight.shown(0).values():
         factor = max(1, round(picture.shape[1] / 4 / small.shape[1]))
         large = small.repeat(factor, 0).repeat(factor, 1)
         picture[corner : corner + large.shape[0], : large.shape[1]] = large

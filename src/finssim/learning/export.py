@@ -220,7 +220,7 @@ class _Graph:
 
 
 def write_seeing(network: Any, n: int, m: int) -> bytes:
-    """The ONNX file of a `SeeingNetwork`: beside `observation` each picture, uint8 (N, height, width, 3), by name."""
+    """The ONNX file of a `SeeingNetwork`: beside `observation` each picture, uint8 (N, *shape), by name."""
     graph = _Graph()
     scale = graph.weight(np.full((), 1.0 / 255.0, np.float32))
     features = ["observation"]

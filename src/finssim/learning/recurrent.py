@@ -51,7 +51,7 @@ class SeeingNetwork(nn.Module):
 
         Args:
             inputs: Numbers in the row.
-            shapes: Of the pictures by name: height, width, 3.
+            shapes: Of the pictures by name: height, width, channels.
             outputs: Numbers in the action.
             channels: Of the convolutions, 3x3 with stride 2 and ELU.
             features: Numbers that an encoder gives.
@@ -70,7 +70,7 @@ class SeeingNetwork(nn.Module):
         self.layers = stack(inputs + len(self.shapes) * features, hidden, outputs, 0.01)
 
     def encode(self, pictures: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Features of pictures, 0 to 255, (N, height, width, 3), side by side in the order of `shapes`."""
+        """Features of pictures, 0 to 255, (N, height, width, channels), side by side in the order of `shapes`."""
         kind = self.layers[0].weight.dtype
         scaled = {name: pictures[name].to(kind) / 255.0 for name in self.shapes}
         return torch.cat([self.encoders[name](x.permute(0, 3, 1, 2)) for name, x in scaled.items()], dim=1)

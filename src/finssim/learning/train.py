@@ -62,7 +62,8 @@ def train(
 
     Args:
         task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking,
-            pursuit, team-pursuit, formation or, with a camera, camera-docking or pipeline; or one's own, FILE.py:CLASS.
+            pursuit, team-pursuit, formation; with a camera camera-docking, pipeline or gate, with a sonar net; or one's
+            own, FILE.py:CLASS.
         out: Directory of the policy; an earlier policy there is replaced when done.
         learner (NAME): Who learns: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; one agent also torchrl-ppo,
             several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; tasks with pictures distill,

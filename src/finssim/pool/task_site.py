@@ -427,10 +427,10 @@ class TaskSite(Fleet):
             )
 
     def _eyes(self, vehicle: Vehicle, seed: int) -> OnboardSensors | None:
-        """The vehicle's own cameras that the task observes, in the world of its episode."""
+        """The vehicle's own sensors that the task observes, in the world of its episode."""
         if self.referee.world is None:
             return None
-        names = [picture.name for picture in self.task.pictures]
+        names = [*(picture.name for picture in self.task.pictures), *self.task.ranges]
         return OnboardSensors(vehicle, self.referee.world, names=names, seed=seed)
 
     def run(self, duration: float | None = None) -> dict[str, float]:

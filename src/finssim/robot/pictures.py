@@ -55,18 +55,22 @@ def picture_of(data: Image | bytes, *, colour: bool = False) -> Image | None:
 
 
 def resized(image: Image | None, shape: Sequence[int]) -> Image:
-    """A picture in another size, each pixel the mean of those that it covers.
+    """A picture in another size, each pixel the mean of those that it covers; of a sonar's the nearest range cells.
 
     Args:
-        image: In colour or gray.
-        shape: Rows, columns, and 3 of one in colour.
+        image: In colour, gray, or a sonar's echoes by beam and range cell.
+        shape: Rows, columns, and 3 of one in colour; of a sonar beams, range cells and 1.
 
     Raises:
         LinkError: It is none, or of another kind.
     """
+    if image is not None and image.ndim == 2 and len(shape) == 3:
+        cut = image[:, : shape[1], None]
+        if cut.shape == tuple(shape):
+            return cut
     if image is None or image.shape[2:] != tuple(shape[2:]):
         kind = "no picture" if image is None else f"a picture of shape {image.shape}"
-        raise LinkError(f"{kind} came where one of shape {tuple(shape)} is seen: name a camera of that kind")
+        raise LinkError(f"{kind} came where one of shape {tuple(shape)} is seen: name a sensor of that kind")
     if image.shape == tuple(shape):
         return image
     import cv2

@@ -75,7 +75,7 @@ class AgentPilot:
         period: Time between two decisions [s].
         observation: What was seen at the last decision; empty before the first.
         action: What was done, in [-1, 1]; empty before the first.
-        pictures: Shape of the pictures that the agent sees, by name.
+        pictures: Shape of what the agent sees, by name of the vehicle's sensor; () of a range in the observation.
         took: What the last decision of the agent took [s]; NaN before the first.
     """
 
@@ -93,12 +93,16 @@ class AgentPilot:
             agent: Made for the vehicle.
             vehicle: Its thrusters are commanded.
             observer: Of the task that the agent does; None where it sees no observation.
-            pictures: Shape (height, width, 3) of the pictures that it sees, by the name of the vehicle's sensor.
+            pictures: Shape of the pictures that it sees, by the name of the vehicle's sensor: (height, width, 3), of a
+                sonar (beams, range cells, 1).
 
         Raises:
             ControlError: The vehicle has no such sensor.
         """
+        task = None if observer is None else observer.task
         self.pictures = {name: tuple(shape) for name, shape in (pictures or {}).items()}
+        self._ranges = () if task is None else task.ranges
+        self.pictures |= dict.fromkeys(self._ranges, ())
         for name in self.pictures:
             if name not in vehicle.perception:
                 raise ControlError(
@@ -107,7 +111,6 @@ class AgentPilot:
                 )
         self.agent, self.observer, self.period, self.name = agent, observer, agent.period, agent.name
         self.mode = action_mode(agent.action, vehicle, agent.wrench_scale)
-        task = None if observer is None else observer.task
         reach = task.approach * task.fit.size if hasattr(task, "approach") else math.inf
         self.reach = reach * (BY_AXES if self.mode.pilot else 1.0)
         """Goals farther away than this are shown so far ahead on the way to them [m]."""
@@ -156,14 +159,18 @@ class AgentPilot:
         seen = {
             name: resized(reading.pictures[name].image, shape)[None]  # type: ignore[attr-defined]
             for name, shape in self.pictures.items()
+            if shape
         }
+        ranges = [reading.pictures[name].ranges[0] for name in self._ranges]  # type: ignore[attr-defined]
         if self._input_noise:
             moved = reading.position + self._random.normal(0.0, self._input_noise["position_std_m"], 3)
             turn = quat_from_yaw(self._random.normal(0.0, self._input_noise["yaw_std_rad"]))
             reading = Track(moved, quat_multiply(turn, reading.quaternion), np.asarray(reading.nu, float))
         if self.observer is not None:
             previous = self.action if self.action.size else None
-            self.observation = self.observer.observe(reading, guide, t, previous, self.reach, self.turn)
+            self.observation = self.observer.observe(
+                reading, guide, t, previous, self.reach, self.turn, ranges
+            )
         rows = [self.observation[None], *(np.asarray(x, float)[None] for x in _state(reading))]
         known = Known(*rows, pictures=seen or None)
         goal = goal_at(guide, t)
@@ -324,13 +331,7 @@ def make_pilot(
 
 def _shapes(task: Task, vehicle: Vehicle) -> dict[str, tuple[int, int, int]]:
     """Shapes of the pictures that a task observes, by name."""
-    from finssim.worlds import device_of
-
-    shapes = {}
-    for picture in task.pictures:
-        lens = device_of(vehicle, picture.name).lens(picture.width)
-        shapes[picture.name] = lens.height, lens.width, 3
-    return shapes
+    return {picture.name: picture.shape(vehicle) for picture in task.pictures}
 
 
 def _state(reading: Measured) -> tuple[Any, Any, Any]:

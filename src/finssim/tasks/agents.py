@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,9 +33,11 @@ from finssim.tasks.docking import Docking
 from finssim.tasks.environment import Environment
 from finssim.tasks.fitting import coefficients_of
 from finssim.tasks.formation import NEAR, Formation
+from finssim.tasks.gate import HALF, Gate
 from finssim.tasks.given import Step
 from finssim.tasks.moving_target import DISTANCE_SCALE as TARGET_DISTANCE_SCALE
 from finssim.tasks.moving_target import TARGET_SCALE
+from finssim.tasks.net import RANGE_SCALE, Net
 from finssim.tasks.pipeline import Pipeline
 from finssim.tasks.pursuit import DISTANCE_SCALE as CHASE_SCALE
 from finssim.tasks.pursuit import PI, DriveNumbers
@@ -580,17 +582,86 @@ class LightServo(DockingPid):
                 number = np.maximum(own.sum((1, 2)), 1)
                 corners.append([(own * grid).sum((1, 2)) / number for grid in (columns, rows)])
                 visible &= own.any((1, 2))
-        focal = self.focal_share * red.shape[2]
-        x, y = np.moveaxis(
-            np.array(corners), 1, 0
-        )  # (4, n): upper left, upper right, lower left, lower right
+        return self.locate(np.array(corners), visible, red.shape[1:])
+
+    def locate(
+        self, corners: Array, visible: NDArray[np.bool_], shape: Sequence[int]
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """The upright square in space.
+
+        Args:
+            corners: Column and row of its upper left, upper right, lower left and lower right corner [px], (4, 2, n).
+            visible: Where all four are in the picture, (n,).
+            shape: Height and width of the picture [px].
+
+        Returns:
+            As `measure`.
+        """
+        x, y = np.moveaxis(corners, 1, 0)
+        focal = self.focal_share * shape[1]
         left, right = (focal * self.side / np.maximum(y[i + 2] - y[i], 0.5) for i in (0, 1))
-        visible &= (y[2] - y[0] > 3.0) & (y[3] - y[1] > 3.0) & (x[1] - x[0] > 3.0)
+        visible = visible & (y[2] - y[0] > 3.0) & (y[3] - y[1] > 3.0) & (x[1] - x[0] > 3.0)
         ahead = 0.5 * (left + right)
-        aside = (0.5 * (red.shape[2] - 1) - x.mean(0)) / focal
-        above = (0.5 * (red.shape[1] - 1) - y.mean(0)) / focal
+        aside = (0.5 * (shape[1] - 1) - x.mean(0)) / focal
+        above = (0.5 * (shape[0] - 1) - y.mean(0)) / focal
         heading = np.arcsin(np.clip((right - left) / self.side, -0.7, 0.7))
         return ahead[:, None] * np.column_stack([np.ones_like(aside), aside, above]), heading, visible
+
+
+# Passing a gate the classical way: its posts are what is redder and greener than the rest of a row, in one column.
+
+
+@dataclass(frozen=True)
+class PostServo(LightServo):
+    """`LightServo` through a gate, whose posts are the sides of the upright square: the left red, the right green.
+
+    A post is the column with the most of its colour above the median of each row; where both are in the picture from
+    head to foot their lengths give distance and heading.
+    """
+
+    side: float = 1.5
+    before: float = 0.0
+    least: float = 60.0
+    """Levels of its colour that a post has in its column, all rows together."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> PostServo:
+        """For a vehicle with a `front_camera`, the gate of the site `gate`, and the time between two actions [s]."""
+        task = Gate().fitted([vehicle])
+        device = device_of(vehicle, task.pictures[0].name)
+        length = task.hull.length
+        return cls(
+            WrenchPid.for_vehicle(vehicle, period).pid,
+            nose=0.5 * length,
+            berth=2.0 * length,
+            wait=-2.0 * length,
+            gap=0.4 * float(HALF),
+            slope=0.5,
+            lead=0.6 * length,
+            focal_share=device.focal_length / device.width,
+            eye=tuple(device.mount.position.tolist()),
+        )
+
+    def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """The square between the posts; see `LightServo`."""
+        red, green, blue = np.moveaxis(picture.astype(float), -1, 0)
+        n, height, width = red.shape
+        ends, visible = [], np.ones(n, bool)
+        for post in (red - np.maximum(green, blue), green - np.maximum(red, blue)):
+            post = post - np.median(post, axis=2, keepdims=True)
+            post = np.maximum(post - 2.0 * np.median(np.abs(post), axis=(1, 2), keepdims=True), 0.0)
+            best = np.clip(post.sum(1).argmax(1), 1, width - 2)
+            near = best[:, None] + np.arange(-1, 2)
+            strip = np.take_along_axis(post, near[:, None], 2)  # three columns around the post
+            share = strip.sum(1)
+            total, profile = share.sum(1), strip.sum(2)
+            lit = profile > 0.3 * profile.max(1, keepdims=True)
+            top, foot = lit.argmax(1), height - 1 - lit[:, ::-1].argmax(1)
+            visible &= (total > self.least) & (top > 0) & (foot < height - 1)
+            column = (share * near).sum(1) / np.maximum(total, 1e-9)
+            ends.append([[column, top - 0.5], [column, foot + 0.5]])
+        (left, right) = ends
+        return self.locate(np.array([left[0], right[0], left[1], right[1]]), visible, (height, width))
 
 
 # Following a pipeline the classical way: a line through what is yellower than its surroundings, and steer along it.
@@ -688,6 +759,110 @@ class LineFollower(DriveBaseline):
         return np.column_stack([mean_y - slope * mean_x, slope]), total > self.least
 
 
+# Along a net the classical way: a line through the loudest echo of each beam, and the altimeter for the height.
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallFollower(DriveBaseline):
+    """Fits a straight line to the loudest echo of each beam, turns square to it and goes along it to the left.
+
+    The fit is repeated with less weight on what is far off the line, as fish are. The altimeter hears the tube at the
+    net's foot, whose slant range and the distance give the height; a range that does not fit is left out.
+    """
+
+    speed: float
+    """Along the net [m/s]."""
+    distance: float
+    """From it [m]."""
+    height: float
+    """Above its foot [m]."""
+    sector: float
+    """Of the sonar [rad]."""
+    bin_length: float
+    """[m]"""
+    eye: tuple[float, float, float]
+    """Of the sonar, body axes [m]."""
+    under: float
+    """Of the altimeter below the body origin [m]."""
+    least: float = 60.0
+    """Level of an echo in the picture that counts."""
+    beams: int = 12
+    """Beams with such an echo, below which the last line is kept."""
+    tube: float = 0.14
+    """Radius of the tube at the net's foot [m]."""
+    gain: float = 0.5
+    """Speed per distance [1/s]."""
+    memory_share: float = 0.5
+    """Of the line before, in the next estimate."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> WallFollower:
+        """For a vehicle with `sonar` and `altimeter`, and the site `net`."""
+        task = Net()
+        sonar: Any = task.pictures[0].device(vehicle)
+        altimeter = device_of(vehicle, task.ranges[0])
+        return cls(
+            drive=DriveNumbers.of(vehicle), speed=task.speed, distance=task.distance, height=task.height,
+            sector=sonar.sector, bin_length=sonar.range / sonar.bins, eye=tuple(sonar.mount.position.tolist()),
+            under=-float(altimeter.mount.position[2]),
+        )  # fmt: skip
+
+    def reset(self, n: int) -> Array:  # type: ignore[override]
+        """The net square ahead at its distance, (n, 2)."""
+        return np.tile([self.distance, 0.0], (n, 1))
+
+    def act(  # type: ignore[override]
+        self, memory: Array, observation: NDArray[np.float32], pictures: Mapping[str, NDArray[np.uint8]]
+    ) -> tuple[NDArray[np.float32], Array]:
+        """Actions for observations and pictures of inspecting a net."""
+        o = np.asarray(observation, float)
+        line, enough = self.line(next(iter(pictures.values())))
+        share = np.where(enough, 1.0 - self.memory_share, 0.0)[:, None]
+        line = memory + share * (line - memory)
+        turn = -np.arctan(line[:, 1])
+        away = line[:, 0] * np.cos(turn)
+        slant = RANGE_SCALE * o[:, 9] + self.tube
+        above = np.sqrt(np.maximum(slant**2 - away**2, 0.0)) + self.under - self.height
+        towards = np.clip(self.gain * (away - self.distance), -0.15, 0.15)
+        wanted = np.column_stack(
+            [
+                towards * np.cos(turn) - self.speed * np.sin(turn),
+                towards * np.sin(turn) + self.speed * np.cos(turn),
+                np.where(np.abs(above) < 1.0, np.clip(-self.gain * above, -0.1, 0.1), 0.0),
+                self.drive.turned(turn),
+            ]
+        )
+        return self.drive.action(o[:, [3, 4, 5, 8]], wanted), line
+
+    def line(self, picture: NDArray[np.uint8]) -> tuple[Array, NDArray[np.bool_]]:
+        """The net in pings.
+
+        Args:
+            picture: uint8 (n, beams, range cells, 1).
+
+        Returns:
+            How far ahead of the body origin it crosses the x axis [m], and how much farther it is per metre to the
+            left, (n, 2); where enough beams hear it, (n,).
+        """
+        levels = picture[..., 0].astype(float)
+        count = levels.shape[1]
+        azimuth = self.sector * (0.5 - (np.arange(count) + 0.5) / count)
+        r = (levels.argmax(2) + 0.5) * self.bin_length
+        heard = (levels.max(2) >= self.least).astype(float)
+        x, y = r * np.cos(azimuth) + self.eye[0], r * np.sin(azimuth)
+        weight = heard
+        for _ in range(6):
+            total = np.maximum(weight.sum(1), 1e-9)
+            mean_x, mean_y = (weight * x).sum(1) / total, (weight * y).sum(1) / total
+            dy = y - mean_y[:, None]
+            slope = (weight * dy * x).sum(1) / np.maximum((weight * dy * dy).sum(1), 1e-9)
+            slope = np.clip(slope, -1.0, 1.0)
+            ahead = mean_x - slope * mean_y
+            rest = x - ahead[:, None] - slope[:, None] * y
+            weight = heard / (1.0 + (rest / 0.1) ** 2)
+        return np.column_stack([ahead, slope]), heard.sum(1) >= self.beams
+
+
 class BaselineError(ValueError):
     """A baseline that does not exist."""
 
@@ -699,6 +874,8 @@ BASELINES: dict[str, dict[str, Callable[..., Baseline]]] = {
     "docking": {"align-insert": DockingPid.for_vehicle},
     "camera-docking": {"light-servo": LightServo.for_vehicle},
     "pipeline": {"line-follower": LineFollower.for_vehicle},
+    "gate": {"post-servo": PostServo.for_vehicle},
+    "net": {"wall-follower": WallFollower.for_vehicle},
     "pursuit": {"lead": LeadPursuit.for_vehicle},
     "team-pursuit": {"formation": FormationPursuit.for_vehicle},
     "formation": {"consensus": ConsensusFormation.for_vehicle},

@@ -123,6 +123,9 @@ class TaskArrays:
     position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured: the truth, or the truth with noise
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
+    ranges: wp.array2d(
+        dtype=float
+    )  # (worlds, task.ranges), as measured [m]; infinite where nothing is in reach
     privileged: wp.array2d(dtype=float)  # (worlds, agents * P): what was drawn, from nominal, unit scale
     final_privileged: wp.array2d(dtype=float)  # the same of the episode that ended last
 

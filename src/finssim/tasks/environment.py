@@ -237,6 +237,11 @@ class Environment:
             self._add_start(self._restart, self.arrays.done)
         self._start = self.simulator.pipeline()
         self._add_start(self._start, self._mask)
+        self._look = self.simulator.pipeline()
+        """Of a task whose row has ranges, which are measured after the step."""
+        if self.task.ranges and self.sight is not None:
+            everywhere = wp.ones(self.worlds, dtype=wp.int32, device=self.device)
+            self.task.add_observe(self._look, batch, everywhere)
 
     def _add_measure(self, pipeline: Any, mask: wp.array | None = None) -> None:
         """Append what is seen: after a step, or where an episode starts and mask is not 0."""
@@ -289,6 +294,7 @@ class Environment:
         pipeline.run()
         if self.sight is not None:
             self.sight.begin(mask)
+            self._look.run()
 
     def _observed(self, which: str) -> Any:
         """Observations, or with which = `final_` the last of the episodes that ended last; views."""
@@ -353,6 +359,7 @@ class Environment:
             self.schedule.after_step()
         if self.sight is not None:
             self.sight.take()
+            self._look.run()
             ended = self.arrays.done.numpy() != 0
             if ended.any():
                 self.sight.keep(ended)

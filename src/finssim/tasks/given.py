@@ -26,7 +26,8 @@ class Step:
 
     observation: Any
     """(worlds, size), or (worlds, agents, size) of several agents; the first of the new episode where one ended. Of a
-    task that sees a dictionary: `state`, which is that, and uint8 (worlds, height, width, 3) by each picture's name."""
+    task that sees a dictionary: `state`, which is that, and by each picture's name uint8 (worlds, height, width, 3),
+    or of a sonar (worlds, beams, range cells, 1)."""
     reward: NDArray[np.float32]
     """(worlds,), or (worlds, agents)."""
     terminated: NDArray[np.bool_]

@@ -16,8 +16,10 @@ from finssim.tasks.camera_docking import CameraDocking
 from finssim.tasks.docking import Docking
 from finssim.tasks.environment import Environment, EnvironmentSetupError
 from finssim.tasks.formation import Formation
+from finssim.tasks.gate import Gate
 from finssim.tasks.measurement import ESTIMATOR, MeasurementNoise
 from finssim.tasks.moving_target import MovingTarget
+from finssim.tasks.net import Net
 from finssim.tasks.pipeline import Pipeline
 from finssim.tasks.pursuit import Pursuit
 from finssim.tasks.sensing import Sensing, load_sensing
@@ -124,7 +126,12 @@ def _of_import(name: str) -> ModuleType:
         raise EnvironmentSetupError(f"module '{name}' cannot be imported: {error}") from error
 
 
-SEEING: dict[str, type[Task]] = {"camera-docking": CameraDocking, "pipeline": Pipeline}
+SEEING: dict[str, type[Task]] = {
+    "camera-docking": CameraDocking,
+    "pipeline": Pipeline,
+    "gate": Gate,
+    "net": Net,
+}
 """Every task that observes pictures, which needs `finssim[perception]`; otherwise as `TASKS`."""
 
 

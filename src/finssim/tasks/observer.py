@@ -114,6 +114,7 @@ class Observer:
         previous: ArrayLike | None = None,
         reach: float = math.inf,
         turn: float = math.inf,
+        ranges: Sequence[float] = (),
     ) -> NDArray[np.float32]:
         """The observation, (schema.size,).
 
@@ -124,6 +125,7 @@ class Observer:
             previous: The action before, in [-1, 1], (size,), for tasks that look at it; zeros if None.
             reach: A goal farther away than this is seen as one so far ahead on the straight way to it [m].
             turn: A heading farther away than this is seen as one so far round on the way to it [rad].
+            ranges: Of the sensors in the task's `ranges` [m].
 
         Raises:
             ControlError: The place of a vehicle that the task needs is not known.
@@ -148,6 +150,7 @@ class Observer:
             a.target.velocity.numpy()[0] = now.velocity
         self._put(self._place, reading.position, reading.quaternion, reading.nu)
         self._put_others(getattr(reading, "tracks", {}), now)
+        a.ranges.numpy()[0, : len(ranges)] = ranges
         self._pipeline.run()
         rows: NDArray[np.float32] = a.observation.numpy()[0].reshape(len(self.task.agents), -1)
         return rows[self._place].copy()

@@ -58,6 +58,8 @@ class Task:
     """Site that its vehicle sees, of the catalogue or a file; empty: nothing."""
     pictures: ClassVar[tuple[Picture, ...]] = ()
     """What is observed beside the row of numbers."""
+    ranges: ClassVar[tuple[str, ...]] = ()
+    """Altimeters and rangefinders of the vehicle's `perception` whose range the row has, as `arrays.ranges[w, i]`."""
     landmark: ClassVar[str] = ""
     """Object of the world whose pose is the goal's."""
     held_out: ClassVar[bool] = False
@@ -175,7 +177,7 @@ class Task:
         out: TaskArrays = allocated(
             TaskArrays, worlds, device, action=action, previous_action=action, observation=observation, taught=taught,
             final_observation=observation, scripted=len(self.others) * action_size, agent_reward=agents, totals=totals,
-            final_totals=totals, earned=earned, final_earned=earned,
+            final_totals=totals, earned=earned, final_earned=earned, ranges=len(self.ranges),
         )  # fmt: skip
         out.action_size = action_size
         if agents == 1:

@@ -32,7 +32,7 @@ TASK = CameraDocking(time_limit=2.0)
 
 def test_a_network_that_sees_is_the_same_in_onnx():
     torch.manual_seed(0)
-    network = SeeingNetwork(5, {"left": (9, 14, 3), "right": (6, 6, 3)}, 4)
+    network = SeeingNetwork(5, {"left": (9, 14, 3), "right": (6, 6, 3), "sonar": (12, 9, 1)}, 4)
     torch.nn.init.normal_(network.layers[-1].weight, std=0.2)
     random = np.random.default_rng(1)
     row = random.normal(size=(7, 5)).astype(np.float32)

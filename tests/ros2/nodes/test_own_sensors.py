@@ -21,7 +21,7 @@ from finssim.pool.pictures import UdpSender
 from finssim.robot.messages import Picture
 from finssim.ros2.nodes.camera import Camera
 from finssim.ros2.nodes.controller import MOST_PICTURES, Controller
-from finssim.ros2.nodes.conversions import RosMessages, image_of, nanoseconds, ros_type, xyz
+from finssim.ros2.nodes.conversions import RosMessages, image_of, nanoseconds, own_reading, ros_type, xyz
 from finssim.ros2.nodes.frames import mounts
 from finssim.ros2.topics import own_topics, quality_profile
 from finssim.vehicles import load_vehicle
@@ -104,6 +104,18 @@ def test_an_altimeter_tells_range_and_reach():
     nothing = made(replace(READINGS[2], ranges=np.array([np.inf], np.float32)))["range"]
     assert nothing.range == math.inf
     assert MAKE.of_own(STAMP, Picture(0.0, 1, source="stranger")) == {}
+
+
+def test_what_the_messages_of_own_sensors_tell_is_what_was_measured():
+    """Pictures, echoes and ranges bit for bit; what is none is nothing."""
+    for reading, key in zip(READINGS[:3], ("image", "sonar", "range"), strict=True):
+        told = own_reading(made(reading)[key])
+        for field in ("image", "ranges"):
+            sent, heard = getattr(reading, field), getattr(told, field)
+            assert (sent is None) == (heard is None) and (sent is None or np.array_equal(heard, sent))
+    cut, nothing = made(READINGS[1])["sonar"], made(READINGS[2])["range"]
+    cut.image.beam_count, nothing.range = 127, math.nan
+    assert own_reading(cut) is None and own_reading(nothing) is None
 
 
 @pytest.mark.slow

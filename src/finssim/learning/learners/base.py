@@ -49,6 +49,8 @@ SETTINGS: Table = {
     "docking": {"ppo": {"steps": 900_000}},
     # Its teacher succeeds in all episodes after a quarter of these steps, and its student after half of them.
     "pipeline": {"distill": {"teacher_steps": 600_000, "steps": 60_000}, **SEEN},
+    "gate": {"distill": {"teacher_steps": 600_000}, **SEEN},
+    "net": {"distill": {"teacher_steps": 600_000, "steps": 40_000}, **SEEN},
     "camera-docking": SEEN,
     "pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "teacher": "lead"}},
     # With 1.5 million, half of the seeds have only begun to capture.
@@ -86,6 +88,8 @@ RANDOMIZED: Table = {
     },
     "t3": {"ppo": {"steps": 1_500_000}},
     "docking": {"ppo": {"steps": 2_000_000}},
+    # In `open_water` its student succeeds in all episodes after half of these steps.
+    "camera-docking": {"distill": {"teacher_steps": 1_500_000, "steps": 60_000}},
     "pursuit": {"ppo": {"steps": 1_500_000}, "on-policy": {"steps": 2_500_000}},
     "team-pursuit": {"ppo": {"steps": 3_000_000}, "on-policy": {"steps": 6_000_000}},
     "formation": {"ppo": {"steps": 3_000_000}, "on-policy": {"steps": 4_000_000}},

@@ -48,7 +48,7 @@ class DistillSettings:
     auxiliary: float = 0.3
     """Weight of the squared error of the predicted teacher's row."""
     colour: float = 0.3
-    """How far colours of the pictures are varied while it learns: other waters do so much more."""
+    """How far colours and levels of the pictures are varied while it learns: other waters do so much more."""
     hidden: tuple[int, ...] = (128, 64)
     """Units of the layers behind the encoder, ELU."""
 
@@ -56,19 +56,24 @@ class DistillSettings:
 def varied(pictures: torch.Tensor, amount: float) -> torch.Tensor:
     """Pictures as other water, light and cameras might have them: each is given its own change of colours.
 
-    Channels are mixed, the level rises or falls from top to bottom, contrast is bent by a power, and noise is added.
+    Channels are mixed, the level rises or falls from top to bottom, of a sonar's from left to right, contrast is bent
+    by a power, and noise is added.
 
     Args:
-        pictures: uint8 (N, height, width, 3).
+        pictures: uint8 (N, height, width, channels).
         amount: Standard deviation of the changes [-].
 
     Returns:
         float32 of the same shape, 0 to 255.
     """
-    n, rows = pictures.shape[:2]
+    n, rows, _, channels = pictures.shape
     draw = {"device": pictures.device, "dtype": torch.float32}
-    mix = torch.eye(3, **draw) + amount * torch.randn(n, 3, 3, **draw)
-    slope = amount * torch.randn(n, 1, 1, 3, **draw) * torch.linspace(-0.5, 0.5, rows, **draw)[:, None, None]
+    mix = torch.eye(channels, **draw) + amount * torch.randn(n, channels, channels, **draw)
+    slope = (
+        amount
+        * torch.randn(n, 1, 1, channels, **draw)
+        * torch.linspace(-0.5, 0.5, rows, **draw)[:, None, None]
+    )
     x = (pictures.flatten(1, 2) / 255.0 @ mix).view(pictures.shape) + slope
     x = x.clamp(1e-3, 1.0) ** torch.exp(amount * torch.randn(n, 1, 1, 1, **draw))
     return 255.0 * (x + 0.1 * amount * torch.randn(pictures.shape, **draw)).clamp(0.0, 1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -20,7 +21,7 @@ from finssim.robot.messages import Picture
 from finssim.robot.pilots import AgentPilot, ModeSwitch, WrenchPilot, make_pilot
 from finssim.robot.reading import Reading
 from finssim.robot.runtime import Runtime
-from finssim.ros2.nodes.conversions import image_of, station_of_pose, trajectory_of, wrench_of
+from finssim.ros2.nodes.conversions import own_reading, station_of_pose, trajectory_of, wrench_of
 from finssim.ros2.nodes.remote import RemoteBridge, RemoteState
 from finssim.ros2.nodes.robot_node import RobotNode
 
@@ -149,8 +150,9 @@ class Controller(RobotNode):
         self.hears("trajectory", self._on_trajectory)
         self.hears("mode", self._on_mode)
         self._seen: list[Picture] = []
-        for name in self.modes.switch.pictures:
-            self.hears(f"{name}/image", partial(self._on_image, name))
+        for name, shape in self.modes.switch.pictures.items():
+            kind = "range" if not shape else "sonar" if shape[-1] == 1 else "image"
+            self.hears(f"{name}/{kind}", partial(self._on_own, name))
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
         self.create_timer(1.0, self._tell)
 
@@ -173,12 +175,13 @@ class Controller(RobotNode):
         if self.runtime.counters.decisions > before:
             self.send("policy", self.modes.told(self.ns(now), self.runtime))
 
-    def _on_image(self, name: str, message: Any) -> None:
-        """A picture of the vehicle's own camera, for a policy that sees it; what is none is left out."""
-        image = image_of(message, colour=True)
-        if image is not None:
+    def _on_own(self, name: str, message: Any) -> None:
+        """A reading of the vehicle's own sensor, for a policy that sees it; what is none is left out."""
+        reading = own_reading(message)
+        if reading is not None:
             late = self.vehicle.perception[name].latency
-            self._seen.append(Picture(self.seconds(message.header.stamp) + late, 0, image, source=name))
+            time = self.seconds(message.header.stamp) + late
+            self._seen.append(replace(reading, time=time, source=name))
             del self._seen[:-MOST_PICTURES]
 
     def _follow(self, guide: Guide) -> None:

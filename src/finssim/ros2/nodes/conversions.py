@@ -194,6 +194,20 @@ def image_of(message: Any, *, colour: bool = False) -> npt.NDArray[np.uint8] | N
     return np.round(pixels @ weights).astype(np.uint8)
 
 
+def own_reading(message: Any) -> Picture | None:
+    """The reading in an Image, a ProjectedSonarImage or a Range, without its time; None where it is none."""
+    if hasattr(message, "beam_directions"):
+        beams, echoes = message.image.beam_count, np.frombuffer(memoryview(message.image.data), np.uint8)
+        if message.image.dtype != 0 or beams == 0 or len(echoes) == 0 or len(echoes) % beams:
+            return None
+        return Picture(0.0, 0, np.ascontiguousarray(echoes.reshape(-1, beams).T))
+    if hasattr(message, "max_range"):
+        distance = np.array([message.range], np.float32)
+        return None if np.isnan(distance[0]) else Picture(0.0, 0, ranges=distance)
+    image = image_of(message, colour=True)
+    return None if image is None else Picture(0.0, 0, image)
+
+
 def compressed_of(message: Any) -> npt.NDArray[np.uint8] | None:
     """The gray picture in a CompressedImage; None where it is none."""
     return picture_of(np.frombuffer(memoryview(message.data), np.uint8))

@@ -1,0 +1,226 @@
+"""Passing a gate by camera: between its posts and below its bar, from the front, without touching them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import warp as wp
+
+from finssim.engine import Pool
+from finssim.engine.state import State
+from finssim.physics.solids import box_distance
+from finssim.physics.types import vec6
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.camera_docking import OWN
+from finssim.tasks.docking import Hull
+from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.sight import Picture
+from finssim.tasks.task import Task
+from finssim.tasks.terms import End, ObservationPart, RewardTerm, Terms, own_velocity, tilted, world_velocity
+from finssim.vehicles import Vehicle
+
+HALF, BAR = wp.constant(0.75), wp.constant(0.045)
+"""Half the width and height of the gates of the site `gate`, and the radius of their bars [m]."""
+
+
+@wp.func
+def in_gate(state: State, arrays: TaskArrays, w: int) -> wp.vec3:
+    """The body origin from the gate's middle, gate axes: x through it, z up [m]."""
+    return wp.quat_rotate_inv(arrays.goal_quaternion[w], state.position[w, 0] - arrays.goal_position[w])
+
+
+@wp.func
+def from_bar(a: wp.vec3, b: wp.vec3, half: wp.vec3) -> float:
+    """Between a box and a straight bar [m]: the box's signed distance is convex along it, so thirds of it are left out.
+
+    Args:
+        a: One end, box axes [m].
+        b: The other [m].
+        half: Half extents of the box [m].
+    """
+    low = float(0.0)
+    high = float(1.0)
+    best = float(1.0e9)
+    for _ in range(20):
+        s = low + (high - low) / 3.0
+        t = high - (high - low) / 3.0
+        near = box_distance(a + s * (b - a), half)[3]
+        far = box_distance(a + t * (b - a), half)[3]
+        best = wp.min(best, wp.min(near, far))
+        if near < far:
+            high = t
+        else:
+            low = s
+    return best - BAR
+
+
+@wp.func
+def clearance(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -> float:
+    """Between the vehicle's envelope and the nearest bar [m]; negative where it touches."""
+    q = wp.quat_inverse(arrays.goal_quaternion[w]) * state.quaternion[w, 0]
+    foot = wp.quat_rotate_inv(q, wp.vec3(0.0, HALF, -HALF) - place)
+    left = wp.quat_rotate_inv(q, wp.vec3(0.0, HALF, HALF) - place)
+    right = wp.quat_rotate_inv(q, wp.vec3(0.0, -HALF, HALF) - place)
+    other = wp.quat_rotate_inv(q, wp.vec3(0.0, -HALF, -HALF) - place)
+    posts = wp.min(from_bar(foot, left, p.half), from_bar(other, right, p.half))
+    return wp.min(posts, from_bar(left, right, p.half))
+
+
+@wp.func
+def approach(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -> float:
+    """Speed towards a point behind the gate's middle as a part of `cruise`, at most 1."""
+    v = wp.quat_rotate_inv(arrays.goal_quaternion[w], world_velocity(state, w, 0))
+    way = wp.normalize(wp.vec3(p.behind + 0.5, 0.0, 0.0) - place)
+    return wp.clamp(wp.dot(v, way) / p.cruise, -1.0, 1.0)
+
+
+@wp.func
+def off_axis(p: Any, place: wp.vec3) -> float:
+    """How far the vehicle is outside the cone that leads to the gate's middle [m]."""
+    return wp.max(wp.length(wp.vec2(place[1], place[2])) - 0.1 - 0.4 * wp.max(-place[0], 0.0), 0.0)
+
+
+@wp.func
+def is_lost(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -> bool:
+    """Half a length from the surface or the floor, or farther from the gate than an episode can need."""
+    z = state.position[w, 0][2]
+    margin = 0.5 * p.hull.length
+    return z > -margin or z < margin - p.depth or wp.length(place) > p.begin[1] + 2.5
+
+
+@wp.func
+def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """At rest before the gate, beside its axis and turned a little; without a world the gate stands anywhere."""
+    rng = wp.rand_init(key, w)
+    yaw = wp.randf(rng, -3.14159265, 3.14159265)
+    z = wp.randf(rng, -0.625 * p.depth, -0.4375 * p.depth)
+    if not p.placed:
+        arrays.goal_position[w] = wp.vec3(0.0, 0.0, z)
+        arrays.goal_quaternion[w] = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
+    q = arrays.goal_quaternion[w]
+    way = wp.randf(rng, p.begin[0], p.begin[1])
+    off = wp.vec3(-way, way * wp.randf(rng, -p.aside, p.aside), wp.randf(rng, -p.over, p.over))
+    state.position[w, 0] = arrays.goal_position[w] + wp.quat_rotate(q, off)
+    roll = wp.randf(rng, -p.tilt, p.tilt)
+    pitch = wp.randf(rng, -p.tilt, p.tilt)
+    state.quaternion[w, 0] = q * tilted(roll, pitch, wp.randf(rng, -p.turn, p.turn))
+    state.velocity[w, 0] = vec6()
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateReward:
+    """Weights of the reward; d: how far the vehicle is off the cone before the gate [m], θ: the attitude error [rad].
+
+    r = progress · min(speed towards a point behind the gate / cruise, 1) - corridor · d - turn · θ
+        - near · max(1 - clearance / near_scale, 0) - action · mean(a²) - change · mean(Δa²) - rate · min(|ω|², 4)
+        + passed - loss, once, behind the gate; where a bar is touched, or the gate or the water is left beside
+    """
+
+    progress: float = 1.0
+    corridor: float = 1.0
+    turn: float = 0.3
+    near: float = 1.0
+    near_scale: float = 0.2
+    action: float = 0.02
+    change: float = 0.05
+    rate: float = 0.02
+    passed: float = 10.0
+    loss: float = 20.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gate(Task):
+    """Pass the nearer gate of the site `gate`, which stands, looks and is lit otherwise in each episode.
+
+    A bar is touched where the vehicle's envelope meets it; that ends the episode, so no force is needed.
+    """
+
+    succeeds: ClassVar[str] = "passed"
+    title: ClassVar[str] = "pass a gate by camera"
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
+    landmark: ClassVar[str] = "near"
+    teacher: ClassVar[tuple[ObservationPart, ...]] = (
+        ObservationPart("way to the gate's middle, body frame", 3, "m", scale=3.0, term="goal_offset"),
+        ObservationPart("gate rotation relative to the body, first two columns", 6, "1", term="goal_columns"),
+        *own_velocity(clip=2.0),
+    )
+    name: str = "gate"
+    observation: tuple[ObservationPart, ...] = OWN
+    world: str = "gate"
+    pictures: tuple[Picture, ...] = (Picture("front_camera", 48),)
+    held_out: bool = False
+    """Draw the looks of the site that are held out of training."""
+    time_limit: float = 25.0
+    hull: Hull = Hull()
+    """Of the vehicle; the environment sets it, ..."""
+    half: tuple[float, float, float] = (0.28, 0.19, 0.15)
+    """... and half the extents of its envelope, which the body origin is the middle of as in contacts [m]."""
+    depth: float = 3.2
+    """Of the water [m]."""
+    begin: tuple[float, float] = (2.0, 4.0)
+    """So far before the gate at the start [m], ..."""
+    aside: float = 0.3
+    """... beside its axis, in parts of that, ..."""
+    over: float = 0.3
+    """... above or below it [m] at most, ..."""
+    turn: float = math.radians(15.0)
+    """... turned from it by this at most [rad]."""
+    tilt: float = math.radians(4.0)
+    """Largest roll and pitch at the start [rad]."""
+    reward: GateReward = field(default_factory=GateReward)
+    training_noise: MeasurementNoise = MeasurementNoise(
+        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
+    )
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "Gate":
+        """With the envelope of the vehicle."""
+        length, width, height = (0.5 * float(x) for x in vehicles[0].body.size)
+        return replace(self, hull=Hull.of(vehicles[0]), half=(length, width, height))
+
+    @property
+    def cruise(self) -> float:
+        """Speed towards the gate that is worth all of its reward [m/s]."""
+        return 0.6 * self.hull.speed
+
+    @property
+    def behind(self) -> float:
+        """The gate is passed with the body origin so far behind it [m]."""
+        return 0.5 * self.hull.length
+
+    @property
+    def placed(self) -> bool:
+        """Whether a world says where the gate is."""
+        return bool(self.world)
+
+    def arena(self) -> Pool | None:
+        """Open water: an episode ends before floor and walls."""
+        return None
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"through the gate from the front within {self.time_limit:g} s, touching no bar"
+
+    def terms(self) -> Terms:
+        """See `GateReward`."""
+        r = self.reward
+        inside = f"wp.max(wp.abs(place[1]), wp.abs(place[2])) < {float(HALF)!r}"
+        return Terms(
+            start=start,
+            shared={"place": in_gate, "room": clearance, "theta": "attitude_error"},
+            rewards=(
+                RewardTerm("progress", approach, r.progress),
+                RewardTerm("corridor", off_axis, -r.corridor),
+                RewardTerm("turn", "theta", -r.turn),
+                RewardTerm("near", "wp.max(1.0 - room / p.reward.near_scale, 0.0)", -r.near),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
+                RewardTerm("rate", "turning", -r.rate),
+            ),
+            ends=(
+                End("touched", "room < 0.0", -r.loss),
+                End("missed", f"place[0] >= 0.0 and not {inside}", -r.loss),
+                End("passed", "place[0] >= p.behind", r.passed),
+                End("lost", is_lost, -r.loss),
+            ),
+        )
