@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.calibration.excitation.programmes import Programme
-from finssim.calibration.excitation.synthetic import NoiseProfile, record, trials_of
 from finssim.calibration.hydrodynamics import fit_hydrodynamics, scaled
-from finssim.calibration.output.vehicle_file import calibrated
-from finssim.calibration.replay.replay import replay
+from finssim.calibration.programmes import Programme
+from finssim.calibration.replay import replay
+from finssim.calibration.synthetic import NoiseProfile, record, trials_of
 from finssim.calibration.trials.trial import Trial
+from finssim.calibration.vehicle_file import calibrated
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 FITTED = ("surge", "sway", "heave", "yaw")

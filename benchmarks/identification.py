@@ -26,15 +26,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.excitation.programmes import Programme, programmes
-from finssim.calibration.excitation.synthetic import Recording, record, simulate_programme, trials_of
 from finssim.calibration.fit import Estimate, Fit
+from finssim.calibration.programmes import Programme, programmes
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.replay.replay import replay
+from finssim.calibration.replay import replay
 from finssim.calibration.simulation.fit import fit_by_simulation
+from finssim.calibration.synthetic import Recording, record, simulate_programme, trials_of
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
-from finssim.vehicles.body import moved_to_origin
+from finssim.vehicles.vehicle import moved_to_origin
 
 FOUR = "surge,sway,heave,yaw"
 

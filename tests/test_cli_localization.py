@@ -315,7 +315,7 @@ def test_localize_looks_for_the_family(files, tmp_path):
 
 def test_localize_uses_pool_and_vehicle(files, tmp_path):
     """Water 10 cm higher puts the vehicle elsewhere, and so does a tag mounted elsewhere."""
-    from finssim.calibration.output.vehicle_file import write_vehicle
+    from finssim.calibration.vehicle_file import write_vehicle
     from finssim.vehicles import Provenance
 
     higher = tmp_path / "higher.yaml"

@@ -9,7 +9,7 @@ from calibration.vision.board_views import PHOTOGRAPHS
 from calibration.vision.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
 from calibration.vision.surveyed_pools import FLOOR, PLUMB_BOB, SOLID, overhead, survey
 from finssim import boundary
-from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.vehicle_file import write_vehicle
 from finssim.cli import app
 from finssim.geometry.optics import Interface, Layer
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix

@@ -34,8 +34,7 @@ ARROWS = {
 FOUNDATION = {
     "",
     "files",
-    "mcap_metadata",
-    "mcap_repair",
+    "mcap_files",
     "page",
     "provenance",
     "quiet",
@@ -106,12 +105,12 @@ HOMES = {
     "pandas": {"engine/recorder.py"},
     "pyarrow": {"calibration/trials/trial_files.py", "engine/recorder.py"},
     "matplotlib": {
-        "calibration/output/report.py",
-        "calibration/replay/report.py",
+        "calibration/report.py",
+        "calibration/replay.py",
         "calibration/vision/camera.py",
         "calibration/vision/pool_fit.py",
         "experiments/figures.py",
-        "vehicles/picture.py",
+        "vehicles/show.py",
     },
     "pymavlink": {
         "calibration/importers/ardusub.py",

@@ -33,13 +33,13 @@ COMMANDS: dict[str, str | Experiment] = {
     "trials check": "finssim.calibration.check:check",
     "trials import": "finssim.calibration.importers.dispatch:import_trials",
     "excite": "finssim.experiments.excitation:excite",
-    "calibrate thruster": "finssim.calibration.output.commands:calibrate_thruster",
-    "calibrate motor": "finssim.calibration.output.commands:calibrate_motor",
-    "calibrate hydrodynamics": "finssim.calibration.output.commands:calibrate_hydrodynamics",
+    "calibrate thruster": "finssim.calibration.thruster:calibrate_thruster",
+    "calibrate motor": "finssim.calibration.motor:calibrate_motor",
+    "calibrate hydrodynamics": "finssim.calibration.hydrodynamics:calibrate_hydrodynamics",
     "calibrate camera": "finssim.calibration.vision.camera:run",
     "calibrate pool": "finssim.calibration.vision.pool_fit:run",
     "calibrate mounts": "finssim.calibration.vision.mounts:run",
-    "replay": "finssim.calibration.replay.replay:run_replay",
+    "replay": "finssim.calibration.replay:run_replay",
     "experiment replay": Experiment("finssim.experiments.replay_experiment:replay_experiment"),
     "experiment localization": Experiment(
         "finssim.experiments.localization_experiment:localization_experiment"
@@ -64,7 +64,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "pool": "finssim.pool.run:run",
     "ardusub-sitl": "finssim.pool.ardusub_sitl:run",
     "view": "finssim.viewer.run:run",
-    "ros2 node": "finssim.ros2.graphs:run_node",
+    "ros2 node": "finssim.ros2.up:run_node",
     "ros2 up": "finssim.ros2.up:up",
 }
 """Words -> what they do."""
@@ -155,7 +155,7 @@ def show_vehicle(
     print_vehicle(vehicle, Console(), None)
     if picture is not None:
         from finssim.files import atomic_write
-        from finssim.vehicles.picture import draw_vehicle
+        from finssim.vehicles.show import draw_vehicle
 
         with atomic_write(picture) as temporary:
             draw_vehicle(vehicle, temporary)

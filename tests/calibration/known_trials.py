@@ -2,9 +2,9 @@
 
 from functools import cache
 
-from finssim.calibration.excitation.programmes import programmes
-from finssim.calibration.excitation.synthetic import NoiseProfile, record, trials_of
+from finssim.calibration.programmes import programmes
 from finssim.calibration.regression.plant_terms import matrices
+from finssim.calibration.synthetic import NoiseProfile, record, trials_of
 from finssim.vehicles import AXES, load_vehicle
 
 NOISE = NoiseProfile(velocity_std=0.01, gyro_std=0.005, attitude_std=0.004)

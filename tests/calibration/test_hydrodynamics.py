@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from finssim.calibration.check import check_trials
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import programmes
-from finssim.calibration.excitation.synthetic import simulate_programme
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.fit import Estimate
 from finssim.calibration.hydrodynamics import fit_hydrodynamics
 from finssim.calibration.importers.dispatch import read_trials
-from finssim.calibration.output.vehicle_file import calibrated
+from finssim.calibration.programmes import programmes
 from finssim.calibration.regression.axis_estimates import trim
-from finssim.calibration.replay.replay import replay
+from finssim.calibration.replay import replay
+from finssim.calibration.synthetic import simulate_programme
+from finssim.calibration.vehicle_file import calibrated
 from finssim.vehicles import load_vehicle
 
 DATA = Path(__file__).parents[1] / "data" / "standins"

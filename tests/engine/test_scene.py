@@ -9,6 +9,8 @@ import pytest
 from finssim.engine import PictureError, Pool, Simulator, SimulatorError, Water, Wave
 from finssim.engine.scene import Scene
 from finssim.geometry.rotations import quat_rotate
+from finssim.worlds import WorldLayout
+from reference.body import rotation
 from reference.cases import EVERY_VEHICLE_AND_MODEL, disturb, load, neutral, random_states, weightless
 
 pytest.importorskip("mujoco")
@@ -267,6 +269,68 @@ def test_equal_scenes_give_equal_runs():
     np.testing.assert_array_equal(once, trajectory(second))
     still = Scene("finsrov", pool=Pool(), objects=CRATE)
     np.testing.assert_array_equal(trajectory(still), trajectory(still))
+
+
+def thing(text):
+    """A world's object of that kind."""
+    return f"objects: {{thing: {{{text}}}}}"
+
+
+FLOORS = {
+    "seabed": "seabed: {depth: 6, size: [12, 12], spacing: 2.0, roughness: {rms: 0.2, wavelength: 8.0}}",
+    "slope": "seabed: {depth: 6, slope: [0.1, -0.05]}",
+    "box": thing("shape: box, position: [0, 0, -6.2], size: [4, 4, 0.4], vary: {position: [0, 0, 0.3], yaw: 3}"),
+    "disc": thing("shape: cylinder, position: [0, 0, -6.2], radius: 2, length: 0.4"),
+    "rails": thing("shape: capsule, position: [0, -0.1, -6.2], radius: 0.2, length: 4, axis: [1, 0, 0],"
+                   "repeat: {count: 2, step: [0, 0.2, 0]}"),
+    "domes": thing("shape: sphere, position: [0, -0.15, -6.2], radius: 0.2, repeat: {count: 2, step: [0, 0.3, 0]}}, "
+                   "m: {shape: sphere, position: [-0.2, 0, -6.2], radius: 0.2, repeat: {count: 2, step: [0.4, 0, 0]}"),
+    "hollow": thing("shape: mesh, file: hollow.stl, position: [0, 0, -6], yaw: 0.3"),
+}  # fmt: skip
+
+
+def write_hollow(path):
+    """A closed block whose top falls by 0.3 to its middle line, as an STL of text: its convex hull would be level."""
+    corners = {(a, y, b): np.array([2.0 * a, y, 0.6 * abs(a) * b - 0.3 * (1 - b)])
+               for a in (-1, 0, 1) for y in (-2, 2) for b in (0, 1)}  # fmt: skip
+    quads = [
+        [(a, -2, b), (a + 1, -2, b), (a + 1, 2, b), (a, 2, b)][:: 2 * b - 1] for a in (-1, 0) for b in (0, 1)
+    ]
+    for a in (-1, 0):
+        quads += [[(a, y, 0), (a + 1, y, 0), (a + 1, y, 1), (a, y, 1)][:: -y // 2] for y in (-2, 2)]
+    quads += [[(x, -2, 0), (x, 2, 0), (x, 2, 1), (x, -2, 1)][::x] for x in (-1, 1)]
+    lines = ["solid hollow"]
+    for quad in quads:
+        for triangle in ((0, 1, 2), (0, 2, 3)):
+            points = ["vertex {} {} {}".format(*corners[quad[k]]) for k in triangle]
+            lines += ["facet normal 0 0 0", "outer loop", *points, "endloop", "endfacet"]
+    path.write_text("\n".join([*lines, "endsolid hollow"]), encoding="utf-8")
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_a_vehicle_rests_where_it_rests_in_the_batch(floor, tmp_path):
+    """Heavy by 5 %, let go above each solid of a drawn world: pose as in the simulator, whose contacts give in.
+
+    The spheres of its hull lie a tenth of the least half extent inside the faces, and its penalties a few millimetres.
+    """
+    head = (
+        "about: A site.\nwater: {attenuation: [0, 0, 0], veil: [0, 0, 0], daylight_attenuation: [0, 0, 0]}\n"
+    )
+    tail = "\ncontact: {friction: 2.0}\nviewpoint: {position: [0, 0, -5]}\n"
+    (tmp_path / "site.yaml").write_text(head + FLOORS[floor] + tail, encoding="utf-8")
+    write_hollow(tmp_path / "hollow.stl")
+    vehicle = FINSROV.replace({"body.displaced_volume": 0.95 * FINSROV.body.mass / FINSROV.water.density})
+    layout, poses = WorldLayout(str(tmp_path / "site.yaml")), []
+    for one in (Scene(vehicle, world=layout), Simulator(vehicle, world=layout, threads=1)):
+        layout.draw(5)
+        one.place((1.4, 0.6, -5.6) if floor == "seabed" else (0.0, 0.0, -5.6))  # within one triangle
+        for _ in range(80):
+            one.step()
+        poses.append((one.numpy("position")[0, 0].copy(), rotation(one.numpy("quaternion")[0, 0])))
+    (x, R), (batch_x, batch_R) = poses
+    half = 0.5 * np.array(FINSROV.body.size)
+    assert np.abs(x - batch_x).max() < 0.1 * half.min() + 0.006
+    assert np.abs(R - batch_R).max() < (0.1 * half.min() + 0.006) / half[1]
 
 
 def test_a_vehicle_pushes_a_crate_along_the_floor():

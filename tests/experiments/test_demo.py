@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from finssim import boundary
-from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.trials.trial_files import load_trials
+from finssim.calibration.vehicle_file import write_vehicle
 from finssim.cli import app
 from finssim.control.pid import axis_model
 from finssim.control.policy import Policy

@@ -8,8 +8,8 @@ import yaml
 from typer.testing import CliRunner
 
 from finssim import boundary
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import Programme, programmes
+from finssim.calibration.findings import CalibrationError
+from finssim.calibration.programmes import Programme, programmes
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.trials.trial_files import load_trials
 from finssim.cli import app
@@ -89,7 +89,7 @@ def test_a_programme_that_the_bridge_stops_is_refused(tmp_path):
     phase = np.array(["baseline"] * 50 + ["excitation"] * (n - 50))
     hard = Programme(name="roll_hard", axes=("roll",), rate=50.0, tau_desired=tau, phase=phase)
     light = FINSROV.replace({"safety.max_tilt": 0.05})
-    from finssim.calibration.output.vehicle_file import write_vehicle
+    from finssim.calibration.vehicle_file import write_vehicle
 
     write_vehicle(light, tmp_path / "light.yaml")
     with pytest.raises(CalibrationError, match="roll_hard in the virtual pool: .*tilt"):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import programmes
+from finssim.calibration.findings import CalibrationError
+from finssim.calibration.programmes import programmes
 from finssim.experiments.excitation import STOPPING, box_of, place_of
 from finssim.geometry.rotations import quat_from_yaw, quat_rotate
 from finssim.pool.plant_spec import Basin

@@ -121,8 +121,8 @@ def test_by_hand_nothing_is_armed_before_the_vehicle_is_at_its_start(tmp_path, r
 
 def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     """Not armed, by hand with nobody there, another plan's folder, no workspace, a start outside it."""
-    from finssim.calibration.errors import CalibrationError
-    from finssim.calibration.output.vehicle_file import write_vehicle
+    from finssim.calibration.findings import CalibrationError
+    from finssim.calibration.vehicle_file import write_vehicle
     from finssim.robot.wiring import Wiring
 
     where = OnRobot(wiring=Wiring(robot="127.0.0.1:1", lockstep=True), pool_file=tmp_path / "pool.yaml")
@@ -140,7 +140,7 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     write_vehicle(small, tmp_path / "small.yaml")
     with pytest.raises(CalibrationError, match="to go along surge"):
         box = box_of(small)
-        from finssim.calibration.excitation.programmes import programmes
+        from finssim.calibration.programmes import programmes
         from finssim.experiments.excitation import place_of
 
         place_of(programmes("surge", small)[0], small, box)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from finssim.calibration.excitation.programmes import Programme
+from finssim.calibration.programmes import Programme
 from finssim.control import ControlError
 from finssim.control.allocation import Allocator
 from finssim.control.guidance import Station

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.excitation.programmes import travel
+from finssim.calibration.programmes import travel
 from finssim.experiments.demo import PERIODS, shuttles
 from finssim.experiments.excitation import box_of, place_of
 from finssim.pool.plant_spec import Basin

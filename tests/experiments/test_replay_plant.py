@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.calibration.excitation.programmes import programmes
+from finssim.calibration.programmes import programmes
 from finssim.engine import Simulator
 from finssim.experiments.replay_experiment import ReplayPlant
 from finssim.vehicles import load_vehicle

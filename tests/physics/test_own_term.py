@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.vehicle_file import write_vehicle
 from finssim.engine import Simulator
 from finssim.engine.ranges_file import RangesError, load_ranges
 from finssim.physics.terms import Term, add_term
@@ -265,8 +265,8 @@ def test_a_term_that_cannot_be_is_refused():
 @pytest.fixture(scope="module")
 def trials():
     """A multisine on surge and heave together of the vehicle with the wing, with noise of its sensors."""
-    from finssim.calibration.excitation.programmes import programmes
-    from finssim.calibration.excitation.synthetic import simulate_programme
+    from finssim.calibration.programmes import programmes
+    from finssim.calibration.synthetic import simulate_programme
 
     vehicle = load_vehicle("bluerov2").replace(
         {"hydrodynamics.calibrated.wing": {"lift": 40.0, "moment": 1.5}}
@@ -282,9 +282,8 @@ def believed(lift):
 @pytest.mark.slow
 def test_a_calibration_estimates_its_parameter(trials, tmp_path):
     """40 N s²/m² from trials of a vehicle whose file says 0: within the interval, which is narrower than a tenth."""
-    from finssim.calibration.output.ranges import write_ranges
-    from finssim.calibration.output.vehicle_file import calibrated
     from finssim.calibration.simulation.fit import fit_by_simulation
+    from finssim.calibration.vehicle_file import calibrated, write_ranges
 
     fit = fit_by_simulation(trials, believed(0.0), axes=("surge", "heave"), estimate=("wing.lift",))
     found = fit.estimates["wing.lift"]
@@ -314,7 +313,7 @@ def test_a_known_wing_does_not_bias_what_is_fitted(trials):
 
 @pytest.mark.slow
 def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials):
-    from finssim.calibration.errors import CalibrationError
+    from finssim.calibration.findings import CalibrationError
     from finssim.calibration.simulation.fit import fit_by_simulation
 
     for vehicle, name in ((load_vehicle("bluerov2"), "wing.lift"), (believed(1.0), "wing.lft")):

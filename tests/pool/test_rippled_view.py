@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.geometry.optics import Camera, Interface, project
-from finssim.pool.camera import paper_lens
-from finssim.pool.corner_camera import RippledView
+from finssim.pool.camera import RippledView, paper_lens
 from finssim.sensors.overhead_camera import Ripples
 from finssim.sensors.overhead_camera.surface import waves_of
 

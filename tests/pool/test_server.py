@@ -14,8 +14,7 @@ import pytest
 from finssim.localization.pool import load_pool
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.fleet import Fleet
-from finssim.pool.run import make_plan
-from finssim.pool.server import LockstepServer, serve_realtime
+from finssim.pool.run import LockstepServer, make_plan, serve_realtime
 from finssim.pool.virtual_pool import VirtualPool, read_truth
 from finssim.robot.goals import station_of
 from finssim.robot.link.frames import Decoder, LinkError

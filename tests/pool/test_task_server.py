@@ -14,8 +14,7 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.control.guidance import Station, Track
 from finssim.pool.fleet import Medium, one_picture
-from finssim.pool.run import swimming
-from finssim.pool.server import MediumServer
+from finssim.pool.run import MediumServer, swimming
 from finssim.robot.pilots import make_pilot
 from finssim.robot.record_reader import open_record
 from finssim.robot.runtime import Runtime

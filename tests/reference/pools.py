@@ -9,7 +9,7 @@ from finssim.geometry.rotations import quat_from_yaw
 from finssim.localization.pool import write_pool
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
-from finssim.pool.server import LockstepServer
+from finssim.pool.run import LockstepServer
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.quiet import start_warp
 from finssim.robot.wiring import Wiring

@@ -45,7 +45,7 @@ from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 
-from finssim.ros2.graphs import NODES
+from finssim.ros2.up import NODES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "rclpy.md"
 FREE = ParameterDescriptor(dynamic_typing=True)

@@ -7,8 +7,8 @@ import struct
 import numpy as np
 import pytest
 
+from finssim.ros2 import MessageError, Ros2Error
 from finssim.ros2.codec import INTERFACES, Definitions, codec_of
-from finssim.ros2.errors import MessageError, Ros2Error
 
 CODEC = codec_of("jazzy")
 

@@ -8,9 +8,8 @@ import pytest
 import yaml
 
 from finssim.robot.goals import GoalError
-from finssim.ros2.errors import Ros2Error
-from finssim.ros2.graphs import GRAPHS, NODES, Plan, topics_of
-from finssim.ros2.up import Options, plan_of
+from finssim.ros2 import Ros2Error
+from finssim.ros2.up import GRAPHS, NODES, Options, Plan, plan_of, topics_of
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ros2.md").read_text()
 FILE = Path("/somewhere/pool.yaml")

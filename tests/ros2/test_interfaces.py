@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 from finssim.ros2.codec import INTERFACES
-from finssim.ros2.graphs import NODES as GRAPH_NODES
 from finssim.ros2.shim.arguments import overrides_for, parse_arguments
 from finssim.ros2.topics import OWN_TOPICS, SERVICES, TOPICS
+from finssim.ros2.up import NODES as GRAPH_NODES
 from finssim.vehicles.loader import catalogue
 
 MESSAGES = sorted(INTERFACES.glob("finssim_msgs/msg/*.msg"))

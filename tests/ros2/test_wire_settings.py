@@ -2,7 +2,7 @@
 
 import pytest
 
-from finssim.ros2.errors import Ros2Error
+from finssim.ros2 import Ros2Error
 from finssim.ros2.wire import LOOPBACK, wire_settings
 
 

@@ -292,9 +292,9 @@ def test_along_a_net_the_row_has_the_range_below_and_the_picture_the_echoes_of_t
         x, net = env.simulator.state.position.numpy()[:, 0], env.arrays.goal_quaternion.numpy()
         place = Rotation.from_quat(net).inv().apply(x - env.arrays.goal_position.numpy())
         assert observation["sonar"].shape == (12, 128, 48, 1) and observation["sonar"].dtype == np.uint8
-        below = 5.0 * observation["state"][:, 9]
+        below = 4.4 + 0.5 * observation["state"][:, 9]
         assert np.median(np.abs(below - np.hypot(place[:, 2] + 6.9, place[:, 0]) + 0.14)) < 0.3
-        np.testing.assert_allclose(below, np.minimum(env.arrays.ranges.numpy()[:, 0], 10.0), rtol=1e-6)
+        np.testing.assert_allclose(below, np.minimum(env.arrays.ranges.numpy()[:, 0], 6.4), rtol=1e-5)
         line, enough = follower.line(observation["sonar"])
         away = line[:, 0] * np.cos(np.arctan(line[:, 1]))
         assert enough.all() and np.median(np.abs(away + place[:, 0])) < 0.05

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.vehicle_file import write_vehicle
 from finssim.geometry.rotations import quat_to_matrix
 from finssim.pool.camera import camera_of
 from finssim.pool.draw_plant import draw_plant

@@ -17,7 +17,7 @@ from finssim.vehicles import (
     catalogue,
     load_vehicle,
 )
-from finssim.vehicles.body import moved_to_origin
+from finssim.vehicles.vehicle import moved_to_origin
 
 EVERY = pytest.mark.parametrize("name", catalogue())
 

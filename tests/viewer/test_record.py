@@ -7,9 +7,8 @@ from finssim.pool.virtual_pool import read_truth
 from finssim.robot.record_reader import open_record
 from finssim.vehicles import VehicleError
 from finssim.viewer.frame import ViewError
-from finssim.viewer.sources.alignment import offset_between
-from finssim.viewer.sources.record import RecordSource
-from finssim.viewer.sources.series import PoseSeries
+from finssim.viewer.series import PoseSeries, offset_between
+from finssim.viewer.sources import RecordSource
 
 GOAL = (0.7, 0.3, -0.6)
 

@@ -15,9 +15,7 @@ from finssim.vehicles import VehicleError, load_vehicle
 from finssim.viewer.app import draw_own
 from finssim.viewer.frame import ViewError
 from finssim.viewer.run import Choice, open_source
-from finssim.viewer.sources.pool import PoolSource
-from finssim.viewer.sources.run import RunSource
-from finssim.viewer.sources.simulator import SimulatorSource
+from finssim.viewer.sources import PoolSource, RunSource, SimulatorSource
 from finssim.worlds import WorldLayout
 
 

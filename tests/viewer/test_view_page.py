@@ -9,7 +9,7 @@ import pytest
 
 from finssim.geometry.rotations import quat_to_matrix
 from finssim.viewer.app import View
-from finssim.viewer.sources.record import RecordSource
+from finssim.viewer.sources import RecordSource
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

@@ -84,6 +84,71 @@ def test_no_gaps_open_on_a_slanting_floor(scenes, level):
     assert last - first > 500 and filled[first : last + 1].all()
 
 
+LOSS = 3.0
+SHALLOW = 0.6
+
+
+def beside_the_surface(scenes, poses, y, **changes):
+    """Echo by range of a ball of 5 cm 4 m away, both 0.6 m down, of a sonar that looks between them."""
+    half = 0.5 * math.atan(2.0 * SHALLOW / 4.0)
+    changes = {"sector": math.radians(20.0), "elevations": 192, "bins": 1000, "surface_loss": LOSS, **changes}
+    pose = poses(((-4.0, y, -SHALLOW), quat_from_euler(0.0, -half, 0.0)))
+    sensor, intensity = echo(scenes("shallow"), sonar(**changes), pose)
+    return sensor, intensity.sum(axis=0), math.sqrt(pattern(half))
+
+
+def expected_ways(one_way):
+    """Range and power of a Lambertian ball's echoes: straight, one way by the surface (two of them), and both ways.
+
+    The ball as seen from an angle away from where the sound comes from: 2/3 mu a² (sin + (pi - angle) cos)/pi, its
+    phase function (Schoenberg); each reflection takes LOSS.
+    """
+    r, image = 4.0, math.hypot(4.0, 2.0 * SHALLOW)
+    angle, rho, ball = (
+        math.atan(2.0 * SHALLOW / 4.0),
+        10.0 ** (-0.1 * LOSS),
+        2.0 / 3.0 * MU * 0.05**2 * one_way**2,
+    )
+    phase = (math.sin(angle) + (math.pi - angle) * math.cos(angle)) / math.pi
+    return [
+        (r, ball / r**4),
+        (0.5 * (r + image), 2.0 * rho * phase * ball / (r * image) ** 2),
+        (image, rho**2 * ball / image**4),
+    ]
+
+
+def test_a_ball_below_the_surface_has_two_ghosts(scenes, poses):
+    """At half the way around and at its image within a cell, as loud as by a mirror within 1 dB."""
+    sensor, power, one_way = beside_the_surface(scenes, poses, 0.0)
+    ways = expected_ways(one_way)
+    edges = [0.0, *(0.5 * (a + b - 0.05) for (a, _), (b, _) in zip(ways, ways[1:], strict=False)), 10.0]
+    for (distance, expected), low, high in zip(ways, edges, edges[1:], strict=False):
+        cells = np.arange(len(power)) * sensor.bin_length
+        own = np.where((cells >= low) & (cells < high), power, 0.0)
+        assert abs(10.0 * math.log10(own.sum() / expected)) < 1.0
+        first = np.flatnonzero(own > 0.01 * own.max())[0] * sensor.bin_length
+        assert abs(first - (distance - 0.05)) <= sensor.bin_length
+
+
+def test_straight_echoes_are_as_without_the_surface(scenes, poses):
+    """By a surface that takes 300 dB: bit for bit."""
+    np.testing.assert_array_equal(
+        beside_the_surface(scenes, poses, 0.0, surface_loss=300.0)[1],
+        beside_the_surface(scenes, poses, 0.0, surface_loss=None)[1],
+    )
+
+
+def test_a_plate_leaves_the_way_by_the_surface_alone(scenes, poses):
+    """In front of a ball, up to 0.45 m below the surface: no echo of the ball but by both ways."""
+    sensor, power, one_way = beside_the_surface(scenes, poses, 100.0)
+    (straight, loud), (half, _), (image, expected) = expected_ways(one_way)
+    cells = np.arange(len(power)) * sensor.bin_length
+    before = (cells > straight - 0.1) & (cells < image - 0.07)
+    assert power[before].sum() < 0.01 * loud and half < image - 0.07
+    behind = power[(cells > image - 0.07) & (cells < image + 0.05)].sum()
+    assert abs(10.0 * math.log10(behind / expected)) < 1.0
+
+
 def test_speckle_is_rayleigh(scenes, level):
     """Power of noise alone is exponential: its standard deviation is its mean; amplitude has 0.52 of its own."""
     device = sonar(noise_level_db=-60.0, mount=Mount(pitch=-0.6))

@@ -13,21 +13,20 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import SEVERITIES, Finding, finding, plain
-from finssim.calibration.motion.signals import (
+from finssim.calibration.findings import SEVERITIES, CalibrationError, Finding, finding, plain
+from finssim.calibration.motion import (
     AttitudeSignal,
     Motion,
     Offset,
     attitude_samples,
     attitude_signal,
     holds_gravity,
+    longest_step,
     motion,
     on_grid,
     stream_offsets,
     up_in_body,
 )
-from finssim.calibration.motion.smoothing import longest_step
 from finssim.calibration.trials.inputs import Drive, drive, implausible
 from finssim.calibration.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
 from finssim.calibration.trials.trial_files import load_trial, trials_at

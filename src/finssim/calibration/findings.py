@@ -1,4 +1,4 @@
-"""What is found out about data and fits: one record for all of it, filtered by its code and worded here alone."""
+"""What is found out about data and fits: one record for all of it, worded here alone; and the error of this package."""
 
 from __future__ import annotations
 
@@ -115,3 +115,17 @@ def wordings() -> dict[str, tuple[Severity, str]]:
     """Code -> its usual severity, and its sentence with the fields that `Finding.values` fills (`findings.yaml`)."""
     table = yaml.safe_load(Path(__file__).with_name("findings.yaml").read_text(encoding="utf-8"))
     return {code: next(iter(wording.items())) for code, wording in table.items()}
+
+
+class CalibrationError(ValueError):
+    """A trial, table or fit that cannot be used; the message says where, what was found and what to do.
+
+    Attributes:
+        subject: The trial or file that cannot be used; empty where the reason names it.
+        reason: The message without it.
+    """
+
+    def __init__(self, reason: str, subject: str = "") -> None:
+        """What is wrong, and with which trial or file."""
+        super().__init__(f"{subject}: {reason}" if subject else reason)
+        self.reason, self.subject = reason, subject

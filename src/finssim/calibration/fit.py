@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,6 +74,19 @@ class Curve:
     fitted: Array
     kind: str = "line"
     """`line` (against time) or `scatter`."""
+
+    @classmethod
+    def joined(cls, title: str, y_label: str, parts: Sequence[tuple[Array, Array, Array]]) -> Curve:
+        """Stretches of time [s], measured and fitted values, (k,) each, one after the other with a second between."""
+        x, start = [], 0.0
+        for t, _, _ in parts:
+            x += [t - t[0] + start, [np.nan]]
+            start = float(x[-2][-1]) + 1.0
+        measured, fitted = (np.concatenate([y for p in parts for y in (p[k], [np.nan])]) for k in (1, 2))
+        label = "time, one after the other [s]"
+        return cls(
+            title=title, x_label=label, y_label=y_label, x=np.concatenate(x), measured=measured, fitted=fitted
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,20 +10,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.fit import Estimate, Fit
-from finssim.calibration.output.vehicle_file import SCALED, calibrated
 from finssim.calibration.regression.axis_estimates import CERTAIN
 from finssim.calibration.regression.plant_terms import matrices
 from finssim.calibration.regression.regress import regress
+from finssim.calibration.report import finish, progress_bar, refuse_places, usable_trials
 from finssim.calibration.trials.inputs import drive
 from finssim.calibration.trials.trial import Trial
-from finssim.vehicles import AXES, Vehicle
+from finssim.calibration.vehicle_file import SCALED, calibrated
+from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 METHODS = ("auto", "regression", "simulation")
 
@@ -172,7 +173,7 @@ def _mean(scores: Mapping[str, float], axes: set[str]) -> float:
 
 def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
     """NRMSE of the replay by axis, the median over the trials; none where nothing can be replayed."""
-    from finssim.calibration.replay.replay import replay
+    from finssim.calibration.replay import replay
 
     try:
         rows = replay(trials, vehicle).scores["calibrated"]
@@ -288,3 +289,102 @@ def _widened(e: Estimate, rigid: float, low: float, high: float) -> Estimate:
         a = max(a, 0.0)
     sure = e.identifiable and (kind in ("bias", "") or 0.5 * (b - a) <= CERTAIN * abs(e.estimate))
     return replace(e, ci95=(a, b), identifiable=sure)
+
+
+def calibrate_hydrodynamics(
+    trials: Sequence[Path],
+    *,
+    vehicle: str,
+    out: Path,
+    axes: str | None = None,
+    method: str = "auto",
+    estimate: str = "",
+    damping: str = "auto",
+    fix: str = "",
+    horizon: float | None = None,
+    report: Path | None = None,
+    ranges: Path | None = None,
+    seed: int = 0,
+    as_json: bool = False,
+) -> Vehicle:
+    """Fit added mass [kg, kg m²] and damping [N s/m, N s²/m², ...] to trials, axis by axis or by simulation.
+
+    Example: finssim calibrate hydrodynamics trials/fit --vehicle mine.yaml --out fitted.yaml --report report
+
+    Args:
+        trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Vehicle file to write (.yaml).
+        axes (AXES): Axes to fit, of surge,sway,heave,roll,pitch,yaw; those that the trials excite if not given.
+        method (METHOD): regression: each axis by its equation of motion; simulation: what simulates the trials best;
+            auto: the regression where it replays the trials very well, else the simulation unless that replays them
+            worse.
+        estimate (NAMES): Also fit, of thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k or the parameters
+            of the vehicle's terms, such as lift.coefficient (simulation method).
+        damping (KIND): Drag: linear, quadratic, both, or auto to choose.
+        fix (AXIS.m=N): Inertias that are known, added mass included [kg, kg m²]: yaw.m=0.6,surge.m=24 (regression).
+        horizon: Longest stretch simulated without a restart [s] (simulation method).
+        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        ranges (FILE): Ranges file to write from the 95 % intervals, for `finssim train --randomize`.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
+
+    Returns:
+        The calibrated vehicle.
+
+    Raises:
+        CalibrationError, VehicleError, OutputError: As they say; nothing is written then.
+        KeyboardInterrupt: After Ctrl-C, when the best until then, if there is any, has been written.
+    """
+    options = dict(locals())
+    further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
+    chosen = _axes(axes)
+    known = _known(fix)
+    refuse_places(out, report, "vehicle")
+    if ranges is not None:
+        refuse_places(ranges, None, "ranges")
+    body = load_vehicle(vehicle)
+    used = usable_trials(trials)
+    with progress_bar() as progress:
+        fit = fit_hydrodynamics(
+            used,
+            body,
+            axes=chosen,
+            method=method,
+            estimate=further,
+            damping=damping,
+            known=known,
+            horizon=horizon,
+            seed=seed,
+            progress=progress,
+        )
+    return finish("hydrodynamics", fit, options)
+
+
+def _axes(words: str | None) -> tuple[str, ...] | None:
+    if words is None or words == "all":
+        return None
+    names = [word.strip() for word in words.split(",")]
+    for name in names:
+        if name not in AXES:
+            raise CalibrationError(f"unknown axis '{name}'; available: {', '.join(AXES)}")
+    return tuple(axis for axis in AXES if axis in names)
+
+
+def _known(words: str) -> dict[str, float]:
+    """Axis -> effective inertia, of `yaw.m=0.6,surge.m=24`."""
+    found = {}
+    for word in filter(None, (part.strip() for part in words.split(","))):
+        name, _, value = word.partition("=")
+        axis, _, letter = name.strip().partition(".")
+        try:
+            size = float(value)
+        except ValueError:
+            size = math.nan
+        if axis not in AXES or letter not in ("m", "m_eff") or not (math.isfinite(size) and size > 0.0):
+            raise CalibrationError(
+                f"--fix is '{word}', expected AXIS.m=NUMBER with an axis of {', '.join(AXES)} and the mass with added "
+                "mass in kg, or the inertia with added inertia in kg m², as in yaw.m=0.6"
+            )
+        found[axis] = size
+    return found

@@ -158,22 +158,20 @@ def trial_covariance(evidence: Evidence) -> Covariance:
     )
 
 
-def intervals(theta: Array, covariance: Covariance, *, level: float = 0.95) -> Array:
-    """Student intervals of the estimates.
+def intervals(theta: Array, covariance: Covariance) -> Array:
+    """Student's 95 % intervals of the estimates.
 
     Args:
         theta: Estimates, (P,).
         covariance: Theirs.
-        level: Probability.
 
     Returns:
         Lower and upper ends, (P, 2); infinite where nothing is known.
     """
     from scipy.stats import norm, t
 
-    p = 0.5 + level / 2.0
     finite = np.isfinite(covariance.dof)
-    quantile = np.where(finite, t.ppf(p, np.where(finite, covariance.dof, 1.0)), norm.ppf(p))
+    quantile = np.where(finite, t.ppf(0.975, np.where(finite, covariance.dof, 1.0)), norm.ppf(0.975))
     half = quantile * covariance.std
     return np.stack([theta - half, theta + half], axis=-1)
 

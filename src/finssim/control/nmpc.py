@@ -18,7 +18,7 @@ from finssim.control.lqr import ANGLE_SCALE, OBSERVER_TIME, POSITION_SCALE, SLOW
 from finssim.control.pid import INTEGRAL_SHARE, Pid
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.vehicles import HydrodynamicSet, Vehicle
-from finssim.vehicles.body import moved_to_origin, skew
+from finssim.vehicles.vehicle import moved_to_origin, skew
 
 Array = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from finssim.control.guidance import Goal, Measured, tracking_error, velocity_at
 from finssim.geometry.frames import FROM_CONTROLLER, TO_CONTROLLER
 from finssim.geometry.rotations import cross, quat_inverse_rotate, quat_rotate, quat_yaw, wrap_angle
 from finssim.vehicles import HydrodynamicSet, Vehicle
-from finssim.vehicles.body import moved_to_origin
+from finssim.vehicles.vehicle import moved_to_origin
 
 # PID gains that put the poles of an identified axis where they are wanted, the actuators' lag included.
 

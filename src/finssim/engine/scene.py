@@ -14,6 +14,7 @@ from finssim.engine.plant_arrays import SimulatorError
 from finssim.engine.scene_model import COLLISION, build_model, load_mujoco, side_by_side, total_inertia
 from finssim.engine.scene_picture import Painter
 from finssim.engine.simulator import Simulator
+from finssim.engine.solids import layout_of, pool_of, solid_shapes
 from finssim.engine.surroundings import Pool, TetherLine, Water
 from finssim.geometry.frames import (
     acceleration_from_mujoco,
@@ -54,6 +55,7 @@ class Scene:
         command: Thruster force commands [N] and disturbance wrenches; write them before `step`.
         plant: Parameters by (1, vehicle); after writing any of them call `refresh`.
         water: Water, as in `Simulator`.
+        world: `finssim.worlds.WorldLayout` of the described world, whose `draw` moves its solids; None without one.
         state: Warp arrays by (1, vehicle). MuJoCo holds the pose: set it by `place`.
         model: The `mujoco.MjModel`.
         data: The `mujoco.MjData`; both also serve MuJoCo's viewer.
@@ -73,6 +75,7 @@ class Scene:
         water: Water | None = None,
         tether: TetherLine | None = None,
         collision: str = "envelope",
+        world: Any = None,
         seed: int = 0,
         max_delay: float | None = None,
     ) -> None:
@@ -90,17 +93,22 @@ class Scene:
                 every physics step: a drift of the same kind as a `Simulator`'s, but not the same one.
             tether: On every vehicle; none if None.
             collision: What touches: `envelope`, the box of the vehicle's size, or `hull`, the convex hull of its mesh.
+            world: Described world whose solids are rigid here, with its friction: a name, a path, or a `World`,
+                `WorldLayout` or `WorldBatch` of one copy, whose draws `step` follows. Its basin is the pool.
             seed: Of everything random in the world.
             max_delay: Longest thruster delay that will be written to `plant` [s]; twice the vehicles' own if None.
 
         Raises:
             SimulatorError: MuJoCo is missing, it refuses the objects, or a name or number is out of its range.
+            WorldError: There is no such world, or its file is wrong.
         """
         self._mujoco = load_mujoco()
         if collision not in COLLISION:
             raise SimulatorError(f"unknown collision shape '{collision}'; available: {', '.join(COLLISION)}")
         if substeps < 1:
             raise SimulatorError(f"substeps={substeps}: expected at least one")
+        if world is not None and pool is not None:
+            raise SimulatorError("pool and world are given: leave pool out, the world's basin is the pool")
         h = control_step / substeps
         # One substep of this simulator is one physics step of the scene; its pose is overwritten after each.
         self._simulator = Simulator(
@@ -110,19 +118,28 @@ class Scene:
         self.vehicles = self._simulator.vehicles
         self.hydrodynamics, self.seed = hydrodynamics, seed
         self.control_step, self.substeps = control_step, substeps
+        self.world = None if world is None else layout_of(world, 1, self._simulator.device)
+        pool = pool if self.world is None else pool_of(self.world.world)
         self.surroundings = (self._simulator.surroundings[0], pool, tether)
         self.state, self.plant = self._simulator.state, self._simulator.plant
         self.water, self.command = self._simulator.water, self._simulator.command
         self.refresh()
         self.model = build_model(
-            self.vehicles, self._inertia, pool=pool, objects=objects, collision=collision, timestep=h
-        )
+            self.vehicles, self._inertia, pool=pool, objects=objects, collision=collision, timestep=h, layout=self.world
+        )  # fmt: skip
         self.data = self._mujoco.MjData(self.model)
+        shapes = {} if self.world is None else {f"solid{k}": k for k in solid_shapes(self.world)}
+        bodies = [self.model.body(i) for i in range(self.model.nbody)]
+        drawn = [b for b in bodies if b.name in shapes and b.mocapid[0] >= 0]
+        self._drawn_solids = [b.mocapid[0] for b in drawn], [shapes[b.name] for b in drawn]
         self._find_vehicles()
         self._painter: Painter | None = None
         names = ("position", "quaternion", "velocity", "acceleration", "pressed")
         self._views = {name: self._simulator.numpy(name)[0] for name in names}
-        self.place(side_by_side(self.vehicles, depth=0.5 * pool.depth if pool else 1.0))
+        start = side_by_side(self.vehicles, depth=0.5 * pool.depth if pool else 1.0)
+        if self.world is not None:
+            start += self.world.world.viewpoint.position - [0.0, 0.0, start[0, 2]]
+        self.place(start)
 
     def _find_vehicles(self) -> None:
         """Where MuJoCo keeps each vehicle: pose, velocity, and the lower triangle of its block of the mass matrix."""
@@ -166,6 +183,7 @@ class Scene:
         d.qvel[self._dofs] = mujoco_velocity(v["velocity"], v["quaternion"])
         self._touch = np.zeros((1, len(self.vehicles), 6))
         self._broken = False
+        self._move_solids()
         mj.mj_kinematics(self.model, d)
 
     def step(self) -> None:
@@ -175,9 +193,20 @@ class Scene:
             SimulatorError: a number stopped being finite; the scene stands still until it is placed anew.
         """
         self._touch[:] = 0.0
+        self._move_solids()
         for _ in range(self.substeps):
             self._substep()
         self._mujoco.mj_kinematics(self.model, self.data)
+
+    def _move_solids(self) -> None:
+        """Put the solids that the world's draws move where they are now."""
+        bodies, shapes = self._drawn_solids
+        if self.world is not None and bodies:
+            pose = self.world.transforms.numpy()[0, shapes].astype(float)
+            self.data.mocap_pos[bodies], self.data.mocap_quat[bodies] = (
+                pose[:, :3],
+                wxyz_from_xyzw(pose[:, 3:]),
+            )
 
     def _substep(self) -> None:
         mj, m, d, dofs = self._mujoco, self.model, self.data, self._dofs

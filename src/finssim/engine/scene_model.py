@@ -12,16 +12,22 @@ from numpy.typing import NDArray
 
 from finssim.engine.packed import Packed
 from finssim.engine.plant_arrays import SimulatorError
+from finssim.engine.solids import solid_shapes
 from finssim.engine.surroundings import Pool
+from finssim.geometry.frames import wxyz_from_xyzw
 from finssim.geometry.rotations import skew
 
 if TYPE_CHECKING:
     from finssim.vehicles import Vehicle
+    from finssim.worlds import WorldLayout
 
 COLLISION = ("envelope", "hull")
 """Shapes that a vehicle may collide with."""
 
 COLOURS = ((0.95, 0.75, 0.1, 1.0), (0.85, 0.25, 0.2, 1.0), (0.3, 0.65, 0.3, 1.0), (0.45, 0.35, 0.75, 1.0))
+
+SHELL = 1.0e-3
+"""Half the thickness of a world's meshes [m]."""
 
 _UNSEEN = 4  # a geom group that MuJoCo leaves out of pictures
 
@@ -62,6 +68,7 @@ def build_model(
     objects: str | Path | None,
     collision: str,
     timestep: float,
+    layout: WorldLayout | None = None,
 ) -> Any:
     """Compile the scene.
 
@@ -75,6 +82,7 @@ def build_model(
         collision: `envelope`, the box of the vehicle file's size about the body origin, or `hull`, the convex hull
             of its mesh.
         timestep: Physics step [s].
+        layout: Of the described world whose solids stand there, `solidK` with the index of the shape K; none if None.
 
     Returns:
         The `mujoco.MjModel`.
@@ -89,6 +97,8 @@ def build_model(
         _paint_surroundings(mj, spec)
         if pool is not None:
             _add_pool(mj, spec, pool)
+        if layout is not None:
+            _add_solids(mj, spec, layout)
         bodies = [
             _add_vehicle(mj, spec, i, vehicle, M, collision)
             for i, (vehicle, M) in enumerate(zip(vehicles, inertias, strict=True))
@@ -170,6 +180,44 @@ def _add_pool(mj: ModuleType, spec: Any, pool: Pool) -> None:
         name="water_surface", type=mj.mjtGeom.mjGEOM_PLANE, size=[x, y, 0.05], contype=0, conaffinity=0,
         rgba=[0.3, 0.6, 0.75, 0.2],
     )  # fmt: skip
+
+
+def _add_solids(mj: ModuleType, spec: Any, layout: WorldLayout) -> None:
+    """The solids of a world, rigid; those that its draws move are mocap bodies.
+
+    Meshes are flexes of triangles that do not move: as a geom MuJoCo would take the convex hull of one.
+    """
+    for k in solid_shapes(layout):
+        shape, pose = layout.shapes[k], layout.transforms.numpy()[0, k].astype(float)
+        position, attitude = pose[:3], wxyz_from_xyzw(pose[3:])
+        name, body = f"solid{k}", spec.worldbody
+        common = {"rgba": [*map(float, shape.finish.colour), 1.0], "priority": 1}
+        common["friction"] = [layout.world.contact.friction, 0.005, 0.0001]
+        if shape.anchor >= 0 or shape.kind == "mesh":
+            body = spec.worldbody.add_body(name=name, mocap=shape.anchor >= 0, pos=position, quat=attitude)
+            position, attitude = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+        if shape.kind == "mesh":
+            flex = spec.add_flex(name=name, dim=2, radius=SHELL, **common)
+            flex.vert, flex.elem = (
+                np.asarray(shape.vertices).ravel().tolist(),
+                np.asarray(shape.faces).ravel().tolist(),
+            )
+            flex.vertbody, flex.selfcollide = [name] * len(shape.vertices), mj.mjtFlexSelf.mjFLEXSELF_NONE
+            continue
+        size = [*shape.size]
+        if shape.heights is not None:
+            low, high = float(shape.heights.min()), float(shape.heights.max())
+            rows, columns = shape.heights.shape
+            rise = max(high - low, 1e-3)
+            spec.add_hfield(
+                name=name, nrow=rows, ncol=columns, size=[shape.size[0], shape.size[1], rise, 1.0],
+                userdata=((shape.heights - low) / rise).ravel().tolist(),
+            )  # fmt: skip
+            common["hfieldname"], position = name, [position[0], position[1], position[2] + low]
+        elif shape.kind == "plane":
+            size = [0.0, 0.0, 0.05]  # without end
+        kind = getattr(mj.mjtGeom, f"mjGEOM_{'HFIELD' if shape.heights is not None else shape.kind.upper()}")
+        body.add_geom(name=name, type=kind, size=size, pos=position, quat=attitude, **common)
 
 
 def _add_vehicle(

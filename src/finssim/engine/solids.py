@@ -53,6 +53,15 @@ def pool_of(world: World) -> Pool | None:
     )
 
 
+def solid_shapes(layout: WorldLayout) -> list[int]:
+    """Which shapes of a layout vehicles run into, beside the basin."""
+    return [
+        k
+        for k, shape in enumerate(layout.shapes)
+        if shape.owner != "basin" and getattr(shape.finish, "solid", True)
+    ]
+
+
 class WorldSolids:
     """What a vehicle can run into beside the basin: the struct that kernels take, and what it points to."""
 
@@ -65,11 +74,7 @@ class WorldSolids:
             lightest: Least mass along an axis of any of them, added mass included [kg].
         """
         device = layout.device
-        chosen = [
-            k
-            for k, shape in enumerate(layout.shapes)
-            if shape.owner != "basin" and getattr(shape.finish, "solid", True)
-        ]
+        chosen = solid_shapes(layout)
         shapes = [layout.shapes[k] for k in chosen]
         self.count = len(shapes)
         contact, solids = layout.world.contact, Solids()

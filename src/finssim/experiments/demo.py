@@ -20,15 +20,14 @@ from typing import Annotated, Any
 import numpy as np
 from rich.console import Console
 
-from finssim.calibration.excitation.programmes import RATE, STEADY, Programme, programmes, which_axes
 from finssim.calibration.findings import Finding, sentences
 from finssim.calibration.fit import Fit
-from finssim.calibration.output.report import interval_text, number_text, state_text, write_report
-from finssim.calibration.output.vehicle_file import all_findings, calibrated, number_in, write_vehicle
+from finssim.calibration.programmes import RATE, STEADY, Programme, programmes, which_axes
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.replay.replay import Replay, replay
-from finssim.calibration.replay.report import draw_response_envelopes
+from finssim.calibration.replay import Replay, draw_response_envelopes, replay
+from finssim.calibration.report import interval_text, number_text, state_text, write_report
 from finssim.calibration.trials.trial_files import load_trials
+from finssim.calibration.vehicle_file import all_findings, calibrated, number_in, write_vehicle
 from finssim.control.pid import axis_model
 from finssim.control.policy import Policy
 from finssim.engine import Pool

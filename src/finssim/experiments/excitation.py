@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import Programme, programmes
-from finssim.calibration.excitation.programmes import excite as write_programmes
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers.dispatch import print_folders, read_trials
+from finssim.calibration.programmes import Programme, programmes
+from finssim.calibration.programmes import excite as write_programmes
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.control import ControlError

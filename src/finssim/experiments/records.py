@@ -35,8 +35,7 @@ from finssim.tasks import Task
 from finssim.tasks.observer import Observer, fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.viewer.frame import ViewError
-from finssim.viewer.sources.alignment import offset_between
-from finssim.viewer.sources.series import PoseSeries
+from finssim.viewer.series import PoseSeries, offset_between
 from finssim.yaml_file import json_value
 
 Array = NDArray[np.float64]

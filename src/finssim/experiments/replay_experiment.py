@@ -13,14 +13,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from finssim.calibration.excitation.programmes import Programme, programmes
-from finssim.calibration.excitation.synthetic import Recording, record, trials_of
 from finssim.calibration.fit import Fit
-from finssim.calibration.output.vehicle_file import calibrated, write_vehicle
+from finssim.calibration.programmes import Programme, programmes
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.replay.replay import Replay, replay
-from finssim.calibration.replay.report import DEFINITION, MODEL_LABELS, draw_response_envelopes
+from finssim.calibration.replay import DEFINITION, MODEL_LABELS, Replay, draw_response_envelopes, replay
+from finssim.calibration.synthetic import Recording, record, trials_of
 from finssim.calibration.trials.trial import Trial
+from finssim.calibration.vehicle_file import calibrated, write_vehicle
 from finssim.engine import Simulator, TetherLine
 from finssim.experiments.campaign import Progress, write_json
 from finssim.experiments.figures import save_figure

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ from finssim.yaml_file import json_value
 
 DATASET_FILE = "metadata.json"
 """Which marks a data set of Minari."""
+STATE = "state"
+"""Key of the row of numbers in an observation with pictures."""
 OURS = "finssim"
 """Key of the metadata under which stands what was demonstrated: task, vehicle, expert, seed, provenance."""
 
@@ -44,6 +46,8 @@ class Episode:
     """Ended by the task; else by its time."""
     metrics: Mapping[str, float]
     """Of the task, such as success."""
+    pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    """Of a task that sees, by name; (T + 1, height, width, 3)."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,8 @@ class Demonstrations:
     mean_return: float
     about: Mapping[str, Any]
     """What was demonstrated: task, observation, action, vehicle, expert, seed, provenance."""
+    pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    """By name, (N, height, width, 3)."""
 
 
 def save(out: str | Path, episodes: Sequence[Episode], described: Mapping[str, Any]) -> Path:
@@ -80,11 +86,13 @@ def save(out: str | Path, episodes: Sequence[Episode], described: Mapping[str, A
     from gymnasium import spaces
     from minari.dataset.minari_storage import MinariStorage
 
-    n, m = episodes[0].observation.shape[1], episodes[0].action.shape[1]
+    first, m = episodes[0], episodes[0].action.shape[1]
+    state = spaces.Box(-np.inf, np.inf, first.observation.shape[1:], np.float32)
+    pictures = {name: spaces.Box(0, 255, x.shape[1:], np.uint8) for name, x in first.pictures.items()}
     with atomic_directory(out, replaces=DATASET_FILE) as folder:
         storage = MinariStorage.new(
             folder,
-            observation_space=spaces.Box(-np.inf, np.inf, (n,), np.float32),
+            observation_space=spaces.Dict({STATE: state, **pictures}) if pictures else state,
             action_space=spaces.Box(-1.0, 1.0, (m,), np.float32),
             data_format="arrow",
         )
@@ -111,7 +119,9 @@ def _buffers(episodes: Iterable[Episode]) -> Iterable[Any]:
         ends[0 if episode.terminated else 1, -1] = True
         yield EpisodeBuffer(
             id=i,
-            observations=episode.observation,
+            observations={STATE: episode.observation, **episode.pictures}
+            if episode.pictures
+            else episode.observation,
             actions=episode.action,
             rewards=episode.reward,
             terminations=ends[0],
@@ -130,14 +140,21 @@ def load(place: str | Path) -> Demonstrations:
 
     described = about(place)
     dataset = minari.MinariDataset(Path(place))
-    rows = [(e.observations, e.actions, float(np.sum(e.rewards))) for e in dataset.iterate_episodes()]
+    rows, pictures, actions, returns = [], [], [], []
+    for e in dataset.iterate_episodes():
+        seen = dict(e.observations) if isinstance(e.observations, dict) else {STATE: e.observations}
+        rows.append(seen.pop(STATE).astype(np.float32))
+        pictures.append(seen)
+        actions.append(e.actions.astype(np.float32))
+        returns.append(float(np.sum(e.rewards)))
     return Demonstrations(
-        observation=np.concatenate([o[:-1] for o, _, _ in rows]).astype(np.float32),
-        action=np.concatenate([a for _, a, _ in rows]).astype(np.float32),
-        following=np.concatenate([o[1:] for o, _, _ in rows]).astype(np.float32),
+        observation=np.concatenate([o[:-1] for o in rows]),
+        action=np.concatenate(actions),
+        following=np.concatenate([o[1:] for o in rows]),
         episodes=len(rows),
-        mean_return=float(np.mean([total for _, _, total in rows])),
+        mean_return=float(np.mean(returns)),
         about=described,
+        pictures={name: np.concatenate([one[name][:-1] for one in pictures]) for name in pictures[0]},
     )
 
 
@@ -290,11 +307,11 @@ def record_episodes(
     quota = np.full(worlds, count // rows)
     quota[: -(-(count - int(quota.sum()) * agents) // agents)] += 1
     fresh = expert.reset(rows)
-    memory, seen = fresh, environment.reset(seed=environment.seed).reshape(rows, -1).copy()
+    memory, (seen, pictures) = fresh, _apart(environment.reset(seed=environment.seed), rows)
     running: list[list[Any]] = [[] for _ in range(rows)]
     found: list[Episode] = []
     while len(found) < count and quota.any():
-        wanted, memory = expert.act(memory, Known(seen), NOWHERE)
+        wanted, memory = expert.act(memory, Known(seen, pictures=pictures or None), NOWHERE)
         wanted = np.clip(wanted, -1.0, 1.0)
         done = np.clip(wanted + disturb * rng.standard_normal(wanted.shape), -1.0, 1.0).astype(np.float32)
         shape = (worlds, -1) if agents == 1 else (worlds, agents, -1)
@@ -302,10 +319,11 @@ def record_episodes(
         reward = step.reward.reshape(rows)
         for i in range(rows):
             if quota[i // agents]:
-                running[i].append((seen[i], wanted[i], float(reward[i])))
+                views = {name: x[i].copy() for name, x in pictures.items()}
+                running[i].append((seen[i], views, wanted[i], float(reward[i])))
         ended = step.terminated | step.truncated
         if ended.any():
-            last = step.final_observation.reshape(rows, -1)
+            last, final_pictures = _apart(step.final_observation, rows)
             measured = environment.task.metrics(environment.arrays)
             broke = ended & (
                 environment.arrays.done.numpy() == 0
@@ -315,22 +333,36 @@ def record_episodes(
                 whole = {name: float(values[w]) for name, values in measured.items()}
                 for i in range(w * agents, (w + 1) * agents):
                     if not broke[w]:
-                        found.append(_episode(running[i], last[i], bool(step.terminated[w]), whole))
+                        views = {name: x[i] for name, x in final_pictures.items()}
+                        found.append(_episode(running[i], last[i], views, bool(step.terminated[w]), whole))
                     running[i] = []
             memory = restarted(memory, fresh, np.repeat(ended, agents))
-        seen = step.observation.reshape(rows, -1).copy()
+        seen, pictures = _apart(step.observation, rows)
         show(min(len(found) / count, 1.0))
     return found[:count]
 
 
+def _apart(observation: Any, rows: int) -> tuple[NDArray[np.float32], dict[str, NDArray[np.uint8]]]:
+    """Numbers (rows, n) and pictures by name of an observation, as copies."""
+    if not isinstance(observation, dict):
+        return observation.reshape(rows, -1).copy(), {}
+    pictures = {name: x.copy() for name, x in observation.items() if name != STATE}
+    return observation[STATE].reshape(rows, -1).copy(), pictures
+
+
 def _episode(
-    steps: list[Any], last: NDArray[np.float32], terminated: bool, metrics: dict[str, float]
+    steps: list[Any],
+    last: NDArray[np.float32],
+    views: dict[str, NDArray[np.uint8]],
+    terminated: bool,
+    metrics: dict[str, float],
 ) -> Episode:
-    observation, action, reward = zip(*steps, strict=True)
+    observation, pictures, action, reward = zip(*steps, strict=True)
     return Episode(
         observation=np.array([*observation, last], dtype=np.float32),
         action=np.array(action, dtype=np.float32),
         reward=np.array(reward, dtype=np.float32),
         terminated=terminated,
         metrics=metrics,
+        pictures={name: np.stack([*(one[name] for one in pictures), x]) for name, x in views.items()},
     )

@@ -72,7 +72,7 @@ def train(
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         action (MODE): What the policy commands: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
         randomize (FILE): Ranges that vehicle and water are drawn from: hold_for_position, fossen_learn_to_swim,
-            equivalent_box, pool, no_thruster_dynamics, or a file.
+            equivalent_box, pool, open_water, no_thruster_dynamics, or a file.
         observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
             through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
         seed: Seed of every random number; equal seeds give equal results.

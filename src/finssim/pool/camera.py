@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -11,25 +11,372 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.optics import Camera, Interface, Lens
-from finssim.geometry.rotations import quat_from_rotvec, quat_multiply, quat_rotate
+from finssim.geometry.rotations import quat_from_rotvec, quat_multiply, quat_rotate, quat_to_matrix
 from finssim.localization.detection.families import bitmap, family_named
 from finssim.localization.pool import Pool
-from finssim.pool.corner_camera import CornerCamera
 from finssim.pool.plant_spec import Basin, PlantSpecError, Severity, basin_of, by_severity
 from finssim.pool.positioning import Exposure, Mail, PoseAt, Shutter
-from finssim.robot.messages import Picture
+from finssim.robot.messages import Picture, TagCorners
 from finssim.sensors import overhead_camera as oc
 from finssim.sensors.overhead_camera import Ripples
+from finssim.sensors.overhead_camera.scene import surface_frame
+from finssim.sensors.overhead_camera.surface import waves_of
 from finssim.vehicles import Vehicle
 from finssim.vehicles.equipment import Mount, Tags
 
-__all__ = ["CameraSettings", "PictureCamera", "PoolCamera", "camera_of", "paper_lens", "true_site"]
+__all__ = [
+    "CameraSettings", "CornerCamera", "CornerFit", "PictureCamera", "PoolCamera", "RippledView", "camera_of",
+    "paper_lens", "true_site",
+]  # fmt: skip
+
+Array = npt.NDArray[np.float64]
+
+
+# Tag corners as a detector reports them, computed from the optics without drawing a picture.
+
+# What a detector that lays the whole known tag over the picture makes of it when ripples bend the tag's image.
+#
+# The fit of `localization.detection` moves a homography until the edges of all cells agree with the picture, so its
+# corners are those of the tag as ripples shift it on average, not of the bent image. For small bends that is linear:
+# the corners follow from a few points of the tag by a matrix that the tag's cells alone decide.
+
+
+NODES = 6
+"""Along each side of the tag: a polynomial of degree 5 follows ripples as long as the tag's edge."""
+HOMOGENEOUS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
+"""Corners of the unit square."""
+_UNITY = np.eye(3)
+
+
+class CornerFit:
+    """The tags of a vehicle: where to look at each, and which corners the fit reports."""
+
+    def __init__(self, family: str, tags: Sequence[int], edge: float) -> None:
+        """
+        Args:
+            family: Name of the tags' family.
+            tags: Their ids.
+            edge: Of the black border [m].
+        """
+        along = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # Chebyshev's, the ends included
+        self._square = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+        self._at_corner = [0, NODES - 1, NODES * NODES - 1, NODES * (NODES - 1)]
+        self.nodes = np.zeros((NODES * NODES, 3))
+        """Points of a tag whose pixels `corners` wants, tag frame [m], (N, 3)."""
+        self.nodes[:, 0] = edge * (self._square[:, 0] - 0.5)
+        self.nodes[:, 1] = edge * (0.5 - self._square[:, 1])
+        self._matrix = np.stack([_fit_matrix(family, tag, along, self._square) for tag in tags])
+
+    def corners(self, pixels: Array) -> tuple[Array, Array]:
+        """Corners that the fit reports, and how far ripples bend each tag.
+
+        Args:
+            pixels: Of `nodes` of every tag, (T, N, 2).
+
+        Returns:
+            Corners (T, 4, 2) [px], and the rms distance of the nodes from where the fit has them, in edges of the tag,
+            (T,). Those of a tag of which not all nodes have pixels mean nothing.
+        """
+        with np.errstate(all="ignore"):
+            square = [_from_square(tag) for tag in pixels[:, self._at_corner].tolist()]
+            H, back = np.array(square), np.array([_adjugate(tag) for tag in square])
+            seen = pixels @ back[:, :, :2].transpose(0, 2, 1) + back[:, None, :, 2]
+            moved = (seen[..., :2] / seen[..., 2:] - self._square).transpose(0, 2, 1).reshape(len(H), -1)
+            change = (self._matrix @ moved[..., None])[..., 0]
+            warp = np.zeros((len(H), 9))
+            warp[:, :8] = change[:, :8]
+            image = HOMOGENEOUS @ (H @ (warp.reshape(-1, 3, 3) + _UNITY)).transpose(0, 2, 1)
+            left = change[:, 8:]
+            bend = np.sqrt(2.0 * (left * left).sum(axis=1) / left.shape[1])
+            return image[..., :2] / image[..., 2:], bend
+
+
+def _fit_matrix(family: str, tag: int, along: Array, square: Array) -> Array:
+    """From motions of the nodes, all x before all y, to the fit's homography (8 rows) and what it leaves of them."""
+    points, across = _cell_edges(family, tag)
+    columns, there = _warp_columns(points), _interpolation(along, points)
+    rows = np.where(across[:, None], columns[:, 0], columns[:, 1])
+    u, v = np.where(across[:, None], there, 0.0), np.where(across[:, None], 0.0, there)
+    warp = np.linalg.pinv(rows) @ np.concatenate([u, v], axis=1)
+    at_nodes = _warp_columns(square)
+    left = np.eye(2 * len(square)) - np.concatenate([at_nodes[:, 0], at_nodes[:, 1]]) @ warp
+    return np.concatenate([warp, left])
+
+
+def _cell_edges(family: str, tag: int) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Middles of all edges between a black and a white cell, unit square of the border with y down, (E, 2), and
+    whether each is upright, so that the fit feels motion along x there, (E,)."""
+    kind = family_named(family)
+    cells = np.pad(bitmap(family, tag).astype(bool), 1, constant_values=True)
+    upright = np.argwhere(cells[:, 1:] != cells[:, :-1])[:, ::-1] + np.array([0.0, -0.5])
+    level = np.argwhere(cells[1:] != cells[:-1])[:, ::-1] + np.array([-0.5, 0.0])
+    points = (np.concatenate([upright, level]) - kind.outside) / kind.border
+    return points, np.arange(len(points)) < len(upright)
+
+
+def _warp_columns(points: Array) -> Array:
+    """d(x, y)/d(h) of the homography I + [[h0, h1, h2], [h3, h4, h5], [h6, h7, 0]] at points, (E, 2, 8)."""
+    x, y = points.T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    return np.stack(
+        [
+            np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=-1),
+            np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=-1),
+        ],
+        axis=1,
+    )
+
+
+def _interpolation(along: Array, points: Array) -> Array:
+    """Weights of the nodes of a square grid in the polynomial through them, at points, (E, N)."""
+    one = np.vander(along, len(along))
+    by_x, by_y = (np.vander(x, len(along)) @ np.linalg.inv(one) for x in points.T)
+    return np.asarray((by_y[:, :, None] * by_x[:, None, :]).reshape(len(points), -1))
+
+
+def _from_square(corners: list[list[float]]) -> list[list[float]]:
+    """The homography that takes the unit square, x right and y down, to four corners, (3, 3); unity where none does."""
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners
+    ux, uy, vx, vy = bx - cx, by - cy, dx - cx, dy - cy
+    wx, wy = ax - bx + cx - dx, ay - by + cy - dy
+    area = ux * vy - uy * vx
+    if not abs(area) > 1e-9:
+        return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    p, q = (wx * vy - wy * vx) / area, (ux * wy - uy * wx) / area
+    return [[bx - ax + p * bx, dx - ax + q * dx, ax], [by - ay + p * by, dy - ay + q * dy, ay], [p, q, 1.0]]
+
+
+def _adjugate(H: list[list[float]]) -> list[list[float]]:
+    """The homography back, (3, 3): the inverse but for a factor, which a homography does not feel."""
+    (a, b, c), (d, e, f), (g, h, i) = H
+    return [
+        [e * i - f * h, c * h - b * i, b * f - c * e],
+        [f * g - d * i, a * i - c * g, c * d - a * f],
+        [d * h - e * g, b * g - a * h, a * e - b * d],
+    ]
+
+
+# Where points in the water appear to a camera above a rippling surface, without drawing a picture.
+
+
+FLAT_STEPS = 2
+"""Of Newton's method for still water: within 1e-5 px. One is enough to begin with ripples."""
+RIPPLE_STEPS = 2
+"""For ripples, with the surface's curvature from the first: within 0.001 px rms at a slope of 0.01, 0.03 px at 0.03."""
+
+
+class RippledView:
+    """The same surface and the same law of refraction as the renderer's, solved from the point to the pixel."""
+
+    def __init__(self, camera: Camera, interface: Interface, ripples: Ripples | None = None) -> None:
+        """
+        Args:
+            camera: Above the water.
+            interface: Still surface, without a window.
+            ripples: As in `sensors.overhead_camera.Scene`; None for a flat surface.
+        """
+        self.camera = camera
+        self._frame = surface_frame(camera, interface)
+        self._ratio = interface.index_near / interface.index_far
+        self._R_sc = np.ascontiguousarray((camera.R_pc.T @ self._frame.R_sp.T).T)
+        self._surface = (
+            None if ripples is None or not ripples.rms_slope else _Surface(ripples, self._frame.offset)
+        )
+
+    def pixels(self, points_p: Array, time: float) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """Pixels at which points appear.
+
+        Args:
+            points_p: Pool frame [m], (N, 3).
+            time: Middle of the exposure [s].
+
+        Returns:
+            Pixels (N, 2), inside the picture or not, and which of them mean something: the point is under water and
+            the lens has a place for it, (N,).
+        """
+        points = self._frame.point(points_p)
+        direction = np.empty_like(points)
+        with np.errstate(all="ignore"):
+            x, y, height = self._crossing(points[:, 0], points[:, 1], -points[:, 2], time)
+            direction[:, 0], direction[:, 1], direction[:, 2] = x, y, height - self._frame.camera_height
+            pixels, seen = self.camera.lens.project(direction @ self._R_sc)
+        return pixels, seen & (points[:, 2] < height) & np.isfinite(x)
+
+    def _crossing(
+        self, px: Array, py: Array, depth: Array, time: float
+    ) -> tuple[Array, Array, Array | float]:
+        """Where the ray from the camera to each point crosses the surface: x, y, height, surface frame [m], (N,).
+
+        Found as the root of the miss: the ray through a place of the surface, bent by the slope there, lands beside
+        the point.
+        """
+        H, r = self._frame.camera_height, self._ratio
+        reach = np.hypot(px, py)
+        radius = reach * (H / (H + r * depth))
+        for _ in range(FLAT_STEPS if self._surface is None else 1):
+            cosine = H / np.sqrt(H * H + radius * radius)
+            beyond = np.sqrt(1.0 - r * r * (1.0 - cosine * cosine))
+            spread = depth * r * cosine / (beyond * H)
+            along = 1.0 + spread * (cosine / beyond) ** 2
+            radius = radius + (reach - radius * (1.0 + spread)) / along
+        share = radius / np.maximum(reach, 1e-12)
+        x, y = px * share, py * share
+        if self._surface is None:
+            return x, y, 0.0
+        across = 1.0 + spread
+        return self._rippled((x, y), (px, py), depth, (along, across, (1.0 - r) / beyond * depth), time)
+
+    def _rippled(
+        self,
+        place: tuple[Array, Array],
+        target: tuple[Array, Array],
+        depth: Array,
+        flat: tuple[Array, Array, Array],
+        time: float,
+    ) -> tuple[Array, Array, Array]:
+        """From the place on still water to that on ripples. `flat`: d landing / d place along the radius and across it
+        on still water, and by how much curvature adds to them."""
+        assert self._surface is not None
+        x, y = place
+        along, across, by_curvature = flat
+        height, sx, sy, hxx, hxy, hyy = self._surface.at(x, y, time)
+        pull = (along - across) / np.maximum(x * x + y * y, 1e-12)
+        a, b, c = (
+            across + pull * x * x + by_curvature * hxx,
+            pull * x * y + by_curvature * hxy,
+            across + pull * y * y + by_curvature * hyy,
+        )
+        inverse = 1.0 / (a * c - b * b)
+        for k in range(RIPPLE_STEPS):
+            if k > 0:
+                height, sx, sy, *_ = self._surface.at(x, y, time)
+            fx, fy = self._step(x, y, height, sx, sy, depth)
+            miss_x, miss_y = (target[0] - x - fx) * inverse, (target[1] - y - fy) * inverse
+            x, y = x + c * miss_x - b * miss_y, y + a * miss_y - b * miss_x
+        return x, y, height
+
+    def _step(
+        self, x: Array, y: Array, height: Array, sx: Array, sy: Array, depth: Array
+    ) -> tuple[Array, Array]:
+        """How far to the side a ray goes under water before it is at a depth [m], (N,) each."""
+        r = self._ratio
+        drop = self._frame.camera_height - height
+        length = np.sqrt(x * x + y * y + drop * drop)
+        steep = 1.0 / np.sqrt(1.0 + sx * sx + sy * sy)
+        cosine = (x * sx + y * sy + drop) * steep / length
+        # Snell's law: b = r ray + (r cos - cos') n, with ray = (x, y, -drop)/length and n = (-sx, -sy, 1) steep.
+        turn = (r * cosine - np.sqrt(1.0 - r * r * (1.0 - cosine * cosine))) * steep
+        short = r / length
+        scale = (depth + height) / (drop * short - turn)
+        return (x * short - sx * turn) * scale, (y * short - sy * turn) * scale
+
+
+class _Surface:
+    """Height, slope and curvature of the ripples, surface frame."""
+
+    def __init__(self, ripples: Ripples, offset: Array) -> None:
+        waves = waves_of(ripples)
+        self._k = np.ascontiguousarray(waves.k.T)
+        self._omega = waves.omega
+        self._phase = waves.phase + offset @ self._k
+        kx, ky = self._k
+        a = waves.amplitude
+        self._of_sine = np.stack([a, -a * kx * kx, -a * kx * ky, -a * ky * ky])
+        self._of_cosine = np.stack([a * kx, a * ky])
+
+    def at(self, x: Array, y: Array, time: float) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """h [m], h_x, h_y, h_xx, h_xy, h_yy [1/m] at places, (N,) each."""
+        angle = np.array((x, y)).T @ self._k
+        angle += self._phase - self._omega * time
+        h, h_xx, h_xy, h_yy = self._of_sine @ np.sin(angle).T
+        h_x, h_y = self._of_cosine @ np.cos(angle).T
+        return h, h_x, h_y, h_xx, h_xy, h_yy
+
+
+# Tag corners as a detector reports them, computed from the optics without drawing a picture.
+
+
+LEAST_EDGE = 12.0
+"""A tag with a shorter edge is not found [px]."""
+RIM = 0.15
+"""White around the tag that must be in the picture too, part of its edge."""
+NARROWEST = 0.25
+"""A tag whose image covers less of the square over its longest side is not found: it is seen from 75° off its normal,
+or from behind."""
+OPPOSITE = [2, 3, 0, 1]
+MOST_BENT = 0.031
+"""A tag that ripples bend further from a plane one is not found, rms in edges of the tag: half of those that are bent
+so are found in rendered pictures."""
+UNEXPLAINED = 0.33
+"""Error of a corner, part of the bend [px]: the fit gives less weight to the cells that are bent most."""
+
+
+class CornerCamera:
+    """Looks at the tags of a vehicle."""
+
+    def __init__(
+        self, tags: Tags, site: Pool, ripples: Ripples | None, *, pixel_noise: float, seed: int
+    ) -> None:
+        """
+        Args:
+            tags: Where they truly sit.
+            site: Camera and water as they are.
+            ripples: Of the water; None for flat.
+            pixel_noise: Standard deviation of a corner, per axis [px].
+            seed: Of the noise.
+        """
+        self._noise, self._seed = pixel_noise, seed
+        self._inside = site.camera.lens.inside
+        self._view = RippledView(site.camera, site.interface, ripples)
+        self._ids = list(tags.mounts)
+        self._fit = CornerFit(tags.family, self._ids, tags.edge)
+        self._nodes_b = np.concatenate(
+            [
+                np.asarray(m.position) + self._fit.nodes @ quat_to_matrix(m.orientation).T
+                for m in tags.mounts.values()
+            ]
+        )
+
+    def picture(
+        self, start: tuple[Array, Array], end: tuple[Array, Array], middle: float, sequence: int
+    ) -> Picture:
+        """Corners at the middle of an exposure.
+
+        Args:
+            start: Position [m] and orientation (xyzw) of the body when it began, pool frame.
+            end: The same when it ended.
+            middle: [s]
+            sequence: Of the picture.
+        """
+        q = start[1] + math.copysign(1.0, float(start[1] @ end[1])) * end[1]
+        position, R = 0.5 * (start[0] + end[0]), quat_to_matrix(q / np.linalg.norm(q))
+        pixels, seen = self._view.pixels(position + self._nodes_b @ R.T, middle)
+        shape = len(self._ids), -1
+        seen = seen.reshape(shape).all(axis=1)
+        corners, bend = self._fit.corners(pixels.reshape(*shape, 2))
+        rim = self._inside(corners + RIM * (corners - corners[:, OPPOSITE])).all(axis=1)
+        noise = np.random.default_rng([self._seed, sequence]).standard_normal(corners.shape)
+        found = [
+            TagCorners(tag, reported)
+            for tag, there, c, b, e in zip(self._ids, seen & rim, corners, bend.tolist(), noise, strict=True)
+            if there and (reported := _reported(c, b, self._noise, e)) is not None
+        ]
+        return Picture(middle, sequence, tags=tuple(found))
+
+
+def _reported(corners: Array, bend: float, pixel_noise: float, noise: Array) -> Array | None:
+    """Corners of one tag in the picture, None where a detector would not find it."""
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners.tolist()
+    sides = math.hypot(bx - ax, by - ay), math.hypot(cx - bx, cy - by), math.hypot(dx - cx, dy - cy)
+    area = 0.5 * ((cx - ax) * (dy - by) - (cy - ay) * (dx - bx))
+    if bend > MOST_BENT or min(sides) < LEAST_EDGE or area < NARROWEST * max(sides) ** 2:
+        return None
+    error = math.hypot(pixel_noise, UNEXPLAINED * bend * math.sqrt(area))
+    return np.asarray(corners + error * noise)
 
 
 # The overhead camera of a virtual pool as it truly hangs, as its calibration has it, and how good its pictures are.
 
-
-Array = npt.NDArray[np.float64]
 
 HEIGHT = 1.4
 """Of the camera above the water, for a pool of 4 m x 2 m [m]. The paper's hung at 1.21 m, from where its lens does not

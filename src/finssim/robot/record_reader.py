@@ -19,7 +19,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from finssim.files import atomic_write
-from finssim.mcap_repair import MAGIC, whole_mcap
+from finssim.mcap_files import MAGIC, whole_mcap
 from finssim.robot.record_messages import METADATA, RecordError, types
 from finssim.yaml_file import json_value
 

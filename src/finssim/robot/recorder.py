@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.files import OutputError, atomic_write, refuse_unwritable
-from finssim.mcap_repair import END
+from finssim.mcap_files import END
 from finssim.provenance import provenance
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry
 from finssim.robot.pictures import jpeg

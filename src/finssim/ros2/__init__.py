@@ -1,1 +1,11 @@
 """ROS 2 for FinsSim: the real wire without a ROS installation, one source for messages, names and frames."""
+
+from __future__ import annotations
+
+
+class Ros2Error(ValueError):
+    """A setting, name or definition of ROS 2 cannot be used; the message is one sentence that says what to do."""
+
+
+class MessageError(AssertionError):
+    """A value does not fit its field. Real rclpy asserts here, so code written for it may expect an AssertionError."""

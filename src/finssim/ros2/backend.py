@@ -13,8 +13,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from finssim.ros2 import Ros2Error
 from finssim.ros2.codec import Codec, codec_of
-from finssim.ros2.errors import Ros2Error
 
 __all__ = ["activate", "install"]
 

@@ -20,7 +20,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from finssim.ros2.errors import MessageError, Ros2Error
+from finssim.ros2 import MessageError, Ros2Error
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,8 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader, Subscriber
 from cyclonedds.topic import Topic
 
+from finssim.ros2 import Ros2Error
 from finssim.ros2.codec import Codec, Distro, Message, Nodetype, codec_of, distro_of
-from finssim.ros2.errors import Ros2Error
 
 MAX_DOMAIN = 232
 """A higher domain has no room for its UDP ports (7400 + 250 d + 2·index)."""

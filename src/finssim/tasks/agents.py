@@ -821,7 +821,7 @@ class WallFollower(DriveBaseline):
         line = memory + share * (line - memory)
         turn = -np.arctan(line[:, 1])
         away = line[:, 0] * np.cos(turn)
-        slant = RANGE_SCALE * o[:, 9] + self.tube
+        slant = self.height + RANGE_SCALE * o[:, 9] + self.tube
         above = np.sqrt(np.maximum(slant**2 - away**2, 0.0)) + self.under - self.height
         towards = np.clip(self.gain * (away - self.distance), -0.15, 0.15)
         wanted = np.column_stack(

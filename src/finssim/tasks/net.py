@@ -31,8 +31,8 @@ from finssim.vehicles import Vehicle
 
 FOOT = 6.9
 """Depth of the sinker tube along the net's foot, in the site `net` [m]."""
-RANGE_SCALE = 5.0
-"""The range is divided by this in the observation [m]."""
+RANGE_SCALE = 0.5
+"""The range below less the set height is divided by this in the observation [m]."""
 
 
 @wp.func
@@ -130,7 +130,14 @@ class Net(Task):
     observation: tuple[ObservationPart, ...] = (
         ObservationPart("up, body frame", 3, "1", term=up),
         *own_velocity(clip=2.0),
-        ObservationPart("range below", 1, "m", scale=RANGE_SCALE, clip=2.0, term="arrays.ranges[w, 0]"),
+        ObservationPart(
+            "range below, less the set height",
+            1,
+            "m",
+            scale=RANGE_SCALE,
+            clip=4.0,
+            term="arrays.ranges[w, 0] - p.height",
+        ),
     )
     world: str = "net"
     pictures: tuple[Picture, ...] = (Picture("sonar", bins=48),)

@@ -1,15 +1,12 @@
 """Vehicles: one file each, read, checked and frozen."""
 
-from finssim.vehicles.body import Body, Hull, Water
-from finssim.vehicles.calibration_record import CalibrationRecord
 from finssim.vehicles.check import Finding, check_vehicle
 from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensors, Tags
-from finssim.vehicles.errors import VehicleError
-from finssim.vehicles.esc import Esc
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.loader import catalogue, catalogue_vehicle, load_vehicle
-from finssim.vehicles.thruster import Thruster
-from finssim.vehicles.vehicle import AXES, Provenance, Vehicle
+from finssim.vehicles.part import VehicleError
+from finssim.vehicles.thruster import Esc, Thruster
+from finssim.vehicles.vehicle import AXES, Body, CalibrationRecord, Hull, Provenance, Vehicle, Water
 
 __all__ = [
     "AXES",

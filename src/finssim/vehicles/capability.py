@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.vehicles.body import moved_to_origin
-from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
-from finssim.vehicles.vehicle import AXES, Vehicle
+from finssim.vehicles.part import VehicleError
+from finssim.vehicles.vehicle import AXES, Vehicle, moved_to_origin
 
 __all__ = [
     "Restoring",

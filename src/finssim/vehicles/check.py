@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.vehicles.capability import trim, wrench_capability
-from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
+from finssim.vehicles.part import VehicleError
 from finssim.vehicles.terms import TERMS
 from finssim.vehicles.vehicle import AXES, Vehicle
 

@@ -24,7 +24,7 @@ from finssim.vehicles.equipment import (
     Sensors,
     Tags,
 )
-from finssim.vehicles.errors import VehicleError
+from finssim.vehicles.part import VehicleError
 
 if TYPE_CHECKING:
     from finssim.vehicles.vehicle import Vehicle

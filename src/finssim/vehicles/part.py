@@ -223,3 +223,7 @@ def sentence_of(detail: Any, shown: str, missing: str = "add it, with its origin
     else:
         problem = f"is {given!r}: {detail['msg']}"
     return ": ".join(filter(None, [shown, ".".join(where[:-1]), f"{where[-1]} {problem}"]))
+
+
+class VehicleError(ValueError):
+    """A vehicle file or a value given for a vehicle is refused; the message says where, what and what to do."""

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from finssim.vehicles.autopilot import Autopilot, refuse_misfit
-from finssim.vehicles.body import Body, Hull, Water, moved_to_origin, skew
-from finssim.vehicles.calibration_record import CalibrationRecord
 from finssim.vehicles.defaults import (
     DEFAULTS,
     default_mcu,
@@ -26,18 +24,116 @@ from finssim.vehicles.defaults import (
     default_tags,
 )
 from finssim.vehicles.equipment import RESERVED, SENSOR_NAME, Mcu, RaySensor, Safety, Sensors, Tags
-from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.hydrodynamics import AnyHydrodynamicSet, HydrodynamicSet, MeshSet
-from finssim.vehicles.part import Part, Vector3, did_you_mean, refuse_section, refuse_value
+from finssim.vehicles.part import (
+    Inertia,
+    Part,
+    Positive,
+    Positive3,
+    Vector3,
+    VehicleError,
+    did_you_mean,
+    refuse_section,
+    refuse_value,
+)
 from finssim.vehicles.thruster import Thruster
+
+Array = NDArray[np.float64]
+
+
+class Water(Part):
+    """The water the numbers of the file were given for."""
+
+    density: Positive
+    """[kg/m³]"""
+    gravity: Positive
+    """[m/s²]"""
+
+
+class Body(Part):
+    """Rigid body: positions are from the body origin, in body axes (x forward, y left, z up)."""
+
+    mass: Positive
+    """Dry mass including flooded-in solids, without entrained water [kg]."""
+    inertia: Inertia
+    """About the centre of gravity, body axes, (3, 3) [kg m²]; the file gives 3 diagonal entries or 3 rows of 3."""
+    center_of_gravity: Vector3
+    """[m], (3,)"""
+    displaced_volume: Positive
+    """Volume of water displaced when fully submerged [m³]."""
+    center_of_buoyancy: Vector3
+    """[m], (3,)"""
+    size: Positive3
+    """Envelope box along x, y, z [m], (3,)."""
+    surface_half_height: Positive
+    """Half height of the layer in which buoyancy fades out at the surface [m]."""
+
+
+class Hull(Part):
+    """The closed surface of the vehicle: a mesh file, or one built from `body` (envelope, volume, centre)."""
+
+    parametric: bool = False
+    """True: build the mesh from `body.size`, `body.displaced_volume` and `body.center_of_buoyancy`."""
+    file: Path | None = None
+    """STL in body axes [m]; a relative path starts at the vehicle file."""
+    scale: Positive = 1.0
+    """Factor on the coordinates of the file."""
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Hull:
+        if self.parametric == (self.file is not None):
+            raise refuse_section("expected either 'parametric: true' or 'file: NAME.stl'")
+        return self
+
+
+def skew(r: NDArray[np.float64]) -> NDArray[np.float64]:
+    """S(r) with S(r) x = r × x."""
+    return np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
+
+
+def moved_to_origin(matrix: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A 6x6 mass or damping matrix that holds at `point` [m, body], for the twist at the body origin.
+
+    H(r)ᵀ M H(r) with H(r) = [[I, -S(r)], [0, I]]                       (Fossen 2021, eq. 3.31)
+    """
+    H = np.eye(6)
+    H[:3, 3:] = -skew(point)
+    return H.T @ matrix @ H
+
+
+class CalibrationRecord(Part):
+    """One entry of `calibrations` in a vehicle file; no clock time is in it, so that equal fits write equal files."""
+
+    kind: Literal["thruster", "motor", "hydrodynamics", "mounts"]
+    """What was calibrated."""
+    method: str
+    """Estimator, such as `regression` or `simulation`."""
+    trials: dict[str, str]
+    """Name of each trial or table -> SHA-256 of its numbers."""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """Options of the method and its seed, as plain values."""
+    start: str = ""
+    """`sha256` of the vehicle that it started from."""
+    finssim: str = ""
+    """Version of FinsSim."""
+    revision: str | None = None
+    """Git commit of FinsSim, where it ran from a checkout."""
+    interrupted: bool = False
+    """Whether it was stopped before it converged."""
+
+    def sentence(self) -> str:
+        """`hydrodynamics by regression on 24 trials`, for lists and notes."""
+        count = len(self.trials)
+        noun = {"thruster": "table", "mounts": "recording"}.get(self.kind, "trial")
+        words = f"{self.kind} by {self.method} on {count} {noun}{'' if count == 1 else 's'}"
+        return f"{words} (interrupted)" if self.interrupted else words
+
 
 Axis = Literal["surge", "sway", "heave", "roll", "pitch", "yaw"]
 AXES: tuple[Axis, ...] = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 Origin = Literal["measured", "published", "derived", "guessed"]
 ORIGINS: tuple[Origin, ...] = ("measured", "published", "derived", "guessed")
-
-Array = NDArray[np.float64]
 
 
 class Provenance(NamedTuple):
@@ -227,9 +323,26 @@ class Vehicle(Part):
         Raises:
             VehicleError: The file gives no hull, or its mesh cannot be used.
         """
-        from finssim.vehicles.hull import hull_mesh
+        from finssim.geometry import mesh  # SciPy, which it uses, is slow to import
 
-        return hull_mesh(self)
+        hull, body = self.hull, self.body
+        if hull is None:
+            raise VehicleError(
+                f"{self.name} has no hull: give 'hull: {{parametric: true}}' or 'hull: {{file: NAME.stl}}'"
+            )
+        if hull.file is None:
+            try:
+                return mesh.parametric_hull(body.size, body.displaced_volume, body.center_of_buoyancy)
+            except mesh.MeshError as error:
+                raise VehicleError(f"parametric hull of {self.name}: {error}") from None
+        if not hull.file.is_file():
+            raise VehicleError(f"file {hull.file} does not exist: give a path relative to the vehicle file")
+        try:
+            vertices, faces = mesh.load_stl(hull.file)
+            mesh.check_closed(vertices, faces)
+        except mesh.MeshError as error:
+            raise VehicleError(f"file {hull.file.name}: {error}") from None
+        return hull.scale * vertices, faces
 
     # -- identity ---------------------------------------------------------------------------------------------
 

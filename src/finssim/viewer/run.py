@@ -14,7 +14,7 @@ from finssim.robot.interrupt import interruptible
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 from finssim.viewer.frame import Source, ViewError
-from finssim.viewer.sources.guides import guide_for
+from finssim.viewer.sources import guide_for
 from finssim.worlds import load_world
 
 _DRIVEN = {"policy", "task", "goal", "trajectory", "seed"}
@@ -82,7 +82,7 @@ def open_source(choice: Choice) -> Source:
         return _simulator(choice)
     path = Path(choice.source)
     if path.is_dir():
-        from finssim.viewer.sources.run import RunSource
+        from finssim.viewer.sources import RunSource
 
         if choice.world is not None and not choice.world.isdecimal():
             raise ViewError(f"--world {choice.world}: expected the number of a world of the folder's run")
@@ -92,7 +92,7 @@ def open_source(choice: Choice) -> Source:
         raise ViewError(
             f"{choice.source}: no such file or folder; give pool, sim, a record (.mcap) or a run's folder"
         )
-    from finssim.viewer.sources.record import RecordSource
+    from finssim.viewer.sources import RecordSource
 
     return RecordSource(
         path,
@@ -155,7 +155,7 @@ def _refuse_strangers(choice: Choice) -> None:
 
 
 def _pool(choice: Choice) -> Source:
-    from finssim.viewer.sources.pool import PoolSource
+    from finssim.viewer.sources import PoolSource
 
     name = choice.vehicle or "finsrov"
     goal = choice.goal
@@ -178,7 +178,7 @@ def _pool(choice: Choice) -> Source:
 
 
 def _simulator(choice: Choice) -> Source:
-    from finssim.viewer.sources.simulator import SimulatorSource
+    from finssim.viewer.sources import SimulatorSource
 
     vehicle = load_vehicle(choice.vehicle or "finsrov")
     return SimulatorSource(

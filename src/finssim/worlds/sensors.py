@@ -794,7 +794,8 @@ def _echo_rays(
 
     relative to the source's level at 1 m. (Lambert's law: 10 log mu + 10 log k²; b² dW is `weight`.) It comes from the
     ranges of its footprint: half-way to the rays above and below where they strike the same shape, else as far as the
-    normal says; so that no gaps open between rays on a slanting floor. `energy` is that of one range cell.
+    normal says; so that no gaps open between rays on a slanting floor. `energy` is that of one range cell. What stands
+    above the water is not heard.
     """
     v, i, block = wp.tid()
     if worlds[v] == SKIPPED:
@@ -805,7 +806,7 @@ def _echo_rays(
         r = depth[v, i, j]
         index = shape_index[v, i, j]
         energy[v, i, j] = 0.0
-        if index != MISS and r > 0.0:
+        if index != MISS and r > 0.0 and wp.transform_point(views[v], r * rays[i, j, 0, 1])[2] < 0.0:
             d = rays[i, j, 0, 1]
             n = wp.quat_rotate_inv(rotation, normal[v, i, j])
             k = wp.max(wp.abs(wp.dot(n, d)), 1.0e-3)
@@ -838,6 +839,121 @@ def _echo_rays(
             echo = weight[i] * surfaces[int(index)].backscatter * k * wp.exp(-decay * r) / (r * r)
             spread[v, i, j] = wp.vec2(first, last)
             energy[v, i, j] = echo / (last - first)
+
+
+@wp.kernel(enable_backward=False)
+def _mirror_views(
+    views: wp.array(dtype=wp.transform), worlds: wp.array(dtype=int), images: wp.array(dtype=wp.transform)
+):
+    """Poses of the sensors' images above the surface, whose bundle has left and right exchanged.
+
+    With M = diag(1, 1, -1), F = diag(1, -1, 1) and a sensor's attitude R, that of its image is M R F = (M R M) (M F).
+    """
+    v = wp.tid()
+    if worlds[v] != SKIPPED:
+        x = wp.transform_get_translation(views[v])
+        q = wp.transform_get_rotation(views[v])
+        turned = wp.quat(-q[0], -q[1], q[2], q[3]) * wp.quat(1.0, 0.0, 0.0, 0.0)
+        images[v] = wp.transform(wp.vec3(x[0], x[1], -x[2]), turned)
+
+
+@wp.kernel(enable_backward=False)
+def _cut_images(
+    worlds: wp.array(dtype=int),
+    rays: wp.array4d(dtype=wp.vec3),
+    views: wp.array(dtype=wp.transform),
+    images: wp.array(dtype=wp.transform),
+    span: int,
+    depth: wp.array3d(dtype=float),
+    shape_index: wp.array3d(dtype=wp.uint32),
+    depth_image: wp.array3d(dtype=float),
+    index_image: wp.array3d(dtype=wp.uint32),
+):
+    """Give rays of images depth 0 where the sensor's own meets something before the surface, or they do above it."""
+    v, i, block = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
+    for j in range(block * span, wp.min(block * span + span, depth.shape[2])):
+        ray = rays[i, j, 0, 1]
+        own = depth[v, i, j] * wp.vec3(ray[0], -ray[1], ray[2])
+        below = shape_index[v, i, j] != MISS and wp.transform_point(views[v], own)[2] < 0.0
+        point = wp.transform_point(images[v], depth_image[v, i, j] * ray)
+        above = index_image[v, i, j] != MISS and point[2] >= 0.0
+        if below or above:
+            depth_image[v, i, j] = 0.0
+            index_image[v, i, j] = wp.uint32(0)
+
+
+@wp.kernel(enable_backward=False)
+def _reflect_echoes(
+    worlds: wp.array(dtype=int),
+    rays: wp.array4d(dtype=wp.vec3),
+    views: wp.array(dtype=wp.transform),
+    depth: wp.array3d(dtype=float),
+    shape_index: wp.array3d(dtype=wp.uint32),
+    normal: wp.array3d(dtype=wp.vec3),
+    energy: wp.array3d(dtype=float),
+    spread: wp.array3d(dtype=wp.vec2),
+    others: wp.array(dtype=wp.transform),
+    other_depth: wp.array3d(dtype=float),
+    other_index: wp.array3d(dtype=wp.uint32),
+    hand: float,
+    pattern: wp.array(dtype=float),
+    first: float,
+    steps: wp.vec2,
+    abeam: int,
+    loss: float,
+    absorption: float,
+    bins_per_metre: float,
+    span: int,
+    echoes: wp.array3d(dtype=float),
+    spreads: wp.array3d(dtype=wp.vec2),
+):
+    """Echoes that go out one way and come back the other: straight, and by the surface as from the sensor's image.
+
+    Lambert's law with another way there: k/r² of `_echo_rays` becomes that of the other way, b² the product of both,
+    and the range half of r + r'. The other way is open unless the ray of `others` that is nearest to it ends at another
+    shape before. `hand` is -1 where that view's bundle has left and right exchanged, `loss` what the reflection leaves.
+    """
+    v, i, block = wp.tid()
+    if worlds[v] == SKIPPED:
+        return
+    origin = wp.transform_get_translation(others[v])
+    attitude = wp.transform_get_rotation(others[v])
+    rows = depth.shape[1]
+    beams = depth.shape[2]
+    for j in range(block * span, wp.min(block * span + span, beams)):
+        echoes[v, i, j] = 0.0
+        if energy[v, i, j] <= 0.0:
+            continue
+        r = depth[v, i, j]
+        n = normal[v, i, j]
+        ray = wp.transform_vector(views[v], rays[i, j, 0, 1])
+        way = wp.transform_get_translation(views[v]) + r * ray - origin
+        other = wp.max(wp.length(way), 1.0e-3)
+        way = way / other
+        # Both ways must meet the same side of the surface.
+        k = wp.dot(n, way) * wp.sign(wp.dot(n, ray))
+        d = wp.quat_rotate_inv(attitude, way)
+        azimuth = wp.atan2(hand * d[1], d[0])
+        row = int(wp.floor((wp.asin(wp.clamp(d[2], -1.0, 1.0)) - first) / wp.max(steps[0], 1.0e-6) + 0.5))
+        beam = int(wp.floor(0.5 * float(beams) - azimuth / steps[1]))
+        if abeam == 1:
+            beam = wp.where(azimuth > 0.0, 0, 1)
+            if wp.abs(wp.abs(azimuth) - wp.static(0.5 * math.pi)) > 0.5 * steps[1]:
+                k = 0.0
+        if k <= 0.0 or row < 0 or row >= rows or beam < 0 or beam >= beams:
+            continue
+        end = other_depth[v, row, beam]
+        met = other_index[v, row, beam]
+        if met != MISS and (end <= 0.0 or (met != shape_index[v, i, j] and end < 0.95 * other - 0.05)):
+            continue
+        own = wp.max(wp.abs(wp.dot(n, ray)), 1.0e-3)
+        longer = 0.5 * (other - r)
+        share = loss * pattern[row] / pattern[i] * k / own * r * r / (other * other)
+        echoes[v, i, j] = share * wp.exp(-0.2 * wp.log(10.0) * absorption * longer) * energy[v, i, j]
+        shift = bins_per_metre * longer
+        spreads[v, i, j] = spread[v, i, j] + wp.vec2(shift, shift)
 
 
 @wp.kernel(enable_backward=False)
@@ -974,11 +1090,22 @@ class SonarBatch(RayBatch):
             self._taps = wp.array(np.float32(taps), dtype=float)
             self._gain = wp.array(np.float32(gain), dtype=float)
             self._exponential = wp.array(np.float32(-np.log1p(-(np.arange(4096) + 0.5) / 4096)), dtype=float)
-            self._energy = wp.zeros(self.depth.shape, dtype=float)
-            self._spread = wp.zeros(self.depth.shape, dtype=wp.vec2)
+            # With the surface, echoes of four ways below each other: straight, and by it there, back, and both.
+            rows = (4 if sonar.surface_loss is not None else 1) * len(elevation)
+            self._energy = wp.zeros((self.count, rows, count), dtype=float)
+            self._spread = wp.zeros(self._energy.shape, dtype=wp.vec2)
             self.intensity = wp.zeros((self.count, count, self.bins), dtype=float)
             self.reading = self.picture = wp.zeros(self.intensity.shape, dtype=wp.uint8)
             self.ranges = wp.zeros(self.intensity.shape[:2], dtype=float)
+        self._image: RayBatch | None = None
+        if sonar.surface_loss is not None:
+            self._reflected = 10.0 ** (-0.1 * sonar.surface_loss)
+            self._first = float(elevation[0])
+            with wp.ScopedDevice(self.device):
+                self._pattern = wp.array(np.float32(np.sqrt(two_way)), dtype=float)
+                self._image_weight = wp.array(np.float32(self._reflected**2 * two_way * solid), dtype=float)
+                self._images = wp.zeros(self.count, dtype=wp.transform)
+            self._image = RayBatch(batch, rays * [1.0, -1.0, 1.0], Mount(), vehicles)
 
     @property
     def bin_length(self) -> float:
@@ -1001,18 +1128,9 @@ class SonarBatch(RayBatch):
         """
         self.cast(poses, mask)
         sonar = self.sonar
-        inputs = [
-            self.worlds,
-            self.rays,
-            self.depth,
-            self.shape_index,
-            self.normal,
-            self.views,
-            self.batch.surfaces,
-        ]
-        inputs += [self._weight, self.absorption, self._steps, 1.0 / self.bin_length]
-        inputs += [self._span(self.depth.shape[2]), self._energy, self._spread]
-        wp.launch(_echo_rays, self._blocks(self.depth), inputs, device=self.device)
+        self._echo(self, self._weight, 0)
+        if self._image is not None:
+            self._reflect(self._image, mask)
         inputs = [self.worlds, self._energy, self._spread, self._taps, self.intensity]
         wp.launch(_gather_echoes, self.intensity.shape[:2], inputs, device=self.device)
         low, high = sonar.display
@@ -1033,6 +1151,40 @@ class SonarBatch(RayBatch):
             inputs = [self.worlds, self.intensity, threshold, self.bin_length, self.ranges]
             wp.launch(_detect, self.ranges.shape, inputs, device=self.device)
         return self.picture
+
+    def _echo(self, view: RayBatch, weight: wp.array, part: int) -> None:
+        """Echoes along the rays of a view, into a part of the rows."""
+        inputs = [view.worlds, view.rays, view.depth, view.shape_index, view.normal, view.views]
+        inputs += [self.batch.surfaces, weight, self.absorption, self._steps, 1.0 / self.bin_length]
+        inputs += [self._span(self.depth.shape[2]), *self._part(part)]
+        wp.launch(_echo_rays, self._blocks(self.depth), inputs, device=self.device)
+
+    def _part(self, part: int) -> tuple[wp.array, wp.array]:
+        """Rows of energy and spread of one of the ways."""
+        rows = self.depth.shape[1]
+        return tuple(array[:, part * rows : (part + 1) * rows] for array in (self._energy, self._spread))
+
+    def _reflect(self, image: RayBatch, mask: wp.array | None) -> None:
+        """Echoes by the surface: both ways as from the sensor's image above it, and one way each."""
+        span, blocks = self._span(self.depth.shape[2]), self._blocks(self.depth)
+        inputs = [self.views, self.worlds, self._images]
+        wp.launch(_mirror_views, self.count, inputs, device=self.device)
+        image.cast(self._images, mask)
+        inputs = [self.worlds, image.rays, self.views, image.views, span, self.depth, self.shape_index]
+        inputs += [image.depth, image.shape_index]
+        wp.launch(_cut_images, blocks, inputs, device=self.device)
+        self._echo(image, self._image_weight, 1)
+        sides = int(self.sonar.mode == "side_scan")
+        # The image's own echoes have lost by two reflections already.
+        for part, own, other, loss in (
+            (2, self, image, self._reflected),
+            (3, image, self, 1.0 / self._reflected),
+        ):
+            inputs = [self.worlds, own.rays, own.views, own.depth, own.shape_index, own.normal]
+            inputs += [*self._part(int(own is image)), other.views, other.depth, other.shape_index]
+            inputs += [1.0 if other is self else -1.0, self._pattern, self._first, self._steps, sides, loss]
+            inputs += [self.absorption, 1.0 / self.bin_length, span, *self._part(part)]
+            wp.launch(_reflect_echoes, blocks, inputs, device=self.device)
 
 
 def beam_pattern(width: float, spacing: float, beams: int) -> np.ndarray:

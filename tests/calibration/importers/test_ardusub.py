@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers import import_trials
 from finssim.calibration.importers.ardusub import Log, velocity_stream
 from finssim.calibration.importers.ardusub_outputs import outputs_of

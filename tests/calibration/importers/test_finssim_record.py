@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers import import_trials
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.trials.inputs import drive

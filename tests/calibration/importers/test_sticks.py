@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.trials.inputs import drive
 from finssim.vehicles import load_vehicle

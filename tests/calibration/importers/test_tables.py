@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers import import_trials
 from finssim.calibration.importers.assemble import read_map
 from finssim.calibration.importers.dispatch import read_trials

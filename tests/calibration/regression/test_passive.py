@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.regression.passive import free_motion, passive
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.trials.trial import Header, Trial

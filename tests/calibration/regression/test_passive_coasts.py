@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.regression.passive import passive
 from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle

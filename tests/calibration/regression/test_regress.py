@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from calibration.known_trials import trials, truth
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.synthetic import NoiseProfile
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.regression.axis_fit import Run, cut, fit_axis, joined, simulate_axis
 from finssim.calibration.regression.plant_terms import matrices
 from finssim.calibration.regression.regress import axis_data, prepare, regress
+from finssim.calibration.synthetic import NoiseProfile
 from finssim.calibration.trials.trial import Header
 from finssim.vehicles import AXES
 

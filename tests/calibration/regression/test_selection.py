@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from calibration.known_trials import NOISE, trials, truth
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.synthetic import NoiseProfile
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.regression.regress import regress
+from finssim.calibration.synthetic import NoiseProfile
 
 
 @pytest.mark.slow
@@ -60,8 +60,8 @@ def test_unknown_damping_is_refused():
 
 def test_slow_speeds_do_not_make_a_quadratic_term():
     """Steps of 1 N: at 2 cm/s the quadratic damping of heave cannot show; it is not called identifiable."""
-    from finssim.calibration.excitation.programmes import programmes
-    from finssim.calibration.excitation.synthetic import record, trials_of
+    from finssim.calibration.programmes import programmes
+    from finssim.calibration.synthetic import record, trials_of
     from finssim.vehicles import load_vehicle
 
     vehicle = load_vehicle("finsrov").replace(

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.programmes import programmes
-from finssim.calibration.excitation.synthetic import simulate_programme
+from finssim.calibration.findings import CalibrationError
+from finssim.calibration.programmes import programmes
 from finssim.calibration.simulation.fit import fit_by_simulation
+from finssim.calibration.synthetic import simulate_programme
 from finssim.engine.plant_arrays import twist_shift
 from finssim.vehicles import AXES, load_vehicle
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.simulation.shooting import Parameters
+from finssim.calibration.findings import CalibrationError
+from finssim.calibration.simulation.fit import Parameters
 from finssim.engine.plant_arrays import vehicle_parameters
 from finssim.vehicles import AXES, load_vehicle
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.simulation.rollout import Rollouts, Segment
 from finssim.engine.simulator import Simulator
 from finssim.vehicles import load_vehicle

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finssim.calibration.simulation.shooting import Linear, Point, blocks_of, solve, step_of, weights_of
+from finssim.calibration.simulation.fit import Linear, Point, blocks_of, solve, step_of, weights_of
 from finssim.calibration.vision.least_squares import Block, arrow_reduced
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers.assemble import Stream, merge, moved_in_time
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.geometry.frames import TO_FOSSEN

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.trials.inputs import applied_wrench, drive, implausible, require_fittable
 from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import Vehicle, load_vehicle

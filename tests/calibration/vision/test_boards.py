@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.camera import Board, board_found, parse_size, see_board
 
 CHESSBOARD = Board(columns=9, rows=6, square=0.025)

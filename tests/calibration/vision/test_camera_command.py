@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from calibration.vision.board_views import PHOTOGRAPHS
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.camera import run
 from finssim.localization.camera_file import load_camera
 

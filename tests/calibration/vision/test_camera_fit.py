@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.vision.board_views import LENSES, PHOTOGRAPHS, photographed, views
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.uncertainty import intervals, trial_covariance
 from finssim.calibration.vision.camera import (
     MODELS,

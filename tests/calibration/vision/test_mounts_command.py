@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calibration.vision.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.findings import CalibrationError
+from finssim.calibration.vehicle_file import write_vehicle
 from finssim.calibration.vision.mounts import read_mount_log, run
 from finssim.geometry.rotations import (
     matrix_to_quat,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.survey import observe, observe_combined, read_survey
 from finssim.localization.detection.detections import Detection, Frame, write_detections
 

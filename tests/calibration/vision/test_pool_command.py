@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.pool_fit import run
 from finssim.files import OutputError
 from finssim.geometry.optics import Interface, back_project

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.pool_fit import calibrate_pool
 from finssim.calibration.vision.pool_model import Settings
 from finssim.geometry.optics import Camera, Interface, project

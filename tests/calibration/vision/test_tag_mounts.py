@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.vision.moving_vehicle import EDGE, MOUNTS, POOL, PORT, moments, motion
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.least_squares import Pose
 from finssim.calibration.vision.mounts import (
     Moment,

@@ -1,5 +1,8 @@
 """A teacher and a student with a camera: training, its policy directory, and who runs it."""
 
+from dataclasses import replace
+
+import minari
 import numpy as np
 import onnxruntime
 import pytest
@@ -7,16 +10,19 @@ import torch
 
 pytest.importorskip("newton")
 
+from finssim.control.guidance import Known
 from finssim.control.policy import Policy, PolicyError
 from finssim.experiments.plants import load_plant
 from finssim.experiments.trials import run_episodes
+from finssim.learning.demonstrations import Episode, collect, load, save
 from finssim.learning.export import write_seeing
 from finssim.learning.learners import LearningError, learner_named
 from finssim.learning.recurrent import SeeingNetwork
 from finssim.learning.train import train
-from finssim.tasks import Environment
-from finssim.tasks.agents import agent_for
+from finssim.tasks import Environment, make
+from finssim.tasks.agents import NOWHERE, agent_for
 from finssim.tasks.camera_docking import CameraDocking
+from finssim.tasks.sight import Picture
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow
@@ -65,7 +71,7 @@ def test_a_policy_refuses_to_act_blind(trained):
 
 
 def test_learners_of_rows_refuse_tasks_that_see_and_the_other_way_round():
-    with pytest.raises(LearningError, match="observes pictures: take distill"):
+    with pytest.raises(LearningError, match="observes pictures: take bc, distill"):
         learner_named("ppo").check(CameraDocking())
     with pytest.raises(LearningError, match="observes no pictures"):
         learner_named("distill").check(CameraDocking().for_teacher())
@@ -97,3 +103,63 @@ def test_the_student_learns_what_the_teacher_does():
     for _ in range(8):
         row = learner.update()
     assert row["imitation_loss"] < 0.02 and len(learner._kept["action"]) == 300
+
+
+def test_demonstrations_keep_what_was_seen(tmp_path):
+    """Bit for bit what the environment showed, by us and by Minari itself; the last picture is the episode's own."""
+    task = CameraDocking(time_limit=0.5)
+    told = collect("light-servo", task, episodes=3, out=tmp_path / "set", seed=4)
+    assert told["episodes"] == 3 and told["steps"] == 15
+    found, environment = load(tmp_path / "set"), make(task, worlds=3, seed=4, observe="training")
+    seen, agent = environment.reset(seed=4), agent_for("light-servo", load_vehicle("finsrov"), task)
+    memory, pictures = agent.reset(3), []
+    for _ in range(5):
+        views = {name: x.copy() for name, x in seen.items() if name != "state"}
+        pictures.append(views["front_camera"])
+        action, memory = agent.act(memory, Known(seen["state"], pictures=views), NOWHERE)
+        step = environment.step(action)
+        seen = step.observation
+    by_episode = found.pictures["front_camera"].reshape(3, 5, 27, 48, 3)
+    assert np.array_equal(by_episode, np.stack(pictures, axis=1))
+    (first, *_) = minari.MinariDataset(tmp_path / "set").iterate_episodes()
+    assert np.array_equal(first.observations["front_camera"][:-1], by_episode[0])
+    assert np.array_equal(first.observations["front_camera"][-1], step.final_observation["front_camera"][0])
+
+
+def shown_spots(folder, rows=400):
+    """A set of which the truth is known: the action says where in a dark picture a bright spot stands."""
+    random = np.random.default_rng(0)
+    picture = random.integers(0, 60, (rows + 1, 27, 48, 3), np.uint8)
+    column = random.integers(4, 44, rows + 1)
+    for one, x in zip(picture, column, strict=True):
+        one[8:20, x - 4 : x + 4] = 230
+    action = np.repeat(((column[:-1, None] - 24) / 24).astype(np.float32), 6, axis=1)
+    state = random.normal(size=(rows + 1, 10)).astype(np.float32)
+    episode = Episode(
+        state, action, np.zeros(rows, np.float32), False, {"return": 0.0}, {"front_camera": picture}
+    )
+    vehicle = {"name": "finsrov", "sha256": load_vehicle("finsrov").sha256}
+    about = {"task": TASK.name, "expert": "spots", "vehicle": vehicle, "action": {"mode": TASK.action}}
+    return str(save(folder, [episode], about))
+
+
+def test_cloning_learns_from_pictures(tmp_path):
+    """Where the picture alone says what to do, a tenth of the variance is left; another size is refused."""
+    place = shown_spots(tmp_path / "set")
+    changes = {
+        "demonstrations": place,
+        "worlds": 2,
+        "steps": 24_000,
+        "rollout": 4000,
+        "batch": 64,
+        "colour": 0.1,
+    }
+    settings = learner_named("bc").settings(TASK, changes=changes)
+    learner = learner_named("bc")(make(TASK, worlds=2, seed=1), settings, seed=1)
+    losses = []
+    while learner.steps < settings.steps:
+        losses.append(learner.update()["imitation_loss"])
+    assert losses[-1] < 0.1 * np.var((np.arange(4, 44) - 24) / 24)
+    wide = replace(TASK, pictures=(Picture("front_camera", 32),))
+    with pytest.raises(LearningError, match="is of pictures .*27, 48.*expected .*18, 32"):
+        learner_named("bc")(make(wide, worlds=2, seed=1), settings, seed=1)

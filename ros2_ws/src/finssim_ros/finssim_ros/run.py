@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from finssim.ros2.graphs import NODES, run_node
+from finssim.ros2.up import NODES, run_node
 
 
 def __getattr__(node):

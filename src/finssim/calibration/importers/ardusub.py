@@ -15,15 +15,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import finding
+from finssim.calibration.findings import CalibrationError, finding
 from finssim.calibration.importers.ardusub_outputs import mixed_pulses, outputs_of
 from finssim.calibration.importers.assemble import ArduSubMap, Frame, Stream, in_our_axes
 from finssim.calibration.trials.conversion import GRAVITY
 from finssim.calibration.trials.trial import Array
 from finssim.control.ardusub import FULL, NEUTRAL
 from finssim.geometry.rotations import wrap_angle
-from finssim.mcap_repair import whole_mcap
+from finssim.mcap_files import whole_mcap
 from finssim.vehicles import Vehicle
 from finssim.vehicles.autopilot import DEMANDS, FRAMES
 

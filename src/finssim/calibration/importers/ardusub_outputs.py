@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.trials.trial import Array
 from finssim.control.ardusub import NEUTRAL, Mixer
 from finssim.geometry.frames import FROM_FOSSEN

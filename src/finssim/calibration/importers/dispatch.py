@@ -13,8 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.importers.assemble import (
     ColumnMap,
     ColumnSource,
@@ -34,8 +33,7 @@ from finssim.calibration.trials.conversion import TIME_UNITS, factor
 from finssim.calibration.trials.trial import Array, Trial, column_of
 from finssim.calibration.trials.trial_files import Table, read_table, write_trial
 from finssim.files import plain_name
-from finssim.mcap_metadata import mcap_metadata
-from finssim.mcap_repair import MAGIC, whole_mcap
+from finssim.mcap_files import MAGIC, mcap_metadata, whole_mcap
 from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import json_value

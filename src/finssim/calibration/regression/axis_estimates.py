@@ -166,9 +166,6 @@ USEFUL = 0.5
 
 DECADE = 10.0
 
-GAP = np.full(1, np.nan)
-"""Between the lines of two trials."""
-
 SET = "hydrodynamics.calibrated"
 
 BIAS_NOTE = (
@@ -416,35 +413,17 @@ def outside(value: float, ends: Array | tuple[float, float]) -> bool:
 
 def curves_of(data: AxisData, chosen: Selection) -> list[Curve]:
     """Wrench, and velocity simulated from the wrench alone, over all trials of an axis."""
-    axis, linear = AXES[data.axis], data.axis < 3
-    lines: list[list[Array]] = [[] for _ in range(6)]
-    t, y, p, tv, v, vs = lines
-    offset = 0.0
+    axis, linear, wrench, velocity = AXES[data.axis], data.axis < 3, [], []
     for g, (s, rows) in enumerate(zip(data.signals, data.rows, strict=True)):
-        clock = s.t - s.t[0] + offset
-        t += [clock[rows.at], GAP]
-        y += [rows.y, GAP]
-        p += [chosen.fit.fitted[g], GAP]
+        wrench.append((s.t[rows.at], rows.y, chosen.fit.fitted[g]))
         if chosen.fit.simulated:
-            inside = np.zeros(len(clock), bool)
+            inside = np.zeros(len(s.t), bool)
             for begin, end in rows.spans:
                 inside[begin:end] = True
-            tv += [clock, GAP]
-            v += [np.where(inside, s.nu[:, data.axis], np.nan), GAP]
-            vs += [np.where(inside, chosen.fit.simulated[g], np.nan), GAP]
-        offset = clock[-1] + 1.0
-    cat = np.concatenate
-    out = [
-        Curve(
-            title=f"{axis}: wrench", x_label="time, trial after trial [s]",
-            y_label="force [N]" if linear else "moment [N m]", x=cat(t), measured=cat(y), fitted=cat(p),
-        )
-    ]  # fmt: skip
-    if tv:
-        out.append(
-            Curve(
-                title=f"{axis}: velocity, simulated from the wrench alone", x_label="time, trial after trial [s]",
-                y_label="velocity [m/s]" if linear else "rate [rad/s]", x=cat(tv), measured=cat(v), fitted=cat(vs),
-            )
-        )  # fmt: skip
+            both = (s.nu[:, data.axis], chosen.fit.simulated[g])
+            velocity.append((s.t, *(np.where(inside, line, np.nan) for line in both)))
+    out = [Curve.joined(f"{axis}: wrench", "force [N]" if linear else "moment [N m]", wrench)]
+    if velocity:
+        title = f"{axis}: velocity, simulated from the wrench alone"
+        out.append(Curve.joined(title, "velocity [m/s]" if linear else "rate [rad/s]", velocity))
     return out

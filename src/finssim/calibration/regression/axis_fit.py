@@ -29,9 +29,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.motion.signals import Motion
-from finssim.calibration.motion.smoothing import spans_of, without_spikes
+from finssim.calibration.findings import CalibrationError
+from finssim.calibration.motion import Motion, spans_of, without_spikes
 from finssim.calibration.regression.plant_terms import Matrices, known_wrench
 from finssim.calibration.uncertainty import (
     Covariance,
@@ -544,8 +543,8 @@ HUBER, REJECT = 1.345, 8.0
 GAUSSIAN_MAD = 1.4826
 """Standard deviation of a Gaussian in units of its median absolute deviation."""
 
-FREE_ROUNDS = 6
-"""After so many the variance of trial offsets stays, so that the rounds settle."""
+ROUNDS, FREE_ROUNDS = 25, 6
+"""Of instruments and weights, at most; after the latter the variance of trial offsets stays, so that they settle."""
 
 FEWEST_TRIALS = 4
 """With fewer, trials are cut into blocks to estimate the spread."""
@@ -618,7 +617,7 @@ class AxisFit:
     """Whether instruments were used; without, noise of the velocity biases the estimates."""
 
 
-def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) -> AxisFit:
+def fit_axis(data: AxisData, terms: NDArray[np.bool_]) -> AxisFit:
     """Instrumental-variable regression with Huber weights and bounds.
 
     Ordinary least squares starts; then velocities simulated with the latest estimate serve as instruments.
@@ -626,7 +625,6 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
     Args:
         data: The axis.
         terms: Which of `TERMS` to fit, (7,); of `data.terms`.
-        iterations: Rounds of instruments and weights.
     """
     p, kept = len(terms), terms
     X = np.concatenate([rows.X for rows in data.rows])
@@ -645,7 +643,7 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
     mean, inverse = (column[kept] for column in data.prior_moments())
     before = (mean, np.zeros_like(inverse))
     pieces = [_cut(data, found, rows) for found, rows in zip(data.signals, data.rows, strict=True)]
-    for round_ in range(iterations + 1):
+    for round_ in range(ROUNDS + 1):
         sums = moments(X[inside], Z[inside], y[inside], weight, group).of(kept)
         previous = theta
         theta = np.zeros(p)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.engine.plant_arrays import twist_shift
 from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.vehicles import HydrodynamicSet, Vehicle
@@ -69,21 +69,20 @@ class Matrices:
         return ~(height > -self.half_height)
 
 
-def matrices(vehicle: Vehicle, density: float | None = None, hydrodynamics: str = "calibrated") -> Matrices:
+def matrices(vehicle: Vehicle, density: float | None = None) -> Matrices:
     """Of a vehicle file.
 
     Args:
         vehicle: The vehicle.
         density: Of the water [kg/m³]; the file's where not given.
-        hydrodynamics: Which set.
 
     Raises:
         CalibrationError: The set has no coefficients to calibrate.
     """
-    chosen = vehicle.hydrodynamics.get(hydrodynamics)
+    chosen = vehicle.hydrodynamics.get("calibrated")
     if not isinstance(chosen, HydrodynamicSet):
         raise CalibrationError(
-            f"{vehicle.name}: no coefficients in hydrodynamics.{hydrodynamics}, expected a set with linear_damping and "
+            f"{vehicle.name}: no coefficients in hydrodynamics.calibrated, expected a set with linear_damping and "
             "quadratic_damping: add one, zeros will do, for the fit to fill"
         )
     r = np.asarray(chosen.reference_point, float)

@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding, sentences
+from finssim.calibration.findings import CalibrationError, Finding, finding, sentences
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
-from finssim.calibration.motion.signals import Motion, attitude_samples, motion
-from finssim.calibration.motion.smoothing import white_noise
+from finssim.calibration.motion import Motion, attitude_samples, motion, white_noise
 from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
     curves_of,
@@ -43,6 +41,8 @@ from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.vehicles import AXES, Vehicle
 
 __all__ = ["axis_data", "prepare", "regress"]
+
+Array = NDArray[np.float64]
 
 USEFUL = 0.5
 """Half width of the interval, as a part of the excess, up to which it is written to the vehicle file."""
@@ -265,8 +265,6 @@ def _level(found: list[Signals], keep: bool) -> tuple[list[Signals], float, list
     cut = [replace(s, usable=s.usable & flat) for s, flat in zip(found, level, strict=True)]
     return cut, beyond / total, [finding("tilted_left_out", percent=percent, tilt=LARGEST_TILT)]
 
-
-Array = NDArray[np.float64]
 
 PASSES = 3
 """Rounds in which the couplings between axes are formed with the latest estimates."""

@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.motion.signals import Motion
-from finssim.calibration.output.vehicle_file import SCALED
+from finssim.calibration.motion import Motion
 from finssim.calibration.regression.axis_estimates import (
     CERTAIN,
+    UNITS,
     AxisResult,
     Number,
     drag_known,
@@ -24,29 +23,1023 @@ from finssim.calibration.regression.axis_estimates import (
 )
 from finssim.calibration.regression.axis_fit import AKAIKE, DAMPING
 from finssim.calibration.regression.plant_terms import matrices
-from finssim.calibration.simulation.rollout import Segment, Streams, segments, streams
-from finssim.calibration.simulation.shooting import (
-    CUT,
-    EXTRAS,
-    Parameters,
-    Point,
-    Shooting,
-    Solution,
-    solve,
-    weights_of,
+from finssim.calibration.simulation.rollout import (
+    CHANNELS,
+    Response,
+    Rollouts,
+    Segment,
+    Streams,
+    segments,
+    streams,
 )
 from finssim.calibration.trials.inputs import require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.uncertainty import Covariance, Evidence, degeneracy, intervals, trial_covariance
-from finssim.engine.plant_arrays import twist_shift
+from finssim.calibration.vehicle_file import SCALED
+from finssim.calibration.vision.least_squares import (
+    Block,
+    arrow_reduced,
+    block_of,
+    boxed,
+    huber_cost,
+    huber_weight,
+)
+from finssim.engine.plant_arrays import twist_shift, vehicle_parameters
+from finssim.geometry.rotations import (
+    quat_conjugate,
+    quat_from_rotvec,
+    quat_multiply,
+    quat_rotate,
+    wrap_angle,
+)
+from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
-from finssim.vehicles.terms import unit_of
+from finssim.vehicles.terms import TERMS, unit_of
 
 __all__ = ["ESTIMATE", "fit_by_simulation"]
 
 Array = NDArray[np.float64]
 
-# What each trial, or each block of a few trials, says about the parameters of a simulation-error fit.
+
+# The fit of simulations to segments; finite differences are worlds.
+
+EXTRAS = ("thrust_scale", "thrust_lag", "thrust_delay", "current", "buoyancy_excess", "k")
+"""What can be estimated besides the axes' own numbers and the parameters of the vehicle's terms."""
+
+MARGIN = 0.95
+"""Part of the rigid-body inertia that a negative added mass may take away."""
+
+FELT, USUAL_SPEED = 0.02, 0.5
+"""Part of the weight, and speed on each axis [m/s, rad/s]."""
+
+LONGEST_DELAY = 1.0
+"""[s]"""
+
+SHORTEST_LAG = 0.005
+"""Time constant below which a step of the simulation shows no lag [s]."""
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One number that a fit moves."""
+
+    name: str
+    unit: str
+    start: float
+    low: float
+    high: float
+    scale: float
+    """What counts as a large change; finite differences step a small part of it."""
+
+
+@dataclass(frozen=True)
+class Plants:
+    """What W vectors mean to the simulator."""
+
+    fields: dict[str, Array]
+    """Fields of `VehicleParameters`, (W, 1, ...)."""
+    bias: Array
+    """Constant wrench that acts, about the body origin, body frame [N, N m], (W, 1, 6)."""
+    current: Array | None
+    """World frame [m/s], to be added to the segments' own, (W, 1, 3)."""
+    lag: Array | None
+    """Time constant of the motors [s], (W,)."""
+    delay: Array | None
+    """[s], (W,)"""
+
+
+def term_coordinate(chosen: HydrodynamicSet, vehicle: Vehicle, path: str) -> Coordinate:
+    """A parameter of a term; a large change of it makes a force of `FELT` of the weight at `USUAL_SPEED`."""
+    terms = tuple(TERMS[name] for name in sorted(chosen.terms))
+    numbers = chosen.term_parameters
+    start = float(numbers[path])
+    rows = [parameter_row(terms, numbers | {path: x}) for x in (start, start + 1.0)]
+    nu = USUAL_SPEED * np.array([[1.0, 1.0, 1.0, 1.0, 1.0, 1.0]])
+    tau = term_wrenches(terms, rows, nu, [[0.0, 0.0, 1.0]], 1.0, vehicle.water.density)[0]
+    change = float(np.abs(tau[1] - tau[0]).max())
+    scale = max(abs(start), FELT * vehicle.weight / change if change > 0.0 else 1.0)
+    return Coordinate(path, unit_of(path), start, *chosen.term_scalars[path], scale)
+
+
+class Parameters:
+    """The free numbers of a fit.
+
+    Every coordinate lies in a box, and every vector of the box gives a plant with positive definite M_RB + M_A and
+    damping that takes energy out: the bounds of a diagonal fit are d1, d2 >= 0 and an added mass that leaves M_RB
+    positive definite even if all axes are at their bounds. A box, because damping
+    may well be exactly zero: a logarithm never reaches it and would make its interval look like an estimate's.
+
+    Attributes:
+        coordinates: In the order of a vector.
+        expected: The vehicle file's numbers, (P,).
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        axes: Sequence[str],
+        damping: dict[str, str],
+        extras: Sequence[str] = (),
+        biases: Sequence[str] = (),
+        hydrodynamics: str = "calibrated",
+        start: Mapping[str, float] | None = None,
+        imposed: Sequence[str] = (),
+        unseen: Sequence[str] = (),
+    ) -> None:
+        """Choose what is free.
+
+        Args:
+            vehicle: Gives the start and everything that is not free.
+            axes: Whose added mass and damping are free.
+            damping: `linear`, `quadratic` or `both` by axis; what is left out is zero.
+            extras: Of `EXTRAS`, and parameters of the vehicle's terms, such as `lift.coefficient`.
+            biases: Axes with a constant wrench b, about the set's reference point and on the side of the damping:
+                M nu_dot + D nu + b = tau.
+            hydrodynamics: Which set of coefficients.
+            start: Coordinate -> where it starts, in place of the vehicle file's number.
+            imposed: Axes that are not fitted: their added mass alone is free, for its momentum turns and pushes the
+                others. Their coordinates come last.
+            unseen: Those of `imposed` that no trial measured, and that therefore are simulated: their drag is free too.
+
+        Raises:
+            CalibrationError: the set holds no coefficients, or an extra is not known.
+        """
+        chosen = vehicle.hydrodynamic_set(hydrodynamics)
+        if not isinstance(chosen, HydrodynamicSet):
+            raise CalibrationError(
+                f"{vehicle.name}: hydrodynamics.{hydrodynamics} has no damping coefficients to fit: give another set"
+            )
+        own = chosen.term_scalars
+        unknown = sorted(set(extras) - {*EXTRAS, *own})
+        if unknown:
+            raise CalibrationError(
+                f"cannot estimate '{unknown[0]}'; available: {', '.join([*EXTRAS, *own])} and the numbers of every axis"
+            )
+        self.vehicle, self.hydrodynamics, self.set = vehicle, hydrodynamics, chosen
+        self.axes = tuple(a for a in AXES if a in axes)
+        self.imposed = tuple(a for a in AXES if a in imposed)
+        self.unseen = tuple(a for a in self.imposed if a in unseen)
+        self.index = np.array([AXES.index(a) for a in self.axes], int)
+        self.damping, self.extras = damping, tuple(extras)
+        self.terms = tuple(path for path in own if path in extras)
+        self.biases = tuple(a for a in AXES if a in biases)
+        self.r_h = np.asarray(chosen.reference_point, float)
+        self.H = twist_shift(self.r_h.tolist())
+        self.M_RB = np.linalg.inv(self.H).T @ vehicle.rigid_body_mass_matrix() @ np.linalg.inv(self.H)
+        self.nominal = vehicle_parameters(vehicle, hydrodynamics)
+        self.M_A = np.asarray(chosen.added_mass, float)
+        self.D1 = np.asarray(chosen.linear_damping, float).copy()
+        self.D2 = np.asarray(chosen.quadratic_damping, float).copy()
+        for a, i in zip(self.axes, self.index, strict=True):
+            if damping[a] == "linear":
+                self.D2[i, :] = self.D2[:, i] = 0.0
+            elif damping[a] == "quadratic":
+                self.D1[i, :] = self.D1[:, i] = 0.0
+        self.coordinates = tuple(self._coordinates())
+        self.names = tuple(c.name for c in self.coordinates)
+        self.start, self.low, self.high, self.scale = (
+            np.array([getattr(c, name) for c in self.coordinates], float)
+            for name in ("start", "low", "high", "scale")
+        )
+        self.expected = np.clip(self.start, self.low, self.high)
+        self._at = {name: i for i, name in enumerate(self.names)}
+        for name, value in (start or {}).items():
+            if name in self._at:
+                self.start[self._at[name]] = value
+        self.start = np.clip(self.start, self.low, self.high)
+
+    # -- coordinates --------------------------------------------------------------------------------------------
+
+    def _coordinates(self) -> list[Coordinate]:
+        kinds = {"linear": ("d1",), "quadratic": ("d2",), "both": ("d1", "d2")}
+        out = []
+        for axis, floor in zip(self.axes, self.mass_floor().tolist(), strict=True):
+            out += [self._of_axis(axis, "added_mass", floor)]
+            out += [self._of_axis(axis, kind) for kind in kinds[self.damping[axis]]]
+        w, inf = self.vehicle, np.inf
+        weight, B = w.weight, w.buoyancy
+        z = self.r_h[2]
+        k = B * (w.body.center_of_buoyancy[2] - z) - weight * (w.body.center_of_gravity[2] - z)
+        tc = float(np.mean([t.time_constant for t in w.thrusters.values()]))
+        late = float(np.mean([t.delay for t in w.thrusters.values()]))
+        table = {
+            "k": [Coordinate("k", "N m/rad", max(float(k), 1e-3), 0.0, inf, max(float(k), 0.02 * B))],
+            "buoyancy_excess": [
+                Coordinate("buoyancy_excess", "N", B - weight, -0.9 * weight, 10.0 * weight, 0.02 * weight)
+            ],
+            "thrust_scale": [Coordinate("thrust_scale", "-", 1.0, 0.05, 20.0, 1.0)],
+            "thrust_lag": [Coordinate("thrust_lag", "s", max(tc, 0.02), SHORTEST_LAG, 5.0, 2.0)],
+            "thrust_delay": [Coordinate("thrust_delay", "s", late, 0.0, LONGEST_DELAY, 0.2)],
+            "current": [Coordinate(f"current.{a}", "m/s", 0.0, -5.0, 5.0, 0.2) for a in "xy"],
+        }
+        out += [c for extra in EXTRAS if extra in self.extras for c in table[extra]]
+        out += [term_coordinate(self.set, w, path) for path in self.terms]
+        out += [self._of_axis(axis, "bias", -inf) for axis in self.biases]
+        for axis in self.imposed:
+            i = AXES.index(axis)
+            out.append(self._of_axis(axis, "added_mass", min(float(self.M_A[i, i]), 0.0)))
+        return out + [self._of_axis(axis, kind) for axis in self.unseen for kind in ("d1", "d2")]
+
+    def _of_axis(self, axis: str, kind: str, low: float = 0.0) -> Coordinate:
+        """An axis' own added mass, d1, d2 or bias, from the vehicle file's number on."""
+        i = AXES.index(axis)
+        m, bias = float((self.M_RB + self.M_A)[i, i]), np.zeros((6, 6))
+        own, size = {
+            "added_mass": (self.M_A, m),
+            "d1": (self.D1, m),
+            "d2": (self.D2, 3.0 * m),
+            "bias": (bias, max(0.5 * m, 1e-3)),
+        }[kind]
+        unit = UNITS["m_eff" if kind == "added_mass" else kind][i > 2]
+        return Coordinate(f"{axis}.{kind}", unit, float(own[i, i]), low, np.inf, size)
+
+    @property
+    def nuisances(self) -> int:
+        """How many coordinates, the last ones, are there for the sake of the others."""
+        return len(self.imposed) + 2 * len(self.unseen)
+
+    def mass_floor(self) -> Array:
+        """Lowest added mass of each free axis, (n,): M stays positive definite with all of them there.
+
+        M_RB (or, where the file couples axes, all of M) less κ diag(c), c = 1/diag(M⁻¹), is positive definite for κ
+        below the smallest eigenvalue of M scaled by c.
+        """
+        couplings = self.M_A - np.diag(np.diag(self.M_A))
+        M, base = (
+            (self.M_RB, np.zeros(6)) if not couplings.any() else (self.M_RB + self.M_A, np.diag(self.M_A))
+        )
+        c = 1.0 / np.diag(np.linalg.inv(M))
+        kappa = MARGIN * float(np.linalg.eigvalsh(M / np.sqrt(np.outer(c, c)))[0])
+        return np.asarray((base - kappa * c)[self.index])
+
+    # -- plants -------------------------------------------------------------------------------------------------
+
+    def value(self, x: Array, name: str, default: float | None = None) -> Any:
+        """Column of a coordinate in vectors (W, P), or a default."""
+        return x[:, self._at[name]] if name in self._at else default
+
+    def matrices(self, x: Array) -> tuple[Array, Array, Array]:
+        """M_A, D1 and D2 at the set's reference point, (W, 6, 6) each."""
+        x = np.clip(np.atleast_2d(x), self.low, self.high)
+        M_A, D1, D2 = (np.repeat(m[None], len(x), axis=0) for m in (self.M_A, self.D1, self.D2))
+        for name, c in self._at.items():
+            axis, _, kind = name.partition(".")
+            if axis in AXES and kind != "bias":
+                i = AXES.index(axis)
+                {"added_mass": M_A, "d1": D1, "d2": D2}[kind][:, i, i] = x[:, c]
+        return M_A, D1, D2
+
+    def buoyancy_height(self, k: Any, volume: Any) -> Any:
+        """z of the centre of buoyancy [m] that gives a stiffness k about the set's reference point [N m/rad]."""
+        water, z = self.vehicle.water, self.r_h[2]
+        gravity_part = self.vehicle.weight * (self.vehicle.body.center_of_gravity[2] - z)
+        return z + (k + gravity_part) / (water.density * water.gravity * volume)
+
+    def plants(self, x: Array) -> Plants:
+        """What the simulator needs.
+
+        Args:
+            x: Vectors, (W, P); numbers outside the box count as on its edge.
+        """
+        x = np.clip(np.atleast_2d(x), self.low, self.high)
+        W = len(x)
+        M_A, D1, D2 = self.matrices(x)
+        fields: dict[str, Array] = {}
+        if self.axes or self.imposed:
+            M_A = self.H.T @ M_A @ self.H
+            fields |= {"M_A": M_A[:, None], "D1": D1[:, None], "D2": D2[:, None]}
+        water, body = self.vehicle.water, self.vehicle.body
+        volume = np.full(W, body.displaced_volume)
+        if "buoyancy_excess" in self._at:
+            weight = self.vehicle.weight
+            volume = (weight + self.value(x, "buoyancy_excess")) / (water.density * water.gravity)
+            fields["volume"] = volume[:, None]
+        if "k" in self._at:
+            r_b = np.tile(np.asarray(body.center_of_buoyancy, float), (W, 1, 1))
+            r_b[:, 0, 2] = self.buoyancy_height(self.value(x, "k"), volume)
+            fields["r_b"] = r_b
+        for path in self.terms:
+            fields[path] = self.value(x, path)[:, None]
+        if "thrust_scale" in self._at:
+            fields["gain"] = np.repeat(self.value(x, "thrust_scale")[:, None, None], 8, axis=-1)
+        bias = np.zeros((W, 1, 6))
+        for axis in self.biases:
+            bias[:, 0, AXES.index(axis)] = -self.value(x, f"{axis}.bias")
+        current = None
+        if "current.x" in self._at:
+            current = np.zeros((W, 1, 3))
+            current[:, 0, 0], current[:, 0, 1] = self.value(x, "current.x"), self.value(x, "current.y")
+        return Plants(
+            fields=fields,
+            bias=bias @ self.H,
+            current=current,
+            lag=self.value(x, "thrust_lag"),
+            delay=self.value(x, "thrust_delay"),
+        )
+
+
+CUT = 2.5
+"""Whitened residual above which Huber's loss grows linearly."""
+
+CLOSE = 0.25
+"""Part of a standard error (of independent noise) that a converged estimate may still be off."""
+
+DAMPINGS = np.array([1e-2, 1e-1, 1.0, 1e1, 1e2, 1e4])
+"""Factors on the damping that are tried at once."""
+
+SMALL = 0.05
+"""Fall of half the sum of losses that is not worth another iteration: an error of a third of a standard error."""
+
+
+class Point(NamedTuple):
+    """Values of all unknowns; with a leading axis of candidates where several are evaluated together."""
+
+    theta: Array
+    """Shared by all segments, (P,)."""
+    z: Array
+    """Of each segment alone, deviations from the prior's mean, (S, q)."""
+
+
+class Linear(NamedTuple):
+    """Residuals at a point, sorted by segment, and derivatives of the predictions."""
+
+    residual: Array
+    """Measured minus predicted, (N,)."""
+    shared: Array
+    """d predicted / d theta, (N, P)."""
+    own: Array
+    """d predicted / d z of the sample's own segment, (N, q)."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where a fit ended."""
+
+    point: Point
+    std: Array
+    """Of every sample, (N,)."""
+    cost: float
+    """Half the sum of the losses."""
+    linear: Linear
+    iterations: int
+    converged: bool
+    interrupted: bool = False
+
+
+def weights_of(residual: Array, std: Array, cut: float = CUT) -> Array:
+    """Huber's weights over the variance of the samples, (N,)."""
+    return huber_weight(np.abs(residual / std), cut) / std**2
+
+
+def blocks_of(problem: Shooting, linear: Linear, std: Array, point: Point, cut: float = CUT) -> list[Block]:
+    """Weighted normal equations of every segment with the prior of z; that of theta is in the first."""
+    root = np.sqrt(weights_of(linear.residual, std, cut))
+    shared, own, residual = linear.shared * root[:, None], linear.own * root[:, None], linear.residual * root
+    blocks = []
+    for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
+        block, stiff = block_of(shared[a:b], own[a:b], residual[a:b]), problem.prior_std[s] ** -2.0
+        blocks.append(block._replace(bb=block.bb + np.diag(stiff), b=block.b - stiff * point.z[s]))
+    known, first = problem.prior_precision, blocks[0]
+    blocks[0] = first._replace(
+        aa=first.aa + np.diag(known), a=first.a - known * (point.theta - problem.prior_mean)
+    )
+    return blocks
+
+
+def step_of(
+    problem: Shooting, reduced: tuple[Array, Array, list[Array]], point: Point, damping: float
+) -> tuple[Array, Array, Array]:
+    """Steps of theta (P,) inside the box and of z (S, q), and standard errors of theta, (P,).
+
+    Args:
+        problem: For its box.
+        reduced: Normal equations of theta alone at the point, and how z follows; of `arrow_reduced`.
+        point: Where the step begins.
+        damping: What the diagonal of theta's grows by, as a part of itself [-].
+    """
+    total, right, inners = reduced
+    scale = np.sqrt(np.maximum(np.diagonal(total), 1e-30 + 1e-12 * np.diagonal(total).max()))
+    A = total / np.outer(scale, scale) + (damping + 1e-9) * np.eye(len(scale))
+    low, high = problem.low - point.theta, problem.high - point.theta
+    step = boxed(A, right / scale, np.minimum(low * scale, -1e-12), np.maximum(high * scale, 1e-12)) / scale
+    z = np.array([inner[:, -1] - inner[:, :-1] @ step for inner in inners])
+    return step, z, np.sqrt(np.diagonal(np.linalg.inv(A))) / scale
+
+
+def costs_of(problem: Shooting, residual: Array, std: Array, points: Point, cut: float = CUT) -> Array:
+    """Half the losses of several points with residuals (N, C), (C,); infinite where one has no answer."""
+    prior = np.square(points.z / problem.prior_std).sum(axis=(1, 2))
+    prior = prior + (points.theta - problem.prior_mean) ** 2 @ problem.prior_precision
+    loss = np.array([huber_cost(np.abs(column / std), cut) for column in residual.T])
+    return np.asarray(np.where(np.isfinite(loss), 0.5 * (loss + prior), np.inf))
+
+
+def solve(
+    problem: Shooting,
+    start: Point,
+    *,
+    iterations: int = 30,
+    std: Array | None = None,
+    rough: bool = False,
+    report: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """Fit; noise and robust weights are estimated along the way.
+
+    Converged where the undamped step moves no judged parameter by more than `CLOSE` of its standard error and grain
+    together, and the noise no longer changes.
+
+    Args:
+        problem: What to fit.
+        start: Where to begin.
+        iterations: At most.
+        std: Of every sample at the start, (N,); from the residuals there if None.
+        rough: Far from a solution: keep `std`, and let no residual count as an outlier, for that is what a wrong
+            parameter looks like too. Ends as soon as an iteration gains less than a hundredth.
+        report: Called with each iteration and the root mean square of the whitened residuals.
+
+    Returns:
+        The best point; after Ctrl-C the best until then, with `interrupted`.
+    """
+    point, damping, done = start, 1e-2, 0
+    linear = problem.linearise(point)
+    if not np.isfinite(linear.residual).all():
+        return Solution(point, np.ones(len(linear.residual)), np.inf, linear, 0, False)
+    std = problem.noise(linear.residual) if std is None else std
+    converged, interrupted, settled, cut = False, False, rough, np.inf if rough else CUT
+
+    def cost_at(std: Array) -> float:
+        one = Point(point.theta[None], point.z[None])
+        return float(costs_of(problem, linear.residual[:, None], std, one, cut)[0])
+
+    cost = cost_at(std)
+    try:
+        for done in range(1, iterations + 1):
+            if report:
+                report(done, float(np.sqrt(2.0 * cost / max(len(std), 1))))
+            reduced = arrow_reduced(blocks_of(problem, linear, std, point, cut), 0.0)
+            step, _, error = step_of(problem, reduced, point, 0.0)
+            near = error + problem.grain(point.theta)
+            remaining = float(np.max(np.abs(step / near)[: problem.judged], initial=0.0))
+            if settled and remaining < CLOSE:
+                converged = True
+                break
+            steps = [step_of(problem, reduced, point, damping * factor) for factor in DAMPINGS]
+            points = Point(
+                np.clip(point.theta + np.array([theta for theta, _, _ in steps]), problem.low, problem.high),
+                point.z + np.array([z for _, z, _ in steps]),
+            )
+            costs = costs_of(problem, problem.residuals(points), std, points, cut)
+            best = int(np.argmin(costs))
+            if costs[best] < cost:
+                damping = float(np.clip(damping * DAMPINGS[best], 1e-9, 1e9))
+                stuck = cost - costs[best] < (1e-2 * cost if rough else SMALL)
+                point = Point(points.theta[best], points.z[best])
+                linear = problem.linearise(point)
+            else:
+                damping = min(damping * 1e5, 1e12)
+                stuck = damping >= 1e12
+            new = std if rough else problem.noise(linear.residual)
+            settled = rough or bool(np.all(np.abs(np.log(new / std)) < 0.01)) or done > 12
+            if stuck and settled:
+                converged = remaining < 1.0
+                break
+            if not settled:
+                std, damping = new, min(damping, 1e-2)
+            cost = cost_at(std)
+    except KeyboardInterrupt:
+        interrupted = True
+    return Solution(point, std, cost, linear, done, converged, interrupted)
+
+
+# What a simulation would have measured, against what was measured.
+
+ANGLES = ("roll", "pitch", "yaw")
+
+
+class Residuals:
+    """Samples of all segments in one list, sorted by segment, then by channel.
+
+    Attributes:
+        names: Channels in use.
+        channel: Index into `names` of each sample, (N,).
+        segment: Index of its segment, (N,).
+        edges: First sample of each segment, and N, (S + 1,).
+        value: Measured, (N,).
+        time: Since the segment's start [s], (N,).
+    """
+
+    def __init__(self, segments: Sequence[Segment], channels: Sequence[str]) -> None:
+        """Collect the samples of some channels."""
+        self.segments = tuple(segments)
+        self.names = tuple(c for c in CHANNELS if c in channels and any(c in s.measured for s in segments))
+        rows: dict[str, list[Array]] = {k: [] for k in ("segment", "channel", "time", "value")}
+        for i, s in enumerate(segments):
+            for j, name in enumerate(self.names):
+                t, values = s.measured.get(name, (np.empty(0), np.empty(0)))
+                rows["segment"].append(np.full(len(t), i))
+                rows["channel"].append(np.full(len(t), j))
+                rows["time"].append(t / s.step)
+                rows["value"].append(values)
+        joined = {k: np.concatenate(v) if v else np.empty(0) for k, v in rows.items()}
+        self.segment, self.channel = joined["segment"].astype(int), joined["channel"].astype(int)
+        self.value, time = joined["value"], joined["time"]
+        self.time = time * segments[0].step
+        self._steps = np.array([s.steps for s in segments])[self.segment]
+        self.edges = np.searchsorted(self.segment, np.arange(len(segments) + 1))
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    def predicted(self, response: Response, late: Array, current: Array | None = None) -> tuple[Array, Array]:
+        """What every candidate's sensors would have read at the samples' times, and its rate of change.
+
+        Args:
+            response: Of the candidates.
+            late: By how much each sample lags what it shows [s], (N, C) or (N, 1).
+            current: World frame [m/s], in place of the segments' own, (C, S, 3).
+
+        Returns:
+            (N, C) each [unit of the channel, and the same per second]; NaN where a candidate diverged. Before a
+            segment's start it is extrapolated in a straight line.
+        """
+        step = self.segments[0].step
+        candidates = response.nu.shape[1]
+        value, rate = (np.empty((len(self), candidates)) for _ in range(2))
+        for j, name in enumerate(self.names):
+            which = np.flatnonzero(self.channel == j)
+            grid = channel(name, response, self.segments, current)
+            for c in range(late.shape[1]):
+                those = slice(None) if late.shape[1] == 1 else slice(c, c + 1)
+                at = (self.time[which] - late[which, c]) / step
+                row = np.clip(np.floor(at).astype(int), 0, self._steps[which] - 1)
+                segment = self.segment[which]
+                a = grid[row, those, segment].astype(float)
+                rise = grid[row + 1, those, segment].astype(float) - a
+                if name in ANGLES:
+                    rise = wrap_angle(rise)
+                value[which, those] = a + (at - row)[:, None] * rise
+                rate[which, those] = rise / step
+        return value, rate
+
+    def difference(self, predicted: Array) -> Array:
+        """Measured minus predicted, angles the short way round, (N, C)."""
+        out = self.value[:, None] - predicted
+        for j, name in enumerate(self.names):
+            if name in ANGLES:
+                which = self.channel == j
+                out[which] = wrap_angle(out[which])
+        return np.asarray(out)
+
+    def noise(self, residual: Array, floor: Array) -> Array:
+        """Standard deviation of each channel from clipped residuals, (channels,).
+
+        Args:
+            residual: Measured minus predicted, (N,).
+            floor: Smallest per channel, (channels,).
+        """
+        out = np.array(floor, float)
+        for j in range(len(self.names)):
+            r = residual[self.channel == j]
+            r = np.abs(r[np.isfinite(r)])
+            sigma = 1.4826 * float(np.median(r)) if len(r) else 0.0
+            sigma = sigma or float(np.sqrt(np.mean(r**2))) if len(r) else floor[j]
+            for _ in range(10):
+                # The factor undoes the clipping for a normal distribution at 2.5 standard deviations.
+                sigma = (
+                    1.011 * float(np.sqrt(np.mean(np.minimum(r, CUT * sigma) ** 2))) if sigma > 0.0 else 0.0
+                )
+            out[j] = max(sigma, floor[j])
+        return out
+
+    def spread(self) -> Array:
+        """Range from the 2nd to the 98th percentile of each channel, the largest of the segments, (channels,)."""
+        out = np.zeros(len(self.names))
+        for a, b in zip(self.edges, self.edges[1:], strict=False):
+            for j in np.unique(self.channel[a:b]):
+                values = self.value[a:b][self.channel[a:b] == j]
+                out[j] = max(out[j], float(np.ptp(np.percentile(values, [2.0, 98.0]))))
+        return out
+
+    def roughness(self) -> Array:
+        """Noise of each channel from third differences of successive samples, robust, (channels,)."""
+        out = np.zeros(len(self.names))
+        for j in range(len(self.names)):
+            parts = [
+                np.diff(self.value[a:b][self.channel[a:b] == j], 3)
+                for a, b in zip(self.edges, self.edges[1:], strict=False)
+            ]
+            d = np.abs(np.concatenate(parts)) if parts else np.empty(0)
+            out[j] = (
+                float(np.sqrt(np.mean(np.minimum(d, 3.0 * 1.4826 * np.median(d) + 1e-12) ** 2) / 20.0))
+                if len(d)
+                else 0.0
+            )
+        return out
+
+
+def channel(
+    name: str, response: Response, segments: Sequence[Segment], current: Array | None = None
+) -> NDArray[np.float32]:
+    """A measured column on the simulation's grid.
+
+    Args:
+        name: Of `CHANNELS`.
+        response: Of every candidate over these segments.
+        segments: Give the sensors' places.
+        current: World frame [m/s], in place of the segments' own, (C, S, 3).
+
+    Returns:
+        (n + 1, C, S)
+    """
+    nu, q = response.nu, response.quaternion
+    if name in ("p", "q", "r"):
+        return nu[..., 3 + "pqr".index(name)]
+    if name in ("u", "v", "w"):
+        i = "uvw".index(name)
+        at = np.stack([s.velocity_at for s in segments]).astype(np.float32)
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out = nu[..., i] + (nu[..., 3 + j] * at[:, k] - nu[..., 3 + k] * at[:, j] if at.any() else 0.0)
+        in_water = np.array([s.velocity_in_water for s in segments])
+        if in_water.any():
+            flow = np.stack([s.current for s in segments])[None] if current is None else current
+            body = quat_rotate(quat_conjugate(q), np.broadcast_to(flow, (*q.shape[1:3], 3)))[..., i]
+            out = out - np.where(in_water, body, 0.0)
+        return np.asarray(out, np.float32)
+    if name in ANGLES:
+        return euler_angle(name, q)
+    sensor = "depth_at" if name == "depth" else "position_at"
+    at = np.stack([getattr(s, sensor) for s in segments])
+    i = 2 if name == "depth" else "xyz".index(name)
+    out = response.position[..., i] + (quat_rotate(q, at)[..., i] if at.any() else 0.0)
+    return np.asarray(-out if name == "depth" else out, np.float32)
+
+
+def euler_angle(name: str, q: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Roll, pitch or yaw of unit quaternions, in their own precision, (..., 4) -> (...)."""
+    x, y, z, w = (q[..., i] for i in range(4))
+    if name == "roll":
+        return np.asarray(np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)))
+    if name == "yaw":
+        return np.asarray(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    return np.asarray(np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0)))
+
+
+# Errors of sensors that a fit allows for: offsets of a stretch, and streams that come late.
+
+STREAMS = {
+    "velocity": ("u", "v", "w"),
+    "rates": ("p", "q", "r"),
+    "attitude": ("roll", "pitch", "yaw"),
+    "position": ("x", "y", "z"),
+    "depth": ("depth",),
+}
+"""Channels that share a clock."""
+
+OFFSETS = {"p": 0.02, "q": 0.02, "r": 0.02, "roll": 0.03, "pitch": 0.03, "depth": 0.1}
+"""Channels with an offset that is constant over a segment, and its standard deviation: biases of gyroscopes [rad/s],
+levels that were mounted askew [rad], pressure at the surface [m]."""
+
+LATEST = 0.3
+"""By how much a stream may lag or lead the inputs [s]."""
+
+LATE_STD = 0.05
+"""By how much streams lag or lead, as far as one knows beforehand [s]: noisy data cannot tell a lag from inertia."""
+
+
+class SensorErrors:
+    """Offsets by segment, and lags of the streams common to all segments.
+
+    Attributes:
+        streams: Names of the streams in use.
+        offsets: Names of the channels that have an offset.
+        std: Prior of the offsets, (k,).
+    """
+
+    def __init__(self, measured: Residuals) -> None:
+        """Allow for what the channels in use may suffer from."""
+        names = measured.names
+        self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(names))
+        # The initial height already takes up an offset of the depth, unless z is measured too.
+        self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
+        self.std = np.array([OFFSETS[c] for c in self.offsets])
+        stream_of = {c: i for i, stream in enumerate(self.streams) for c in STREAMS[stream]}
+        self._stream = np.array([stream_of[c] for c in names], int)[measured.channel]
+        self._offset = np.zeros((len(measured), len(self.offsets)))
+        for k, name in enumerate(self.offsets):
+            self._offset[measured.channel == names.index(name), k] = 1.0
+        self._segment = measured.segment
+
+    def late(self, late: Array) -> Array:
+        """Lag of every sample [s], (N, C), or (N, 1) where all candidates agree, from the streams', (C, streams)."""
+        same = bool((late == late[:1]).all())
+        return np.asarray((late[:1] if same else late).T[self._stream])
+
+    def offset(self, offset: Array) -> Array:
+        """What offsets (C, S, k) add to every sample, (N, C)."""
+        out = np.zeros((len(self._segment), len(offset)))
+        for k in range(offset.shape[2]):
+            out += self._offset[:, k : k + 1] * offset[:, self._segment, k].T
+        return out
+
+    def slopes(self, rate: Array) -> tuple[Array, Array]:
+        """Derivatives of the readings by lag (N, streams) and by offset (N, k).
+
+        Args:
+            rate: Of change of the predicted readings [unit of the channel/s], (N,).
+        """
+        late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -rate[:, None], 0.0)
+        return late, self._offset
+
+
+# Where each segment begins: what was measured there, and how far a fit may move it.
+
+STATES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
+"""Numbers of an initial state: nu, a small turn about the body axes [rad], a world displacement [m]."""
+
+UNKNOWN = np.array([0.5, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 1e-6, 1e-6, 1e-6, 1e-6])
+"""Standard deviation of what nobody measured; heading and place do not matter then."""
+
+LOOSE = np.array([0.2, 0.2, 0.2, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
+"""Of what was measured and is compared: wide, for the same measurements count as residuals."""
+
+TIGHT = np.array([0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.02, 0.02, 0.02, 0.03, 0.03, 0.03])
+"""Of what was measured and is not compared."""
+
+SHOWN_BY = (
+    *(("u", "x", "y"), ("v", "x", "y"), ("w", "z", "depth"), ("p", "roll"), ("q", "pitch"), ("r", "yaw")),
+    *(("roll",), ("pitch",), ("yaw",), ("x",), ("y",), ("z", "depth")),
+)
+"""Channels that show a state, in the order of `STATES`."""
+
+STEPS = np.array([0.002] * 9 + [0.005] * 3)
+"""Of the finite differences: small, for what is unstable multiplies them."""
+
+
+class InitialStates:
+    """Deviations z of the segments' initial states from the measured ones, with a prior.
+
+    Attributes:
+        free: Which of `STATES` a fit moves, indices (q,).
+        std: Of the prior, (S, q).
+    """
+
+    def __init__(self, segments: Sequence[Segment]) -> None:
+        """Free velocities and tilt everywhere, heading and place where some segment knows them."""
+        known = np.stack([s.known for s in segments])
+        self.free = np.concatenate([np.arange(8), 8 + np.flatnonzero(known[:, 8:].any(axis=0))])
+        seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
+        self.std = np.where(known, np.where(seen, LOOSE, TIGHT), UNKNOWN)[:, self.free]
+        self._nu = np.stack([s.nu for s in segments])
+        self._quaternion = np.stack([s.quaternion for s in segments])
+        self._position = np.stack([s.position for s in segments])
+
+    @property
+    def steps(self) -> Array:
+        """Finite difference of each free number, (q,)."""
+        return np.asarray(STEPS[self.free])
+
+    def initial(self, z: Array) -> dict[str, Array]:
+        """`nu`, `quaternion` and `position` for `Rollouts.run`.
+
+        Args:
+            z: Deviations, (C, S, q); C may be 1.
+        """
+        full = np.zeros((*z.shape[:2], 12))
+        full[..., self.free] = z
+        return {
+            "nu": self._nu + full[..., :6],
+            "quaternion": quat_multiply(self._quaternion, quat_from_rotvec(full[..., 6:9])),
+            "position": self._position + full[..., 9:],
+        }
+
+
+RELATIVE_STEP = 0.006
+"""Of the finite differences, against a coordinate's size: single precision leaves them three digits."""
+
+GRAIN = 0.004
+"""Part of a number that nobody minds."""
+
+COARSE = 0.05
+"""Of a channel's range: residuals of that size are small while the parameters are still far off."""
+
+VAGUE = 8.0
+"""What is known of a fitted number beforehand: the file's within so many times its scale."""
+
+EXACT_CLOCK = 1e-3
+"""How far the stream that serves as the clock may lag [s]."""
+
+FLOOR = 1e-4
+"""Smallest noise of a channel, against the range it covers: below it are the simulation's own errors."""
+
+
+class Shooting:
+    """Residuals of segments under parameters, trial biases and initial states.
+
+    Attributes:
+        axes_of_trials: Axes with a constant wrench that differs from trial to trial.
+        edges: First sample of each segment, and N, (S + 1,).
+        low: Least theta, (P,).
+        high: Largest theta, (P,).
+        prior_std: Of z around zero, (S, q).
+        prior_mean: What is known of theta beforehand, (P,).
+        prior_precision: One over its variance; 0 where nothing is known, (P,).
+        judged: How many of theta, from the first, have to be accurate; the rest are there for their sake.
+    """
+
+    def __init__(
+        self,
+        segments: Sequence[Segment],
+        parameters: Parameters,
+        channels: Sequence[str],
+        *,
+        trial_biases: Sequence[str] = (),
+        lagged: NDArray[np.bool_] | None = None,
+        few: bool = False,
+    ) -> None:
+        """Set up.
+
+        Args:
+            segments: What to fit.
+            parameters: What is free.
+            channels: Measured columns to compare.
+            trial_biases: Axes whose constant wrench is free in every trial.
+            lagged: Which segments' inputs an estimated lag or delay acts on, (S,); the commanded ones if None.
+            few: Whether some axis is excited by too few trials to show how trials differ.
+        """
+        self.segments, self.parameters = tuple(segments), parameters
+        self.measured = Residuals(segments, channels)
+        self.states = InitialStates(segments)
+        self.rollouts = Rollouts(
+            parameters.vehicle,
+            segments,
+            hydrodynamics=parameters.hydrodynamics,
+            max_delay=LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5,
+            moving_water="current.x" in parameters.names,
+        )
+        self.edges = self.measured.edges
+        self.groups = np.array([s.index for s in segments])
+        self.few = few
+        self.judged = len(parameters.names) - parameters.nuisances
+        self.errors = SensorErrors(self.measured)
+        far = np.full(len(self.errors.streams), LATEST)
+        self.axes_of_trials = tuple(a for a in AXES if a in trial_biases)
+        self._bias_rows = np.array([AXES.index(a) for a in self.axes_of_trials], int)
+        free = np.full((int(self.groups.max()) + 1) * len(self._bias_rows), np.inf)
+        self.low = np.concatenate([parameters.low, -far, -free])
+        self.high = np.concatenate([parameters.high, far, free])
+        # Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a
+        # solution, over short segments, nothing else keeps them from infinity. Streams tell the same time to hundredths
+        # of a second.
+        none = np.zeros(len(free))
+        self.prior_mean = np.concatenate([parameters.expected, 0.0 * far, none])
+        imposed = np.arange(len(parameters.low)) >= self.judged
+        wide = [VAGUE * (name != "thrust_scale") for name in parameters.names]
+        size = np.where(imposed, 1.0, np.array(wide, float)) * parameters.scale
+        known = np.where(size > 0.0, np.maximum(size, 1e-150) ** -2.0, 0.0)
+        self.prior_precision = np.concatenate([known, 0.0 * far + LATE_STD**-2.0, none])
+        if "thrust_delay" in parameters.names:
+            # A common lag of all streams is a delay of the thrust: the first stream is the clock then.
+            self.prior_precision[len(parameters.names)] = EXACT_CLOCK**-2.0
+        width = (len(segments), len(self.errors.std))
+        self.prior_std = np.concatenate([self.states.std, np.broadcast_to(self.errors.std, width)], axis=1)
+        self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
+        self._floor = FLOOR * self.measured.spread() + 1e-12
+        self.first_noise = np.maximum(self.measured.roughness(), self._floor)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of theta: the parameters, the lags of the streams [s], then the biases of trial after trial [N, N m]."""
+        late = tuple(f"{stream}.late" for stream in self.errors.streams)
+        trials = range(int(self.groups.max()) + 1)
+        biases = tuple(f"{axis}.bias of trial {g}" for g in trials for axis in self.axes_of_trials)
+        return self.parameters.names + late + biases
+
+    @property
+    def shared(self) -> int:
+        """How many of theta are parameters or lags of streams."""
+        return len(self.parameters.names) + len(self.errors.streams)
+
+    def start(self) -> Point:
+        """The vehicle file's numbers, the measured initial states, no errors of sensors."""
+        rest = np.zeros(len(self.low) - len(self.parameters.names))
+        return Point(np.concatenate([self.parameters.start, rest]), np.zeros(self.prior_std.shape))
+
+    def cost(self, point: Point) -> float:
+        """Half the loss of one point, with what counts as large residuals far from a solution; clocks agree."""
+        one = Point(point.theta[None], point.z[None])
+        return float(costs_of(self, self.residuals(one), self.size(), one)[0])
+
+    def residuals(self, points: Point) -> Array:
+        """Measured minus predicted of several points, (N, C)."""
+        return self._residual(points, self._predicted(points)[0])
+
+    def _residual(self, points: Point, value: Array) -> Array:
+        offset = points.z[..., len(self.states.free) :]
+        return self.measured.difference(value + self.errors.offset(offset))
+
+    def _predicted(self, points: Point) -> tuple[Array, Array]:
+        """What sensors without offsets would have read and its rate of change, (N, C) each."""
+        P, C = len(self.parameters.names), len(points.theta)
+        p = self.parameters.plants(points.theta[:, :P])
+        fields = dict(p.fields)
+        own = self.rollouts.own
+        for name, values in (("time_constant", p.lag), ("delay", p.delay)):
+            if values is not None:
+                tail = (1,) * (own[name].ndim - 1)
+                mask = self.lagged.reshape(-1, *tail)
+                fields[name] = np.where(mask, values.reshape(-1, 1, *tail), own[name])
+        extra = np.zeros((C, len(self.segments), 6))
+        if len(self._bias_rows):
+            biases = points.theta[:, self.shared :].reshape(C, -1, len(self._bias_rows))
+            extra[..., self._bias_rows] = biases[:, self.groups]
+        current = None
+        if p.current is not None:
+            current = p.current + np.stack([s.current for s in self.segments])
+        response = self.rollouts.run(
+            fields,
+            initial=self.states.initial(points.z[..., : len(self.states.free)]),
+            disturbance=p.bias + extra @ self.parameters.H,
+            current=current,
+            candidates=C,
+        )
+        late = self.errors.late(points.theta[:, P : self.shared])
+        return self.measured.predicted(response, late, current)
+
+    def linearise(self, point: Point) -> Linear:
+        """Residuals and derivatives: central differences for what moves the vehicle, exact for what sensors add."""
+        points, wide = self._neighbours(point)
+        value, rate = self._predicted(points)
+        rise = value[:, 1::2] - value[:, 2::2]
+        for j, name in enumerate(self.measured.names):
+            if name in ANGLES:
+                which = self.measured.channel == j
+                rise[which] = wrap_angle(rise[which])
+        slopes = np.nan_to_num(rise / wide)
+        late, offset = self.errors.slopes(np.nan_to_num(rate[:, 0]))
+        P, b = len(self.parameters.names), len(self._bias_rows)
+        # A bias moves its own trial alone: all of an axis were moved at once.
+        trial = self.groups[self.measured.segment]
+        own = trial[:, None] == np.arange(int(self.groups.max()) + 1)
+        biases = (own[:, :, None] * slopes[:, None, P : P + b]).reshape(len(slopes), -1)
+        one = Point(*(part[:1] for part in points))
+        return Linear(
+            self._residual(one, value[:, :1])[:, 0],
+            np.concatenate([slopes[:, :P], late, biases], axis=1),
+            np.concatenate([slopes[:, P + b :], offset], axis=1),
+        )
+
+    def _neighbours(self, point: Point) -> tuple[Point, Array]:
+        """The point, one on either side of it for every unknown that moves the vehicle, and their distances."""
+        P, b, q = len(self.parameters.names), len(self._bias_rows), len(self.states.free)
+        count = P + b + q
+        theta, z = (np.repeat(part[None], 1 + 2 * count, axis=0) for part in point)
+        up, down = 1 + 2 * np.arange(count), 2 + 2 * np.arange(count)
+        i = np.arange(P)
+        step = RELATIVE_STEP * np.maximum(np.abs(point.theta[:P]), 0.25 * self.parameters.scale)
+        theta[up[:P], i] = np.minimum(point.theta[:P] + step, self.high[:P])
+        theta[down[:P], i] = np.maximum(point.theta[:P] - step, self.low[:P])
+        wide = [theta[up[:P], i] - theta[down[:P], i]]
+        push = RELATIVE_STEP * np.diag(self.parameters.M_RB)[self._bias_rows]
+        for k in range(b):
+            theta[up[P + k], self.shared + k :: b] += push[k]
+            theta[down[P + k], self.shared + k :: b] -= push[k]
+        for k, step_k in enumerate(self.states.steps):
+            z[up[P + b + k], :, k] += step_k
+            z[down[P + b + k], :, k] -= step_k
+        return Point(theta, z), np.concatenate([*wide, 2.0 * push, 2.0 * self.states.steps])
+
+    def growth(self, point: Point) -> Array:
+        """Largest factor by which a small change of the initial velocity grows within each segment, (S,)."""
+        own = np.abs(self.linearise(point).own[:, :6])
+        speeds = [
+            i for i, name in enumerate(self.measured.names) if name in STREAMS["velocity"] + STREAMS["rates"]
+        ]
+        own[~np.isin(self.measured.channel, speeds)] = 0.0
+        return np.asarray(np.maximum.reduceat(own.max(axis=1), self.edges[:-1]))
+
+    def grain(self, theta: Array) -> Array:
+        """Differences of theta that nobody minds, (P,)."""
+        P = len(self.parameters.names)
+        size = np.maximum(np.abs(theta[:P]), 0.1 * self.parameters.scale)
+        return GRAIN * np.append(size, np.full(len(theta) - P, 1.0))
+
+    def hold_clocks(self, hold: bool) -> None:
+        """Keep the lags of all streams at zero, or let them go: far from a solution they imitate inertia."""
+        late, far = slice(len(self.parameters.names), self.shared), 0.0 if hold else LATEST
+        self.low[late], self.high[late] = -far, far
+
+    def size(self) -> Array:
+        """What counts as a large residual of every sample far from a solution, (N,)."""
+        size = np.maximum(3.0 * self.first_noise, COARSE * self.measured.spread())
+        return np.asarray(size[self.measured.channel])
+
+    def noise(self, residual: Array) -> Array:
+        """Standard deviation of every sample: that of its channel."""
+        return np.asarray(self.measured.noise(residual, self._floor)[self.measured.channel])
+
+
+# The fit of a vehicle with them: first, what each trial, or each block of a few trials, says about its parameters.
 
 FEWEST_TRIALS = 4
 """With fewer, trials are cut into blocks to estimate the spread."""
@@ -350,13 +1343,11 @@ def speeds(motions: Sequence[Motion], axis: str) -> tuple[float, float]:
     )
 
 
-def horizon(
-    vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str], hydrodynamics: str = "calibrated"
-) -> float:
+def horizon(vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str]) -> float:
     """Length of segments that shows steady motion and yet forgets what no model knows [s]: five of the slowest time
     constant, at least forty samples, between 5 and 12 s."""
-    chosen = vehicle.hydrodynamic_set(hydrodynamics)
-    M = np.diag(vehicle.mass_matrix(hydrodynamics))
+    chosen = vehicle.hydrodynamic_set("calibrated")
+    M = np.diag(vehicle.mass_matrix("calibrated"))
     slowest = 0.5
     if isinstance(chosen, HydrodynamicSet):
         for axis in axes:
@@ -432,20 +1423,15 @@ def pictures(problem: Shooting, solution: Solution, axes: Sequence[str]) -> tupl
     clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
     for axis in axes:
         name, rows, trial, spans = _shown_by(problem, axis)
-        x, y, p, offset = [], [], [], 0.0
+        parts = []
         for g in sorted(sorted(spans, key=lambda g: -spans[g])[:SHOWN]):
             those = rows[trial == g]
             those = those[np.argsort(clock[those], kind="stable")]
-            t = clock[those] - clock[those[0]] + offset
-            x += [t, [np.nan]]
-            y += [m.value[those], [np.nan]]
-            p += [m.value[those] - solution.linear.residual[those], [np.nan]]
-            offset = float(t[-1]) + 1.0
+            value = m.value[those]
+            parts.append((clock[those], value, value - solution.linear.residual[those]))
         if name:
             title = f"{axis}: {name}, simulated from the inputs alone"
-            columns = dict(zip(("x", "measured", "fitted"), map(np.concatenate, (x, y, p)), strict=True))
-            labels = {"x_label": "time, trial after trial [s]", "y_label": f"{name} [{_unit(name)}]"}
-            out.append(Curve(title=title, **labels, **columns))
+            out.append(Curve.joined(title, f"{name} [{_unit(name)}]", parts))
     return tuple(out)
 
 

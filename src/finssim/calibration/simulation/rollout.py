@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.motion.signals import EULER, Motion, attitude_samples, motion
+from finssim.calibration.findings import CalibrationError
+from finssim.calibration.motion import EULER, Motion, attitude_samples, motion
 from finssim.calibration.trials.inputs import Drive, drive
 from finssim.calibration.trials.trial import Trial
 from finssim.engine.plant_arrays import NO_LIMIT, vehicle_parameters
@@ -320,11 +320,9 @@ class Rollouts:
         segments: Sequence[Segment],
         *,
         hydrodynamics: str = "calibrated",
-        integrator: str = "rk4",
         substeps: int | None = None,
         max_delay: float = 0.5,
         moving_water: bool = False,
-        threads: int | None = None,
     ) -> None:
         """Set up.
 
@@ -332,12 +330,10 @@ class Rollouts:
             vehicle: Gives every number that a candidate does not.
             segments: All of one step; they may be of different lengths and drives.
             hydrodynamics: Key of the vehicle's hydrodynamic sets.
-            integrator: As the simulator's.
             substeps: Physics steps in a step; enough for `LONGEST_STEP` if None. Applied forces are linear between
                 samples with one, which is what the default step has; with more they lead by up to half a step.
             max_delay: Longest delay that a candidate may have [s].
             moving_water: Whether candidates bring currents.
-            threads: Of the simulator.
 
         Raises:
             CalibrationError: no segments, steps that differ, or a drive with more than eight channels.
@@ -360,10 +356,9 @@ class Rollouts:
             "hydrodynamics": hydrodynamics,
             "control_step": self.step,
             "substeps": substeps or max(1, math.ceil(self.step / LONGEST_STEP - 1e-9)),
-            "integrator": integrator,
+            "integrator": "rk4",
             "max_delay": max(max_delay, float(self.nominal["delay"])),
             "water_moves": self._moving,
-            "threads": threads,
         }
         self._simulators: dict[int, Simulator] = {}
         self._lengths = np.array([s.steps for s in segments])

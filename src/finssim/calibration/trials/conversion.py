@@ -8,8 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.trials.trial import column_of
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import (
@@ -20,6 +19,8 @@ from finssim.geometry.rotations import (
     quat_to_euler,
 )
 from finssim.vehicles.part import did_you_mean
+
+Array = NDArray[np.float64]
 
 GRAVITY = 9.80665
 """Standard gravity, of the units g and kgf [m/s²]."""
@@ -129,8 +130,6 @@ def factor(unit: str | None, canonical: str) -> float:
 def _like(target: str) -> str:
     return f"one of {', '.join(UNITS[_DIMENSION[target]])}"
 
-
-Array = NDArray[np.float64]
 
 SAME_ROW = 1.0e-6
 """Samples closer than this share a row [s]."""

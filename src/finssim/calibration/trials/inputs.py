@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.trials.trial import INPUT_PREFIXES, TAU, Header, Trial
 from finssim.geometry.rotations import skew
 from finssim.physics.types import MAX_THRUSTERS
@@ -18,6 +17,8 @@ from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.capability import terminal_speeds
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.part import did_you_mean
+
+Array = NDArray[np.float64]
 
 # What every fit asks of the trials and axes that it is given.
 
@@ -315,8 +316,6 @@ def _what_is_missing(present: dict[str, list[str]], vehicle: Vehicle) -> str:
         "vehicle, or write 'passive: true' in trial.yaml if the thrusters were off"
     )
 
-
-Array = NDArray[np.float64]
 
 ACTED = ("rpm_", "force_", "tau")
 """Inputs that are what acted, unless the header says otherwise."""

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding
+from finssim.calibration.findings import CalibrationError, Finding
 from finssim.vehicles.part import Part, refuse_section, refuse_value
 from finssim.vehicles.vehicle import Axis
 
 __all__ = ["Array", "Header", "NU", "PHASES", "TAU", "Trial", "TrialWater", "column_of"]
+
+Array = NDArray[np.float64]
 
 
 def _point(value: Any) -> Any:
@@ -174,8 +175,6 @@ def column_of(name: str) -> Column | None:
             return column
     return None
 
-
-Array = NDArray[np.float64]
 
 PHASES = ("baseline", "excitation", "coast", "rest")
 """Words of the `phase` column; an empty word is none of them."""

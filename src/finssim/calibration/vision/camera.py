@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding, plain
+from finssim.calibration.findings import CalibrationError, Finding, finding, plain
 from finssim.calibration.fit import Correlation, Estimate
-from finssim.calibration.output.report import (
+from finssim.calibration.report import (
     BLUE,
     GRAY,
     HEADS,

@@ -18,13 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.motion.signals import RATE, offset
-from finssim.calibration.motion.smoothing import smooth
-from finssim.calibration.output.commands import finish
-from finssim.calibration.output.report import refuse_places
+from finssim.calibration.motion import RATE, offset, smooth
+from finssim.calibration.report import finish, refuse_places
 from finssim.calibration.uncertainty import Covariance, intervals, trial_covariance
 from finssim.calibration.vision.least_squares import (
     Block,

@@ -15,10 +15,9 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding, plain
+from finssim.calibration.findings import CalibrationError, Finding, finding, plain
 from finssim.calibration.fit import Correlation, Estimate
-from finssim.calibration.output.report import (
+from finssim.calibration.report import (
     AS_GIVEN,
     HEADS,
     Report,
@@ -1047,19 +1046,15 @@ BETTER = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoolFit:
+class PoolFit(Refined):
     """The result, in the survey's frame."""
 
-    model: PoolModel
     surface: bool
     """The plane was taken for a water surface, its normal along the survey's z."""
     settings: Settings
     estimates: dict[str, Estimate]
     correlation: Correlation
     seen: Observations
-    used: NDArray[np.bool_]
-    """Rows that are not outliers, (N,)."""
-    noise: Noise
     residual: Array
     """Measured minus predicted [px], (N, 2)."""
     error: Array
@@ -1128,14 +1123,12 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
     touching = touched(fit, seen)
     contradicted = _contradicted(seen, settings, fit)
     return PoolFit(
-        model=fit.model,
+        **vars(fit),
         surface=found.surface,
         settings=settings,
         estimates=table,
         correlation=errors,
         seen=seen,
-        used=fit.used,
-        noise=fit.noise,
         residual=residuals(fit.model, seen)[0],
         error=error_vectors(fit.model, seen, normal),
         held_out=parts[0],

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.least_squares import descent
 from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Camera, Interface, Layer, Lens, Status, project, projection_jacobians
@@ -22,16 +22,6 @@ Array = NDArray[np.float64]
 
 POSE_NAMES = ("camera_x", "camera_y", "camera_z", "rotation_x", "rotation_y", "rotation_z")
 LENS_NAMES = ("focal", "center_x", "center_y", *(f"distortion_{k}" for k in range(1, 6)))
-NAMES = (
-    "focal",
-    "center_x",
-    "center_y",
-    "distortion_1",
-    "distortion_2",
-    "distortion_3",
-    "distortion_4",
-    "distortion_5",
-)
 NAMES = (*POSE_NAMES, "tilt_x", "tilt_y", "depth", "index", *LENS_NAMES)
 """Order of every vector of parameters: camera centre [m], rotation by pool axes [rad], tilt of the plane about the
 reference point [rad], distance of the plane from the reference point [m], index beyond it, logarithm of the focal

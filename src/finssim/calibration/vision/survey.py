@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.trials.conversion import UNITS
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
 from finssim.localization import LocalizationError

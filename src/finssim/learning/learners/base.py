@@ -33,6 +33,9 @@ CHASE: dict[str, dict[str, Any]] = {
     "ppo": {"discount": 0.99, "steps": 600_000},
 }
 
+SEEN: dict[str, dict[str, Any]] = {"bc": {"steps": 600_000, "hidden": (128, 64), "batch": 256}}
+"""Of tasks with pictures, each of which costs a network of its own."""
+
 SETTINGS: Table = {
     # Smaller networks than the default are as good here, and are learnt in three quarters of the time.
     "t1": {"ppo": {"hidden": (48, 48)}},
@@ -45,9 +48,11 @@ SETTINGS: Table = {
     "t3": {"on-policy": {"discount": 0.95}, "ppo": {"steps": 600_000}},
     "docking": {"ppo": {"steps": 900_000}},
     # Its teacher succeeds in all episodes after a quarter of these steps, and its student after half of them.
-    "pipeline": {"distill": {"teacher_steps": 600_000, "steps": 60_000}},
-    "gate": {"distill": {"teacher_steps": 600_000}},
-    "net": {"distill": {"teacher_steps": 600_000, "steps": 40_000}},
+    "pipeline": {"distill": {"teacher_steps": 600_000, "steps": 60_000}, **SEEN},
+    "gate": {"distill": {"teacher_steps": 600_000}, **SEEN},
+    # Its student succeeds in all episodes after a quarter of these steps.
+    "net": {"distill": {"teacher_steps": 300_000, "steps": 12_800}, **SEEN},
+    "camera-docking": SEEN,
     "pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "teacher": "lead"}},
     # With 1.5 million, half of the seeds have only begun to capture.
     "team-pursuit": {
@@ -84,6 +89,8 @@ RANDOMIZED: Table = {
     },
     "t3": {"ppo": {"steps": 1_500_000}},
     "docking": {"ppo": {"steps": 2_000_000}},
+    # In `open_water` its student succeeds in all episodes after half of these steps.
+    "camera-docking": {"distill": {"teacher_steps": 1_500_000, "steps": 60_000}},
     "pursuit": {"ppo": {"steps": 1_500_000}, "on-policy": {"steps": 2_500_000}},
     "team-pursuit": {"ppo": {"steps": 3_000_000}, "on-policy": {"steps": 6_000_000}},
     "formation": {"ppo": {"steps": 3_000_000}, "on-policy": {"steps": 4_000_000}},

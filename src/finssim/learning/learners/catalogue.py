@@ -62,8 +62,8 @@ class LearnerKind:
     """What of FinsSim must be installed, as pip takes it."""
     agents: str = "any"
     """How many agents of a task it can train: one, several, or any."""
-    sees: bool = False
-    """Whether it trains tasks that observe pictures, and these alone."""
+    sees: bool | None = False
+    """Whether it trains tasks that observe pictures, and these alone; None: with pictures and without."""
     own: type | None = None
     """The class itself, of a learner from outside the package."""
 
@@ -107,8 +107,9 @@ class LearnerKind:
         Raises:
             LearningError: It cannot.
         """
-        if bool(task.pictures) != self.sees and self.own is None:
-            able = [name for name, kind in LEARNERS.items() if kind.sees == bool(task.pictures)]
+        sees = bool(task.pictures)
+        if self.sees not in (sees, None) and self.own is None:
+            able = [name for name, kind in LEARNERS.items() if kind.sees in (sees, None)]
             observes = "pictures" if task.pictures else "no pictures"
             raise LearningError(f"task '{task.name}' observes {observes}: take {', '.join(able)}")
         n = len(task.agents)
@@ -155,7 +156,7 @@ LEARNERS: dict[str, LearnerKind] = {
         extra="torchrl",
         agents="several",
     ),
-    "bc": LearnerKind("imitation", "Bc", "behaviour cloning of demonstrations", extra="imitation"),
+    "bc": LearnerKind("imitation", "Bc", "behaviour cloning of demonstrations", extra="imitation", sees=None),
     "dagger": LearnerKind(
         "imitation", "Dagger", "DAgger: an expert says what it would have done", extra="imitation"
     ),

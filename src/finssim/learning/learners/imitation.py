@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import torch
+import warp as wp
 from torch import nn
 
 from finssim.control.guidance import Known
 from finssim.learning.demonstrations import Demonstrations, load
 from finssim.learning.learners.base import ActingLearner, expert_in
 from finssim.learning.learners.catalogue import LearningError
-from finssim.learning.recurrent import stack
+from finssim.learning.learners.distill import varied
+from finssim.learning.recurrent import SeeingNetwork, stack
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment
@@ -37,7 +41,9 @@ class BcSettings:
     """At the start; falls linearly to zero."""
     weight_decay: float = 1.0e-5
     hidden: tuple[int, ...] = (64, 64)
-    """Units of the hidden layers, ELU."""
+    """Units of the hidden layers, ELU; of a task that sees, those behind the encoder of `distill`."""
+    colour: float = 0.3
+    """How far colours of pictures are varied while it learns, as of `distill`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,12 +84,14 @@ def demonstrations_for(environment: Environment, place: str) -> Demonstrations:
             "no demonstrations are named: collect some with finssim collect, and give --set demonstrations=DIR"
         )
     found = load(place)
-    vehicle = environment.simulator.vehicles[0]
+    vehicle, sight = environment.simulator.vehicles[0], environment.sight
+    shapes = {name: list(x.shape[1:]) for name, x in sight.pictures.items()} if sight else {}
     for what, has, wanted in (
         ("task", found.about["task"], environment.task.name),
         ("action mode", found.about["action"]["mode"], environment.action_mode),
         ("vehicle", found.about["vehicle"]["sha256"], vehicle.sha256),
         ("observation", found.observation.shape[1], environment.observation_size),
+        ("pictures", {k: list(x.shape[1:]) for k, x in found.pictures.items()}, shapes),
     ):
         if has != wanted:
             raise LearningError(f"{place} is of {what} {has}, expected {wanted}: collect for what is trained")
@@ -101,21 +109,33 @@ class _Cloner(ActingLearner):
         age_episodes(environment)
         self.device = device
         self._worlds = Tensors(environment)
-        self.policy = stack(environment.observation_size, settings.hidden, environment.action_size, 0.01).to(
-            device
-        )
+        n, m, sight = environment.observation_size, environment.action_size, environment.sight
+        self._pictures = {name: wp.to_torch(x) for name, x in sight.pictures.items()} if sight else {}
+        shapes = {name: tuple(x.shape[1:]) for name, x in self._pictures.items()}
+        self.policy = (
+            SeeingNetwork(n, shapes, m, hidden=settings.hidden)
+            if sight
+            else stack(n, settings.hidden, m, 0.01)
+        ).to(device)
         self.optimizer = torch.optim.Adam(
             self.policy.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
 
-    def _fit(self, observation: torch.Tensor, action: torch.Tensor, count: int) -> float:
+    def _fit(
+        self,
+        observation: torch.Tensor,
+        action: torch.Tensor,
+        count: int,
+        pictures: Mapping[str, torch.Tensor] = MappingProxyType({}),
+    ) -> float:
         """Regression on batches drawn with replacement; the mean squared error over all of them."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.settings.learning_rate * self.left
         total, rounds = 0.0, max(1, count // self.settings.batch)
         for _ in range(rounds):
             index = torch.randint(len(observation), (self.settings.batch,))
-            loss = nn.functional.mse_loss(self.policy(observation[index]), action[index])
+            views = {name: varied(x[index], self.settings.colour) for name, x in pictures.items()}
+            loss = nn.functional.mse_loss(self.policy(observation[index], **views), action[index])
             self.optimizer.zero_grad()
             loss.backward()
             self.optimizer.step()
@@ -126,7 +146,8 @@ class _Cloner(ActingLearner):
         with torch.no_grad():
             for _ in range(steps):
                 seen = self._worlds.observation.to(self.device, copy=True)
-                self._worlds.step(self.policy(seen).clamp(-1.0, 1.0))
+                seen = seen[:, 0] if self._pictures else seen  # only one vehicle can see
+                self._worlds.step(self.policy(seen, **self._pictures).clamp(-1.0, 1.0))
                 self.tally.look()
 
     def network(self) -> nn.Module:
@@ -157,11 +178,12 @@ class Bc(_Cloner):
         found = demonstrations_for(environment, settings.demonstrations)
         self._observation = torch.from_numpy(found.observation).to(device)
         self._action = torch.from_numpy(found.action).to(device)
+        self._shown = {name: torch.from_numpy(x).to(device) for name, x in found.pictures.items()}
 
     def update(self) -> dict[str, float]:
         """One round of regression, then a while of driving, which only measures."""
         count = min(self.settings.rollout, self.settings.steps - self.steps)
-        loss = self._fit(self._observation, self._action, count)
+        loss = self._fit(self._observation, self._action, count, self._shown)
         self.steps += max(count, 1)
         self._drive(10)
         return {**self.tally.row(), "imitation_loss": loss}

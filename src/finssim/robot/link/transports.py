@@ -96,17 +96,10 @@ class UdpTransport:
         self.refused: Counter[Address | None] = Counter()
         self.send_errors = 0
         self._send_problem, self._longest = "", longest
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket = bound_socket(socket.SOCK_DGRAM, here)
         self._socket.setblocking(False)
-        try:
-            if buffer:
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
-            self._socket.bind(here)
-        except OSError as problem:
-            self._socket.close()
-            raise LinkError(
-                f"cannot bind {here[0]}:{here[1]} ({problem.strerror}): end the program that has it, or bind another"
-            ) from None
+        if buffer:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
         self.address: Address = self._socket.getsockname()
 
     def send(self, data: bytes) -> None:

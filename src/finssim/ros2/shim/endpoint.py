@@ -9,8 +9,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+from finssim.ros2 import Ros2Error
 from finssim.ros2.codec import HEADER, Message, codec_of
-from finssim.ros2.errors import Ros2Error
 from finssim.ros2.shim.exceptions import InvalidHandle
 from finssim.ros2.shim.qos import quality_of
 from finssim.ros2.wire import ClientEnd, Quality, ServerEnd

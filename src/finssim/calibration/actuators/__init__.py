@@ -1,1 +1,0 @@
-"""Thrust curves, speed controllers, and motor responses, from benches and step logs."""

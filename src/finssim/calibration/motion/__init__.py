@@ -1,1 +1,0 @@
-"""From a trial's streams to velocities, accelerations and attitude on one grid."""

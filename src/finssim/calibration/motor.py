@@ -1,0 +1,683 @@
+"""From step logs to the response of a vehicle's motors.
+
+First order plus dead time, K e^(-T_d s) / (τ s + 1), in the quantity on which the vehicle file lets the lag act.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.findings import CalibrationError, Finding, finding
+from finssim.calibration.fit import Curve, Estimate, Fit
+from finssim.calibration.motion import without_spikes
+from finssim.calibration.report import finish, refuse_places, usable_trials
+from finssim.calibration.thrust_table import find_steps
+from finssim.calibration.thruster import jackknife
+from finssim.calibration.trials.trial import Trial
+from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
+from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.thruster import Thruster
+
+__all__ = ["cut_steps", "fit_motor", "fit_response"]
+
+
+Array = NDArray[np.float64]
+
+RPM = math.pi / 30.0
+
+# Command and response of a thruster in a trial.
+
+DOMAINS = ("force", "speed")
+"""Thrust [N] and shaft speed [rad/s]."""
+
+UNIT = {"force": "N", "speed": "rad/s"}
+
+BEFORE = 0.3
+"""Longest part of the level before a step that is fitted with it [s]."""
+
+FEWEST = 5
+"""Samples after a step that it needs."""
+
+SETTLED = 0.4
+"""Part of a level, at its end, that counts as settled."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepRecord:
+    """Samples around one step of the command."""
+
+    trial: str
+    t: Array
+    """Since the step [s], (n,)."""
+    y: Array
+    """Response, (n,)."""
+    sample: float
+    """Time in which the command's change is not told apart [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Log:
+    """One thruster of one trial, thrust [N] or shaft speed [rad/s]."""
+
+    records: list[StepRecord]
+    levels: list[tuple[float, float]]
+    """Held commands and the response at the end of each."""
+    measured: str
+    """Column of the response."""
+    same_unit: bool
+    """Whether command and response are the same quantity; pulses without an ESC's law are not."""
+    findings: tuple[Finding, ...]
+
+
+def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Log | None:
+    """Command and response of a thruster.
+
+    Commands, the first that is there: `rpm_command_NAME` [rpm], `command_NAME` [N], `pwm_NAME` [µs], and `force_NAME`
+    where the header says that inputs are commanded and speeds are measured. Responses: `rpm_NAME`, else `force_NAME`.
+    Thrust and speed turn into each other by the thruster's curve. A response without sign gets the command's.
+
+    Returns:
+        None where the trial has not both.
+    """
+    columns = _columns(trial, name)
+    if columns is None:
+        return None
+    asked, measured = columns
+    findings: list[Finding] = []
+    times, raw = trial.series(asked)
+    same_unit, held = True, raw
+    if asked.startswith("pwm_") and thruster.esc is None:
+        command, same_unit = raw - 1500.0, False
+        findings.append(finding("pulses_raw"))
+    elif asked.startswith("pwm_"):
+        voltage = np.interp(times, *trial.series("voltage")) if trial.has("voltage") else trial.header.voltage
+        command = _as(domain, thruster.shaft_speed(raw, voltage), thruster, "speed")
+    elif asked.startswith("rpm_"):
+        command = _as(domain, raw * RPM, thruster, "speed")
+    else:
+        # Small steps of a force are as plain as large ones in the speed.
+        command, held = _as(domain, raw, thruster, "force"), thruster.speed(raw)
+    t, raw = trial.series(measured)
+    good = without_spikes(t, raw[:, None])
+    if not good.all():
+        findings.append(finding("spikes", samples=np.count_nonzero(~good), column=measured))
+    t, raw = t[good], raw[good]
+    if np.min(command) < 0.0 < np.max(raw) and np.min(raw) > -0.02 * np.max(raw):
+        latest = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
+        raw = np.abs(raw) * _last_sign(command)[latest]
+        findings.append(finding("sign_of_command", column=measured))
+    from_unit = "speed" if measured.startswith("rpm_") else "force"
+    response = _as(domain, raw * RPM if from_unit == "speed" else raw, thruster, from_unit)
+    steps = find_steps(times, held)
+    levels = []
+    for step in steps:
+        rows = (t >= step.end - SETTLED * (step.end - step.time)) & (t <= step.end)
+        if rows.any():
+            level = float(command[np.searchsorted(times, step.time)])
+            levels.append((level, float(np.mean(response[rows]))))
+    records = cut_steps(trial.name, t, response, times, [(s.start, s.time, s.end) for s in steps])
+    return Log(
+        records=records, levels=levels, measured=measured, same_unit=same_unit, findings=tuple(findings)
+    )
+
+
+def cut_steps(
+    trial: str, t: Array, y: Array, command_times: Array, steps: Sequence[tuple[float, float, float]]
+) -> list[StepRecord]:
+    """Samples of the response around every step; steps with fewer than `FEWEST` samples after them are left out.
+
+    The level before a step is taken along where it has settled.
+
+    Args:
+        trial: Its name.
+        t: Times of the response's samples [s], (n,).
+        y: Response, (n,).
+        command_times: Times of the command's samples [s], (m,).
+        steps: Last time before the change, first after it, and last before the next [s].
+    """
+    records = []
+    previous = float(t[0]) if t.size else 0.0
+    for start, time, end in steps:
+        after = (t >= time) & (t <= end)
+        before = (t < time) & (t >= max(previous, time - BEFORE))
+        lately = y[(t < time) & (t >= previous + 0.5 * (time - previous))]
+        scatter = float(np.ptp(lately)) if lately.size else np.inf
+        moved = float(np.ptp(y[after])) if after.any() else 0.0
+        rows = after | before if scatter < 0.25 * moved else after
+        if np.count_nonzero(after) >= FEWEST:
+            near = np.diff(command_times[(command_times >= previous) & (command_times <= end)])
+            sample = float(np.median(near)) if near.size else time - start
+            records.append(StepRecord(trial=trial, t=t[rows] - time, y=y[rows], sample=sample))
+        previous = time
+    return records
+
+
+def _columns(trial: Trial, name: str) -> tuple[str, str] | None:
+    """Columns of command and response, or None."""
+    responses = [column for column in (f"rpm_{name}", f"force_{name}") if trial.has(column)]
+    commands = [c for c in (f"rpm_command_{name}", f"command_{name}", f"pwm_{name}") if trial.has(c)]
+    if not commands and trial.header.inputs == "commanded" and len(responses) == 2:
+        commands = [responses.pop()]
+    return (commands[0], responses[0]) if commands and responses else None
+
+
+def _as(domain: str, values: Array, thruster: Thruster, unit: str) -> Array:
+    if domain == unit:
+        return values
+    return thruster.thrust(values) if domain == "force" else thruster.speed(values)
+
+
+def _last_sign(command: Array) -> Array:
+    """Sign of the last command that was not zero, at every sample; until the first one, the first's."""
+    sign = np.sign(command)
+    known = np.flatnonzero(sign)
+    index = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), known[0]))
+    return np.asarray(sign[index])
+
+
+# One dead time and time constant for all steps of a thruster.
+
+GRID = 21
+"""Dead times and time constants of the coarse search, each way."""
+
+LONGEST_DELAY, DELAY_SHARE = 0.8, 0.45
+"""T_d <= min(0.8 s, 0.45 of the step's duration) (facts, §5)."""
+
+OVERSHOOT, NRMSE = 0.10, 0.10
+"""A step is accepted up to this overshoot and this error over its height (facts, §5)."""
+
+FEWEST_TRIALS = 4
+"""With fewer, intervals are over steps."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Response:
+    """What all steps have in common."""
+
+    delay: float
+    """T_d [s]."""
+    time_constant: float
+    """τ [s]."""
+    delay_interval: tuple[float, float]
+    time_constant_interval: tuple[float, float]
+    sample: float
+    """Of the measurement, median [s]."""
+    nrmse: Array
+    """Error of every step over its height, (n,)."""
+    overshoot: Array
+    """Of every step beyond its final level, over its height; noise taken off, (n,)."""
+    moved: NDArray[np.bool_]
+    """Which steps the response follows at all; it does not inside a dead zone, (n,)."""
+    accepted: NDArray[np.bool_]
+    """Which steps follow first order plus dead time, (n,)."""
+    used: NDArray[np.bool_]
+    """Steps that the numbers rest on: the accepted ones, or all that moved where none is accepted, (n,)."""
+
+    @property
+    def hidden(self) -> bool:
+        """Whether the time constant is below half a sample, where the log cannot tell it from 0."""
+        return self.time_constant < 0.5 * self.sample
+
+    @property
+    def error(self) -> float:
+        """Median over the steps used."""
+        return float(np.median(self.nrmse[self.used]))
+
+
+def fit_response(records: Sequence[StepRecord]) -> Response:
+    """One dead time and time constant for all steps; every step has levels of its own.
+
+    y = a + b (1 - e^(-(t - T_d) / τ)) from t = T_d on, with a and b of each step by least squares (variable
+    projection), so that static nonlinearity (dead zone, thrust curve) stays out of the dynamics. A coarse grid of T_d
+    and τ starts SciPy's least squares.
+
+    Args:
+        records: At least one step in which the response moves.
+
+    Returns:
+        Estimates with 95 % intervals, over the steps (over the trials where there are four or more), with the time in
+        which samples cannot tell apart added to T_d's.
+    """
+    sample = float(np.median(np.concatenate([np.diff(record.t) for record in records])))
+    duration = float(np.median([record.t[-1] for record in records]))
+    longest = min(LONGEST_DELAY, DELAY_SHARE * duration)
+    low, high = np.array([0.0, math.log(0.1 * sample)]), np.array([longest, math.log(duration)])
+    corners = np.stack(np.meshgrid(*np.linspace(low, high, GRID).T), axis=-1).reshape(-1, 2)
+    power = np.array([float(np.var(record.y)) * len(record.y) for record in records])
+    left = np.array([[float(np.sum(_misfit(one, x) ** 2)) for one in records] for x in corners])
+    explained = 1.0 - left.min(axis=0) / np.maximum(power, 1e-300)
+    moved = (explained > 0.5) & (power > 0.0)
+    first = moved if moved.any() else np.arange(len(records)) == np.argmax(explained)
+    spread = (left / np.maximum(power, 1e-300))[:, first].sum(axis=1)
+    x = _solved(records, first, corners[np.argmin(spread)], low, high)
+    nrmse, overshoot = np.array([_figures(one, x) for one in records]).T
+    accepted = moved & (nrmse <= NRMSE) & (overshoot <= OVERSHOOT)
+    used = accepted if accepted.any() else first
+    x = _solved(records, used, x, low, high)
+    nrmse, overshoot = np.array([_figures(one, x) for one in records]).T
+    chosen = [record for record, on in zip(records, used, strict=True) if on]
+    ends = intervals(x, trial_covariance(_evidence(chosen, x)))
+    blur = 0.5 * float(np.median([record.sample for record in chosen]))
+    slow = np.exp(np.clip(ends[1], -50.0, 50.0))
+    return Response(
+        delay=float(x[0]),
+        time_constant=float(np.exp(x[1])),
+        delay_interval=(max(float(ends[0, 0]) - blur, 0.0), float(ends[0, 1]) + blur),
+        time_constant_interval=(float(slow[0]), float(slow[1])),
+        sample=sample,
+        nrmse=nrmse,
+        overshoot=overshoot,
+        moved=moved,
+        accepted=accepted,
+        used=used,
+    )
+
+
+def unit_response(t: Array, x: Array) -> Array:
+    """1 - e^(-(t - T_d) / τ) from T_d on, (n,).
+
+    Args:
+        t: Time since the step [s], (n,).
+        x: T_d [s] and ln τ, τ in s, (2,).
+    """
+    return np.asarray(-np.expm1(-np.maximum(t - x[0], 0.0) / math.exp(x[1])))
+
+
+def _levels(record: StepRecord, x: Array) -> tuple[Array, Array]:
+    """Level before a step and height that fit best, and the basis that they multiply, (2,) and (n, 2)."""
+    rows = np.column_stack([np.ones(len(record.t)), unit_response(record.t, x)])
+    return np.linalg.lstsq(rows, record.y, rcond=None)[0], rows
+
+
+def _misfit(record: StepRecord, x: Array) -> Array:
+    """What the best levels leave, (n,): the response and the samples without their means and what they share."""
+    r = unit_response(record.t, x)
+    r, y = r - r.mean(), record.y - record.y.mean()
+    power = float(r @ r)
+    return np.asarray(y - r * (float(r @ y) / power) if power > 1e-12 else y)
+
+
+def _solved(
+    records: Sequence[StepRecord], which: NDArray[np.bool_], x: Array, low: Array, high: Array
+) -> Array:
+    from scipy.optimize import least_squares
+
+    chosen = [record for record, on in zip(records, which, strict=True) if on]
+    scale = [max(float(np.std(record.y)), 1e-300) for record in chosen]
+
+    def residual(x: Array) -> Array:
+        return np.concatenate([_misfit(one, x) / s for one, s in zip(chosen, scale, strict=True)])
+
+    start = np.clip(x, low + 1e-6, high - 1e-6)
+    return np.asarray(
+        least_squares(residual, start, bounds=(low, high), x_scale=(0.01, 0.1), diff_step=1e-5).x
+    )
+
+
+def _evidence(records: Sequence[StepRecord], x: Array) -> Evidence:
+    """What each step, or each trial, says of T_d and ln τ."""
+    h = np.array([1e-4, 1e-3])
+    normal, score = [], []
+    for record in records:
+        r = _misfit(record, x)
+        J = (
+            np.stack(
+                [(_misfit(record, x + step) - _misfit(record, x - step)) / 2.0 for step in np.diag(h)], axis=1
+            )
+            / h
+        )
+        variance = (
+            float(np.mean(r**2)) * len(r) / max(len(r) - 4, 1) + 1e-12 * float(np.var(record.y)) + 1e-300
+        )
+        variance *= correlated_samples(r)
+        normal.append(J.T @ J / variance)
+        score.append(-J.T @ r / variance)
+    trials = [record.trial for record in records]
+    labels = trials if len(set(trials)) >= FEWEST_TRIALS else [str(i) for i in range(len(records))]
+    groups = [[i for i, label in enumerate(labels) if label == name] for name in dict.fromkeys(labels)]
+    return Evidence(
+        names=("delay", "ln_time_constant"),
+        normal=np.array([np.sum([normal[i] for i in rows], axis=0) for rows in groups]),
+        score=np.array([np.sum([score[i] for i in rows], axis=0) for rows in groups]),
+        unit="trials",
+    )
+
+
+def _figures(record: StepRecord, x: Array) -> tuple[float, float]:
+    """Error of one step over its height, and its largest excursion beyond the final level, of means of three samples,
+    less twice their noise."""
+    (start, _), rows = _levels(record, x)
+    settled = record.y[record.t >= 0.75 * record.t[-1]]
+    height = float(np.mean(settled)) - float(start)
+    error = float(np.sqrt(np.mean(_misfit(record, x) ** 2))) / max(abs(height), 1e-300)
+    beyond = (record.y[record.t > 0.0] - np.mean(settled)) * np.sign(height)
+    if len(beyond) < FEWEST or height == 0.0:
+        return error, 0.0
+    smooth = np.convolve(beyond, np.full(3, 1.0 / 3.0), "valid")
+    noise = 2.0 * float(np.std(settled)) / math.sqrt(3.0)
+    return error, max(float(np.max(smooth)) - noise, 0.0) / abs(height)
+
+
+# What the logs say of one thruster.
+
+STANDING = 0.02
+"""Share of the largest response below which a held level counts as standing."""
+
+NARROW_DEAD_ZONE = 2.0
+"""A dead zone is told where the smallest command that turns is at most this times the largest that does not."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """One thruster over all its trials."""
+
+    name: str
+    domain: str
+    logs: tuple[Log, ...]
+    response: Response
+    other_error: float
+    """Error of the same fit in the other domain, over the steps' height; NaN where it could not be made."""
+
+    @property
+    def records(self) -> list[StepRecord]:
+        """All steps."""
+        return [record for log in self.logs for record in log.records]
+
+    @property
+    def same_unit(self) -> bool:
+        """Whether gains and dead zone compare equal quantities."""
+        return all(log.same_unit for log in self.logs)
+
+    @property
+    def sure(self) -> bool:
+        """Whether a step follows first order plus dead time well enough for the numbers to be written."""
+        return bool(self.response.accepted.any())
+
+    @property
+    def levels(self) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+        """Commands and responses of all levels, and of those that move."""
+        pairs = [pair for log in self.logs for pair in log.levels]
+        largest = max((abs(y) for _, y in pairs), default=0.0)
+        return pairs, [(u, y) for u, y in pairs if u != 0.0 and abs(y) > STANDING * largest]
+
+    @property
+    def gain(self) -> tuple[float, float]:
+        """Steady response over command by least squares through zero, and the half-width of its interval."""
+        _, moving = self.levels
+        if not moving:
+            return math.nan, math.inf
+        u, y = np.array(moving).T
+        if len(u) < 3:
+            return float(u @ y / (u @ u)), math.inf
+        others = [np.arange(len(u)) != i for i in range(len(u))]
+        left_out = np.array([[u[rows] @ y[rows] / (u[rows] @ u[rows])] for rows in others])
+        return float(u @ y / (u @ u)), float(jackknife(left_out)[0])
+
+
+def study(name: str, trials: Sequence[Trial], thruster: Thruster) -> Study | None:
+    """Fit one thruster over all trials that hold it; None where no command of it holds and changes.
+
+    Args:
+        name: Of the thruster.
+        trials: All of them.
+        thruster: As the vehicle file has it; its curve turns thrust and speed into each other.
+    """
+    chosen = thruster.domain
+    logs = {
+        d: [log for trial in trials if (log := log_of(trial, name, thruster, d)) is not None] for d in DOMAINS
+    }
+    records = {d: [record for log in found for record in log.records] for d, found in logs.items()}
+    if not records[chosen]:
+        return None
+    responses = {d: fit_response(found) for d, found in records.items() if found}
+    other = responses.get(DOMAINS[1 - DOMAINS.index(chosen)])
+    return Study(
+        name=name, domain=chosen, logs=tuple(logs[chosen]), response=responses[chosen],
+        other_error=math.nan if other is None else other.error,
+    )  # fmt: skip
+
+
+def estimates_of(found: Study, thruster: Thruster) -> list[Estimate]:
+    """K, T_d, τ and the dead zone of one thruster."""
+    response, name = found.response, found.name
+    count = int(response.used.sum())
+    rests = f"{count} step{'s' if count != 1 else ''} sampled every {response.sample:.3g} s"
+    if not found.sure:
+        rests += ": no step follows first order plus dead time within 10 %"
+    if response.hidden:
+        rests += "; below half a sample, the log cannot tell it from 0"
+    late = "the command's change is known to one sample of its log, which is in the interval"
+    if response.delay < response.sample:
+        late = f"delay {response.delay:.3g} s is below one sample of {response.sample:.3g} s"
+    gain, half = found.gain
+    estimates = [
+        Estimate(
+            name=f"{name}.time_constant", estimate=response.time_constant, ci95=response.time_constant_interval,
+            unit="s", identifiable=found.sure and not response.hidden, note=rests,
+            path=f"thrusters.{name}.time_constant",
+        ),
+        Estimate(
+            name=f"{name}.delay", estimate=response.delay, ci95=response.delay_interval, unit="s",
+            identifiable=found.sure, note=late,
+        ),
+        Estimate(
+            name=f"{name}.gain", estimate=gain, ci95=(gain - half, gain + half),
+            unit="-" if found.same_unit else f"{UNIT[found.domain]}/µs",
+            identifiable=math.isfinite(half) and half < abs(gain),
+            note=f"steady {'thrust' if found.domain == 'force' else 'speed'} over what was asked",
+        ),
+    ]  # fmt: skip
+    return estimates + (_dead_zones(found, thruster) if found.same_unit else [])
+
+
+def _dead_zones(found: Study, thruster: Thruster) -> list[Estimate]:
+    """The slowest speed that turns the shaft either way, between two commands that were tried."""
+    pairs, moving = found.levels
+    estimates = []
+    for side, sign in (("plus", 1.0), ("minus", -1.0)):
+        turn = [sign * u for u, _ in moving if sign * u > 0.0]
+        if not turn:
+            continue
+        stand = [sign * u for u, y in pairs if sign * u > 0.0 and (u, y) not in moving]
+        low, high = max([u for u in stand if u < min(turn)], default=0.0), min(turn)
+        if found.domain == "force":
+            low, high = (abs(float(thruster.speed(sign * force))) for force in (low, high))
+        known = low > 0.0 and high <= NARROW_DEAD_ZONE * low
+        note = "no commands were tried between the last that stands and the first that turns"
+        if known:
+            note = "between the last command that leaves the shaft standing and the first that turns it"
+        elif low == 0.0:
+            note = f"the smallest command tried, {high / RPM:.0f} rpm, already turns the shaft"
+        ends = sorted((sign * low / RPM + 0.0, sign * high / RPM + 0.0))
+        estimates.append(
+            Estimate(
+                name=f"{found.name}.dead_rpm_{side}", ci95=(ends[0], ends[1]), unit="rpm", identifiable=known,
+                estimate=sign * (0.5 * (low + high) if low > 0.0 else 0.0) / RPM + 0.0, note=note,
+                path=f"thrusters.{found.name}.dead_rpm_{side}",
+            )
+        )  # fmt: skip
+    return estimates
+
+
+def quality_of(found: Study) -> dict[str, float]:
+    """Figures of the fit: overshoot and steady error of the steps, error over their height."""
+    response, (_, moving) = found.response, found.levels
+    errors = [abs(y - u) / abs(u) for u, y in moving]
+    return {
+        "nrmse": response.error,
+        "overshoot": float(response.overshoot[response.used].max(initial=0.0)),
+        "steady_error": float(np.mean(errors)) if errors and found.same_unit else math.nan,
+        "steps": float(len(response.nrmse)),
+        "accepted": float(response.accepted.sum()),
+        "sample": response.sample,
+        "nrmse_other_domain": found.other_error,
+    }
+
+
+def findings_of(found: Study) -> list[Finding]:
+    """What a reader of the numbers must know."""
+    response, (gain, half) = found.response, found.gain
+    out = [one.about(log.records[0].trial) for log in found.logs for one in log.findings if log.records]
+    accepted, moved = int(response.accepted.sum()), int(response.moved.sum())
+    if moved == 0:
+        out.append(finding("not_followed", found.name, column=found.logs[0].measured))
+    elif accepted == 0:
+        out.append(finding("steps_refused", found.name, limit=NRMSE, error=response.error))
+    elif accepted < moved:
+        out.append(finding("steps_left_out", found.name, steps=moved - accepted, total=moved, limit=NRMSE))
+    if found.other_error < 0.5 * response.error and response.error > 0.02:
+        other = DOMAINS[1 - DOMAINS.index(found.domain)]
+        out.append(
+            finding("other_domain", found.name, domain=other, other=found.other_error, error=response.error)
+        )
+    if found.same_unit and abs(gain - 1.0) > 0.1 + half:
+        out.append(finding("steady_gain", found.name, gain=gain))
+    return out
+
+
+def curve_of(found: Study) -> Curve:
+    """Steps used, one after the other, with the common response at each step's own levels."""
+    parameters, parts = np.array([found.response.delay, math.log(found.response.time_constant)]), []
+    for record in np.array(found.records, dtype=object)[found.response.used]:
+        level, rows = _levels(record, parameters)
+        parts.append((record.t, record.y, rows @ level))
+    unit = "thrust [N]" if found.domain == "force" else "shaft speed [rad/s]"
+    return Curve.joined(f"{found.name}: steps", unit, parts)
+
+
+def fit_motor(
+    trials: Iterable[Trial],
+    vehicle: Vehicle,
+    *,
+    seed: int = 0,
+) -> Fit:
+    """Fit first order plus dead time to the steps of each thruster, in the vehicle file's domain.
+
+    Thrusters that no trial steps get the mean of their propeller group's. All thrusters share one link, so the vehicle
+    file gets one delay, the median of theirs.
+
+    Args:
+        trials: With a held and changed command and its response per thruster; see `log_of` for the columns.
+        vehicle: Whose thrusters they are; its curves turn thrust into speed.
+        seed: For the record; the intervals need no random numbers.
+
+    Returns:
+        Estimates `THRUSTER.time_constant`, `.delay`, `.gain`, `.dead_rpm_plus`, ...; `delay` of all.
+
+    Raises:
+        CalibrationError: No trial holds a command that steps and its response.
+    """
+    trials = list(trials)
+    studies, findings = [], list[Finding]()
+    for name in _names(trials, vehicle):
+        found = study(name, trials, vehicle.thrusters[name])
+        if found is None:
+            findings.append(finding("no_steps", name))
+            continue
+        studies.append(found)
+        findings += findings_of(found)
+    if not studies:
+        raise CalibrationError(
+            f"{', '.join(trial.name for trial in trials)}: no command holds a level and changes: log steps of at least "
+            "0.5 s, such as those of 'finssim excite'"
+        )
+    estimates = [e for found in studies for e in estimates_of(found, vehicle.thrusters[found.name])]
+    changes = {e.path: e.estimate for e in estimates if e.path is not None and e.identifiable}
+    sure = [found for found in studies if found.sure]
+    if sure:
+        estimates.insert(0, _common_delay(sure))
+        changes["thrusters.*.delay"] = estimates[0].estimate
+        changes |= _untested(sure, vehicle, changes, findings)
+    return Fit(
+        kind="motor",
+        method="first order plus dead time",
+        vehicle=vehicle,
+        estimates={e.name: e for e in estimates},
+        changes=changes,
+        quality={found.name: quality_of(found) for found in studies},
+        curves=tuple(curve_of(found) for found in studies),
+        findings=tuple(dict.fromkeys(findings)),
+        trials={trial.name: trial.sha256 for trial in trials},
+        settings={"seed": seed},
+    )
+
+
+def _names(trials: Sequence[Trial], vehicle: Vehicle) -> list[str]:
+    names = [name for name in vehicle.thrusters if any(_columns(trial, name) for trial in trials)]
+    if not names:
+        shown = ", ".join(trial.name for trial in trials) or "no trial"
+        raise CalibrationError(
+            f"{shown}: no thruster of {vehicle.name} has a command (rpm_command_NAME, command_NAME or pwm_NAME) and a "
+            f"response (rpm_NAME or force_NAME); its thrusters are {', '.join(vehicle.thrusters)}"
+        )
+    return names
+
+
+def _common_delay(studies: Sequence[Study]) -> Estimate:
+    """The delay of the link that all thrusters share."""
+    delays = [found.response.delay for found in studies]
+    ends = [found.response.delay_interval for found in studies]
+    middle = float(np.median(delays))
+    note = f"median of {len(delays)} thrusters, which share one link"
+    if any(high < middle or low > middle for low, high in ends):
+        note += f"; they differ by {max(delays) - min(delays):.3g} s, more than their intervals"
+    low, high = (float(end) for end in np.median(ends, axis=0))
+    return Estimate(
+        name="delay", estimate=middle, ci95=(low, high), unit="s", identifiable=True, note=note,
+        path="thrusters.*.delay",
+    )  # fmt: skip
+
+
+def _untested(
+    studies: Sequence[Study], vehicle: Vehicle, changes: dict[str, Any], findings: list[Finding]
+) -> dict[str, float]:
+    """Time constants of the thrusters that no trial steps, from those of their group."""
+    groups: dict[str, list[float]] = {}
+    for found in studies:
+        if f"thrusters.{found.name}.time_constant" in changes:
+            group = vehicle.thrusters[found.name].group
+            groups.setdefault(group, []).append(found.response.time_constant)
+    tested = {found.name for found in studies}
+    out = {}
+    for name, thruster in vehicle.thrusters.items():
+        if name not in tested and thruster.group in groups:
+            out[f"thrusters.{name}.time_constant"] = float(np.mean(groups[thruster.group]))
+            findings.append(finding("group_mean", name))
+        elif name not in tested:
+            findings.append(finding("file_response", name))
+    return out
+
+
+def calibrate_motor(
+    trials: Sequence[Path],
+    *,
+    vehicle: str,
+    out: Path,
+    report: Path | None = None,
+    seed: int = 0,
+    as_json: bool = False,
+) -> Vehicle:
+    """Fit the motors' response to steps: delay and lag [s], dead zone.
+
+    Example: finssim calibrate motor steps --vehicle mine.yaml --out mine.yaml
+
+    Args:
+        trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Vehicle file to write (.yaml).
+        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
+    """
+    options = dict(locals())
+    refuse_places(out, report, "vehicle")
+    body = load_vehicle(vehicle)
+    fit = fit_motor(usable_trials(trials), body, seed=seed)
+    return finish("motor", fit, options)

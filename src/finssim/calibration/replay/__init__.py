@@ -1,1 +1,0 @@
-"""Models driven with recorded inputs, scored against what was recorded."""

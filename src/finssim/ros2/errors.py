@@ -1,9 +1,0 @@
-"""The errors of this layer."""
-
-
-class Ros2Error(ValueError):
-    """A setting, name or definition of ROS 2 cannot be used; the message is one sentence that says what to do."""
-
-
-class MessageError(AssertionError):
-    """A value does not fit its field. Real rclpy asserts here, so code written for it may expect an AssertionError."""
