@@ -116,21 +116,14 @@ def test_a_search_finds_the_least_and_proposes_the_same_again(tmp_path, monkeypa
             "plants": {"nominal": {"e_p_m": error}},
         }, {}
 
-    def here(jobs, processes):
-        for job in jobs:
-            try:
-                yield job, made_up(job)
-            except RuntimeError as error:
-                yield job, error
-
-    monkeypatch.setattr(command, "_here", here)
+    monkeypatch.setattr(command, "play", made_up)
     file = tmp_path / "sweep.yaml"
     options = {
         "settings.learning_rate": {"low": 1e-6, "high": 1e-2, "log": True}, "settings.memory": {"choice": [0, 32]},
     }  # fmt: skip
     plan = {"task": "t1", "seeds": 2, "search": {"trials": 24, "minimise": "e_p_m", "options": options}}
     file.write_text(yaml.safe_dump(plan), encoding="utf-8")
-    result = command.sweep(file, out=tmp_path / "out")
+    result = command.sweep(file, out=tmp_path / "out", processes=1)
     best = result["best"]
     assert len(result["rows"]) == len(played) == 48 and best["value"] < 0.3
     assert best["options"]["settings.memory"] == 0 and not result["ok"]
@@ -140,7 +133,7 @@ def test_a_search_finds_the_least_and_proposes_the_same_again(tmp_path, monkeypa
     shutil.rmtree(gone)
     failed = {row["run"] for row in result["rows"] if "error" in row}
     played.clear()
-    again = command.sweep(file, out=tmp_path / "out")
+    again = command.sweep(file, out=tmp_path / "out", processes=1)
     assert again["best"] == best and set(played) == {gone.name} | failed
 
 
