@@ -114,7 +114,7 @@ class Graph:
 
 
 @pytest.fixture(scope="module")
-def graph(tmp_path_factory):
+def graph(alone, tmp_path_factory):
     """Running."""
     graph = Graph(tmp_path_factory.mktemp("graph"))
     yield graph

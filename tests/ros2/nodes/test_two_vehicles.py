@@ -127,7 +127,7 @@ class Graph:
 
 
 @pytest.fixture(scope="module")
-def graph():
+def graph(alone):
     made = Graph()
     yield made
     made.end()
