@@ -15,7 +15,9 @@ from finssim.cli import app
 from finssim.control.policy import Policy
 from finssim.experiments import sweep as command
 from finssim.experiments import transfer
+from finssim.experiments.anatomy import anatomy
 from finssim.experiments.campaign import ClusterError
+from finssim.experiments.faults import faults_experiment
 from finssim.experiments.sweep import load_sweep
 
 ray = pytest.importorskip("ray")
@@ -189,6 +191,12 @@ def test_an_experiment_trains_and_plays_on_a_cluster(tmp_path, two_machines, mon
     monkeypatch.setattr("finssim.experiments.pool_trial.play", played_here)
     again = transfer.t1(out=tmp_path, processes=1, **how)
     assert again["rows"] == away["rows"] and away["rows"]["pid"]["success"] == 1
+    found = anatomy(
+        out=tmp_path / "anatomy", causes=("lag",), rows=("pid",), seeds=1, trials=1, address=cluster.address
+    )
+    assert found["foreign"]["pid"]["success"]["count"] == 10
+    broken = faults_experiment(out=tmp_path / "faults", scenarios=["frozen-depth"], address=cluster.address)
+    assert broken["ok"] and broken["trials"]
 
 
 @pytest.mark.parametrize(

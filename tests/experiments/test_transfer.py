@@ -26,6 +26,7 @@ def test_the_tuned_pid_holds_a_setpoint_of_the_pool(small):
     row = result["rows"]["pid"]
     assert (row["success"], row["trials"], row["stopped"], row["worst_success"]) == (1, 1, 0, 1)
     assert row["e_p_m"]["value"] < 0.05 and row["e_p_m"]["ci95"] == [row["e_p_m"]["value"]] * 2
+    assert row["energy"]["value"] > 0.0
     assert json.loads((out / "t1.json").read_text())["rows"] == result["rows"]
     assert (out / "t1_envelopes.png").stat().st_size > 10_000
 

@@ -5,9 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from finssim.control.pid import axis_model
 from finssim.engine import Dock, Pool
@@ -194,6 +192,7 @@ class Docking(Task):
     """
 
     succeeds: ClassVar[str] = "once"
+    fails: ClassVar[tuple[str, ...]] = ("crash",)
     title: ClassVar[str] = "enter a funnel nose first, gently"
     needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     name: str = "docking"
@@ -290,16 +289,6 @@ class Docking(Task):
     def success_rule(self) -> str:
         """See `Task`."""
         return f"nose in the tube, slow, for {self.hold:g} s, without a crash"
-
-    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """As every task's; success (docked for `hold` at any time, and no crash), its time [s], contact.
-
-        `success_time` is not a number where there was no success; contact_impulse [N s], peak_force [N], crash 0 or 1.
-        """
-        measured = super().metrics(arrays)
-        measured["success"] *= 1.0 - measured["crash"]
-        measured["success_time"][measured["success"] == 0.0] = np.nan
-        return measured
 
     def terms(self) -> Terms:
         """See `DockingReward`."""

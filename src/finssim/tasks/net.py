@@ -116,6 +116,7 @@ class Net(Task):
     """
 
     succeeds: ClassVar[str] = "once"
+    fails: ClassVar[tuple[str, ...]] = ("touched", "lost")
     title: ClassVar[str] = "inspect a net by sonar"
     needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     action: ClassVar[str] = "wrench4"
@@ -208,8 +209,6 @@ class Net(Task):
         measured = super().metrics(arrays)
         del measured["begun"]
         measured["error"] /= self.control_step * np.maximum(measured["length"], 1.0)
-        measured["success"] *= (1.0 - measured["touched"]) * (1.0 - measured["lost"])
-        measured["success_time"][measured["success"] == 0.0] = np.nan
         return measured
 
     def terms(self) -> Terms:

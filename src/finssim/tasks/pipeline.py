@@ -146,6 +146,7 @@ class Pipeline(Task):
     """Follow the pipeline of the site `pipeline`, which lies, looks and is lit otherwise in each episode."""
 
     succeeds: ClassVar[str] = "once"
+    fails: ClassVar[tuple[str, ...]] = ("lost",)
     title: ClassVar[str] = "follow a pipeline by camera"
     needs: ClassVar[tuple[str, ...]] = ("surge", "heave", "yaw")
     action: ClassVar[str] = "wrench4"
@@ -239,8 +240,6 @@ class Pipeline(Task):
         """As every task's; success, its time [s], worst (distance from the line [m]), lost 0 or 1."""
         measured = super().metrics(arrays)
         del measured["begun"]
-        measured["success"] *= 1.0 - measured["lost"]
-        measured["success_time"][measured["success"] == 0.0] = np.nan
         return measured
 
     def terms(self) -> Terms:

@@ -69,6 +69,8 @@ class Task:
     succeeds: ClassVar[str] = ""
     """When an episode is a success: `held`, for `hold` seconds at its end; `once`, for `hold` seconds at any time; or
     the name of an end. Empty: nothing is."""
+    fails: ClassVar[tuple[str, ...]] = ()
+    """Ends after which the episode is no success, whatever came before."""
 
     name: str
     observation: tuple[ObservationPart, ...] = field(repr=False)
@@ -234,6 +236,8 @@ class Task:
         elif self.succeeds and self.succeeds != "once":
             out["success"] = np.where(out[self.succeeds] > 0.0, 1.0, 0.0)
             out["success_time"] = self.control_step * out["length"]
+        for name in self.fails:
+            out["success"] *= 1.0 - out[name]
         if "success_time" in out:
             out["success_time"][out["success"] == 0.0] = np.nan
         return out
