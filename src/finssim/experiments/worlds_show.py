@@ -27,7 +27,7 @@ from finssim.worlds.rays import fan_picture
 WIDTH = 800
 """Of the camera's part of a picture [px], each the mean of 2 x 2 rays."""
 SETTLING = 10
-"""Pictures until automatic exposure has settled."""
+"""Small pictures until automatic exposure has settled."""
 LAMPS = ((0.15, 0.30, -0.05), (0.15, -0.30, -0.05))
 """Places of a vehicle's two lights, body axes [m]."""
 
@@ -116,9 +116,12 @@ def _draw(
         if lamps
         else ()
     )
-    camera = CameraBatch(batch, eye, width=2 * WIDTH, lamps=lights)
+    small = CameraBatch(batch, eye, width=WIDTH // 5, lamps=lights)
     for k in range(SETTLING):
-        fine = camera.update(pose, seed=0, time=float(k)).numpy()[0].astype(float)
+        small.update(pose, seed=0, time=float(k))
+    camera = CameraBatch(batch, eye, width=2 * WIDTH, lamps=lights)
+    camera.gain.assign(small.gain)
+    fine = camera.update(pose, seed=0, time=float(SETTLING)).numpy()[0].astype(float)
     rows, columns = fine.shape[0] // 2, fine.shape[1] // 2
     picture = fine[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, 3).mean(axis=(1, 3)) / 255.0
     levels = SonarBatch(batch, ear).update(pose, seed=0).numpy()[0]
