@@ -160,6 +160,7 @@ HYDRODYNAMICS = ["calibrate", "hydrodynamics", "TRIALS", "--vehicle", "finsrov"]
             "--estimate needs --method simulation",
         ),
         ([*HYDRODYNAMICS, "--out", "v.yaml", "--fix", "yaw=0.6"], "expected AXIS.m=NUMBER"),
+        ([*HYDRODYNAMICS, "--out", "v.yaml", "--fix", "yaw.m=1e300"], "expected AXIS.m=NUMBER"),
         (
             [*HYDRODYNAMICS, "--out", "v.yaml", "--method", "simulation", "--fix", "yaw.m=0.6"],
             "known inertias need the regression",

@@ -100,6 +100,14 @@ def test_signs_come_from_what_has_them(tmp_path, unsigned):
         ),
         ("RPM,Thrust (N)\n1,2\n", "1 rows hold numbers, expected at least 3"),
         ("PWM,Thrust (N)\n-1,-9\n0,0\n0.5,2\n1,9\n", "expected 500 to 2500 µs"),
+        (
+            "RPM,Thrust (N)\n500,1\n600,1e300\n700,3\n",
+            r"forces run from 1 to 1e\+300 N, expected -1e\+06 to 1e\+06 N",
+        ),
+        (
+            "RPM,Voltage (V),Thrust (N)\n500,1e300,1\n600,16,2\n700,16,3\n",
+            r"voltages run .*expected 0 to 10000 V",
+        ),
     ],
 )
 def test_what_can_be_read_in_two_ways_is_refused(tmp_path, text, said):

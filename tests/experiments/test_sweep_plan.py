@@ -1,5 +1,7 @@
 """Sweep files: every setting with every seed, and one sentence for what cannot be."""
 
+import math
+
 import pytest
 import yaml
 
@@ -67,6 +69,7 @@ def test_a_plant_that_is_not_there_is_told_before_any_training(tmp_path):
     [
         ({"task": "t9"}, "task is 't9', expected one of t1"),
         ({"train": {"stepz": 1}}, "'stepz' is no option of a training; available: learner"),
+        ({"train": {"worlds": math.nan}}, "worlds is nan, expected a finite number"),
         ({"settings": {"a": {"out": "x"}}}, "'out' is no option"),
         ({"seeds": []}, "expected at least one, each once"),
         ({"seeds": [1, 1]}, "expected at least one, each once"),

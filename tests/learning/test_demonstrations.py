@@ -82,6 +82,23 @@ def test_an_episode_of_a_world_that_breaks_is_no_demonstration(monkeypatch, tmp_
     assert all(np.isfinite(e.observation).all() and not e.terminated for e in found)
 
 
+def test_worlds_that_always_break_are_refused(monkeypatch, tmp_path):
+    """In place of waiting for an episode that never ends well."""
+    monkeypatch.chdir(tmp_path)
+    env, step = environment(), Environment.step
+
+    def breaking(self, action):
+        position = self.simulator.state.position.numpy()
+        self.simulator.state.position.assign(np.full_like(position, np.nan))
+        return step(self, action)
+
+    monkeypatch.setattr(Environment, "step", breaking)
+    with pytest.raises(
+        DatasetError, match="ended in a number that is not finite, 0 did not: narrow the ranges"
+    ):
+        record_episodes(env, Constant(), 3)
+
+
 def test_written_and_read_back(tmp_path):
     """By us and by Minari itself, bit for bit."""
     episodes = record_episodes(environment(), Constant(), 4)

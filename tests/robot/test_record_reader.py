@@ -10,7 +10,7 @@ from rosbags.highlevel import AnyReader
 
 from finssim.robot.messages import Telemetry
 from finssim.robot.record_messages import RecordError
-from finssim.robot.record_reader import open_record, repair_record
+from finssim.robot.record_reader import open_record, repair_record, write_whole
 from finssim.robot.recorder import Recorder
 from finssim.vehicles import load_vehicle
 
@@ -113,6 +113,17 @@ def test_a_broken_index_costs_nothing(run, tmp_path):
     assert repair_record(damaged, tmp_path / "mended.mcap") == [
         "damaged.mcap is damaged: its index cannot be read"
     ]
+
+
+def test_damage_that_has_no_message_is_named_by_its_kind(run, tmp_path):
+    """The reader raises an error without one where a file ends between two of its records."""
+    cut, notes, data, at = tmp_path / "cut.mcap", [], run.read_bytes(), 8
+    while at < run.stat().st_size // 2:
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    cut.write_bytes(data[:at])
+    write_whole(cut, tmp_path / "copy.mcap", notes)
+    assert notes == ["cut.mcap is damaged and was read up to there: EndOfFile"]
+    assert depths(tmp_path / "copy.mcap")
 
 
 def test_a_record_is_not_repaired_into_itself(run):

@@ -71,6 +71,7 @@ def test_files_reach_the_nodes_they_name(parameters, node, values):
         ("/**: {ros__parameters: [1]}", "expected parameters and values"),
         ("/a: &x {ros__parameters: {gain: 1.0}}\n/b: *x", "no aliases"),
         ("/**: {ros__parameters: {", "while parsing"),
+        (f"/**: {{ros__parameters: {'[' * 3000}", "line 1: nested more than 100 deep"),
     ],
 )
 def test_files_that_rcl_refuses_are_refused(tmp_path, text, words):

@@ -381,7 +381,7 @@ def _known(words: str) -> dict[str, float]:
             size = float(value)
         except ValueError:
             size = math.nan
-        if axis not in AXES or letter not in ("m", "m_eff") or not (math.isfinite(size) and size > 0.0):
+        if axis not in AXES or letter not in ("m", "m_eff") or not 1e-6 <= size <= 1e9:
             raise CalibrationError(
                 f"--fix is '{word}', expected AXIS.m=NUMBER with an axis of {', '.join(AXES)} and the mass with added "
                 "mass in kg, or the inertia with added inertia in kg m², as in yaw.m=0.6"

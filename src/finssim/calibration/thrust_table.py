@@ -302,22 +302,32 @@ def without_offset(
     return force - offset
 
 
-def check_pulses(pulse: Array, shown: str) -> None:
-    """Refuse pulses that are no microseconds.
+PLAUSIBLE = {
+    "pulse": (500.0, 2500.0, "µs"),
+    "speed": (-1e5, 1e5, "rad/s"),
+    "force": (-1e6, 1e6, "N"),
+    "voltage": (0.0, 1e4, "V"),
+}
+"""What a column of a table may hold: least, most, unit."""
+
+
+def check_values(full: Mapping[str, Array], shown: str) -> None:
+    """Refuse numbers that cannot be what their column says.
 
     Args:
-        pulse: Of the motor controller [µs], (n,); NaN and 0 are passed over.
+        full: Columns of `PLAUSIBLE`, (n,) each; NaN is passed over, and so is a pulse of 0.
         shown: Name of the table, for messages.
 
     Raises:
-        CalibrationError: A pulse is outside 500 to 2500 µs.
+        CalibrationError: A number is beyond its limits.
     """
-    known = pulse[np.isfinite(pulse) & (pulse != 0.0)]
-    if known.size and (known.min() < 500.0 or known.max() > 2500.0):
-        raise CalibrationError(
-            f"{shown}: pulses run from {known.min():g} to {known.max():g} µs, expected 500 to 2500 µs: check the "
-            "column's name and unit"
-        )
+    for key, (least, most, unit) in PLAUSIBLE.items():
+        known = full[key][np.isfinite(full[key]) & (full[key] != 0.0)]
+        if known.size and (known.min() < least or known.max() > most):
+            raise CalibrationError(
+                f"{shown}: {key}s run from {known.min():g} to {known.max():g} {unit}, expected {least:g} to {most:g} "
+                f"{unit}: check the column's name and unit"
+            )
 
 
 def signed(
@@ -496,8 +506,8 @@ def _table(
     if np.count_nonzero(good) < 3:
         raise CalibrationError(f"{shown}: {np.count_nonzero(good)} rows hold numbers, expected at least 3")
     full = {key: value[good] for key, value in full.items()}
+    check_values(full, shown)
     full["force"] = without_offset(full, speed_known, neutral, findings)
-    check_pulses(full["pulse"], shown)
     full["speed"], full["force"], keep = signed(full, speed_known, neutral, sources, shown, findings)
     full = {key: value[keep] for key, value in full.items()}
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(full[key] + 0.0).tobytes() for key in sorted(full)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+import math
 import os
 import socket
 import tempfile
@@ -220,7 +221,11 @@ def load_sweep(path: str | Path) -> Sweep:
         SweepError: It is not there, or something in it is not as expected; says where.
         PlantError: A plant that it names is not there, or wrong: told now, and not after the first training.
     """
-    data = _placed(read_mapping(Path(path), SweepError, such_as="task: t1"), Path(path).parent)
+    data = read_mapping(Path(path), SweepError, such_as="task: t1")
+    try:
+        data = _placed(data, Path(path).parent)
+    except SweepError as error:
+        raise SweepError(f"{path}: {error}") from None
     try:
         sweep = Sweep.model_validate(data)
     except ValidationError as error:
@@ -236,6 +241,8 @@ def _placed(value: Any, folder: Path, key: Any = "") -> Any:
         return {name: _placed(one, folder, key if key in FILES else name) for name, one in value.items()}
     if isinstance(value, list):
         return [_placed(one, folder, key) for one in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        raise SweepError(f"{key} is {value}, expected a finite number")
     beside = folder / value if isinstance(value, str) and key in FILES else None
     return str(beside.resolve()) if beside is not None and beside.is_file() else value
 

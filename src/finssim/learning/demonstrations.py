@@ -291,7 +291,7 @@ def record_episodes(
 ) -> list[Episode]:
     """Episodes of every agent; every world gives as many, one more or less, so that short ones are not favoured.
 
-    Those of a world in which a number stopped being finite are left out.
+    Those of a world in which a number stopped being finite are left out, and counted.
 
     Args:
         environment: Its episodes start over here.
@@ -300,6 +300,9 @@ def record_episodes(
         disturb: Noise on what is done [part of full action].
         seed: Of that noise.
         show: Called with the part done.
+
+    Raises:
+        DatasetError: Far more episodes are left out than kept.
     """
     rng = np.random.default_rng(seed)
     worlds, agents = environment.worlds, environment.agents
@@ -310,6 +313,7 @@ def record_episodes(
     memory, (seen, pictures) = fresh, _apart(environment.reset(seed=environment.seed), rows)
     running: list[list[Any]] = [[] for _ in range(rows)]
     found: list[Episode] = []
+    broken = 0
     while len(found) < count and quota.any():
         wanted, memory = expert.act(memory, Known(seen, pictures=pictures or None), NOWHERE)
         wanted = np.clip(wanted, -1.0, 1.0)
@@ -328,6 +332,12 @@ def record_episodes(
             broke = ended & (
                 environment.arrays.done.numpy() == 0
             )  # began anew after a number that was not finite
+            broken += int(np.count_nonzero(broke & (quota > 0)))
+            if broken > 10 * (count + rows):
+                raise DatasetError(
+                    f"{broken} episodes ended in a number that is not finite, {len(found)} did not: narrow the ranges, "
+                    "or check the vehicle file"
+                )
             for w in np.flatnonzero(ended & (quota > 0)):
                 quota[w] -= not broke[w]
                 whole = {name: float(values[w]) for name, values in measured.items()}

@@ -113,7 +113,8 @@ def write_whole(source: Path, target: Path, notes: list[str]) -> None:
                             one.create_time, one.log_time, one.name, one.media_type, one.data
                         )
         except Exception as error:  # damage shows in whatever layer meets it
-            notes.append(f"{source.name} is damaged and was read up to there: {str(error).splitlines()[0]}")
+            why = str(error).partition("\n")[0] or type(error).__name__
+            notes.append(f"{source.name} is damaged and was read up to there: {why}")
         if not started:
             writer.start()
         writer.finish()

@@ -316,8 +316,12 @@ def test_a_slow_stream_written_into_every_row_is_thinned(tmp_path, pool):
             "expected the columns t, p, q, r",
         ),
         (lambda d: write_table(d / "depth.csv", ("t", "depth"), [(0, 1), (1e9, 1)]), "is a stamp wrong"),
+        (
+            lambda d: write_table(d / "imu.csv", ("t", "p", "q", "r"), [(20 * k, 0, 0, 1) for k in range(9)]),
+            "rates of turn come every 20 s, expected at most 2 s: are its times in seconds",
+        ),
     ],
-    ids=["nothing", "wrong column", "no time", "no rows", "no rate", "two clocks"],
+    ids=["nothing", "wrong column", "no time", "no rows", "no rate", "two clocks", "milliseconds"],
 )
 def test_logs_that_cannot_be_used_are_refused_in_a_sentence(tmp_path, pool, write, sentence):
     """What is wrong, where, and what was expected."""

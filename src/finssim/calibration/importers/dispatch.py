@@ -569,7 +569,9 @@ def _collect(
     except Exception as error:  # a damaged bag breaks in whatever layer reads it
         if not any(len(times) >= 2 for times, _, _ in collected.values()):
             raise CalibrationError(f"the bag breaks at its first messages: {error}") from None
-        findings.append(finding("bag_damaged", reason=str(error).splitlines()[0][:120]))
+        findings.append(
+            finding("bag_damaged", reason=str(error).partition("\n")[0][:120] or type(error).__name__)
+        )
     return collected
 
 

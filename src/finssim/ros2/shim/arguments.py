@@ -17,6 +17,7 @@ from finssim.ros2.shim.exceptions import (
     RosArgumentsError,
 )
 from finssim.ros2.shim.logging import LoggingSeverity
+from finssim.yaml_file import DEEPEST
 
 TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"
 _TOPIC = re.compile(rf"^(~|(~/|/)?{TOKEN}(/{TOKEN})*)$")
@@ -193,20 +194,22 @@ def _document(text: str) -> Tree:
     return None
 
 
-def _tree(event: Any, events: Iterator[Any]) -> Tree:
+def _tree(event: Any, events: Iterator[Any], depth: int = 0) -> Tree:
+    if depth > DEEPEST:
+        raise ValueError(f"line {event.start_mark.line + 1}: nested more than {DEEPEST} deep")
     if isinstance(event, yaml.AliasEvent):
         raise ValueError(f"line {event.start_mark.line + 1}: rcl takes no aliases: write the value out")
     if isinstance(event, yaml.SequenceStartEvent):
         parts = []
         while not isinstance(part := next(events), yaml.SequenceEndEvent):
-            parts.append(_tree(part, events))
+            parts.append(_tree(part, events, depth + 1))
         return parts
     if isinstance(event, yaml.MappingStartEvent):
         pairs = []
         while not isinstance(key := next(events), yaml.MappingEndEvent):
             if not isinstance(key, yaml.ScalarEvent) or not key.value:
                 raise ValueError(f"line {key.start_mark.line + 1}: expected a name before the colon")
-            pairs.append((key.value, _tree(next(events), events)))
+            pairs.append((key.value, _tree(next(events), events, depth + 1)))
         return tuple(pairs)
     return event
 
