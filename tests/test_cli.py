@@ -66,7 +66,6 @@ COMMANDS = [
     "ros2 node",
     "ros2 up",
     "worlds",
-    "worlds list",
     "worlds show",
 ]
 

@@ -19,7 +19,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "validate": Experiment("finssim.experiments.validate:validate"),
     "bench": Experiment("finssim.experiments.bench:bench"),
     "bench cameras": Experiment("finssim.experiments.bench_cameras:bench_cameras"),
-    "worlds list": Experiment("finssim.experiments.worlds_show:worlds_list"),
+    "worlds": Experiment("finssim.experiments.worlds_show:worlds_list"),
     "worlds show": Experiment("finssim.experiments.worlds_show:worlds_show"),
     "doctor": "finssim.doctor:doctor",
     "train": "finssim.learning.train:train",
@@ -70,7 +70,6 @@ COMMANDS: dict[str, str | Experiment] = {
 """Words -> what they do."""
 
 GROUPS = {
-    "worlds": "Look at the sites that cameras and sonars see.\n\nExample: finssim worlds show dock",
     "trials": "Look at logs of trials, and make trials of foreign logs.\n\nExample: finssim trials check trials",
     "calibrate": "Fit a vehicle's numbers to measurements and write a vehicle file with their 95 % intervals.\n\n"
     "Example: finssim calibrate hydrodynamics --help",

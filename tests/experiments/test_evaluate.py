@@ -10,7 +10,6 @@ from torch import nn
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.control import ControlError
 from finssim.control.modes import action_mode
 from finssim.control.policy import PolicyDescription, PolicyError, VehicleIdentity
 from finssim.engine import read_run
@@ -22,7 +21,7 @@ from finssim.experiments.trials import run_trials
 from finssim.files import OutputError
 from finssim.learning.export import export_policy
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
-from finssim.tasks.agents import PidAgent
+from finssim.tasks.agents import AgentError, PidAgent
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
@@ -225,7 +224,13 @@ def test_a_plant_may_change_what_a_policy_was_trained_for(policy, monkeypatch):
 @pytest.mark.parametrize(
     ("controller", "options", "error", "sentence"),
     [
-        ("no/such/policy", {}, PolicyError, "no such policy directory"),
+        (
+            "no/such/policy",
+            {},
+            AgentError,
+            "neither a policy directory nor a controller of task 't1'; controllers: pid, ",
+        ),
+        ("pid", {"task": "gate"}, AgentError, "controller of task 'gate'; controllers: post-servo"),
         ("pid", {"task": "t9"}, EnvironmentSetupError, "unknown task 't9'; available: t1"),
         ("pid", {"trials": 0}, EvaluationError, "trials is 0, expected 1 or more"),
         ("pid", {"plant": "pool"}, PlantError, "no plant 'pool'"),
@@ -250,8 +255,8 @@ def test_a_plant_that_cannot_name_a_folder_is_refused_among_several(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["plant.yaml"]
 
 
-def test_an_unknown_controller_is_taken_for_a_directory():
-    with pytest.raises((PolicyError, ControlError), match="pidd"):
+def test_an_unknown_controller_is_refused_with_those_there_are():
+    with pytest.raises(AgentError, match="'pidd' is neither .*; controllers: pid, "):
         evaluate_controller("pidd", NOMINAL)
 
 

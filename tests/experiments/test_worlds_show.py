@@ -18,7 +18,7 @@ def finssim(*words):
 
 def test_every_site_and_sensor_is_listed(capsys):
     """By name, with what it is."""
-    assert finssim("worlds", "list") == 0
+    assert finssim("worlds") == 0
     out = capsys.readouterr().out
     assert all(name in out for name in (*sites(), *devices()))
 

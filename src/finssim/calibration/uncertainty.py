@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.fit import Correlation
 
 __all__ = [
@@ -84,6 +84,10 @@ class Covariance:
 
 def _whitener(normal: Array) -> tuple[Array, Array]:
     """T (P, K) with Tᵀ N T = 1 on the K known directions, and the parameters that touch unknown ones, (P,) bool."""
+    if not np.isfinite(normal).all():
+        raise CalibrationError(
+            "the trials hold numbers that cannot be computed with: check the units of their columns"
+        )
     scale = np.sqrt(np.maximum(np.diagonal(normal), 0.0))
     safe = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(normal / np.outer(safe, safe))

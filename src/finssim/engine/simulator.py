@@ -85,7 +85,7 @@ class Simulator:
             pool: Walls and floor; open water if None.
             tether: On every vehicle; none if None.
             dock: One in every world, which touches every vehicle; none if None.
-            world: Site that vehicles collide with, and start in: a name of `finssim worlds list`, a path, or a
+            world: Site that vehicles collide with, and start in: a name of `finssim worlds`, a path, or a
                 `finssim.worlds` `World`, `WorldLayout` or `WorldBatch` of as many worlds. Its basin is the pool.
             device: Warp device, `cpu` or `cuda`.
             threads: Threads on a CPU; all processors if None.

@@ -112,9 +112,19 @@ class ResultError(ValueError):
 
 
 def write_json(path: Path, result: Mapping[str, Any], tables: Sequence[Table] = ()) -> None:
-    """Write a result, and beside it, ending in .md, the page that a person reads."""
+    """Write a result, and beside it, ending in .md, the page that a person reads.
+
+    Raises:
+        ResultError: It holds a number that is not finite.
+    """
+    try:
+        text = json.dumps(result, indent=1, allow_nan=False)
+    except ValueError:
+        raise ResultError(
+            f"{path}: not written, since it would hold a number that is not finite: look for one in what it is made of"
+        ) from None
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(text + "\n", encoding="utf-8")
     if tables:
         with atomic_write(path.with_suffix(".md")) as temporary:
             temporary.write_text(markdown_of(tables), encoding="utf-8")

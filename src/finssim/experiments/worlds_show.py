@@ -33,9 +33,9 @@ LAMPS = ((0.15, 0.30, -0.05), (0.15, -0.30, -0.05))
 
 
 def worlds_list() -> dict[str, Any]:
-    """List the sites and the sensors of the catalogue.
+    """List the sites and the sensors of the catalogue; `show SITE` says what one holds, and draws it.
 
-    Example: finssim worlds list
+    Example: finssim worlds
     """
     return {
         "sites": {name: load_world(name).about for name in sites()},

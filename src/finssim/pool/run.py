@@ -529,7 +529,7 @@ def run(
         site (NAME): Where: pool, tank or open-water (current, waves, 20 m of water). If not given: pool; of a world its
             basin, or open water as deep as its seabed.
         world (SITE|FILE): What the vehicle's own cameras, sonars and altimeters see, drawn from --seed: a site of
-            finssim worlds list, or a world file. Their readings go the way of the pictures.
+            finssim worlds, or a world file. Their readings go the way of the pictures.
         positioning (NAME): Fixes on the robot's wire: none, motion-capture or usbl.
         firmware (NAME): What steers the motors: mcu, the motor controller of `finssim run`, or ardusub, an autopilot
             that answers as ArduSub 4.5 does, over MAVLink, with a compass and a Doppler log.

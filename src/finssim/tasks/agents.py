@@ -1103,12 +1103,21 @@ def agent_for(
     The PIDs of T1 and T2 are the robot's, which know state and goal; other baselines see what a policy sees.
 
     Raises:
+        AgentError: It is neither.
         PolicyError, ControlError: It does not fit the vehicle or the task.
     """
-    if task.name in TASKS_OF_PIDS and str(name_or_directory) in CONTROLLERS:
-        return PidAgent(str(name_or_directory), vehicle, task.name)
-    if str(name_or_directory) in BASELINES.get(task.name, {}):
-        return BaselineAgent(str(name_or_directory), vehicle, task)
+    name = str(name_or_directory)
+    robots = tuple(CONTROLLERS) if task.name in TASKS_OF_PIDS else ()
+    if name in robots:
+        return PidAgent(name, vehicle, task.name)
+    if name in BASELINES.get(task.name, {}):
+        return BaselineAgent(name, vehicle, task)
+    if not Path(name_or_directory).exists():
+        have = ", ".join([*robots, *BASELINES.get(task.name, {})])
+        raise AgentError(
+            f"'{name}' is neither a policy directory nor a controller of task '{task.name}'; controllers: "
+            f"{have or 'none'}"
+        )
     return PolicyAgent(name_or_directory, vehicle, task)
 
 

@@ -155,7 +155,7 @@ class RaySensor(Sensor):
     """A camera, imaging sonar, altimeter, rangefinder or DVL's beams: what sees or hears the things at a site."""
 
     device: str
-    """A sensor of `finssim worlds list`, or a file (`.yaml`) beside the vehicle file."""
+    """A sensor of `finssim worlds`, or a file (`.yaml`) beside the vehicle file."""
     orientation: Quaternion | None = None  # type: ignore[assignment]
     """Sensor frame (x along its view, y left, z up) to body frame, xyzw, (4,); its device's own where not given."""
     width: Annotated[int, Field(strict=True, ge=2, le=8192)] | None = None

@@ -126,7 +126,7 @@ def _with_parents(path: Path, shown: str, children: tuple[Path, ...]) -> tuple[T
             if not file.is_file():
                 raise VehicleError(
                     f"{shown}: perception.{name}: no file {device} beside it: give a sensor's file, or a name of "
-                    "'finssim worlds list'"
+                    "'finssim worlds'"
                 )
             entry["device"] = str(file)
     parent = values.pop("extends", None)

@@ -61,7 +61,7 @@ class Choice:
     basin: str | None = None
     """(L,W,D) Pool to draw around a record: length,width,depth [m]; the vehicle's workspace if not given."""
     world: str | None = None
-    """(SITE|FILE|NUMBER) Of the pool what the vehicle's own cameras and sonars see, a site of finssim worlds list or a
+    """(SITE|FILE|NUMBER) Of the pool what the vehicle's own cameras and sonars see, a site of finssim worlds or a
     file, where motion capture locates it; of a record the world to draw around it, as --seed drew it; of a folder the
     number of the run's world, the first that it has if not given."""
     seed: int = 0
