@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from finssim.calibration.findings import CalibrationError
 from finssim.calibration.uncertainty import (
     Evidence,
     correlated_samples,
@@ -183,3 +184,10 @@ def test_infinite_variance_is_said():
     assert findings[0].values == {"parameters": ("sway.d1",)}
     assert found.matrix[0, 1] == pytest.approx(0.5)
     assert np.isfinite(correlation(("a", "b", "c"), covariance).matrix).all()
+
+
+def test_numbers_that_overflow_are_refused():
+    """As inputs of millions of revolutions a minute make them."""
+    evidence = Evidence(names=("c",), normal=np.full((2, 1, 1), np.nan), score=np.zeros((2, 1)))
+    with pytest.raises(CalibrationError, match="cannot be computed with: check the units"):
+        trial_covariance(evidence)

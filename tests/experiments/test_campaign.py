@@ -1,6 +1,7 @@
 """A campaign plays each trial once, keeps what is finished, and returns results in the order of its jobs."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from signal import SIGINT, SIGKILL, SIGTERM
 
 import pytest
 
-from finssim.experiments.campaign import ResultError, keep_result, kept_result, run_jobs
+from finssim.experiments.campaign import ResultError, keep_result, kept_result, run_jobs, write_json
 from finssim.experiments.pool_trial import Job
 from reference import played
 
@@ -138,3 +139,11 @@ def test_a_key_names_everything_that_decides_the_result():
     assert Job(row="x", controller="pid", target="P01").key().removeprefix("x") == base.key().removeprefix(
         "pid"
     )
+
+
+def test_a_result_with_nan_is_refused_and_nothing_is_written(tmp_path):
+    with pytest.raises(
+        ResultError, match="result.json: not written, since it would hold a number that is not finite"
+    ):
+        write_json(tmp_path / "result.json", {"e_p_m": math.nan})
+    assert list(tmp_path.iterdir()) == []

@@ -315,7 +315,7 @@ def check_values(full: Mapping[str, Array], shown: str) -> None:
     """Refuse numbers that cannot be what their column says.
 
     Args:
-        full: Columns of `PLAUSIBLE`, (n,) each; NaN is passed over, and so is a pulse of 0.
+        full: Columns of `PLAUSIBLE`, (n,) each; NaN and 0 are passed over.
         shown: Name of the table, for messages.
 
     Raises:

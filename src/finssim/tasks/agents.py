@@ -1107,13 +1107,14 @@ def agent_for(
         PolicyError, ControlError: It does not fit the vehicle or the task.
     """
     name = str(name_or_directory)
-    robots = tuple(CONTROLLERS) if task.name in TASKS_OF_PIDS else ()
-    if name in robots:
+    controllers = tuple(CONTROLLERS) if task.name in TASKS_OF_PIDS else ()
+    baselines = BASELINES.get(task.name, {})
+    if name in controllers:
         return PidAgent(name, vehicle, task.name)
-    if name in BASELINES.get(task.name, {}):
+    if name in baselines:
         return BaselineAgent(name, vehicle, task)
     if not Path(name_or_directory).exists():
-        have = ", ".join([*robots, *BASELINES.get(task.name, {})])
+        have = ", ".join([*controllers, *baselines])
         raise AgentError(
             f"'{name}' is neither a policy directory nor a controller of task '{task.name}'; controllers: "
             f"{have or 'none'}"

@@ -28,7 +28,7 @@ TIME = ("t", "time", "time_s", "timestamp", "stamp", "seconds")
 WORDS = ("image", "status", "reason")
 """Columns that are words even where they look like numbers."""
 QUATERNION = ("qx", "qy", "qz", "qw")
-SLOWEST = 2.0
+LONGEST_GAP = 2.0
 """Longest time between two rates of turn that can be right [s]."""
 TRUTH = {"true": 1.0, "yes": 1.0, "false": 0.0, "no": 0.0}
 
@@ -342,10 +342,10 @@ def _imu(
     tilt = np.full((len(omega), 2), np.nan) if up is None else np.stack(roll_pitch(up), axis=-1)
     rows = np.flatnonzero(~np.isnan(omega).any(axis=1))
     apart = float(np.median(np.diff(table.t[rows]))) if len(rows) > 2 else 0.0
-    if apart > SLOWEST:
+    if apart > LONGEST_GAP:
         raise LocalizationError(
-            f"{table.name}: rates of turn come every {apart:.3g} s, expected at most {SLOWEST:g} s: are its times in "
-            "seconds?"
+            f"{table.name}: rates of turn come every {apart:.3g} s, expected at most {LONGEST_GAP:g} s: are its times "
+            "in seconds?"
         )
     if len(rows) > 1:  # an attitude that was logged in rows of its own is carried on to the next rate
         tilt = _carried(table.t, tilt)
