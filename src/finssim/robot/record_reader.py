@@ -90,10 +90,11 @@ def write_whole(source: Path, target: Path, notes: list[str]) -> None:
         writer = Writer(made, compression=CompressionType.LZ4)
         try:
             for one in StreamReader(given, validate_crcs=True).records:
+                if not started:  # a header comes first, unless it was damaged
+                    header = one if isinstance(one, records.Header) else records.Header("", "")
+                    writer.start(header.profile, header.library)
+                    started = True
                 match one:
-                    case records.Header():
-                        writer.start(one.profile, one.library)
-                        started = True
                     case records.Schema() if one.id not in schemas:
                         schemas[one.id] = writer.register_schema(one.name, one.encoding, one.data)
                     case records.Channel() if one.id not in channels:
