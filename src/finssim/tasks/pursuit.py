@@ -592,6 +592,15 @@ class Pursuit(Chase):
                 "spin": "state.velocity[w, 0][5]",
             },
             seen={"gap": prey_gap},
+            meanings={
+                "progress": "How much nearer the prey came: closing speed times the length of the step [m].",
+                "distance": "Distance to the prey over 8 m, at most 1.",
+                "near": f"1 within {r.near_radius:g} m of the prey, otherwise 0.",
+                "spin": "Square of the yaw rate [rad²/s²].",
+                "step": "1 in every step: sooner is better.",
+                "captured": f"The prey {self.success_rule()}.",
+                "closest": "Least distance to the prey so far [m].",
+            },
             rewards=(
                 RewardTerm("progress", "-wp.dot(way, motion) / d * p.control_step", r.progress),
                 RewardTerm("distance", "wp.min(d / 8.0, 1.0)", -r.distance),

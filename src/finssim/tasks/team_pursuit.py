@@ -319,6 +319,13 @@ class TeamPursuit(Team, Chase):
             command=command_prey,
             seen={"gap": prey_gap},
             shared={"net": net_gap, "near": nearest_pursuer, "gap_now": missing},
+            meanings={
+                "progress": "By how much the step shortened the distance left to a capture [m].",
+                "distance": "Distance left to a capture over 8 m, at most 1.",
+                "step": "1 in every step: sooner is better.",
+                "closest": "Least distance of an agent to the prey so far [m].",
+                "closest_to_net": "Least distance of the prey to the net so far [m].",
+            },
             rewards=(
                 RewardTerm("progress", "gap - gap_now", r.progress),
                 RewardTerm("distance", "wp.min(gap_now / 8.0, 1.0)", -r.distance),
