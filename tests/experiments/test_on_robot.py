@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from finssim.control.guidance import Station
-from finssim.experiments.on_robot import RobotTrial, Stages, start_bounds
+from finssim.experiments.robot_trials import RobotTrial, Stages, start_bounds
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.robot.pilots import WrenchPilot
 from finssim.robot.reading import Reading

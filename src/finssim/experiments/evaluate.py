@@ -11,12 +11,7 @@ from typing import Annotated, Any, NamedTuple
 
 from finssim.experiments import campaign
 from finssim.experiments.campaign import progress_bar, write_json
-from finssim.experiments.figures import (
-    draw_envelopes,
-    draw_tracking,
-    error_envelope,
-    save_figure,
-)
+from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
 from finssim.experiments.metrics import (
     PAPER_T2,
     T1_SETPOINTS,

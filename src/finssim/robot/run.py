@@ -231,12 +231,8 @@ def run_team(
     with interruptible() as interrupted:
         try:
             for i, agent in enumerate(agents):
-                ends = [
-                    "--robot",
-                    f"udp://{theirs}:{port + APART * i}",
-                    "--bind",
-                    f"{host}:{own + APART * i}",
-                ]
+                further = APART * i
+                ends = ["--robot", f"udp://{theirs}:{port + further}", "--bind", f"{host}:{own + further}"]
                 kept = [] if record is None else ["--record", str(record / f"{agent}.mcap")]
                 children[agent] = subprocess.Popen(
                     [sys.executable, "-m", "finssim", "run", "--agent", agent, *ends, *kept, *alike],
@@ -411,14 +407,7 @@ def run(
         if not arm:
             console.print("dry run: thrusters will not turn without --arm")
         runtime = Runtime(
-            ours,
-            pool,
-            pilot,
-            guide,
-            arm=arm,
-            perception=perception,
-            recorder=recorder,
-            team=team,
+            ours, pool, pilot, guide, arm=arm, perception=perception, recorder=recorder, team=team
         )
         monitor = _Monitor(runtime, duration, wiring.robot, console)
 

@@ -143,12 +143,7 @@ class StationKeeping(PoolTask):
     """... for this long [s]."""
     reward: Reward = field(default_factory=Reward)
     training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01,
-        yaw_std=math.radians(1.0),
-        velocity_std=0.02,
-        rate_std=0.02,
-        delay=0.1,
-        graded=True,
+        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02, delay=0.1, graded=True
     )
     """As late as an estimate, and noisier, by worlds from none to all of it: with exact states alone gains are learnt
     that chatter; with noise alone, vehicles that hardly damp their turning are held only while it shakes them."""

@@ -195,6 +195,26 @@ def place_at_rest(state: State, w: int, v: int, x: wp.vec3, yaw: float):
 
 
 @wp.func
+def place_tilted(state: State, w: int, x: wp.vec3, q: wp.quat, rng: wp.uint32, tilt: float, turn: float):
+    """Put vehicle 0 somewhere at rest, turned from an attitude by a yaw, a pitch and a roll that are drawn.
+
+    Args:
+        state: Where it is put.
+        w: Number of the world.
+        x: Body origin, world frame [m].
+        q: Attitude that it is turned from, body to world, xyzw.
+        rng: Stream of the draws.
+        tilt: Largest roll and pitch [rad].
+        turn: Largest yaw [rad].
+    """
+    roll = wp.randf(rng, -tilt, tilt)
+    pitch = wp.randf(rng, -tilt, tilt)
+    state.position[w, 0] = x
+    state.quaternion[w, 0] = q * tilted(roll, pitch, wp.randf(rng, -turn, turn))
+    state.velocity[w, 0] = vec6()
+
+
+@wp.func
 def world_velocity(state: State, w: int, v: int) -> wp.vec3:
     """Velocity of a vehicle, world frame [m/s]."""
     nu = state.velocity[w, v]
