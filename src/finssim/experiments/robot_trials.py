@@ -58,7 +58,7 @@ ROUGHLY = (0.15, math.radians(20.0), 0.1, math.inf, 10.0)
 AFLOAT = (0.30, math.radians(20.0), 0.4, math.inf, 2.0)
 """The same in open water, where waves leave nothing at rest."""
 APPROACH = 60.0
-"""Longest way to a start [s]."""
+"""Longest way to a start, and longest wait for the vehicle with nobody beside it [s]."""
 
 
 def start_bounds(site: str, exact: bool) -> tuple[tuple[float, ...], ...]:
@@ -210,6 +210,10 @@ class Stages:
             return self._end("interrupted")
         if not reading.ready:
             self._line(f"waiting for the vehicle: {reading.reason}")
+            if self._attendant is None and now - self._since > APPROACH:
+                return self._end(
+                    "not there", f"its state is not known after {APPROACH:g} s: {reading.reason}"
+                )
         elif not self.there(reading, now) and self._by_hand:
             self._line(f"bring it to its start: {self._way(reading)}")
         elif self._attendant is not None and not {"\r", "\n"} & set(keys):

@@ -314,7 +314,7 @@ def run(
         goal (X,Y,Z,YAW|FILE): Station to keep: x,y,z [m] in the world frame (z = 0 on the water, negative below) and
             heading [deg], or a file with goal: [x, y, z, yaw_deg].
         trajectory (NAME|FILE): Trajectory to follow in place of a goal: straight, broken, ellipse, lemniscate, circle,
-            helix, or a file.
+            figure_eight, helix, or a file.
         robot (ADDRESS): Motor controller: udp://HOST:PORT, serial:DEVICE, or pool for the virtual pool on this machine;
             or autopilot: mavlink://udpin:HOST:PORT, udpout:, tcp: or serial:, with ?dvl=HOST for a Water Linked log, or
             mavlink for that of the virtual pool.

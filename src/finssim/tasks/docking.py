@@ -294,6 +294,15 @@ class Docking(Task):
                 "docked": is_docked,
             },
             seen={"nose": seen_nose, "offset": berth_offset},
+            meanings={
+                "position": f"1 with the nose in its berth, 1/e at {r.position_scale:.3g} vehicle lengths from it.",
+                "distance": "From the nose to its berth, in vehicle lengths.",
+                "heading": f"1 in the dock's attitude, 1/e at {r.heading_scale:.3g} rad from it.",
+                "contact": "Greatest contact force in the step as a part of the one that ends the episode, at most 1.",
+                "crash": f"A contact force above {self.force_limit:.3g} N.",
+                "contact_impulse": "Contact force, integrated over the episode [N s].",
+                "peak_force": "Greatest contact force so far [N].",
+            },
             rewards=(
                 RewardTerm("position", "wp.exp(-e / p.reward.position_scale)", r.position),
                 RewardTerm("distance", "e", -r.distance),

@@ -189,6 +189,12 @@ class Gate(SeeingTask):
         return Terms(
             start=start,
             shared={"place": in_gate, "room": clearance, "theta": "attitude_error"},
+            meanings={
+                "near": f"1 where a bar is touched, falling to 0 at {r.near_scale:g} m from the nearest one.",
+                "touched": "The vehicle's envelope meets a bar.",
+                "missed": "The body origin went past the gate, outside of it.",
+                "passed": f"Through the gate: the body origin is {self.behind:.3g} m behind it.",
+            },
             rewards=(
                 RewardTerm("progress", approach, r.progress),
                 RewardTerm("corridor", off_axis, -r.corridor),

@@ -197,6 +197,13 @@ class Net(SeeingTask):
                 "e": "wp.length(wp.vec2(place[0] + p.distance, place[2] - p.level))",
                 "theta": "attitude_error",
             },
+            meanings={
+                "near": f"1 on the line along the net, 1/e at {r.near_scale:.3g} m from it.",
+                "distance": "From the line along the net [m].",
+                "lost": f"More than {self.lost:g} m from the line along the net.",
+                "begun": "How far along the net the episode began [m].",
+                "error": "Error of the distance from the net, integrated over the episode [m s].",
+            },
             rewards=(
                 RewardTerm("pace", pace, r.pace),
                 RewardTerm("near", "wp.exp(-e / p.reward.near_scale)", r.near),

@@ -227,6 +227,13 @@ class Pipeline(SeeingTask):
                 "theta": heading_off,
             },
             seen={"place": place_seen},
+            meanings={
+                "near": f"1 on the line above the pipe, 1/e at {r.near_scale:.3g} m from it.",
+                "distance": "From the line above the pipe [m].",
+                "lost": f"More than {self.lost[0]:g} m to a side of the line, or {self.lost[1]:g} m above or below it.",
+                "begun": "How far along the pipe the episode began [m].",
+                "worst": "Greatest distance from the line so far [m].",
+            },
             rewards=(
                 RewardTerm("progress", progress, r.progress),
                 RewardTerm("near", "wp.exp(-e / p.reward.near_scale)", r.near),

@@ -598,6 +598,15 @@ class Pursuit(Chase):
                 "spin": "state.velocity[w, 0][5]",
             },
             seen={"gap": prey_gap},
+            meanings={
+                "progress": "How much nearer the prey came: closing speed times the length of the step [m].",
+                "distance": "Distance to the prey over 8 m, at most 1.",
+                "near": f"1 within {r.near_radius:g} m of the prey, otherwise 0.",
+                "spin": "Square of the yaw rate [rad²/s²].",
+                "step": "1 in every step: sooner is better.",
+                "captured": f"The prey {self.success_rule()}.",
+                "closest": "Least distance to the prey so far [m].",
+            },
             rewards=(
                 RewardTerm("progress", "-wp.dot(way, motion) / d * p.control_step", r.progress),
                 RewardTerm("distance", "wp.min(d / 8.0, 1.0)", -r.distance),
@@ -903,6 +912,13 @@ class TeamPursuit(Team, Chase):
             command=command_prey,
             seen={"gap": prey_gap},
             shared={"net": net_gap, "near": nearest_pursuer, "gap_now": missing},
+            meanings={
+                "progress": "By how much the step shortened the distance left to a capture [m].",
+                "distance": "Distance left to a capture over 8 m, at most 1.",
+                "step": "1 in every step: sooner is better.",
+                "closest": "Least distance of an agent to the prey so far [m].",
+                "closest_to_net": "Least distance of the prey to the net so far [m].",
+            },
             rewards=(
                 RewardTerm("progress", "gap - gap_now", r.progress),
                 RewardTerm("distance", "wp.min(gap_now / 8.0, 1.0)", -r.distance),

@@ -159,6 +159,10 @@ class StationKeeping(PoolTask):
         return Terms(
             start=start,
             shared={"e": "position_error", "theta": "attitude_error"},
+            meanings={
+                "position": f"1 at the goal, 1/e at {self.fit.size * r.position_scale:.3g} m from it.",
+                "heading": f"1 in the goal's attitude, 1/e at {r.heading_scale:.3g} rad from it.",
+            },
             seen={"offset": "goal_offset"},
             rewards=(
                 RewardTerm("position", "wp.exp(-e / (p.fit.size * p.reward.position_scale))", r.position),

@@ -87,6 +87,9 @@ class Terms:
     """Of which several terms are made: name -> term of the truth, once a step; the terms take it by that name."""
     seen: Mapping[str, Any] = field(default_factory=dict)
     """The same for observation terms: name -> term of what is measured, once for each agent."""
+    meanings: Mapping[str, str] = field(default_factory=dict)
+    """What a reward, an end or a total that is an expression gives: name -> sentence with the unit. A function has its
+    docstring."""
     shown: bool = True
     """Whether the observation is written by the terms of its parts; False: the task writes it by itself."""
     command: Any = None

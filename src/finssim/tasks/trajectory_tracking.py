@@ -456,6 +456,10 @@ class TrajectoryTracking(FittedTask):
             advance=lead_reference,
             shared={"e": "position_error", "pose": "wp.exp(-e / (p.fit.size * p.reward.track_scale))"},
             seen={"drift": reference_drift},
+            meanings={
+                "track": f"1 on the reference, 1/e at {self.fit.size * r.track_scale:.3g} m from it.",
+                "spin": "Size of the yaw rate [rad/s].",
+            },
             rewards=(
                 RewardTerm("track", "pose", r.track),
                 RewardTerm("posture", posture, r.posture),
