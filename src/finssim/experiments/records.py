@@ -365,6 +365,9 @@ def _guides(
     return lambda rows: station_at(drive.goal[rows[0]])
 
 
+GIVE = "give the name or the file of what was followed (evaluate --trajectory, collect --goal)"
+
+
 def station_at(goal: Sequence[float] | Array) -> Station:
     """The station of a goal: x, y, z [m], yaw [rad], world frame, (4,)."""
     x, y, z, yaw = map(float, goal)
@@ -388,18 +391,14 @@ def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Gu
         *PUBLISHED_NAMES,
     ):  # what a record names is no path
         raise DriveError(
-            f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: give --goal, the "
-            "name or the file of what was followed"
+            f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: {GIVE}"
         )
     if np.isnan(drive.motion.t).any():
         raise DriveError(f"{drive.path}: does not say when its trajectory began: not a record of finssim run")
     guide = load_trajectory(name, vehicle=vehicle)
     off = float(np.linalg.norm(guide.at(drive.motion.t).position - drive.goal[:, :3], axis=1).max())
     if off > SAME_GOAL:
-        raise DriveError(
-            f"{drive.path}: its goals are up to {off:.3g} m off the trajectory '{name}': give --goal, the name or the "
-            "file of what was followed"
-        )
+        raise DriveError(f"{drive.path}: its goals are up to {off:.3g} m off the trajectory '{name}': {GIVE}")
     return guide
 
 
