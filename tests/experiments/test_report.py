@@ -109,7 +109,7 @@ def test_a_file_that_is_no_result_is_refused(tmp_path):
     for text, message in (
         ("no", "is no result"),
         ("[]", "is no result"),
-        ('{"experiment": "soak"}', "'soak', expected"),
+        ('{"experiment": "stack"}', "'stack', expected"),
     ):
         (tmp_path / "x.json").write_text(text)
         with pytest.raises(ReportError, match=message):
