@@ -43,7 +43,7 @@ KINDS: Mapping[str, Any] = {
 }  # fmt: skip
 """Name of an annotation -> what the command line makes of a word."""
 MAKERS = {
-    "OnRobot": "finssim.experiments.on_robot:robot_or_none",
+    "OnRobot": "finssim.experiments.robot_trials:robot_or_none",
     "Choice": "finssim.viewer.run:Choice",
     "Options": "finssim.ros2.up:Options",
 }

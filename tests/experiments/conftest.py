@@ -5,8 +5,8 @@ import os
 import pytest
 
 from finssim.experiments import metrics
-from finssim.experiments.pool_trial import Job
 from finssim.experiments.records import read_record
+from finssim.experiments.robot_trials import Job
 
 
 @pytest.fixture(scope="session", autouse=True)

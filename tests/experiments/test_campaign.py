@@ -12,7 +12,7 @@ from signal import SIGINT, SIGKILL, SIGTERM
 import pytest
 
 from finssim.experiments.campaign import ResultError, keep_result, kept_result, run_jobs, write_json
-from finssim.experiments.pool_trial import Job
+from finssim.experiments.robot_trials import Job
 from reference import played
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -92,7 +92,7 @@ def test_workers_do_not_outlive_a_campaign(tmp_path, signal):
         "import sys; sys.path.insert(0, 'tests')\n"
         "from pathlib import Path\nfrom reference import played\n"
         "from finssim.experiments.campaign import run_jobs\n"
-        "from finssim.experiments.pool_trial import Job\n"
+        "from finssim.experiments.robot_trials import Job\n"
         "if __name__ == '__main__':\n"
         "    jobs = [Job(row='pid', controller='pid', target='P01')]\n"
         f"    run_jobs(jobs, Path({str(tmp_path)!r}), played.endless, processes=2)\n"

@@ -19,7 +19,7 @@ from finssim.experiments import demo as demo_module
 from finssim.experiments.demo import FULL, Scope, demo, identify
 from finssim.experiments.figures import new_figure, save_figure
 from finssim.experiments.metrics import T1_SETPOINTS
-from finssim.experiments.on_robot import RobotError
+from finssim.experiments.robot_trials import RobotError
 from finssim.experiments.trials import Motion
 from finssim.learning.training_loop import Loop
 from finssim.pool import load_plant_spec

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from finssim.control.policy import Policy
 from finssim.experiments.demo import Scope, demo
-from finssim.experiments.on_robot import OnRobot, RobotError
+from finssim.experiments.robot_trials import OnRobot, RobotError
 from finssim.robot.wiring import Wiring
 from finssim.vehicles import load_vehicle
 from reference.pools import Person, lockstep_pool

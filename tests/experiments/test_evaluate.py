@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.control.modes import action_mode
 from finssim.control.policy import PolicyDescription, PolicyError, VehicleIdentity
+from finssim.control.trajectories import TRAJECTORIES
 from finssim.engine import read_run
 from finssim.experiments import trials as trials_module
 from finssim.experiments.evaluate import EvaluationError, evaluate, evaluate_controller
@@ -20,6 +22,7 @@ from finssim.experiments.plants import Plant, PlantError, available_plants, load
 from finssim.experiments.trials import run_trials
 from finssim.files import OutputError
 from finssim.learning.export import export_policy
+from finssim.robot.run import run
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
 from finssim.tasks.agents import AgentError, PidAgent
 from finssim.vehicles import load_vehicle
@@ -253,6 +256,13 @@ def test_a_plant_that_cannot_name_a_folder_is_refused_among_several(tmp_path):
         with pytest.raises(EvaluationError, match="^plant '.*expected the plain name of a file or folder"):
             evaluate("pid", plant=["lag", tmp_path / "plant.yaml"], out=tmp_path / "e")
     assert [path.name for path in tmp_path.iterdir()] == ["plant.yaml"]
+
+
+def test_the_help_names_every_plant_and_every_trajectory():
+    """As they are in the catalogue; `run` names the trajectories too."""
+    for page, names in ((evaluate, [*available_plants(), *TRAJECTORIES]), (run, TRAJECTORIES)):
+        words = set(re.findall(r"\w+", page.__doc__))
+        assert not set(names) - words
 
 
 def test_an_unknown_controller_is_refused_with_those_there_are():

@@ -11,7 +11,7 @@ from finssim import boundary
 from finssim.calibration.trials.trial_files import load_trials
 from finssim.cli import app
 from finssim.experiments.excitation import excite_on_robot
-from finssim.experiments.on_robot import NEAR, TURNED, OnRobot, RobotError
+from finssim.experiments.robot_trials import NEAR, TURNED, OnRobot, RobotError
 from finssim.robot.record_reader import open_record
 from finssim.vehicles import load_vehicle
 from reference.pools import Person, lockstep_pool

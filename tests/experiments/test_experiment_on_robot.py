@@ -8,8 +8,8 @@ import pytest
 from finssim import boundary
 from finssim.cli import app
 from finssim.control.guidance import Station
-from finssim.experiments.on_robot import OnRobot, RobotError, RobotTrial, session
 from finssim.experiments.records import read_record
+from finssim.experiments.robot_trials import OnRobot, RobotError, RobotTrial, session
 from finssim.experiments.transfer import T1, T2, transfer_experiment
 from finssim.pool import read_truth
 from finssim.robot.pilots import make_pilot

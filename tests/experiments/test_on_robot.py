@@ -1,12 +1,13 @@
 """Where a trial of a robot may begin: at rest at its start, or, if that need not be exact, roughly there."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from finssim.control.guidance import Station
-from finssim.experiments.on_robot import RobotTrial, Stages, start_bounds
+from finssim.experiments.robot_trials import RobotTrial, Stages, start_bounds
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.robot.pilots import WrenchPilot
 from finssim.robot.reading import Reading
@@ -14,6 +15,35 @@ from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
 START = Station((0.5, -0.2, -0.5), 0.3)
+
+
+def waited(attendant):
+    """How the wait for a vehicle ends that says nothing for two minutes, and when [s]."""
+    pilot = WrenchPilot(lambda: np.zeros(6), FINSROV, name="idle")
+    trial = RobotTrial(name="x", pilot=pilot, guide=START, duration=1.0, over=lambda runtime: False)
+
+    def drive(runtime, until, **_):
+        for now in range(120):
+            runtime.reading = Reading(
+                time=float(now),
+                position=np.full(3, np.nan),
+                quaternion=quat_from_yaw(0.0),
+                nu=np.zeros(6),
+                ready=False,
+                reason="no telemetry yet",
+            )
+            if until(runtime):
+                return
+
+    outcome = Stages(trial, FINSROV, START, start_bounds("pool", True), attendant=attendant).play(drive, None)
+    return outcome.ended, outcome.fault, outcome.runtime.reading.time
+
+
+def test_nobody_waits_for_ever_for_a_vehicle_that_says_nothing():
+    """With nobody beside it the trial ends after a minute and says why; somebody at the keys may wait."""
+    assert waited(None) == ("not there", "its state is not known after 60 s: no telemetry yet", 61.0)
+    beside = SimpleNamespace(keys=lambda: (), line=lambda text: None)
+    assert waited(beside) == ("interrupted", "not finished", 119.0)
 
 
 def begins(exact, off, turn_deg, speed, rate_deg, site="pool"):

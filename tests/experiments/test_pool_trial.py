@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room
-from finssim.experiments.on_robot import OnRobot, RobotError
-from finssim.experiments.pool_trial import Job, play, play_jobs
+from finssim.experiments.robot_trials import Job, OnRobot, RobotError, play, play_jobs
 from finssim.experiments.trials import Motion
 from finssim.robot.goals import GoalError
 from finssim.robot.wiring import Wiring

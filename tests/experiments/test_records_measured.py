@@ -116,6 +116,7 @@ def test_evaluate_takes_a_record_and_prints_what_it_prints_of_a_simulation(held,
     assert boundary.run(app, [*words, "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert "P03" in said and "1/1" in said and "paper" in said
+    assert "run.mcap: the robot's estimate was 0.0" in said and "ended early" not in said
     assert (tmp_path / "out" / "error_envelope.png").stat().st_size > 10_000
     assert boundary.run(app, [*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -123,11 +124,15 @@ def test_evaluate_takes_a_record_and_prints_what_it_prints_of_a_simulation(held,
     assert len(told["records"][0]["sha256"]) == 64
 
 
-def test_a_run_that_ended_early_counts_without_success(tmp_path):
-    """Three seconds: no errors late in the hold."""
+def test_a_run_that_ended_early_is_named_and_has_no_late_errors(tmp_path, capsys):
+    """Three seconds: no 10 s of success in them either; t2 would need a trajectory, and the command says how."""
     record, _, _ = driven(tmp_path, Station((X, Y, Z), YAW), 5.0)
     (trial,) = evaluate([record], task="t1")["per_trial"]
     assert not trial["success"] and trial["e_p_m"] is None and trial["fault"] == "ended early"
+    assert boundary.run(app, ["evaluate", str(record)]) == 0
+    assert "run.mcap: ended early" in capsys.readouterr().out
+    assert boundary.run(app, ["evaluate", str(record), "--task", "t2"]) == 2
+    assert "(evaluate --trajectory" in capsys.readouterr().err
 
 
 def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):
@@ -205,7 +210,7 @@ def test_a_memory_that_was_drawn_is_not_in_a_record(held, tmp_path):
     ("words", "sentence"),
     [
         (["a.mcap", "pid"], "one controller at a time"),
-        (["a.mcap", "--trials", "3"], "leave --trials out"),
+        (["a.mcap", "--trials", "3", "--hydrodynamics", "mesh"], "leave --trials, --hydrodynamics out"),
         (["pid", "--truth", "m.csv"], "--truth tells of records"),
     ],
 )

@@ -188,7 +188,7 @@ def test_an_experiment_trains_and_plays_on_a_cluster(tmp_path, two_machines, mon
     def played_here(*_):
         raise AssertionError("was played already")
 
-    monkeypatch.setattr("finssim.experiments.pool_trial.play", played_here)
+    monkeypatch.setattr("finssim.experiments.robot_trials.play", played_here)
     again = transfer.t1(out=tmp_path, processes=1, **how)
     assert again["rows"] == away["rows"] and away["rows"]["pid"]["success"] == 1
     found = anatomy(

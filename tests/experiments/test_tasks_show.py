@@ -1,6 +1,7 @@
 """`finssim tasks`: every task in a line; one in full, with the numbers that its environment has."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -8,10 +9,11 @@ import pytest
 from finssim import boundary
 from finssim.cli import app
 from finssim.experiments.tasks_show import attribute_docs, describe_task
-from finssim.tasks import TASKS, make
+from finssim.tasks import SEEING, TASKS, make
 from finssim.tasks.station_keeping import StationKeeping
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task_torch.py"
+WARP_EXAMPLE = EXAMPLE.with_name("own_task.py")
 
 
 def finssim(*words):
@@ -24,6 +26,16 @@ def test_every_task_is_listed(capsys):
     out = capsys.readouterr().out
     assert all(name in out for name in TASKS)
     assert all(words in out for words in ("align-insert", "formation", "pid", "[s]"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", (*TASKS, *SEEING, f"{EXAMPLE}:KeepDepth", f"{WARP_EXAMPLE}:KeepDepth"))
+def test_rewards_ends_and_totals_are_told_in_words(name):
+    """Also those that are expressions: a sentence stands in place of the source."""
+    told = describe_task(name)
+    for one in (*told["reward"]["terms"], *told["ends"], *told["totals"]):
+        assert one["told"].endswith("."), one
+        assert not re.search(r"\bp\.|\bw[,\]]|wp\.|\[0\]|>=| \* ", one["told"]), one
 
 
 @pytest.mark.slow

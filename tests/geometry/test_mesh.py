@@ -143,6 +143,10 @@ def test_unreadable_stl_is_refused(tmp_path):
         (b"solid nothing\nendsolid nothing\n", "three per triangle"),
         (b"solid a\nvertex 0 0 zero\nendsolid a\n", "unreadable vertex"),
         (b"solid a\nvertex 0 0 nan\nvertex 0 1 0\nvertex 1 0 0\nendsolid a\n", "finite"),
+        (
+            b"solid a\nvertex 0 0 2e38\nvertex 0 1 0\nvertex 1 0 0\nendsolid a\n",
+            "2e\\+38, expected up to 100000 m",
+        ),
     ]:
         (tmp_path / "bad.stl").write_bytes(content)
         with pytest.raises(MeshError, match=f"bad.stl.*{message}"):

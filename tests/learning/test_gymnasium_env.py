@@ -13,7 +13,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from finssim.learning.gymnasium_env import Env, VectorEnv
 from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping
-from finssim.tasks.camera_docking import CameraDocking
+from finssim.tasks.docking import CameraDocking
 
 SHORT = StationKeeping(time_limit=0.5)
 ALONE = [name for name, kind in TASKS.items() if len(kind.agents) == 1]

@@ -11,7 +11,7 @@ from finssim.engine import Pool
 from finssim.learning.gymnasium_env import Env
 from finssim.learning.sb3 import Sb3VecEnv
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, StationKeeping
-from finssim.tasks.camera_docking import CameraDocking
+from finssim.tasks.docking import CameraDocking
 from finssim.tasks.net import Net
 from reference.pair import Pair
 

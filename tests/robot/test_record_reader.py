@@ -115,6 +115,15 @@ def test_a_broken_index_costs_nothing(run, tmp_path):
     ]
 
 
+def test_a_record_without_its_header_is_read(run, tmp_path):
+    """Its first record is another one: the copy with an index is a file all the same."""
+    damaged, data = tmp_path / "damaged.mcap", bytearray(run.read_bytes())
+    data[8] ^= 0x40  # the kind of the header
+    data[-100] ^= 0x10
+    damaged.write_bytes(data)
+    assert depths(damaged) == depths(run)
+
+
 def test_damage_that_has_no_message_is_named_by_its_kind(run, tmp_path):
     """The reader raises an error without one where a file ends between two of its records."""
     cut, notes, data, at = tmp_path / "cut.mcap", [], run.read_bytes(), 8

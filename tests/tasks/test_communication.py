@@ -7,7 +7,7 @@ import pytest
 
 from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.tasks.communication import Communication
-from finssim.tasks.team_pursuit import TeamPursuit
+from finssim.tasks.pursuit import TeamPursuit
 
 SLOW = Communication(period=0.5, processing=0.23, loss=0.0, speed_of_sound=6.0)
 """Sound so slow that a metre more is a control step later or two."""

@@ -271,16 +271,16 @@ def test_nothing_is_made_where_sensors_are_not_asked_for():
 def test_fixes_of_another_site_are_a_file(tmp_path):
     """What is left out of a fix is 0; mistakes are told with file and key."""
     file = tmp_path / "usbl.yaml"
-    file.write_text("rate: 1\nfixes: {position_std: 0.2, delay: 0.5}\n")
+    file.write_text("rate: 1\nfixes: {position_std: 0.2, yaw_std: 1, delay: 0.5}\n")
     env = finssim.make("t1", worlds=1, observe=str(file))
-    assert env.noise == Sensing(rate=1.0, fixes=MeasurementNoise(position_std=0.2, delay=0.5))
+    assert env.noise == Sensing(rate=1.0, fixes=MeasurementNoise(position_std=0.2, yaw_std=1.0, delay=0.5))
     for text, sentence in (
         ("fixes: {}", "rate is missing: give the fixes a second"),
         ("rate: fast", "rate is 'fast', expected a number"),
         ("rate: 1\nfix: {}", "unknown key 'fix', expected rate, fixes"),
         ("rate: 1\nfixes: 3", "fixes is 3, expected keys such as position_std"),
         ("rate: 1\nfixes: {velocity_std: 0.1}", "unknown key 'velocity_std', expected position_std"),
-        ("rate: 1\nfixes: {delay: 9}", "delay of the measurement is 9 s, expected at most 2 s"),
+        ("rate: 1\nfixes: {delay: 9}", "delay of the measurement is 9.0 s, expected at most 2 s"),
         ("rate: -1", "rate of the fixes is -1.0 Hz"),
     ):
         file.write_text(text)

@@ -12,8 +12,8 @@ pytest.importorskip("newton")
 from finssim.experiments.plants import PlantError, load_plant
 from finssim.tasks import SEEING, Environment, EnvironmentSetupError, make, sight
 from finssim.tasks.agents import LightServo, LineFollower, PostServo, WallFollower, agent_for
-from finssim.tasks.camera_docking import CameraDocking
 from finssim.tasks.check import check_task
+from finssim.tasks.docking import CameraDocking
 from finssim.tasks.gate import Gate, from_bar
 from finssim.tasks.net import Net
 from finssim.tasks.pipeline import Pipeline

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.tasks.agents import baseline
 from finssim.tasks.communication import Communication
-from finssim.tasks.pursuit import DriveNumbers, Prey
-from finssim.tasks.team_pursuit import LEVELS, TeamPursuit, net_distance
+from finssim.tasks.pursuit import LEVELS, DriveNumbers, Prey, TeamPursuit, net_distance
 from finssim.vehicles import load_vehicle
 
 

@@ -54,6 +54,7 @@ def test_every_sensor_says_where_its_figures_are_from(name):
         (", radius: 0.3", "", "objects.ball: a sphere needs radius: add it"),
         ("radius: 0.3", "radius: 0.3, length: 1", "objects.ball: a sphere has no length: remove it"),
         ("radius: 0.3", "radius: 0.3, colour: [1, 2, 0]", "expected 3 numbers from 0 to 1"),
+        ("radius: 0.3", "radius: 0.3, backscatter_strength_db: 1e9", "is 1000000000.0, expected <= 100"),
         ("radius: 0.3", "radius: 0.3, axis: [0, 0, 1], yaw: 1", "give one"),
         ("radius: 0.3", "radius: 0.3, repeat: {count: 5000, step: [1, 0, 0]}", "count is 5000, expected <= 4096"),
         ("frame: rig", "frame: rog", "objects.ball: frame is 'rog', did you mean 'rig'?"),

@@ -28,20 +28,6 @@ import warp as wp
 from finssim.control import ControlError
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
-__all__ = [
-    "REGULARISATION",
-    "AllocationData",
-    "Allocator",
-    "RowLaunch",
-    "Tables",
-    "allocate",
-    "allocation_data",
-    "axis_weights",
-    "regularisation_weight",
-    "tables",
-]
-
-
 # The tables that wrench allocation looks up, computed once per vehicle in float64.
 
 
@@ -115,12 +101,7 @@ def tables(
         response = -np.linalg.solve(H[np.ix_(F, F)], H[np.ix_(F, C)])
         clamped[mask][np.ix_(C, F)] = response.T
         clamped[mask][np.ix_(C, C)] = (H[np.ix_(C, C)] + H[np.ix_(C, F)] @ response) / h
-    return Tables(
-        gain.astype(np.float32),
-        clamped.astype(np.float32),
-        _toward_zero(low),
-        _toward_zero(high),
-    )
+    return Tables(gain.astype(np.float32), clamped.astype(np.float32), _toward_zero(low), _toward_zero(high))
 
 
 def _toward_zero(limits: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:

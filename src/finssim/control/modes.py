@@ -22,20 +22,6 @@ from finssim.control.ardusub import FROM_BODY, MixerData, dead_band, mixed_thrus
 from finssim.control.policy import first_difference, plain_data
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
-__all__ = [
-    "AXES",
-    "MODES",
-    "ActionMode",
-    "ModeData",
-    "ModeKind",
-    "action_mode",
-    "axis_dead_band",
-    "before_dead_band",
-    "mode_data",
-    "mode_from_dict",
-    "thrusts_of",
-]
-
 Array = npt.NDArray[np.float64]
 
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")

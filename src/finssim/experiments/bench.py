@@ -36,11 +36,7 @@ _MUJOCO_BODY = """<mujoco><option timestep="0.01" integrator="Euler"/><worldbody
 <inertial pos="0 0 0" mass="12" diaginertia="0.13 0.23 0.25"/></body></worldbody></mujoco>"""
 
 
-def best_rate(
-    step: Callable[[], object],
-    work: float,
-    finish: Callable[[], object] = lambda: None,
-) -> float:
+def best_rate(step: Callable[[], object], work: float, finish: Callable[[], object] = lambda: None) -> float:
     """Work done per second in the best of several rounds, which take `SECONDS` in all.
 
     Args:

@@ -35,15 +35,17 @@ from finssim.experiments.campaign import Progress
 from finssim.experiments.compare import draw_training, groups_of
 from finssim.experiments.evaluate import T1_COLUMNS
 from finssim.experiments.excitation import record_programmes
-from finssim.experiments.figures import (
-    COLORS,
-    legend_below,
-    new_figure,
-    save_figure,
-)
+from finssim.experiments.figures import COLORS, legend_below, new_figure, save_figure
 from finssim.experiments.metrics import T1_SETPOINTS
-from finssim.experiments.on_robot import Attendant, OnRobot, take_folder
-from finssim.experiments.pool_trial import FIRMWARES, Job, firmware_of, played_trial
+from finssim.experiments.robot_trials import (
+    FIRMWARES,
+    Attendant,
+    Job,
+    OnRobot,
+    firmware_of,
+    played_trial,
+    take_folder,
+)
 from finssim.experiments.tables import Table, cells, html_of, print_tables
 from finssim.experiments.transfer import T1, Spec, transfer_experiment
 from finssim.experiments.trials import Trial

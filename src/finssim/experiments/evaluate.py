@@ -11,12 +11,7 @@ from typing import Annotated, Any, NamedTuple
 
 from finssim.experiments import campaign
 from finssim.experiments.campaign import progress_bar, write_json
-from finssim.experiments.figures import (
-    draw_envelopes,
-    draw_tracking,
-    error_envelope,
-    save_figure,
-)
+from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
 from finssim.experiments.metrics import (
     PAPER_T2,
     T1_SETPOINTS,
@@ -147,14 +142,24 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
             rows.append([f"paper, {name or paper}", *cells(row, form.columns)])
     heads = [heading.replace(" [", "\n[") for heading, *_ in form.columns.values()]  # for 80 columns
     note = f"{form.caption} paper: its vehicle in its pool, {', '.join(papers)}, for orientation."
-    return [Table(title=title, heads=[form.kind, *heads], rows=rows, note=note)]
+    sentences = [] if several else _remarks(first["per_trial"])
+    return [Table(title=title, heads=[form.kind, *heads], rows=rows, note=note, sentences=sentences)]
+
+
+def _remarks(trials: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What is to be known of records: why one is not complete, and how far its estimate was from the truth."""
+    faults = [f"{trial['record']}: {trial['fault']}" for trial in trials if trial.get("fault")]
+    located = [(trial["record"], trial["localization"]) for trial in trials if trial.get("localization")]
+    return faults + [
+        f"{record}: the robot's estimate was {off['position_m']:.3g} m, {off['heading_deg']:.2g}° off the truth (rms)"
+        for record, off in located
+    ]
 
 
 def _episodes_table(results: Sequence[Mapping[str, Any]], title: str) -> Table:
     """A row for each measure of an episode, and a column for each plant."""
     first = results[0]
     complete = "" if results[1:] else f" · {first['valid']} of {first['trials']} episodes"
-    trials = [trial for result in results for trial in result["per_trial"] if trial.get("fault")]
     return Table(
         title=title + complete,
         heads=["measure", *(result["plant"]["name"] for result in results)],
@@ -163,7 +168,7 @@ def _episodes_table(results: Sequence[Mapping[str, Any]], title: str) -> Table:
             for name in first["metrics"]
         ],
         note=EPISODES_CAPTION,
-        sentences=[f"{trial['record']}: {trial['fault']}" for trial in trials],
+        sentences=_remarks([trial for result in results for trial in result["per_trial"]]),
         intervals=True,
     )
 
@@ -260,8 +265,8 @@ def evaluate(
             vehicle.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), current, held_out, lag, mesh, noise,
-            randomised, sensors, simplified, waves, or a file. May be given several times.
+        plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), current, foreign, held_out, lag, mesh,
+            noise, randomised, sensors, simplified, waves, or a file. May be given several times.
         observe (FILE|NAME): What is seen in every plant: truth, estimator, sensors or a file of fixes; what the plant
             says if not given.
         trajectories (FILE|NAME): What t2 follows: straight, broken, ellipse, lemniscate (all four if not given),
@@ -288,6 +293,7 @@ def evaluate(
     simulated = {"--observe": observe, "--trials": trials}
     unheeded = [name for name, value in simulated.items() if value is not None]
     unheeded += ["--plant"] if tuple(plant) != ("nominal",) and plant != "nominal" else []
+    unheeded += ["--hydrodynamics"] if hydrodynamics != "calibrated" else []
     if records and unheeded:
         raise EvaluationError(f"a record was made once and for all: leave {', '.join(unheeded)} out")
     if truth is not None and not records:

@@ -25,16 +25,18 @@ from finssim.control.allocation import Allocator
 from finssim.control.controllers import controller
 from finssim.control.guidance import Goal, Guide, Measured, Station, goal_at
 from finssim.experiments.campaign import Progress, Show, progress_bar, run_jobs
-from finssim.experiments.on_robot import (
+from finssim.experiments.robot_trials import (
     Attendant,
     OnRobot,
     Outcome,
+    PoolJob,
     RobotTrial,
     check_starts,
+    noise_seed,
+    play_in_pool,
     session,
     take_folder,
 )
-from finssim.experiments.pool_trial import PoolJob, noise_seed, play_in_pool
 from finssim.files import atomic_directory
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import draw_plant

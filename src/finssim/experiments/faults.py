@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.experiments.campaign import Progress, check_choices, run_jobs, write_json
-from finssim.experiments.pool_trial import PoolJob, noise_seed
+from finssim.experiments.robot_trials import PoolJob, noise_seed
 from finssim.experiments.tables import Table
 from finssim.pool import TruthError, VirtualPool, read_truth
 from finssim.pool.firmware import Firmware
@@ -283,34 +283,39 @@ UNWATCHED: Mapping[str, Any] = {
 """Bridge settings without watchdogs: the control that shows that they are needed, and that the table can tell."""
 
 
-def _one(title: str, begin: Touch, **more: Any) -> Scenario:
-    """A fault of one kind only."""
-    return Scenario(title=title, faults={"": Fault(begin=begin, **more)})
+def _scenario(title: str, faults: Touch | Fault | Mapping[str, Touch], **more: Any) -> Scenario:
+    """A fault of one kind, or its variants by name; one that stays needs to say no more than how it begins."""
+    variants = faults if isinstance(faults, Mapping) else {"": faults}
+    made = {name: x if isinstance(x, Fault) else Fault(begin=x) for name, x in variants.items()}
+    return Scenario(title=title, faults=made, **more)
 
 
 def _lost(title: str, share: float) -> Scenario:
     """So much of what passes upwards, downwards, or both and of the pictures."""
-    touches = {
-        "up": pool_fault(drop=share),
-        "down": pool_fault(drop_commands=share),
-        "all": pool_fault(share, drop=share, drop_commands=share),
-    }
-    return Scenario(title=title, faults={name: Fault(begin=touch) for name, touch in touches.items()})
+    everything = pool_fault(share, drop=share, drop_commands=share)
+    up, down = pool_fault(drop=share), pool_fault(drop_commands=share)
+    return _scenario(title, {"up": up, "down": down, "all": everything})
 
 
 def _nan(field: str) -> Scenario:
     names = [field, *(f"{field}.{i}" for i in range(VALUES[field]))]
-    faults = {name: Fault(begin=pool_fault(nan_field=name)) for name in names}
-    return Scenario(title=f"NaN in {field}", faults=faults, motions=("moving",))
+    return _scenario(
+        f"NaN in {field}", {name: pool_fault(nan_field=name) for name in names}, motions=("moving",)
+    )
 
 
 def _jumps(title: str, touch: Callable[[float], Touch], *steps: float) -> Scenario:
-    return Scenario(title=title, faults={f"{step:+g} s": Fault(begin=touch(step)) for step in steps})
+    return _scenario(title, {f"{step:+g} s": touch(step) for step in steps})
 
 
 def _blind(lasts: float) -> Scenario:
     blind, sighted = on_wire(pictures=lambda pictures: ()), on_wire(pictures=None)
-    return _one(f"{lasts:g} s without vision", blind, end=sighted, lasts=lasts)
+    return _scenario(f"{lasts:g} s without vision", Fault(begin=blind, end=sighted, lasts=lasts))
+
+
+def reboot(bench: Bench) -> None:
+    """The motor controller, or the autopilot, starts anew."""
+    bench.pool.reboot()
 
 
 def another_station(
@@ -351,91 +356,75 @@ def _command(number: int, *values: float) -> Touch:
     return another_station("command_long", 1, 1, number, 0, *values, *[0] * (7 - len(values)), times=1)
 
 
-def _autopilot(title: str, ends: str, limit: float, *faults: Fault, **more: Any) -> Scenario:
-    variants = {"" if len(faults) == 1 else str(i): fault for i, fault in enumerate(faults, 1)}
-    return Scenario(title=title, faults=variants, firmware="ardusub", ends=ends, limit=limit, **more)
+def _autopilot(title: str, ends: str, limit: float, faults: Any, **more: Any) -> Scenario:
+    return _scenario(title, faults, firmware="ardusub", ends=ends, limit=limit, **more)
 
 
 SILENT, WAITS = "no fresh telemetry", "held longer than"
+UNARMED = "failsafe|was disarmed"
 AUTOPILOT: Mapping[str, Scenario] = {
-    "ap-none": _autopilot("no fault", "", math.inf, Fault(begin=pool_fault())),
+    "ap-none": _autopilot("no fault", "", math.inf, pool_fault()),
     "ap-heartbeat": _autopilot(
-        "its heartbeat is lost", "no heartbeat from the autopilot", 3.5, Fault(begin=pool_fault(no_heartbeat=True))
+        "its heartbeat is lost", "no heartbeat from the autopilot", 3.5, pool_fault(no_heartbeat=True)
     ),
-    "ap-our-heartbeat": _autopilot(
-        "ours is lost", "", math.inf, Fault(begin=pool_fault(no_ground_heartbeat=True))
-    ),
-    "ap-silence": _autopilot("telemetry is lost", SILENT, 1.0, Fault(begin=pool_fault(drop=1.0))),
+    "ap-our-heartbeat": _autopilot("ours is lost", "", math.inf, pool_fault(no_ground_heartbeat=True)),
+    "ap-silence": _autopilot("telemetry is lost", SILENT, 1.0, pool_fault(drop=1.0)),
     "ap-deaf": _autopilot(
-        "what is sent is lost", "what we send is lost|was disarmed", 3.5,
-        Fault(begin=pool_fault(drop_commands=1.0)),
+        "what is sent is lost", "what we send is lost|was disarmed", 3.5, pool_fault(drop_commands=1.0)
     ),
     "ap-joystick": _autopilot(
-        "a joystick steers", "somebody else steers", 0.5,
-        Fault(begin=another_station("manual_control", 1, 0, 0, 500, 400, 0)), handed_over=True,
+        "a joystick steers", "somebody else steers", 0.5, another_station("manual_control", 1, 0, 0, 500, 400, 0),
+        handed_over=True,
     ),
-    "ap-mode": _autopilot(
-        "the mode is changed", "mode to ALT_HOLD", 0.5, Fault(begin=_command(176, 1, 2)), handed_over=True
-    ),
-    "ap-disarm": _autopilot("somebody disarms", "was disarmed", 0.5, Fault(begin=_command(400, 0))),
-    "ap-station": _autopilot(
-        "a second ground station, which looks", "", math.inf,
-        Fault(begin=another_station("heartbeat", 6, 8, 0, 0, 0, 3, every=1.0, system=254)),
-        Fault(begin=another_station("request_data_stream", 1, 1, 0, 2, 1, every=2.0)),
-    ),
+    "ap-mode": _autopilot("the mode is changed", "mode to ALT_HOLD", 0.5, _command(176, 1, 2), handed_over=True),
+    "ap-disarm": _autopilot("somebody disarms", "was disarmed", 0.5, _command(400, 0)),
+    "ap-station": _autopilot("a second ground station, which looks", "", math.inf, {
+        "1": another_station("heartbeat", 6, 8, 0, 0, 0, 3, every=1.0, system=254),
+        "2": another_station("request_data_stream", 1, 1, 0, 2, 1, every=2.0),
+    }),
     "ap-dvl": _autopilot(
         "Doppler log lost for 10 s", WAITS, 4.0,
         Fault(begin=pool_fault(dvl_silent=True), end=pool_fault(dvl_silent=False), lasts=10.0),
     ),
-    "ap-depth": _autopilot("depth frozen", WAITS, 4.0, Fault(begin=pool_fault(freeze_depth=True))),
-    "ap-battery": _autopilot(
-        "battery low", "failsafe|was disarmed", 10.5, Fault(begin=pool_fault(battery_voltage=9.0))
-    ),
-    "ap-leak": _autopilot("leak", "failsafe|was disarmed", 1.0, Fault(begin=pool_fault(leak=True))),
+    "ap-depth": _autopilot("depth frozen", WAITS, 4.0, pool_fault(freeze_depth=True)),
+    "ap-battery": _autopilot("battery low", UNARMED, 10.5, pool_fault(battery_voltage=9.0)),
+    "ap-leak": _autopilot("leak", UNARMED, 1.0, pool_fault(leak=True)),
     "ap-spoiled": _autopilot(
-        "a tenth lost and spoiled", "", math.inf, Fault(begin=pool_fault(drop=0.1, corrupt=0.1, drop_commands=0.1))
+        "a tenth lost and spoiled", "", math.inf, pool_fault(drop=0.1, corrupt=0.1, drop_commands=0.1)
     ),
-    "ap-corrupt": _autopilot("all frames spoiled", SILENT, 1.0, Fault(begin=pool_fault(corrupt=1.0))),
-    "ap-reboot": _autopilot(
-        "it restarts", f"restarted|{SILENT}", 0.5, Fault(begin=lambda bench: bench.pool.reboot())
-    ),
+    "ap-corrupt": _autopilot("all frames spoiled", SILENT, 1.0, pool_fault(corrupt=1.0)),
+    "ap-reboot": _autopilot("it restarts", f"restarted|{SILENT}", 0.5, reboot),
 }  # fmt: skip
 """Those of an emulated ArduSub; what each must end in stands in docs/bluerov2.md."""
 
 SCENARIOS: Mapping[str, Scenario] = {
-    "loss-0": _one("no fault", pool_fault()),
+    "loss-0": _scenario("no fault", pool_fault()),
     **{f"loss-{percent}": _lost(f"packet loss {percent} %", percent / 100) for percent in (10, 30, 50)},
     "link-cut": _lost("link cut", 1.0),
-    "reordering": _one("reordering, half of the frames", pool_fault(reorder=0.5)),
-    "duplicates": _one("duplicates, half of the frames", pool_fault(duplicate=0.5)),
-    "corrupt": Scenario(
-        title="corrupt frames",
-        faults={
-            "half": Fault(begin=pool_fault(corrupt=0.5)),
-            "all": Fault(begin=pool_fault(corrupt=1.0)),
-        },
-    ),
-    "frozen-imu": _one("frozen IMU", stuck_sensors("quaternion", "gyro", "accel")),
-    "frozen-depth": _one("frozen depth", stuck_sensors("depth", "pressure")),
-    "frozen-sensors": _one("all sensors frozen", pool_fault(freeze_sensors=True)),
-    "frozen-picture": _one("frozen picture", stuck_pictures),
+    "reordering": _scenario("reordering, half of the frames", pool_fault(reorder=0.5)),
+    "duplicates": _scenario("duplicates, half of the frames", pool_fault(duplicate=0.5)),
+    "corrupt": _scenario("corrupt frames", {"half": pool_fault(corrupt=0.5), "all": pool_fault(corrupt=1.0)}),
+    "frozen-imu": _scenario("frozen IMU", stuck_sensors("quaternion", "gyro", "accel")),
+    "frozen-depth": _scenario("frozen depth", stuck_sensors("depth", "pressure")),
+    "frozen-sensors": _scenario("all sensors frozen", pool_fault(freeze_sensors=True)),
+    "frozen-picture": _scenario("frozen picture", stuck_pictures),
     **{f"nan-{field}": _nan(field) for field in VALUES},
     "blind-3": _blind(3.0),
     "blind-10": _blind(10.0),
-    "second-publisher": _one("second publisher", two_publishers, during=two_publishers),
-    "mcu-reboot": _one("MCU reboot", lambda bench: bench.pool.reboot()),
+    "second-publisher": _scenario("second publisher", Fault(begin=two_publishers, during=two_publishers)),
+    "mcu-reboot": _scenario("MCU reboot", reboot),
     "robot-clock": _jumps(
         "robot's clock jumps", lambda step: on_wire(shift=step), -3600.0, -2.0, -0.2, 0.5, 2.0, 3600.0
     ),
     "mcu-clock": _jumps("MCU's clock jumps", jump_mcu_clock, -100.0, -2.0, -0.2, 0.5, 2.0, 100.0),
-    "full-disk": _one("full disk", full_disk, cuts_record=True),
-    "control": Scenario(
-        title="control: no watchdogs, link cut up",
-        faults={"": Fault(begin=pool_fault(drop=1.0))},
+    "full-disk": _scenario("full disk", Fault(begin=full_disk, cuts_record=True)),
+    "control": _scenario(
+        "control: no watchdogs, link cut up",
+        pool_fault(drop=1.0),
         settings=UNWATCHED,
         motions=("moving",),
         must_fail=True,
-    ),
+    ),  # fmt: skip
     **AUTOPILOT,
 }
 """Name -> scenario, in the order of the table; those with processes of their own are `faults.KILLS`."""
@@ -810,44 +799,31 @@ def pair(job: FaultJob, folder: Path) -> Iterator[Pair]:
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
-        port: int = free.getsockname()[
-            1
-        ]  # and the five after it: another attempt is made where they are taken
+        # And the five after it: another attempt is made where they are taken.
+        port: int = free.getsockname()[1]
     start, goal, *_ = MOTIONS[job.motion]
     truth, record = folder / "truth", folder / "run.mcap"
-    end, both = f"127.0.0.1:{port + 4}", ["--vehicle", job.vehicle, "--pool-file", str(folder / "pool.yaml")]
-    world = ["pool", *both, "--port", str(port), "--robot", end, "--plant", str(job.plant), "--start", start]
-    world += [
-        "--severity",
-        job.severity,
-        "--seed",
-        str(job.seed),
-        "--camera",
-        "corners",
-        "--truth",
-        str(truth),
-    ]
-    ours = [
-        "run",
-        *both,
-        "--goal",
-        goal,
-        "--arm",
-        "--json",
-        "--bind",
-        end,
-        "--policy",
-        "pid",
-        "--record",
-        str(record),
-    ]
-    ours += ["--robot", f"udp://127.0.0.1:{port}", "--pictures", f"udp://127.0.0.1:{port + 1}"]
+    end = f"127.0.0.1:{port + 4}"
+    both = {"vehicle": job.vehicle, "pool-file": folder / "pool.yaml"}
+    world = _words(
+        "pool", **both, port=port, robot=end, plant=job.plant, start=start, severity=job.severity, seed=job.seed,
+        camera="corners", truth=truth,
+    )  # fmt: skip
+    ours = _words(
+        "run", "--arm", "--json", **both, goal=goal, bind=end, policy="pid", record=record,
+        robot=f"udp://127.0.0.1:{port}", pictures=f"udp://127.0.0.1:{port + 1}",
+    )  # fmt: skip
     with Process(world, folder, "pool") as pool:
         _await(lambda: "pictures: " in pool.said, "the pool never said 'pictures: '", pool)
         with Process(ours, folder, "robot") as robot:
             both_at_work = Pair(pool, robot, port, truth, record)
             _await(both_at_work.turning, "no thruster ever turned", robot, 20.0 * POLL)
             yield both_at_work
+
+
+def _words(*words: str, **options: Any) -> list[str]:
+    """A command line: words, then options with their values."""
+    return [*words, *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
 
 
 def _await(ready: Callable[[], bool], failure: str, process: Process, poll: float = POLL) -> None:

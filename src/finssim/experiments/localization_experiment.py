@@ -442,12 +442,7 @@ class Scores:
 
 
 def locate(
-    campaign: Campaign,
-    seen: Sequence[Picture],
-    pool: Pool,
-    method: str,
-    *,
-    pixel_std: float,
+    campaign: Campaign, seen: Sequence[Picture], pool: Pool, method: str, *, pixel_std: float
 ) -> Scores:
     """Locate the tag in every picture of the held-out visits and average over each visit.
 

@@ -15,8 +15,7 @@ import numpy.typing as npt
 from finssim.control.guidance import Station
 from finssim.control.trajectories import Trajectory
 from finssim.experiments.campaign import Progress, check_choices, write_json
-from finssim.experiments.on_robot import RobotTrial
-from finssim.experiments.pool_trial import play_in_pool
+from finssim.experiments.robot_trials import RobotTrial, play_in_pool
 from finssim.experiments.tables import Columns, Table, cells
 from finssim.experiments.trials import interpolated
 from finssim.geometry.rotations import quat_yaw

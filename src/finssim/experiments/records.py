@@ -23,8 +23,9 @@ from finssim.experiments.metrics import MAX_GAP, T1_SETPOINTS, in_room
 from finssim.experiments.tables import Table
 from finssim.experiments.trials import DURATION, Motion, Trial, follows, interpolated, localization_errors
 from finssim.geometry.rotations import quat_from_yaw
-from finssim.learning.demonstrations import Episode, about, found_in, save
+from finssim.learning.demonstrations import DatasetError, Episode, about, found_in, save
 from finssim.learning.demonstrations import collect as collect_episodes
+from finssim.learning.lerobot import export_lerobot
 from finssim.pool.task_site import Referee
 from finssim.pool.virtual_pool import read_truth
 from finssim.provenance import provenance
@@ -364,6 +365,9 @@ def _guides(
     return lambda rows: station_at(drive.goal[rows[0]])
 
 
+GIVE = "give the name or the file of what was followed (evaluate --trajectory, collect --goal)"
+
+
 def station_at(goal: Sequence[float] | Array) -> Station:
     """The station of a goal: x, y, z [m], yaw [rad], world frame, (4,)."""
     x, y, z, yaw = map(float, goal)
@@ -387,18 +391,14 @@ def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Gu
         *PUBLISHED_NAMES,
     ):  # what a record names is no path
         raise DriveError(
-            f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: give --goal, the "
-            "name or the file of what was followed"
+            f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: {GIVE}"
         )
     if np.isnan(drive.motion.t).any():
         raise DriveError(f"{drive.path}: does not say when its trajectory began: not a record of finssim run")
     guide = load_trajectory(name, vehicle=vehicle)
     off = float(np.linalg.norm(guide.at(drive.motion.t).position - drive.goal[:, :3], axis=1).max())
     if off > SAME_GOAL:
-        raise DriveError(
-            f"{drive.path}: its goals are up to {off:.3g} m off the trajectory '{name}': give --goal, the name or the "
-            "file of what was followed"
-        )
+        raise DriveError(f"{drive.path}: its goals are up to {off:.3g} m off the trajectory '{name}': {GIVE}")
     return guide
 
 
@@ -456,15 +456,26 @@ def collect(
     )  # fmt: skip
 
 
-def datasets(places: Sequence[Path]) -> dict[str, Any]:
-    """List demonstrations: task, vehicle, expert, episodes, steps.
+def datasets(places: Sequence[Path], *, lerobot: Path | None = None) -> dict[str, Any]:
+    """List demonstrations: task, vehicle, expert, episodes, steps. With --lerobot, write one as LeRobot reads it too.
 
     Example: finssim datasets demonstrations
 
     Args:
         places (PATH...): Data sets, or folders that hold some.
+        lerobot (DIR): Folder for a LeRobot data set (format 3.0) of the one data set that is named.
     """
-    return {str(path): about(path) for place in places for path in found_in(place)}
+    found = [path for place in places for path in found_in(place)]
+    if lerobot is None:
+        return {str(path): about(path) for path in found}
+    if len(found) != 1:
+        raise DatasetError(f"--lerobot {lerobot}: {len(found)} data sets are named, expected one")
+    return {
+        str(found[0]): {
+            **about(found[0]),
+            "lerobot": {"written": str(lerobot), **export_lerobot(found[0], lerobot)},
+        }
+    }
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
@@ -484,7 +495,12 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         for name, row in result.items()
     ]  # fmt: skip
     heads = ("data set", "task", "vehicle", "expert", "observes", "episodes", "steps")
-    return [Table(title="", heads=heads, rows=rows, left=range(5))]
+    written = [
+        f"{row['lerobot']['written']}: LeRobot, {row['lerobot']['frames']:,} frames at {row['lerobot']['fps']} Hz"
+        for row in result.values()
+        if "lerobot" in row
+    ]
+    return [Table(title="", heads=heads, rows=rows, left=range(5), sentences=written)]
 
 
 def collect_records(
@@ -542,6 +558,8 @@ def collect_records(
         )
     described = {
         "task": the_task.name,
+        "title": the_task.title,
+        "period": the_task.control_step,
         "expert": " and ".join(dict.fromkeys(str(source["driver"]) for source in sources)),
         "observation": the_task.schema.model_dump(mode="json"),
         "action": mode.describe(),

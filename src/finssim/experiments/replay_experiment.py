@@ -271,11 +271,7 @@ def replay_experiment(
 
 
 def experiment_seed(
-    vehicle: Vehicle,
-    plant: ReplayPlant,
-    seed: int,
-    repeats: int = REPEATS,
-    axes: Sequence[str] = AXES,
+    vehicle: Vehicle, plant: ReplayPlant, seed: int, repeats: int = REPEATS, axes: Sequence[str] = AXES
 ) -> SeedResult:
     """One seed of the experiment; arguments as for `replay_experiment`."""
     trials = plant.trials(programmes(axes, vehicle, kind="published", repeats=repeats), vehicle, seed)

@@ -26,12 +26,7 @@ class ReportError(ValueError):
     """A page asks for a table that the results do not hold."""
 
 
-def report(
-    results: Sequence[Path],
-    *,
-    into: Annotated[Sequence[Path], "--into"],
-    check: bool = False,
-) -> int:
+def report(results: Sequence[Path], *, into: Annotated[Sequence[Path], "--into"], check: bool = False) -> int:
     """Fill the tables of Markdown pages with what experiments have measured.
 
     A page has a table where it says <!-- finssim report: t1 --> and <!-- end -->, for the result in t1.json; after the

@@ -21,6 +21,7 @@ from finssim.tasks.given import crew
 from finssim.tasks.make import task_named
 from finssim.tasks.sensing import Sensing, seen_with
 from finssim.tasks.task import Task
+from finssim.tasks.terms import End, ObservationPart, RewardTerm, Total
 from finssim.vehicles import Vehicle
 
 
@@ -70,7 +71,7 @@ def describe_task(
         {
             "first": entry.indices[0],
             **{name: getattr(part, name) for name in ("name", "size", "unit", "scale", "clip")},
-            "told": _text(the_task, part.term),
+            "told": _text(the_task, part),
         }
         for entry, part in zip(entries, the_task.observation, strict=True)
     ]
@@ -90,10 +91,9 @@ def describe_task(
         "time_limit_s": the_task.time_limit,
         "reward": _reward(the_task),
         "ends": [
-            {"name": one.name, "reward": one.reward, "told": _text(the_task, one.term)} for one in terms.ends
+            {"name": one.name, "reward": one.reward, "told": _text(the_task, one)} for one in terms.ends
         ],
-        "totals": [{"name": one.name, "told": _text(the_task, one.term)} for one in terms.totals],
-        "inside": _text(the_task, terms.inside),
+        "totals": [{"name": one.name, "told": _text(the_task, one)} for one in terms.totals],
         "success": the_task.success_rule(),
         "settings": _settings(the_task),
         "training_noise": seen_with(the_task.training_noise, vehicles[0]),
@@ -102,13 +102,18 @@ def describe_task(
     }
 
 
-def _text(task: Task, term: Any) -> str:
-    """The docstring of a term, or of what is shared under its name; an expression itself."""
-    if isinstance(term, str):
-        terms = task.terms()
-        named = {**terms.shared, **terms.seen}.get(term, getattr(library, term, None))
-        return term.replace("wp.", "") if named is None else _text(task, named)
-    return " ".join((inspect.getdoc(term.func) or "").split()) if term is not None else ""
+def _text(task: Task, one: ObservationPart | RewardTerm | End | Total) -> str:
+    """What the task says of a term; otherwise the docstring of the function, also of one that is shared by name.
+
+    An expression of which nothing is said is its own text, but in an observation, whose part is named by what it is.
+    """
+    terms, term = task.terms(), one.term
+    shared = {**terms.shared, **terms.seen}
+    while isinstance(term, str) and (term in shared or hasattr(library, term)):
+        term = shared.get(term, getattr(library, term, None))
+    expression = "" if isinstance(one, ObservationPart) or term is None else str(one.term)
+    text = (inspect.getdoc(term.func) or "") if hasattr(term, "func") else expression
+    return terms.meanings.get(one.name) or " ".join(text.split())
 
 
 def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
@@ -127,8 +132,7 @@ def _reward(task: Task) -> dict[str, Any]:
     weights = asdict(own) if is_dataclass(own) and not isinstance(own, type) else {}
     told = inspect.getdoc(type(own) if weights else own) if weights or callable(own) else ""
     terms = [
-        {"name": one.name, "weight": one.weight, "told": _text(task, one.term)}
-        for one in task.terms().rewards
+        {"name": one.name, "weight": one.weight, "told": _text(task, one)} for one in task.terms().rewards
     ]
     return {"terms": terms, "weights": weights, "told": told or ""}
 

@@ -22,8 +22,16 @@ from finssim.experiments.campaign import Progress, Show, check_choices, spread, 
 from finssim.experiments.evaluate import T1_COLUMNS
 from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row, paper_t2_row
-from finssim.experiments.on_robot import Attendant, OnRobot
-from finssim.experiments.pool_trial import FIRMWARES, HARDWARE, Job, firmware_of, play_jobs, played_trial
+from finssim.experiments.robot_trials import (
+    FIRMWARES,
+    HARDWARE,
+    Attendant,
+    Job,
+    OnRobot,
+    firmware_of,
+    play_jobs,
+    played_trial,
+)
 from finssim.experiments.statistics import Statistic, paired_difference, with_interval
 from finssim.experiments.tables import Columns, Table, cells
 from finssim.experiments.trials import T2_TRAJECTORIES

@@ -122,6 +122,10 @@ class MeshError(ValueError):
     """A mesh file, or the surface it holds, that cannot serve as a hull."""
 
 
+FARTHEST = 1e5
+"""Coordinate in a file, of a hull in millimetres too; what is farther is a wrong number [m]."""
+
+
 def load_stl(path: str | Path) -> tuple[Vertices, Faces]:
     """Read a binary or ASCII STL file.
 
@@ -132,7 +136,7 @@ def load_stl(path: str | Path) -> tuple[Vertices, Faces]:
         Vertices (n, 3) [m], equal corners merged into one, and faces (m, 3).
 
     Raises:
-        MeshError: The file is neither form of STL, is cut short, or holds no triangle.
+        MeshError: The file is neither form of STL, is cut short, holds no triangle, or a number beyond reason.
     """
     data = Path(path).read_bytes()
     triangles = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
@@ -157,6 +161,10 @@ def load_stl(path: str | Path) -> tuple[Vertices, Faces]:
         )
     if not np.isfinite(corners).all():
         raise MeshError(f"{path}: holds coordinates that are not finite numbers: save the mesh again")
+    if (farthest := float(np.abs(corners).max())) > FARTHEST:
+        raise MeshError(
+            f"{path}: a coordinate is {farthest:.3g}, expected up to {FARTHEST:g} m: save the mesh again, in metres"
+        )
     vertices, index = np.unique(corners, axis=0, return_inverse=True)
     return vertices, index.reshape(-1, 3).astype(np.int64)
 

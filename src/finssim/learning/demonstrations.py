@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -95,6 +95,7 @@ def save(out: str | Path, episodes: Sequence[Episode], described: Mapping[str, A
             observation_space=spaces.Dict({STATE: state, **pictures}) if pictures else state,
             action_space=spaces.Box(-1.0, 1.0, (m,), np.float32),
             data_format="arrow",
+            jpeg_encoding=False,  # which is lossy: a policy would learn from other pictures than it acts on
         )
         storage.update_metadata(
             {
@@ -136,26 +137,34 @@ def load(place: str | Path) -> Demonstrations:
     Raises:
         DatasetError: There is none, or it was not made by FinsSim.
     """
+    described, found = about(place), list(read_episodes(place))
+    return Demonstrations(
+        observation=np.concatenate([e.observation[:-1] for e in found]),
+        action=np.concatenate([e.action for e in found]),
+        following=np.concatenate([e.observation[1:] for e in found]),
+        episodes=len(found),
+        mean_return=float(np.mean([np.sum(e.reward) for e in found])),
+        about=described,
+        pictures={name: np.concatenate([e.pictures[name][:-1] for e in found]) for name in found[0].pictures},
+    )
+
+
+def read_episodes(place: str | Path) -> Iterator[Episode]:
+    """The episodes of a data set, one after another."""
     import minari
 
-    described = about(place)
     dataset = minari.MinariDataset(Path(place))
-    rows, pictures, actions, returns = [], [], [], []
-    for e in dataset.iterate_episodes():
+    measured = dataset.storage.get_episode_metadata(dataset.episode_indices)
+    for e, metrics in zip(dataset.iterate_episodes(), measured, strict=True):
         seen = dict(e.observations) if isinstance(e.observations, dict) else {STATE: e.observations}
-        rows.append(seen.pop(STATE).astype(np.float32))
-        pictures.append(seen)
-        actions.append(e.actions.astype(np.float32))
-        returns.append(float(np.sum(e.rewards)))
-    return Demonstrations(
-        observation=np.concatenate([o[:-1] for o in rows]),
-        action=np.concatenate(actions),
-        following=np.concatenate([o[1:] for o in rows]),
-        episodes=len(rows),
-        mean_return=float(np.mean(returns)),
-        about=described,
-        pictures={name: np.concatenate([one[name][:-1] for one in pictures]) for name in pictures[0]},
-    )
+        yield Episode(
+            observation=seen.pop(STATE).astype(np.float32),
+            action=e.actions.astype(np.float32),
+            reward=e.rewards.astype(np.float32),
+            terminated=bool(e.terminations[-1]),
+            metrics={name: float(x) for name, x in metrics.items() if isinstance(x, int | float)},
+            pictures=seen,
+        )
 
 
 def about(place: str | Path) -> dict[str, Any]:
@@ -258,6 +267,8 @@ def collect(
     found = record_episodes(environment, who, episodes, disturb=disturb, seed=seed, show=show)
     described = {
         "task": environment.task.name,
+        "title": environment.task.title,
+        "period": environment.task.control_step,
         "expert": who.name,
         "observation": environment.task.schema.model_dump(mode="json"),
         "action": action_mode(environment.action_mode, body).describe(),

@@ -40,10 +40,10 @@ from finssim.robot.team import Team, encode_track
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task, one_world, unscored
-from finssim.tasks.reference import fill_table
 from finssim.tasks.sight import first_draw
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.terms import Terms
+from finssim.tasks.trajectory_tracking import fill_table
 from finssim.vehicles import Vehicle
 from finssim.worlds import WorldBatch
 

@@ -27,25 +27,6 @@ from finssim.robot.messages import CommandEcho, Telemetry, ThrusterCommand
 from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 
-__all__ = [
-    "STATES",
-    "Bridge",
-    "BridgeError",
-    "BridgeSettings",
-    "Clock",
-    "Commander",
-    "EchoWatch",
-    "Event",
-    "EventLog",
-    "Lasting",
-    "StateWatch",
-    "Supervision",
-    "TelemetryWatch",
-    "TiltWatch",
-    "Workspace",
-]
-
-
 # What a bridge tells its operator and its record: events in order, a repeated one at most once a second.
 
 

@@ -250,8 +250,8 @@ def run_lockstep(
     rate: float = 60.0,
     start: float = 0.0,
     gentle: bool = False,
-    show: Callable[[Runtime], None] | None = None,
-    until: Callable[[Runtime], bool] | None = None,
+    show: Callable[[Runtime], None] = lambda runtime: None,
+    until: Callable[[Runtime], bool] = lambda runtime: False,
 ) -> float:
     """Run a robot against a world until the time is over or `until` says so; then stop its thrusters.
 
@@ -270,14 +270,9 @@ def run_lockstep(
         Robot's clock at the end [s].
     """
     return run_together(
-        {"": (runtime, world)},
-        duration,
-        rate=rate,
-        start=start,
-        gentle=gentle,
-        show=None if show is None else lambda: show(runtime),
-        until=None if until is None else lambda: until(runtime),
-    )
+        {"": (runtime, world)}, duration, rate=rate, start=start, gentle=gentle, show=lambda: show(runtime),
+        until=lambda: until(runtime),
+    )  # fmt: skip
 
 
 def run_together(
@@ -288,8 +283,8 @@ def run_together(
     rate: float = 60.0,
     start: float = 0.0,
     gentle: bool = False,
-    show: Callable[[], None] | None = None,
-    until: Callable[[], bool] | None = None,
+    show: Callable[[], None] = lambda: None,
+    until: Callable[[], bool] = lambda: False,
 ) -> float:
     """Run several robots, each against its world, on one clock; as `run_lockstep`.
 
@@ -308,7 +303,7 @@ def run_together(
     """
     now: float = start
     sent: dict[str, list[bytes]] = {name: [] for name in stacks}
-    with interruptible() if gentle else nullcontext(_never) as interrupted:
+    with interruptible() if gentle else nullcontext(lambda: False) as interrupted:
         for k in itertools.count(1):
             if interrupted() or k > duration * rate + 1e-6:
                 break
@@ -324,9 +319,8 @@ def run_together(
             for name, (runtime, _) in stacks.items() if carrier is not None else ():
                 for datagram in runtime.told:
                     carrier.send(now, name, datagram)
-            if show is not None:
-                show()
-            if until is not None and until():
+            show()
+            if until():
                 break
     # A world that broke off above stands still: only one that goes on needs to hear of the end.
     last = [
@@ -334,7 +328,3 @@ def run_together(
         for runtime, world in stacks.values()
     ]
     return last[0]
-
-
-def _never() -> bool:
-    return False

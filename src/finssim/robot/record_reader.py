@@ -26,11 +26,7 @@ from finssim.yaml_file import json_value
 __all__ = ["Entry", "Record", "describe_record", "events_of", "open_record", "play", "repair_record"]
 
 
-def repair(
-    file: Path,
-    *,
-    out: Path | None = None,
-) -> None:
+def repair(file: Path, *, out: Path | None = None) -> None:
     """Write a whole record of all that can be read of a cut or damaged one; FILE itself stays as it is.
 
     Example: finssim record repair run.mcap --out whole.mcap
@@ -94,10 +90,11 @@ def write_whole(source: Path, target: Path, notes: list[str]) -> None:
         writer = Writer(made, compression=CompressionType.LZ4)
         try:
             for one in StreamReader(given, validate_crcs=True).records:
+                if not started:  # a header comes first, unless it was damaged
+                    header = one if isinstance(one, records.Header) else records.Header("", "")
+                    writer.start(header.profile, header.library)
+                    started = True
                 match one:
-                    case records.Header():
-                        writer.start(one.profile, one.library)
-                        started = True
                     case records.Schema() if one.id not in schemas:
                         schemas[one.id] = writer.register_schema(one.name, one.encoding, one.data)
                     case records.Channel() if one.id not in channels:
@@ -367,11 +364,7 @@ def json_line(entry: Entry) -> str:
 EVENTS_SHOWN = 20
 
 
-def info(
-    path: Path,
-    *,
-    as_json: bool = False,
-) -> None:
+def info(path: Path, *, as_json: bool = False) -> None:
     """Tell what a record holds: vehicle, duration [s], topics with rates [Hz] and gaps [s], events, damage.
 
     Example: finssim record info run.mcap

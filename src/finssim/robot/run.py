@@ -231,12 +231,8 @@ def run_team(
     with interruptible() as interrupted:
         try:
             for i, agent in enumerate(agents):
-                ends = [
-                    "--robot",
-                    f"udp://{theirs}:{port + APART * i}",
-                    "--bind",
-                    f"{host}:{own + APART * i}",
-                ]
+                further = APART * i
+                ends = ["--robot", f"udp://{theirs}:{port + further}", "--bind", f"{host}:{own + further}"]
                 kept = [] if record is None else ["--record", str(record / f"{agent}.mcap")]
                 children[agent] = subprocess.Popen(
                     [sys.executable, "-m", "finssim", "run", "--agent", agent, *ends, *kept, *alike],
@@ -318,7 +314,7 @@ def run(
         goal (X,Y,Z,YAW|FILE): Station to keep: x,y,z [m] in the world frame (z = 0 on the water, negative below) and
             heading [deg], or a file with goal: [x, y, z, yaw_deg].
         trajectory (NAME|FILE): Trajectory to follow in place of a goal: straight, broken, ellipse, lemniscate, circle,
-            helix, or a file.
+            figure_eight, helix, or a file.
         robot (ADDRESS): Motor controller: udp://HOST:PORT, serial:DEVICE, or pool for the virtual pool on this machine;
             or autopilot: mavlink://udpin:HOST:PORT, udpout:, tcp: or serial:, with ?dvl=HOST for a Water Linked log, or
             mavlink for that of the virtual pool.
@@ -411,14 +407,7 @@ def run(
         if not arm:
             console.print("dry run: thrusters will not turn without --arm")
         runtime = Runtime(
-            ours,
-            pool,
-            pilot,
-            guide,
-            arm=arm,
-            perception=perception,
-            recorder=recorder,
-            team=team,
+            ours, pool, pilot, guide, arm=arm, perception=perception, recorder=recorder, team=team
         )
         monitor = _Monitor(runtime, duration, wiring.robot, console)
 

@@ -424,15 +424,10 @@ class Runtime:
             self.recorder.goal(now, goal.position, float(goal.yaw))
             self.recorder.command(now, force, self.pilot.name, self.vehicle.control_matrix @ force)
             self.recorder.policy(
-                now,
-                self.pilot.name,
-                period=self.pilot.period,
-                missed=self.counters.missed,
-                force=force,
-                observation=getattr(self.pilot, "observation", ()),
-                action=getattr(self.pilot, "action", ()),
+                now, self.pilot.name, period=self.pilot.period, missed=self.counters.missed, force=force,
+                observation=getattr(self.pilot, "observation", ()), action=getattr(self.pilot, "action", ()),
                 vehicle_sha256=self.vehicle.sha256,
-            )
+            )  # fmt: skip
 
     def _asked(self, now: float, reading: Reading) -> Array | None:
         """What the pilot wants; None, and the vehicle stopped, where it fails."""
@@ -453,14 +448,9 @@ class Runtime:
         if self.recorder is not None:
             self.recorder.reading(now, reading)
             self.recorder.thrusters(
-                now,
-                bridge.state,
-                reason=bridge.reason,
-                source=bridge.source,
-                requested=bridge.requested,
-                force=bridge.force,
-                normalised=command.normalised,
-            )
+                now, bridge.state, reason=bridge.reason, source=bridge.source, requested=bridge.requested,
+                force=bridge.force, normalised=command.normalised,
+            )  # fmt: skip
         self._record_events()
 
     def _record_events(self) -> None:

@@ -88,14 +88,7 @@ class Team:
         refused: Datagrams that were none.
     """
 
-    def __init__(
-        self,
-        name: str,
-        others: tuple[str, ...],
-        *,
-        period: float = 0.1,
-        turn: float = 0.0,
-    ) -> None:
+    def __init__(self, name: str, others: tuple[str, ...], *, period: float = 0.1, turn: float = 0.0) -> None:
         """
         Args:
             name: This vehicle's place in the task.

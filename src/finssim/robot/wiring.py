@@ -51,8 +51,8 @@ def run_realtime(
     mates: Transport | None = None,
     rate: float = 60.0,
     duration: float = math.inf,
-    until: Callable[[Runtime], bool] | None = None,
-    show: Callable[[Runtime], None] | None = None,
+    until: Callable[[Runtime], bool] = lambda runtime: False,
+    show: Callable[[Runtime], None] = lambda runtime: None,
     clock: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
 ) -> float:
@@ -91,9 +91,8 @@ def run_realtime(
                 for data in runtime.told if mates is not None else ():
                     mates.send(data)
                 runtime.sent(clock())
-                if show is not None:
-                    show(runtime)
-                if until is not None and until(runtime):
+                show(runtime)
+                if until(runtime):
                     break
                 turn += 1
                 slack = start + turn * period - clock()

@@ -5,12 +5,11 @@ from finssim.tasks.environment import Environment, EnvironmentSetupError, Step
 from finssim.tasks.make import SEEING, TASKS, make, task_named
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.moving_target import MovingTarget
-from finssim.tasks.reference import follow
 from finssim.tasks.sensing import Sensing
 from finssim.tasks.station_keeping import StationKeeping
 from finssim.tasks.task import Task
 from finssim.tasks.terms import ObservationPart
-from finssim.tasks.trajectory_tracking import TrajectoryTracking
+from finssim.tasks.trajectory_tracking import TrajectoryTracking, follow
 
 __all__ = [
     "SEEING",

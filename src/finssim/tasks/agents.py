@@ -27,20 +27,19 @@ from finssim.geometry.rotations import (
     quat_multiply,
     quat_rotate,
 )
-from finssim.tasks.camera_docking import DEPTH_SCALE, CameraDocking
 from finssim.tasks.docking import DISTANCE_SCALE as DOCK_SCALE
-from finssim.tasks.docking import Docking
-from finssim.tasks.environment import Environment
+from finssim.tasks.docking import CameraDocking, Docking
+from finssim.tasks.environment import Environment, Step
 from finssim.tasks.fitting import coefficients_of
 from finssim.tasks.formation import NEAR, Formation
 from finssim.tasks.gate import HALF, Gate
-from finssim.tasks.given import Step
 from finssim.tasks.moving_target import DISTANCE_SCALE as TARGET_DISTANCE_SCALE
 from finssim.tasks.moving_target import TARGET_SCALE
 from finssim.tasks.net import RANGE_SCALE, Net
 from finssim.tasks.pipeline import Pipeline
 from finssim.tasks.pursuit import DISTANCE_SCALE as CHASE_SCALE
 from finssim.tasks.pursuit import PI, DriveNumbers
+from finssim.tasks.seeing import DEPTH_SCALE
 from finssim.tasks.station_keeping import DISTANCE_SCALE as STATION_SCALE
 from finssim.tasks.task import Task
 from finssim.tasks.trajectory_tracking import DISTANCE_SCALE as TRACKING_SCALE
@@ -49,6 +48,11 @@ from finssim.vehicles import Vehicle, load_vehicle
 from finssim.worlds.description import device_of
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.float32]
+"""Observations or actions, (n, numbers)."""
+Mask = NDArray[np.bool_]
+Pictures = Mapping[str, NDArray[np.uint8]]
+"""What is seen, by name, uint8 (n, height, width, channels)."""
 
 
 # Classical controllers by task: each sees what a policy sees and acts as a policy does.
@@ -70,7 +74,7 @@ class Baseline(Protocol):
     def reset(self, n: int) -> Any:
         """Memory at the start of n episodes: arrays with n rows, in tuples; or None."""
 
-    def act(self, memory: Any, observation: NDArray[Any]) -> tuple[NDArray[np.float32], Any]:
+    def act(self, memory: Any, observation: NDArray[Any]) -> tuple[Rows, Any]:
         """Actions (n, size) for observations (n, numbers), in the task's own action mode, and the memory after."""
 
 
@@ -94,13 +98,13 @@ class WrenchPid:
         """Empty integrals."""
         return self.pid.reset(n)
 
-    def command(self, memory: PidMemory, seen: Measured, goal: Goal) -> tuple[NDArray[np.float32], PidMemory]:
+    def command(self, memory: PidMemory, seen: Measured, goal: Goal) -> tuple[Rows, PidMemory]:
         """Actions (n, 6), as parts of each axis' limit within ±1, and the memory after."""
         tau, memory = self.pid.command(memory, seen, goal)
         return part_of_limits(tau, np.asarray(self.pid.wrench_limits)), memory
 
 
-def part_of_limits(tau: Array, limits: Array) -> NDArray[np.float32]:
+def part_of_limits(tau: Array, limits: Array) -> Rows:
     """A wrench as a part of each axis' limit, 0 where there is none, (..., 6).
 
     Args:
@@ -113,16 +117,14 @@ def part_of_limits(tau: Array, limits: Array) -> NDArray[np.float32]:
 class StationPid(WrenchPid):
     """PID of T1. The goal is level, so its own axes have z up: the vehicle's pose in them is all that matters."""
 
-    def act(
-        self, memory: PidMemory, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], PidMemory]:
+    def act(self, memory: PidMemory, observation: Rows) -> tuple[Rows, PidMemory]:
         """Actions for observations of T1."""
         seen = seen_from_goal(observation)
         here = Goal(np.zeros_like(seen.position), np.broadcast_to(LEVEL, seen.quaternion.shape))
         return self.command(memory, seen, here)
 
 
-def seen_from_goal(observation: NDArray[np.float32]) -> Track:
+def seen_from_goal(observation: Rows) -> Track:
     """The vehicle in the axes of its goal, from the first 15 numbers of T1's observation."""
     o = np.asarray(observation, float)
     q = turned_from(o)
@@ -154,9 +156,7 @@ class TrackingPid(WrenchPid):
         """Heading zero, empty integrals."""
         return TrackingMemory(np.zeros(n), self.pid.reset(n))
 
-    def act(
-        self, memory: TrackingMemory, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], TrackingMemory]:
+    def act(self, memory: TrackingMemory, observation: Rows) -> tuple[Rows, TrackingMemory]:
         """Actions for observations of T2."""
         o = np.asarray(observation, float)
         up, nu = o[..., 21:24], o[..., 15:21]
@@ -178,9 +178,7 @@ class TargetPid(TrackingPid):
     The heading is the one at the start, as the yaw rate tells; roll and pitch are left to the water and their rates.
     """
 
-    def act(
-        self, memory: TrackingMemory, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], TrackingMemory]:
+    def act(self, memory: TrackingMemory, observation: Rows) -> tuple[Rows, TrackingMemory]:
         """Actions for observations of T3."""
         o = np.asarray(observation, float)
         q, nu = quat_from_yaw(memory.heading), o[..., 6:12]
@@ -251,7 +249,7 @@ class DriveBaseline:
         """It remembers nothing."""
         return None
 
-    def act(self, memory: None, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], None]:
+    def act(self, memory: None, observation: Rows) -> tuple[Rows, None]:
         """Actions for observations, (n, numbers)."""
         o = np.asarray(observation, dtype=float)
         wanted, turn = self.wanted(o)
@@ -423,9 +421,24 @@ class DockingPid(WrenchPid):
     """How far the vehicle may be turned away [rad]."""
 
     @classmethod
-    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> DockingPid:
-        """For a vehicle and its dock, and the time between two actions [s]."""
-        task = Docking().fitted([vehicle])
+    def for_vehicle(
+        cls,
+        vehicle: Vehicle,
+        period: float = PERIOD,
+        task: Docking | None = None,
+        lead: float = 0.25,
+        **more: Any,
+    ) -> Any:
+        """For a vehicle and its dock.
+
+        Args:
+            vehicle: Its file.
+            period: Time between two actions [s].
+            task: Whose dock it is; None: that of `Docking`.
+            lead: How far the goal runs ahead of the nose, in lengths of the vehicle.
+            more: Further fields.
+        """
+        task = (task or Docking()).fitted([vehicle])
         dock, hull = task.dock(), task.hull
         return cls(
             WrenchPid.for_vehicle(vehicle, period).pid,
@@ -434,19 +447,16 @@ class DockingPid(WrenchPid):
             wait=-dock.cone_length - 0.5 * hull.length,
             gap=dock.throat_radius - hull.girth,
             slope=0.5 * np.tan(task.cone),
-            lead=0.25 * hull.length,
+            lead=lead * hull.length,
+            **more,
         )
 
-    def act(
-        self, memory: PidMemory, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], PidMemory]:
+    def act(self, memory: PidMemory, observation: Rows) -> tuple[Rows, PidMemory]:
         """Actions for observations of docking."""
         o = np.asarray(observation, float)
         return self.steer(memory, DOCK_SCALE * o[..., 15:18], turned_from(o), o[..., 9:15])
 
-    def steer(
-        self, memory: PidMemory, nose: Array, q: Array, nu: Array
-    ) -> tuple[NDArray[np.float32], PidMemory]:
+    def steer(self, memory: PidMemory, nose: Array, q: Array, nu: Array) -> tuple[Rows, PidMemory]:
         """Actions for where the nose is.
 
         Args:
@@ -473,6 +483,12 @@ class DockingPid(WrenchPid):
 
 
 # Docking by camera the classical way: find the guide lights by their colours, measure the dock by them, and go in.
+
+
+def camera_of(vehicle: Vehicle, task: Task) -> dict[str, Any]:
+    """Of the camera that a task sees with: focal length as a share of its width, and place, body axes [m]."""
+    device = device_of(vehicle, task.pictures[0].name)
+    return {"focal_share": device.focal_length / device.width, "eye": tuple(device.mount.position.tolist())}
 
 
 class SightMemory(NamedTuple):
@@ -511,31 +527,17 @@ class LightServo(DockingPid):
     """How far ahead the dock is taken to be until it has been found [m]."""
 
     @classmethod
-    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> LightServo:
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD, **more: Any) -> Any:
         """For a vehicle with a `front_camera`, the dock of the site `dock`, and the time between two actions [s]."""
-        task = CameraDocking().fitted([vehicle])
-        dock, hull = task.dock(), task.hull
-        device = device_of(vehicle, task.pictures[0].name)
-        return cls(
-            WrenchPid.for_vehicle(vehicle, period).pid,
-            nose=0.5 * hull.length,
-            berth=task.berth * dock.tube_length,
-            wait=-dock.cone_length - 0.5 * hull.length,
-            gap=dock.throat_radius - hull.girth,
-            slope=0.5 * np.tan(task.cone),
-            lead=0.4 * hull.length,
-            focal_share=device.focal_length / device.width,
-            eye=tuple(device.mount.position.tolist()),
-        )
+        task = CameraDocking()
+        return super().for_vehicle(vehicle, period, task, lead=0.4, **camera_of(vehicle, task))
 
     def reset(self, n: int) -> SightMemory:
         """A dock straight ahead, unseen."""
         dock = np.tile([self.first, 0.0, 0.0, 0.0], (n, 1))
         return SightMemory(np.zeros((n, 3)), np.zeros(n), dock, np.zeros(n), self.pid.reset(n))
 
-    def act(  # type: ignore[override]
-        self, memory: SightMemory, observation: NDArray[np.float32], pictures: Mapping[str, NDArray[np.uint8]]
-    ) -> tuple[NDArray[np.float32], SightMemory]:
+    def act(self, memory: SightMemory, observation: Rows, pictures: Pictures) -> tuple[Rows, SightMemory]:  # type: ignore[override]
         """Actions for observations and pictures of docking by camera."""
         o = np.asarray(observation, float)
         up, nu, depth = o[:, :3], o[:, 3:9], DEPTH_SCALE * o[:, 9]
@@ -558,7 +560,7 @@ class LightServo(DockingPid):
         turned = memory.heading + self.period * heading_rate(up, nu)
         return action, SightMemory(moved, turned, dock, looks, pid)
 
-    def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, Mask]:
         """The square of lights in pictures.
 
         Args:
@@ -584,9 +586,7 @@ class LightServo(DockingPid):
                 visible &= own.any((1, 2))
         return self.locate(np.array(corners), visible, red.shape[1:])
 
-    def locate(
-        self, corners: Array, visible: NDArray[np.bool_], shape: Sequence[int]
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def locate(self, corners: Array, visible: Mask, shape: Sequence[int]) -> tuple[Array, Array, Mask]:
         """The upright square in space.
 
         Args:
@@ -625,10 +625,9 @@ class PostServo(LightServo):
     """Levels of its colour that a post has in its column, all rows together."""
 
     @classmethod
-    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> PostServo:
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD, **more: Any) -> PostServo:
         """For a vehicle with a `front_camera`, the gate of the site `gate`, and the time between two actions [s]."""
         task = Gate().fitted([vehicle])
-        device = device_of(vehicle, task.pictures[0].name)
         length = task.hull.length
         return cls(
             WrenchPid.for_vehicle(vehicle, period).pid,
@@ -638,11 +637,10 @@ class PostServo(LightServo):
             gap=0.4 * float(HALF),
             slope=0.5,
             lead=0.6 * length,
-            focal_share=device.focal_length / device.width,
-            eye=tuple(device.mount.position.tolist()),
+            **camera_of(vehicle, task),
         )
 
-    def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, Mask]:
         """The square between the posts; see `LightServo`."""
         red, green, blue = np.moveaxis(picture.astype(float), -1, 0)
         n, height, width = red.shape
@@ -697,19 +695,16 @@ class LineFollower(DriveBaseline):
     def for_vehicle(cls, vehicle: Vehicle) -> LineFollower:
         """For a vehicle with a `front_camera`, and the site `pipeline`."""
         task = Pipeline().fitted([vehicle])
-        device = device_of(vehicle, task.pictures[0].name)
         return cls(
             drive=DriveNumbers.of(vehicle), cruise=task.cruise, charted=-task.bottom, height=task.height,
-            focal_share=device.focal_length / device.width, eye=tuple(device.mount.position.tolist()),
+            **camera_of(vehicle, task),
         )  # fmt: skip
 
     def reset(self, n: int) -> Array:  # type: ignore[override]
         """The line straight below and ahead, (n, 2)."""
         return np.zeros((n, 2))
 
-    def act(  # type: ignore[override]
-        self, memory: Array, observation: NDArray[np.float32], pictures: Mapping[str, NDArray[np.uint8]]
-    ) -> tuple[NDArray[np.float32], Array]:
+    def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
         """Actions for observations and pictures of following a pipeline."""
         o = np.asarray(observation, float)
         depth = DEPTH_SCALE * o[:, 9]
@@ -727,7 +722,7 @@ class LineFollower(DriveBaseline):
         )
         return self.drive.action(o[:, [3, 4, 5, 8]], wanted), line
 
-    def line(self, picture: NDArray[np.uint8], up: Array, above: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def line(self, picture: NDArray[np.uint8], up: Array, above: Array) -> tuple[Array, Mask]:
         """The pipe in pictures.
 
         Args:
@@ -811,9 +806,7 @@ class WallFollower(DriveBaseline):
         """The net square ahead at its distance, (n, 2)."""
         return np.tile([self.distance, 0.0], (n, 1))
 
-    def act(  # type: ignore[override]
-        self, memory: Array, observation: NDArray[np.float32], pictures: Mapping[str, NDArray[np.uint8]]
-    ) -> tuple[NDArray[np.float32], Array]:
+    def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
         """Actions for observations and pictures of inspecting a net."""
         o = np.asarray(observation, float)
         line, enough = self.line(next(iter(pictures.values())))
@@ -834,7 +827,7 @@ class WallFollower(DriveBaseline):
         )
         return self.drive.action(o[:, [3, 4, 5, 8]], wanted), line
 
-    def line(self, picture: NDArray[np.uint8]) -> tuple[Array, NDArray[np.bool_]]:
+    def line(self, picture: NDArray[np.uint8]) -> tuple[Array, Mask]:
         """The net in pings.
 
         Args:
@@ -964,7 +957,7 @@ class AgentError(ValueError):
 def known_in(environment: Environment) -> Known:
     """What an environment measured: the observation of every agent of every world, the state of the first vehicle."""
     arrays = environment.arrays
-    observed: NDArray[np.float32] = arrays.observation.numpy()
+    observed: Rows = arrays.observation.numpy()
     state = (arrays.position, arrays.quaternion, arrays.velocity)
     sight = environment.sight
     return Known(
@@ -988,7 +981,7 @@ class Agent(Protocol):
     def reset(self, n: int) -> Any:
         """Memory before the first of n episodes' actions: arrays with n rows, in tuples; or None."""
 
-    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
+    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[Rows, Any]:
         """Actions (n, size) and the memory after."""
 
     def describe(self) -> dict[str, Any]:
@@ -999,12 +992,7 @@ class PolicyAgent:
     """A policy directory, run with onnxruntime."""
 
     def __init__(
-        self,
-        directory: str | Path,
-        vehicle: Vehicle,
-        task: Task,
-        *,
-        period: float | None = None,
+        self, directory: str | Path, vehicle: Vehicle, task: Task, *, period: float | None = None
     ) -> None:
         """Load a policy for the vehicle and task.
 
@@ -1031,7 +1019,7 @@ class PolicyAgent:
         """Memory of the policy, if it has one."""
         return self.policy.reset(n)
 
-    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
+    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[Rows, Any]:
         """Actions for the environment's observations, a row for each agent of each world."""
         return self.policy.step(memory, known.observation, known.pictures)
 
@@ -1067,7 +1055,7 @@ class PidAgent:
         """Memory before the first of n episodes' actions: empty integrals."""
         return self.controller.reset(n)
 
-    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
+    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[Rows, Any]:
         """Wrench of each world, as a part of the limits; more than a limit is limited axis by axis."""
         tau, memory = self.controller.command(memory, known, goal)
         return part_of_limits(tau, self._limits), memory
@@ -1088,7 +1076,7 @@ class BaselineAgent(PidAgent):
         self.controller = baseline(task.name, name, vehicle)
         self.period = self.controller.period
 
-    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
+    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[Rows, Any]:
         """Actions, a row for each agent of each world."""
         seen = () if known.pictures is None else (known.pictures,)
         action, memory = self.controller.act(memory, known.observation, *seen)

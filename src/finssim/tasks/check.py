@@ -98,14 +98,8 @@ def _play(environment: Environment, actions: NDArray[np.float32]) -> Played:
     worlds = environment.worlds
     for action in actions:
         step = environment.step(action)
-        rows.append(
-            (
-                step.observation.reshape(worlds, -1).copy(),
-                step.reward.reshape(worlds, -1).copy(),
-                step.terminated.copy(),
-                step.truncated.copy(),
-            )
-        )
+        numbers = (x.reshape(worlds, -1).copy() for x in (step.observation, step.reward))
+        rows.append((*numbers, step.terminated.copy(), step.truncated.copy()))
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     return Played(*columns, environment.task.metrics(environment.arrays))
 
@@ -141,18 +135,20 @@ def _ends(played: Played) -> Iterator[str]:
 
 def _repeats(first: Played, again: Played, many: Played) -> Iterator[str]:
     """Equal seeds, equal numbers, for any number of worlds."""
-    pairs = [(a, b) for a, b in zip(first[:4], again[:4], strict=True)]
-    if not all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in pairs):
+    if not _equal(first, again):
         yield "equal seeds give other numbers: draw from wp.rand_init(key, world) or w.uniform alone"
         return
-    if not all(
-        np.array_equal(a, b[:, :WORLDS], equal_nan=a.dtype.kind == "f")
-        for a, b in zip(first[:4], many[:4], strict=True)
-    ):
+    if not _equal(first, many):
         yield (
             "a world's numbers depend on how many worlds there are: index by the world's number, with world_offset; in "
             "torch, do not mix rows, and take arctangent of torch_rotations for atan2"
         )
+
+
+def _equal(first: Played, other: Played) -> bool:
+    """Whether the first worlds of another play gave the same numbers."""
+    pairs = zip(first[:4], other[:4], strict=True)
+    return all(np.array_equal(a, b[:, :WORLDS], equal_nan=a.dtype.kind == "f") for a, b in pairs)
 
 
 def _leaks(first: Played, past: Played) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Docking: enter a funnel nose first, gently, and stay in its tube."""
+"""Docking: enter a funnel nose first, gently, and stay in its tube; where it is, is told, or found in a picture."""
 
 import math
 from collections.abc import Sequence
@@ -13,18 +13,11 @@ from finssim.engine.state import State
 from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.fitting import coefficients_of
-from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.measurement import TRAINING, MeasurementNoise
+from finssim.tasks.seeing import SeeingTask
 from finssim.tasks.task import Task
-from finssim.tasks.terms import (
-    End,
-    ObservationPart,
-    RewardTerm,
-    Terms,
-    Total,
-    own_velocity,
-    tilted,
-    uniform3,
-)
+from finssim.tasks.terms import End, ObservationPart, RewardTerm, Terms, Total, own_velocity, tilted, uniform3
 from finssim.vehicles import Vehicle
 from finssim.vehicles.capability import terminal_speeds
 
@@ -238,9 +231,7 @@ class Docking(Task):
     """A contact force ends the episode above that of a hit at this part of the speed the dock is built for, and of a
     press with all the vehicle's thrust on top."""
     reward: DockingReward = field(default_factory=DockingReward)
-    training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
-    )
+    training_noise: MeasurementNoise = TRAINING
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Docking":
         """With a dock that fits the vehicle."""
@@ -303,6 +294,15 @@ class Docking(Task):
                 "docked": is_docked,
             },
             seen={"nose": seen_nose, "offset": berth_offset},
+            meanings={
+                "position": f"1 with the nose in its berth, 1/e at {r.position_scale:.3g} vehicle lengths from it.",
+                "distance": "From the nose to its berth, in vehicle lengths.",
+                "heading": f"1 in the dock's attitude, 1/e at {r.heading_scale:.3g} rad from it.",
+                "contact": "Greatest contact force in the step as a part of the one that ends the episode, at most 1.",
+                "crash": f"A contact force above {self.force_limit:.3g} N.",
+                "contact_impulse": "Contact force, integrated over the episode [N s].",
+                "peak_force": "Greatest contact force so far [N].",
+            },
             rewards=(
                 RewardTerm("position", "wp.exp(-e / p.reward.position_scale)", r.position),
                 RewardTerm("distance", "e", -r.distance),
@@ -321,3 +321,72 @@ class Docking(Task):
                 Total("peak_force", "wp.max(was, force)"),
             ),
         )
+
+
+# The same by camera: find a dock in the picture.
+
+
+MOUTH, THROAT, CONE, TUBE = 0.745, 0.32, 0.75, 0.93
+"""Inner radii of the funnel of the site `dock`, its length, and that of its tube up to the plate [m]."""
+
+
+@wp.func
+def start_at_site(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """The dock where the world has it, or where `Docking` draws it, and a vehicle at rest before its mouth."""
+    x = arrays.goal_position[w]
+    q = arrays.goal_quaternion[w]
+    start(state, arrays, p, key, w)
+    if p.placed:
+        back = wp.quat_inverse(arrays.goal_quaternion[w])
+        state.position[w, 0] = x + wp.quat_rotate(q * back, state.position[w, 0] - arrays.goal_position[w])
+        state.quaternion[w, 0] = q * back * state.quaternion[w, 0]
+        arrays.goal_position[w] = x
+        arrays.goal_quaternion[w] = q
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraDocking(SeeingTask, Docking):
+    """Docking into the dock of the site `dock`, which stands, looks and is lit otherwise in each episode.
+
+    The row of numbers holds attitude, velocity and depth alone: where the dock is, the picture shows. What `docking`
+    observes is `teacher`, for who may know it in training.
+    """
+
+    title: ClassVar[str] = "dock by camera"
+    landmark: ClassVar[str] = "dock"
+    teacher: ClassVar[tuple[ObservationPart, ...]] = OBSERVATION
+    name: str = "camera-docking"
+    world: str = "dock"
+    time_limit: float = 30.0
+    cone: float = math.atan((MOUTH - THROAT) / CONE)
+    berth: float = 0.55
+    inside: float = 0.3
+    start: tuple[float, float] = (2.0, 4.5)
+    start_aside: tuple[float, float] = (1.2, 0.6)
+    turn: float = math.radians(15.0)
+    tank: tuple[float, float] = (10.0, 6.0)
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "CameraDocking":
+        """For the vehicle, if it fits into the dock."""
+        fitted = replace(self, hull=Hull.of(vehicles[0]))
+        if fitted.hull.girth > 0.95 * THROAT:
+            raise EnvironmentSetupError(
+                f"vehicle '{vehicles[0].name}' is {2.0 * fitted.hull.girth:.2f} m across its corners, and the dock of "
+                f"site 'dock' takes {2.0 * 0.95 * THROAT:.2f} m: take a slimmer one, such as finsrov"
+            )
+        return fitted
+
+    def dock(self) -> Dock:
+        """The funnel that the picture shows, with stiffness and damping as of `Docking`."""
+        return replace(
+            super().dock(),
+            mouth_radius=MOUTH, throat_radius=THROAT, cone_length=CONE, tube_length=TUBE, rim=0.06,
+        )  # fmt: skip
+
+    def arena(self) -> Pool:
+        """Up to the quay and the bottom; without the world, where the dock looks any way, as wide as long."""
+        return replace(Docking.arena(self), length=24.0, width=7.8 if self.placed else 24.0, depth=4.95)
+
+    def terms(self) -> Terms:
+        """Those of `Docking`."""
+        return replace(super().terms(), start=start_at_site)

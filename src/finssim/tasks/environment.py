@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,7 @@ from finssim.engine.randomize import Draws, Randomization
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.given import (
-    GREATEST_SEED,
-    EnvironmentSetupError,
-    Step,
-    checked_action,
-    checked_seed,
-    crew,
-    refuse_other_thrusters,
-)
+from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
 from finssim.tasks.schedule import Schedule
 from finssim.tasks.sensing import Sensing, SensingBatch
@@ -32,11 +25,28 @@ from finssim.tasks.sight import Sight
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["GREATEST_SEED", "Environment", "EnvironmentSetupError", "Step"]
-
-
+GREATEST_SEED = 2**31 - 1
+"""Kernels take seeds as 32-bit integers."""
 GPU_FROZEN_CHECK = 100
 """Steps between looks for frozen worlds on a GPU."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one step gave; NumPy views of the environment's own arrays, valid until the next step."""
+
+    observation: Any
+    """(worlds, size), or (worlds, agents, size) of several agents; the first of the new episode where one ended. Of a
+    task that sees a dictionary: `state`, which is that, and by each picture's name uint8 (worlds, height, width, 3),
+    or of a sonar (worlds, beams, range cells, 1)."""
+    reward: NDArray[np.float32]
+    """(worlds,), or (worlds, agents)."""
+    terminated: NDArray[np.bool_]
+    """Ended by the task, (worlds,)."""
+    truncated: NDArray[np.bool_]
+    """Ended by the time limit, (worlds,)."""
+    final_observation: Any
+    """Last observation of the episodes that ended in this step; older rows elsewhere."""
 
 
 @wp.kernel(enable_backward=False)
@@ -458,6 +468,51 @@ class Environment:
         structs = {"state": simulator.state, "water": simulator.water, "task": self.arrays}
         for name, struct in {**structs, **(self.sensing.structs() if self.sensing else {})}.items():
             yield from _members(name, struct)
+
+
+def refuse_other_thrusters(vehicles: Sequence[Vehicle], nominal: Sequence[Vehicle]) -> None:
+    """Refuse vehicles whose thrusters are not those that their controllers command.
+
+    Raises:
+        EnvironmentSetupError: They differ in number, name or order.
+    """
+    for one, known in zip(vehicles, nominal, strict=True):
+        if one.thruster_names != known.thruster_names:
+            raise EnvironmentSetupError(
+                f"{one.name} has thrusters {', '.join(one.thruster_names)}, "
+                f"expected those that its controller commands: {', '.join(known.thruster_names)}"
+            )
+
+
+def checked_seed(seed: int) -> int:
+    """The seed, if the kernels can take it.
+
+    Raises:
+        EnvironmentSetupError: They cannot.
+    """
+    if not 0 <= seed <= GREATEST_SEED:
+        raise EnvironmentSetupError(f"seed is {seed}, expected 0 to {GREATEST_SEED}")
+    return int(seed)
+
+
+def checked_action(action: ArrayLike, worlds: int, agents: int, size: int) -> NDArray[np.float32]:
+    """Actions as rows of worlds, (worlds, agents * size).
+
+    Raises:
+        EnvironmentSetupError: The shape is wrong or a number is not finite.
+    """
+    a = np.asarray(action, dtype=np.float32)
+    expected = (worlds, size) if agents == 1 else (worlds, agents, size)
+    if a.shape != expected:
+        who = "world" if agents == 1 else "agent"
+        raise EnvironmentSetupError(f"action has shape {a.shape}, expected {expected}: one row per {who}")
+    a = a.reshape(worlds, -1)
+    if not np.isfinite(a).all():
+        world = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])
+        raise EnvironmentSetupError(
+            f"action of world {world} has a number that is not finite: {a[world].tolist()}"
+        )
+    return a
 
 
 def _members(prefix: str, struct: Any) -> Iterator[tuple[str, wp.array]]:

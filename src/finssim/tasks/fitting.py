@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finssim.control.pid import axis_model
 from finssim.engine import Pool
-from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.measurement import TRAINING, MeasurementNoise
 from finssim.tasks.task import Task
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.capability import terminal_speeds
@@ -100,10 +100,7 @@ class FittedTask(Task):
     """Largest roll and pitch at the start."""
     ceiling: float = 0.3
     """Rising above this height ends the episode."""
-    training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
-    )
-    """About what an estimate is off by: with exact states, gains are learnt that chatter on measured ones."""
+    training_noise: MeasurementNoise = TRAINING
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> FittedTask:
         """As large and fast as suits the vehicle."""

@@ -360,6 +360,17 @@ class Formation(Team):
                 "holding": holds,
             },
             seen={"left": next_place, "right": last_place, "net": seen_net},
+            meanings={
+                "net": "How much nearer the net came to the target in the step [m].",
+                "goal": "How much nearer the target came to the goal in the step [m].",
+                "step": "1 in every step: sooner is better.",
+                "delivered": f"Success: {self.success_rule()}.",
+                "torn": f"An edge longer than {self.stretch:g} sides for more than {self.grace:g} s.",
+                "held_time": "For how long the net held the target [s].",
+                "to_net": "From the target to the net [m].",
+                "to_goal": "From the target to the goal [m].",
+                "stretched": "For how long an edge has been too long [s].",
+            },
             rewards=(
                 RewardTerm("net", "to_net - net[0]", r.net),
                 RewardTerm("goal", "to_goal - away", r.goal),

@@ -7,17 +7,20 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from finssim.engine import Pool
 from finssim.engine.state import State
 from finssim.physics.solids import box_distance
-from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.camera_docking import OWN
 from finssim.tasks.docking import Hull
-from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.sight import Picture
-from finssim.tasks.task import Task
-from finssim.tasks.terms import End, ObservationPart, RewardTerm, Terms, own_velocity, tilted, world_velocity
+from finssim.tasks.seeing import SeeingTask
+from finssim.tasks.terms import (
+    End,
+    ObservationPart,
+    RewardTerm,
+    Terms,
+    own_velocity,
+    place_tilted,
+    world_velocity,
+)
 from finssim.vehicles import Vehicle
 
 HALF, BAR = wp.constant(0.75), wp.constant(0.045)
@@ -101,11 +104,8 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     q = arrays.goal_quaternion[w]
     way = wp.randf(rng, p.begin[0], p.begin[1])
     off = wp.vec3(-way, way * wp.randf(rng, -p.aside, p.aside), wp.randf(rng, -p.over, p.over))
-    state.position[w, 0] = arrays.goal_position[w] + wp.quat_rotate(q, off)
-    roll = wp.randf(rng, -p.tilt, p.tilt)
-    pitch = wp.randf(rng, -p.tilt, p.tilt)
-    state.quaternion[w, 0] = q * tilted(roll, pitch, wp.randf(rng, -p.turn, p.turn))
-    state.velocity[w, 0] = vec6()
+    x = arrays.goal_position[w] + wp.quat_rotate(q, off)
+    place_tilted(state, w, x, q, rng, p.tilt, p.turn)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +130,7 @@ class GateReward:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gate(Task):
+class Gate(SeeingTask):
     """Pass the nearer gate of the site `gate`, which stands, looks and is lit otherwise in each episode.
 
     A bar is touched where the vehicle's envelope meets it; that ends the episode, so no force is needed.
@@ -138,7 +138,6 @@ class Gate(Task):
 
     succeeds: ClassVar[str] = "passed"
     title: ClassVar[str] = "pass a gate by camera"
-    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     landmark: ClassVar[str] = "near"
     teacher: ClassVar[tuple[ObservationPart, ...]] = (
         ObservationPart("way to the gate's middle, body frame", 3, "m", scale=3.0, term="goal_offset"),
@@ -146,11 +145,7 @@ class Gate(Task):
         *own_velocity(clip=2.0),
     )
     name: str = "gate"
-    observation: tuple[ObservationPart, ...] = OWN
     world: str = "gate"
-    pictures: tuple[Picture, ...] = (Picture("front_camera", 48),)
-    held_out: bool = False
-    """Draw the looks of the site that are held out of training."""
     time_limit: float = 25.0
     hull: Hull = Hull()
     """Of the vehicle; the environment sets it, ..."""
@@ -166,12 +161,7 @@ class Gate(Task):
     """... above or below it [m] at most, ..."""
     turn: float = math.radians(15.0)
     """... turned from it by this at most [rad]."""
-    tilt: float = math.radians(4.0)
-    """Largest roll and pitch at the start [rad]."""
     reward: GateReward = field(default_factory=GateReward)
-    training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
-    )
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Gate":
         """With the envelope of the vehicle."""
@@ -188,15 +178,6 @@ class Gate(Task):
         """The gate is passed with the body origin so far behind it [m]."""
         return 0.5 * self.hull.length
 
-    @property
-    def placed(self) -> bool:
-        """Whether a world says where the gate is."""
-        return bool(self.world)
-
-    def arena(self) -> Pool | None:
-        """Open water: an episode ends before floor and walls."""
-        return None
-
     def success_rule(self) -> str:
         """See `Task`."""
         return f"through the gate from the front within {self.time_limit:g} s, touching no bar"
@@ -208,6 +189,12 @@ class Gate(Task):
         return Terms(
             start=start,
             shared={"place": in_gate, "room": clearance, "theta": "attitude_error"},
+            meanings={
+                "near": f"1 where a bar is touched, falling to 0 at {r.near_scale:g} m from the nearest one.",
+                "touched": "The vehicle's envelope meets a bar.",
+                "missed": "The body origin went past the gate, outside of it.",
+                "passed": f"Through the gate: the body origin is {self.behind:.3g} m behind it.",
+            },
             rewards=(
                 RewardTerm("progress", approach, r.progress),
                 RewardTerm("corridor", off_axis, -r.corridor),

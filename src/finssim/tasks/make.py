@@ -12,8 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from finssim.engine.randomize import Randomization
-from finssim.tasks.camera_docking import CameraDocking
-from finssim.tasks.docking import Docking
+from finssim.tasks.docking import CameraDocking, Docking
 from finssim.tasks.environment import Environment, EnvironmentSetupError
 from finssim.tasks.formation import Formation
 from finssim.tasks.gate import Gate
@@ -21,11 +20,10 @@ from finssim.tasks.measurement import ESTIMATOR, MeasurementNoise
 from finssim.tasks.moving_target import MovingTarget
 from finssim.tasks.net import Net
 from finssim.tasks.pipeline import Pipeline
-from finssim.tasks.pursuit import Pursuit
+from finssim.tasks.pursuit import Pursuit, TeamPursuit
 from finssim.tasks.sensing import Sensing, load_sensing
 from finssim.tasks.station_keeping import StationKeeping
 from finssim.tasks.task import Task
-from finssim.tasks.team_pursuit import TeamPursuit
 from finssim.tasks.trajectory_tracking import TrajectoryTracking
 from finssim.vehicles import Vehicle
 

@@ -60,6 +60,8 @@ class MeasurementNoise:
         return any(getattr(self, field.name) for field in fields(self))
 
 
+TRAINING = MeasurementNoise(position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02)
+"""About what an estimate is off by: with exact states, gains are learnt that chatter on measured ones."""
 ESTIMATOR = MeasurementNoise(
     position_std=0.003,
     yaw_std=math.radians(0.15),

@@ -208,6 +208,11 @@ class MovingTarget(PoolTask):
                 "turn": "wp.length(angular_velocity)",
             },
             seen={"offset": "goal_offset"},
+            meanings={
+                "near": f"1 at the target, 1/e at {self.fit.size * r.near_scale:.3g} m from it.",
+                "match": f"`near`, times 1/e per {self.fit.pace * r.match_scale:.3g} m/s off the target's velocity.",
+                "spin": "Size of the angular velocity, at most 2 [rad/s].",
+            },
             rewards=(
                 RewardTerm("near", "close", r.near),
                 RewardTerm("match", "close * wp.exp(-u / (p.fit.pace * p.reward.match_scale))", r.match),

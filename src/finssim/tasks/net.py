@@ -9,14 +9,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.engine import Pool
 from finssim.engine.state import State
-from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.camera_docking import up
-from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.seeing import SeeingTask, up
 from finssim.tasks.sight import Picture
-from finssim.tasks.task import Task
 from finssim.tasks.terms import (
     End,
     ObservationPart,
@@ -24,7 +20,7 @@ from finssim.tasks.terms import (
     Terms,
     Total,
     own_velocity,
-    tilted,
+    place_tilted,
     world_velocity,
 )
 from finssim.vehicles import Vehicle
@@ -81,11 +77,8 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     q = arrays.goal_quaternion[w]
     along = wp.randf(rng, p.begin[0], p.begin[1])
     off = wp.vec3(wp.randf(rng, -p.off, p.off) - p.distance, along, p.level + wp.randf(rng, -p.over, p.over))
-    state.position[w, 0] = arrays.goal_position[w] + wp.quat_rotate(q, off)
-    roll = wp.randf(rng, -p.tilt, p.tilt)
-    pitch = wp.randf(rng, -p.tilt, p.tilt)
-    state.quaternion[w, 0] = q * tilted(roll, pitch, wp.randf(rng, -p.turn, p.turn))
-    state.velocity[w, 0] = vec6()
+    x = arrays.goal_position[w] + wp.quat_rotate(q, off)
+    place_tilted(state, w, x, q, rng, p.tilt, p.turn)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +101,7 @@ class NetReward:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Net(Task):
+class Net(SeeingTask):
     """Inspect the net of the site `net`, which hangs otherwise in each episode, from right to left.
 
     The row of numbers holds attitude, velocity and the altimeter's range to what lies below, the tube at the net's
@@ -118,7 +111,6 @@ class Net(Task):
     succeeds: ClassVar[str] = "once"
     fails: ClassVar[tuple[str, ...]] = ("touched", "lost")
     title: ClassVar[str] = "inspect a net by sonar"
-    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     action: ClassVar[str] = "wrench4"
     landmark: ClassVar[str] = "cage"
     ranges: ClassVar[tuple[str, ...]] = ("altimeter",)
@@ -142,8 +134,6 @@ class Net(Task):
     )
     world: str = "net"
     pictures: tuple[Picture, ...] = (Picture("sonar", bins=48),)
-    held_out: bool = False
-    """Draw the looks of the site that are held out of training."""
     time_limit: float = 36.0
     half: tuple[float, float, float] = (0.28, 0.19, 0.15)
     """Half the extents of the vehicle's envelope [m]; the environment sets them."""
@@ -171,12 +161,7 @@ class Net(Task):
     """... above or below the line [m] at most, ..."""
     turn: float = math.radians(15.0)
     """... turned from it by this at most [rad]."""
-    tilt: float = math.radians(4.0)
-    """Largest roll and pitch at the start [rad]."""
     reward: NetReward = field(default_factory=NetReward)
-    training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
-    )
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Net":
         """With the envelope of the vehicle."""
@@ -187,15 +172,6 @@ class Net(Task):
     def level(self) -> float:
         """z of the line [m]."""
         return self.height - FOOT
-
-    @property
-    def placed(self) -> bool:
-        """Whether a world says where the net is."""
-        return bool(self.world)
-
-    def arena(self) -> Pool | None:
-        """Open water."""
-        return None
 
     def success_rule(self) -> str:
         """See `Task`."""
@@ -221,6 +197,13 @@ class Net(Task):
                 "e": "wp.length(wp.vec2(place[0] + p.distance, place[2] - p.level))",
                 "theta": "attitude_error",
             },
+            meanings={
+                "near": f"1 on the line along the net, 1/e at {r.near_scale:.3g} m from it.",
+                "distance": "From the line along the net [m].",
+                "lost": f"More than {self.lost:g} m from the line along the net.",
+                "begun": "How far along the net the episode began [m].",
+                "error": "Error of the distance from the net, integrated over the episode [m s].",
+            },
             rewards=(
                 RewardTerm("pace", pace, r.pace),
                 RewardTerm("near", "wp.exp(-e / p.reward.near_scale)", r.near),
@@ -230,10 +213,7 @@ class Net(Task):
                 RewardTerm("change", "action_change", -r.change),
                 RewardTerm("rate", "turning", -r.rate),
             ),
-            ends=(
-                End("touched", touches, -r.loss),
-                End("lost", "e > p.lost", -r.loss),
-            ),
+            ends=(End("touched", touches, -r.loss), End("lost", "e > p.lost", -r.loss)),
             inside="place[1] - begun >= p.way and error <= p.tolerance * arrays.time[w]",
             totals=(
                 Total("begun", "was", first="place[1]"),

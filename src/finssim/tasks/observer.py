@@ -22,8 +22,8 @@ from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.make import task_named
-from finssim.tasks.reference import fill_table
 from finssim.tasks.task import Batch, Task
+from finssim.tasks.trajectory_tracking import fill_table
 from finssim.vehicles import Vehicle
 
 Array = NDArray[np.float64]

@@ -9,15 +9,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.engine import Pool
 from finssim.engine.state import State
-from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.camera_docking import OWN, up
 from finssim.tasks.docking import Hull
-from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.sight import Picture
-from finssim.tasks.task import Task
+from finssim.tasks.seeing import SeeingTask, up
 from finssim.tasks.terms import (
     End,
     ObservationPart,
@@ -25,7 +20,7 @@ from finssim.tasks.terms import (
     Terms,
     Total,
     own_velocity,
-    tilted,
+    place_tilted,
     world_velocity,
 )
 from finssim.vehicles import Vehicle
@@ -115,11 +110,8 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     here = beside(arrays, w, arrays.goal_position[w] + wp.quat_rotate(q, point))
     off = wp.vec3(0.0, wp.randf(rng, -p.aside, p.aside), p.height + wp.randf(rng, -p.over, p.over))
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), here[3])
-    state.position[w, 0] = arrays.goal_position[w] + wp.quat_rotate(q, point + wp.quat_rotate(turn, off))
-    roll = wp.randf(rng, -p.tilt, p.tilt)
-    pitch = wp.randf(rng, -p.tilt, p.tilt)
-    state.quaternion[w, 0] = q * turn * tilted(roll, pitch, wp.randf(rng, -p.turn, p.turn))
-    state.velocity[w, 0] = vec6()
+    x = arrays.goal_position[w] + wp.quat_rotate(q, point + wp.quat_rotate(turn, off))
+    place_tilted(state, w, x, q * turn, rng, p.tilt, p.turn)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +134,7 @@ class PipelineReward:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pipeline(Task):
+class Pipeline(SeeingTask):
     """Follow the pipeline of the site `pipeline`, which lies, looks and is lit otherwise in each episode."""
 
     succeeds: ClassVar[str] = "once"
@@ -167,11 +159,7 @@ class Pipeline(Task):
         *own_velocity(clip=2.0),
     )
     name: str = "pipeline"
-    observation: tuple[ObservationPart, ...] = OWN
     world: str = "pipeline"
-    pictures: tuple[Picture, ...] = (Picture("front_camera", 48),)
-    held_out: bool = False
-    """Draw the looks of the site that are held out of training."""
     time_limit: float = 45.0
     hull: Hull = Hull()
     """Of the vehicle; the environment sets it."""
@@ -191,13 +179,8 @@ class Pipeline(Task):
     """... above or below the line [m] at most, ..."""
     turn: float = math.radians(20.0)
     """... turned from it by this at most [rad]."""
-    tilt: float = math.radians(4.0)
-    """Largest roll and pitch at the start [rad]."""
     ahead: tuple[float, float, float] = AHEAD
     reward: PipelineReward = field(default_factory=PipelineReward)
-    training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
-    )
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Pipeline":
         """With the speed of the vehicle."""
@@ -209,18 +192,9 @@ class Pipeline(Task):
         return 0.6 * self.hull.speed
 
     @property
-    def placed(self) -> bool:
-        """Whether a world says where the pipe is."""
-        return bool(self.world)
-
-    @property
     def bottom(self) -> float:
         """z of the pipe without a world [m]."""
         return -11.86
-
-    def arena(self) -> Pool | None:
-        """Open water."""
-        return None
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """The pipe's axis as a line of points, from the objects `pipe_...` of the site."""
@@ -253,6 +227,13 @@ class Pipeline(Task):
                 "theta": heading_off,
             },
             seen={"place": place_seen},
+            meanings={
+                "near": f"1 on the line above the pipe, 1/e at {r.near_scale:.3g} m from it.",
+                "distance": "From the line above the pipe [m].",
+                "lost": f"More than {self.lost[0]:g} m to a side of the line, or {self.lost[1]:g} m above or below it.",
+                "begun": "How far along the pipe the episode began [m].",
+                "worst": "Greatest distance from the line so far [m].",
+            },
             rewards=(
                 RewardTerm("progress", progress, r.progress),
                 RewardTerm("near", "wp.exp(-e / p.reward.near_scale)", r.near),

@@ -117,7 +117,9 @@ def load_sensing(path: str | Path) -> Sensing:
     if "rate" not in data:
         raise EnvironmentSetupError(f"{path}: rate is missing: give the fixes a second [Hz], 0 for none")
     try:
-        return Sensing(rate=float(data["rate"]), fixes=MeasurementNoise(**fixes))
+        return Sensing(
+            rate=float(data["rate"]), fixes=MeasurementNoise(**{name: float(x) for name, x in fixes.items()})
+        )
     except ValueError as error:
         raise EnvironmentSetupError(f"{path}: {error}") from None
 

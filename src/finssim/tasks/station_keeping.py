@@ -144,12 +144,7 @@ class StationKeeping(PoolTask):
     """... for this long [s]."""
     reward: Reward = field(default_factory=Reward)
     training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01,
-        yaw_std=math.radians(1.0),
-        velocity_std=0.02,
-        rate_std=0.02,
-        delay=0.1,
-        graded=True,
+        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02, delay=0.1, graded=True
     )
     """As late as an estimate, and noisier, by worlds from none to all of it: with exact states alone gains are learnt
     that chatter; with noise alone, vehicles that hardly damp their turning are held only while it shakes them."""
@@ -165,6 +160,10 @@ class StationKeeping(PoolTask):
         return Terms(
             start=start,
             shared={"e": "position_error", "theta": "attitude_error"},
+            meanings={
+                "position": f"1 at the goal, 1/e at {self.fit.size * r.position_scale:.3g} m from it.",
+                "heading": f"1 in the goal's attitude, 1/e at {r.heading_scale:.3g} rad from it.",
+            },
             seen={"offset": "goal_offset"},
             rewards=(
                 RewardTerm("position", "wp.exp(-e / (p.fit.size * p.reward.position_scale))", r.position),

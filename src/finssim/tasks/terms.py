@@ -87,6 +87,9 @@ class Terms:
     """Of which several terms are made: name -> term of the truth, once a step; the terms take it by that name."""
     seen: Mapping[str, Any] = field(default_factory=dict)
     """The same for observation terms: name -> term of what is measured, once for each agent."""
+    meanings: Mapping[str, str] = field(default_factory=dict)
+    """What a reward, an end or a total that is an expression gives: name -> sentence with the unit. A function has its
+    docstring."""
     shown: bool = True
     """Whether the observation is written by the terms of its parts; False: the task writes it by itself."""
     command: Any = None
@@ -189,6 +192,26 @@ def place_at_rest(state: State, w: int, v: int, x: wp.vec3, yaw: float):
     state.position[w, v] = x
     state.quaternion[w, v] = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
     state.velocity[w, v] = vec6()
+
+
+@wp.func
+def place_tilted(state: State, w: int, x: wp.vec3, q: wp.quat, rng: wp.uint32, tilt: float, turn: float):
+    """Put vehicle 0 somewhere at rest, turned from an attitude by a yaw, a pitch and a roll that are drawn.
+
+    Args:
+        state: Where it is put.
+        w: Number of the world.
+        x: Body origin, world frame [m].
+        q: Attitude that it is turned from, body to world, xyzw.
+        rng: Stream of the draws.
+        tilt: Largest roll and pitch [rad].
+        turn: Largest yaw [rad].
+    """
+    roll = wp.randf(rng, -tilt, tilt)
+    pitch = wp.randf(rng, -tilt, tilt)
+    state.position[w, 0] = x
+    state.quaternion[w, 0] = q * tilted(roll, pitch, wp.randf(rng, -turn, turn))
+    state.velocity[w, 0] = vec6()
 
 
 @wp.func

@@ -270,6 +270,11 @@ class TorchTask(Task):
             rewards=(RewardTerm("reward", "arrays.answers.reward[w, a]", 1.0),),
             ends=(End("terminated", "arrays.answers.terminated[w] != 0"),),
             inside="arrays.answers.inside[w] != 0",
+            meanings={
+                "reward": "What `reward` returns.",
+                "terminated": "Where `terminated` is true.",
+                **dict.fromkeys(self.totals, "Sum of what `counted` returns by this name."),
+            },
             totals=tuple(
                 Total(name, f"was + arrays.answers.counted[w, {i}]") for i, name in enumerate(self.totals)
             ),

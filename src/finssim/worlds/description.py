@@ -125,7 +125,7 @@ class Finish(Part):
     texture: Texture | None = None
     glow: NonNegative3 = Field(default_factory=lambda: zeros(3))
     """Radiance of its own, as a beacon has."""
-    backscatter_strength_db: Number = -27.0
+    backscatter_strength_db: Annotated[float, Field(strict=True, ge=-200.0, le=100.0)] = -27.0
     """10 log10 of Lambert's parameter mu [dB]: echo strength of 1 m² seen head-on. The default is that of sea floors
     (Mackenzie 1961); hard and rough walls have -15 to -5."""
 

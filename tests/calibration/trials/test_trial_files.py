@@ -264,6 +264,10 @@ def test_quaternions_get_unit_length_and_one_sign(tmp_path):
         ("t,u\n0,\n1,\n", "no usable column beside t"),
         ("0,1\n1,2\n", "begins with numbers"),
         ("t,u,u\n0,1,2\n1,2,3\n", "column 'u' is there twice"),
+        (
+            "t,u\n0,1\n20,2\n40,3\n",
+            "t has a row every 20 s, expected one every 2 s .* in ms, import it with a map",
+        ),
         ("", "no line of column names"),
         ("t,u\n" + "1,2,3,4\n" * 10, "do not have 2 cells"),
     ],

@@ -21,7 +21,7 @@ from finssim.learning.recurrent import SeeingNetwork
 from finssim.learning.train import train
 from finssim.tasks import Environment, make
 from finssim.tasks.agents import NOWHERE, agent_for
-from finssim.tasks.camera_docking import CameraDocking
+from finssim.tasks.docking import CameraDocking
 from finssim.tasks.sight import Picture
 from finssim.vehicles import load_vehicle
 

@@ -179,6 +179,9 @@ def column_of(name: str) -> Column | None:
 PHASES = ("baseline", "excitation", "coast", "rest")
 """Words of the `phase` column; an empty word is none of them."""
 
+SLOWEST = 2.0
+"""Between the rows of a trial, usually: no motion can be learnt of what is seldomer [s]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
@@ -206,6 +209,11 @@ class Trial:
         t = self.t
         if t.ndim != 1 or len(t) < 2 or not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
             raise CalibrationError(f"{self.name}: t is not at least 2 strictly increasing times in s")
+        if (step := float(np.median(np.diff(t)))) > SLOWEST:
+            raise CalibrationError(
+                f"{self.name}: t has a row every {step:.3g} s, expected one every {SLOWEST:g} s at least: if its times "
+                "are in ms, import it with a map that says so (time: {column: t, unit: ms})"
+            )
         for column, values in self.channels.items():
             if column_of(column) is None:
                 raise CalibrationError(f"{self.name}: '{column}' is not a column of a trial")

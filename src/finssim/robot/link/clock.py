@@ -12,8 +12,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-__all__ = ["ClockMap"]
-
 _WRAP = 1 << 32
 _OVERTAKEN = 5000
 """[ms] A frame at most this much older than the newest was overtaken by it."""

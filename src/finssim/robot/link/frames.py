@@ -21,37 +21,6 @@ import numpy.typing as npt
 
 from finssim.robot.messages import CommandEcho, NavigationAid, Telemetry, ThrusterCommand
 
-__all__ = [
-    "COMMAND",
-    "DEBUG_CONFIG",
-    "DEBUG_ECHO",
-    "ECHO",
-    "HOST",
-    "LAYOUTS",
-    "MCU",
-    "NAVIGATION",
-    "TELEMETRY",
-    "DebugConfig",
-    "Decoder",
-    "Field",
-    "Form",
-    "Layout",
-    "LinkError",
-    "McuLink",
-    "Message",
-    "RejectFlag",
-    "StatusFlag",
-    "command_count",
-    "crc16_modbus",
-    "encode_command",
-    "encode_debug_config",
-    "encode_echo",
-    "encode_navigation",
-    "encode_telemetry",
-    "forms",
-]
-
-
 # What a frame is made of: fields in the order of the wire, and the one description that writes and reads them.
 
 

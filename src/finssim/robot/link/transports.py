@@ -19,22 +19,6 @@ from urllib.parse import parse_qs, urlsplit
 
 from finssim.robot.link.frames import LinkError
 
-__all__ = [
-    "DEFAULT_BIND",
-    "DryRun",
-    "MavlinkAddress",
-    "MemoryTransport",
-    "SerialTransport",
-    "TcpServer",
-    "TcpTransport",
-    "Transport",
-    "UdpTransport",
-    "bound_socket",
-    "memory_pair",
-    "open_transport",
-]
-
-
 # The wire as UDP datagrams, to and from one peer alone.
 
 

@@ -8,13 +8,7 @@ keep 0.001 px.
 import warp as wp
 
 from finssim.sensors.overhead_camera.photometry import fresnel, refracted, through_water
-from finssim.sensors.overhead_camera.surface import (
-    Patch,
-    Wave,
-    distance_to,
-    normal_of,
-    surface_hit,
-)
+from finssim.sensors.overhead_camera.surface import Patch, Wave, distance_to, normal_of, surface_hit
 
 # What light meets in and around the pool: printed tags and the tiled basin, each for one ray.
 #
