@@ -102,8 +102,8 @@ HOMES = {
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
     "mujoco": {"engine/scene_model.py", "engine/scene_picture.py", "experiments/bench.py"},
-    "pandas": {"engine/recorder.py"},
-    "pyarrow": {"calibration/trials/trial_files.py", "engine/recorder.py"},
+    "pandas": {"engine/recorder.py", "learning/lerobot.py"},
+    "pyarrow": {"calibration/trials/trial_files.py", "engine/recorder.py", "learning/lerobot.py"},
     "matplotlib": {
         "calibration/report.py",
         "calibration/replay.py",

@@ -135,8 +135,9 @@ def test_what_is_no_trajectory_is_refused():
         load_trajectory("elipse")
     with pytest.raises(ControlError, match="heading is 'north'"):
         load_trajectory("circle", heading="north")
-    with pytest.raises(ControlError, match="duration is"):
-        replace(TRAJECTORIES["circle"], duration=0.0)
+    for wrong in (0.0, 1e19, float("nan")):
+        with pytest.raises(ControlError, match="duration is .* s, expected more than 0 and at most 86400"):
+            replace(TRAJECTORIES["circle"], duration=wrong)
 
 
 @EVERY

@@ -290,4 +290,4 @@ def test_methods_are_told_the_noise_that_the_calibration_found(monkeypatch):
     )
     one = experiment._one("published", 1, "geometry", {"locations": (5, 4), "images": 40})
     assert len(told) == len(experiment.METHODS_SHOWN)
-    assert set(told) == {one.found.pixel_std} and one.found.pixel_std > 0.1
+    assert set(told) == {one.found.refractive.pixel_std} and one.found.refractive.pixel_std > 0.1

@@ -10,7 +10,10 @@ from finssim.experiments.report import ReportError, filled, report
 
 ROOT = Path(__file__).parents[2]
 RESULTS = sorted((ROOT / "results").glob("*.json"))
-PAGES = (ROOT / "README.md", ROOT / "docs" / "experiments.md", ROOT / "docs" / "learning.md")
+PAGES = [
+    ROOT / "README.md",
+    *(ROOT / f"docs/{name}.md" for name in ("experiments", "learning", "reliability")),
+]
 
 
 def figures(value):
@@ -61,6 +64,30 @@ def test_a_block_is_filled_and_the_rest_stays(tmp_path):
     assert report([result], into=[page], check=True) == 0
 
 
+def test_a_result_in_sentences_is_a_list():
+    """A soak has no table."""
+    soaked = {
+        "experiment": "soak",
+        "vehicle_h": 20.0,
+        "wall_s": 7200.0,
+        "times_real_time": 10.0,
+        "verdict": "flat",
+        "slope_mib_per_h": 0.01,
+        "first_mib": 340.0,
+        "last_mib": 341.0,
+        "error_rms_m": 0.02,
+        "faults": [],
+        "missed_decisions": 0,
+        "decisions": 1440000,
+    }
+    page = filled("<!-- finssim report: soak -->\n<!-- end -->", {"soak": soaked}, "page")
+    assert page.splitlines()[1:4] == [
+        "- 20.00 h of vehicle time in 120.0 min, 10.0 times real time",
+        "- memory: flat, +0.01 MiB per hour of vehicle time; 340.0 MiB at the start, 341.0 at the end",
+        "- off the station: rms 2.0 cm; faults: none; decisions missed: 0 of 1440000",
+    ]
+
+
 @pytest.mark.parametrize(
     ("what", "message"),
     [
@@ -82,7 +109,7 @@ def test_a_file_that_is_no_result_is_refused(tmp_path):
     for text, message in (
         ("no", "is no result"),
         ("[]", "is no result"),
-        ('{"experiment": "soak"}', "'soak', expected"),
+        ('{"experiment": "stack"}', "'stack', expected"),
     ):
         (tmp_path / "x.json").write_text(text)
         with pytest.raises(ReportError, match=message):

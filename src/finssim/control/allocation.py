@@ -408,6 +408,9 @@ class RowLaunch:
 def axis_weights(wrench_limits: npt.ArrayLike) -> Array:
     """Diagonal of W [1/N, 1/(N m)], (6,): one over each wrench limit, and zero on an axis with no authority.
 
+    Where thrusters saturate, W decides which axis gives way: an error counts as a part of its axis's limit, and no axis
+    has priority.
+
     Args:
         wrench_limits: Largest wrench on each axis alone, body axes [N, N m], (6,).
     """

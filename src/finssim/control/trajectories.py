@@ -184,6 +184,9 @@ TANGENT_SPAN = 0.1
 CHECK_STEP = 0.02
 """Limits are checked at times this far apart [s]."""
 
+LONGEST = 86400.0
+"""A day, of any trajectory [s]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
@@ -202,9 +205,9 @@ class Trajectory:
     """A heading of its own at times within the duration [rad], in place of a fixed one; `yaw` is added."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.duration) and self.duration > 0.0):
+        if not 0.0 < self.duration <= LONGEST:
             raise ControlError(
-                f"trajectory {self.name}: duration is {self.duration}, expected a positive time"
+                f"trajectory {self.name}: duration is {self.duration:g} s, expected more than 0 and at most {LONGEST:g}"
             )
         if self.heading not in ("fixed", "tangent"):
             raise ControlError(

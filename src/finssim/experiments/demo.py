@@ -251,14 +251,7 @@ def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identific
     text = json.dumps(scored.as_json(), indent=2, allow_nan=False) + "\n"
     (folder / "replay.json").write_text(text, encoding="utf-8")
     save_figure(draw_response_envelopes(scored.pairs), folder / "replay.png")
-    return Identification(
-        vehicle=vehicle,
-        fit=fit,
-        replay=scored,
-        truth=truth,
-        findings=findings,
-        seconds=time.perf_counter() - began,
-    )
+    return Identification(vehicle, fit, scored, truth, findings, time.perf_counter() - began)
 
 
 def commands(folder: Path, name: str, seed: int) -> list[str]:

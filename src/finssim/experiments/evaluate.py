@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 
 from finssim.experiments import campaign
 from finssim.experiments.campaign import progress_bar, write_json
-from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
+from finssim.experiments.figures import draw_envelopes, draw_tracking, save_figure
 from finssim.experiments.metrics import (
     PAPER_T2,
     T1_SETPOINTS,
@@ -98,14 +98,10 @@ class Form(NamedTuple):
     draw: Callable[[Mapping[str, Sequence[Trial]], str], Any]
 
 
-def _draw_envelopes(runs: Mapping[str, Sequence[Trial]], title: str) -> Any:
-    return draw_envelopes({label: error_envelope(trials) for label, trials in runs.items()}, title)
-
-
 FORMS: Mapping[str, Form] = {
     "t1": Form(
         "setpoint", tuple(T1_SETPOINTS), T1_COLUMNS, CAPTION, summarize, lambda name: {"": paper_row(name)},
-        "error_envelope.png", _draw_envelopes,
+        "error_envelope.png", draw_envelopes,
     ),
     "t2": Form(
         "trajectory", T2_TRAJECTORIES, T2_COLUMNS, T2_CAPTION, summarize_tracking,

@@ -202,8 +202,7 @@ def pool_fault(pictures: float = 0.0, **fields: Any) -> Touch:
     """Sets fields of `pool.faults`; pictures are lost with a probability of their own."""
 
     def begin(bench: Bench) -> None:
-        for name, value in fields.items():
-            setattr(bench.pool.faults, name, value)
+        vars(bench.pool.faults).update(fields)
         if pictures:
             random = np.random.default_rng([bench.pool.faults.seed, 0xB11D])
             bench.wire.pictures = lambda found: [p for p in found if random.random() >= pictures]
@@ -247,12 +246,7 @@ def two_publishers(bench: Bench) -> None:
 
 def on_wire(**fields: Any) -> Touch:
     """Sets fields of the wire."""
-
-    def begin(bench: Bench) -> None:
-        for name, value in fields.items():
-            setattr(bench.wire, name, value)
-
-    return begin
+    return lambda bench: vars(bench.wire).update(fields)
 
 
 def jump_mcu_clock(step: float) -> Touch:
@@ -560,11 +554,8 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         record = Path(folder) / "run.mcap"
         with Recorder(record, vehicle, {"command": "finssim experiment faults"}) as recorder:
             bridge = Bridge(vehicle, BridgeSettings.of(vehicle, **{**workspace, **scenario.settings}))
-            reckoned = (
-                Perception(vehicle, None, mode="error-state", let_in=station_of(start).position[:2])
-                if aided
-                else None
-            )
+            let_in = station_of(start).position[:2]
+            reckoned = Perception(vehicle, None, mode="error-state", let_in=let_in) if aided else None
             runtime = Runtime(
                 vehicle, plan.calibrated, make_pilot("pid", vehicle), station_of(goal), arm=True, bridge=bridge,
                 recorder=recorder, perception=reckoned,

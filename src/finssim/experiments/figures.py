@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -78,27 +77,16 @@ def png(figure: Any) -> bytes:
     return buffer.getvalue()
 
 
-@dataclass(frozen=True, kw_only=True)
-class Envelope:
-    """Lower quartile, median and upper quartile over the trials of one controller, at each time."""
-
-    t: Array
-    """Time since the start of the hold [s], shape (G,)."""
-    position: Array
-    """Distance to the goal [m], shape (3, G)."""
-    yaw: Array
-    """Magnitude of the yaw error [rad], shape (3, G)."""
-    trials: int
-
-
-def error_envelope(trials: Sequence[Trial]) -> Envelope:
+def error_envelope(trials: Sequence[Trial]) -> tuple[Array, Array, Array]:
     """Pointwise quartiles of the errors of one controller's trials, on the 10 Hz evaluation grid.
 
     Args:
         trials: Of station keeping.
 
     Returns:
-        The envelope, as long as the shortest grid; NaN where more than half of the trials have no value.
+        Time since the start of the hold [s], shape (G,), as long as the shortest grid; lower quartile, median and upper
+        quartile, shape (3, G), of the distance to the goal [m] and of the magnitude of the yaw error [rad]: NaN where
+        more than half of the trials have no value.
 
     Raises:
         ValueError: There is no trial.
@@ -114,32 +102,35 @@ def error_envelope(trials: Sequence[Trial]) -> Envelope:
         turns.append(np.abs(yaw_error))
     length = min(map(len, grids))
     position, yaw = (_quartiles(np.stack([x[:length] for x in each])) for each in (distances, turns))
-    return Envelope(t=grids[0][:length], position=position, yaw=yaw, trials=len(trials))
+    return grids[0][:length], position, yaw
 
 
-def draw_envelopes(envelopes: Mapping[str, Envelope], title: str = "") -> Any:
+def draw_envelopes(runs: Mapping[str, Sequence[Trial]], title: str = "") -> Any:
     """The figure: position error above, yaw error below, a colour for each controller.
 
     The success limits are drawn dashed and the evaluation window is gray. Scales are logarithmic, since errors fall
     from metres to millimetres, and start at 1 mm and 0.01 deg, where smaller errors leave the figure.
 
     Args:
-        envelopes: Legend label -> envelope.
+        runs: Legend label -> trials of station keeping, of one controller.
         title: Written above, or left out when empty.
     """
     figure = new_figure(7.2, 5.6, title)
     above, below = figure.subplots(2, 1, sharex=True)
     clean(above, below)
-    for i, (label, envelope) in enumerate(envelopes.items()):
-        label = f"{label} ({envelope.trials} trial{'s' if envelope.trials != 1 else ''})"
-        for axes, (low, median, high) in ((above, envelope.position), (below, np.degrees(envelope.yaw))):
+    ends = []
+    for i, (label, trials) in enumerate(runs.items()):
+        t, position, yaw = error_envelope(trials)
+        ends.append(float(t[-1]))
+        label = f"{label} ({len(trials)} trial{'s' if len(trials) != 1 else ''})"
+        for axes, (low, median, high) in ((above, position), (below, np.degrees(yaw))):
             color = COLORS[i % len(COLORS)]
-            axes.fill_between(envelope.t, low, high, color=color, alpha=0.2, linewidth=0.0)
-            axes.plot(envelope.t, median, color=color, linewidth=1.6, label=label)
+            axes.fill_between(t, low, high, color=color, alpha=0.2, linewidth=0.0)
+            axes.plot(t, median, color=color, linewidth=1.6, label=label)
     _scale(above, 1e-3, POSITION_TOLERANCE, f"success: {POSITION_TOLERANCE:.2f} m on each axis")
     _scale(below, 1e-2, math.degrees(YAW_TOLERANCE), f"success: {math.degrees(YAW_TOLERANCE):.0f}°")
     above.set_ylabel("position error [m]")
-    end = max((float(e.t[-1]) for e in envelopes.values()), default=EVALUATION_WINDOW[1])
+    end = max(ends, default=EVALUATION_WINDOW[1])
     below.set(ylabel="yaw error [°]", xlabel="time since the start of the hold [s]", xlim=(0.0, end))
     labels = above.get_legend_handles_labels()[1]
     legend_below(figure, above, 3 if max(map(len, labels), default=0) <= LONGEST_OF_THREE else 2)

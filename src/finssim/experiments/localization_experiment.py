@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -154,10 +155,7 @@ def draw_campaign(
     focal, x, y = random.normal(0.0, conditions.lens, 3).tolist()
     true = truth.camera.lens
     lens = replace(true, fx=true.fx + focal, fy=true.fy + focal, cx=true.cx + x, cy=true.cy + y)
-    places = np.stack(
-        np.meshgrid(*(np.linspace(-r, r, n) for r, n in zip(REACH, locations, strict=True)), indexing="ij"),
-        -1,
-    ).reshape(-1, 2)
+    places = np.array(list(product(*(np.linspace(-r, r, n) for r, n in zip(REACH, locations, strict=True)))))
     count = len(places)
     pictures = np.full(count, images // count)
     pictures[random.permutation(count)[: images - pictures.sum()]] += 1
@@ -309,11 +307,6 @@ class Calibrated:
     """Detections of the half that calibrates."""
     survey: list[Row]
     """Where the tag was said to lie in each of them."""
-
-    @property
-    def pixel_std(self) -> float:
-        """Standard deviation of a corner per axis, ripples included, as the residuals tell it [px]."""
-        return self.refractive.pixel_std
 
 
 def calibrate(campaign: Campaign, seen: Sequence[Picture]) -> Calibrated:
@@ -475,14 +468,9 @@ def locate(
         else:
             reasons[measured.reason.partition(":")[0]] += 1
     index = np.array(sorted(places), np.intp)
-    means, surveyed, true = (
-        np.array(rows).reshape(-1, 2)
-        for rows in (
-            [np.mean(places[k], axis=0) for k in index],
-            [campaign.visits[k].nominal[:2] for k in index],
-            [campaign.visits[k].position[:2] for k in index],
-        )
-    )
+    means = np.array([np.mean(places[k], axis=0) for k in index]).reshape(-1, 2)
+    surveyed = np.array([visit.nominal[:2] for visit in campaign.visits])[index]
+    true = np.array([visit.position[:2] for visit in campaign.visits])[index]
     located = sum(map(len, places.values()))
     return Scores(index, means - surveyed, means - true, len(held_out), located, reasons)
 
@@ -548,7 +536,11 @@ def _draw_error_map(campaign: Campaign, pinhole: Scores, refractive: Scores, pat
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
     """The tables, ours by conditions, then the paper's; and what the calibrations got wrong."""
     title, origin = "Horizontal localization through water", result["provenance"]
-    tables = [Table(title=title, headline=_headline(result), note=_gain(result))]
+    headline = (
+        f"{len(result['seeds'])} seeds, each {result['pictures_per_seed']} pictures at {result['places']} places, "
+        f"renderer {result['renderer']}"
+    )
+    tables = [Table(title=title, headline=headline, note=_gain(result))]
     for name, methods in result["results"].items():
         rows = [
             [
@@ -580,14 +572,6 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
             note=f"FinsSim {origin['finssim']}, revision {origin['revision']}, seeds {result['seeds']}.",
         ),
     ]
-
-
-def _headline(result: Mapping[str, Any]) -> str:
-    return (
-        f"{len(result['seeds'])} seeds, each {result['pictures_per_seed']} pictures at"
-        f" {result['places']} places,"
-        f" renderer {result['renderer']}"
-    )
 
 
 def _gain(result: Mapping[str, Any]) -> str:
@@ -672,7 +656,7 @@ def localization_experiment(
             for name, each in scores.items()
         },
         "lift_m": LIFT,
-        "pixel_std_px": [one.found.pixel_std for one in runs],
+        "pixel_std_px": [one.found.refractive.pixel_std for one in runs],
         "calibration": [_errors(one) for one in runs],
         "paper": {m: {"rmse_cm": r, "p95_cm": p} for m, (r, p) in PAPER_TABLE_2.items()},
         "provenance": provenance(),
@@ -704,7 +688,7 @@ def _one(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedRe
 def _scored(campaign: Campaign, seen: Sequence[Picture], found: Calibrated) -> dict[str, Scores]:
     pools = {"refractive": found.refractive, "pinhole": found.pinhole}
     return {
-        row: locate(campaign, seen, pools[kind], method, pixel_std=found.pixel_std)
+        row: locate(campaign, seen, pools[kind], method, pixel_std=found.refractive.pixel_std)
         for row, (method, kind) in METHODS_SHOWN.items()
     }
 
@@ -712,18 +696,15 @@ def _scored(campaign: Campaign, seen: Sequence[Picture], found: Calibrated) -> d
 def _errors(one: SeedResult) -> dict[str, Any]:
     """What the calibration of one seed got wrong, the truth being known here."""
     true, fit = one.campaign.truth, one.found.refractive
-    x, y = true.camera.position[:2]
-    heights = [float(pool.camera.position[2]) for pool in (true, fit)]
-    over = [
-        h - float(pool.interface.height(*pool.camera.position[:2]))
-        for h, pool in zip(heights, (true, fit), strict=True)
-    ]
+    (x, y, height), (x_fit, y_fit, height_fit) = true.camera.position, fit.camera.position
+    over = height - true.interface.height(x, y)
+    over_fit = height_fit - fit.interface.height(x_fit, y_fit)
     lean = float(np.clip(true.interface.normal @ fit.interface.normal, -1.0, 1.0))
     return {
         "seed": one.campaign.seed,
-        "camera_height_mm": 1000.0 * (heights[1] - heights[0]),
+        "camera_height_mm": 1000.0 * float(height_fit - height),
         "water_height_mm": 1000.0 * float(fit.interface.height(x, y) - true.interface.height(x, y)),
-        "camera_over_water_mm": 1000.0 * float(over[1] - over[0]),
+        "camera_over_water_mm": 1000.0 * float(over_fit - over),
         "tilt_deg": float(np.degrees(np.arccos(lean))),
         "index": float(fit.interface.index_far - true.interface.index_far),
     }

@@ -98,7 +98,7 @@ def paper_t2_row(name: str, trajectory: str) -> dict[str, Any] | None:
 Array = NDArray[np.float64]
 
 POSITION_TOLERANCE = 0.10
-"""Largest error on each axis that counts as holding the position [m]."""
+"""Largest error on each axis that counts as holding the position [m]; in training, `StationKeeping` decides."""
 
 YAW_TOLERANCE = math.radians(10.0)
 """Largest yaw error that counts as holding the heading [rad]."""

@@ -386,10 +386,8 @@ def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Gu
         DriveError: The record does not tell, or its goals are not on the trajectory.
     """
     name = name or drive.guide
-    if name == drive.guide and name not in (
-        *TRAJECTORIES,
-        *PUBLISHED_NAMES,
-    ):  # what a record names is no path
+    known = name in TRAJECTORIES or name in PUBLISHED_NAMES
+    if name == drive.guide and not known:  # what a record names is no path
         raise DriveError(
             f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: {GIVE}"
         )

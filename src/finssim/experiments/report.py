@@ -9,13 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from finssim.experiments import anatomy, transfer
+from finssim.experiments import anatomy, faults, soak, transfer
 from finssim.experiments.tables import Table, markdown_table
 from finssim.files import atomic_write
 
 TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Table]]] = {
     **dict.fromkeys(transfer.SPECS, transfer.tables_of),
     "anatomy": anatomy.tables_of,
+    "faults": faults.tables_of,
+    "soak": soak.tables_of,
 }
 """Experiment -> the tables of its result."""
 
@@ -30,13 +32,13 @@ def report(results: Sequence[Path], *, into: Annotated[Sequence[Path], "--into"]
     """Fill the tables of Markdown pages with what experiments have measured.
 
     A page has a table where it says <!-- finssim report: t1 --> and <!-- end -->, for the result in t1.json; after the
-    name may stand table=2 (the second of the result), columns=0,1,3, and rows=calibrated;paper: calibrated (names as
-    the table has them).
+    name may stand table=2 (the second of the result), columns=0,1,3, rows=calibrated;paper: calibrated (names as the
+    table has them), and headline=yes. A result in sentences, as of soak, is a list of them.
 
     Example: finssim report results/t1.json results/anatomy.json --into docs/experiments.md --into README.md
 
     Args:
-        results (FILE.json...): Results of experiments t1, t2 and anatomy.
+        results (FILE.json...): Results of experiments t1, t2, anatomy, faults and soak.
         into (PAGE.md): Page whose tables are filled. May be given several times.
         check: Change nothing; exit status 1 where a page does not say what the results do.
 
@@ -98,7 +100,7 @@ def filled(page: str, results: Mapping[str, Mapping[str, Any]], name: str) -> st
 
 
 def _table(tables: Sequence[Table], options: str) -> str:
-    chosen = dict(re.findall(r"(table|columns|rows)=((?:[^=]*?)(?=\s+\w+=|$))", options))
+    chosen = dict(re.findall(r"(table|columns|rows|headline)=((?:[^=]*?)(?=\s+\w+=|$))", options))
     number = int(chosen.get("table", "1"))
     if not 1 <= number <= len(tables):
         raise ReportError(f"table {number}: the result has {len(tables)}")
@@ -120,4 +122,5 @@ def _table(tables: Sequence[Table], options: str) -> str:
             rows=[[row[k] for k in columns] for row in shown.rows if row],
         )
     rows = [[row[0].strip(), *row[1:]] for row in shown.rows if row]
-    return markdown_table(shown.heads, rows)
+    table = markdown_table(shown.heads, rows) if rows else "\n".join(f"- {text}" for text in shown.sentences)
+    return f"{shown.headline}:\n\n{table}" if chosen.get("headline") == "yes" else table

@@ -20,7 +20,7 @@ from finssim.control.policy import DESCRIPTION_FILE, Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.campaign import Progress, Show, check_choices, spread, write_json
 from finssim.experiments.evaluate import T1_COLUMNS
-from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
+from finssim.experiments.figures import draw_envelopes, draw_tracking, save_figure
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row, paper_t2_row
 from finssim.experiments.robot_trials import (
     FIRMWARES,
@@ -453,13 +453,13 @@ def played_in(result: Mapping[str, Any], what: str) -> str:
 def _draw_t1(by_row: Results, folder: Path) -> Path:
     """Position and yaw error against time of the rows of `T1_DRAWN` that were played, or of all."""
     drawn = {name: by_row[name] for name in T1_DRAWN if name in by_row} or by_row
-    envelopes = {
-        ROWS["t1"][name].title: error_envelope([played_trial(r, folder / "trials") for r in results])
+    runs = {
+        ROWS["t1"][name].title: [played_trial(r, folder / "trials") for r in results]
         for name, results in drawn.items()
     }
     hardware = any(r["job"]["severity"] == HARDWARE for results in by_row.values() for r in results)
     title = f"T1 {'on hardware' if hardware else 'in the virtual pool'}: median and middle half"
-    return save_figure(draw_envelopes(envelopes, title), folder / "t1_envelopes.png")
+    return save_figure(draw_envelopes(runs, title), folder / "t1_envelopes.png")
 
 
 def _draw_t2(by_row: Results, folder: Path) -> Path | None:

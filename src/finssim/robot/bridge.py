@@ -867,11 +867,6 @@ class Bridge:
         """The newest command before all limits, canonical order [N], (n,)."""
         return self._commander.force
 
-    @property
-    def events(self) -> list[Event]:
-        """Events that nobody has drained yet."""
-        return list(self.log.events)
-
     def drain(self) -> list[Event]:
         """Events since the last call."""
         return self.log.drain()

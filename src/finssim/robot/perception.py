@@ -449,7 +449,7 @@ class Perception:
     def reading(self, now: float) -> Reading:
         """The state at a time [s], in world and body axes."""
         estimate = self._estimate(now)
-        health = self._health_of(estimate)
+        health = health_of(estimate, self.estimator.settings, self.estimator.site, {}, "", {})
         self._tell_let_in(now)
         position, quaternion, velocity = self._frame.state(estimate)
         return Reading(
@@ -483,9 +483,6 @@ class Perception:
             return estimate
         raw = self.unfused
         return replace(estimate, x=raw.x, yaw=raw.yaw, vision_time=raw.vision_time)
-
-    def _health_of(self, estimate: Estimate) -> Health:
-        return health_of(estimate, self.estimator.settings, self.estimator.site, {}, "", {})
 
     def _turning(self, estimate: Estimate) -> Array:
         """Angular velocity, body frame [rad/s], less what is known of the gyro's bias: its part about the vertical."""

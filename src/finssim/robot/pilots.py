@@ -24,7 +24,6 @@ from finssim.vehicles import Vehicle
 if TYPE_CHECKING:
     from finssim.tasks.agents import Agent
     from finssim.tasks.observer import Observer
-    from finssim.tasks.task import Task
 
 
 Array = npt.NDArray[np.float64]
@@ -321,17 +320,13 @@ def make_pilot(
                 f"{who}: neither {' nor '.join(names)} nor a policy directory: give one of these"
             )
         seen = Observer(str(task), vehicle, agent=agent)
-        return AgentPilot(BaselineAgent(who, vehicle, seen.task), vehicle, seen, _shapes(seen.task, vehicle))
+        shapes = {picture.name: picture.shape(vehicle) for picture in seen.task.pictures}
+        return AgentPilot(BaselineAgent(who, vehicle, seen.task), vehicle, seen, shapes)
     trained = read_description(Path(who))
     mode = mode_from_dict(trained.action, vehicle)
     seen = Observer(task or trained.task, vehicle, agent=agent, action=mode.name)
     shapes = {name: about["shape"] for name, about in trained.pictures.items()}
     return AgentPilot(PolicyAgent(who, vehicle, seen.task, period=period), vehicle, seen, shapes)
-
-
-def _shapes(task: Task, vehicle: Vehicle) -> dict[str, tuple[int, int, int]]:
-    """Shapes of the pictures that a task observes, by name."""
-    return {picture.name: picture.shape(vehicle) for picture in task.pictures}
 
 
 def _state(reading: Measured) -> tuple[Any, Any, Any]:

@@ -382,7 +382,8 @@ class Recorder:
             self._put("tags", at, self._messages.tags(picture))
         if picture.image is not None and self._pictures == "jpeg":
             image = picture.image
-            self._sink.put("picture", at, lambda: self._compressed(stamp, image), image.nbytes)
+            compressed = partial(self._made, "picture", lambda: self._messages.picture(stamp, jpeg(image)))
+            self._sink.put("picture", at, compressed, image.nbytes)
 
     def _own(self, now: float, picture: Picture) -> None:
         """Its messages but for raw pictures, made on the writing thread."""
@@ -416,18 +417,12 @@ class Recorder:
         if kind not in self._schemas:
             self._schemas[kind] = writer.register_schema(kind, "ros2msg", definition(kind).encode())
         quality = {"offered_qos_profiles": offered_qos(self._topics[key].quality)}
-        return int(writer.register_channel(self._topic_name(key), "cdr", self._schemas[kind], quality))
-
-    def _topic_name(self, key: str) -> str:
-        return self._topics[key].under(self._name)
+        topic = self._topics[key].under(self._name)
+        return int(writer.register_channel(topic, "cdr", self._schemas[kind], quality))
 
     def _put(self, key: str, at: int, message: Any) -> None:
         data = self._messages.cdr(message, self._topics[key].type)
         self._sink.put(key, at, data, len(data))
-
-    def _compressed(self, stamp: int, image: npt.NDArray[np.uint8]) -> bytes | None:
-        """Runs on the writing thread."""
-        return self._made("picture", lambda: self._messages.picture(stamp, jpeg(image)))
 
     def _ns(self, seconds: float) -> int:
         # An MCAP has no time before 0: a clock that was set back further is recorded as standing there.

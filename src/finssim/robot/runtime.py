@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from finssim.control.guidance import Guide
 from finssim.localization.pool import Pool
-from finssim.robot.bridge import Bridge
+from finssim.robot.bridge import Autopilot, Bridge
 from finssim.robot.link.clock import ClockMap
 from finssim.robot.link.frames import McuLink, Message
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry, ThrusterCommand
@@ -147,20 +147,11 @@ def _percentiles(times: deque[float]) -> dict[str, float | None]:
 USED = ("accepted", "initialized", "reacquired")
 
 
-class Link(Protocol):
+class Link(Autopilot, Protocol):
     """Who turns the bridge's commands into motion at the other end of the wire: a motor controller or an autopilot."""
-
-    peer: str
-    """Which of them it is, in sentences."""
 
     def feed(self, now: float, data: bytes) -> list[Message]:
         """Messages that bytes complete, which came at a time [s]; never raises, whatever they are."""
-
-    def prepare(self, now: float) -> str:
-        """Called while the bridge is about to be armed: "" once commands will count, else what is waited for."""
-
-    def alarm(self, now: float) -> str:
-        """Asked while the bridge is armed: why the vehicle is no longer ours, in a sentence; "" while it is."""
 
     def encode(self, now: float, command: ThrusterCommand, state: str) -> list[bytes]:
         """Frames to send at a time [s] for the bridge's command and state."""

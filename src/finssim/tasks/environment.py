@@ -308,15 +308,12 @@ class Environment:
 
     def _observed(self, which: str) -> Any:
         """Observations, or with which = `final_` the last of the episodes that ended last; views."""
-        rows = self._by_agent(getattr(self.arrays, f"{which}observation").numpy())
+        rows = getattr(self.arrays, f"{which}observation").numpy()
+        rows = rows if self.agents == 1 else rows.reshape(self.worlds, self.agents, -1)
         if self.sight is None:
             return rows
         pictures: dict[str, wp.array] = getattr(self.sight, f"{which}pictures")
         return {"state": rows, **{name: picture.numpy() for name, picture in pictures.items()}}
-
-    def _by_agent(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Rows of a world as rows of its agents, where there are several; a view."""
-        return rows if self.agents == 1 else rows.reshape(self.worlds, self.agents, -1)
 
     def start(
         self, position: ArrayLike, quaternion: ArrayLike, goal_position: ArrayLike, goal_quaternion: ArrayLike

@@ -115,7 +115,8 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 class StationKeeping(PoolTask):
     """T1. Lengths in metres, angles in radians, world frame with z up and 0 on the water.
 
-    A longer vehicle has goals, starts and pool `fit.size` times as large; the tolerance stays.
+    A longer vehicle has goals, starts and pool `fit.size` times as large; the tolerance stays. Success here is to hold
+    at the end of an episode; a trial of `finssim evaluate` is judged by `finssim.experiments.metrics`, as the paper's.
     """
 
     succeeds: ClassVar[str] = "held"

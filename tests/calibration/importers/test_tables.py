@@ -9,7 +9,6 @@ from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers import import_trials
 from finssim.calibration.importers.assemble import read_map
 from finssim.calibration.importers.dispatch import read_trials
-from finssim.calibration.trials.conversion import factor
 from finssim.calibration.trials.trial_files import load_trial
 from finssim.files import OutputError
 
@@ -79,31 +78,6 @@ def test_what_is_written_reads_back_with_the_same_numbers(folder, tmp_path):
     (written,) = import_trials(paths, out=tmp_path / "out", vehicle="finsrov")
     assert load_trial(written).sha256 == trial.sha256
     assert load_trial(written).header.vehicle == "finsrov"
-
-
-@pytest.mark.parametrize(
-    "unit, column, si",
-    [
-        ("deg", "roll", np.pi / 180.0),
-        ("deg/s", "p", np.pi / 180.0),
-        ("rpm", "r", np.pi / 30.0),
-        ("rad/s", "rpm_T1", 30.0 / np.pi),
-        ("rps", "rpm_T1", 60.0),
-        ("kgf", "tau_x", 9.80665),
-        ("lbf", "force_T1", 4.4482216),
-        ("g", "az", 9.80665),
-        ("mm/s", "u", 1e-3),
-        ("kn", "u", 0.514444),
-        ("mm", "x", 1e-3),
-        ("mV", "voltage", 1e-3),
-        ("ms", "pwm_T1", 1e3),
-        ("dbar", "pressure", 1e4),
-        ("N mm", "tau_k", 1e-3),
-    ],
-)
-def test_units_become_si(unit, column, si):
-    """One of the unit is so many of the canonical one."""
-    assert factor(unit, column) == pytest.approx(si, rel=1e-6)
 
 
 def test_scale_offset_sign_and_unit_go_together_in_that_order(folder, tmp_path):

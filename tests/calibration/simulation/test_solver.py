@@ -104,6 +104,13 @@ def test_outliers_hardly_move_a_fit():
     assert solution.point.theta[0] == pytest.approx(1.3, abs=0.1)
 
 
+def test_a_residual_of_five_standard_deviations_weighs_half():
+    """Huber's weight is 1 up to 2.5 standard deviations and 2.5 / size beyond; over the variance."""
+    std = np.array([0.1, 0.1, 3.0, 3.0])
+    weight = weights_of(np.array([2.4, 5.0, -2.4, -25.0]) * std, std)
+    np.testing.assert_allclose(weight * std**2, [1.0, 0.5, 1.0, 0.1])
+
+
 def test_a_fit_stops_at_a_bound():
     """Where the best rate lies outside the box, the edge is the answer and the rest fits as it can."""
     problem = Decays(low=2.0)

@@ -6,6 +6,7 @@ import pytest
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers.assemble import Stream, merge, moved_in_time
 from finssim.calibration.importers.dispatch import read_trials
+from finssim.calibration.trials.conversion import factor
 from finssim.geometry.frames import TO_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_multiply, quat_rotate, quat_to_euler
 
@@ -107,6 +108,45 @@ def test_a_forgotten_convention_is_noticed(tmp_path):
     assert "upside_down" in {one.code for one in trial.findings}
     upright = log(tmp_path / "b", {"roll": 0.1, "pitch": 0.0, "yaw": 0.0})
     assert "upside_down" not in {one.code for one in upright.findings}
+
+
+@pytest.mark.parametrize(
+    "unit, column, si",
+    [
+        ("deg", "roll", np.pi / 180.0),
+        ("deg/s", "p", np.pi / 180.0),
+        ("rpm", "r", np.pi / 30.0),
+        ("rad/s", "rpm_T1", 30.0 / np.pi),
+        ("rps", "rpm_T1", 60.0),
+        ("kgf", "tau_x", 9.80665),
+        ("lbf", "force_T1", 4.4482216),
+        ("g", "az", 9.80665),
+        ("mm/s", "u", 1e-3),
+        ("kn", "u", 0.514444),
+        ("mm", "x", 1e-3),
+        ("mV", "voltage", 1e-3),
+        ("ms", "pwm_T1", 1e3),
+        ("dbar", "pressure", 1e4),
+        ("N mm", "tau_k", 1e-3),
+    ],
+)
+def test_units_become_si(unit, column, si):
+    """One of the unit is so many of the canonical one."""
+    assert factor(unit, column) == pytest.approx(si, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "unit, column, sentence",
+    [
+        ("rad", "u", "unit of u is 'rad', an angle, expected one of m/s"),
+        ("Pa", "tau_x", "unit of tau_x is 'Pa', a pressure, expected one of N"),
+        ("kgff", "tau_x", "did you mean 'kgf'?"),
+    ],
+)
+def test_a_unit_of_the_wrong_kind_is_refused(unit, column, sentence):
+    with pytest.raises(CalibrationError) as refused:
+        factor(unit, column)
+    assert sentence in str(refused.value)
 
 
 def test_units_names_and_offsets_come_first(tmp_path):

@@ -272,6 +272,27 @@ def test_an_end_by_the_task_ends_the_value():
     assert learner._advantages()[1].max() <= 1.0 + 1e-5
 
 
+def test_advantages_are_the_discounted_sum_of_differences_up_to_the_end():
+    """A_t = Σ (γ λ)^k δ_(t+k), summed forwards in each episode; nothing of the next one enters."""
+    learner = made(Guess(), ranges=None, discount=0.9, gae_lambda=0.7)
+    random = np.random.default_rng(0)
+    for x in (learner._r, learner._c):
+        x[:] = random.standard_normal(x.shape)
+    learner._go[:] = random.random(learner._go.shape) < 0.7
+    found = learner._advantages()[0]
+    rows = learner._c.shape[1]
+    value = learner.critic(learner._c.reshape(-1, learner._c.shape[2])).reshape(-1, rows).copy()
+    for t, w in np.ndindex(found.shape):
+        expected, weight = 0.0, 1.0
+        for k in range(t, len(found)):
+            after = 0.9 * value[k + 1, w] if learner._go[k, w] else 0.0
+            expected += weight * (learner._r[k, w] + after - value[k, w])
+            if not learner._go[k, w]:
+                break
+            weight *= 0.9 * 0.7
+        assert found[t, w] == pytest.approx(expected, abs=1e-5)
+
+
 def test_the_noise_of_an_action_is_known_exactly():
     """The ratio of the new density to the old one is 1 before the first gradient step."""
     learner = made(StationKeeping(), memory=8)

@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
-from finssim.localization.fusion import error_state
-from finssim.localization.fusion.error_state import InertialState
 from finssim.localization.fusion.estimator import Estimator
 from finssim.localization.fusion.fuse_settings import Aids, Settings, settings_of, site_of
 from finssim.localization.fusion.streams import (
@@ -137,49 +134,6 @@ def test_a_late_fix_changes_what_it_would_have_changed_in_time():
     late, timely = (swim(1, **{**CHOICES["log, compass and acoustics"], "late": x}) for x in (0.4, 0.0))
     np.testing.assert_allclose(late[0], timely[0], atol=1e-9)
     np.testing.assert_allclose(late[1], timely[1], atol=1e-12)
-
-
-def state(random):
-    return InertialState(
-        random.standard_normal(3), random.standard_normal(3), quat_from_euler(0.2, -0.1, 1.0),
-        0.01 * random.standard_normal(3), np.zeros(3), np.eye(20), np.array([0.02, 0.01, 0.1, -0.2, 0.05]),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("model", ["velocity", "heading"])
-def test_jacobians_are_the_derivatives_of_the_models(model):
-    """Central differences through `correct`, which moves the error into the state."""
-    random = np.random.default_rng(3)
-    s, omega, lever = state(random), random.standard_normal(3), np.array([0.1, -0.2, 0.3])
-
-    def value(x):
-        return (
-            error_state.velocity_model(x, omega, lever)
-            if model == "velocity"
-            else error_state.heading_model(x)
-        )
-
-    _, H = value(s)
-    for k in range(20):
-        ends = []
-        for sign in (1.0, -1.0):
-            gain = np.zeros((20, 1))
-            gain[k] = 1.0
-            moved = error_state.correct(s, np.array([sign * 1e-6]), np.zeros((1, 20)), np.eye(1), gain)
-            ends.append(value(moved)[0])
-        np.testing.assert_allclose((ends[0] - ends[1]) / 2e-6, H[:, k], atol=2e-6)
-
-
-def test_a_log_reads_what_a_turning_vehicle_moves_at():
-    """At rest but turning, a log ahead of the IMU reads ω x l; scale and offset are on top."""
-    q, none = quat_from_euler(0.0, 0.0, 0.7), np.zeros(3)
-    turning = InertialState(none, none, q, none, none, np.eye(20), np.zeros(5))
-    read, _ = error_state.velocity_model(turning, np.array([0.0, 0.0, 0.5]), np.array([0.4, 0.0, 0.0]))
-    np.testing.assert_allclose(read, [0.0, 0.2, 0.0], atol=1e-12)
-    north, extra = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.1, 0.0, 0.0, 0.3])
-    moving = InertialState(none, north, q, none, none, np.eye(20), extra)
-    expected = 1.1 * quat_to_matrix(q).T @ north + [0.0, 0.0, 0.3]
-    np.testing.assert_allclose(error_state.velocity_model(moving, none, none)[0], expected)
 
 
 def test_without_log_and_compass_nothing_is_added():

@@ -12,6 +12,7 @@ from finssim.geometry.rotations import (
     quat_from_rotvec,
     quat_multiply,
     quat_rotate,
+    quat_to_matrix,
     quat_to_rotvec,
     wrap_angle,
 )
@@ -22,10 +23,12 @@ from finssim.localization.fusion.error_state import (
     correct,
     depth_model,
     error_innovation,
+    heading_model,
     position_model,
     predict,
     restarted,
     turned,
+    velocity_model,
     yaw_model,
 )
 
@@ -97,6 +100,45 @@ def test_measurement_jacobians_are_derivatives(model, m):
     state = some_state(1)
     numeric = jacobian(lambda d: model(moved(state, d))[0] - model(state)[0], m)
     np.testing.assert_allclose(model(state)[1], numeric, atol=1e-8)
+
+
+def aided_state(random):
+    return InertialState(
+        random.standard_normal(3), random.standard_normal(3), quat_from_euler(0.2, -0.1, 1.0),
+        0.01 * random.standard_normal(3), np.zeros(3), np.eye(20), np.array([0.02, 0.01, 0.1, -0.2, 0.05]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("model", ["velocity", "heading"])
+def test_jacobians_of_doppler_log_and_compass_are_derivatives(model):
+    """Central differences through `correct`, which moves the error into the state."""
+    random = np.random.default_rng(3)
+    s, omega, lever = aided_state(random), random.standard_normal(3), np.array([0.1, -0.2, 0.3])
+
+    def value(x):
+        return velocity_model(x, omega, lever) if model == "velocity" else heading_model(x)
+
+    _, H = value(s)
+    for k in range(20):
+        ends = []
+        for sign in (1.0, -1.0):
+            gain = np.zeros((20, 1))
+            gain[k] = 1.0
+            moved = correct(s, np.array([sign * 1e-6]), np.zeros((1, 20)), np.eye(1), gain)
+            ends.append(value(moved)[0])
+        np.testing.assert_allclose((ends[0] - ends[1]) / 2e-6, H[:, k], atol=2e-6)
+
+
+def test_a_doppler_log_reads_what_a_turning_vehicle_moves_at():
+    """At rest but turning, a log ahead of the IMU reads ω x l; scale and offset are on top."""
+    q, none = quat_from_euler(0.0, 0.0, 0.7), np.zeros(3)
+    turning = InertialState(none, none, q, none, none, np.eye(20), np.zeros(5))
+    read, _ = velocity_model(turning, np.array([0.0, 0.0, 0.5]), np.array([0.4, 0.0, 0.0]))
+    np.testing.assert_allclose(read, [0.0, 0.2, 0.0], atol=1e-12)
+    north, extra = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.1, 0.0, 0.0, 0.3])
+    moving = InertialState(none, north, q, none, none, np.eye(20), extra)
+    expected = 1.1 * quat_to_matrix(q).T @ north + [0.0, 0.0, 0.3]
+    np.testing.assert_allclose(velocity_model(moving, none, none)[0], expected)
 
 
 def test_a_constant_push_in_a_turn_is_followed_to_second_order():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.localization.fusion.error_state import GateMemory, due, judge, remember
+from finssim.localization.fusion.error_state import GateMemory, due, judge, judge_carried, remember
 from finssim.localization.fusion.fuse_settings import Gate
 
 
@@ -22,6 +22,20 @@ def test_nine_for_all_is_two_different_gates():
     limit = Gate(fixed=9.0).limit(1)
     assert np.mean(draws[:, 0] > limit) == pytest.approx(0.0027, abs=0.0003)
     assert np.mean(draws.sum(axis=1) > Gate(fixed=9.0).limit(2)) == pytest.approx(0.0111, abs=0.0006)
+
+
+@pytest.mark.parametrize("carried", [False, True])
+def test_an_outlier_is_what_lies_beyond_the_limit(carried):
+    """99.9 % of chi-square: a yaw passes at 10.82 and not at 10.84, a position in the plane at 13.8 and not at 13.9."""
+
+    def verdict(distance, dimension):
+        memory, R = GateMemory(5), 1e-4 * np.eye(dimension)
+        if dimension == 1 and carried:
+            return judge_carried(Gate(), memory, 0.0, 0.03, 1e-4, distance, 0.05, True)[0]
+        return judge(Gate(), memory, 0.0, np.zeros(dimension), R, distance, 0.3)[0]
+
+    assert [verdict(10.82, 1), verdict(10.84, 1)] == ["accepted", "gate"]
+    assert [verdict(13.8, 2), verdict(13.9, 2)] == ["accepted", "gate"]
 
 
 def refused(gate, values, period=0.1, variance=1e-4, support=5):

@@ -145,6 +145,15 @@ def test_a_heartbeat_from_before_its_disarming_arms_no_bridge():
     assert link.prepare(10.7) == "waiting for it to arm"
 
 
+def test_three_seconds_without_a_heartbeat_are_an_alarm():
+    """Armed and heard at 10 s: nothing at 12.9 s, whatever else arrives meanwhile, and an alarm at 13.1 s."""
+    link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
+    link.feed(10.0, bytes(mavlink.MAVLink_heartbeat_message(12, 3, 209, 19, 4, 3).pack(auto)))
+    link.feed(12.8, bytes(mavlink.MAVLink_attitude_message(10, 0, 0, 0, 0, 0, 0).pack(auto)))
+    assert link.alarm(12.9) == ""
+    assert link.alarm(13.1) == "no heartbeat from the autopilot for 3 s"
+
+
 def test_signed_frames_pass_and_unsigned_ones_do_not():
     key = bytes(range(32))
     link, stranger = MavlinkLink(HEAVY, key=key), mavlink.MAVLink(None, 1, 1)

@@ -650,7 +650,7 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_]) -> AxisFit:
         theta[kept] = solve(sums, ratio, before)[0]
         residual = y[inside] - X[inside] @ theta
         centred = residual - _group_means(residual, weight, group)
-        weight = _weights(centred)
+        weight = robust_weights(centred)
         correlated = correlated_samples(
             centred * np.sqrt(weight), (np.flatnonzero(np.diff(group)) + 1).tolist()
         )
@@ -708,8 +708,12 @@ def informative(rows: Rows, signals: Signals) -> NDArray[np.bool_]:
     return signals.wanted[rows.at] & ~(still & (np.abs(rows.y) < SMALL_WRENCH))
 
 
-def _weights(residual: Array) -> Array:
-    """Huber's, by the median absolute deviation; 0 beyond `REJECT` standard deviations, (n,)."""
+def robust_weights(residual: Array) -> Array:
+    """Huber's weights, (n,), by the median absolute deviation; 0 for outliers, beyond `REJECT` standard deviations.
+
+    Args:
+        residual: Residuals [N, N m], body frame, (n,).
+    """
     size = np.abs(residual - np.median(residual))
     scale = GAUSSIAN_MAD * float(np.median(size))
     if scale <= 0.0 or len(residual) < 8:

@@ -167,7 +167,7 @@ def judge(
     distance: float,
     drift: float,
 ) -> tuple[str, GateMemory]:
-    """Whether a measurement is believed, and the gate's memory after it.
+    """Whether a measurement is accepted or refused as an outlier, and the gate's memory after it.
 
     A state that was started from one measurement is no surer than that one: until `reacquire_samples` others have
     supported it, a run takes over as soon as it outnumbers its support.

@@ -27,7 +27,7 @@ def _quantile(dimension: int, probability: float) -> float:
 
 @dataclass(frozen=True)
 class Gate:
-    """What a squared Mahalanobis distance may be, and when a run of refused measurements takes over."""
+    """Beyond which squared Mahalanobis distance a measurement is an outlier, and when a run of them takes over."""
 
     probability: float = 0.999
     """Share of honest measurements that pass."""
