@@ -16,6 +16,7 @@ from finssim.control.allocation import (
     allocation_data,
     regularisation_weight,
 )
+from finssim.control.modes import action_mode
 from finssim.physics.types import vec6, vec8
 from finssim.vehicles import catalogue, load_vehicle
 
@@ -232,3 +233,11 @@ def test_bad_problems_are_refused(finsrov, change, message):
 def test_bad_wrenches_are_refused(finsrov, tau):
     with pytest.raises(ControlError):
         allocator(finsrov).allocate(tau)
+
+
+def test_a_first_allocation_waits_for_no_compiler(monkeypatch):
+    """Kernels are loaded where an allocator or an action mode is made: a robot's first decision only launches them."""
+    vehicle = load_vehicle("finsrov")
+    made, mode = Allocator.from_vehicle(vehicle), action_mode("wrench6", vehicle)
+    monkeypatch.setattr(wp, "launch", None)
+    assert np.allclose(made.allocate(np.zeros(6)), 0.0) and np.allclose(mode.to_thrusters(np.zeros(6)), 0.0)

@@ -384,21 +384,25 @@ class RowLaunch:
         data: Warp struct on the CPU.
         """
         self._kernel, self._dtype, self._data = kernel, dtype, data
-        self._count = -1
+        self._record(1)  # a robot's first decision must not wait for the compiler
 
     def __call__(self, rows: npt.ArrayLike) -> Array:
         """Thrusts [N], (..., 8), for rows (..., m); what a vector holds beyond m is zero."""
         rows = np.asarray(rows, float)
         flat = rows.reshape(-1, rows.shape[-1])
         if len(flat) != self._count:
-            self._count = len(flat)
-            self._arrays = [wp.zeros(self._count, dtype=kind, device="cpu") for kind in (self._dtype, vec8)]
-            inputs = [self._arrays[0], self._data, self._arrays[1]]
-            self._command = wp.launch(self._kernel, self._count, inputs, device="cpu", record_cmd=True)
-            self._given, self._thrusts = (array.numpy() for array in self._arrays)
+            self._record(len(flat))
         self._given[:, : flat.shape[1]] = flat
         self._command.launch()
         return self._thrusts.astype(float).reshape(*rows.shape[:-1], MAX_THRUSTERS)
+
+    def _record(self, count: int) -> None:
+        """Arrays and launch of so many rows; compiles the kernel where that was not done before."""
+        self._count = count
+        self._arrays = [wp.zeros(count, dtype=kind, device="cpu") for kind in (self._dtype, vec8)]
+        inputs = [self._arrays[0], self._data, self._arrays[1]]
+        self._command = wp.launch(self._kernel, count, inputs, device="cpu", record_cmd=True)
+        self._given, self._thrusts = (array.numpy() for array in self._arrays)
 
 
 def axis_weights(wrench_limits: npt.ArrayLike) -> Array:

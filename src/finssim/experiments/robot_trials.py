@@ -466,7 +466,7 @@ class Session:
         while True:
             trial = make()
             x, y, z = start.position
-            self.say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {math.degrees(start.yaw):.0f}°")
+            self.say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {round(math.degrees(start.yaw))}°")
             partial = record.with_name(f".{record.stem}.partial.mcap")
             partial.parent.mkdir(parents=True, exist_ok=True)
             partial.unlink(missing_ok=True)
