@@ -13,7 +13,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from finssim.calibration.findings import SEVERITIES, CalibrationError, Finding, finding, plain
+from finssim.calibration.findings import SEVERITIES, CalibrationError, Finding, finding, listed, plain
 from finssim.calibration.motion import (
     AttitudeSignal,
     Motion,
@@ -377,7 +377,7 @@ def stream_reports(trial: Trial) -> tuple[list[StreamReport], list[Finding]]:
         for name in names:
             for one in _values(trial, name):
                 of.setdefault(one, []).append(name)
-    findings += [one.about(_shown(columns)) for one, columns in of.items()]
+    findings += [one.about(listed(columns, 4)) for one, columns in of.items()]
     few = [name for name in trial.channels if not trial.has(name)]
     if few:
         findings.append(finding("few_samples", columns=tuple(few)))
@@ -421,10 +421,6 @@ def _sampling(report: StreamReport) -> list[Finding]:
     if report.rate < FEW_HERTZ and report.group in ("velocity", "rates"):
         found.append(finding("slow", rate=report.rate))
     return found
-
-
-def _shown(columns: list[str]) -> str:
-    return ", ".join(columns[:4]) + (f" and {len(columns) - 4} more" if len(columns) > 4 else "")
 
 
 def _values(trial: Trial, name: str) -> list[Finding]:
@@ -772,7 +768,7 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
             return [finding("acceleration_unit", value=mean, unit=unit, factor=scale)]
     if not holds_gravity(trial, g):
         if abs(mean / g - 1.0) < 0.2:
-            return [_upside_down(f.mean(axis=0))]
+            return [finding("gravity_wrong_way", az=f.mean(axis=0)[2])]
         return [finding("no_gravity")] if mean < 0.3 * g else []
     up = up_in_body(attitude.quaternion) if attitude.tilt else np.tile([0.0, 0.0, 1.0], (len(t), 1))
     f, _ = on_grid(trial, ("ax", "ay", "az"), t)
@@ -783,7 +779,7 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
     middle, expected = np.median(f, axis=0), np.median(up, axis=0)
     cosine = float(middle @ expected / (np.linalg.norm(middle) * np.linalg.norm(expected)))
     if cosine < -0.5:
-        return [_upside_down(middle)]
+        return [finding("gravity_wrong_way", az=middle[2])]
     found = []
     if cosine < np.cos(np.radians(15.0)):
         against = "the attitude" if attitude.tilt else "level"
@@ -794,10 +790,6 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
         if swing > 0.4 and _correlation(f[:, i], up[:, i]) < AGAINST:
             found.append(finding("acceleration_sign", column=f"a{'xy'[i]}", angle=angle_name))
     return found
-
-
-def _upside_down(felt: Array) -> Finding:
-    return finding("gravity_wrong_way", az=felt[2])
 
 
 def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import string
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -31,10 +31,11 @@ class _Template(string.Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         if not isinstance(value, (tuple, list)):
             return str(super().format_field(value, format_spec))
-        return _listed([format(item, format_spec) for item in value], MOST_NAMES)
+        return listed([format(item, format_spec) for item in value], MOST_NAMES)
 
 
-def _listed(words: list[str], most: int) -> str:
+def listed(words: Sequence[str], most: int) -> str:
+    """Words after one another, and how many more than `most` there are."""
     return ", ".join(words[:most]) + (f" and {len(words) - most} more" if len(words) > most else "")
 
 
@@ -93,7 +94,7 @@ def sentences(findings: Iterable[Finding]) -> list[str]:
         if one.subject not in named:
             named.append(one.subject)
     return [
-        f"{_listed(named, MOST_SUBJECTS)}: {text}" if any(named) else text
+        f"{listed(named, MOST_SUBJECTS)}: {text}" if any(named) else text
         for (_, text), named in subjects.items()
     ]
 

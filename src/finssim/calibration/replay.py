@@ -21,7 +21,7 @@ from finssim.calibration.findings import CalibrationError, Finding, finding, pla
 from finssim.calibration.motion import phase_at, white_noise
 from finssim.calibration.report import new_figure
 from finssim.calibration.simulation.rollout import Response, Rollouts, Segment, Streams, segments, streams
-from finssim.calibration.trials.trial import NU, Array, Trial
+from finssim.calibration.trials.trial import COLUMNS, NU, Array, Trial
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.geometry.rotations import quat_rotate, quat_to_euler
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
@@ -32,7 +32,6 @@ from finssim.vehicles.vehicle import AXES, Axis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from rich.console import Console
 
 __all__ = [
     "Aggregate", "Ahead", "Pair", "RESAMPLES", "Replay", "Score", "UNITS", "aggregate", "error_ahead",
@@ -43,13 +42,7 @@ __all__ = [
 RESPONSES = (*NU, "roll", "pitch", "depth")
 """What is compared: body velocities, and attitude and depth where they were measured."""
 
-UNITS = {
-    **dict.fromkeys("uvw", "m/s"),
-    **dict.fromkeys("pqr", "rad/s"),
-    "roll": "rad",
-    "pitch": "rad",
-    "depth": "m",
-}
+UNITS = {name: COLUMNS[name].unit for name in RESPONSES}
 """Response -> unit."""
 
 EXCITED = 0.3
@@ -559,7 +552,7 @@ def _add(
         pieces.append((inside, since[inside], t, _responses(segment, response, rows, k)))
 
     def at(late: float) -> dict[str, Array]:
-        values = {name: np.full(n, np.nan) for name in (*NU, "roll", "pitch", "depth")}
+        values = {name: np.full(n, np.nan) for name in RESPONSES}
         for inside, since, t, found in pieces:
             for name, x in found.items():
                 values[name][inside] = np.interp(since - late, t, x)
@@ -753,7 +746,6 @@ class Replay:
 
     def as_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-
         return replay_json(self)
 
 
@@ -850,10 +842,6 @@ def run_replay(
     Raises:
         CalibrationError, VehicleError, OutputError: As they say.
     """
-    import json
-
-    from rich.console import Console
-
     from finssim.calibration.trials.trial_files import load_trials
 
     body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
@@ -935,8 +923,11 @@ def draw_response_envelopes(pairs: Sequence[Pair], title: str = "") -> Figure:
     """
     held_out = [pair for pair in pairs if not pair.in_sample]
     shown = held_out or list(pairs)
-    panels = {axis: [p for p in shown if axis in p.axes and _drawable(p, axis)] for axis in AXES}
-    panels = {axis: chosen for axis, chosen in panels.items() if chosen}
+
+    def drawable(pair: Pair, axis: Axis) -> bool:
+        return axis in pair.axes and response_span(pair, pair.response(axis)).value is not None
+
+    panels = {axis: chosen for axis in AXES if (chosen := [p for p in shown if drawable(p, axis)])}
     if not panels:
         raise ValueError(
             "no trial has a response that could be drawn: nothing was measured on an excited axis"
@@ -980,7 +971,7 @@ def draw_overlay(pair: Pair) -> Figure:
             values = _broken(pair, pair.simulated[model][response])
             figure_of = score(pair, model, response).value
             note = "" if figure_of is None else f" {figure_of:.3f}"
-            label = f"{MODEL_LABELS.get(model, model)}{note}"
+            label = f"{_label(model)}{note}"
             axes.plot(
                 pair.t, values, color=_color(model, models), linestyle=_style(model), lw=1.3, label=label
             )
@@ -1013,7 +1004,7 @@ def draw_ahead(ahead: Mapping[Axis, Mapping[str, Ahead]]) -> Figure:
     figure, axes_of = _panels(len(ahead), rows, columns, (1.2 + 2.4 * columns, 2.0 * rows + 0.5))
     for axes, (axis, by_model) in zip(axes_of.flat, ahead.items(), strict=False):
         for model, a in by_model.items():
-            label, color = MODEL_LABELS.get(model, model), _color(model, tuple(by_model))
+            label, color = _label(model), _color(model, tuple(by_model))
             look = {"color": color, "linestyle": _style(model), "linewidth": 1.4}
             axes.plot(a.seconds, a.nrmse, marker="o", markersize=3, label=label, **look)
         first = next(iter(by_model.values()))
@@ -1052,7 +1043,7 @@ def _envelope_panel(axes: Any, axis: Axis, pairs: Sequence[Pair], models: Sequen
             if model in p.simulated
         ]
         color = _color(model, models)
-        _band(axes, grid, np.array(values), color, MODEL_LABELS.get(model, model), _style(model), zorder=3)
+        _band(axes, grid, np.array(values), color, _label(model), _style(model), zorder=3)
         scores = [{axis: score(p, model, p.response(axis)).value} for p in pairs if model in p.simulated]
         value = aggregate(scores, resamples=1).value
         if value is not None:
@@ -1081,10 +1072,6 @@ def _input_panel(axes: Any, pair: Pair) -> None:
         axes.plot(pair.t, values, color="0.35", linestyle=style, linewidth=1.1, label=f"{axis} [{unit}]")
     axes.set_ylabel("input")
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=7.5)
-
-
-def _drawable(pair: Pair, axis: Axis) -> bool:
-    return response_span(pair, pair.response(axis)).value is not None
 
 
 def _coasts(pair: Pair, axis: Axis) -> bool:
@@ -1253,17 +1240,13 @@ def _trial(replay: Replay, i: int, pair: Pair) -> dict[str, Any]:
                     a: {p: phase_score(pair, model, pair.response(a), p).value for p in PHASES}
                     for a in pair.axes
                 },
-                "other_responses": _others(pair, model, others),
+                "other_responses": {
+                    r: value for r in others if (value := score(pair, model, r).value) is not None
+                },
             }
             for model in replay.models
         },
     }
-
-
-def _others(pair: Pair, model: str, responses: list[str]) -> dict[str, float]:
-    """NRMSE of what was measured besides the excited axes, where it is more than noise."""
-    found = {r: score(pair, model, r).value for r in responses}
-    return {r: value for r, value in found.items() if value is not None}
 
 
 REPLAY_FILE = "replay.json"
@@ -1357,10 +1340,7 @@ def _trial_table(replay: Replay) -> tuple[list[str], Rows]:
     rows: Rows = []
     for pair, scores in zip(replay.pairs, replay.scores[model], strict=True):
         for axis, one in scores.items():
-            phases = [
-                _number(phase_score(pair, model, pair.response(axis), p).value)
-                for p in ("excitation", "coast")
-            ]
+            phases = [_number(phase_score(pair, model, pair.response(axis), p).value) for p in PHASES]
             kind = "in-sample" if pair.in_sample else "held-out"
             rows.append([pair.name, axis, kind, _number(one.value), *phases])
     return ["trial", "axis", "", "NRMSE", "excitation", "coast"], rows

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.findings import CalibrationError, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.importers.ardusub_outputs import mixed_pulses, outputs_of
 from finssim.calibration.importers.assemble import ArduSubMap, Frame, Stream, in_our_axes
 from finssim.calibration.trials.conversion import GRAVITY
@@ -65,17 +65,20 @@ class Log:
         """A field of every message of a kind, NaN where it has none, (n,)."""
         return np.array([_number(message.get(name)) for message in self.messages[kind]], dtype=float)
 
+    def stream(self, kind: str, channels: dict[str, Array], *findings: Finding) -> Stream:
+        """Columns at the times of a kind of message."""
+        source = f"{self.shown} {kind}"
+        return Stream(source=source, t=self.times[kind], channels=channels, findings=findings)
+
     def some(self, kind: str, name: str, value: int | str) -> Log:
         """The log with only those messages of a kind whose field has that value; all where none has the field."""
         if not any(name in message for message in self.messages.get(kind, ())):
             return self
         keep = [i for i, message in enumerate(self.messages[kind]) if message.get(name) == value]
-        return Log(
-            self.shown,
-            self.telemetry,
-            {**self.times, kind: self.times[kind][keep]},
-            {**self.messages, kind: [self.messages[kind][i] for i in keep]},
-            self.parameters,
+        return replace(
+            self,
+            times={**self.times, kind: self.times[kind][keep]},
+            messages={**self.messages, kind: [self.messages[kind][i] for i in keep]},
         )
 
 
@@ -214,9 +217,7 @@ def _recorded(path: Path, kinds: frozenset[str]) -> Iterator[tuple[str, dict[str
         while True:
             try:
                 _, channel, message = next(messages)
-            except StopIteration:
-                return
-            except Exception:  # at the cut of a log, in whatever layer reads it
+            except Exception:  # at the end, or at the cut of a log in whatever layer reads it
                 return
             topic = MAVLINK_TOPIC.fullmatch(channel.topic)
             if topic is None or topic[3] not in kinds:
@@ -323,13 +324,9 @@ def _position_deltas(log: Log) -> Stream | None:
     good = dt > 1e-3
     velocity = np.where(good[:, None], delta / np.where(good, dt, 1.0)[:, None], np.nan)
     # A delta is the mean over the time before its stamp.
-    stream = Stream(
-        source=f"{log.shown} {kind}",
-        t=log.times[kind] - 0.5 * np.where(good, dt, 0.0),
-        channels=dict(zip("uvw", velocity.T, strict=True)),
-        findings=(finding("velocity_at_sensor", kind=kind),),
-    )
-    return in_our_axes(stream, FRD)
+    channels = dict(zip("uvw", velocity.T, strict=True))
+    stream = log.stream(kind, channels, finding("velocity_at_sensor", kind=kind))
+    return in_our_axes(replace(stream, t=stream.t - 0.5 * np.where(good, dt, 0.0)), FRD)
 
 
 def _estimate(log: Log) -> Stream | None:
@@ -341,19 +338,15 @@ def _estimate(log: Log) -> Stream | None:
     usable = HORIZONTAL_VELOCITY | RELATIVE_POSITION
     flags = _held(first_core, status, flag_name, first_core.times[kind], usable).astype(np.int64)
     moving = (flags & HORIZONTAL_VELOCITY > 0) & (flags & STANDING_STILL == 0)
-    source = f"{log.shown} {kind}"
     if moving.mean() < LEAST_USABLE:
         unusable = finding("velocity_left_out", kind=kind, share=1.0 - moving.mean())
-        return Stream(source=source, t=first_core.times[kind], findings=(unusable,))
+        return first_core.stream(kind, {}, unusable)
     placed = moving & (flags & (RELATIVE_POSITION | ABSOLUTE_POSITION) > 0)
     values = [first_core.numbers(kind, name) for name in names]
     channels = {c: np.where(moving, v, np.nan) for c, v in zip(("vx", "vy", "vz"), values[:3], strict=True)}
     if placed.any():
         channels |= {c: np.where(placed, v, np.nan) for c, v in zip("xyz", values[3:], strict=True)}
-    estimated = (finding("velocity_estimated", kind=kind),)
-    return in_our_axes(
-        Stream(source=source, t=first_core.times[kind], channels=channels, findings=estimated), FRD
-    )
+    return in_our_axes(first_core.stream(kind, channels, finding("velocity_estimated", kind=kind)), FRD)
 
 
 def _held(log: Log, kind: str, name: str, t: Array, otherwise: float) -> Array:
@@ -432,7 +425,7 @@ def _attitude(log: Log) -> Stream | None:
     else:
         return None
     channels |= dict(zip(("roll", "pitch", "yaw"), angles, strict=True))
-    stream = in_our_axes(Stream(source=f"{log.shown} {kind}", t=log.times[kind], channels=channels), FRD)
+    stream = in_our_axes(log.stream(kind, channels), FRD)
     wrapped = {name: wrap_angle(stream.channels[name]) for name in ("roll", "yaw")}
     return replace(stream, channels={**stream.channels, **wrapped})
 
@@ -448,14 +441,12 @@ def _inertial(log: Log, asked: ArduSubMap) -> Stream | None:
             raise CalibrationError(f"{log.shown}: holds no IMU {asked.imu}: give 'ardusub: {{imu: 0}}'")
         channels = {f"a{axis.lower()}": one.numbers(kind, f"Acc{axis}") for axis in "XYZ"}
         channels |= {name: one.numbers(kind, f"Gyr{axis}") for name, axis in zip("pqr", "XYZ", strict=True)}
-        return in_our_axes(Stream(source=f"{log.shown} {kind}", t=one.times[kind], channels=channels), FRD)
+        return in_our_axes(one.stream(kind, channels), FRD)
     for kind in INERTIAL:
         if log.has(kind) and np.any(log.numbers(kind, "zacc")):
             # [milli-g], and zero in every field of a chip that has no such sensor
             channels = {f"a{axis}": 1e-3 * GRAVITY * log.numbers(kind, f"{axis}acc") for axis in "xyz"}
-            return in_our_axes(
-                Stream(source=f"{log.shown} {kind}", t=log.times[kind], channels=channels), FRD
-            )
+            return in_our_axes(log.stream(kind, channels), FRD)
     return None
 
 
@@ -471,9 +462,8 @@ def _depth(log: Log, asked: ArduSubMap) -> Stream | None:
     one = log.some(kind, "I", chosen)
     if not one.has(kind):
         return None
-    of = (finding("depth_of_barometer", number=chosen),)
-    channels = {"depth": -one.numbers(kind, "Alt")}
-    return Stream(source=f"{log.shown} {kind}", t=one.times[kind], channels=channels, findings=of)
+    of = finding("depth_of_barometer", number=chosen)
+    return one.stream(kind, {"depth": -one.numbers(kind, "Alt")}, of)
 
 
 def _depth_from_pressure(log: Log, chosen: int) -> Stream | None:
@@ -484,11 +474,10 @@ def _depth_from_pressure(log: Log, chosen: int) -> Stream | None:
     ground = log.parameters.get(f"BARO{chosen + 1}_GND_PRESS", 0.0)
     if ground <= 0.0:
         # The trial's maker knows the surface pressure and the density.
-        return Stream(source=f"{log.shown} {kind}", t=log.times[kind], channels={"pressure": pressure})
+        return log.stream(kind, {"pressure": pressure})
     # 9800 Pa for a metre of fresh water, as the autopilot reckons.
     depth = (pressure - ground) / (9800.0 * log.parameters.get("BARO_SPEC_GRAV", 1.0))
-    of = (finding("depth_of_message", kind=kind, ground=ground),)
-    return Stream(source=f"{log.shown} {kind}", t=log.times[kind], channels={"depth": depth}, findings=of)
+    return log.stream(kind, {"depth": depth}, finding("depth_of_message", kind=kind, ground=ground))
 
 
 def _voltage(log: Log) -> Stream | None:
@@ -503,8 +492,7 @@ def _voltage(log: Log) -> Stream | None:
         volts = unit * one.numbers(kind, name)
         measured = (volts > 1.0) & (volts < 65.0)  # 0 and 65.535 V stand for "not measured"
         if measured.sum() >= 2:
-            t, volts = one.times[kind][measured], volts[measured]
-            return Stream(source=f"{log.shown} {kind}", t=t, channels={"voltage": volts})
+            return one.stream(kind, {"voltage": volts}).taken(measured)
     return None
 
 
@@ -550,7 +538,7 @@ def _pulses(log: Log, asked: ArduSubMap, vehicle: Vehicle | None) -> list[Stream
     for output, (name, sign) in outputs.items():
         pulse = one.numbers(kind, field.format(output))
         channels[f"pwm_{name}"] = np.where(pulse > 0.0, NEUTRAL + sign * (pulse - NEUTRAL), np.nan)
-    return [Stream(source=f"{log.shown} {kind}", t=one.times[kind], channels=channels, findings=(of,))]
+    return [one.stream(kind, channels, of)]
 
 
 MANUAL = 19
@@ -583,7 +571,7 @@ def _driven_by_sticks(log: Log, asked: ArduSubMap, vehicle: Vehicle, streams: li
     except CalibrationError as error:
         raise CalibrationError(f"{log.shown}: {error}") from None
     note = finding("sticks_mixed", frame=FRAMES[config][0], gain=1.0)
-    pulses = Stream(source=f"{log.shown} {kind}", t=t, channels=channels, findings=(note, mapped))
+    pulses = log.stream(kind, channels, note, mapped)
     # A held command knows no gap but one of the whole recording.
     kept, other = [], 0
     for stream in (*streams, pulses):

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
-from finssim.calibration.findings import CalibrationError, Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding, listed
 from finssim.calibration.importers.assemble import (
     ColumnMap,
     ColumnSource,
@@ -167,8 +167,7 @@ def _date(word: str) -> str:
 
 
 def _column_list(table: Table) -> str:
-    names = table.columns
-    return ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
+    return listed(table.columns, 40)
 
 
 # What our own records add to a bag: thrusters by name, phases and arming from events, the vehicle they are of.
@@ -341,8 +340,7 @@ def word_at(message: Any, path: str, topic: str) -> str:
 
 def stamp_of(message: Any) -> int | None:
     """The header's stamp [ns], or None where there is none or it was left at zero."""
-    header = getattr(message, "header", None)
-    stamp = getattr(header, "stamp", None)
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is None:
         return None
     nanoseconds = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
@@ -362,7 +360,7 @@ def _value_at(message: Any, path: str, topic: str) -> Any:
                 )
             continue
         key = index or name
-        names = [str(x) for x in getattr(message, "names", getattr(message, "name", ()))]
+        names = _names(message)
         place = int(key) if key.lstrip("-").isdigit() else names.index(key) if key in names else None
         if place is None:
             raise CalibrationError(
@@ -544,11 +542,7 @@ def _collect(
 ) -> dict[str, tuple[list[float], dict[str, list[float]], dict[str, list[str]]]]:
     """Per topic: times, numbers by canonical column, and words."""
     collected: dict[str, Any] = {
-        topic: (
-            [],
-            {name: [] for name in columns},
-            {name: [] for name in worded(topics[topic])},
-        )
+        topic: ([], {name: [] for name in columns}, {name: [] for name in worded(topics[topic])})
         for topic, columns in sources.items()
     }
     connections = [c for c in reader.connections if c.topic in sources]
