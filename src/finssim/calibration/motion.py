@@ -16,6 +16,7 @@ from scipy.fft import dst
 from scipy.linalg import solveh_banded
 
 from finssim.calibration.findings import Finding, finding
+from finssim.calibration.trials.conversion import EULER, QUATERNION
 from finssim.calibration.trials.inputs import Drive, applied_wrench, drive
 from finssim.calibration.trials.trial import COLUMNS, NU, Trial
 from finssim.geometry.rotations import (
@@ -33,9 +34,6 @@ __all__ = [
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
-
-QUATERNION = ("qx", "qy", "qz", "qw")
-EULER = ("roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,7 +223,7 @@ def _origin(
     if not trial.has("z") and trial.has("depth"):
         depth = _column(trial, "depth", at, 3)
         z = replace(depth, value=-depth.value, slope=-depth.slope)
-        arms[2] = _depth_at(trial, vehicle)
+        arms[2] = depth_place(trial, vehicle)
     known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
     turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
     value = np.stack([x.value, y.value, z.value], axis=-1)
@@ -239,7 +237,8 @@ def _origin(
     return value, slope, np.array([c.slope_std for c in (x, y, z)])
 
 
-def _depth_at(trial: Trial, vehicle: Vehicle) -> Array:
+def depth_place(trial: Trial, vehicle: Vehicle) -> Array:
+    """Body point of the pressure sensor [m], (3,): the header's, the vehicle's, or the origin."""
     if trial.header.depth_at is not None:
         return np.asarray(trial.header.depth_at, float)
     return np.zeros(3) if vehicle.sensors.depth is None else np.asarray(vehicle.sensors.depth.position, float)

@@ -152,15 +152,11 @@ def multisine(
 
 def _lowest_peak(harmonics: NDArray[np.int64], turns: Array, rng: np.random.Generator) -> Array:
     """The sum of cosines whose random phases give the lowest peak."""
-    amplitude = harmonics**-0.5
-    best = None
-    for _ in range(DRAWS):
-        phases = rng.uniform(0.0, 2.0 * math.pi, len(harmonics))
-        wave = np.cos(2.0 * math.pi * turns[:, None] * harmonics + phases) @ amplitude
-        if best is None or np.abs(wave).max() < np.abs(best).max():
-            best = wave
-    assert best is not None
-    return np.asarray(best)
+    draws = (rng.uniform(0.0, 2.0 * math.pi, len(harmonics)) for _ in range(DRAWS))
+    waves = (
+        np.cos(2.0 * math.pi * turns[:, None] * harmonics + phases) @ harmonics**-0.5 for phases in draws
+    )
+    return min(waves, key=lambda wave: float(np.abs(wave).max()))
 
 
 def _feasible(tau: Array, vehicle: Vehicle) -> float:
@@ -507,6 +503,7 @@ def write_programme(programme: Programme, vehicle: Vehicle, folder: Path) -> Non
     rows = ([*(f"{x:g}" for x in row), word] for row, word in zip(numbers, programme.phase, strict=True))
     names = ["t", *TAU, *(f"force_{name}" for name in vehicle.thruster_names), "phase"]
     write_csv(folder / "programme.csv", names, rows)
+    peaks = np.abs(programme.tau_desired).max(axis=0).tolist()
     about: dict[str, Any] = {
         "name": programme.name,
         "vehicle": vehicle.name,
@@ -514,13 +511,9 @@ def write_programme(programme: Programme, vehicle: Vehicle, folder: Path) -> Non
         "rate": programme.rate,
         "duration": programme.duration,
         "wrench_at": [float(x) for x in vehicle.wrench_reference],
-        "peak": {axis: _peak(programme, i) for i, axis in enumerate(TAU) if _peak(programme, i) > 0.0},
+        "peak": {axis: peak for axis, peak in zip(TAU, peaks, strict=True) if peak > 0.0},
     }
     if programme.ascent_speed is not None:
         about["end_coast_early"] = {"ascent_speed": programme.ascent_speed, "after": programme.ascent_time}
     with atomic_write(folder / "programme.yaml") as path:
         path.write_text(yaml_text(about), encoding="utf-8")
-
-
-def _peak(programme: Programme, i: int) -> float:
-    return float(np.abs(programme.tau_desired[:, i]).max())

@@ -521,30 +521,20 @@ def _inputs(
         thrust = thrust[::every]
     command = recording.command[::every].astype(float)
     out: dict[str, Array] = {}
-    names = vehicle.thruster_names
+    thrusters = list(enumerate(vehicle.thrusters.items()))
     if "rpm" in inputs:
-        out |= {f"rpm_{name}": _rpm(thrust[..., k], vehicle, k) for k, name in enumerate(names)}
+        turns = 60.0 / (2.0 * np.pi)
+        out |= {f"rpm_{name}": one.speed(thrust[..., k]) * turns for k, (name, one) in thrusters}
     if "force" in inputs:
-        out |= {f"force_{name}": thrust[..., k] for k, name in enumerate(names)}
+        out |= {f"force_{name}": thrust[..., k] for k, (name, _) in thrusters}
     if "wrench" in inputs:
         tau = thrust @ vehicle.control_matrix.T
         out |= {name: tau[..., i] for i, name in enumerate(TAU)}
     if "command" in inputs:
-        out |= {f"command_{name}": command[..., k] for k, name in enumerate(names)}
+        out |= {f"command_{name}": command[..., k] for k, (name, _) in thrusters}
     if "pwm" in inputs:
-        out |= {f"pwm_{name}": _pulse(command[..., k], vehicle, k) for k, name in enumerate(names)}
+        out |= {f"pwm_{name}": one.pulse(one.speed(command[..., k])) for k, (name, one) in thrusters}
     return out
-
-
-def _rpm(thrust: Array, vehicle: Vehicle, k: int) -> Array:
-    """Shaft speed at which the file says thruster k gives a thrust [rpm]."""
-    return vehicle.thrusters[vehicle.thruster_names[k]].speed(thrust) * (60.0 / (2.0 * np.pi))
-
-
-def _pulse(thrust: Array, vehicle: Vehicle, k: int) -> Array:
-    """Pulse width at which the file says thruster k gives a thrust [µs]."""
-    thruster = vehicle.thrusters[vehicle.thruster_names[k]]
-    return thruster.pulse(thruster.speed(thrust))
 
 
 def _end(programme: Programme, recording: Recording, world: int) -> float:

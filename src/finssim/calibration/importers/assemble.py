@@ -14,8 +14,10 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.importers.ardusub_outputs import STICKS, mixed_pulses
 from finssim.calibration.trials.conversion import (
+    EULER,
     EXTRA_COLUMNS,
     GRAVITY,
+    QUATERNION,
     SAME_ROW,
     TIME_UNITS,
     factor,
@@ -601,8 +603,6 @@ def _refuse_apart(streams: Sequence[Stream]) -> None:
             )
 
 
-EULER = ("roll", "pitch", "yaw")
-QUATERNION = ("qx", "qy", "qz", "qw")
 WORLD_VELOCITY = ("vx", "vy", "vz")
 STANDARD_ATMOSPHERE = 101325.0
 LONGEST_BRIDGE = 0.5

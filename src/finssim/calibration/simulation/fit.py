@@ -33,6 +33,7 @@ from finssim.calibration.simulation.rollout import (
     segments,
     streams,
 )
+from finssim.calibration.trials.conversion import EULER
 from finssim.calibration.trials.inputs import require_axes, require_fittable
 from finssim.calibration.trials.trial import COLUMNS, Trial
 from finssim.calibration.uncertainty import Covariance, Evidence, degeneracy, intervals, trial_covariance
@@ -500,8 +501,6 @@ def solve(
 
 # What a simulation would have measured, against what was measured.
 
-ANGLES = ("roll", "pitch", "yaw")
-
 
 class Residuals:
     """Samples of all segments in one list, sorted by segment, then by channel.
@@ -562,7 +561,7 @@ class Residuals:
                 segment = self.segment[which]
                 a = grid[row, those, segment].astype(float)
                 rise = grid[row + 1, those, segment].astype(float) - a
-                if name in ANGLES:
+                if name in EULER:
                     rise = wrap_angle(rise)
                 value[which, those] = a + (at - row)[:, None] * rise
                 rate[which, those] = rise / step
@@ -572,7 +571,7 @@ class Residuals:
         """Measured minus predicted, angles the short way round, (N, C)."""
         out = self.value[:, None] - predicted
         for j, name in enumerate(self.names):
-            if name in ANGLES:
+            if name in EULER:
                 which = self.channel == j
                 out[which] = wrap_angle(out[which])
         return np.asarray(out)
@@ -652,7 +651,7 @@ def channel(
             body = quat_rotate(quat_conjugate(q), np.broadcast_to(flow, (*q.shape[1:3], 3)))[..., i]
             out = out - np.where(in_water, body, 0.0)
         return np.asarray(out, np.float32)
-    if name in ANGLES:
+    if name in EULER:
         return euler_angle(name, q)
     sensor = "depth_at" if name == "depth" else "position_at"
     at = np.stack([getattr(s, sensor) for s in segments])
@@ -957,7 +956,7 @@ class Shooting:
         value, rate = self._predicted(points)
         rise = value[:, 1::2] - value[:, 2::2]
         for j, name in enumerate(self.measured.names):
-            if name in ANGLES:
+            if name in EULER:
                 which = self.measured.channel == j
                 rise[which] = wrap_angle(rise[which])
         slopes = np.nan_to_num(rise / wide)

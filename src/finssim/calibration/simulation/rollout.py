@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.findings import CalibrationError
-from finssim.calibration.motion import EULER, Motion, attitude_samples, motion
+from finssim.calibration.motion import Motion, attitude_samples, depth_place, motion
+from finssim.calibration.trials.conversion import EULER
 from finssim.calibration.trials.inputs import Drive, drive
 from finssim.calibration.trials.trial import Trial
 from finssim.engine.plant_arrays import NO_LIMIT, vehicle_parameters
@@ -186,8 +187,6 @@ def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, i
         if inside.any():
             measured[column] = (np.maximum(t[inside] - t0, 0.0), values[inside])
     water = header.water
-    depth = vehicle.sensors.depth
-    at = header.depth_at if header.depth_at is not None else (depth.position if depth else (0.0, 0.0, 0.0))
     return Segment(
         trial=s.trial.name,
         index=index,
@@ -209,7 +208,7 @@ def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, i
         velocity_at=np.asarray(header.velocity_at, float),
         velocity_in_water=header.velocity == "water",
         position_at=np.asarray(header.position_at, float),
-        depth_at=np.asarray(at, float),
+        depth_at=depth_place(s.trial, vehicle),
     )
 
 

@@ -198,24 +198,16 @@ def _read_parquet(path: Path) -> Table:
         ) from None
     table = Table()
     _check_names(content.column_names, path)
+    of = pyarrow.types
     for name in content.column_names:
         kind = content.schema.field(name).type
         column = content.column(name)
-        if pyarrow.types.is_timestamp(kind):
+        if of.is_timestamp(kind):
             table.words[name] = [str(word) for word in column.to_numpy()]
-        elif (
-            pyarrow.types.is_integer(kind)
-            or pyarrow.types.is_floating(kind)
-            or pyarrow.types.is_boolean(kind)
-            or pyarrow.types.is_decimal(kind)
-        ):
+        elif any(is_kind(kind) for is_kind in (of.is_integer, of.is_floating, of.is_boolean, of.is_decimal)):
             if name != "phase":
                 table.numbers[name] = np.array(column.cast(pyarrow.float64(), safe=False), dtype=np.float64)
-        elif (
-            pyarrow.types.is_string(kind)
-            or pyarrow.types.is_large_string(kind)
-            or (pyarrow.types.is_dictionary(kind))
-        ):
+        elif any(is_kind(kind) for is_kind in (of.is_string, of.is_large_string, of.is_dictionary)):
             cells = ["" if cell is None else str(cell) for cell in column.to_pylist()]
             numbers = [number(cell) for cell in cells]
             _keep(table, name, [c if x is None else x for c, x in zip(cells, numbers, strict=True)])
@@ -566,11 +558,9 @@ def trials_at(path: Path) -> list[Path]:
         raise CalibrationError(
             f"{path}: holds no trial: expected data.csv or data.parquet in it or in folders of it"
         )
-    return sorted(trials, key=lambda item: [int(w) if w.isdigit() else w for w in _words(item.name)])
-
-
-def _words(name: str) -> list[str]:
-    return re.split(r"(\d+)", name)
+    return sorted(
+        trials, key=lambda item: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", item.name)]
+    )
 
 
 def _unique_names(trials: list[Trial], paths: list[Path]) -> list[str]:

@@ -32,7 +32,7 @@ from finssim.calibration.report import (
     refuse_places,
 )
 from finssim.calibration.uncertainty import Covariance, Evidence, correlation, intervals, trial_covariance
-from finssim.calibration.vision.least_squares import Pose, arrow_evidence, block_of
+from finssim.calibration.vision.least_squares import Pose, arrow_evidence, block_of, rms
 from finssim.geometry.optics import Lens
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix, skew
 from finssim.localization.camera_file import write_camera
@@ -312,12 +312,7 @@ class Bundle:
     @property
     def rms(self) -> Array:
         """Root of the mean squared distance of corners, per view [px]."""
-        return np.array([_rms(r) for r in self.residuals])
-
-
-def _rms(residuals: Array) -> float:
-    """Root of the mean squared length of vectors (n, 2)."""
-    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1))))
+        return np.array([rms(r) for r in self.residuals])
 
 
 def lens_names(model: str) -> tuple[str, ...]:
@@ -433,7 +428,7 @@ class View:
     @property
     def rms(self) -> float:
         """Root of the mean squared distance of its corners [px]."""
-        return _rms(self.residuals)
+        return rms(self.residuals)
 
     @property
     def tilt(self) -> float:
@@ -501,7 +496,7 @@ def calibrate_camera(views: Sequence[BoardView], *, model: str = "plumb_bob", se
         estimates=estimates,
         correlation=correlation(covariance.names, covariance.local),
         views=every,
-        rms=_rms(np.concatenate(bundle.residuals)),
+        rms=rms(np.concatenate(bundle.residuals)),
         held_out_rms=_held_out(some, model, seed),
         error95=error95,
         covariance=covariance,
@@ -576,7 +571,7 @@ def _held_out(views: Sequence[BoardView], model: str, seed: int) -> float:
         for view in (view for view, part in zip(views, fold, strict=True) if part == k):
             if (pose := board_pose(lens, view)) is not None:
                 residuals.append(_residual(lens, pose, view))
-    return _rms(np.concatenate(residuals)) if residuals else math.nan
+    return rms(np.concatenate(residuals)) if residuals else math.nan
 
 
 def _views(views: Sequence[BoardView], used: Mapping[str, int], bundle: Bundle) -> tuple[View, ...]:
@@ -586,7 +581,7 @@ def _views(views: Sequence[BoardView], used: Mapping[str, int], bundle: Bundle) 
         if pose is None:
             continue
         residual = _residual(bundle.lens, pose, view)
-        reason = f"its corners miss by {_rms(residual):.2f} px, those of the others by {median:.2f} px"
+        reason = f"its corners miss by {rms(residual):.2f} px, those of the others by {median:.2f} px"
         left_out = "" if view.name in used else reason
         every.append(
             View(name=view.name, pixels=view.pixels, residuals=residual, pose=pose, left_out=left_out)

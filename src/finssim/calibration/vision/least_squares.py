@@ -58,6 +58,11 @@ def descent(
         damping = max(damping / 6.0, 1e-12)
 
 
+def rms(errors: Array) -> float:
+    """Root mean square length of vectors (K, n); NaN of none."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else float("nan")
+
+
 def huber_weight(size: Array, limit: float) -> Array:
     """1 up to a limit, falling as 1 / size beyond."""
     return np.asarray(np.minimum(1.0, limit / np.maximum(size, 1e-300)))

@@ -31,7 +31,7 @@ from finssim.calibration.report import (
     refuse_places,
 )
 from finssim.calibration.uncertainty import correlation
-from finssim.calibration.vision.least_squares import huber_weight
+from finssim.calibration.vision.least_squares import huber_weight, rms
 from finssim.calibration.vision.pool_model import (
     LENS_NAMES,
     NAMES,
@@ -751,11 +751,6 @@ class HeldOut:
         }
 
 
-def rms(errors: Array) -> float:
-    """Root mean square length of vectors (K, n)."""
-    return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else float("nan")
-
-
 def held_out(fit: Refined, seen: Observations, folds: int, seed: int, normal: Array) -> HeldOut | None:
     """Refit without each part of the locations in turn; None where too few would be left.
 
@@ -991,7 +986,7 @@ def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[Find
         change = float(np.exp(pull * prior.lens_std[0]) - 1.0)
         yield finding("focal_pulled", change=change, expected=prior.lens_std[0])
     if np.isfinite(prior.tilt_std) and prior.normal is not None:
-        lean = float(np.arccos(np.clip(model.interface.normal @ prior.normal, -1.0, 1.0)))
+        lean = _lean(model, prior.normal)
         if lean > 3.0 * prior.tilt_std:
             yield finding("tilt_pulled", lean=float(np.degrees(lean)), remedy=lens)
 
@@ -1201,18 +1196,20 @@ def _released(seen: Observations, settings: Settings, fit: Refined, notes: list[
         return fit
     free = _without(seen, settings, fit, replace(fit.prior, tilt_std=np.inf))
     assert fit.prior.normal is not None
-    if free is None or not _leans(free, fit.prior.normal):
+    if free is None:
         return fit
-    lean = float(np.degrees(np.arccos(np.clip(free.model.interface.normal @ fit.prior.normal, -1.0, 1.0))))
-    notes.append(finding("plane_tilted", lean=lean))
+    # Small enough to be a tilt, and told by the pixels rather than free to go anywhere.
+    lean = _lean(free.model, fit.prior.normal)
+    error = float(np.sqrt(max(free.covariance[k, k] for k in (6, 7))))
+    if not (lean < MOST_LEAN and error < lean / 3.0):
+        return fit
+    notes.append(finding("plane_tilted", lean=float(np.degrees(lean))))
     return free
 
 
-def _leans(free: Refined, normal: Array) -> bool:
-    """Whether the tilt is small enough to be one, and told by the pixels rather than free to go anywhere."""
-    lean = float(np.arccos(np.clip(free.model.interface.normal @ normal, -1.0, 1.0)))
-    error = float(np.sqrt(max(free.covariance[k, k] for k in (6, 7))))
-    return lean < MOST_LEAN and error < lean / 3.0
+def _lean(model: PoolModel, normal: Array) -> float:
+    """Angle between the plane's normal and another [rad]."""
+    return float(np.arccos(np.clip(model.interface.normal @ normal, -1.0, 1.0)))
 
 
 def _contradicted(seen: Observations, settings: Settings, fit: Refined) -> list[Finding]:

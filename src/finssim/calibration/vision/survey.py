@@ -419,15 +419,11 @@ class Observations:
     def subset(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
         """Some of the rows; locations keep their indices."""
         index = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
+        columns = ("pixels", "points", "location", "sigma", "arm", "dry")
         return replace(
             self,
-            pixels=self.pixels[index],
-            points=self.points[index],
-            location=self.location[index],
+            **{name: getattr(self, name)[index] for name in columns},
             names=tuple(self.names[i] for i in index),
-            sigma=self.sigma[index],
-            arm=self.arm[index],
-            dry=self.dry[index],
         )
 
 
