@@ -21,9 +21,9 @@ from finssim.calibration.regression.axis_estimates import CERTAIN
 from finssim.calibration.regression.plant_terms import matrices
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.report import finish, progress_bar, refuse_places, usable_trials
-from finssim.calibration.trials.inputs import drive
+from finssim.calibration.trials.inputs import drive, require_axes
 from finssim.calibration.trials.trial import Trial
-from finssim.calibration.vehicle_file import SCALED, calibrated
+from finssim.calibration.vehicle_file import calibrated, scaled_thrust
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 METHODS = ("auto", "regression", "simulation")
@@ -120,7 +120,7 @@ def fit_hydrodynamics(
     if "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle):
         free = _or_none(lambda body: regression(body, known={}, file_prior=False), vehicle)
         scale, std = _thrust_scale(free, vehicle, known)
-    body = vehicle.replace(scaled(vehicle, scale)) if std else vehicle
+    body = vehicle.replace(scaled_thrust(vehicle, scale)) if std else vehicle
     before = _scores(vehicle, trials)
     driven = [trial for trial in trials if not trial.header.passive]
     if method == "simulation" or asked:
@@ -216,15 +216,6 @@ def _unknown_voltage(trials: Sequence[Trial], vehicle: Vehicle) -> bool:
     return sources == {"pwm"} and silent
 
 
-def scaled(vehicle: Vehicle, scale: float) -> dict[str, Any]:
-    """Changes of the vehicle file that multiply every thrust."""
-    return {
-        f"thrusters.{name}.{key}": scale * float(getattr(thruster, key))
-        for name, thruster in vehicle.thrusters.items()
-        for key in SCALED
-    }
-
-
 def _thrust_scale(fit: Fit | None, vehicle: Vehicle, known: Mapping[str, float]) -> tuple[float, float]:
     """Thrust over that of the file, and the standard deviation of its logarithm.
 
@@ -271,7 +262,7 @@ def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float, known: Map
         fit,
         vehicle=vehicle,
         estimates=found,
-        changes={**scaled(vehicle, scale), **fit.changes},
+        changes={**scaled_thrust(vehicle, scale), **fit.changes},
         findings=(finding("voltage_unknown", percent=100.0 * (high - 1.0)), *fit.findings),
     )
 
@@ -365,9 +356,7 @@ def _axes(words: str | None) -> tuple[str, ...] | None:
     if words is None or words == "all":
         return None
     names = [word.strip() for word in words.split(",")]
-    for name in names:
-        if name not in AXES:
-            raise CalibrationError(f"unknown axis '{name}'; available: {', '.join(AXES)}")
+    require_axes(names)
     return tuple(axis for axis in AXES if axis in names)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -384,6 +384,10 @@ def _same_way(
         )
 
 
+QUANTITIES = ("speed", "force", "pulse", "voltage")
+"""Columns of a `ThrustTable`."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ThrustTable:
     """Steady values of one thruster (or one type of thruster); NaN where a column or cell is missing."""
@@ -407,8 +411,7 @@ class ThrustTable:
 
     def at(self, rows: NDArray[np.bool_]) -> ThrustTable:
         """The same table with some of its rows."""
-        columns = {key: getattr(self, key)[rows] for key in ("speed", "force", "pulse", "voltage")}
-        return replace(self, **columns)
+        return replace(self, **{key: getattr(self, key)[rows] for key in QUANTITIES})
 
 
 def read_table(path: str | os.PathLike[str], *, neutral: float = 1500.0) -> ThrustTable:
@@ -500,7 +503,7 @@ def _table(
         values, kept = last_parts(values)
         findings.append(kept)
     count = len(values["force"])
-    full = {key: values.get(key, np.full(count, np.nan)) for key in ("speed", "force", "pulse", "voltage")}
+    full = {key: values.get(key, np.full(count, np.nan)) for key in QUANTITIES}
     speed_known = "speed" in values
     good = np.isfinite(full["force"]) & np.isfinite(full["speed"] if speed_known else full["pulse"])
     if np.count_nonzero(good) < 3:
@@ -509,17 +512,10 @@ def _table(
     check_values(full, shown)
     full["force"] = without_offset(full, speed_known, neutral, findings)
     full["speed"], full["force"], keep = signed(full, speed_known, neutral, sources, shown, findings)
-    full = {key: value[keep] for key, value in full.items()}
-    digest = hashlib.sha256(b"".join(np.ascontiguousarray(full[key] + 0.0).tobytes() for key in sorted(full)))
-    return ThrustTable(
-        name=name,
-        speed=full["speed"],
-        force=full["force"],
-        pulse=full["pulse"],
-        voltage=full["voltage"],
-        sha256=digest.hexdigest(),
-        findings=tuple(findings),
-    )
+    columns: dict[str, Any] = {key: value[keep] for key, value in full.items()}
+    numbers = (np.ascontiguousarray(columns[key] + 0.0).tobytes() for key in sorted(columns))
+    digest = hashlib.sha256(b"".join(numbers))
+    return ThrustTable(name=name, **columns, sha256=digest.hexdigest(), findings=tuple(findings))
 
 
 def _cells(path: Path, shown: str) -> tuple[list[str], Array]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from finssim.calibration.findings import CalibrationError, Finding, finding, sentences
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.report import finish, refuse_places
-from finssim.calibration.thrust_table import STANDING, ThrustTable, read_table, tables_of_trial
+from finssim.calibration.thrust_table import QUANTITIES, STANDING, ThrustTable, read_table, tables_of_trial
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
@@ -251,21 +251,21 @@ def fit_esc(
         zero, emf, load = _law(*law, edge / span)
         label = np.argsort(np.argsort(law[0], kind="stable")) * PULSE_BLOCKS // len(law[0])
         left_out = [
-            _law(*_others(law, label != i), edge / span) for i in range(PULSE_BLOCKS) if np.any(label == i)
+            _law(*(column[label != i] for column in law), edge / span)
+            for i in range(PULSE_BLOCKS)
+            if np.any(label == i)
         ]
         half = jackknife(np.array(left_out))
         numbers |= {f"dead_{name}": neutral + sign * edge, f"zero_{name}": neutral + sign * span * zero}
         numbers |= {f"emf_{name}": emf, f"load_{name}": load}
         ends = sorted(neutral + sign * x for x in edge_interval)
         intervals[f"dead_{name}"] = (ends[0], ends[1])
-        intervals[f"zero_{name}"] = _around(numbers[f"zero_{name}"], span * half[0])
-        intervals[f"emf_{name}"] = _around(emf, half[1])
-        intervals[f"load_{name}"] = _around(load, half[2])
-        for key, value, ceiling in (
-            ("zero", zero, edge / span),
-            ("emf", emf, np.inf),
-            ("load", load, np.inf),
+        for key, value, width, ceiling in (
+            ("zero", zero, span * half[0], edge / span),
+            ("emf", emf, half[1], np.inf),
+            ("load", load, half[2], np.inf),
         ):
+            intervals[f"{key}_{name}"] = _around(numbers[f"{key}_{name}"], width)
             if value <= 1e-9 or value >= ceiling * (1.0 - 1e-9):
                 unsure[f"{key}_{name}"] = "rests on a bound of the law"
     esc = Esc(pulse_neutral=neutral, pulse_min=low, pulse_max=high, voltage=volts, **numbers)
@@ -333,13 +333,6 @@ def _residual(parameters: Array, duty: Array, volts: Array, omega: Array, weight
     share = np.maximum((duty - zero) * volts, 0.0)
     denominator = np.maximum(emf + np.sqrt(emf**2 + 4.0 * load * share), 1e-12)
     return weight * (2.0 * share / denominator - omega)
-
-
-def _others(
-    law: tuple[Array, Array, Array, Array], rows: NDArray[np.bool_]
-) -> tuple[Array, Array, Array, Array]:
-    duty, volts, omega, weight = law
-    return duty[rows], volts[rows], omega[rows], weight[rows]
 
 
 def _around(value: float, half: float) -> tuple[float, float]:
@@ -699,12 +692,14 @@ def curves_of(name: str, result: Bench, before: Thruster) -> list[Curve]:
     order = np.argsort(rows.speed)
     rpm = rows.speed[order] * TO_RPM
     fitted = predicted_thrust(result, before, rows.speed[order])
-    curves = []
+    curves = list[Curve]()
+
+    def add(title: str, x_label: str, y_label: str, x: Array, measured: Array, fitted: Array) -> None:
+        labels = {"title": f"{name}: {title}", "x_label": x_label, "y_label": y_label, "kind": "scatter"}
+        curves.append(Curve(x=x, measured=measured, fitted=fitted, **labels))
+
     if result.speeds_measured:
-        force = rows.force[order]
-        curves.append(
-            _quality_curve(f"{name}: thrust", "shaft speed [rpm]", "thrust [N]", rpm, force, fitted)
-        )
+        add("thrust", "shaft speed [rpm]", "thrust [N]", rpm, rows.force[order], fitted)
     if result.esc is None:
         return curves
     for volt in sorted({round(v, 1) for v, _ in result.levels if not math.isnan(v)}) or [math.nan]:
@@ -713,35 +708,19 @@ def curves_of(name: str, result: Bench, before: Thruster) -> list[Curve]:
         pulse, label = level.pulse[order], "" if math.isnan(volt) else f" at {volt:g} V"
         speed = result.esc.esc.shaft_speed(pulse, level.voltage[order] if label else None)
         thrust = predicted_thrust(result, before, speed)
-        axes = ("pulse [µs]", "shaft speed [rpm]")
         if result.speeds_measured:
-            measured = level.speed[order] * TO_RPM
-            curves.append(
-                _quality_curve(f"{name}: speed from pulse{label}", *axes, pulse, measured, speed * TO_RPM)
-            )
-        curves.append(
-            _quality_curve(
-                f"{name}: thrust from pulse{label}", axes[0], "thrust [N]", pulse, level.force[order], thrust
-            )
-        )
+            measured, axes = level.speed[order] * TO_RPM, ("pulse [µs]", "shaft speed [rpm]")
+            add(f"speed from pulse{label}", *axes, pulse, measured, speed * TO_RPM)
+        add(f"thrust from pulse{label}", "pulse [µs]", "thrust [N]", pulse, level.force[order], thrust)
     return curves
-
-
-def _quality_curve(title: str, x_label: str, y_label: str, x: Array, measured: Array, fitted: Array) -> Curve:
-    return Curve(
-        title=title, x_label=x_label, y_label=y_label, x=x, measured=measured, fitted=fitted, kind="scatter"
-    )
 
 
 def _stack(tables: list[ThrustTable] | tuple[ThrustTable, ...]) -> ThrustTable:
     """All rows of several tables as one."""
-    return ThrustTable(
-        name=tables[0].name,
-        speed=np.concatenate([table.speed for table in tables]),
-        force=np.concatenate([table.force for table in tables]),
-        pulse=np.concatenate([table.pulse for table in tables]),
-        voltage=np.concatenate([table.voltage for table in tables]),
-    )
+    columns: dict[str, Any] = {
+        key: np.concatenate([getattr(table, key) for table in tables]) for key in QUANTITIES
+    }
+    return ThrustTable(name=tables[0].name, **columns)
 
 
 def _rms(error: Array) -> float:
@@ -770,10 +749,13 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
     before, rows = vehicle.thrusters[target.thrusters[0]], list[Estimate]()
     volts = f"{result.voltage:g} V" if math.isfinite(result.voltage) else ""
 
-    def add(key: str, value: float, half: float, unit: str, sure: bool, note: str = "") -> None:
-        ends = (float(value - half), float(value + half))
-        path = None if key == "reverse_ratio" else _path(target, key)
-        rows.append(_estimate(target, key, value, ends, unit, sure, note, path))
+    def add(key: str, value: float, ends: tuple[float, float], unit: str, sure: bool, note: str = "") -> None:
+        rows.append(
+            Estimate(
+                name=f"{target.name}.{key}", estimate=float(value), ci95=ends, unit=unit, identifiable=sure, note=note,
+                path=None if key == "reverse_ratio" else _path(target, key),
+            )
+        )  # fmt: skip
 
     for name, sign in SIDES:
         side, zone = result.sides.get(name), result.dead.get(name)
@@ -782,18 +764,16 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
         sure = math.isfinite(side.half_width) and side.c > side.half_width
         note = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N{volts and ', '}{volts}"
         note += "" if sure else ": too few or too scattered to tell"
-        add(f"c_{name}", side.c, side.half_width, "N s²/rad²", sure, note)
+        add(f"c_{name}", side.c, _around(side.c, side.half_width), "N s²/rad²", sure, note)
         if zone is not None:
             low, high = sorted(sign * TO_RPM * end for end in zone.interval)
             note = zone.note or f"slowest speed that turns; {side.c * zone.speed**2:.2g} N there"
-            key, value = f"dead_rpm_{name}", sign * TO_RPM * zone.speed + 0.0
-            rows.append(
-                _estimate(target, key, value, (low, high), "rpm", zone.known, note, _path(target, key))
-            )
+            add(f"dead_rpm_{name}", sign * TO_RPM * zone.speed + 0.0, (low, high), "rpm", zone.known, note)
     if len(result.sides) == 2:
         plus, minus = result.sides["plus"], result.sides["minus"]
-        half = minus.c / plus.c * math.hypot(plus.half_width / plus.c, minus.half_width / minus.c)
-        add("reverse_ratio", minus.c / plus.c, half, "-", math.isfinite(half))
+        ratio = minus.c / plus.c
+        half = ratio * math.hypot(plus.half_width / plus.c, minus.half_width / minus.c)
+        add("reverse_ratio", ratio, _around(ratio, half), "-", math.isfinite(half))
     for name, sign in SIDES:
         end, side = "max" if sign > 0.0 else "min", result.sides.get(name)
         c, old_c = side.c if side else getattr(before, f"c_{name}"), getattr(before, f"c_{name}")
@@ -807,20 +787,21 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
         moves = at_end or speed > old_speed
         note = "beyond the vehicle file's" if moves else "the table ends here; the vehicle file's stays"
         note = f"full pulse{volts and ' at '}{volts}" if at_end else note
-        add(f"rpm_{end}", sign * speed * TO_RPM, scatter * TO_RPM, "rpm", moves, note)
+        rpm = sign * speed * TO_RPM
+        add(f"rpm_{end}", rpm, _around(rpm, scatter * TO_RPM), "rpm", moves, note)
         force = c * (speed if moves else old_speed) ** 2
         half = force * side.half_width / side.c if side else 0.0
         if old_force < (1.0 - CHOSEN_LIMIT) * old_c * old_speed**2 and old_force < force:
-            add(f"force_{end}", sign * old_force, 0.0, "N", False, "the vehicle file's own, below the curve")
+            force, half, sure, note = old_force, 0.0, False, "the vehicle file's own, below the curve"
         else:
-            add(f"force_{end}", sign * force, half, "N", math.isfinite(half), f"c_{name} at the speed limit")
+            sure, note = math.isfinite(half), f"c_{name} at the speed limit"
+        add(f"force_{end}", sign * force, _around(sign * force, half), "N", sure, note)
     units = {"dead": "µs", "zero": "µs", "emf": "V s/rad", "load": "V s²/rad²"}
     together = "zero, emf and load of a direction vary together: the speed they give is surer than each"
     for key, ends in result.esc.intervals.items() if result.esc is not None else ():
         note = result.esc.unsure.get(key, "" if key.startswith("dead") else together)
         value, sure = float(getattr(result.esc.esc, key)), key not in result.esc.unsure
-        unit, key = units[key.partition("_")[0]], f"esc.{key}"
-        rows.append(_estimate(target, key, value, ends, unit, sure, note, _path(target, key)))
+        add(f"esc.{key}", value, ends, units[key.partition("_")[0]], sure, note)
     return rows
 
 
@@ -829,22 +810,6 @@ def _path(target: Target, key: str) -> str:
     if target.name in target.thrusters:
         return f"thrusters.{target.name}.{key}"
     return f"thrusters.*.{key}" if target.name == "all" else f"thruster_groups.{target.name}.{key}"
-
-
-def _estimate(
-    target: Target,
-    key: str,
-    value: float,
-    ends: tuple[float, float],
-    unit: str,
-    sure: bool,
-    note: str,
-    path: str | None,
-) -> Estimate:
-    return Estimate(
-        name=f"{target.name}.{key}", estimate=float(value), ci95=ends, unit=unit, identifiable=sure, note=note,
-        path=path,
-    )  # fmt: skip
 
 
 def fit_thruster(
@@ -888,7 +853,8 @@ def fit_thruster(
         own = estimates_of(target, result, vehicle)
         estimates |= {estimate.name: estimate for estimate in own}
         for estimate in own:
-            if estimate.identifiable and (key := estimate.name.rpartition(".")[2]) in _WRITTEN:
+            key = estimate.name.rpartition(".")[2]
+            if estimate.identifiable and key.startswith(WRITTEN):
                 changes |= {f"thrusters.{name}.{key}": estimate.estimate for name in target.thrusters}
         if result.esc is not None:
             changes |= {f"thrusters.{name}.esc": result.esc.esc.values() for name in target.thrusters}
@@ -914,13 +880,8 @@ def fit_thruster(
     )
 
 
-_WRITTEN = {
-    f"{key}{end}"
-    for key, ends in (("c_", ("plus", "minus")), ("dead_rpm_", ("plus", "minus")), ("rpm_", ("max", "min")),
-                      ("force_", ("max", "min")))
-    for end in ends
-}  # fmt: skip
-"""Keys of a thruster that an estimate goes to."""
+WRITTEN = ("c_", "dead_rpm_", "rpm_", "force_")
+"""Beginnings of the keys of a thruster that an estimate goes to."""
 
 
 def _read(item: ThrustTable | Trial | str | os.PathLike[str], vehicle: Vehicle) -> list[ThrustTable]:

@@ -74,12 +74,8 @@ class Covariance:
     @property
     def std(self) -> Array:
         """Standard errors, (P,): from the trials, from `local` for what rests on one trial."""
-        variance = np.where(self.alone, np.maximum(self.variance("local"), self.variance("trials")), 0.0)
-        return np.asarray(np.sqrt(np.where(self.alone, variance, self.variance("trials"))))
-
-    def variance(self, which: str) -> Array:
-        """Diagonal of `local` or `trials`, (P,)."""
-        return np.diagonal(self.local if which == "local" else self.trials)
+        local, trials = np.diagonal(self.local), np.diagonal(self.trials)
+        return np.asarray(np.sqrt(np.where(self.alone, np.maximum(local, trials), trials)))
 
 
 def _whitener(normal: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from finssim.calibration.findings import CalibrationError, Finding, finding
+from finssim.calibration.findings import CalibrationError, Finding, finding, plain
 from finssim.calibration.fit import Estimate, Fit
 from finssim.files import atomic_write
 from finssim.provenance import provenance
@@ -34,8 +34,8 @@ from finssim.vehicles import (
 from finssim.vehicles.terms import TERMS
 
 __all__ = [
-    "SCALED", "all_findings", "calibrated", "estimate_at", "file_tree", "folded", "kept", "leaves",
-    "number_in", "number_origins", "write_vehicle",
+    "all_findings", "calibrated", "estimate_at", "file_tree", "folded", "kept", "leaves",
+    "number_in", "number_origins", "scaled_thrust", "write_vehicle",
 ]  # fmt: skip
 
 Key = tuple[str, ...]
@@ -43,8 +43,7 @@ Key = tuple[str, ...]
 
 def file_tree(vehicle: Vehicle) -> dict[str, Any]:
     """The values that the vehicle's file gives, with diagonal matrices by their diagonals."""
-    tree: dict[str, Any] = _shortened(vehicle.values())
-    return tree
+    return dict(_shortened(vehicle.values()))
 
 
 def leaves(node: Any, path: Key = ()) -> Iterator[tuple[Key, float]]:
@@ -106,11 +105,8 @@ def _fold(
 def _shortened(node: Any) -> Any:
     if isinstance(node, dict):
         return {key: value if key == "calibrations" else _shortened(value) for key, value in node.items()}
-    if (
-        _is_list(node)
-        and len(node) in (3, 6)
-        and all(_is_list(row) and len(row) == len(node) for row in node)
-    ):
+    square = isinstance(node, list) and len(node) in (3, 6)
+    if square and all(isinstance(row, list) and len(row) == len(node) for row in node):
         matrix = np.array(node)
         if not np.any(matrix - np.diag(np.diag(matrix))):
             return np.diag(matrix).tolist()
@@ -119,12 +115,8 @@ def _shortened(node: Any) -> Any:
 
 def _at(tree: Any, path: Key) -> Any:
     for key in path:
-        tree = tree[int(key)] if _is_list(tree) else tree[key if key in tree else int(key)]
+        tree = tree[int(key)] if isinstance(tree, list) else tree[key if key in tree else int(key)]
     return tree
-
-
-def _is_list(node: Any) -> bool:
-    return isinstance(node, list)
 
 
 # The text of a vehicle file: sections in the catalogue's order, origins at the highest level they hold for, units.
@@ -461,6 +453,15 @@ SCALED = ("c_plus", "c_minus", "force_min", "force_max")
 """Numbers of a thruster that `thrust_scale` multiplies."""
 
 
+def scaled_thrust(vehicle: Vehicle, scale: float) -> dict[str, float]:
+    """Changes of the vehicle file that multiply every thrust by a scale [-]."""
+    return {
+        f"thrusters.{name}.{key}": scale * float(getattr(thruster, key))
+        for name, thruster in vehicle.thrusters.items()
+        for key in SCALED
+    }
+
+
 def calibrated(fit: Fit) -> Vehicle:
     """The vehicle with what the fit determined; everything else keeps its number and its origin.
 
@@ -475,7 +476,8 @@ def calibrated(fit: Fit) -> Vehicle:
     record = _calibration_record(fit)
     source = f"calibration {number}: {record.sentence()}"
     try:
-        changes = {path: _rounded(value) for path, value in fit.changes.items()}
+        # Seven digits: far more than any interval is worth, and a file that can be read.
+        changes = plain(fit.changes, 7)
         after = before.replace(changes, Provenance("measured", source)) if changes else before
     except VehicleError as error:
         raise CalibrationError(
@@ -569,17 +571,6 @@ def _calibration_record(fit: Fit) -> CalibrationRecord:
         revision=origin["revision"],
         interrupted=fit.interrupted,
     )
-
-
-def _rounded(value: Any) -> Any:
-    """Numbers with seven digits: far more than any interval is worth, and a file that can be read."""
-    if isinstance(value, Mapping):
-        return {key: _rounded(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [_rounded(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(f"{value:.7g}")
-    return value
 
 
 def _plain_value(value: Any) -> Any:

@@ -106,9 +106,9 @@ def test_stiffness_is_the_restoring_moment_of_the_plant():
     assert k == pytest.approx(5.0)
 
 
-def test_what_cannot_be_estimated_is_refused():
-    """Unknown words and sets without coefficients say what there is."""
-    with pytest.raises(CalibrationError, match="cannot estimate 'colour'"):
-        made("finsrov", ("surge",), ("colour",))
-    with pytest.raises(CalibrationError, match="no damping coefficients"):
-        Parameters(VEHICLES["finsrov"], axes=("surge",), damping={"surge": "both"}, hydrodynamics="mesh")
+def test_a_set_without_coefficients_is_refused():
+    """A mesh has no damping that could be fitted."""
+    sets = VEHICLES["finsrov"].hydrodynamics
+    bare = VEHICLES["finsrov"].model_copy(update={"hydrodynamics": {"calibrated": sets["mesh"]}})
+    with pytest.raises(CalibrationError, match="no coefficients in hydrodynamics.calibrated"):
+        Parameters(bare, axes=("surge",), damping={"surge": "both"})

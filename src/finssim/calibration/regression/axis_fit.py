@@ -208,7 +208,7 @@ def axis_rows(found: Signals, axis: int, kernels: Kernel) -> Rows | None:
     if not spans:
         return None
     X, y, at = [], [], []
-    offset = np.where(np.isfinite(found.up[:, 2]), found.up[:, 2], 1.0) if axis == 2 else np.ones(len(nu))
+    offset = _offset(found, axis)
     for begin, end in spans:
         cut = slice(begin, end)
         centre, rhs = _filtered(left[cut, None], kernels)
@@ -527,13 +527,6 @@ def offset_ratio(found: Moments, correlated: float) -> float:
     return ratio
 
 
-def evidence(
-    names: tuple[str, ...], N_g: Array, scores: Array, variance: float, unit: str, prior: Array
-) -> Evidence:
-    """For `trial_covariance`, in units of the variance of an independent row."""
-    return Evidence(names=names, normal=N_g / variance, score=scores / variance, unit=unit, prior=prior)
-
-
 TERMS = ("m_eff", "d1", "d2", "bias", "delay", "smoothing", "k")
 """Names of the first columns; see the module for `delay` [s] and `smoothing` [s²]."""
 
@@ -642,7 +635,10 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_]) -> AxisFit:
     ratio, theta = 0.0, np.zeros(p)
     mean, inverse = (column[kept] for column in data.prior_moments())
     before = (mean, np.zeros_like(inverse))
-    pieces = [_cut(data, found, rows) for found, rows in zip(data.signals, data.rows, strict=True)]
+    pieces = [
+        cut(s.rate, rows.spans, s.nu[:, data.axis], _sine(s.up, data.axis))
+        for s, rows in zip(data.signals, data.rows, strict=True)
+    ]
     for round_ in range(ROUNDS + 1):
         sums = moments(X[inside], Z[inside], y[inside], weight, group).of(kept)
         previous = theta
@@ -681,11 +677,13 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_]) -> AxisFit:
     unit = "trials"
     if len(data.rows) < FEWEST_TRIALS:
         blocks = _blocks(group, correlated)
-        cut = moments(X[inside], Z[inside], y[inside], weight, blocks).of(kept)
-        _, N_g, scores, _ = solve(cut, 0.0, before)
+        sums = moments(X[inside], Z[inside], y[inside], weight, blocks).of(kept)
+        _, N_g, scores, _ = solve(sums, 0.0, before)
         unit = "blocks"
     names = tuple(name for name, on in zip(TERMS, kept, strict=True) if on)
-    found = evidence(names, N_g, scores, variance, unit, np.diag(inverse))
+    found = Evidence(
+        names=names, normal=N_g / variance, score=scores / variance, unit=unit, prior=np.diag(inverse)
+    )
     ends = np.cumsum([len(rows.y) for rows in data.rows])[:-1]
     return AxisFit(
         terms=kept,
@@ -762,11 +760,6 @@ def _simulate(data: AxisData, theta: Array, pieces: list[list[Piece]]) -> tuple[
     return np.concatenate(Z), nu
 
 
-def _cut(data: AxisData, found: Signals, rows: Rows) -> list[Piece]:
-    sine = (found.up[:, 1] if data.axis == 3 else -found.up[:, 0]) if data.restoring else None
-    return cut(found.rate, rows.spans, found.nu[:, data.axis], sine)
-
-
 def _offset(found: Signals, axis: int) -> Array:
     """What the bias multiplies: 1, and in heave the vertical component of `up`."""
     if axis != 2:
@@ -782,8 +775,6 @@ AKAIKE = 0.157
 
 TELLING = 6.0
 """Twice a logarithm of likelihoods below which linear drag is not preferred to quadratic: odds of 20 to 1."""
-
-D1, D2 = TERMS.index("d1"), TERMS.index("d2")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -815,27 +806,19 @@ def select(data: AxisData, damping: str = "auto") -> Selection:
     """
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
-    terms = data.terms
-    if damping in ("linear", "quadratic"):
-        terms[D2 if damping == "linear" else D1] = False
-        smoothed = fit_axis(data, terms)
-        fit = _without_needless_smoothing(data, smoothed)
-        return Selection(
-            fit=fit, full=fit, dropped=(), p_value={}, interval=_with_lag(data, _interval(fit), smoothed)
-        )
-    smoothed = fit_axis(data, terms)
+    left_out = {"linear": "d2", "quadratic": "d1"}.get(damping)
+    smoothed = fit_axis(data, _without(data.terms, left_out) if left_out else data.terms)
     full = _without_needless_smoothing(data, smoothed)
-    terms = full.terms.copy()
-    p_value = {name: _p_value(full, TERMS.index(name)) for name in ("d1", "d2")}
+    p_value = {} if left_out else {name: _p_value(full, TERMS.index(name)) for name in ("d1", "d2")}
     weak = [name for name, p in p_value.items() if p > AKAIKE]
     if damping == "both" or not weak:
         interval = _with_lag(data, _interval(full), smoothed)
         return Selection(fit=full, full=full, dropped=(), p_value=p_value, interval=interval)
     dropped = max(weak, key=lambda name: p_value[name])
-    fit = fit_axis(data, _without(terms, dropped))
+    fit = fit_axis(data, _without(full.terms, dropped))
     tried = [full, fit]
     if dropped == "d2":
-        other = fit_axis(data, _without(terms, "d1"))
+        other = fit_axis(data, _without(full.terms, "d1"))
         if _evidence(data, fit, other) < TELLING:
             dropped, fit = "d1", other
             tried.append(other)
@@ -854,7 +837,7 @@ def _without(terms: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:
 
 def _evidence(data: AxisData, one: AxisFit, other: AxisFit) -> float:
     """Twice the logarithm of the likelihood of one fit over another's with as many terms."""
-    if not (one.theta[0] > 0.0 and other.theta[0] > 0.0) or other.active[D2]:
+    if not (one.theta[0] > 0.0 and other.theta[0] > 0.0) or other.active[TERMS.index("d2")]:
         return np.inf
     rss = [
         sum(
@@ -868,12 +851,8 @@ def _evidence(data: AxisData, one: AxisFit, other: AxisFit) -> float:
 
 def _without_needless_smoothing(data: AxisData, fit: AxisFit) -> AxisFit:
     """Once more without `smoothing` where the recording shows none: it costs certainty of the inertia."""
-    term = TERMS.index("smoothing")
-    if _p_value(fit, term) <= AKAIKE:
-        return fit
-    terms = fit.terms.copy()
-    terms[term] = False
-    return fit_axis(data, terms)
+    shown = _p_value(fit, TERMS.index("smoothing")) <= AKAIKE
+    return fit if shown else fit_axis(data, _without(fit.terms, "smoothing"))
 
 
 def _with_lag(data: AxisData, interval: Array, smoothed: AxisFit) -> Array:

@@ -15,6 +15,7 @@ from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion import Motion
 from finssim.calibration.regression.axis_estimates import (
     CERTAIN,
+    SET,
     UNITS,
     AxisResult,
     Number,
@@ -33,9 +34,9 @@ from finssim.calibration.simulation.rollout import (
     streams,
 )
 from finssim.calibration.trials.inputs import require_axes, require_fittable
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import COLUMNS, Trial
 from finssim.calibration.uncertainty import Covariance, Evidence, degeneracy, intervals, trial_covariance
-from finssim.calibration.vehicle_file import SCALED
+from finssim.calibration.vehicle_file import scaled_thrust
 from finssim.calibration.vision.least_squares import (
     Block,
     arrow_reduced,
@@ -44,7 +45,7 @@ from finssim.calibration.vision.least_squares import (
     huber_cost,
     huber_weight,
 )
-from finssim.engine.plant_arrays import twist_shift, vehicle_parameters
+from finssim.engine.plant_arrays import twist_shift
 from finssim.geometry.rotations import (
     quat_conjugate,
     quat_from_rotvec,
@@ -142,7 +143,6 @@ class Parameters:
         damping: dict[str, str],
         extras: Sequence[str] = (),
         biases: Sequence[str] = (),
-        hydrodynamics: str = "calibrated",
         start: Mapping[str, float] | None = None,
         imposed: Sequence[str] = (),
         unseen: Sequence[str] = (),
@@ -156,41 +156,27 @@ class Parameters:
             extras: Of `EXTRAS`, and parameters of the vehicle's terms, such as `lift.coefficient`.
             biases: Axes with a constant wrench b, about the set's reference point and on the side of the damping:
                 M nu_dot + D nu + b = tau.
-            hydrodynamics: Which set of coefficients.
             start: Coordinate -> where it starts, in place of the vehicle file's number.
             imposed: Axes that are not fitted: their added mass alone is free, for its momentum turns and pushes the
                 others. Their coordinates come last.
             unseen: Those of `imposed` that no trial measured, and that therefore are simulated: their drag is free too.
 
         Raises:
-            CalibrationError: the set holds no coefficients, or an extra is not known.
+            CalibrationError: The calibrated set holds no coefficients.
         """
-        chosen = vehicle.hydrodynamic_set(hydrodynamics)
-        if not isinstance(chosen, HydrodynamicSet):
-            raise CalibrationError(
-                f"{vehicle.name}: hydrodynamics.{hydrodynamics} has no damping coefficients to fit: give another set"
-            )
-        own = chosen.term_scalars
-        unknown = sorted(set(extras) - {*EXTRAS, *own})
-        if unknown:
-            raise CalibrationError(
-                f"cannot estimate '{unknown[0]}'; available: {', '.join([*EXTRAS, *own])} and the numbers of every axis"
-            )
-        self.vehicle, self.hydrodynamics, self.set = vehicle, hydrodynamics, chosen
+        plant, chosen = matrices(vehicle), vehicle.hydrodynamics["calibrated"]
+        assert isinstance(chosen, HydrodynamicSet)
+        self.vehicle, self.set = vehicle, chosen
         self.axes = tuple(a for a in AXES if a in axes)
         self.imposed = tuple(a for a in AXES if a in imposed)
         self.unseen = tuple(a for a in self.imposed if a in unseen)
         self.index = np.array([AXES.index(a) for a in self.axes], int)
         self.damping, self.extras = damping, tuple(extras)
-        self.terms = tuple(path for path in own if path in extras)
+        self.terms = tuple(path for path in self.set.term_scalars if path in extras)
         self.biases = tuple(a for a in AXES if a in biases)
-        self.r_h = np.asarray(chosen.reference_point, float)
-        self.H = twist_shift(self.r_h.tolist())
-        self.M_RB = np.linalg.inv(self.H).T @ vehicle.rigid_body_mass_matrix() @ np.linalg.inv(self.H)
-        self.nominal = vehicle_parameters(vehicle, hydrodynamics)
-        self.M_A = np.asarray(chosen.added_mass, float)
-        self.D1 = np.asarray(chosen.linear_damping, float).copy()
-        self.D2 = np.asarray(chosen.quadratic_damping, float).copy()
+        self.r_h = np.asarray(self.set.reference_point, float)
+        self.H, self.M_RB, self.M_A = plant.H, plant.M_RB, plant.M_A
+        self.D1, self.D2 = plant.D1, plant.D2
         for a, i in zip(self.axes, self.index, strict=True):
             if damping[a] == "linear":
                 self.D2[i, :] = self.D2[:, i] = 0.0
@@ -873,7 +859,6 @@ class Shooting:
         self.rollouts = Rollouts(
             parameters.vehicle,
             segments,
-            hydrodynamics=parameters.hydrodynamics,
             max_delay=LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5,
             moving_water="current.x" in parameters.names,
         )
@@ -1218,7 +1203,7 @@ def other_estimates(
             note = "the trials do not determine it"
         elif half > limit:
             note = f"known to no better than ±{half:.2g} {unit}"
-        path = PATHS[name] if name in PATHS else f"hydrodynamics.{p.hydrodynamics}.{name}"
+        path = PATHS[name] if name in PATHS else f"{SET}.{name}"
         out[name] = Estimate(
             name=name,
             estimate=value,
@@ -1431,14 +1416,8 @@ def pictures(problem: Shooting, solution: Solution, axes: Sequence[str]) -> tupl
             parts.append((clock[those], value, value - solution.linear.residual[those]))
         if name:
             title = f"{axis}: {name}, simulated from the inputs alone"
-            out.append(Curve.joined(title, f"{name} [{_unit(name)}]", parts))
+            out.append(Curve.joined(title, f"{name} [{COLUMNS[name].unit}]", parts))
     return tuple(out)
-
-
-def _unit(name: str) -> str:
-    if name in ("u", "v", "w"):
-        return "m/s"
-    return "rad/s" if name in ("p", "q", "r") else "rad" if name in ("roll", "pitch", "yaw") else "m"
 
 
 def fit_findings(
@@ -1512,9 +1491,7 @@ def changes(
         if found[path].identifiable:
             out[str(found[path].path)] = found[path].estimate
     if "thrust_scale" in found and found["thrust_scale"].identifiable and scaled:
-        scale = found["thrust_scale"].estimate
-        for name, thruster in p.vehicle.thrusters.items():
-            out |= {f"thrusters.{name}.{key}": scale * float(getattr(thruster, key)) for key in SCALED}
+        out |= scaled_thrust(p.vehicle, found["thrust_scale"].estimate)
     return out
 
 
@@ -1778,9 +1755,8 @@ class Stages:
 
 def _matrices(p: Parameters, x: Array) -> dict[str, Any]:
     """Changes of the vehicle file to the matrices of a vector."""
-    base = f"hydrodynamics.{p.hydrodynamics}"
     names = ("added_mass", "linear_damping", "quadratic_damping")
-    return {f"{base}.{name}": m[0] for name, m in zip(names, p.matrices(x), strict=True)}
+    return {f"{SET}.{name}": m[0] for name, m in zip(names, p.matrices(x), strict=True)}
 
 
 Progress = Callable[[float, str], None]
