@@ -115,7 +115,7 @@ def test_without_a_camera_a_fix_is_what_is_missing():
     """Nobody looks for a camera that there is not."""
     perception = Perception(VEHICLE, None)
     readings = run(Rounds(overhead(), VEHICLE), perception, 0.5, picture=lambda t, x: None)
-    assert readings[-1].reason == "no position fix yet"
+    assert readings[-1].reason == "no position fix yet, and where it was let in is not given"
 
 
 def test_three_seconds_without_vision_end_readiness_and_it_comes_back():

@@ -15,6 +15,7 @@ from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import decode_request, encode_delivery, receive
 from finssim.robot.messages import Delivery
 from finssim.robot.record_reader import open_record
+from finssim.robot.run import _used
 from finssim.tasks import task_named
 from finssim.vehicles import load_vehicle
 from reference.policies import linear, written
@@ -130,7 +131,7 @@ def test_dead_reckoning_begins_where_the_vehicle_was_let_in(capsys, tmp_path):
     how = {"site": "open-water", "severity": "realistic", "position": (3.0, -2.0, -5.0), "truth": truth}
     with lockstep_pool(heavy, None, **how) as wiring:
         status, summary = told(capsys, *words, "--robot", wiring.robot, "--duration", "1")
-    assert status == 0 and summary["reason"] == "no position fix yet"
+    assert status == 0 and summary["reason"] == "no position fix yet, and where it was let in is not given"
     with lockstep_pool(heavy, None, **how) as wiring:
         place = ("--let-in", "3,-2")
         status, summary = told(capsys, *words, *place, "--robot", wiring.robot, "--duration", "20")
@@ -152,6 +153,27 @@ def test_a_policy_runs_where_the_vehicle_is_equipped_otherwise(capsys, tmp_path)
     with open_record(record) as opened:
         assert opened.metadata["vehicle_sha256"] == load_vehicle("finsrov").sha256
         assert opened.metadata["site"] == "open-water"
+
+
+def test_without_a_pool_file_it_says_where_one_comes_from(capsys, tmp_path, monkeypatch):
+    """The default is looked for in this folder; what was named is another matter."""
+    monkeypatch.chdir(tmp_path)
+    assert finssim("--policy", "pid", "--goal", "0,0,-0.5,0") == 2
+    assert "there is no pool.yaml in this folder: name the pool file" in capsys.readouterr().err
+    assert finssim("--policy", "pid", "--goal", "0,0,-0.5,0", "--pool-file", "other.yaml") == 2
+    assert "other.yaml: cannot be read" in capsys.readouterr().err
+
+
+def test_what_became_part_of_the_state_is_named_by_what_came():
+    """Pictures where there is a camera; fixes, velocities and headings where a site has these."""
+    seen = {"fixes": 7, "pictures": 9, "samples": {"vision": {"accepted": 7, "gated": 2}, "velocity": {}}}
+    assert _used(seen) == {"pictures used": "7 of 9"}
+    verdicts = {"vision": {"initialized": 1, "accepted": 4, "late": 1}, "velocity": {"accepted": 3}}
+    assert _used({"fixes": 0, "pictures": 0, "samples": verdicts}) == {
+        "position fixes used": "5 of 6",
+        "velocities used": "3 of 3",
+    }
+    assert _used({"fixes": 0, "pictures": 0, "samples": {}}) == {"pictures used": "0 of 0"}
 
 
 def test_a_trajectory_can_be_followed_in_place_of_a_goal(capsys, pool_file):

@@ -566,7 +566,11 @@ def _why(health: Health, camera: bool) -> str:
     if math.isnan(health.age_depth) or not health.depth_fresh:
         return "no depth"
     if health.vision_mode == "uninitialized":
-        return "not seen by the camera yet" if camera else "no position fix yet"
+        return (
+            "not seen by the camera yet"
+            if camera
+            else "no position fix yet, and where it was let in is not given"
+        )
     if health.vision_mode in ("hold", "lost"):
         what = "not seen by the camera" if camera else "no position fix or velocity"
         return f"{what} for {health.age_vision:.1f} s"

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,7 +32,7 @@ from finssim.robot.link.transports import host_port
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, make_pilot
 from finssim.robot.recorder import Recorder, recording
-from finssim.robot.runtime import Runtime
+from finssim.robot.runtime import USED, Runtime
 from finssim.robot.team import Team
 from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
@@ -136,6 +136,24 @@ def _waiting(runtime: Runtime) -> str:
     return "" if began or runtime.reading is None else runtime.reading.reason
 
 
+AIDS = {"vision": "position fixes", "velocity": "velocities", "heading": "compass headings"}
+"""Streams of the filter that a site may have in place of pictures, and what their samples are called."""
+
+
+def _used(told: Mapping[str, Any]) -> dict[str, str]:
+    """How many pictures became part of the state, and how many of what came in their place."""
+    rows = {"pictures used": f"{told['fixes']} of {told['pictures']}"}
+    streams = [stream for stream in AIDS if stream != "vision" or not told["pictures"]]
+    for stream in streams:
+        verdicts = told["samples"].get(stream)
+        if verdicts:
+            used = sum(n for verdict, n in verdicts.items() if verdict in USED)
+            rows[f"{AIDS[stream]} used"] = f"{used} of {sum(verdicts.values())}"
+    if not told["pictures"] and len(rows) > 1:
+        del rows["pictures used"]
+    return rows
+
+
 def show(told: dict[str, Any], console: Console) -> None:
     """Print what `_Monitor.report` told as a table."""
     table = Table(show_header=False, box=None)
@@ -146,7 +164,7 @@ def show(told: dict[str, Any], console: Console) -> None:
         "state": told["state"] + (f": {told['reason']}" if told["reason"] else ""),
         "time": f"{told['duration_s']:.1f} s",
         f"off the goal, rms of the last {LAST:g} s": off,
-        "pictures used": f"{told['fixes']} of {told['pictures']}",
+        **_used(told),
         "decisions missed": f"{told['missed']} of {told['decisions'] + told['missed']}",
         "late steps": f"{told['overruns']} of {told['steps']}",
         "picture to command": "no picture"
@@ -374,6 +392,11 @@ def run(
     wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep, team=messages)
     console, site = Console(stderr=True), site or "pool"
     file = None if pool_file == "none" else Path(pool_file or "pool.yaml")
+    if pool_file is None and not Path("pool.yaml").exists():
+        raise ControlError(
+            "there is no pool.yaml in this folder: name the pool file that finssim pool or calibrate pool has written "
+            "with --pool-file, or give --pool-file none where no camera looks"
+        )
     filed = load_vehicle(vehicle)
     ours = numbered(vehicle_at(site, filed, navigation=robot.startswith("mavlink")), number)
     pilot = _pilot(policy, filed, task, agent=agent, follows=trajectory is not None)
