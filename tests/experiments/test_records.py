@@ -202,6 +202,9 @@ def test_the_trajectory_that_a_record_names_is_no_file(tmp_path, monkeypatch, na
     path = written(
         tmp_path / "run.mcap", meta={"command": "finssim run"}, events=[(0.0, "trial_start", told)]
     )
-    with pytest.raises(DriveError, match=f"followed '{told}', which is none of .*: give the name or the file of what was followed"):
+    with pytest.raises(
+        DriveError,
+        match=f"followed '{told}', which is none of .*: give the name or the file of what was followed",
+    ):
         collect_records([path], "t2", out=tmp_path / "set")
     assert not (tmp_path / "set").exists()
