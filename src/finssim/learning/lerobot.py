@@ -54,60 +54,21 @@ def export_lerobot(place: str | Path, out: str | Path) -> dict[str, Any]:
         OutputError: The folder cannot be written.
     """
     import pandas as pd
-    import pyarrow.parquet as pq
 
     described = about(place)
     fps, title = _rate(described, place), str(described.get("title") or described["task"])
-    rows: list[dict[str, Any]] = []
-    parts: dict[str, list[NDArray[Any]]] = {}
-    features: dict[str, Any] = {}
-    began, file, size, writer = 0, 0, 0, None
     with atomic_directory(out, replaces=INFO_FILE) as folder:
-        (folder / "meta/episodes/chunk-000").mkdir(parents=True)
-        for i, episode in enumerate(read_episodes(place)):
-            columns = _columns(episode, i, began, fps)
-            features = features or _features(columns, described)
-            table = _table(columns)
-            if writer is None or size >= FILE_MIB * 2**20:
-                if writer is not None:
-                    writer.close()
-                    file, size = file + 1, 0
-                path = folder / "data" / f"{_place(file)}.parquet"
-                path.parent.mkdir(parents=True, exist_ok=True)
-                writer = pq.ParquetWriter(path, table.schema)
-            writer.write_table(table)
-            size += table.nbytes
-            steps = len(episode.action)
-            rows.append(
-                {
-                    "episode_index": i,
-                    "tasks": [title],
-                    "length": steps,
-                    "data/chunk_index": file // FILES,
-                    "data/file_index": file % FILES,
-                    "dataset_from_index": began,
-                    "dataset_to_index": began + steps,
-                    "meta/episodes/chunk_index": 0,
-                    "meta/episodes/file_index": 0,
-                    **{
-                        f"stats/{key}/{name}": value
-                        for key, x in columns.items()
-                        for name, value in _statistics(x).items()
-                    },
-                }
-            )
-            began += steps
-            for key, x in columns.items():
-                parts.setdefault(key, []).append(x)
-        if writer is not None:
-            writer.close()
-        pd.DataFrame(rows).to_parquet(folder / "meta/episodes" / f"{_place(0)}.parquet", index=False)
+        rows, parts = _frames(folder, place, fps, title)
+        features = _features({key: x[0] for key, x in parts.items()}, described)
+        episodes = folder / "meta/episodes" / f"{_place(0)}.parquet"
+        episodes.parent.mkdir(parents=True)
+        pd.DataFrame(rows).to_parquet(episodes, index=False)
         pd.DataFrame({"task_index": [0]}, index=[title]).to_parquet(folder / "meta/tasks.parquet")
         info = {
             "codebase_version": FORMAT,
             "robot_type": described["vehicle"]["name"],
             "total_episodes": len(rows),
-            "total_frames": began,
+            "total_frames": rows[-1]["dataset_to_index"],
             "total_tasks": 1,
             "chunks_size": FILES,
             "data_files_size_in_mb": FILE_MIB,
@@ -121,7 +82,60 @@ def export_lerobot(place: str | Path, out: str | Path) -> dict[str, Any]:
         statistics = {key: _statistics(np.concatenate(x)) for key, x in parts.items()}
         for name, value in (("info", info), ("stats", statistics), (OURS, described)):
             (folder / f"meta/{name}.json").write_text(json.dumps(value, indent=2), encoding="utf-8")
-    return {"episodes": len(rows), "frames": began, "fps": fps, "features": list(features)}
+    return {"episodes": len(rows), "frames": info["total_frames"], "fps": fps, "features": list(features)}
+
+
+def _frames(
+    folder: Path, place: str | Path, fps: int, title: str
+) -> tuple[list[dict[str, Any]], dict[str, list[NDArray[Any]]]]:
+    """Write the files of frames: the row of each episode in the table of episodes, and all columns by episode."""
+    import pyarrow.parquet as pq
+
+    rows: list[dict[str, Any]] = []
+    parts: dict[str, list[NDArray[Any]]] = {}
+    began, file, size, writer = 0, 0, 0, None
+    for i, episode in enumerate(read_episodes(place)):
+        columns = _columns(episode, i, began, fps)
+        table = _table(columns)
+        if writer is not None and size >= FILE_MIB * 2**20:
+            writer.close()
+            file, size, writer = file + 1, 0, None
+        if writer is None:
+            path = folder / "data" / f"{_place(file)}.parquet"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            writer = pq.ParquetWriter(path, table.schema)
+        writer.write_table(table)
+        size += table.nbytes
+        rows.append(_episode_row(i, columns, began, file, title))
+        began = rows[-1]["dataset_to_index"]
+        for key, x in columns.items():
+            parts.setdefault(key, []).append(x)
+    if writer is not None:
+        writer.close()
+    return rows, parts
+
+
+def _episode_row(
+    index: int, columns: Mapping[str, NDArray[Any]], began: int, file: int, title: str
+) -> dict[str, Any]:
+    """Of the table of episodes: where its frames are, and their statistics."""
+    steps = len(columns["action"])
+    return {
+        "episode_index": index,
+        "tasks": [title],
+        "length": steps,
+        "data/chunk_index": file // FILES,
+        "data/file_index": file % FILES,
+        "dataset_from_index": began,
+        "dataset_to_index": began + steps,
+        "meta/episodes/chunk_index": 0,
+        "meta/episodes/file_index": 0,
+        **{
+            f"stats/{key}/{name}": value
+            for key, x in columns.items()
+            for name, value in _statistics(x).items()
+        },
+    }
 
 
 def _rate(described: Mapping[str, Any], place: str | Path) -> int:

@@ -142,16 +142,14 @@ AIDS = {"vision": "position fixes", "velocity": "velocities", "heading": "compas
 
 def _used(told: Mapping[str, Any]) -> dict[str, str]:
     """How many pictures became part of the state, and how many of what came in their place."""
-    rows = {"pictures used": f"{told['fixes']} of {told['pictures']}"}
-    streams = [stream for stream in AIDS if stream != "vision" or not told["pictures"]]
-    for stream in streams:
+    rows = {}
+    for stream, name in AIDS.items():
         verdicts = told["samples"].get(stream)
-        if verdicts:
+        if verdicts and not (stream == "vision" and told["pictures"]):
             used = sum(n for verdict, n in verdicts.items() if verdict in USED)
-            rows[f"{AIDS[stream]} used"] = f"{used} of {sum(verdicts.values())}"
-    if not told["pictures"] and len(rows) > 1:
-        del rows["pictures used"]
-    return rows
+            rows[f"{name} used"] = f"{used} of {sum(verdicts.values())}"
+    pictures = {"pictures used": f"{told['fixes']} of {told['pictures']}"}
+    return pictures | rows if told["pictures"] else rows or pictures
 
 
 def show(told: dict[str, Any], console: Console) -> None:
