@@ -700,15 +700,15 @@ def _read_imu(path: Path, vehicle: Vehicle, findings: list[Finding]) -> tuple[Se
     if up is None or not np.isfinite(up).any():
         findings.append(finding("tilt_unknown", file=IMU))
         return None, None
-    tilt = series("attitude", table.t, up, LONGEST_AGE, where=str(path))
+    tilt = series("attitude", table.t, up, LONGEST_AGE, label=str(path))
     if not rated or len(tilt.t) < 2:
         return tilt, None
-    rate = series("rate", table.t, omega, math.inf, where=str(path))
+    rate = series("rate", table.t, omega, math.inf, label=str(path))
     within = (rate.t >= tilt.t[0]) & (rate.t <= tilt.t[-1])
     t, about = rate.t[within], np.zeros(int(within.sum()))
     for i in range(3):
         about += rate.values[within, i] * np.interp(t, tilt.t, tilt.values[:, i])
-    turning = series("turning", t, about[:, None], math.inf, where=str(path)) if len(t) > 2 else None
+    turning = series("turning", t, about[:, None], math.inf, label=str(path)) if len(t) > 2 else None
     return tilt, turning
 
 
@@ -744,7 +744,7 @@ def _read_depth(path: Path, findings: list[Finding]) -> Series | None:
         raise CalibrationError(
             f"{path}: no column 'depth': add the depth of the pressure port [m], positive down"
         )
-    return series("depth", table.t, table.columns("depth"), LONGEST_AGE, where=str(path))
+    return series("depth", table.t, table.columns("depth"), LONGEST_AGE, label=str(path))
 
 
 # The mounts, as estimates and as numbers of the vehicle file.
