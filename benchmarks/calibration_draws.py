@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.calibration.hydrodynamics import fit_hydrodynamics, scaled
+from finssim.calibration.hydrodynamics import fit_hydrodynamics
 from finssim.calibration.programmes import Programme
 from finssim.calibration.replay import replay
 from finssim.calibration.synthetic import NoiseProfile, record, trials_of
 from finssim.calibration.trials.trial import Trial
-from finssim.calibration.vehicle_file import calibrated
+from finssim.calibration.vehicle_file import calibrated, scaled_thrust
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 FITTED = ("surge", "sway", "heave", "yaw")
@@ -111,7 +111,7 @@ def draw(seed: int, method: str) -> dict[str, object]:
     fit = fit_hydrodynamics([t for t in trials if t.name.endswith(low)], vehicle, method=method)
     after = calibrated(fit)
     held = [t for t in trials if not t.name.endswith(low)]
-    true = plant.replace(scaled(plant, scale))
+    true = plant.replace(scaled_thrust(plant, scale))
     bodies = {"file": vehicle, "calibrated": after, "truth": true}
     scores = {name: _by_axis(body, held) for name, body in bodies.items()}
     chosen = plant.hydrodynamics["calibrated"]

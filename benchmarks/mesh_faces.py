@@ -1,7 +1,7 @@
 """How many hull faces per second the mesh drag visits, wholly submerged: `python benchmarks/mesh_faces.py [device]`."""
 
+import argparse
 import json
-import sys
 import time
 
 import warp as wp
@@ -71,8 +71,10 @@ def _best(launch, seconds: float, device: str) -> float:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("device", nargs="?", default="cpu", help="Warp device")
+    device = parser.parse_args().device
     wp.config.quiet = True
-    device = sys.argv[1] if len(sys.argv) > 1 else "cpu"
     result = {
         "device": wp.get_device(device).name,
         "drag_submerged_faces_per_second": faces_per_second(device),

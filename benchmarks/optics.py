@@ -4,6 +4,7 @@ Microseconds per call and per point on one core, the best of many, and the ratio
 water) in the same run.
 """
 
+import argparse
 import json
 import time
 
@@ -63,6 +64,7 @@ def every_derivative(points: np.ndarray) -> list[np.ndarray]:
 
 def main() -> None:
     """Print one JSON object per number of points."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     for count in (8, 1000):
         times = measure(count)
         print(

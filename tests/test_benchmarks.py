@@ -1,0 +1,37 @@
+"""Benchmarks load with what they import and explain themselves, so that a refactoring that breaks one is noticed."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+ASK_EACH = """
+import contextlib, io, runpy, sys, traceback
+
+for path in sys.argv[1:]:
+    sys.argv = [path, "--help"]
+    text, status = io.StringIO(), "it did not stop at --help"
+    try:
+        with contextlib.redirect_stdout(text):
+            runpy.run_path(path, run_name="__main__")
+    except SystemExit as stop:
+        status = "" if stop.code == 0 and "usage:" in text.getvalue() else f"--help ends with {stop.code}"
+    except BaseException:
+        status = traceback.format_exc()
+    if status:
+        print(f"{path}: {status}")
+"""
+
+
+@pytest.mark.slow
+def test_every_benchmark_loads_and_answers_help():
+    """In one process, since most of the time goes into imports that they share."""
+    paths = sorted(map(str, BENCHMARKS.glob("*.py")))
+    assert len(paths) > 20
+    done = subprocess.run(
+        [sys.executable, "-c", ASK_EACH, *paths], capture_output=True, text=True, timeout=300
+    )
+    assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
