@@ -141,9 +141,9 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     with pytest.raises(CalibrationError, match="to go along surge"):
         box = box_of(small)
         from finssim.calibration.programmes import programmes
-        from finssim.experiments.excitation import place_of
+        from finssim.experiments.excitation import start_of
 
-        place_of(programmes("surge", small)[0], small, box)
+        start_of(programmes("surge", small)[0], small, box)
 
 
 @pytest.mark.parametrize(

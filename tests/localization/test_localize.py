@@ -11,7 +11,7 @@ from finssim.geometry.rotations import quat_from_euler
 from finssim.localization import LocalizationError, localize
 from finssim.localization.detection.detections import Frame, write_detections
 from finssim.localization.detection.families import printable
-from finssim.localization.localize import known_of
+from finssim.localization.localize import prior_sources
 from finssim.localization.pool import write_pool
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.vehicles import load_vehicle
@@ -215,7 +215,7 @@ def test_an_interrupt_keeps_the_rows_so_far(files, monkeypatch):
 def test_height_follows_from_pressure_behind_a_wall(tmp_path):
     """Where the plane is a wall, the surface is the world frame's origin."""
     pool = replace(POOLS["window wall"], world_position=(0.0, 0.0, 1.2))
-    known = known_of(pool, load_vehicle("finsrov"), depth=0.5, imu=None)
+    known = prior_sources(pool, load_vehicle("finsrov"), depth=0.5, imu=None)
     found = known.at(0.0, needs_height=True)
     assert found.z_b == pytest.approx(1.2 - 0.5 + 0.115)
     assert found.up == (0.0, 0.0, 1.0)

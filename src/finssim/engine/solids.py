@@ -137,7 +137,7 @@ def _is_closed(points: Any, faces: Any) -> bool:
 
 
 @wp.kernel(enable_backward=False)
-def look_around(
+def refresh_clearing(
     state: State,
     solids: Solids,
     plant: wp.array2d(dtype=VehicleParameters),

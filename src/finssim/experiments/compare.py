@@ -41,7 +41,7 @@ class CompareError(ValueError):
 class Run:
     """One training."""
 
-    place: Path
+    path: Path
     description: PolicyDescription
     curves: dict[str, NDArray[np.float64]]
     """Columns of `curves.csv`; empty if it has none."""
@@ -124,7 +124,7 @@ def _check(name: str, runs: Sequence[Run]) -> None:
         different = next((key for key in {**ours, **theirs} if ours.get(key) != theirs.get(key)), "")
         if different:
             raise CompareError(
-                f"{first.place} and {run.place} are both '{name}', but differ in {different}: "
+                f"{first.path} and {run.path} are both '{name}', but differ in {different}: "
                 "name them apart with NAME=DIR"
             )
     seeds = [run.seed for run in runs]
@@ -326,7 +326,7 @@ def compare(
     jobs = [
         Job(
             row=group.name, target=run.description.task, task=run.description.task, seed=run.seed, noise=seed,
-            controller=str(run.place), vehicle=vehicle, water=water, trials=trials,
+            controller=str(run.path), vehicle=vehicle, water=water, trials=trials,
         )
         for group in groups for run in group.runs
     ]  # fmt: skip
@@ -371,7 +371,7 @@ def comparison(
     for group in groups:
         seconds = [run.seconds for run in group.runs if run.seconds is not None]
         rows[group.name] = {
-            "runs": [str(run.place) for run in group.runs],
+            "runs": [str(run.path) for run in group.runs],
             "seeds": [run.seed for run in group.runs],
             "steps": group.runs[0].description.training.get("steps"),
             "seconds": sum(seconds) / len(seconds) if seconds else None,

@@ -555,7 +555,7 @@ class _Demonstration:
         """Where trials are made."""
         return FIRMWARES[self.firmware].site if self.robot is None else self.robot.site
 
-    def tell(self, text: str) -> None:
+    def report(self, text: str) -> None:
         """Show a line of progress."""
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
@@ -563,7 +563,7 @@ class _Demonstration:
     def _working(self, doing: str) -> Iterator[Progress]:
         """Show what is done, and how far it is; a robot's session has a line of its own."""
         text = f"{doing} {'in the virtual pool' if self.robot is None else 'on the robot'}"
-        self.tell(text)
+        self.report(text)
         with nullcontext() if self.robot is not None else self.console.status(text) as status:
             yield lambda part, detail: status.update(f"{text}: {detail}") if status else None
 
@@ -588,13 +588,13 @@ class _Demonstration:
                 record_programmes, plans, robot=self.robot, **person, pool_vehicle=self.name, plant=self.seed,
                 severity=SEVERITY, seed=self.seed, site=self.site, firmware=self.firmware, leave_out=True,
                 processes=self.processes, progress=progress,
-                show=lambda run, result: self.tell(
+                show=lambda run, result: self.report(
                     f"  {run.target}: {'left out: ' if result['fault'] else ''}{result['fault'] or result['text']}"
                 ),
             )  # fmt: skip
             result = identify(self.out, self.name, seed=self.seed, record=record)
         identifiable = sum(e.identifiable for e in result.fit.estimates.values())
-        self.tell(
+        self.report(
             f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
             f"{len(result.fit.estimates)} parameters told, NRMSE on {len(result.replay.pairs)} other trials "
             f"{result.replay.aggregate('calibrated').value:.3f}"
@@ -605,7 +605,7 @@ class _Demonstration:
         held = "held" if result["success"] else result["fault"] or "not held"
         if result["e_p_m"] is not None:
             held += f", {result['e_p_m']:.3f} m and {result['e_psi_deg']:.1f}° off"
-        self.tell(f"  {job.row} at {job.target}: {held}")
+        self.report(f"  {job.row} at {job.target}: {held}")
 
     def _commands(self) -> list[str]:
         """Command lines that repeat the demonstration's steps by hand."""

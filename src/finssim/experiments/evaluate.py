@@ -295,7 +295,7 @@ def evaluate(
     if truth is not None and not records:
         raise EvaluationError("--truth tells of records: a simulation knows its own")
     plants = [] if records else _plants([plant] if isinstance(plant, str | Path) else plant)
-    plants = plants if observe is None else [plant_file.seen(observe) for plant_file in plants]
+    plants = plants if observe is None else [plant_file.with_view(observe) for plant_file in plants]
     with atomic_directory(out, replaces=EVALUATION_FILE) if out is not None else nullcontext() as folder:
         evaluations = [_recorded(records, task, vehicle, trajectories, truth)] if records else []
         for plant_file in plants:
@@ -406,7 +406,11 @@ def evaluate_controller(
         else:
             measures = run_episodes(agent, the_task, body, plant, **options)
     plant_values = plant.model_dump(mode="json", exclude_defaults=True)
-    about = {"hydrodynamics": plant.hydrodynamics or hydrodynamics, "seed": seed, **plant.told_of_sight(body)}
+    about = {
+        "hydrodynamics": plant.hydrodynamics or hydrodynamics,
+        "seed": seed,
+        **plant.observe_record(body),
+    }
     return evaluation(agent.describe(), task, body, plant_values, measures, played, **about)
 
 

@@ -201,7 +201,7 @@ LEAST_ROOM = 0.15
 
 
 @dataclass(frozen=True)
-class Place:
+class Start:
     """Where a programme begins."""
 
     position: tuple[float, float, float]
@@ -221,7 +221,7 @@ def box_of(surroundings: Basin | Vehicle) -> Box:
     return tuple(map(float, lower)), tuple(map(float, upper))  # type: ignore[return-value]
 
 
-def place_of(programme: Programme, vehicle: Vehicle, box: Box) -> Place:
+def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> Start:
     """The start of a programme: its way then lies in the middle of the water, surge and sway along x.
 
     One that goes both ways begins in the middle itself, and has half of the way to either side.
@@ -241,7 +241,7 @@ def place_of(programme: Programme, vehicle: Vehicle, box: Box) -> Place:
     x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (top + bottom)
     axis = programme.axes[0]
     if len(programme.axes) != 1 or axis in ("roll", "pitch", "yaw"):
-        return Place((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
+        return Start((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
     column = programme.tau_desired[:, AXES.index(axis)]
     sign = float(column.max() > 0.0) - float(column.min() < 0.0)  # 0 where it goes both ways
     # Heading along x for surge; across it for sway, so that its left is where x falls.
@@ -258,7 +258,7 @@ def place_of(programme: Programme, vehicle: Vehicle, box: Box) -> Place:
             f"{programme.name}: the pool leaves {way:.2f} m to go along {axis}, expected {LEAST_ROOM} m or more: use a "
             "larger pool"
         )
-    return Place((x, y, z), yaw, way)
+    return Start((x, y, z), yaw, way)
 
 
 ESTIMATOR = "error-state"
@@ -266,7 +266,7 @@ ESTIMATOR = "error-state"
 
 
 def programme_trial(
-    programme: Programme, vehicle: Vehicle, start: Place, *, hold: str | None = "pid"
+    programme: Programme, vehicle: Vehicle, start: Start, *, hold: str | None = "pid"
 ) -> RobotTrial:
     """The trial that plays a programme, and ends with it; its record has the phases.
 
@@ -343,7 +343,7 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     record.parent.mkdir(parents=True, exist_ok=True)
     record.unlink(missing_ok=True)
     vehicle, seed = load_vehicle(run.vehicle), noise_seed(run.seed, run.row, run.target)
-    start = place_of(run.programme, vehicle, run.water)
+    start = start_of(run.programme, vehicle, run.water)
     trial = programme_trial(run.programme, vehicle, start, hold=run.hold)
     about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
     with Recorder(record, vehicle, about, pictures="none") as recorder:
@@ -372,7 +372,7 @@ def record_programmes(
     console: Console | None = None,
     **pool: Any,
 ) -> dict[str, list[Path]]:
-    """Make trials of programmes, played by the robot's whole software at the start that `place_of` gives each.
+    """Make trials of programmes, played by the robot's whole software at the start that `start_of` gives each.
 
     Args:
         plans: What is played.
@@ -415,7 +415,7 @@ def _on_robot(
         for programme in plan
         if not (folders[role] / programme.name).is_dir()
     ]
-    places = {path: place_of(programme, vehicle, box_of(vehicle)) for _, programme, path in remaining}
+    places = {path: start_of(programme, vehicle, box_of(vehicle)) for _, programme, path in remaining}
     starts = {path: Station(start.position, start.yaw) for path, start in places.items()}
     check_starts({path.name: start for path, start in starts.items()}, vehicle)
     if not remaining:
@@ -476,7 +476,7 @@ def _in_pool(
     ]
     body = load_vehicle(vehicle)
     for run in runs:  # what cannot be is refused before anything is played
-        place_of(run.programme, body, runs[0].water)
+        start_of(run.programme, body, runs[0].water)
     with tempfile.TemporaryDirectory() as scratch:
         results = run_jobs(
             runs, Path(scratch), play_programme, processes=processes, progress=progress, show=show

@@ -23,7 +23,7 @@ from finssim.experiments.metrics import MAX_GAP, T1_SETPOINTS, in_room
 from finssim.experiments.tables import Table
 from finssim.experiments.trials import DURATION, Motion, Trial, follows, interpolated, localization_errors
 from finssim.geometry.rotations import quat_from_yaw
-from finssim.learning.demonstrations import DatasetError, Episode, about, found_in, save
+from finssim.learning.demonstrations import DatasetError, Episode, about, data_sets_in, save
 from finssim.learning.demonstrations import collect as collect_episodes
 from finssim.learning.lerobot import export_lerobot
 from finssim.pool.task_site import Referee
@@ -463,7 +463,7 @@ def datasets(places: Sequence[Path], *, lerobot: Path | None = None) -> dict[str
         places (PATH...): Data sets, or folders that hold some.
         lerobot (DIR): Folder for a LeRobot data set (format 3.0) of the one data set that is named.
     """
-    paths = [path for location in places for path in found_in(location)]
+    paths = [path for location in places for path in data_sets_in(location)]
     if lerobot is None:
         return {str(path): about(path) for path in paths}
     if len(paths) != 1:

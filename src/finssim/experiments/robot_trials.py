@@ -429,7 +429,7 @@ class Session:
         """Of a robot that was let in: one for all trials, so that what it reckons is carried from each to the next."""
         return Perception(self.equipped, None, mode="error-state", let_in=self.robot.let_in)
 
-    def say(self, text: str) -> None:
+    def notify(self, text: str) -> None:
         """Tell whoever watches."""
         self.console.print(text, highlight=False, markup=False)
 
@@ -467,7 +467,7 @@ class Session:
         while True:
             trial = make()
             x, y, z = start.position
-            self.say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {round(math.degrees(start.yaw))}°")
+            self.notify(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {round(math.degrees(start.yaw))}°")
             partial = record.with_name(f".{record.stem}.partial.mcap")
             partial.parent.mkdir(parents=True, exist_ok=True)
             partial.unlink(missing_ok=True)
@@ -496,7 +496,7 @@ class Session:
                 return outcome
             self._put_away(partial, record, outcome)
             if outcome.ended == "skipped":
-                self.say(f"{trial.name}: skipped")
+                self.notify(f"{trial.name}: skipped")
                 return None
             if outcome.ended == "interrupted":
                 raise KeyboardInterrupt
@@ -504,7 +504,7 @@ class Session:
                 raise RobotError(
                     f"{trial.name}: {outcome.fault}: look at the vehicle, then give the command again: it goes on here"
                 )
-            self.say(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
+            self.notify(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
 
     def _put_away(self, partial: Path, record: Path, outcome: Outcome) -> None:
         """Keep what there is of a trial that was begun; nothing was recorded of one that was not."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.campaign import keep_result, kept_result
+from finssim.experiments.campaign import keep_result, load_result
 from finssim.experiments.plants import load_plant
 from finssim.experiments.tables import Table, figure_text
 from finssim.experiments.trials import EpisodeError, follows, run_episodes, summarize_episodes
@@ -135,7 +135,7 @@ def play(
         "plant": plant, "severity": severity, "seed": seed,
     }  # fmt: skip
     file = None if out is None else out / ROWS
-    earlier = kept_result(file) if file is not None and file.is_file() else {}
+    earlier = load_result(file) if file is not None and file.is_file() else {}
     rows = (
         list(earlier["episodes"]) if earlier and earlier == {**about, "episodes": earlier["episodes"]} else []
     )

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from rich.console import Console
 
-from finssim.experiments.campaign import Progress, keep_result, kept_result, spread, write_json
+from finssim.experiments.campaign import Progress, keep_result, load_result, spread, write_json
 from finssim.experiments.compare import MEASURES
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
@@ -131,7 +131,7 @@ class Search(BaseModel):
     """Option of a training, or settings.NAME of its learner -> what it may be."""
 
     @model_validator(mode="after")
-    def _one(self) -> Search:
+    def _single_measure(self) -> Search:
         for name in self.options:
             if "." in name and not name.startswith("settings."):
                 raise ValueError(f"'{name}' is no option: one with a dot is settings.NAME, of the learner")
@@ -165,7 +165,7 @@ class Sweep(BaseModel):
         return tuple(range(1, value + 1)) if isinstance(value, int) and not isinstance(value, bool) else value
 
     @model_validator(mode="after")
-    def _known(self) -> Sweep:
+    def _check_options(self) -> Sweep:
         if self.task not in TASKS:
             raise ValueError(f"task is '{self.task}', expected one of {', '.join(TASKS)}")
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
@@ -306,7 +306,7 @@ def sweep(
         """The rows of jobs, those that are missing after playing them."""
         for job in jobs:
             if (path := runs / job.key / ROW_FILE).is_file():
-                rows[job.key] = kept_result(path)
+                rows[job.key] = load_result(path)
         missing = [job for job in jobs if job.key not in rows]
         if missing:
             with closing(spread(play, missing, processes, address)) as outcomes:

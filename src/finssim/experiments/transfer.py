@@ -94,7 +94,7 @@ class Spec:
     """In the order of the table."""
     targets: Sequence[str]
     """Setpoints or trajectories that are played."""
-    known_targets: Sequence[str]
+    allowed_targets: Sequence[str]
     """All that may be requested."""
     kind: str
     """What targets are, in the plural."""
@@ -244,7 +244,7 @@ def transfer_experiment(
     usual = [name for name, row in spec.rows.items() if row.controller not in COSTLY]
     rows, targets = list(rows or usual), list(targets or spec.targets)
     check_choices(rows, spec.rows, "row", ValueError)
-    check_choices(targets, spec.known_targets, "target", ValueError)
+    check_choices(targets, spec.allowed_targets, "target", ValueError)
     check_choices([severity], ("nominal", "realistic", "hard"), "severity", ValueError)
     check_choices([camera], ("corners", "pictures"), "camera", ValueError)
     check_choices([estimator], MODELS, "estimator", ValueError)
@@ -487,7 +487,7 @@ T1 = Spec(
     title="Station keeping",
     rows=ROWS["t1"],
     targets=tuple(T1_SETPOINTS),
-    known_targets=tuple(T1_SETPOINTS),
+    allowed_targets=tuple(T1_SETPOINTS),
     kind="setpoints",
     by_target=False,
     columns=T1_COLUMNS,
@@ -511,7 +511,7 @@ T2 = Spec(
     title="Trajectory tracking",
     rows=ROWS["t2"],
     targets=T2_TRAJECTORIES,
-    known_targets=tuple(TRAJECTORIES),
+    allowed_targets=tuple(TRAJECTORIES),
     kind="trajectories",
     by_target=True,
     columns={

@@ -189,7 +189,7 @@ def about(folder: str | Path) -> dict[str, Any]:
     return {**described, "episodes": metadata["total_episodes"], "steps": metadata["total_steps"]}
 
 
-def found_in(folder: str | Path) -> list[Path]:
+def data_sets_in(folder: str | Path) -> list[Path]:
     """The data sets at a place: itself, or those right under it.
 
     Raises:
@@ -323,7 +323,7 @@ def record_episodes(
     quota = np.full(worlds, count // rows)
     quota[: -(-(count - int(quota.sum()) * agents) // agents)] += 1
     fresh = expert.reset(rows)
-    memory, (observed, pictures) = fresh, _apart(environment.reset(seed=environment.seed), rows)
+    memory, (observed, pictures) = fresh, _separated(environment.reset(seed=environment.seed), rows)
     running: list[list[Any]] = [[] for _ in range(rows)]
     episodes: list[Episode] = []
     broken = 0
@@ -340,7 +340,7 @@ def record_episodes(
                 running[i].append((observed[i], views, action[i], float(reward[i])))
         ended = step.terminated | step.truncated
         if ended.any():
-            last, final_pictures = _apart(step.final_observation, rows)
+            last, final_pictures = _separated(step.final_observation, rows)
             measured = environment.task.metrics(environment.arrays)
             broke = ended & (
                 environment.arrays.done.numpy() == 0
@@ -362,12 +362,12 @@ def record_episodes(
                         )
                     running[i] = []
             memory = restarted(memory, fresh, np.repeat(ended, agents))
-        observed, pictures = _apart(step.observation, rows)
+        observed, pictures = _separated(step.observation, rows)
         show(min(len(episodes) / count, 1.0))
     return episodes[:count]
 
 
-def _apart(observation: Any, rows: int) -> tuple[NDArray[np.float32], dict[str, NDArray[np.uint8]]]:
+def _separated(observation: Any, rows: int) -> tuple[NDArray[np.float32], dict[str, NDArray[np.uint8]]]:
     """Numbers (rows, n) and pictures by name of an observation, as copies."""
     if not isinstance(observation, dict):
         return observation.reshape(rows, -1).copy(), {}

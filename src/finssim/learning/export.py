@@ -28,7 +28,7 @@ from finssim.learning.network import (
     Cell,
     Linear,
     Network,
-    asked,
+    answer_of,
     first_memory,
 )
 from finssim.provenance import provenance
@@ -501,7 +501,7 @@ def _answer(
         copy = deepcopy(network).cpu().eval().to(torch.float64 if kind is np.float64 else torch.float32)
         with torch.no_grad():
             tensors = {name: torch.from_numpy(x) for name, x in pictures.items()}
-            parts = asked(copy, *(None if x is None else torch.from_numpy(x) for x in inputs), tensors)
+            parts = answer_of(copy, *(None if x is None else torch.from_numpy(x) for x in inputs), tensors)
         action, after = (None if x is None else x.numpy() for x in parts)
     action = np.clip(action, -1.0, 1.0) if limited else action
     return action if after is None else np.concatenate([action, after], axis=1)

@@ -127,12 +127,12 @@ def train(
 
     from finssim.learning.episodes import HELD_WORLDS, HeldEvaluation, held_seed
     from finssim.learning.export import description_of
-    from finssim.learning.layers import one_thread
+    from finssim.learning.layers import single_thread
     from finssim.learning.training_loop import Loop, TrainingView, last_checkpoint
 
     checkpoint = last_checkpoint(side) if resume else None
     randomized = randomization is not None
-    changes = dict(settings) if isinstance(settings, Mapping) else settings_of_words(settings)
+    changes = dict(settings) if isinstance(settings, Mapping) else parse_settings(settings)
     values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=changes)
     values = _taught(values, init, learner, mode_name == the_task.action)
 
@@ -160,7 +160,7 @@ def train(
     )
     began = time.perf_counter()
     full = randomization and randomization.at_full_width()  # as it is measured, whatever it grew from
-    with one_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
+    with single_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a last small batch does no harm
         warnings.filterwarnings("ignore", message=".*on the GPU.*")
         loop = Loop(
@@ -177,7 +177,7 @@ def train(
                 f"no checkpoint in {side} yet: starting from the beginning", soft_wrap=True, markup=False
             )
         stopped = loop.run()
-    folder = (interrupted or _place_beside(Path(out), side)) if stopped else Path(out)
+    folder = (interrupted or _path_beside(Path(out), side)) if stopped else Path(out)
     _finish(
         loop, folder, stopped, console, folder if stopped else shown or folder, time.perf_counter() - began
     )
@@ -197,7 +197,7 @@ def _taught(values: Any, init: str | Path | None, learner: str, default_action: 
     return values if default_action else replace(values, teacher="")
 
 
-def settings_of_words(texts: Sequence[str]) -> dict[str, Any]:
+def parse_settings(texts: Sequence[str]) -> dict[str, Any]:
     """Changes of settings from NAME=VALUE; a value with commas is a list.
 
     Raises:
@@ -233,7 +233,7 @@ def _finish(loop: Any, folder: Path, stopped: bool, console: Console, label: Pat
         raise KeyboardInterrupt
 
 
-def _place_beside(out: Path, side: Path) -> Path:
+def _path_beside(out: Path, side: Path) -> Path:
     """Where an unfinished policy goes: a finished one that is there already must not be lost to it."""
     return side / "interrupted" if (out / DESCRIPTION_FILE).is_file() else out
 

@@ -46,7 +46,7 @@ DEPTH_STD = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class PriorSources:
     """Sources of height and tilt."""
 
     base: Constraints
@@ -92,7 +92,7 @@ class Known:
         return replace(self.base, z_b=self.surface - below - lever, roll=roll, pitch=pitch)
 
 
-def known_of(
+def prior_sources(
     pool: Pool,
     vehicle: Vehicle,
     *,
@@ -102,7 +102,7 @@ def known_of(
     tilt_std: float | None = None,
     shared_pixel_std: float = 0.0,
     longest_gap: float = 1.0,
-) -> Known:
+) -> PriorSources:
     """Read the sources.
 
     Args:
@@ -137,7 +137,7 @@ def known_of(
         assumed.append(f"no --imu: the vehicle is taken as level, give or take {spread:.1f} degrees")
     if sensor is None and depth is not None:
         assumed.append(f"{vehicle.name} has no depth sensor: the depth is taken as that of the body origin")
-    return Known(base, surface, _depth(depth, longest_gap), _tilt(imu, longest_gap), tuple(assumed))
+    return PriorSources(base, surface, _depth(depth, longest_gap), _tilt(imu, longest_gap), tuple(assumed))
 
 
 def _vertical(pool: Pool) -> tuple[tuple[float, float, float], float]:
@@ -205,7 +205,7 @@ class Locator:
         self,
         pool: Pool,
         vehicle: Vehicle,
-        prior: Known,
+        prior: PriorSources,
         *,
         method: str = "refractive",
         pixel_std: float = 0.5,
@@ -565,7 +565,7 @@ def run(
             f"longest_gap is {longest_gap}, expected a time in seconds that is not negative"
         )
     site, body = load_pool(pool), load_vehicle(str(vehicle))
-    prior = known_of(
+    prior = prior_sources(
         site,
         body,
         depth=depth,

@@ -30,7 +30,7 @@ _BAD_ROWS_NAMED = 5
 class PointTable:
     """A table as it was read."""
 
-    where: str
+    label: str
     """The file, as messages call it."""
     names: list[str]
     """All columns, as the file calls them."""
@@ -152,7 +152,7 @@ def run_project(
     columns = {
         "u": _cells(projection.pixels[:, 0], 6),
         "v": _cells(projection.pixels[:, 1], 6),
-        "status": _words(projection.status),
+        "status": _status_names(projection.status),
     }
     _give(table, columns, projection.status, "project", "points have a pixel in the image", out, as_json)
 
@@ -198,7 +198,7 @@ def run_backproject(
     else:
         points, status = rays.at_plane(normal, offset)
     columns = {axis: _cells(points[:, i], 9) for i, axis in enumerate("xyz")}
-    columns["status"] = _words(status)
+    columns["status"] = _status_names(status)
     if pixel_std is not None:
         by_pixel = plane_jacobian(scene.camera, scene.interface, points, normal)[..., :2]
         sigma = pixel_std * np.sqrt(np.sum(by_pixel**2, axis=-1))
@@ -223,7 +223,7 @@ def _plane(table: PointTable, z: float | None, plane: str | None) -> tuple[Array
         return up, -table.numbers["z"]
     if z is None:
         raise LocalizationError(
-            f"{table.where}: nothing says on which plane the points lie: give a height z, a plane, or a column z"
+            f"{table.label}: nothing says on which plane the points lie: give a height z, a plane, or a column z"
         )
     if not np.isfinite(z):
         raise LocalizationError(f"z is {z}, expected a finite height in metres")
@@ -235,7 +235,7 @@ def _cells(values: Array, digits: int) -> list[str]:
     return [f"{x:.{digits}f}" if np.isfinite(x) else "" for x in values.tolist()]
 
 
-def _words(status: npt.NDArray[np.int8]) -> list[str]:
+def _status_names(status: npt.NDArray[np.int8]) -> list[str]:
     return [Status(i).name.lower() for i in status.tolist()]
 
 

@@ -19,7 +19,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from finssim.files import atomic_write
-from finssim.mcap_files import MAGIC, whole_mcap
+from finssim.mcap_files import MAGIC, intact_mcap
 from finssim.robot.record_messages import METADATA, RecordError, types
 from finssim.yaml_file import json_value
 
@@ -59,7 +59,7 @@ def repair_record(path: Path, out: Path) -> list[str]:
     if out.resolve() == path.resolve():
         raise RecordError(f"{path}: cannot be repaired into itself: give another file with --out")
     notes: list[str] = []
-    with whole_mcap(path, notes) as complete, atomic_write(out) as temporary:
+    with intact_mcap(path, notes) as complete, atomic_write(out) as temporary:
         write_whole(complete, temporary, notes)
     return notes
 
@@ -219,7 +219,7 @@ def open_record(path: Path | str) -> Iterator[Record]:
     refuse_foreign(path)
     notes: list[str] = []
     with ExitStack() as stack:
-        complete = stack.enter_context(whole_mcap(path, notes))
+        complete = stack.enter_context(intact_mcap(path, notes))
         file = stack.enter_context(complete.open("rb"))
         if not _indexed(file):
             copy = Path(stack.enter_context(TemporaryDirectory())) / path.name

@@ -99,7 +99,7 @@ class Header(_Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _one_axis(cls, data: Any) -> Any:
+    def _single_axis(cls, data: Any) -> Any:
         """A single axis may stand without brackets."""
         if isinstance(data, dict) and "convert" in data:
             raise refuse_section(

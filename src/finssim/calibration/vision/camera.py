@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "Board", "BoardView", "MODELS", "adjust", "board_found", "calibrate_camera", "evidence",
+    "Board", "BoardView", "MODELS", "adjust", "common_board", "calibrate_camera", "evidence",
     "lens_names", "lens_vector", "parse_size", "run", "see_board",
 ]  # fmt: skip
 
@@ -157,7 +157,7 @@ def see_board(image: NDArray[np.uint8], board: Board) -> tuple[Array, Array] | N
     return pixels, board.corners[index]
 
 
-def board_found(images: Iterable[tuple[str, NDArray[np.uint8]]], square: float) -> Board:
+def common_board(images: Iterable[tuple[str, NDArray[np.uint8]]], square: float) -> Board:
     """The common chessboard that most of some pictures show.
 
     Args:
@@ -271,7 +271,7 @@ SPREAD = 4.0
 NONSENSE = 0.003
 """Residual of the usual picture, in widths of the image, with which nothing can be right."""
 
-MOST_LEFT_OUT = 0.25
+MAX_EXCLUDED = 0.25
 FOLDS = 8
 
 UNSURE_FOCAL = 0.02
@@ -546,7 +546,7 @@ def _refuse_nonsense(bundle: Bundle, views: Sequence[BoardView]) -> None:
 def _without_outliers(views: Sequence[BoardView], bundle: Bundle) -> tuple[list[BoardView], Bundle]:
     """Leave out the worst view as long as it is far from the others, and fit again; the others, and their fit."""
     used = list(views)
-    for _ in range(min(int(MOST_LEFT_OUT * len(views)), len(views) - FEWEST_VIEWS)):
+    for _ in range(min(int(MAX_EXCLUDED * len(views)), len(views) - FEWEST_VIEWS)):
         if not _outliers(bundle.rms).any():
             break
         del used[int(np.argmax(bundle.rms))]
@@ -881,7 +881,7 @@ def run(
     screen = Console(stderr=True)
     chosen = _board(board, square, charuco, marker, dictionary)
     if chosen is None:
-        chosen = board_found(((name, image) for _, name, image in pictures(images)), square)
+        chosen = common_board(((name, image) for _, name, image in pictures(images)), square)
         screen.print(f"found a {chosen.words}; --board says otherwise", highlight=False, markup=False)
     views, without = _board_views(images, chosen, screen)
     for name in without:
