@@ -103,9 +103,9 @@ EXTRA_OF_MODULE = {
 
 
 def doctor(*, as_json: bool = False) -> int:
-    """Say what is installed, which devices compute, and what each missing extra would enable.
+    """List installed packages and compute devices, and what each missing extra would enable.
 
-    Exit status 1: of what everything needs, the core packages and a processor that computes, something is not there.
+    Exit status 1: a core package or a working compute device is missing.
 
     Example: finssim doctor
     """

@@ -670,9 +670,9 @@ def calibrate_motor(
 
     Args:
         trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
-        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        report (DIR): Directory for report.html, report.md, figures and fit.json.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
     """

@@ -426,11 +426,12 @@ def demo(
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
 ) -> Path:
-    """Identify a vehicle in the virtual pool or on a robot, train in it, deploy there beside two PIDs, write a report.
+    """Identify a vehicle in the virtual pool or on a robot, train and deploy a policy, write a report.
 
-    Trials are recorded and controllers deployed through the robot's whole software: camera, localization, fusion,
-    controller, allocation, bridge and the motor controller's protocol. Beside the policy, `pid` and `pid-paper` try the
-    same setpoints in the same pool, `pid` tuned from the identified vehicle.
+    Trials are recorded and controllers deployed through the robot's complete software: camera, localization,
+    fusion,
+    controller, allocation, bridge and the motor controller's protocol. For comparison, `pid` (tuned from the
+    identified vehicle) and `pid-paper` run the same setpoints in the same pool.
 
     Example: finssim demo --vehicle bluerov2_heavy --out demo
 
@@ -440,15 +441,15 @@ def demo(
 
     Args:
         out: Directory of trials, vehicle, policy, results and report.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         seed: Seed of every random number; equal seeds give equal results.
-        steps: Control steps to learn from, all worlds together; what the task needs if not given.
+        steps: Control steps of the training, summed over all worlds; the task's default if not given.
         console: Where progress is shown; standard error if None.
         scope: How much of it; `FULL` if None.
         processes: As many as there are processors if None.
-        firmware (NAME): What steers the motors: mcu, FinsROV's motor controller, or ardusub, an autopilot: commands
-            then go by MAVLink, the policy acts by its axes (`pilot6`), and in place of the pool and its camera there is
-            a tank, a Doppler log, a compass, and setpoints three times as far.
+        firmware (NAME): Firmware of the vehicle: mcu (FinsROV's motor controller) or ardusub (an autopilot over
+            MAVLink: the policy uses its axes, `pilot6`, in a tank with a DVL and a compass instead of the pool and
+            its camera, with setpoints three times as far).
         robot: Where trials are made and setpoints held, in place of the virtual pool.
         attendant: The person beside that robot, instead of the terminal's keyboard.
 

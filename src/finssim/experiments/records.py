@@ -416,25 +416,25 @@ def collect(
     seed: int = 42,
     progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
-    """Keep episodes of a task as a Minari data set: let an expert do it, or take what was done with a vehicle.
+    """Store episodes of a task as a Minari data set, from an expert or from records of a driven vehicle.
 
     Example: finssim collect pid --task t1 --episodes 200 --out demonstrations/hold
 
     Args:
         experts (DIR|NAME|RECORD...): A policy's directory or a baseline of the task; or records of driven vehicles
             (.mcap).
-        task (TASK): Task to be shown; finssim tasks lists them.
+        task (TASK): Task of the demonstrations; finssim tasks lists them.
         out (DATASET): Folder of the data set.
-        episodes: How many; each agent's is one of its own. Not of records.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        episodes: Number of episodes, counted per agent. Not for records.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        action: What is commanded: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
-        randomize (FILE): Ranges that vehicle and water are drawn from, by name or file.
+        action: Action mode: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
+        randomize (FILE): Ranges of vehicle and water parameters, by name or file.
         observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
             through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
-        disturb: Noise on what is done, not on what is written, in parts of full action: shows recoveries.
-        goal (GOAL): Of records: where to, in place of what they say: x,y,z,yaw_deg [m, deg], or end: where each stretch
-            ended; of t2 the trajectory.
+        disturb: Noise on the executed but not on the stored action, as a fraction of full action: shows recoveries.
+        goal (GOAL): Goal for records, instead of the recorded one: x,y,z,yaw_deg [m, deg], or end for the final
+            pose of each interval; for t2 the trajectory.
         seed: Seed of every random number; equal seeds give equal results.
         progress: Told the share that is done.
     """
@@ -455,13 +455,13 @@ def collect(
 
 
 def datasets(places: Sequence[Path], *, lerobot: Path | None = None) -> dict[str, Any]:
-    """List demonstrations: task, vehicle, expert, episodes, steps. With --lerobot, write one as LeRobot reads it too.
+    """List demonstrations: task, vehicle, expert, episodes, steps. With --lerobot, export one for LeRobot.
 
     Example: finssim datasets demonstrations
 
     Args:
-        places (PATH...): Data sets, or folders that hold some.
-        lerobot (DIR): Folder for a LeRobot data set (format 3.0) of the one data set that is named.
+        places (PATH...): Data sets, or folders of them.
+        lerobot (DIR): Folder for the LeRobot data set (format 3.0), from a single data set.
     """
     found = [path for place in places for path in found_in(place)]
     if lerobot is None:

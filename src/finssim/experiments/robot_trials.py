@@ -346,22 +346,22 @@ def robot_or_none(
     """The robot that options name; none where they name none, and nothing tells of one.
 
     Args:
-        robot (ADDRESS): Robot on which it is done: its motor controller's udp://HOST:PORT or serial:DEVICE, its
-            autopilot's mavlink://KIND:WHERE, or pool or mavlink for the virtual pool on this machine. With --lockstep:
+        robot (ADDRESS): Run on this robot: its motor controller's udp://HOST:PORT or serial:DEVICE, its autopilot's
+            mavlink://KIND:ADDRESS, or pool or mavlink for the virtual pool on this machine. With --lockstep:
             pool, mavlink, or HOST:PORT.
-        pool_file (FILE|none): Of that robot: camera, water plane and frames (.yaml); none where no camera looks and
-            position fixes come by wire.
-        site (NAME): Where that robot is: pool, tank or open-water, by which it is equipped. If not given: pool.
-        bind (ADDRESS:PORT): Address and port of this end, for udp; pictures come to the port after it. Loopback unless
-            given.
+        pool_file (FILE|none): Pool file of that robot: camera, water plane and frames (.yaml); none if position
+            fixes arrive over the link.
+        site (NAME): Site of that robot, which sets its sensors: pool (default), tank or open-water.
+        bind (ADDRESS:PORT): Local address and port for udp; images arrive at the next port. Loopback if not given.
         pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
             otherwise none, if not given.
-        lockstep: Take turns with finssim pool --lockstep, as fast as both compute.
-        arm: Let thrusters turn, as soon as the state is known. Without it they never do.
-        by_hand: Somebody carries the vehicle to where each trial starts; the tuned PID steers it there if not given.
-        unattended: Nobody presses enter before each trial; a fault ends the session, and nothing is armed after it.
-        let_in (X,Y): Where the vehicle is when the command begins, world frame [m], known to 5 cm: its position is
-            reckoned on from there by Doppler log and compass through all trials. With --pool-file none.
+        lockstep: Run in lock-step with finssim pool --lockstep, as fast as possible.
+        arm: Arm, as soon as the state is known. Without it the thrusters never turn.
+        by_hand: The vehicle is carried to the start of each trial by hand; by default the tuned PID steers it
+            there.
+        unattended: Start each trial without waiting for enter; a fault ends the session.
+        let_in (X,Y): Position of the vehicle at the start of the command, world frame [m], known to 5 cm: start of
+            dead reckoning by DVL and compass through all trials. With --pool-file none.
 
     Raises:
         GoalError: --let-in is no place.

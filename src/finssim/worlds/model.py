@@ -56,7 +56,7 @@ class WorldBatch(WorldLayout):
     Args:
         world: A site of the catalogue, a path, or a world.
         worlds: How many copies.
-        device: Where to compute: cpu or cuda.
+        device: Compute device: cpu or cuda.
     """
 
     def __init__(self, world: World | str, worlds: int = 1, device: str = "cpu") -> None:

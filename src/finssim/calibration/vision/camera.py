@@ -850,20 +850,20 @@ def run(
     seed: int = 0,
     as_json: bool = False,
 ) -> CameraFit:
-    """Fit a lens to pictures of a board: focal length and centre [px], distortion, with 95 % intervals.
+    """Fit a lens to images of a board: focal length and centre [px], distortion, with 95 % intervals.
 
     Example: finssim calibrate camera board/*.jpg --board 9x6 --square 0.025 --out camera.yaml
 
     Args:
-        images (IMAGE): Pictures of a board, folders of them, or videos.
+        images (IMAGE): Images of a board, folders of them, or videos.
         out (FILE): Camera file to write (.yaml).
-        board (NxM): Inner corners of a chessboard, such as 9x6; common ones are tried if not given.
+        board (NxM): Inner corners of a chessboard, such as 9x6; common sizes are tried if not given.
         square: Edge of a square [m].
-        charuco (NxM): Squares of a ChArUco board in place of a chessboard, such as 7x5.
+        charuco (NxM): Squares of a ChArUco board instead of a chessboard, such as 7x5.
         marker: Edge of its markers [m]; three quarters of a square if not given.
-        dictionary (NAME): Dictionary of its markers, as OpenCV calls it.
+        dictionary (NAME): OpenCV's name of the marker dictionary.
         model (MODEL): Lens: plumb_bob, rational or fisheye.
-        report (DIR): Directory for the report and its pictures.
+        report (DIR): Directory for the report and its figures.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 

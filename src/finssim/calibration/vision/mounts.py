@@ -972,16 +972,16 @@ def run(
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Find where tags sit on the vehicle, from its motion, its IMU and its pressure port: poses [m, deg].
+    """Estimate the mounts of tags on the vehicle from its motion, IMU and pressure port: poses [m, deg].
 
     Example: finssim calibrate mounts log --pool pool.yaml --vehicle mine.yaml --out mine.yaml
 
     Args:
         log (LOG): Folder with detections.csv, imu.csv and depth.csv.
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
-        report (DIR): Directory for the report and its pictures.
+        report (DIR): Directory for the report and its figures.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 
