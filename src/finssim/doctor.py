@@ -67,13 +67,11 @@ EXTRAS = {
     ),
     "view": Extra(
         {"matplotlib": "matplotlib", "viser": "viser"},
-        "draw pictures of vehicles and figures of evaluations, see runs live in the browser",
+        "draw pictures of vehicles and figures of evaluations, show runs live in the browser",
     ),
     "mujoco": Extra({"mujoco": "mujoco"}, "measure speed as a ratio to MuJoCo's"),
     "mpc": Extra({"casadi": "casadi"}, "control by nonlinear model prediction (nmpc)"),
-    "perception": Extra(
-        {"newton": "newton"}, "let cameras, sonars and altimeters see the worlds of finssim.worlds"
-    ),
+    "perception": Extra({"newton": "newton"}, "simulate cameras, sonars and altimeters in finssim.worlds"),
     "vision": Extra(
         {"opencv-python-headless": "cv2", "pupil-apriltags": "pupil_apriltags", "matplotlib": "matplotlib"},
         "detect tags, calibrate cameras and pools from pictures, locate a vehicle from pictures or video",

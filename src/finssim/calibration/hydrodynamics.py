@@ -98,7 +98,7 @@ def fit_hydrodynamics(
         raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
     if asked and (method == "regression" or known):
         raise CalibrationError(
-            f"{asked[0]} needs --method simulation: a regression looks at one axis at a time"
+            f"{asked[0]} needs --method simulation: the regression fits one axis at a time"
         )
     if known and method == "simulation":
         raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")

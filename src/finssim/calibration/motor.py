@@ -452,8 +452,8 @@ def estimates_of(found: Study, thruster: Thruster) -> list[Estimate]:
     if not found.sure:
         rests += ": no step follows first order plus dead time within 10 %"
     if response.hidden:
-        rests += "; below half a sample, the log cannot tell it from 0"
-    late = "the command's change is known to one sample of its log, which is in the interval"
+        rests += "; below half a sample it is indistinguishable from 0"
+    late = "the command's change is known to one sample of its log; the interval includes this"
     if response.delay < response.sample:
         late = f"delay {response.delay:.3g} s is below one sample of {response.sample:.3g} s"
     gain, half = found.gain
@@ -490,9 +490,9 @@ def _dead_zones(found: Study, thruster: Thruster) -> list[Estimate]:
         if found.domain == "force":
             low, high = (abs(float(thruster.speed(sign * force))) for force in (low, high))
         known = low > 0.0 and high <= NARROW_DEAD_ZONE * low
-        note = "no commands were tried between the last that stands and the first that turns"
+        note = "no commands were logged between the last without and the first with rotation"
         if known:
-            note = "between the last command that leaves the shaft standing and the first that turns it"
+            note = "between the last command without and the first with rotation"
         elif low == 0.0:
             note = f"the smallest command tried, {high / RPM:.0f} rpm, already turns the shaft"
         ends = sorted((sign * low / RPM + 0.0, sign * high / RPM + 0.0))

@@ -763,7 +763,7 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
             continue
         sure = math.isfinite(side.half_width) and side.c > side.half_width
         note = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N{volts and ', '}{volts}"
-        note += "" if sure else ": too few or too scattered to tell"
+        note += "" if sure else ": too few or too scattered"
         add(f"c_{name}", side.c, _around(side.c, side.half_width), "N s²/rad²", sure, note)
         if zone is not None:
             low, high = sorted(sign * TO_RPM * end for end in zone.interval)

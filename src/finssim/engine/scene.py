@@ -243,8 +243,8 @@ class Scene:
     def _refuse(self) -> None:
         self._broken = True
         raise SimulatorError(
-            f"a number stopped being finite {self.data.time:.3f} s into the scene: look at commands and parameters, "
-            "or take more substeps, and place the vehicles anew"
+            f"a number stopped being finite {self.data.time:.3f} s into the scene: check commands "
+            "and parameters, or use more substeps, and place the vehicles again"
         )
 
     @property

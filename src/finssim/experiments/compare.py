@@ -125,7 +125,7 @@ def _check(name: str, runs: Sequence[Run]) -> None:
         if different:
             raise CompareError(
                 f"{first.place} and {run.place} are both '{name}', but differ in {different}: "
-                "name them apart with NAME=DIR"
+                "give different names with NAME=DIR"
             )
     seeds = [run.seed for run in runs]
     for seed in seeds:
@@ -189,12 +189,12 @@ def scores_of(runs: Sequence[Sequence[Mapping[str, Any]]], measure: str) -> NDAr
 
 NOTE = (
     "interquartile mean over seeds and targets; in brackets 95 % of a bootstrap over the seeds, stratified by target. "
-    "With fewer than five seeds an interval is too narrow; with fewer than three nobody is called better."
+    "With fewer than five seeds an interval is too narrow; with fewer than three no group is called better."
 )
 VERDICTS = {
     "better": "{a} is better than {b} in {measure}",
     "worse": "{b} is better than {a} in {measure}",
-    "open": "{a} and {b} are not told apart in {measure}",
+    "open": "{a} and {b} are not distinguishable in {measure}",
 }
 
 

@@ -235,7 +235,9 @@ def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identific
     found = calibrated(fit)
     findings = tuple(all_findings(fit, found))
     found = _named(
-        found, f"{name} as identified", "Hydrodynamics from trials where they tell it, else guesses."
+        found,
+        f"{name} as identified",
+        "Hydrodynamics from trials where these determine them, otherwise guesses.",
     )
     write_vehicle(found, folder / vehicle_file)
     vehicle = load_vehicle(folder / vehicle_file)
@@ -271,13 +273,13 @@ ARROW = 0.18
 
 HEADS = ("parameter", "estimate", "95 % interval", "catalogue", "unit", "state")
 UNSURE = (
-    "unsure: told together with another number and not alone, as a part of the drag. file kept: the trials do not "
+    "unsure: determined only jointly with another number, such as a part of the drag. file kept: the trials do not "
     "determine the number, and the vehicle keeps its guess."
 )
 POOL_VEHICLE = (
     " The catalogue's vehicle is the one around which the pool drew its own: the plant's coefficients are known to the "
-    "pool alone. Its propellers push up to 15 % more or less than the bench said, so what is found are effective "
-    "masses and dampings: those of the thrust that the vehicle file promises."
+    "pool alone. Its propellers push up to 15 % more or less than the bench said, so the estimates "
+    "are effective masses and dampings: those for the nominal thrust of the vehicle file."
 )
 
 
@@ -314,7 +316,7 @@ def _identification(result: Identification, hardware: bool) -> list[Table]:
     lead = (
         f"Identified in {result.seconds:.0f} s from {len(result.fit.trials)} trials of {source}, beginning with "
         "guessed hydrodynamics: the robot's own software played each programme, and its record became a trial. "
-        f"{len(result.replay.pairs)} other trials, at levels that the fit has not seen, are replayed with an NRMSE of "
+        f"{len(result.replay.pairs)} other trials, at levels that were not fitted, are replayed with an NRMSE of "
         f"{'unknown' if score is None else f'{score:.3f}'}. What follows was trained and tuned in the identified "
         f"vehicle, and tried {same}."
     )

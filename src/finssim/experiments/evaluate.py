@@ -292,7 +292,7 @@ def evaluate(
     if records and unheeded:
         raise EvaluationError(f"a record was made once and for all: leave {', '.join(unheeded)} out")
     if truth is not None and not records:
-        raise EvaluationError("--truth tells of records: a simulation knows its own")
+        raise EvaluationError("--truth is for records: a simulation has its own truth")
     plants = [] if records else _plants([plant] if isinstance(plant, str | Path) else plant)
     plants = plants if observe is None else [one.seen(observe) for one in plants]
     with atomic_directory(out, replaces=EVALUATION_FILE) if out is not None else nullcontext() as folder:
@@ -383,7 +383,7 @@ def evaluate_controller(
         record: New folder for every state, command and thrust; none if None.
     """
     if trajectories and task != "t2":
-        raise EvaluationError(f"task '{task}' follows no trajectory: leave it out, or evaluate t2")
+        raise EvaluationError(f"task '{task}' follows no trajectory: omit it, or evaluate t2")
     the_task = task_named(task)
     count = len(trajectories) or (len(FORMS[task].targets) if task in FORMS else EPISODES)
     trials = count if trials is None else trials

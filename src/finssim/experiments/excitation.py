@@ -561,15 +561,11 @@ def excite(
     }  # fmt: skip
     of_pool = severity is not None or pool_vehicle is not None
     if robot is not None and (simulate or pool is not None or of_pool):
-        raise CalibrationError(
-            "--robot is where it is done: leave --simulate, --pool and what tells of it out"
-        )
+        raise CalibrationError("--robot excludes --simulate, --pool and their options")
     if pool is not None and (simulate or room is not None):
         raise CalibrationError("--pool goes with neither --simulate nor --room: a pool has its own room")
     if pool is None and of_pool:
-        raise CalibrationError(
-            "--severity and --pool-vehicle tell of a virtual pool: name one with --pool SEED"
-        )
+        raise CalibrationError("--severity and --pool-vehicle need a virtual pool: give --pool SEED")
     if robot is not None:
         folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, room=room, **plan)
     elif pool is not None:

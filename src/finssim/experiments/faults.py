@@ -372,7 +372,7 @@ AUTOPILOT: Mapping[str, Scenario] = {
     ),
     "ap-mode": _autopilot("the mode is changed", "mode to ALT_HOLD", 0.5, _command(176, 1, 2), handed_over=True),
     "ap-disarm": _autopilot("somebody disarms", "was disarmed", 0.5, _command(400, 0)),
-    "ap-station": _autopilot("a second ground station, which looks", "", math.inf, {
+    "ap-station": _autopilot("a second ground station, which listens", "", math.inf, {
         "1": another_station("heartbeat", 6, 8, 0, 0, 0, 3, every=1.0, system=254),
         "2": another_station("request_data_stream", 1, 1, 0, 2, 1, every=2.0),
     }),

@@ -149,7 +149,7 @@ def read_drive(path: Path, vehicle: Vehicle) -> Drive:
 def _check(record: Record, vehicle: Vehicle) -> None:
     about = record.metadata
     if "vehicle_sha256" not in about:
-        raise DriveError(f"{record.path}: does not say of which vehicle it is: not a record of FinsSim")
+        raise DriveError(f"{record.path}: does not name its vehicle: not a record of FinsSim")
     if about["vehicle_sha256"] != vehicle.sha256:
         raise DriveError(
             f"{record.path}: is of the vehicle {about['vehicle']} {about['vehicle_sha256'][:12]}, expected "
@@ -281,7 +281,7 @@ def episodes_of(
     if drive.period > period * (1.0 + 1e-6):
         raise DriveError(
             f"{drive.path}: {drive.driver} decided every {drive.period:g} s, expected at most {period:g} s, the period "
-            f"of {task.name}: it cannot be taken for a controller of that task"
+            f"of {task.name}, so it is not a controller of that task"
         )
     guide_of = _guides(drive, vehicle, task.moving, goal)
     stretches = indices_of(drive, period, split_goals=not task.moving and goal is None)
@@ -392,7 +392,7 @@ def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Gu
             f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: {GIVE}"
         )
     if np.isnan(drive.motion.t).any():
-        raise DriveError(f"{drive.path}: does not say when its trajectory began: not a record of finssim run")
+        raise DriveError(f"{drive.path}: has no start time of its trajectory: not a record of finssim run")
     guide = load_trajectory(name, vehicle=vehicle)
     off = float(np.linalg.norm(guide.at(drive.motion.t).position - drive.goal[:, :3], axis=1).max())
     if off > SAME_GOAL:
@@ -441,8 +441,7 @@ def collect(
     records = [Path(word) for word in experts if word.endswith(".mcap")]
     if records and (len(records) < len(experts) or episodes or randomize or disturb):
         raise DriveError(
-            "records are taken as they are, and by themselves: leave out other experts, --episodes, --randomize and "
-            "--disturb"
+            "records cannot be combined with other experts, --episodes, --randomize and --disturb"
         )
     if records:
         return collect_records(records, task, out=out, vehicle=vehicle, action=action, goal=goal)
@@ -551,7 +550,7 @@ def collect_records(
     if not found:
         names = ", ".join(str(path) for path in records)
         raise DriveError(
-            f"{names}: nowhere was the robot armed, its estimate ready and its driver at the helm for two decisions "
+            f"{names}: the robot was never armed, its estimate ready and its driver in control for two decisions "
             f"{the_task.control_step:g} s apart towards one goal: nothing to learn from"
         )
     described = {

@@ -117,11 +117,11 @@ RESULT_FILE = "replay_experiment.json"
 
 NOTE = (
     "ours: held-out trials of a virtual plant outside all three model classes. paper: Unity replaying trials of the "
-    "real FinsROV in its pool. These are different experiments and stand side by side for orientation."
+    "real FinsROV in its pool. These are different experiments, listed together for orientation."
 )
 LEVELS = {
     "same_levels": "held-out repeats of the fitted levels",
-    "other_levels": "the validation sweeps, levels that no fit has seen",
+    "other_levels": "the validation sweeps, at levels that were not fitted",
 }
 
 

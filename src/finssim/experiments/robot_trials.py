@@ -371,13 +371,13 @@ def robot_or_none(
         told = (arm, by_hand, unattended, lockstep, pool_file, pictures, site, let_in)
         if any(x is not None and x is not False for x in told):
             raise RobotError(
-                "--arm, --by-hand, --unattended, --lockstep, --pool-file, --site, --let-in and --pictures tell of a "
-                "robot: name one with --robot"
+                "--arm, --by-hand, --unattended, --lockstep, --pool-file, --site, --let-in and "
+                "--pictures need a robot: give --robot"
             )
         return None
     if pool_file is None:
         raise RobotError(
-            "a robot knows where it is by its pool file: give --pool-file, or none where position fixes come by wire"
+            "a robot needs its pool file: give --pool-file, or none if position fixes arrive over the link"
         )
     wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep)
     file = None if pool_file == "none" else Path(pool_file)
@@ -501,7 +501,7 @@ class Session:
                 raise KeyboardInterrupt
             if self.attendant is None:
                 raise RobotError(
-                    f"{trial.name}: {outcome.fault}: look at the vehicle, then give the command again: it goes on here"
+                    f"{trial.name}: {outcome.fault}: check the vehicle, then repeat the command, which continues here"
                 )
             self.say(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
 
@@ -536,9 +536,7 @@ def session(
     if not robot.arm:
         raise RobotError("trials turn thrusters: give --arm when the water is clear of people and cables")
     if robot.unattended and robot.by_hand:
-        raise RobotError(
-            "by hand somebody has to press enter at every start: leave --unattended or --by-hand out"
-        )
+        raise RobotError("--by-hand waits for enter at every start: omit --unattended or --by-hand")
     console = console or Console(stderr=True)
     site = None if robot.pool_file is None else load_pool(robot.pool_file)
     with ExitStack() as stack:
@@ -546,7 +544,7 @@ def session(
         if attendant is None and not robot.unattended:
             if not sys.stdin.isatty():
                 raise RobotError(
-                    "nobody can press enter, as standard input is no terminal: run it in one, or give --unattended"
+                    "standard input is not a terminal, so enter cannot be pressed: use one, or give --unattended"
                 )
             keyboard = Keyboard()
             stack.enter_context(keyboard)
@@ -570,8 +568,8 @@ def take_folder(file: Path, about: Mapping[str, Any]) -> None:
             temporary.write_text(text, encoding="utf-8")
     elif not file.is_file() or file.read_text(encoding="utf-8") != text:
         raise RobotError(
-            f"{out}: holds other files, or what was made with other settings: give a new --out, or the same settings, "
-            "such as vehicle and seed, to go on"
+            f"{out}: holds other files, or results of other settings: give a new --out, or the same "
+            "settings, such as vehicle and seed, to continue"
         )
 
 
@@ -879,8 +877,8 @@ def play_jobs(
         console.print(f"  {held}", highlight=False, markup=False)
         if result["fault"] and robot.unattended:
             raise RobotError(
-                f"{job.row}, {job.target}: stopped, which counts: {result['fault']}: look at the vehicle, then give "
-                "the command again, which goes on with the next trial"
+                f"{job.row}, {job.target}: stopped, which counts: {result['fault']}: check the "
+                "vehicle, then repeat the command, which continues with the next trial"
             )
 
     with ExitStack() as stack:

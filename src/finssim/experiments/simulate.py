@@ -126,7 +126,7 @@ def simulate(
     last, achieved = rows[-1], allocator.achieved(thrust)
     angles_deg = np.degrees(quat_to_euler(last[4:8]))
     cells = [
-        ["wrench asked [N, N m]", *(f"{x:.4g}" for x in tau)],
+        ["requested wrench [N, N m]", *(f"{x:.4g}" for x in tau)],
         ["wrench given [N, N m]", *(f"{x:.4g}" for x in achieved.round(4) + 0.0)],
         ["velocity [m/s, rad/s]", *(f"{x:.3f}" for x in last[8:14])],
         ["place [m, deg]", *(f"{x:.2f}" for x in last[1:4]), *(f"{x:.1f}" for x in angles_deg)],

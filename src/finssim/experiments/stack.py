@@ -124,7 +124,7 @@ def play(
         PolicyError, ControlError, BaselineError, VehicleError, OutputError: As they say.
     """
     if records and out is None:
-        raise EpisodeError("--records are kept in a directory: give --out")
+        raise EpisodeError("--records needs a directory: give --out")
     body = load_vehicle(vehicle)
     fitted = fitted_task(task, body)
     vehicles = [body] * len(fitted.vehicles)

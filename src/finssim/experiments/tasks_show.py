@@ -191,7 +191,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         return [Table(title="", heads=heads, rows=rows, left=(0, 6, 7), whole=(0, 6))]
     parts = {
         "Observation, of one agent: each over its scale, within ± clip": (result["observation"]["parts"], ""),
-        "Action: what -1 and 1 stand for": (result["action"]["components"], ""),
+        "Action: limits at -1 and 1": (result["action"]["components"], ""),
         "Reward, in every step": (result["reward"]["terms"], result["reward"]["told"]),
         "Ends": (result["ends"], ""),
         "Counted": (result["totals"], ""),

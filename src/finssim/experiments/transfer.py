@@ -164,7 +164,10 @@ class Spec:
         source, units = (
             ("hardware, by the robot's own estimate, whose error is not in it", "seeds")
             if hardware
-            else ("a virtual pool whose vehicle, water and camera no training has seen", "plants and seeds")
+            else (
+                "a virtual pool whose vehicle, water and camera were not used in training",
+                "plants and seeds",
+            )
         )
         first = ["trajectory"] if self.by_target else []
         return Table(

@@ -180,9 +180,7 @@ def about(place: str | Path) -> dict[str, Any]:
     except (ValueError, OSError) as error:
         raise DatasetError(f"{place}: no data set there: make one with finssim collect") from error
     if OURS not in found:
-        raise DatasetError(
-            f"{place}: not a data set of FinsSim: it does not say of which task and vehicle it is"
-        )
+        raise DatasetError(f"{place}: not a data set of FinsSim: task and vehicle are missing")
     described: dict[str, Any] = json_value(found[OURS], DatasetError, str(place))
     return {**described, "episodes": found["total_episodes"], "steps": found["total_steps"]}
 

@@ -187,9 +187,7 @@ def _taught(values: Any, init: str | Path | None, learner: str, own_action: bool
     if not hasattr(values, "teacher"):
         if init is None:
             return values
-        raise TrainingError(
-            f"learner '{learner}' imitates nobody before it learns: leave init out, or take ppo"
-        )
+        raise TrainingError(f"learner '{learner}' has no initial imitation: omit init, or use ppo")
     if init is not None:
         return replace(values, teacher="" if str(init) == "none" else str(init))
     return values if own_action else replace(values, teacher="")

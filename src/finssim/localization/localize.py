@@ -134,9 +134,11 @@ def known_of(
     assumed = []
     if imu is None:
         spread = math.degrees(base.tilt_std)
-        assumed.append(f"no --imu: the vehicle is taken as level, give or take {spread:.1f} degrees")
+        assumed.append(f"no --imu: the vehicle is assumed level, within {spread:.1f} degrees")
     if sensor is None and depth is not None:
-        assumed.append(f"{vehicle.name} has no depth sensor: the depth is taken as that of the body origin")
+        assumed.append(
+            f"{vehicle.name} has no depth sensor: the depth is assumed to be that of the body origin"
+        )
     return Known(base, surface, _depth(depth, longest_gap), _tilt(imu, longest_gap), tuple(assumed))
 
 

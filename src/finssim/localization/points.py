@@ -223,7 +223,7 @@ def _plane(table: PointTable, z: float | None, plane: str | None) -> tuple[Array
         return up, -table.numbers["z"]
     if z is None:
         raise LocalizationError(
-            f"{table.where}: nothing says on which plane the points lie: give a height z, a plane, or a column z"
+            f"{table.where}: the plane of the points is missing: give a height z, a plane, or a column z"
         )
     if not np.isfinite(z):
         raise LocalizationError(f"z is {z}, expected a finite height in metres")

@@ -584,7 +584,7 @@ def run(
     if not (0 < port or (ardusub and not lockstep and camera == "none")) or port > 65533:
         raise LinkError(f"port {port}: expected 1 to 65533, as the two after it are taken too")
     if pool_file is not None and plan.calibrated is None:
-        raise PlantSpecError("--pool-file tells of the camera, and --camera none has none: leave one out")
+        raise PlantSpecError("--pool-file describes the camera, and --camera none has none: omit one")
 
     def make_world(eye: Any) -> VirtualPool:
         """Begins to write files: only when every wire is open, lest those of a pool that is running are replaced."""

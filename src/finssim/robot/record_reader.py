@@ -183,7 +183,7 @@ class Record:
                 continue
             if schema.name not in types().types:
                 raise RecordError(
-                    f"{self.path}: {channel.topic} is of the unknown type {schema.name}: leave it out"
+                    f"{self.path}: {channel.topic} is of the unknown type {schema.name}: omit it"
                 )
             try:
                 decoded = types().deserialize_cdr(message.data, schema.name)

@@ -368,7 +368,9 @@ def run(
     if team is not None and _is_address(team):
         team, messages = None, team
     if (policy is None) == (team is None):
-        raise ControlError("who steers? give --policy for this vehicle, or --team for all of a task")
+        raise ControlError(
+            "no controller: give --policy for this vehicle, or --team for all agents of a task"
+        )
     if team is not None:
         if agent is not None or trajectory is not None or lockstep or number or let_in is not None:
             raise ControlError(
@@ -394,7 +396,7 @@ def run(
     if pool_file is None and not Path("pool.yaml").exists():
         raise ControlError(
             "there is no pool.yaml in this folder: name the pool file that finssim pool or calibrate pool has written "
-            "with --pool-file, or give --pool-file none where no camera looks"
+            "with --pool-file, or give --pool-file none without a camera"
         )
     filed = load_vehicle(vehicle)
     ours = numbered(vehicle_at(site, filed, navigation=robot.startswith("mavlink")), number)

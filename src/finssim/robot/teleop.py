@@ -531,7 +531,7 @@ def run(
     pool = load_pool(pool_file) if pool_file is not None else None
     other, guide = _controller(policy, goal, body, pool)
     if pictures is not None and pool is None:
-        raise TeleopError("--pictures says nothing without the camera's pose: give --pool-file, too")
+        raise TeleopError("--pictures needs the camera's pose: give --pool-file, too")
     with ExitStack() as stack:
         if device == "keyboard":
             hands, keys = stack.enter_context(Keyboard(hold=key_hold)), KEYBOARD_HELP
@@ -558,7 +558,7 @@ def _controller(
     """Whom the person hands over to, and where it steers to."""
     if policy is None:
         if goal is not None:
-            raise TeleopError("--goal is where a controller steers to: give --policy, too, or leave it out")
+            raise TeleopError("--goal is where a controller steers to: give --policy, too, or omit it")
         return None, None
     if pool is None or goal is None:
         raise TeleopError(

@@ -205,7 +205,7 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
     sees = o.world is not None or o.pictures is not None
     plan = Plan(graph, o.vehicle, namespace, extra=extra, blind=blind, sees=sees)
     if graph == "robot" and o.pool_file is None and not blind:
-        raise Ros2Error("a robot needs its pool file: give --pool-file, or none where no camera looks")
+        raise Ros2Error("a robot needs its pool file: give --pool-file, or none without a camera")
     plan.set("/**", site=o.site, frame_prefix=f"{o.namespace}/" if o.namespace else None)
     plan.set("controller", policy=o.policy, task=o.task, goal=o.goal, trajectory=o.trajectory)
     plan.set("sim", start=o.start, hydrodynamics=o.hydrodynamics, seed=o.seed)
@@ -304,7 +304,7 @@ def _await(pool_file: Path, nodes: Supervisor, interrupted: Callable[[], bool]) 
         if interrupted():
             raise KeyboardInterrupt
         if nodes.look() or time.monotonic() > end:
-            raise Ros2Error("the virtual pool did not start: see what it said above")
+            raise Ros2Error("the virtual pool did not start: see its output above")
         time.sleep(0.05)
 
 
@@ -317,7 +317,7 @@ def _watch(
 ) -> int:
     died = False
     if not options.arm:
-        say("disarmed: thrusters will not turn until somebody publishes true on the topic arm, or with --arm")
+        say("disarmed: thrusters turn only after true on the topic arm, or with --arm")
     end = time.monotonic() + (float("inf") if options.duration is None else options.duration)
     while not interrupted() and time.monotonic() < end:
         watcher.turn(0.2)

@@ -151,7 +151,7 @@ def _refuse_strangers(choice: Choice) -> None:
     for name in sorted(set().union(*HEEDED.values()) - HEEDED[kind]):
         if getattr(choice, name) != getattr(usual, name):
             takers = " and ".join(other for other in HEEDED if name in HEEDED[other])
-            raise ViewError(f"--{name.replace('_', '-')} is for {takers}, not for a {kind}: leave it out")
+            raise ViewError(f"--{name.replace('_', '-')} is for {takers}, not for a {kind}: omit it")
 
 
 def _pool(choice: Choice) -> Source:

@@ -455,8 +455,8 @@ class World(Part):
         for name, item in self.objects.items():
             if item.frame is not None and item.frame not in earlier:
                 raise refuse_section(
-                    f"objects.{name}: frame is '{item.frame}'{did_you_mean(item.frame, earlier)} expected an object "
-                    f"that stands before it: {', '.join(earlier) or 'there is none'}"
+                    f"objects.{name}: frame is '{item.frame}'{did_you_mean(item.frame, earlier)} expected an "
+                    f"object defined before it: {', '.join(earlier) or 'there is none'}"
                 )
             earlier.append(name)
         if (count := sum(len(item.positions) for item in self.objects.values())) > LARGEST:

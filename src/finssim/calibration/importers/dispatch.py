@@ -720,7 +720,7 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
     """Tables by trial: those for which `{trial}` or the first `*` of their patterns stands for the same text."""
     if paths and has_map and not mapped.files:
         raise CalibrationError(
-            f"the map says nothing about files such as {paths[0].name}: give 'files:' or 'columns:'"
+            f"the map has no entry for files such as {paths[0].name}: give 'files:' or 'columns:'"
         )
     found: dict[str, list[tuple[str, Path, SourceMap | None]]] = {}
     unread = []

@@ -536,8 +536,9 @@ def _refuse_nonsense(bundle: Bundle, views: Sequence[BoardView]) -> None:
     usual, limit = float(np.median(bundle.rms)), max(1.0, NONSENSE * views[0].width)
     if not usual <= limit:
         raise CalibrationError(
-            f"corners miss their places by {usual:.1f} px in the usual picture, expected below {limit:.1f} px: no lens "
-            "explains them: count the board's corners again, and see that it is flat and that the model suits the lens"
+            f"corner residuals are {usual:.1f} px in the median image, expected below {limit:.1f} px: no "
+            "lens fits them: check the count of the board's corners, that it is flat, and that the "
+            "model suits the lens"
         )
 
 
@@ -595,12 +596,20 @@ def _estimates(lens: Lens, half: Array) -> dict[str, Estimate]:
     for name, value, width in zip(lens_names(lens.model), lens_vector(lens), half, strict=True):
         unit, limit, note = "-", math.inf, "not told"
         if name.startswith("f"):
-            unit, limit, note = "px", UNSURE_FOCAL * value, "not told apart from the distance of the board"
+            unit, limit, note = (
+                "px",
+                UNSURE_FOCAL * value,
+                "not distinguishable from the distance of the board",
+            )
         elif name.startswith("c"):
-            unit, limit, note = "px", UNSURE_CENTRE * lens.width, "not told apart from a turn of the board"
+            unit, limit, note = (
+                "px",
+                UNSURE_CENTRE * lens.width,
+                "not distinguishable from a rotation of the board",
+            )
         estimate = Estimate.within(name, value, width, unit, width < limit, note)
         if unit == "-" and abs(value) < width < limit:
-            estimate = replace(estimate, note="not told apart from 0")
+            estimate = replace(estimate, note="not distinguishable from 0")
         estimates[name] = estimate
     return estimates
 
@@ -789,7 +798,7 @@ def _views_table(fit: CameraFit) -> ExtraTable:
 def camera_pictures(fit: CameraFit) -> dict[str, tuple[str, bytes]]:
     """File name -> what the picture shows, and the PNG."""
     drawn = {
-        "coverage.png": ("Where corners were seen, and how well pixels are known there", _coverage(fit)),
+        "coverage.png": ("Detected corners, and uncertainty of pixels", _coverage(fit)),
         "residuals.png": ("Corners less what the lens predicts, enlarged", _residuals(fit)),
     }
     return {name: (text, png(figure)) for name, (text, figure) in drawn.items()}

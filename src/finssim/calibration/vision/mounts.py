@@ -432,7 +432,7 @@ def reference_tag(moments: Sequence[Moment], mounts: Mapping[int, Pose]) -> int:
     if best is None or not counts[best]:
         seen = sorted({tag for moment in moments for tag in moment.corners})
         raise CalibrationError(
-            f"none of the vehicle file's tags {sorted(mounts)} is seen, only {seen}: give the file the right ids"
+            f"none of the vehicle file's tags {sorted(mounts)} is seen, only {seen}: correct the ids in the file"
         )
     return best
 
@@ -752,7 +752,7 @@ def _read_depth(path: Path, findings: list[Finding]) -> Series | None:
 EDGE_STD = 0.25e-3
 """Standard deviation of a tag's edge measured with a ruler [m]: it makes every distance wrong by the same share."""
 
-KEPT = "the motion does not tell it: kept from the file"
+KEPT = "the motion does not determine it: kept from the file"
 
 
 def distance_std(found: MountFit) -> float:
@@ -929,7 +929,7 @@ def imu_clock(
     if found is None:
         return None
     half = 1.96 * found.std
-    note = "the vehicle turns too evenly to tell the clocks apart: taken as 0"
+    note = "the vehicle turns too evenly to estimate the clock offset: assumed 0"
     return Estimate.within("imu.time_offset", found.seconds, half, "s", half < UNSURE_CLOCK, note)
 
 

@@ -872,18 +872,18 @@ def _doubt(name: str, std: float, fit: Refined, settings: Settings) -> str:
     reach = model.clearance + max(model.depth, 0.0)
     before, sentence = np.inf, ""
     if name == "index":
-        before, sentence = prior.index_std, f"the pixels do not tell it: held at {settings.index:g}"
+        before, sentence = prior.index_std, f"not determined by the pixels: fixed at {settings.index:g}"
     elif name in ("tilt_x", "tilt_y"):
-        before, sentence = np.degrees(prior.tilt_std), "the pixels do not tell it: held level"
+        before, sentence = np.degrees(prior.tilt_std), "not determined by the pixels: assumed level"
     elif name in LENS_NAMES:
         before = prior.lens_std[LENS_NAMES.index(name)] * (model.camera.lens.fx if name == "focal" else 1.0)
-        sentence = "the pixels do not tell it: held at the camera file's"
+        sentence = "not determined by the pixels: fixed at the camera file's"
     elif name in ("water_height", "point_distance") and settings.known_depth:
         before, sentence = prior.depth_std, "rests on the measured height"
     elif name in ("camera_height", "camera_distance", "water_height", "point_distance"):
         if min(model.clearance, model.depth - model.interface.thickness) < AT_BOUND * reach:
             return "at its bound: the plane touches the camera or a point"
-        before, sentence = FAR * reach / TOLD, "the pixels do not tell it"
+        before, sentence = FAR * reach / TOLD, "not determined by the pixels"
     return sentence if np.isfinite(before) and std > TOLD * before else ""
 
 
@@ -1318,8 +1318,9 @@ def _touching(fit: PoolFit) -> list[Finding]:
         return []
     if error > ABSURD:
         raise CalibrationError(
-            f"the camera ends on the plane itself, with residuals of {error:.0f} px: no camera before this plane sees "
-            "the points so; check the unit and sign of the water's height, the window's thickness [m], the index, and "
+            f"the fitted camera is on the plane itself, with residuals of {error:.0f} px: no camera "
+            "in front of this plane fits the points; check the unit and sign of the water's height, the "
+            "window's thickness [m], the index, and "
             "whether there is water between at all; nothing is written"
         )
     return [finding("camera_on_plane", residual=error)]
@@ -1362,9 +1363,10 @@ LEAST_SPREAD = 5.0
 """Largest width of all pixels that are refused: numbers from 0 to 1 are no pixels [px]."""
 
 READING = (
-    "The interval holds the true value in 19 of 20 such calibrations, if what was given beforehand (index, tape, "
-    "level, camera file) is as exact as it was said to be. A note says where the pixels do not tell a number and what "
-    "it rests on instead. Judge the result by the error at points held out, in the depth where it will be used. "
+    "The interval holds the true value in 19 of 20 such calibrations, if the priors (index, tape, "
+    "level, camera file) are as accurate as stated. A note marks a number that the pixels do not "
+    "determine, and names its prior. Judge the result by the error at points held out, in the depth "
+    "where it will be used. "
     "Arrows that swirl or grow outwards tell of a wrong lens, window or water height; others are noise."
 )
 
