@@ -70,6 +70,7 @@ EXTRAS = {
         "draw pictures of vehicles and figures of evaluations, show runs live in the browser",
     ),
     "mujoco": Extra({"mujoco": "mujoco"}, "measure speed as a ratio to MuJoCo's"),
+    "usd": Extra({"usd-core": "pxr"}, "place USD models in described worlds"),
     "mpc": Extra({"casadi": "casadi"}, "control by nonlinear model prediction (nmpc)"),
     "perception": Extra({"newton": "newton"}, "simulate cameras, sonars and altimeters in finssim.worlds"),
     "vision": Extra(
