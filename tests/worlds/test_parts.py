@@ -15,7 +15,8 @@ MJCF = """<mujoco><asset><mesh name="wedge" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/
 <geom type="mesh" mesh="wedge" pos="2 0 0"/></worldbody></mujoco>"""
 URDF = """<robot name="buoy"><link name="base">
 <inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-<collision><origin xyz="0 0 0.4" rpy="1.5708 0 0"/><geometry><cylinder radius="0.2" length="1.0"/></geometry></collision>
+<collision><origin xyz="0 0 0.4" rpy="1.5708 0 0"/>
+<geometry><cylinder radius="0.2" length="1.0"/></geometry></collision>
 </link></robot>"""
 USD = """#usda 1.0
 (
