@@ -97,8 +97,8 @@ class WorldLayout:
         numbers = _uniform(seeds, rows, self._drawn.shape[1] + 1)
         look = self._first[2]
         self._drawn[rows] = 2.0 * np.delete(numbers, look, axis=1) - 1.0
-        looks = np.flatnonzero([look is not None and look.held_out == held_out for look in self.looks])
-        choice = looks if held_out else np.concatenate([[0], looks])
+        candidates = np.flatnonzero([look is not None and look.held_out == held_out for look in self.looks])
+        choice = candidates if held_out else np.concatenate([[0], candidates])
         choice = choice if len(choice) else np.zeros(1, int)
         self._look[rows] = choice[(numbers[:, look] * len(choice)).astype(int)]
         self._place(rows)
@@ -147,9 +147,9 @@ class WorldLayout:
         frames[:, :, 6] = 1.0  # the last is the world's
         scale, size = np.ones((len(self._varied) + 1, n)), self._first[2]
         for i, (item, anchor, rest) in enumerate(self._varied):
-            own = drawn[:, 1 + 4 * i : 5 + 4 * i]
+            drawn_pose = drawn[:, 1 + 4 * i : 5 + 4 * i]
             shift = np.concatenate(
-                [own[:, :3] * item.vary.position, quat_from_yaw(own[:, 3] * item.vary.yaw)], 1
+                [drawn_pose[:, :3] * item.vary.position, quat_from_yaw(drawn_pose[:, 3] * item.vary.yaw)], 1
             )
             frames[i] = _compose(_compose(frames[anchor], rest, scale[anchor]), shift)
             scale[i] = scale[anchor]
