@@ -11,7 +11,7 @@ once:
         Args:
             duration: Simulated time [s].
             out (FILE): Table to write.
-            device (DEVICE): Where to compute: cpu or cuda.
+            device (DEVICE): Compute device: cpu or cuda.
         \"\"\"
 
 What comes before `*` is typed by its place, the rest as `--name`; a bool is a flag, a `Sequence` may be given several
@@ -74,7 +74,7 @@ class Option:
     name: str
     kind: Any
     many: bool
-    """May be given several times."""
+    """May be repeated."""
     positional: bool
     default: Any
     """`inspect.Parameter.empty` where it must be given."""

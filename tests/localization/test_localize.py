@@ -130,7 +130,7 @@ def test_a_constant_depth_needs_no_time(files, capsys):
     depth = -float(POOL.interface.distance(position + rotation(angles, up) @ PORT))
     _, rows = located(files, depth=str(depth))
     printed = capsys.readouterr().out
-    assert "taken as level, give or take 2.0 degrees" in printed
+    assert "assumed level, within 2.0 degrees" in printed
     assert [float(rows[0][k]) for k in "xyz"] == pytest.approx(position, abs=1e-6)
     assert rows[1]["reason"] == "no tag seen"
     assert float(rows[0]["std_x"]) > 3e-3  # 2 degrees of tilt, and a depth sensor's centimetre

@@ -1016,13 +1016,13 @@ def check(
     vehicle: str | None = None,
     as_json: bool = False,
 ) -> None:
-    """Say what trials can and cannot identify: rates [Hz], gaps [s], clock jumps, saturation, excitation.
+    """Report what trials can and cannot identify: rates [Hz], gaps [s], clock jumps, saturation, excitation.
 
     Example: finssim trials check trials --vehicle bluerov2
 
     Args:
         paths (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
-        vehicle (NAME|FILE): Vehicle that made them, where their headers name none.
+        vehicle (NAME|FILE): Vehicle of the trials, if their headers name none.
         as_json: Print one JSON object instead of tables.
 
     Raises:

@@ -486,10 +486,10 @@ class Report:
 
 
 READING = (
-    "The interval holds the true value in 19 of 20 such calibrations, if the model's form is right: it knows of noise "
-    "and of how much trials differ, not of a wrong model. `unsure`: written, though told together with another number "
-    "and not alone. `file kept`: the trials do not determine it, and the vehicle file keeps its own. Score the result "
-    "on trials that the fit has not seen with `finssim replay` before relying on it."
+    "The interval holds the true value in 19 of 20 such calibrations, if the model's form is right: it "
+    "covers noise and the differences between trials, but not a wrong model. `unsure`: written, "
+    "although determined only jointly with another number. `file kept`: the trials do not determine it, and "
+    "the vehicle file's value is kept. Score the result on held-out trials with `finssim replay` before relying on it."
 )
 
 

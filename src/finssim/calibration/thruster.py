@@ -765,7 +765,7 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
             continue
         sure = math.isfinite(side.half_width) and side.c > side.half_width
         note = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N{volts and ', '}{volts}"
-        note += "" if sure else ": too few or too scattered to tell"
+        note += "" if sure else ": too few or too scattered"
         add(f"c_{name}", side.c, _around(side.c, side.half_width), "N s²/rad²", sure, note)
         if zone is not None:
             low, high = sorted(sign * TO_RPM * end for end in zone.interval)
@@ -828,7 +828,7 @@ def fit_thruster(
     Args:
         tables: CSV files (see `read_table`), folders of bench trials, or what was read from them.
         vehicle: Whose thrusters they are.
-        group: Propeller group that all tables speak about.
+        group: Propeller group of all tables.
         voltage: At which the numbers shall hold [V], and for tables without a voltage column the voltage they were
             taken at; where not given, the tables' only one, else that of the vehicle file's ESC, else the middle one.
         pool_voltages: Fit all voltages together; otherwise the others only check the prediction.
@@ -951,12 +951,12 @@ def calibrate_thruster(
 
     Args:
         tables (TABLE): Tables of force against rpm or pulse width (.csv), or trials.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
-        group (NAME): Propeller group that all tables speak about.
-        voltage: Battery voltage at which the numbers shall hold [V], where tables have several.
-        pool_voltages: Fit all voltages together instead of checking one on the others.
-        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        group (NAME): Propeller group of all tables.
+        voltage: Battery voltage of the fit [V], if the tables have several.
+        pool_voltages: Fit all voltages jointly instead of validating one fit on the others.
+        report (DIR): Directory for report.html, report.md, figures and fit.json.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
     """

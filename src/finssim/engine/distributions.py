@@ -104,7 +104,7 @@ class Distribution(Part):
         if not all(math.isfinite(x) for x in numbers):
             raise ValueError("expected finite numbers")
         if (self.within is not None) > (self.normal is not None):
-            raise ValueError("within belongs to a normal distribution: leave it out")
+            raise ValueError("within belongs to a normal distribution: omit it")
         if self.weights is not None and (self.choice is None or len(self.weights) != len(self.choice)):
             raise ValueError("weights belong to choices: give one for each")
         if self.weights is not None and (min(self.weights) < 0.0 or sum(self.weights) <= 0.0):

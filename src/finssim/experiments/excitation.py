@@ -522,7 +522,7 @@ def excite(
     seed: int = 0,
     as_json: bool = False,
 ) -> list[Path]:
-    """Write excitation programmes (wrench [N, N m] and thrust [N] at 50 Hz) for a robot, or run them in a simulation.
+    """Play excitation programmes on a robot or in simulation, or write them as tables (wrench [N, N m], 50 Hz).
 
     Example: finssim excite surge,yaw --vehicle finsrov --pool 1 --out trials
 
@@ -530,22 +530,22 @@ def excite(
 
     Args:
         axes (AXES): all, or of surge,sway,heave,roll,pitch,yaw separated by commas.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (DIR): Directory of the programmes or trials.
         kind (KIND): published (steps, dive-and-coast, pulses), validation, or multisine.
         levels (LEVELS): Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times.
-        repeats: How often every programme comes.
-        simulate: Run them in the simulator and write the trials they make.
-        pool (SEED): Seed of a virtual pool: the robot's whole software plays them there, records, and makes trials.
-        severity (NAME): Of that pool: nominal, realistic or hard; realistic if not given.
-        pool_vehicle (NAME|FILE): Vehicle around which that pool's own is drawn; the robot's if not given.
+        repeats: Repeats of every programme.
+        simulate: Run them in the simulator and write the trials.
+        pool (SEED): Seed of a virtual pool, in which the robot's software plays them, records, and writes trials.
+        severity (NAME): Severity of that pool: nominal, realistic or hard; realistic if not given.
+        pool_vehicle (NAME|FILE): Vehicle around which that pool's plant is drawn; the robot's if not given.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         noise (NAME): Noise of simulated trials: sensors, published or none.
-        inputs (NAMES): Inputs that simulated trials log, of wrench,rpm,force,pwm,command.
+        inputs (NAMES): Inputs logged in simulated trials, of wrench,rpm,force,pwm,command.
         rate: Rows of a simulated trial per second [Hz].
         coast: Longest coast after a dive [s].
-        duration: Of a multi-sine [s].
-        room: Longest way along a linear axis [m]: lowers the levels to fit a pool.
+        duration: Duration of a multi-sine [s].
+        room: Longest distance along a linear axis [m]: lowers the levels to fit a pool.
         robot: The robot that plays them, in place of a simulation.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
@@ -561,15 +561,11 @@ def excite(
     }  # fmt: skip
     of_pool = severity is not None or pool_vehicle is not None
     if robot is not None and (simulate or pool is not None or of_pool):
-        raise CalibrationError(
-            "--robot is where it is done: leave --simulate, --pool and what tells of it out"
-        )
+        raise CalibrationError("--robot excludes --simulate, --pool and their options")
     if pool is not None and (simulate or room is not None):
         raise CalibrationError("--pool goes with neither --simulate nor --room: a pool has its own room")
     if pool is None and of_pool:
-        raise CalibrationError(
-            "--severity and --pool-vehicle tell of a virtual pool: name one with --pool SEED"
-        )
+        raise CalibrationError("--severity and --pool-vehicle need a virtual pool: give --pool SEED")
     if robot is not None:
         folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, room=room, **plan)
     elif pool is not None:

@@ -374,7 +374,7 @@ AUTOPILOT: Mapping[str, Scenario] = {
     ),
     "ap-mode": _autopilot("the mode is changed", "mode to ALT_HOLD", 0.5, _command(176, 1, 2), handed_over=True),
     "ap-disarm": _autopilot("somebody disarms", "was disarmed", 0.5, _command(400, 0)),
-    "ap-station": _autopilot("a second ground station, which looks", "", math.inf, {
+    "ap-station": _autopilot("a second ground station, which listens", "", math.inf, {
         "1": another_station("heartbeat", 6, 8, 0, 0, 0, 3, every=1.0, system=254),
         "2": another_station("request_data_stream", 1, 1, 0, 2, 1, every=2.0),
     }),
@@ -1019,24 +1019,24 @@ def faults_experiment(
     address: str | None = None,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Break one thing after another while a vehicle drives: time until thrust is gone [s], place in the workspace [m].
+    """Inject faults while a vehicle drives: time until the thrust is zero [s], distance to the workspace [m].
 
-    Exit status 3: a fault did what it must not.
+    Exit status 3: a trial failed.
 
     Example: finssim experiment faults --scenarios link-cut,blind-3 --out faults
 
     Args:
-        out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
-        seeds: Virtual pools, each with its own vehicle, water and noise.
+        out (DIR): Directory for JSON, Markdown, figures, policies and trials; an interrupted one is continued.
+        seeds: Number of virtual pools, each with different vehicle, water and noise.
         seed: Seed of every random number; equal seeds give equal results.
         scenarios (NAMES): Faults, separated by commas; all if not given.
-        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file; finsrov, with ardusub
+        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file; finsrov, with ardusub
             bluerov2_heavy, if not given.
-        firmware (NAME): What steers the motors: mcu, the motor controller of finssim run, or ardusub, an autopilot, in
-            the tank, with a Doppler log in place of the camera.
-        processes: Trials at once; as many as processors if not given.
-        address (ADDRESS): Of a Ray cluster that does the work in their place, HOST:PORT or auto; kills stay here.
+        firmware (NAME): Firmware of the vehicle: mcu (the motor controller of finssim run) or ardusub (an
+            autopilot, in the tank, with a DVL instead of the camera).
+        processes: Parallel trials; one per processor if not given.
+        address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto; kills stay here.
         progress: Told the share that is done and what comes next.
 
     Returns:

@@ -608,15 +608,15 @@ def localization_experiment(
     progress: Progress = lambda part, text: None,
     **size: Any,
 ) -> dict[str, Any]:
-    """Locate a tag at places that the calibration has not seen, by refractive and pinhole methods: RMSE, P95 [cm].
+    """Locate a tag at places held out from the calibration, by refractive and pinhole methods: RMSE, P95 [cm].
 
-    Every seed draws the places' survey errors, readings, camera file, plumb line, ripples and noise anew.
+    Every seed draws the places' survey errors, readings, camera file, plumb line, ripples and noise again.
 
     Example: finssim experiment localization --seeds 3 --out localization
 
     Args:
         out (DIR): Directory for JSON, Markdown and figures.
-        renderer (NAME): own, or geometry (no pictures: exact corners with noise).
+        renderer (NAME): own, or geometry (exact corners with noise instead of images).
         seeds: Repetitions with other errors.
         seed: Seed of every random number; equal seeds give equal results.
         progress: Told the share that is done and what comes next.

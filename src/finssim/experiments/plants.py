@@ -123,7 +123,7 @@ class Plant(BaseModel):
         """
         if self.held_out and not task.world:
             raise PlantError(
-                f"plant '{self.name}' changes how a site looks, and task '{task.name}' sees none: take another plant"
+                f"plant '{self.name}' changes what a site looks like, and task '{task.name}' sees none: use another"
             )
         return Environment(
             replace(task, held_out=True) if self.held_out else task,

@@ -276,17 +276,17 @@ def sweep(
     processes: Annotated[int | None, (1, None)] = None,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Train every setting with every seed on one machine or many, and evaluate each policy; goes on where it was.
+    """Train every setting with every seed on one machine or several, and evaluate each policy; resumes.
 
-    Exit status 3: a training failed, which the table tells.
+    Exit status 3: a training failed, as the table shows.
 
     Example: finssim sweep sweep.yaml --out swept
 
     Args:
-        file (FILE): What to train: task, seeds, settings (.yaml).
-        out (DIR): Directory of the runs; those that it has are kept.
-        address (ADDRESS): Of a Ray cluster to join, HOST:PORT or auto; this machine alone if not given.
-        processes: Trainings at once on this machine; one a processor if not given.
+        file (FILE): Sweep file: task, seeds, settings (.yaml).
+        out (DIR): Directory of the runs; existing ones are kept.
+        address (ADDRESS): Ray cluster to use, HOST:PORT or auto; only this machine if not given.
+        processes: Parallel trainings on this machine; one per processor if not given.
         progress: Told the share that is done.
 
     Returns:

@@ -182,9 +182,7 @@ def about(folder: str | Path) -> dict[str, Any]:
     except (ValueError, OSError) as error:
         raise DatasetError(f"{folder}: no data set there: make one with finssim collect") from error
     if OURS not in metadata:
-        raise DatasetError(
-            f"{folder}: not a data set of FinsSim: it does not say of which task and vehicle it is"
-        )
+        raise DatasetError(f"{folder}: not a data set of FinsSim: task and vehicle are missing")
     described: dict[str, Any] = json_value(metadata[OURS], DatasetError, str(folder))
     return {**described, "episodes": metadata["total_episodes"], "steps": metadata["total_steps"]}
 

@@ -142,7 +142,7 @@ def _rate(described: Mapping[str, Any], source: str | Path) -> int:
     """Frames in a second [Hz]."""
     period = described.get("period")
     if not period:
-        raise DatasetError(f"{source}: does not tell its period: collect it again with this version")
+        raise DatasetError(f"{source}: has no period: collect it again with this version")
     fps = round(1.0 / period)
     if abs(fps * period - 1.0) > 1e-6:
         raise DatasetError(

@@ -267,7 +267,7 @@ class Loop:
             if saved != value:
                 raise ResumeError(
                     f"cannot go on in {self.side}: {name} was {saved!r} and is {value!r} now: "
-                    "give what the training began with, or leave out --resume"
+                    "give the original settings, or omit --resume"
                 )
         if "best" not in state:
             raise ResumeError(f"{self.side}: the checkpoint is of an earlier version: leave out --resume")

@@ -130,7 +130,7 @@ def run_project(
     out: Path | None = None,
     as_json: bool = False,
 ) -> None:
-    """Pixels [px] at which points in the water appear.
+    """Project points in the water to pixels [px].
 
     Example: finssim project points.csv --pool pool.yaml
 
@@ -167,15 +167,15 @@ def run_backproject(
     out: Path | None = None,
     as_json: bool = False,
 ) -> None:
-    """Points [m] in the water that pixels see, on a plane.
+    """Back-project pixels to points [m] on a plane in the water.
 
     Example: finssim backproject pixels.csv --pool pool.yaml --z 0
 
     Args:
         pixels (PIXELS): Table with columns u, v [px]; - for standard input.
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
-        z: Height of the points, pool frame [m]; a column z goes before it.
-        plane: Plane of the points in place of --z: a,b,c,d with a x + b y + c z + d = 0 [m].
+        z: Height of the points, pool frame [m]; a column z has priority.
+        plane: Plane of the points, instead of --z: a,b,c,d with a x + b y + c z + d = 0 [m].
         pixel_std: Error of a pixel [px]; adds columns with the error of the points [m].
         out (FILE): Table to write; standard output if not given.
         as_json: Print one JSON object instead of tables.
@@ -223,7 +223,7 @@ def _plane(table: PointTable, z: float | None, plane: str | None) -> tuple[Array
         return up, -table.numbers["z"]
     if z is None:
         raise LocalizationError(
-            f"{table.label}: nothing says on which plane the points lie: give a height z, a plane, or a column z"
+            f"{table.label}: the plane of the points is missing: give a height z, a plane, or a column z"
         )
     if not np.isfinite(z):
         raise LocalizationError(f"z is {z}, expected a finite height in metres")

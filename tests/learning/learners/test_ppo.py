@@ -146,7 +146,7 @@ def test_an_informed_teacher_sees_what_was_drawn_and_the_student_does_not():
 
 
 def test_without_ranges_there_is_nothing_to_be_informed_of():
-    with pytest.raises(LearningError, match="sees what randomisation has drawn: give randomize"):
+    with pytest.raises(LearningError, match="observes the drawn parameters: give randomize"):
         made(StationKeeping(), ranges=None, **INFORMED)
 
 

@@ -135,7 +135,7 @@ def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[i
             else f"has FRAME_CONFIG {int(config)}, which is not known here"
         )
         raise CalibrationError(
-            f"the log {lack}, so nothing tells which output drives which thruster: {way_out}"
+            f"the log {lack}, so it is unknown which output drives which thruster: {way_out}"
         )
     frame, factors = FRAMES[int(config)]
     names = list(vehicle.thrusters)

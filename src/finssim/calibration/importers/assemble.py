@@ -357,7 +357,7 @@ def split_rule(text: str) -> SplitRule:
         )
     except ValueError:
         raise CalibrationError(
-            f"split is '{text}', expected phase, gaps, gaps=SECONDS, arming or column; time windows stand in a map file"
+            f"split is '{text}', expected phase, gaps, gaps=SECONDS, arming or column; give time windows in a map file"
         ) from None
 
 
@@ -403,7 +403,7 @@ def _part(table: Table, rows: Rows) -> Table:
 
 WORDED = {
     "phase": ("phase", "no source of the map names a phase column"),
-    "arming": ("arming", "the log says nothing about arming"),
+    "arming": ("arming", "the log has no arming messages"),
     "column": ("split", "no source of the map names a split column"),
 }
 """Rule -> the words that it goes by, and what is said where there are none."""

@@ -600,19 +600,19 @@ def import_trials(
     split: str | None = None,
     as_json: bool = False,
 ) -> list[Path]:
-    """Make trial folders of logs, in SI units and the body frame x forward, y left, z up.
+    """Convert logs to trial folders, in SI units and the body frame x forward, y left, z up.
 
     Example: finssim trials import dive.BIN --vehicle bluerov2 --split arming --out trials
 
     Args:
         logs (LOG): Tables (.csv, .parquet), ArduSub logs (.BIN, .tlog, .mcap of BlueOS), ROS 2 bags (.mcap, .db3,
-            folder). Tables and bags that belong together make one trial.
-        out (DIR): Folder in which the trial folders are made.
+            folder). Tables and bags that belong together form one trial.
+        out (DIR): Folder for the trial folders.
         column_map (FILE): Map of the log's columns or topics, with units and frames (.yaml).
         format (FORMAT): auto (by suffix), csv, ardupilot or rosbag.
-        vehicle (NAME|FILE): Vehicle that made the logs; before the map's.
-        split (RULE): Several trials of one log: by phase, gaps, gaps=SECONDS, arming or column; before the map's.
-        as_json: Print one JSON object instead of a line for each trial.
+        vehicle (NAME|FILE): Vehicle of the logs; overrides the map's.
+        split (RULE): Split a log into trials: by phase, gaps, gaps=SECONDS, arming or column; overrides the map's.
+        as_json: Print one JSON object instead of one line per trial.
 
     Returns:
         The folders, in the order of their trials; what was repaired or left out is told on standard error.
@@ -723,7 +723,7 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
     """Tables by trial: those for which `{trial}` or the first `*` of their patterns stands for the same text."""
     if paths and has_map and not mapped.files:
         raise CalibrationError(
-            f"the map says nothing about files such as {paths[0].name}: give 'files:' or 'columns:'"
+            f"the map has no entry for files such as {paths[0].name}: give 'files:' or 'columns:'"
         )
     by_trial: dict[str, list[tuple[str, Path, SourceMap | None]]] = {}
     unread = []

@@ -55,7 +55,7 @@ def require_fittable(trials: Sequence[Trial], vehicle: Vehicle) -> None:
     for trial in trials:
         if trial.header.role == "held-out":
             raise CalibrationError(
-                f"{trial.name}: its header says that it is held out: fit on other trials and replay this one"
+                f"{trial.name}: it is marked as held out: fit on other trials and replay this one"
             )
         for item in implausible(trial, vehicle):
             raise CalibrationError(f"{trial.name}: {item}")

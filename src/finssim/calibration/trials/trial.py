@@ -161,7 +161,7 @@ INPUT_PREFIXES: dict[str, Column] = {
     "force_": Column("command", "N", "thrust of one thruster"),
     "rpm_": Column("command", "rpm", "shaft speed of one thruster, positive for positive thrust"),
     "pwm_": Column("command", "µs", "pulse width sent to the speed controller of one thruster"),
-    "command_": Column("command", "N", "thrust asked of one thruster"),
+    "command_": Column("command", "N", "requested thrust of one thruster"),
 }
 """Columns named PREFIX + thruster name."""
 

@@ -198,7 +198,7 @@ def _read_parquet(path: Path) -> Table:
         content = pyarrow.parquet.read_table(path)
     except (OSError, pyarrow.ArrowException) as error:
         raise CalibrationError(
-            f"{path}: is not a whole Parquet file: {' '.join(str(error).split())[:120]}"
+            f"{path}: is not a complete Parquet file: {' '.join(str(error).split())[:120]}"
         ) from None
     table = Table()
     _check_names(content.column_names, path)

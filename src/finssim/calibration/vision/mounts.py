@@ -432,7 +432,7 @@ def reference_tag(moments: Sequence[Moment], mounts: Mapping[int, Pose]) -> int:
     if best is None or not counts[best]:
         visible = sorted({tag for moment in moments for tag in moment.corners})
         raise CalibrationError(
-            f"none of the vehicle file's tags {sorted(mounts)} is seen, only {visible}: give the file the right ids"
+            f"none of the vehicle file's tags {sorted(mounts)} is seen, only {visible}: correct the ids in the file"
         )
     return best
 
@@ -752,7 +752,7 @@ def _read_depth(path: Path, findings: list[Finding]) -> Series | None:
 EDGE_STD = 0.25e-3
 """Standard deviation of a tag's edge measured with a ruler [m]: it makes every distance wrong by the same share."""
 
-RETAINED = "the motion does not tell it: kept from the file"
+RETAINED = "the motion does not determine it: kept from the file"
 
 
 def distance_std(fit: MountFit) -> float:
@@ -929,7 +929,7 @@ def imu_clock(
     if lag is None:
         return None
     half = 1.96 * lag.std
-    note = "the vehicle turns too evenly to tell the clocks apart: taken as 0"
+    note = "the vehicle turns too evenly to estimate the clock offset: assumed 0"
     return Estimate.within("imu.time_offset", lag.seconds, half, "s", half < UNSURE_CLOCK, note)
 
 
@@ -972,16 +972,16 @@ def run(
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Find where tags sit on the vehicle, from its motion, its IMU and its pressure port: poses [m, deg].
+    """Estimate the mounts of tags on the vehicle from its motion, IMU and pressure port: poses [m, deg].
 
     Example: finssim calibrate mounts log --pool pool.yaml --vehicle mine.yaml --out mine.yaml
 
     Args:
         log (LOG): Folder with detections.csv, imu.csv and depth.csv.
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
-        report (DIR): Directory for the report and its pictures.
+        report (DIR): Directory for the report and its figures.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 

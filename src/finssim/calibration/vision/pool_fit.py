@@ -879,18 +879,18 @@ def _doubt(name: str, std: float, fit: Refined, settings: Settings) -> str:
     reach = model.clearance + max(model.depth, 0.0)
     before, sentence = np.inf, ""
     if name == "index":
-        before, sentence = prior.index_std, f"the pixels do not tell it: held at {settings.index:g}"
+        before, sentence = prior.index_std, f"not determined by the pixels: fixed at {settings.index:g}"
     elif name in ("tilt_x", "tilt_y"):
-        before, sentence = np.degrees(prior.tilt_std), "the pixels do not tell it: held level"
+        before, sentence = np.degrees(prior.tilt_std), "not determined by the pixels: assumed level"
     elif name in LENS_NAMES:
         before = prior.lens_std[LENS_NAMES.index(name)] * (model.camera.lens.fx if name == "focal" else 1.0)
-        sentence = "the pixels do not tell it: held at the camera file's"
+        sentence = "not determined by the pixels: fixed at the camera file's"
     elif name in ("water_height", "point_distance") and settings.stated_depth:
         before, sentence = prior.depth_std, "rests on the measured height"
     elif name in ("camera_height", "camera_distance", "water_height", "point_distance"):
         if min(model.clearance, model.depth - model.interface.thickness) < AT_BOUND * reach:
             return "at its bound: the plane touches the camera or a point"
-        before, sentence = FAR * reach / IDENTIFIED, "the pixels do not tell it"
+        before, sentence = FAR * reach / IDENTIFIED, "not determined by the pixels"
     return sentence if np.isfinite(before) and std > IDENTIFIED * before else ""
 
 
@@ -1331,8 +1331,9 @@ def _touching(fit: PoolFit) -> list[Finding]:
         return []
     if error > ABSURD:
         raise CalibrationError(
-            f"the camera ends on the plane itself, with residuals of {error:.0f} px: no camera before this plane sees "
-            "the points so; check the unit and sign of the water's height, the window's thickness [m], the index, and "
+            f"the fitted camera is on the plane itself, with residuals of {error:.0f} px: no camera "
+            "in front of this plane fits the points; check the unit and sign of the water's height, the "
+            "window's thickness [m], the index, and "
             "whether there is water between at all; nothing is written"
         )
     return [finding("camera_on_plane", residual=error)]
@@ -1375,9 +1376,10 @@ LEAST_SPREAD = 5.0
 """Largest width of all pixels that are refused: numbers from 0 to 1 are no pixels [px]."""
 
 READING = (
-    "The interval holds the true value in 19 of 20 such calibrations, if what was given beforehand (index, tape, "
-    "level, camera file) is as exact as it was said to be. A note says where the pixels do not tell a number and what "
-    "it rests on instead. Judge the result by the error at points held out, in the depth where it will be used. "
+    "The interval holds the true value in 19 of 20 such calibrations, if the priors (index, tape, "
+    "level, camera file) are as accurate as stated. A note marks a number that the pixels do not "
+    "determine, and names its prior. Judge the result by the error at points held out, in the depth "
+    "where it will be used. "
     "Arrows that swirl or grow outwards tell of a wrong lens, window or water height; others are noise."
 )
 
@@ -1547,38 +1549,41 @@ def run(
     seed: int = 0,
     as_json: bool = False,
 ) -> PoolFit:
-    """Find camera pose [m, deg] and water plane (height [m], tilt [deg], index) from surveyed points in the water.
+    """Estimate camera pose [m, deg] and water plane (height [m], tilt [deg], index) from surveyed points in the
+    water.
 
     Example: finssim calibrate pool points.csv --surveyed survey.csv --camera camera.yaml --out pool.yaml
 
     Args:
-        inputs (INPUT): Detections (.csv), pixels (id,u,v), pixels with points (u,v,x,y,z), or pictures of tags.
+        inputs (INPUT): Detections (.csv), pixels (id,u,v), pixels with points (u,v,x,y,z), or images of tags.
         camera (FILE): Camera file: ours, or one of OpenCV, ROS or Kalibr.
         out (FILE): Pool file to write (.yaml).
         surveyed (FILE): Survey (.csv): id,x,y,z of points, or tag,x,y,z,yaw_deg,edge of tags, or
-            image,x,y,z,yaw_deg,edge of one tag that was moved; not needed where the inputs hold the points.
-        report (DIR): Directory for the report and its pictures.
-        interface (KIND): What the camera looks through: surface, wall, or auto to try.
-        plane (PLANE): The surveyed plane itself, n_x,n_y,n_z,b with n . X + b = 0 [m].
-        window (LAYER): Solid layer THICKNESS:INDEX, such as 0.010:1.52 for 10 mm of glass; several from the camera on.
-        water_height: z of the surface in the survey's frame, by a tape [m].
-        water_depth: In place of it: from the surveyed points to the surface [m].
-        water_height_sigma: Error of either, or of the plane's place [m]; 0.005 if not given.
+            image,x,y,z,yaw_deg,edge of one moved tag; not needed if the inputs contain the points.
+        report (DIR): Directory for the report and its figures.
+        interface (KIND): Interface between camera and water: surface, wall, or auto.
+        plane (PLANE): Surveyed interface plane n_x,n_y,n_z,b with n . X + b = 0 [m].
+        window (LAYER): Solid layer THICKNESS:INDEX, such as 0.010:1.52 for 10 mm of glass; several in order from
+            the camera.
+        water_height: z of the surface in the survey's frame, from a tape measure [m].
+        water_depth: Depth of the surveyed points below the surface [m], instead of --water-height.
+        water_height_sigma: Standard deviation of either, or of the plane's position [m]; 0.005 if not given.
         index: Refractive index of the water.
-        index_sigma: Error of that; 0.003 if neither is given, 0 (held) if only --index is.
-        tilt_sigma: How far the plane may lean [deg]; 0.2 for a surface, 0.5 for --plane, free for a wall.
-        fit (NAMES): What is fitted, of pose,height,tilt,index,focal,center,distortion; chosen if not given.
-        focal_sigma: Relative error of the camera file's focal length; what the file says if not given.
-        center_sigma: Error of its optical centre [px]; what the file says if not given.
-        pixel_sigma: Error of a pixel [px]; from the residuals if not given.
-        survey_sigma: Error of a surveyed coordinate [m].
-        survey_yaw_sigma: Error of a tag's direction [deg].
-        unit (UNIT): Of lengths in tables that do not say: m, cm, mm, in, ft.
-        z: Height of points whose table has no such column [m].
-        edge: Of tags whose survey has no such column [m].
-        family (NAME): Of tags in pictures.
-        latency: Time stamps of pictures minus their exposure [s], kept in the file.
-        folds: Parts that are held out in turn.
+        index_sigma: Standard deviation of the index; 0.003 if neither is given, 0 (fixed) if only --index is.
+        tilt_sigma: Standard deviation of the plane's tilt [deg]; 0.2 for a surface, 0.5 for --plane, free for a
+            wall.
+        fit (NAMES): Parameters to fit, of pose,height,tilt,index,focal,center,distortion; automatic if not given.
+        focal_sigma: Relative standard deviation of the camera file's focal length; from the file if not given.
+        center_sigma: Standard deviation of its optical centre [px]; from the file if not given.
+        pixel_sigma: Standard deviation of a pixel [px]; from the residuals if not given.
+        survey_sigma: Standard deviation of a surveyed coordinate [m].
+        survey_yaw_sigma: Standard deviation of a tag's heading [deg].
+        unit (UNIT): Unit of lengths in tables without one: m, cm, mm, in, ft.
+        z: Height of points in tables without z [m].
+        edge: Edge of tags in surveys without that column [m].
+        family (NAME): Family of the tags in images.
+        latency: Time stamps of images minus their exposure [s], written to the file.
+        folds: Folds of the cross-validation.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 

@@ -222,7 +222,7 @@ class Settings:
     survey_yaw_sigma: float = math.radians(0.5)
     """Of a tag's direction [rad]."""
     folds: int = 5
-    """Parts that are held out in turn."""
+    """Folds of the cross-validation."""
     seed: int = 0
     """Of the parts and of samples."""
 

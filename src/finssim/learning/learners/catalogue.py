@@ -145,25 +145,23 @@ LEARNERS: dict[str, LearnerKind] = {
     "torchrl-ippo": LearnerKind(
         "torchrl_ppo",
         "TorchRlIppo",
-        "independent PPO of TorchRL: each agent's value from what it sees",
+        "independent PPO of TorchRL: each agent's value from its own observation",
         extra="torchrl",
         agents="several",
     ),
     "torchrl-mappo": LearnerKind(
         "torchrl_ppo",
         "TorchRlMappo",
-        "multi-agent PPO of TorchRL: values from what all agents see",
+        "multi-agent PPO of TorchRL: values from the observations of all agents",
         extra="torchrl",
         agents="several",
     ),
     "bc": LearnerKind("imitation", "Bc", "behaviour cloning of demonstrations", extra="imitation", sees=None),
-    "dagger": LearnerKind(
-        "imitation", "Dagger", "DAgger: an expert says what it would have done", extra="imitation"
-    ),
+    "dagger": LearnerKind("imitation", "Dagger", "DAgger: an expert labels each step", extra="imitation"),
     "distill": LearnerKind(
         "distill",
         "Distill",
-        "a teacher by PPO, who shows a student with a camera what to do",
+        "a teacher by PPO, distilled into a student with images",
         extra="perception",
         agents="one",
         sees=True,

@@ -184,7 +184,7 @@ class Ppo(ActingLearner):
         )
         if s.teacher == INFORMED and not has_privileged:
             raise LearningError(
-                "an informed teacher sees what randomisation has drawn: give randomize, and leave asymmetric as it is"
+                "an informed teacher observes the drawn parameters: give randomize, and keep asymmetric"
             )
         self._window = s.history * n + (m if s.last_action else 0)
         drawn = 0 if self._drawn is None else self._drawn.shape[1]

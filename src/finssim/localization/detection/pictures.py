@@ -55,7 +55,7 @@ def pictures(
     if clock is not None:
         for file, name in names.items():
             if file.suffix.lower() in PICTURE_FILES and name not in clock and file.name not in clock:
-                raise LocalizationError(f"{times}: no time of {name}: add a line with it or leave it out")
+                raise LocalizationError(f"{times}: no time of {name}: add a line with it or omit it")
     return _stream(files, names, clock or {}, tell or _print_note)
 
 

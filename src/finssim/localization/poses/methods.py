@@ -335,8 +335,8 @@ WORST = 4.0
 WORST_WITHOUT_WATER = 40.0
 """The same where the water is left out, which alone may cost many pixels."""
 _SUSPECTS = (
-    "look at the tag's id, edge and mount, the depth, the tilt and the pool file",
-    "the tags contradict each other: look at their ids and mounts, the depth, the tilt and the pool file",
+    "check the tag's id, edge and mount, the depth, the tilt and the pool file",
+    "the tags contradict each other: check their ids and mounts, the depth, the tilt and the pool file",
 )
 
 
@@ -437,7 +437,7 @@ def _solve(corners: CornerPoints, level: Array, pixel_std: float, limit: float, 
         used = retained
         fit = _fit(corners, level, used, pixel_std)
     if fit is None:
-        return _Solved(None, used, rejected, "the corners lie too close together to tell the heading")
+        return _Solved(None, used, rejected, "the corners are too close together to determine the heading")
     if not fit.converged:
         return _Solved(None, used, rejected, f"did not converge in {fit.iterations} steps")
     if fit.missed.max() > limit:
