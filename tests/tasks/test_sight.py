@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("newton")
 
 from finssim.experiments.plants import PlantError, load_plant
-from finssim.tasks import SEEING, Environment, EnvironmentSetupError, make, sight
+from finssim.tasks import SEEING, Environment, EnvironmentSetupError, environment, make, measurement, sight
 from finssim.tasks.agents import LightServo, LineFollower, PostServo, WallFollower, agent_for
 from finssim.tasks.check import check_task
 from finssim.tasks.docking import CameraDocking
@@ -278,8 +278,25 @@ def test_the_post_servo_finds_the_gate_in_the_picture():
     assert np.median(error[visible]) < 0.1 and np.degrees(np.median(np.abs(turned[visible]))) < 15.0
 
 
+def corners(env):
+    """Ends and corners of each world's net, world frame, (worlds, 4, 3)."""
+    net = Rotation.from_quat(np.repeat(env.arrays.goal_quaternion.numpy(), 4, axis=0))
+    places = net.apply(env.arrays.reference.position.numpy().reshape(-1, 3)).reshape(-1, 4, 3)
+    return places + env.arrays.goal_position.numpy()[:, None]
+
+
+def way_to_net(points, corners):
+    """From points seen from above to the nearest point of a net, (n, 2), whose sides run through corners, (4, 2)."""
+    ways = []
+    for a, b in zip(corners, corners[1:], strict=False):
+        t = np.clip((points - a) @ (b - a) / np.sum((b - a) ** 2), 0.0, 1.0)
+        ways.append(a + t[:, None] * (b - a) - points)
+    nearest = np.linalg.norm(ways, axis=2).argmin(0)
+    return np.array(ways)[nearest, np.arange(len(points))]
+
+
 def test_along_a_net_the_row_has_the_range_below_and_the_picture_the_echoes_of_the_net():
-    """The range is the slant way to the tube at the net's foot, to 0.3 m; the line through the echoes is the net.
+    """The range is the slant way to the tube at the net's foot, to 0.3 m; the point the baseline finds is the net's.
 
     Both are those of now, at the start of an episode and after steps, of a sensor without latency; the last row of an
     episode is kept with its range.
@@ -289,20 +306,56 @@ def test_along_a_net_the_row_has_the_range_below_and_the_picture_the_echoes_of_t
     follower = WallFollower.for_vehicle(env.nominal[0])
     observation = env.reset()
     for k in range(6):
-        x, net = env.simulator.state.position.numpy()[:, 0], env.arrays.goal_quaternion.numpy()
-        place = Rotation.from_quat(net).inv().apply(x - env.arrays.goal_position.numpy())
+        x, net = env.simulator.state.position.numpy()[:, 0], corners(env)
+        away = [np.linalg.norm(way_to_net(x[w : w + 1, :2], net[w, :, :2])) for w in range(12)]
         assert observation["sonar"].shape == (12, 128, 48, 1) and observation["sonar"].dtype == np.uint8
         below = 4.4 + 0.5 * observation["state"][:, 9]
-        assert np.median(np.abs(below - np.hypot(place[:, 2] + 6.9, place[:, 0]) + 0.14)) < 0.3
+        assert np.median(np.abs(below - np.hypot(x[:, 2] + 6.9, away) + 0.14)) < 0.3
         np.testing.assert_allclose(below, np.minimum(env.arrays.ranges.numpy()[:, 0], 6.4), rtol=1e-5)
-        line, enough = follower.line(observation["sonar"])
-        away = line[:, 0] * np.cos(np.arctan(line[:, 1]))
-        assert enough.all() and np.median(np.abs(away + place[:, 0])) < 0.05
+        point, enough = follower.nearest(observation["sonar"], np.full(12, 1.5))
+        assert enough.all() and np.median(np.abs(np.linalg.norm(point, axis=1) - away)) < 0.05
         step = env.step(np.zeros((12, 4)))
         observation = step.observation
         if k == 4:
             assert step.truncated.all() and step.final_observation["sonar"].any()
             assert np.all(step.final_observation["state"][:, 9] != observation["state"][:, 9])
+
+
+def test_the_sides_of_a_net_meet_as_those_of_its_site_do_with_a_world_and_without():
+    """Equal lengths, and corners at angles of up to 30° to either side; the ropes stand where the sides meet."""
+    bends = {}
+    for task in (Net(), Net().for_teacher()):
+        env = Environment(task, worlds=200, seed=3)
+        sides = np.diff(env.arrays.reference.position.numpy()[:, :, :2], axis=1)
+        np.testing.assert_allclose(np.linalg.norm(sides, axis=2), np.tile(task.sides, (200, 1)), atol=1e-5)
+        bends[task.world] = np.diff(np.degrees(np.arctan2(-sides[..., 0], sides[..., 1])), axis=1)
+        assert np.all(np.abs(bends[task.world]) < 30.001)
+        np.testing.assert_allclose(bends[task.world].std(axis=0), 60.0 / np.sqrt(12.0), rtol=0.1)
+        if env.sight is not None:
+            rope = env.sight.batch.poses("rope_2")[:, :2]
+            np.testing.assert_allclose(corners(env)[:, 2, :2], rope, atol=1e-5)
+            assert load_world("net").objects["middle"].vary.yaw == pytest.approx(task.bend, abs=1e-4)
+
+
+def test_the_teacher_of_the_net_sees_the_line_round_the_corner():
+    """Now and 0.5 m on, the way there leads to 1.5 m from the net, and where it faces is where the net is."""
+    env, random = Environment(Net().for_teacher(), worlds=200, seed=4), np.random.default_rng(1)
+    goal, net_q = env.arrays.goal_position.numpy().copy(), env.arrays.goal_quaternion.numpy().copy()
+    off = random.uniform([-1.8, -1.0, -2.8], [-1.2, 3.0, -2.2], (200, 3))
+    x = goal + Rotation.from_quat(net_q).apply(off)
+    q = Rotation.from_euler("z", random.uniform(-np.pi, np.pi, (200, 1)))
+    env.start(x, q.as_quat(), goal, net_q)
+    taught, net = env.arrays.taught.numpy(), corners(env)
+    for first in (0, 6):
+        line, nose = x + q.apply(taught[:, first : first + 3]), q.apply(taught[:, first + 3 : first + 6])
+        way = np.array([way_to_net(line[w : w + 1, :2], net[w, :, :2])[0] for w in range(200)])
+        error = np.abs(np.linalg.norm(way, axis=1) - 1.5)
+        assert np.median(error) < 1e-3 and np.percentile(error, 90) < 0.1
+        off_nose = np.degrees(
+            np.arctan2(nose[:, 0] * way[:, 1] - nose[:, 1] * way[:, 0], np.sum(nose[:, :2] * way, axis=1))
+        )
+        assert np.median(np.abs(off_nose)) < 1.5 and np.percentile(np.abs(off_nose), 95) < 16.0
+        np.testing.assert_allclose(line[:, 2], env.task.level, atol=1e-4)
 
 
 def test_a_net_is_touched_with_the_nose_and_lost_beside_the_line():
@@ -311,11 +364,11 @@ def test_a_net_is_touched_with_the_nose_and_lost_beside_the_line():
     check_task(task)
     nose, level = 0.5 * load_vehicle("finsrov").body.size[0], task.level
     places = [
-        [-nose - 0.13, 0, level],
-        [-nose - 0.11, 0, level],
-        [-1.5, 0, level],
-        [-2.32, 0, level],
-        [-1.5, 0, level + 0.82],
+        [-nose - 0.13, -1.6, level],
+        [-nose - 0.11, -1.6, level],
+        [-1.5, -1.6, level],
+        [-2.32, -1.6, level],
+        [-1.5, -1.6, level + 0.82],
     ]
     measured, step = stepped(replace(task, lost=1.5), places[:3])
     np.testing.assert_array_equal(step.terminated, [False, True, False])
@@ -323,6 +376,35 @@ def test_a_net_is_touched_with_the_nose_and_lost_beside_the_line():
     measured, step = stepped(task, places[2:])
     np.testing.assert_array_equal(step.terminated, [False, True, True])
     np.testing.assert_array_equal(measured["lost"][1:], 1.0)
+
+
+def test_a_net_is_touched_wherever_the_envelope_meets_it_round_its_corners_too():
+    """Level vehicles at any heading near both corners: by the distance of points of theirs from the sides.
+
+    Where corner meets corner the task may say so 5 cm too early.
+    """
+    worlds, random = 400, np.random.default_rng(7)
+    env = Environment(
+        replace(Net().for_teacher(), lost=9.0, tilt=0.0), worlds=worlds, seed=5, auto_reset=False
+    )
+    goal, q = env.arrays.goal_position.numpy().copy(), env.arrays.goal_quaternion.numpy().copy()
+    places = random.uniform([-0.8, -0.8, env.task.level], [0.8, 3.4, env.task.level], (worlds, 3))
+    x, yaw = goal + Rotation.from_quat(q).apply(places), random.uniform(-np.pi, np.pi, worlds)
+    env.start(x, Rotation.from_euler("z", yaw[:, None]).as_quat(), goal, q)
+    net = corners(env)
+    env.step(np.zeros((worlds, env.action_size)))
+    touched = env.task.metrics(env.arrays)["touched"]
+    half, side = 0.5 * load_vehicle("finsrov").body.size[:2], np.linspace(-1.0, 1.0, 41)
+    inside = half * np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    apart = np.zeros(worlds)
+    for w in range(worlds):
+        c, s = np.cos(yaw[w]), np.sin(yaw[w])
+        points = x[w, :2] + inside @ np.array([[c, s], [-s, c]])
+        apart[w] = np.linalg.norm(way_to_net(points, net[w, :, :2]), axis=1).min()
+    growth = env.task.growth
+    assert np.all(touched[apart < growth - 0.005] == 1.0)
+    assert np.all(touched[apart > growth + 0.05] == 0.0)
+    assert np.mean(touched != (apart < growth)) < 0.03 and 0.2 < touched.mean() < 0.9
 
 
 def test_who_follows_the_net_at_the_wrong_distance_has_not_inspected_it():
@@ -339,12 +421,16 @@ def test_who_follows_the_net_at_the_wrong_distance_has_not_inspected_it():
         assert (measured["error"] < 0.1).all() == (success == 1.0)
 
 
-@pytest.mark.parametrize("task", [kind() for kind in SEEING.values()], ids=lambda task: task.name)
-def test_the_kernels_of_tasks_that_see_compile_for_cuda(task, tmp_path):
-    """NVRTC, which needs no device, makes a binary for a compute capability of 7.5."""
+@pytest.mark.parametrize("kind", SEEING.values(), ids=SEEING)
+def test_the_kernels_of_tasks_that_see_compile_for_cuda(kind, tmp_path):
+    """NVRTC, which needs no device, makes a binary for a compute capability of 7.5: of the task, of its teacher's, and
+    of what all of them are run, measured and seen with."""
     wp.init()
     if wp.get_cuda_toolkit_version() is None:
         pytest.skip("this Warp has no CUDA compiler")
-    for i, module in enumerate((kernels_of(task).evaluate.module, wp.get_module(sight.__name__))):
+    made = [kernels_of(task).evaluate.module for task in (kind(), kind().for_teacher())]
+    common = [wp.get_module(module.__name__) for module in (sight, environment, measurement)]
+    for i, module in enumerate([*made, *(common if kind is Net else [])]):
+        assert module.kernels
         wp.compile_aot_module(module, arch=75, module_dir=tmp_path / str(i))
         assert [file.stat().st_size > 0 for file in (tmp_path / str(i)).glob("*.cubin")] == [True]

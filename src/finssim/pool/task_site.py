@@ -40,7 +40,7 @@ from finssim.robot.team import Team, encode_track
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task, one_world, unscored
-from finssim.tasks.sight import first_draw
+from finssim.tasks.sight import first_draw, put_goal
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.terms import Terms
 from finssim.tasks.trajectory_tracking import fill_table
@@ -226,9 +226,7 @@ class Referee:
         elif task.world:
             self.world = WorldBatch(task.world)
             self.world.draw(first_draw(seed), held_out=task.held_out)
-            pose = self.world.poses(task.landmark)[0]
-            self.arrays.goal_position.numpy()[0] = pose[:3]
-            self.arrays.goal_quaternion.numpy()[0] = pose[3:]
+            put_goal(task, self.world, self.arrays)
         batch, mask = Batch(self._state, self.arrays, seed), wp.ones(1, dtype=wp.int32, device=device)
         self._evaluate, opening = Pipeline(1, device), Pipeline(1, device)
         task.add_spawn(opening, batch, mask)

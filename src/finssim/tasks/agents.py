@@ -754,15 +754,48 @@ class LineFollower(DriveBaseline):
         return np.column_stack([mean_y - slope * mean_x, slope]), total > self.least
 
 
-# Along a net the classical way: a line through the loudest echo of each beam, and the altimeter for the height.
+# Along a net the classical way: straight sides through the loudest echoes, and the altimeter for the height.
+
+
+class Side(NamedTuple):
+    """A straight side of a net, as a ping shows it, in the plane of the body's x and y axes."""
+
+    angle: Array
+    """Of its normal, away from the vehicle [rad], (n,)."""
+    distance: Array
+    """Along that, of its straight line [m], (n,)."""
+    right: Array
+    """Along the line to the left from the point nearest to the vehicle: where it begins [m], (n,), ..."""
+    left: Array
+    """... and where it ends."""
+
+    @property
+    def nearest(self) -> Array:
+        """Its point nearest to the vehicle [m], (n, 2)."""
+        along = np.where(self.right < self.left, np.clip(0.0, self.right - 0.1, self.left + 0.1), 0.0)
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        return np.column_stack([self.distance * c - along * s, self.distance * s + along * c])
+
+    def meets(self, other: Side, reach: float) -> Mask:
+        """Where the two lines cross at most so far beyond an end of each [m], at 3° to 40°, (n,)."""
+        turn = other.angle - self.angle
+        sine = np.where(np.abs(turn) < 0.05, 1.0, np.sin(turn))
+        beyond = np.zeros_like(turn)
+        for side, far, sign in ((self, other, -1.0), (other, self, 1.0)):
+            along = sign * (side.distance * np.cos(turn) - far.distance) / sine
+            gap = np.minimum(np.abs(along - side.right), np.abs(along - side.left))
+            beyond = np.maximum(beyond, gap)
+        return (np.abs(turn) > 0.05) & (np.abs(turn) < 0.7) & (beyond < reach)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WallFollower(DriveBaseline):
-    """Fits a straight line to the loudest echo of each beam, turns square to it and goes along it to the left.
+    """Finds the net's sides among the two loudest echoes of each beam, faces its nearest point and goes to the left.
 
-    The fit is repeated with less weight on what is far off the line, as fish are. The altimeter hears the tube at the
-    net's foot, whose slant range and the distance give the height; a range that does not fit is left out.
+    The side on which most echoes lie is the one with the most votes of a Hough transform, refined by least squares with
+    less weight on what is far off it, as fish are. Of what is left, a second and a third side are found likewise, and
+    believed where they meet the first near its end and theirs. The altimeter hears the tube at the net's foot, whose
+    slant range and the distance give the height; a range that does not fit is left out.
     """
 
     speed: float
@@ -781,14 +814,20 @@ class WallFollower(DriveBaseline):
     """Of the altimeter below the body origin [m]."""
     least: float = 60.0
     """Level of an echo in the picture that counts."""
-    beams: int = 12
-    """Beams with such an echo, below which the last line is kept."""
+    behind: float = 0.03
+    """The loudest echo of twine comes from so far behind the net's plane, from above or below the beam's middle [m]."""
+    echoes: int = 12
+    """On a side, below which it is not believed."""
+    reach: float = 0.45
+    """Sides that meet do so at most this beyond the last echo on each [m]."""
     tube: float = 0.14
     """Radius of the tube at the net's foot [m]."""
     gain: float = 0.5
     """Speed per distance [1/s]."""
+    jump: float = 0.25
+    """Distance and heading change by less from ping to ping [m, rad]."""
     memory_share: float = 0.5
-    """Of the line before, in the next estimate."""
+    """Of distance and heading before, in the next estimate."""
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle) -> WallFollower:
@@ -809,11 +848,11 @@ class WallFollower(DriveBaseline):
     def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
         """Actions for observations and pictures of inspecting a net."""
         o = np.asarray(observation, float)
-        line, enough = self.line(next(iter(pictures.values())))
+        point, enough = self.nearest(next(iter(pictures.values())), memory[:, 0])
+        measured = np.column_stack([np.hypot(point[:, 0], point[:, 1]), np.arctan2(point[:, 1], point[:, 0])])
         share = np.where(enough, 1.0 - self.memory_share, 0.0)[:, None]
-        line = memory + share * (line - memory)
-        turn = -np.arctan(line[:, 1])
-        away = line[:, 0] * np.cos(turn)
+        memory = memory + share * np.clip(measured - memory, -self.jump, self.jump)
+        away, turn = memory.T
         slant = self.height + RANGE_SCALE * o[:, 9] + self.tube
         above = np.sqrt(np.maximum(slant**2 - away**2, 0.0)) + self.under - self.height
         towards = np.clip(self.gain * (away - self.distance), -0.15, 0.15)
@@ -825,35 +864,75 @@ class WallFollower(DriveBaseline):
                 self.drive.turned(turn),
             ]
         )
-        return self.drive.action(o[:, [3, 4, 5, 8]], wanted), line
+        return self.drive.action(o[:, [3, 4, 5, 8]], wanted), memory
 
-    def line(self, picture: NDArray[np.uint8]) -> tuple[Array, Mask]:
+    def nearest(self, picture: NDArray[np.uint8], before: Array) -> tuple[Array, Mask]:
         """The net in pings.
 
         Args:
             picture: uint8 (n, beams, range cells, 1).
+            before: Its distance before [m], (n,).
 
         Returns:
-            How far ahead of the body origin it crosses the x axis [m], and how much farther it is per metre to the
-            left, (n, 2); where enough beams hear it, (n,).
+            Its nearest point, from the body origin along x and y [m], (n, 2); where there is one, (n,).
         """
         levels = picture[..., 0].astype(float)
-        count = levels.shape[1]
+        count, cells = levels.shape[1:]
         azimuth = self.sector * (0.5 - (np.arange(count) + 0.5) / count)
-        r = (levels.argmax(2) + 0.5) * self.bin_length
-        heard = (levels.max(2) >= self.least).astype(float)
-        x, y = r * np.cos(azimuth) + self.eye[0], r * np.sin(azimuth)
-        weight = heard
-        for _ in range(6):
-            total = np.maximum(weight.sum(1), 1e-9)
-            mean_x, mean_y = (weight * x).sum(1) / total, (weight * y).sum(1) / total
-            dy = y - mean_y[:, None]
-            slope = (weight * dy * x).sum(1) / np.maximum((weight * dy * dy).sum(1), 1e-9)
-            slope = np.clip(slope, -1.0, 1.0)
-            ahead = mean_x - slope * mean_y
-            rest = x - ahead[:, None] - slope[:, None] * y
-            weight = heard / (1.0 + (rest / 0.1) ** 2)
-        return np.column_stack([ahead, slope]), heard.sum(1) >= self.beams
+        rows = []
+        for _ in range(2):
+            cell = levels.argmax(2)
+            r = (cell + 0.5) * self.bin_length - self.behind
+            weight = r * (
+                levels.max(2) >= self.least
+            )  # the way along a side from beam to beam grows with the range
+            rows.append((r * np.cos(azimuth) + self.eye[0], r * np.sin(azimuth), weight))
+            levels = np.where(np.abs(np.arange(cells) - cell[..., None]) <= 3, 0.0, levels)
+        x, y, weight = (np.concatenate(parts, 1) for parts in zip(*rows, strict=True))
+        first, on = self.side(x, y, weight)
+        point, found = first.nearest, on.sum(1) >= self.echoes
+        for _ in range(2):
+            weight = np.where(on, 0.0, weight)
+            other, on = self.side(x, y, weight)
+            away = np.hypot(*other.nearest.T)
+            likely = (away < np.hypot(*point.T)) & (np.abs(away - before) < self.jump)
+            use = likely & (on.sum(1) >= self.echoes) & first.meets(other, self.reach)
+            point = np.where(use[:, None], other.nearest, point)
+        return point, found
+
+    def side(self, x: Array, y: Array, weight: Array) -> tuple[Side, Mask]:
+        """The straight side on which the greatest weight lies, and which points lie on it.
+
+        Args:
+            x: Of the points, from the body origin [m], (n, points).
+            y: Likewise.
+            weight: Likewise [-].
+        """
+        n, angles, step, rows = len(x), np.radians(np.arange(-48.0, 49.0, 3.0)), 0.05, 80
+        distance = x[..., None] * np.cos(angles) + y[..., None] * np.sin(angles)
+        row = np.clip(distance / step, 0, rows - 1).astype(int)
+        index = (np.arange(n)[:, None, None] * len(angles) + np.arange(len(angles))) * rows + row
+        votes = np.bincount(
+            index.ravel(), np.broadcast_to(weight[..., None], row.shape).ravel(), n * len(angles) * rows
+        ).reshape(n, len(angles), rows)
+        votes[..., 1:-1] = votes[..., :-2] + votes[..., 1:-1] + votes[..., 2:]
+        best = votes.reshape(n, -1).argmax(1)
+        angle, distance = angles[best // rows], (best % rows + 0.5) * step
+        for width in (0.15, 0.1, 0.1):
+            off = x * np.cos(angle)[:, None] + y * np.sin(angle)[:, None] - distance[:, None]
+            w = weight * np.maximum(1.0 - (off / width) ** 2, 0.0) ** 2
+            total = np.maximum(w.sum(1), 1e-9)
+            mean_x, mean_y = (w * x).sum(1) / total, (w * y).sum(1) / total
+            dx, dy = x - mean_x[:, None], y - mean_y[:, None]
+            spread = (w * (dx * dx - dy * dy)).sum(1)
+            angle = 0.5 * np.arctan2(-2.0 * (w * dx * dy).sum(1), -spread)  # of the normal
+            distance = mean_x * np.cos(angle) + mean_y * np.sin(angle)
+        off = x * np.cos(angle)[:, None] + y * np.sin(angle)[:, None] - distance[:, None]
+        on = (np.abs(off) < 0.12) & (weight > 0.0)
+        along = y * np.cos(angle)[:, None] - x * np.sin(angle)[:, None]
+        right = np.sort(np.where(on, along, np.inf), 1)[:, 3]  # not the last: one fish may lie on the line
+        left = -np.sort(np.where(on, -along, np.inf), 1)[:, 3]
+        return Side(angle, distance, right, left), on
 
 
 class BaselineError(ValueError):

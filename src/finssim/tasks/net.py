@@ -10,6 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.engine.state import State
+from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.seeing import SeeingTask, up
 from finssim.tasks.sight import Picture
@@ -29,51 +30,150 @@ FOOT = 6.9
 """Depth of the sinker tube along the net's foot, in the site `net` [m]."""
 RANGE_SCALE = 0.5
 """The range below less the set height is divided by this in the observation [m]."""
+BLEND = wp.constant(0.05)
+"""Two sides of the net are nearly as near where their distances differ by less than about this [m]."""
+AHEAD = (0.0, 0.5, 1.0)
+"""The teacher sees the line so far to the left along the net [m]."""
 
 
 @wp.func
-def by_net(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec3:
-    """A point in the net's axes: x towards the net, in which it lies at 0, y along it to the left, z up [m]."""
-    return wp.quat_rotate_inv(arrays.goal_quaternion[w], x - arrays.goal_position[w])
+def by_net(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec4:
+    """Where a point is by the net: way to its nearest point along x and y of the goal's axes, height z [m], and the
+    heading that faces the net there [rad].
+
+    The net hangs straight down along the line through `reference`; its first and last side go on without end. Where
+    two sides are nearly as near, the heading is between those that face the two.
+    """
+    place = wp.quat_rotate_inv(arrays.goal_quaternion[w], x - arrays.goal_position[w])
+    last = arrays.reference.position.shape[1] - 2
+    way = wp.vec2(1.0e9, 0.0)
+    for k in range(last + 1):
+        r = to_side(arrays, w, k, last, place)
+        if wp.length(r) < wp.length(way):
+            way = r
+    facing = wp.vec2(0.0)
+    for k in range(last + 1):
+        r = to_side(arrays, w, k, last, place)
+        facing += wp.exp((wp.length(way) - wp.length(r)) / BLEND) * wp.normalize(r)
+    return wp.vec4(way[0], way[1], place[2], wp.atan2(facing[1], facing[0]))
 
 
 @wp.func
-def place_now(state: State, arrays: TaskArrays, w: int) -> wp.vec3:
+def to_side(arrays: TaskArrays, w: int, k: int, last: int, place: wp.vec3) -> wp.vec2:
+    """From a point to the nearest of one of the net's sides, along x and y of the goal's axes [m]."""
+    a = arrays.reference.position[w, k]
+    d = arrays.reference.position[w, k + 1] - a
+    side = wp.vec2(d[0], d[1])
+    r = wp.vec2(place[0] - a[0], place[1] - a[1])
+    t = wp.dot(r, side) / wp.dot(side, side)
+    if k > 0:
+        t = wp.max(t, 0.0)
+    if k < last:
+        t = wp.min(t, 1.0)
+    return t * side - r
+
+
+@wp.func
+def place_now(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
     """`by_net` of the vehicle."""
     return by_net(arrays, w, state.position[w, 0])
 
 
 @wp.func
-def way_to_line(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
-    """To the line along the net at the set distance and height, beside the vehicle, body frame [m]."""
-    place = by_net(arrays, w, arrays.position[w, 0])
-    way = wp.vec3(-p.distance - place[0], 0.0, p.level - place[2])
-    return wp.quat_rotate_inv(arrays.quaternion[w, 0], wp.quat_rotate(arrays.goal_quaternion[w], way))
+def distance_now(place: wp.vec4) -> float:
+    """From the net [m]."""
+    return wp.length(wp.vec2(place[0], place[1]))
 
 
 @wp.func
-def touches(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -> bool:
-    """Whether the vehicle's envelope reaches what grows on the net."""
+def facing(arrays: TaskArrays, w: int, place: wp.vec4) -> wp.quat:
+    """Attitude that faces the net, to world."""
+    return arrays.goal_quaternion[w] * wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), place[3])
+
+
+@wp.func
+def ahead(arrays: TaskArrays, p: Any, w: int, k: int) -> vec6:
+    """Of the line along the net, `ahead` [k] to the left of the vehicle: the way there [m], and where it faces, body
+    frame."""
+    x = arrays.position[w, 0]
+    left = wp.quat_rotate(facing(arrays, w, by_net(arrays, w, x)), wp.vec3(0.0, 1.0, 0.0))
+    x += p.ahead[k] * left
+    place = by_net(arrays, w, x)
+    short = 1.0 - p.distance / distance_now(place)
+    rest = wp.vec3(short * place[0], short * place[1], p.level - place[2])
+    way = x + wp.quat_rotate(arrays.goal_quaternion[w], rest) - arrays.position[w, 0]
+    nose = wp.quat_rotate(facing(arrays, w, place), wp.vec3(1.0, 0.0, 0.0))
+    r = wp.quat_rotate_inv(arrays.quaternion[w, 0], way)
+    n = wp.quat_rotate_inv(arrays.quaternion[w, 0], nose)
+    return vec6(r[0], r[1], r[2], n[0], n[1], n[2])
+
+
+@wp.func
+def misfacing(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> float:
+    """Angle of the rotation from the vehicle's attitude to the one that faces the net [rad], in [0, π]."""
+    d = wp.quat_inverse(state.quaternion[w, 0]) * facing(arrays, w, place)
+    return 2.0 * wp.atan2(wp.length(wp.vec3(d[0], d[1], d[2])), wp.abs(d[3]))
+
+
+@wp.func
+def touches(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
+    """Whether the vehicle's envelope, seen from above, comes as near to a side as growth on the net stands out.
+
+    It does not where along one of these directions there is more between the two: the nearest way from the vehicle's
+    middle to the side, the side's normal, those of the envelope's own edges.
+    """
+    place = wp.quat_rotate_inv(arrays.goal_quaternion[w], state.position[w, 0] - arrays.goal_position[w])
     R = wp.quat_to_matrix(wp.quat_inverse(arrays.goal_quaternion[w]) * state.quaternion[w, 0])
-    reach = wp.abs(R[0, 0]) * p.half[0] + wp.abs(R[0, 1]) * p.half[1] + wp.abs(R[0, 2]) * p.half[2]
-    return place[0] + reach + p.growth > 0.0
+    last = arrays.reference.position.shape[1] - 2
+    touched = bool(False)
+    for k in range(last + 1):
+        a = arrays.reference.position[w, k]
+        d = arrays.reference.position[w, k + 1] - a
+        apart = float(-1.0e9)
+        for i in range(5):
+            u = to_side(arrays, w, k, last, place)
+            if i == 1:
+                u = wp.vec2(d[1], -d[0])
+            elif i > 1:
+                u = wp.vec2(R[1, i - 2], -R[0, i - 2])
+            size = wp.length(u)
+            if size > 1.0e-6:
+                u /= size
+                near = u[0] * (a[0] - place[0]) + u[1] * (a[1] - place[1])
+                far = near + u[0] * d[0] + u[1] * d[1]
+                reach = float(0.0)
+                for j in range(3):
+                    reach += wp.abs(u[0] * R[0, j] + u[1] * R[1, j]) * p.half[j]
+                apart = wp.max(apart, wp.max(wp.min(near, far), -wp.max(near, far)) - reach)
+        touched = touched or apart < p.growth
+    return touched
 
 
 @wp.func
-def pace(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
-    """1 at the set speed along the net, falling to 0 where it stands still, or is twice as fast."""
-    v = wp.quat_rotate_inv(arrays.goal_quaternion[w], world_velocity(state, w, 0))
-    return wp.max(1.0 - wp.abs(v[1] - p.speed) / p.speed, -1.0)
+def along_speed(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> float:
+    """Speed to the left along the net [m/s]."""
+    v = wp.quat_rotate_inv(facing(arrays, w, place), world_velocity(state, w, 0))
+    return v[1]
 
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """At rest before the net's right end, not quite on the line, turned a little; without a world it hangs anywhere."""
+    """At rest before the net's right side, not quite on the line, turned a little.
+
+    Without a world the net is drawn: it has any heading, and sides that meet at angles as those of the site do.
+    """
     rng = wp.rand_init(key, w)
     yaw = wp.randf(rng, -3.14159265, 3.14159265)
     if not p.placed:
         arrays.goal_position[w] = wp.vec3(0.0)
         arrays.goal_quaternion[w] = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
+        corner = wp.vec3(0.0, -p.sides[0], 0.0)
+        bend = float(0.0)
+        for k in range(4):
+            arrays.reference.position[w, k] = corner
+            if k < 3:
+                corner += p.sides[k] * wp.vec3(-wp.sin(bend), wp.cos(bend), 0.0)
+                bend += wp.randf(rng, -p.bend, p.bend)
     q = arrays.goal_quaternion[w]
     along = wp.randf(rng, p.begin[0], p.begin[1])
     off = wp.vec3(wp.randf(rng, -p.off, p.off) - p.distance, along, p.level + wp.randf(rng, -p.over, p.over))
@@ -102,7 +202,7 @@ class NetReward:
 
 @dataclass(frozen=True, kw_only=True)
 class Net(SeeingTask):
-    """Inspect the net of the site `net`, which hangs otherwise in each episode, from right to left.
+    """Inspect the net of the site `net`, which hangs otherwise in each episode, from right to left round its corners.
 
     The row of numbers holds attitude, velocity and the altimeter's range to what lies below, the tube at the net's
     foot; where the net is, the sonar's picture shows.
@@ -113,10 +213,20 @@ class Net(SeeingTask):
     title: ClassVar[str] = "inspect a net by sonar"
     action: ClassVar[str] = "wrench4"
     landmark: ClassVar[str] = "cage"
+    marks: ClassVar[tuple[str, ...]] = ("rope_0", "rope_1", "rope_2", "rope_3")
     ranges: ClassVar[tuple[str, ...]] = ("altimeter",)
     teacher: ClassVar[tuple[ObservationPart, ...]] = (
-        ObservationPart("way to the line along the net, body frame", 3, "m", term=way_to_line),
-        ObservationPart("net rotation relative to the body, first two columns", 6, "1", term="goal_columns"),
+        *(
+            ObservationPart(
+                f"way to the line {x:g} m along the net, and where it faces, body frame",
+                6,
+                "m, 1",
+                term=ahead,
+                index=k,
+            )
+            for k, x in enumerate(AHEAD)
+        ),
+        ObservationPart("up, body frame", 3, "1", term=up),
         *own_velocity(clip=2.0),
     )
     name: str = "net"
@@ -153,14 +263,19 @@ class Net(SeeingTask):
     """How far what grows on the net stands out [m]."""
     lost: float = 0.8
     """The line is lost so far from it [m]."""
-    begin: tuple[float, float] = (-3.6, -3.1)
-    """Along the net from its middle at the start [m], ..."""
+    begin: tuple[float, float] = (-2.6, -2.1)
+    """Along the net from its first corner at the start [m], ..."""
     off: float = 0.4
     """... nearer or farther, ..."""
     over: float = 0.3
     """... above or below the line [m] at most, ..."""
     turn: float = math.radians(15.0)
     """... turned from it by this at most [rad]."""
+    sides: tuple[float, float, float] = (3.0, 2.6, 3.6)
+    """Lengths of the net's sides from right to left, in the site `net` [m]."""
+    bend: float = math.radians(30.0)
+    """Two of them meet at an angle of at most this, to either side [rad]."""
+    ahead: tuple[float, float, float] = AHEAD
     reward: NetReward = field(default_factory=NetReward)
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Net":
@@ -173,6 +288,12 @@ class Net(SeeingTask):
         """z of the line [m]."""
         return self.height - FOOT
 
+    def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
+        """The net's ends and corners, goal axes: a flat one, until a world or `start` says otherwise."""
+        corners = np.zeros((worlds, len(self.marks), 3), np.float32)
+        corners[:, :, 1] = np.cumsum([-self.sides[0], *self.sides])
+        arrays.reference.position = wp.array(corners, dtype=wp.vec3, device=device)
+
     def success_rule(self) -> str:
         """See `Task`."""
         return (
@@ -181,9 +302,9 @@ class Net(SeeingTask):
         )
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """As every task's; success, its time [s], mean error of the distance [m], touched and lost 0 or 1."""
+        """As every task's; success, its time [s], way along the net and mean error of the distance [m], touched and
+        lost 0 or 1."""
         measured = super().metrics(arrays)
-        del measured["begun"]
         measured["error"] /= self.control_step * np.maximum(measured["length"], 1.0)
         return measured
 
@@ -194,18 +315,21 @@ class Net(SeeingTask):
             start=start,
             shared={
                 "place": place_now,
-                "e": "wp.length(wp.vec2(place[0] + p.distance, place[2] - p.level))",
-                "theta": "attitude_error",
+                "d": distance_now,
+                "along": along_speed,
+                "e": "wp.length(wp.vec2(d - p.distance, place[2] - p.level))",
+                "theta": misfacing,
             },
             meanings={
                 "near": f"1 on the line along the net, 1/e at {r.near_scale:.3g} m from it.",
                 "distance": "From the line along the net [m].",
                 "lost": f"More than {self.lost:g} m from the line along the net.",
-                "begun": "How far along the net the episode began [m].",
+                "pace": "1 at the set speed along the net, falling to 0 where it stands still, or is twice as fast.",
+                "way": "How far along the net the vehicle has come, at its distance from it [m].",
                 "error": "Error of the distance from the net, integrated over the episode [m s].",
             },
             rewards=(
-                RewardTerm("pace", pace, r.pace),
+                RewardTerm("pace", "wp.max(1.0 - wp.abs(along - p.speed) / p.speed, -1.0)", r.pace),
                 RewardTerm("near", "wp.exp(-e / p.reward.near_scale)", r.near),
                 RewardTerm("distance", "e", -r.distance),
                 RewardTerm("turn", "theta", -r.turn),
@@ -214,9 +338,9 @@ class Net(SeeingTask):
                 RewardTerm("rate", "turning", -r.rate),
             ),
             ends=(End("touched", touches, -r.loss), End("lost", "e > p.lost", -r.loss)),
-            inside="place[1] - begun >= p.way and error <= p.tolerance * arrays.time[w]",
+            inside="way >= p.way and error <= p.tolerance * arrays.time[w]",
             totals=(
-                Total("begun", "was", first="place[1]"),
-                Total("error", "was + p.control_step * wp.abs(place[0] + p.distance)"),
+                Total("way", "was + p.control_step * along"),
+                Total("error", "was + p.control_step * wp.abs(d - p.distance)"),
             ),
         )

@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.engine.simulator import Simulator
+from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.vehicles import Vehicle
@@ -18,6 +19,7 @@ from finssim.worlds.description import CameraDevice, RangeDevice, SonarDevice, d
 
 if TYPE_CHECKING:
     from finssim.tasks.task import Task
+    from finssim.worlds.layout import WorldLayout
 
 DRAWS = 1_000_003
 """Between the seeds of a world's draws from episode to episode."""
@@ -28,6 +30,18 @@ SETTLING = 3
 def first_draw(seed: int) -> int:
     """Seed of the draw of the first episode's worlds, from that of the environment."""
     return seed + DRAWS
+
+
+def put_goal(task: Task, layout: WorldLayout, arrays: TaskArrays) -> None:
+    """Put a task's goal where its landmark stands in each world, and the reference where its marks do."""
+    pose = layout.poses(task.landmark)
+    arrays.goal_position.assign(np.float32(pose[:, :3]))
+    arrays.goal_quaternion.assign(np.float32(pose[:, 3:]))
+    if task.marks:
+        places = [
+            quat_inverse_rotate(pose[:, 3:], layout.poses(name)[:, :3] - pose[:, :3]) for name in task.marks
+        ]
+        arrays.reference.position.assign(np.float32(np.stack(places, axis=1)))
 
 
 @dataclass(frozen=True)
@@ -170,9 +184,7 @@ class Sight:
         self._episodes[mask] += 1
         seeds = first_draw(self.seed) + DRAWS * (self._episodes - 1)
         self.batch.draw(seeds, mask, held_out=self._task.held_out)
-        pose = self.batch.poses(self._task.landmark).astype(np.float32)
-        self._arrays.goal_position.assign(np.ascontiguousarray(pose[:, :3]))
-        self._arrays.goal_quaternion.assign(np.ascontiguousarray(pose[:, 3:]))
+        put_goal(self._task, self.batch, self._arrays)
 
     def begin(self, mask: NDArray[np.bool_]) -> None:
         """Take the first pictures of the episodes that have begun where mask is true, (worlds,)."""

@@ -62,6 +62,8 @@ class Task:
     """Altimeters and rangefinders of the vehicle's `perception` whose range the row has, as `arrays.ranges[w, i]`."""
     landmark: ClassVar[str] = ""
     """Object of the world whose pose is the goal's."""
+    marks: ClassVar[tuple[str, ...]] = ()
+    """Objects whose places in the goal's axes stand in `reference.position`, one after the other."""
     held_out: ClassVar[bool] = False
     """Whether the looks of the world are drawn that are held out of training."""
     teacher: ClassVar[tuple[ObservationPart, ...]] = ()
