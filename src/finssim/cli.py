@@ -98,8 +98,8 @@ def main() -> None:
     sys.exit(boundary.run(app, sys.argv[1:]))
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(requested: bool) -> None:
+    if requested:
         typer.echo(f"finssim {__version__}")
         raise typer.Exit
 

@@ -100,21 +100,23 @@ class Option:
         else:
             flag = "--json" if self.name == "as_json" else f"--{self.name.replace('_', '-')}"
             info = typer.Option(*(named or [flag]), **about)
-        where = inspect.Parameter.KEYWORD_ONLY
-        return inspect.Parameter(self.name, where, default=default, annotation=Annotated[kind, info])
+        kind_of_parameter = inspect.Parameter.KEYWORD_ONLY
+        return inspect.Parameter(
+            self.name, kind_of_parameter, default=default, annotation=Annotated[kind, info]
+        )
 
-    def value(self, given: Any) -> Any:
+    def value(self, typed: Any) -> Any:
         """What the function is called with.
 
         Raises:
             BadParameter: A number without bounds that is not finite, or beyond any quantity.
         """
-        if given is None:
+        if typed is None:
             return self.default
-        if isinstance(given, float) and not abs(given) <= LARGEST:
-            expected = f"{given:g} is not a number from {-LARGEST:g} to {LARGEST:g}."
+        if isinstance(typed, float) and not abs(typed) <= LARGEST:
+            expected = f"{typed:g} is not a number from {-LARGEST:g} to {LARGEST:g}."
             raise typer.BadParameter(expected, param_hint=f"'--{self.name.replace('_', '-')}'")
-        return tuple(word.strip() for word in given.split(",")) if "," in self.notes else given
+        return tuple(word.strip() for word in typed.split(",")) if "," in self.notes else typed
 
 
 @dataclass(frozen=True)
@@ -135,21 +137,21 @@ class Definition:
         for maker in self.made.values():
             yield from maker.options
 
-    def values(self, given: Mapping[str, Any]) -> dict[str, Any]:
+    def values(self, typed: Mapping[str, Any]) -> dict[str, Any]:
         """Parameter -> what it is called with, of what was typed."""
-        values = {option.name: option.value(given[option.name]) for option in self.options}
-        return values | {name: maker.call(given) for name, maker in self.made.items()}
+        values = {option.name: option.value(typed[option.name]) for option in self.options}
+        return values | {name: maker.call(typed) for name, maker in self.made.items()}
 
-    def call(self, given: Mapping[str, Any], *words: str) -> Any:
+    def call(self, typed: Mapping[str, Any], *extra: str) -> Any:
         """Call it with what was typed."""
-        values = self.values(given)
+        values = self.values(typed)
         positional = [values.pop(option.name) for option in self.options if option.positional]
-        return loaded(self.place)(*positional, *words, **values)
+        return loaded(self.place)(*positional, *extra, **values)
 
 
-def loaded(place: str) -> Callable[..., Any]:
+def loaded(path: str) -> Callable[..., Any]:
     """The function; Warp starts silently where its module needs it."""
-    module, _, name = place.partition(":")
+    module, _, name = path.partition(":")
     function: Callable[..., Any] = getattr(import_module(module), name)
     if "warp" in sys.modules:
         from finssim.quiet import start_warp
@@ -159,27 +161,27 @@ def loaded(place: str) -> Callable[..., Any]:
 
 
 @cache
-def read(place: str) -> Definition:
+def read(path: str) -> Definition:
     """Read a function, or a dataclass of settings, from its source."""
-    module, _, name = place.partition(":")
+    module, _, name = path.partition(":")
     source = (ROOT / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8")
     start = re.search(rf"^(def {name}\(|class {name}[(:])", source, re.MULTILINE)
-    assert start is not None, place
+    assert start is not None, path
     text = re.split(r"\n(?=[^\s)#])", source[start.start() :], maxsplit=1)[0]
     (node,) = ast.parse(text).body
     assert isinstance(node, ast.FunctionDef | ast.ClassDef)
     about = inspect.cleandoc(ast.get_docstring(node) or "")
     helps = _helps(about)
-    taken = _fields(node) if isinstance(node, ast.ClassDef) else _arguments(node, helps)
-    options, made = [], {}
-    for argument, annotation, default, positional, (metavar, words) in taken:
+    arguments = _fields(node) if isinstance(node, ast.ClassDef) else _arguments(node, helps)
+    options, makers = [], {}
+    for argument, annotation, default, positional, (metavar, help_text) in arguments:
         kind, many, notes = _kind(annotation)
         if kind in MAKERS:
-            made[argument] = read(MAKERS[kind])
+            makers[argument] = read(MAKERS[kind])
         elif kind is not None and "python" not in notes:
             value = inspect.Parameter.empty if default is None else _literal(default, source)
-            words = words or (JSON if argument == "as_json" else "")
-            options.append(Option(argument, kind, many, positional, value, notes, metavar, words))
+            help_text = help_text or (JSON if argument == "as_json" else "")
+            options.append(Option(argument, kind, many, positional, value, notes, metavar, help_text))
     rest = node.args.kwarg.arg if isinstance(node, ast.FunctionDef) and node.args.kwarg else ""
     reference = re.match(r"As of ([\w.]+)\.(\w+)(?:, without ([\w, ]+))?", helps.get(rest, (None, ""))[1])
     if isinstance(node, ast.FunctionDef) and reference is not None:
@@ -187,10 +189,10 @@ def read(place: str) -> Definition:
         names = {argument.arg for argument in node.args.args + node.args.kwonlyargs}
         names |= set((reference[3] or "").split(", "))
         options += [option for option in further.options if option.name not in names]
-        made |= {name: maker for name, maker in further.made.items() if name not in names}
-    shown = re.split(r"\n(?:Args|Returns|Raises|Note):\n", about)[0].replace("`", "")
+        makers |= {name: maker for name, maker in further.made.items() if name not in names}
+    lines_of_help = re.split(r"\n(?:Args|Returns|Raises|Note):\n", about)[0].replace("`", "")
     extra = isinstance(node, ast.FunctionDef) and node.args.vararg is not None
-    return Definition(place, shown, tuple(options), made, extra)
+    return Definition(path, lines_of_help, tuple(options), makers, extra)
 
 
 Help = tuple[str | None, str]
@@ -200,10 +202,14 @@ Taken = Iterator[tuple[str, ast.expr | None, ast.expr | None, bool, Help]]
 
 
 def _arguments(function: ast.FunctionDef, helps: Mapping[str, Help]) -> Taken:
-    taken = function.args
-    defaults = [*[None] * (len(taken.args) - len(taken.defaults)), *taken.defaults, *taken.kw_defaults]
-    for k, (a, default) in enumerate(zip([*taken.args, *taken.kwonlyargs], defaults, strict=True)):
-        yield a.arg, a.annotation, default, k < len(taken.args), helps.get(a.arg, (None, ""))
+    arguments = function.args
+    defaults = [
+        *[None] * (len(arguments.args) - len(arguments.defaults)),
+        *arguments.defaults,
+        *arguments.kw_defaults,
+    ]
+    for k, (a, default) in enumerate(zip([*arguments.args, *arguments.kwonlyargs], defaults, strict=True)):
+        yield a.arg, a.annotation, default, k < len(arguments.args), helps.get(a.arg, (None, ""))
 
 
 def _fields(settings: ast.ClassDef) -> Taken:
@@ -213,20 +219,20 @@ def _fields(settings: ast.ClassDef) -> Taken:
             text = ast.literal_eval(below.value) if isinstance(below, ast.Expr) else ""
             match = re.match(r"(?:\((.*?)\) )?(.*)", text, re.DOTALL)
             assert match is not None
-            words = " ".join(match[2].replace("`", "").split())
-            yield field.target.id, field.annotation, field.value, False, (match[1], words)
+            help_text = " ".join(match[2].replace("`", "").split())
+            yield field.target.id, field.annotation, field.value, False, (match[1], help_text)
 
 
 def _helps(about: str) -> dict[str, Help]:
     """Argument -> its METAVAR, if it has one, and its words."""
     section = re.search(r"^Args:\n((?: .*\n?|\n(?= ))*)", about, re.MULTILINE)
     entries = re.split(r"^ {4}(?=\w)", section[1], flags=re.MULTILINE)[1:] if section else []
-    found = {}
+    helps = {}
     for entry in entries:
         match = re.match(r"(\w+)(?: \((.*?)\))?:\s+(.*)", entry, re.DOTALL)
         assert match is not None, entry
-        found[match[1]] = (match[2], " ".join(match[3].replace("`", "").split()))
-    return found
+        helps[match[1]] = (match[2], " ".join(match[3].replace("`", "").split()))
+    return helps
 
 
 def _kind(annotation: ast.expr | None) -> tuple[Any, bool, tuple[Any, ...]]:
@@ -270,46 +276,46 @@ def command_app(commands: Mapping[str, Work], groups: Mapping[str, str], **setti
     """
     app = typer.Typer(**SETTINGS, **settings)
     apps: dict[str, typer.Typer] = {}
-    for words, what in commands.items():
-        first, _, last = words.partition(" ")
-        is_group = any(other.startswith(f"{words} ") for other in commands)
+    for name, work in commands.items():
+        first, _, last = name.partition(" ")
+        is_group = any(other.startswith(f"{name} ") for other in commands)
         if is_group or (last and first not in apps):
             apps[first] = typer.Typer(**SETTINGS, invoke_without_command=True)
             app.add_typer(apps[first], name=first)
-            handler = _handler(words, what, group=True) if is_group else _group(groups[first])
+            handler = _handler(name, work, group=True) if is_group else _group(groups[first])
             apps[first].callback()(handler)
         if not is_group:
-            handler = _handler(words, what)
+            handler = _handler(name, work)
             extra = getattr(handler, "definition").extra  # noqa: B009
             options = {"allow_extra_args": True, "ignore_unknown_options": True} if extra else None
             (apps[first] if last else app).command(last or first, context_settings=options)(handler)
     return app
 
 
-def _group(words: str) -> Callable[..., None]:
+def _group(title: str) -> Callable[..., None]:
     def show(context: typer.Context) -> None:
         if context.invoked_subcommand is None:
             typer.echo(context.get_help())
 
-    show.__doc__ = words
+    show.__doc__ = title
     show.__annotations__ = {"context": typer.Context, "return": None}
     return show
 
 
-def _handler(words: str, what: Work, *, group: bool = False) -> Callable[..., Any]:
+def _handler(name: str, work: Work, *, group: bool = False) -> Callable[..., Any]:
     """A function with the signature that Typer reads, which calls the one that is meant."""
-    experiment = what if isinstance(what, Experiment) else None
-    definition = read(experiment.work if experiment else str(what))
+    experiment = work if isinstance(work, Experiment) else None
+    definition = read(experiment.work if experiment else str(work))
     options = list(definition.all_options())
     if experiment is not None:
         options.append(Option("as_json", bool, False, False, False, (), None, JSON))
 
-    def handle(context: typer.Context, **given: Any) -> Any:
+    def handle(context: typer.Context, **typed: Any) -> Any:
         if group and context.invoked_subcommand is not None:
             return None
         if experiment is not None:
-            return _experiment(words, definition, given)
-        return _status(definition.call(given, *(context.args if definition.extra else ())))
+            return _experiment(name, definition, typed)
+        return _status(definition.call(typed, *(context.args if definition.extra else ())))
 
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
     parameters = [context, *(option.parameter() for option in options)]
@@ -320,13 +326,13 @@ def _handler(words: str, what: Work, *, group: bool = False) -> Callable[..., An
     return handle
 
 
-def _experiment(words: str, definition: Definition, given: Mapping[str, Any]) -> int:
+def _experiment(name: str, definition: Definition, typed: Mapping[str, Any]) -> int:
     from finssim.experiments.campaign import run_experiment
 
-    place = definition.place
-    work, tables = loaded(place), loaded(f"{place.partition(':')[0]}:tables_of")
-    options = {"bar": given.get("robot") is None, "as_json": given["as_json"]}
-    return _status(run_experiment(words, work, tables, **options, **definition.values(given)))
+    path = definition.place
+    work, tables = loaded(path), loaded(f"{path.partition(':')[0]}:tables_of")
+    options = {"bar": typed.get("robot") is None, "as_json": typed["as_json"]}
+    return _status(run_experiment(name, work, tables, **options, **definition.values(typed)))
 
 
 def _status(result: Any) -> int:

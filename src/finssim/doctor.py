@@ -109,12 +109,12 @@ def doctor(*, as_json: bool = False) -> int:
 
     Example: finssim doctor
     """
-    found = examine()
+    report = examine()
     if as_json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(report, indent=2))
     else:
-        _print(found)
-    return 0 if found["healthy"] else 1
+        _print(report)
+    return 0 if report["healthy"] else 1
 
 
 def examine() -> dict[str, Any]:
@@ -177,33 +177,33 @@ def _devices() -> list[dict[str, Any]]:
             answer.update(works=False, detail=" ".join(str(error).split()) or type(error).__name__)
         return answer
 
-    found = [attempt(device) for device in wp.get_devices()]
+    attempts = [attempt(device) for device in wp.get_devices()]
     if not wp.is_cuda_available():
-        found.append({"name": "cuda", "works": False, "detail": "no NVIDIA GPU or driver found"})
-    return found
+        attempts.append({"name": "cuda", "works": False, "detail": "no NVIDIA GPU or driver found"})
+    return attempts
 
 
-def _print(found: dict[str, Any]) -> None:
+def _print(report: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
-    machine = found["machine"]
+    machine = report["machine"]
     console.print(
         f"Python {machine['python']} on {machine['system']}, {machine['cores']} cores", highlight=False
     )
     table = Table(box=None, pad_edge=False)
     for heading in ("", "state", "what it is for, or found"):
         table.add_column(heading, overflow="fold")
-    for name, version in found["core"].items():
+    for name, version in report["core"].items():
         table.add_row(
             name, version or "[red]missing[/]", "needed: pip install finssim" if version is None else "core"
         )
-    for device in found["devices"]:
+    for device in report["devices"]:
         absent = device["name"] == "cuda"
         state = "[green]works[/]" if device["works"] else ("absent" if absent else "[red]fails[/]")
         table.add_row(f"device {device['name']}", state, device["detail"].replace("[", r"\["))
-    for name, extra in found["extras"].items():
+    for name, extra in report["extras"].items():
         missing = "missing" if extra["missing"] else "[green]complete[/]"
         table.add_row(f"extra {name}", missing, extra["enables"])
         if extra["versions"]:
@@ -211,9 +211,9 @@ def _print(found: dict[str, Any]) -> None:
                 "", "", "[dim]" + ", ".join(f"{k} {v}" for k, v in extra["versions"].items()) + "[/]"
             )
         if extra["missing"]:
-            wanted = ", ".join(extra["missing"])
-            table.add_row("", "", f"without {wanted}: pip install 'finssim\\[{name}]'")
+            missing_text = ", ".join(extra["missing"])
+            table.add_row("", "", f"without {missing_text}: pip install 'finssim\\[{name}]'")
     console.print(table)
     console.print(
-        "ready" if found["healthy"] else "[red]not ready: the core does not work[/]", highlight=False
+        "ready" if report["healthy"] else "[red]not ready: the core does not work[/]", highlight=False
     )

@@ -54,7 +54,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         OutputError: The target is a directory or a device, or the system refused to write.
     """
     target = Path(os.path.realpath(path))
-    with _one_sentence(target, shown=path):
+    with _one_sentence(target, label=path):
         if target.is_dir():
             raise OutputError(f"cannot write {path}: it is a directory: give a file name")
         if target.exists() and not target.is_file():
@@ -91,7 +91,7 @@ def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = Non
         OutputError: The target is a file or holds other files, or the system refused to write.
     """
     target = Path(os.path.realpath(path))
-    with _one_sentence(target, shown=path):
+    with _one_sentence(target, label=path):
         _refuse_foreign(target, path, replaces)
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = _beside(target)
@@ -108,7 +108,7 @@ def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = Non
         _flush(target.parent)
 
 
-def plain_name(name: str, where: str, error: type[Exception]) -> str:
+def plain_name(name: str, subject: str, error: type[Exception]) -> str:
     """A name that came from data, where it becomes part of a path: it stands for one file or folder in one place.
 
         file = folder / f"{plain_name(name, 'run.mcap: vehicle', ViewError)}.yaml"
@@ -118,7 +118,7 @@ def plain_name(name: str, where: str, error: type[Exception]) -> str:
 
     Args:
         name: From a file, a record, a message or another machine.
-        where: What is named and by whom; the message begins with it.
+        subject: What is named and by whom; the message begins with it.
         error: Class of the refusal.
 
     Returns:
@@ -129,8 +129,8 @@ def plain_name(name: str, where: str, error: type[Exception]) -> str:
     """
     reason = _no_plain_name(name)
     if reason:
-        shown = repr(name if len(name) <= 60 else f"{name[:57]}...")
-        raise error(f"{where} {shown} {reason}, expected the plain name of a file or folder: rename it")
+        quoted = repr(name if len(name) <= 60 else f"{name[:57]}...")
+        raise error(f"{subject} {quoted} {reason}, expected the plain name of a file or folder: rename it")
     return name
 
 
@@ -157,32 +157,32 @@ class _Probe(Exception):
     """Leaves an atomic output without making it."""
 
 
-def refuse_unwritable(place: AbstractContextManager[Path]) -> None:
+def refuse_unwritable(writer: AbstractContextManager[Path]) -> None:
     """Refuse a place that cannot be written before long work, not after it; nothing is written.
 
         refuse_unwritable(atomic_directory("runs/hold", replaces="policy.yaml"))
 
     Args:
-        place: An `atomic_write` or `atomic_directory` that has not been entered.
+        writer: An `atomic_write` or `atomic_directory` that has not been entered.
 
     Raises:
         OutputError: As the place says.
     """
     try:
-        with place:
+        with writer:
             raise _Probe
     except _Probe:
         pass
 
 
-def _refuse_foreign(target: Path, shown: str | os.PathLike[str], replaces: str | None) -> None:
+def _refuse_foreign(target: Path, label: str | os.PathLike[str], replaces: str | None) -> None:
     if not target.exists():
         return
     if not target.is_dir():
-        raise OutputError(f"cannot write {shown}: it is a file: give a directory name")
+        raise OutputError(f"cannot write {label}: it is a file: give a directory name")
     ours = replaces is not None and (target / replaces).is_file()
     if not ours and any(target.iterdir()):
-        raise OutputError(f"cannot write {shown}: the directory already holds files: give a new or empty one")
+        raise OutputError(f"cannot write {label}: the directory already holds files: give a new or empty one")
 
 
 def _take_the_place(target: Path, temporary: Path) -> None:
@@ -223,7 +223,7 @@ def _flush(path: Path) -> None:
 
 
 @contextmanager
-def _one_sentence(target: Path, *, shown: str | os.PathLike[str]) -> Iterator[None]:
+def _one_sentence(target: Path, *, label: str | os.PathLike[str]) -> Iterator[None]:
     """Turn the system's refusals to write under the target's directory into one `OutputError`."""
     try:
         yield
@@ -232,7 +232,7 @@ def _one_sentence(target: Path, *, shown: str | os.PathLike[str]) -> Iterator[No
     except OSError as error:
         if error.errno not in _WHAT_TO_DO or not _about_output(error, target):
             raise
-        raise OutputError(f"cannot write {shown}: {_WHAT_TO_DO[error.errno]}") from error
+        raise OutputError(f"cannot write {label}: {_WHAT_TO_DO[error.errno]}") from error
 
 
 def _about_output(error: OSError, target: Path) -> bool:

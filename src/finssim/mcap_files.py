@@ -228,20 +228,20 @@ def mcap_metadata(path: Path, name: str) -> dict[str, str]:
             if kind != METADATA:
                 file.seek(length, 1)
                 continue
-            words = _words(file.read(length))
-            if len(words) % 2 and words[0] == name:
-                return dict(zip(words[1::2], words[2::2], strict=True))
+            strings = _words(file.read(length))
+            if len(strings) % 2 and strings[0] == name:
+                return dict(zip(strings[1::2], strings[2::2], strict=True))
     return {}
 
 
 def _words(data: bytes) -> list[str]:
     """The name, and keys and values by turns; as many as the data hold."""
-    found, at = [], 0
+    strings, at = [], 0
     while at + 4 <= len(data):
         (length,) = struct.unpack_from("<I", data, at)
         at += 4
-        found.append(data[at : at + length].decode("utf-8", errors="replace"))
+        strings.append(data[at : at + length].decode("utf-8", errors="replace"))
         at += length
-        if len(found) == 1:
+        if len(strings) == 1:
             at += 4  # the length of the whole table
-    return found
+    return strings

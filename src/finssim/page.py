@@ -108,12 +108,12 @@ class Page:
 
     def pictures(self, pictures: Pictures) -> None:
         """Every picture below what it shows."""
-        shown = ""
+        last_text = ""
         for name, (text, data) in pictures.items():
-            if text != shown:
+            if text != last_text:
                 self.heading(text)
             self._add(html_picture(data, text), f"![{text}]({name})")
-            shown = text
+            last_text = text
 
     def code(self, heading: str, lines: Sequence[str]) -> None:
         """A section of lines as they are."""

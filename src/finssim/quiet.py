@@ -60,11 +60,11 @@ def _tell(line: str) -> None:
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
     """Nothing written to the process's standard error, by native code either, while the block runs."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(saved, 2)
+        os.close(saved)
         os.close(nowhere)

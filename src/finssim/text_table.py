@@ -77,13 +77,13 @@ def read_text(path: str | os.PathLike[str], error: type[Exception]) -> tuple[str
         raw = Path(path).read_bytes()
     except OSError as reason:
         raise error(f"{path}: cannot be read: {reason.strerror or reason}") from None
-    whole = raw.split(b"\0", 1)[0]
+    intact = raw.split(b"\0", 1)[0]
     try:
-        text = whole.decode("utf-8-sig")
+        text = intact.decode("utf-8-sig")
     except UnicodeDecodeError:  # spreadsheets write µ and ± in one byte; what holds control bytes is no text
-        codec = "utf-8-sig" if re.search(rb"[\x01-\x08\x0e-\x1f\x7f]", whole) else "latin-1"
-        text = whole.decode(codec, errors="replace")
-    return text, len(whole) < len(raw)
+        codec = "utf-8-sig" if re.search(rb"[\x01-\x08\x0e-\x1f\x7f]", intact) else "latin-1"
+        text = intact.decode(codec, errors="replace")
+    return text, len(intact) < len(raw)
 
 
 def read_text_table(

@@ -38,17 +38,17 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         return whole_number(text) if kind == "int" else float(re.sub(r"\.(?=[a-zA-Z])", "", text))
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: set[Any] = set()
+        keys: set[Any] = set()
         for key_node, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             key = self.construct_object(key_node, deep=True)
             problem = None
             if not isinstance(key, Hashable):
                 problem = f"a key is a {type(key).__name__}, expected a word"
-            elif key in seen:
+            elif key in keys:
                 problem = f"key '{key}' is given twice"
             if problem:
                 raise yaml.constructor.ConstructorError(None, None, problem, key_node.start_mark)
-            seen.add(key)
+            keys.add(key)
         return super().construct_mapping(node, deep)  # type: ignore[no-any-return]
 
 
@@ -186,7 +186,7 @@ def read_mapping(
     refuse: type[Exception],
     *,
     such_as: str,
-    shown: str | None = None,
+    label: str | None = None,
     cleaned: Callable[[str], str] = str,
 ) -> dict[Any, Any]:
     """The mapping that a YAML file holds.
@@ -195,13 +195,13 @@ def read_mapping(
         path: The file.
         refuse: Class of the error, made from one sentence.
         such_as: An example of what the file should hold, for that sentence.
-        shown: How the sentence calls the file; its path where not given.
+        label: How the sentence calls the file; its path where not given.
         cleaned: Makes standard YAML of the text of a dialect.
 
     Raises:
         refuse: The file is missing or unreadable, not text, malformed, or holds no mapping.
     """
-    name = str(path) if shown is None else shown
+    name = str(path) if label is None else label
     try:
         with path.open("rb") as file:
             data = file.read(LONGEST + 1)
@@ -220,8 +220,8 @@ def read_mapping(
     except yaml.YAMLError as error:
         raise refuse(f"{name}: not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(tree, dict):
-        found = "nothing" if tree is None else f"a {type(tree).__name__}"
-        raise refuse(f"{name}: expected keys such as '{such_as}', found {found}")
+        actual = "nothing" if tree is None else f"a {type(tree).__name__}"
+        raise refuse(f"{name}: expected keys such as '{such_as}', found {actual}")
     return tree
 
 
@@ -232,5 +232,5 @@ def first_problem(error: Any) -> str:
         error: A `pydantic.ValidationError`.
     """
     problem = error.errors()[0]
-    where, what = ".".join(map(str, problem["loc"])), str(problem["msg"]).removeprefix("Value error, ")
-    return f"{where}: {what}" if where else what
+    location, message = ".".join(map(str, problem["loc"])), str(problem["msg"]).removeprefix("Value error, ")
+    return f"{location}: {message}" if location else message

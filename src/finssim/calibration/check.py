@@ -48,43 +48,43 @@ def told_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> list[s
         report.name
         for report in reports
         if report.verdict != "refused" and report.role != "held-out"
-        for found in report.axes
-        if found.axis == axis and parameter in found.tells and found.tells[parameter].can
+        for axis_report in report.axes
+        if axis_report.axis == axis and parameter in axis_report.tells and axis_report.tells[parameter].can
     ]
 
 
 def together(reports: Sequence[TrialReport]) -> list[Finding]:
     """Findings about the set."""
-    found = []
+    findings = []
     vehicles = {report.vehicle for report in reports if report.vehicle}
     if len(vehicles) > 1:
-        found.append(finding("several_vehicles", vehicles=tuple(sorted(vehicles))))
+        findings.append(finding("several_vehicles", vehicles=tuple(sorted(vehicles))))
     names = [report.name for report in reports]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        found.append(finding("equal_names", names=tuple(twice)))
+        findings.append(finding("equal_names", names=tuple(twice)))
     good = [report for report in reports if report.verdict != "refused"]
     if reports and not good:
-        found.append(finding("none_usable"))
-        return found
+        findings.append(finding("none_usable"))
+        return findings
     held_out = [report.name for report in good if report.role == "held-out"]
     if held_out and len(held_out) == len(good):
-        found.append(finding("all_held_out"))
+        findings.append(finding("all_held_out"))
     elif not held_out and len(good) > 1:
-        found.append(finding("none_held_out"))
+        findings.append(finding("none_held_out"))
     fitting = len(good) - len(held_out)
     if 0 < fitting < 5:
-        found.append(finding("few_trials", trials=fitting))
-    found += _late(good)
+        findings.append(finding("few_trials", trials=fitting))
+    findings += _late(good)
     nothing = [a for a in AXES if not any(told_by(reports, a, parameter) for parameter in PARAMETERS)]
     if nothing and len(nothing) < len(AXES):
-        found.append(finding("axes_untold", axes=tuple(map(str, nothing))))
-    return found
+        findings.append(finding("axes_untold", axes=tuple(map(str, nothing))))
+    return findings
 
 
 def _late(reports: Sequence[TrialReport]) -> list[Finding]:
     """Streams that are late or early by the same time in three trials or more."""
-    found = []
+    findings = []
     for group in dict.fromkeys(group for report in reports for group in report.offsets):
         offsets = [report.offsets[group] for report in reports if group in report.offsets]
         seconds = np.array([offset["seconds"] for offset in offsets if offset["correlation"] > AGREE])
@@ -96,7 +96,7 @@ def _late(reports: Sequence[TrialReport]) -> list[Finding]:
             abs(middle) > max(LATE, 3.0 * spread / np.sqrt(len(seconds)))
             and np.mean(seconds * middle > 0.0) > 0.8
         ):
-            found.append(
+            findings.append(
                 finding(
                     "stream_offset_common",
                     group=group,
@@ -107,7 +107,7 @@ def _late(reports: Sequence[TrialReport]) -> list[Finding]:
                     seconds=middle,
                 )
             )
-    return found
+    return findings
 
 
 # What a check of trials says, as data.
@@ -198,13 +198,13 @@ class TrialReport:
     @property
     def verdict(self) -> Verdict:
         """By the worst finding."""
-        levels = {one.severity for one in self.findings}
+        levels = {finding_.severity for finding_ in self.findings}
         return "refused" if "refused" in levels else "usable with care" if "care" in levels else "usable"
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; numbers that are not finite become None."""
         record = {key: value for key, value in asdict(self).items() if key != "axes"}
-        record |= {"verdict": self.verdict, "findings": [one.as_json() for one in self.findings]}
+        record |= {"verdict": self.verdict, "findings": [entry.as_json() for entry in self.findings]}
         axes = {axis.axis: {k: v for k, v in asdict(axis).items() if k != "axis"} for axis in self.axes}
         return {**plain(record), "axes": plain(axes)}
 
@@ -229,8 +229,8 @@ def print_reports(reports: Sequence[TrialReport], console: Console, common: Sequ
         _print_trial(report, console, brief=len(reports) > MANY)
     if len(reports) > 1:
         _print_overview(reports, console)
-    for one in common:
-        console.print(f"{MARKS[one.severity]} {escape(str(one))}")
+    for entry in common:
+        console.print(f"{MARKS[entry.severity]} {escape(str(entry))}")
 
 
 def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
@@ -242,9 +242,9 @@ def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
         f"{', ' + escape(report.vehicle) if report.vehicle else ''}: [{colour}]{report.verdict}[/{colour}]"
     )
     grid = Table.grid(padding=(0, 1))
-    for one in sorted(report.findings, key=lambda f: SEVERITIES.index(f.severity)):
-        if not (brief and one.severity == "note"):
-            grid.add_row("", MARKS[one.severity], escape(str(one)))
+    for entry in sorted(report.findings, key=lambda f: SEVERITIES.index(f.severity)):
+        if not (brief and entry.severity == "note"):
+            grid.add_row("", MARKS[entry.severity], escape(str(entry)))
     if grid.row_count:
         console.print(grid, highlight=False)
     if brief:
@@ -257,11 +257,11 @@ def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
     console.print()
 
 
-def _table(heads: Sequence[str], left: Sequence[str], title: str | None = None) -> Table:
+def _table(heads: Sequence[str], left_aligned: Sequence[str], title: str | None = None) -> Table:
     """An empty table of columns, some of them to the left."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
     for name in heads:
-        table.add_column(name, justify="left" if name in left else "right", overflow="fold")
+        table.add_column(name, justify="left" if name in left_aligned else "right", overflow="fold")
     return table
 
 
@@ -308,18 +308,18 @@ def _tells(axes: Sequence[AxisReport], passive: bool) -> Table:
     grid = Table.grid(padding=(0, 1))
     for a in axes:
         # Of a passive trial it goes without saying that nothing is known of thrust.
-        shown = {n: t for n, t in a.tells.items() if t.can or not (passive and n in THRUST)}
+        displayed = {n: t for n, t in a.tells.items() if t.can or not (passive and n in THRUST)}
         by_reason: dict[tuple[bool, str], list[str]] = {}
-        for name, told in shown.items():
-            by_reason.setdefault((told.can, told.why), []).append(name)
+        for name, verdict in displayed.items():
+            by_reason.setdefault((verdict.can, verdict.why), []).append(name)
         if len(by_reason) == 1 and not next(iter(by_reason))[0]:
             grid.add_row("", a.axis, f"[red]nothing[/red]: {escape(next(iter(by_reason))[1])}")
         elif by_reason:
             parts = [
-                f"[green]{', '.join(names)}[/green] ({escape(why)})"
+                f"[green]{', '.join(names)}[/green] ({escape(reason)})"
                 if can
-                else f"not {', '.join(names)} ({escape(why)})"
-                for (can, why), names in sorted(by_reason.items(), key=lambda item: not item[0][0])
+                else f"not {', '.join(names)} ({escape(reason)})"
+                for (can, reason), names in sorted(by_reason.items(), key=lambda item: not item[0][0])
             ]
             grid.add_row("", a.axis, "; ".join(parts))
     return grid
@@ -372,12 +372,12 @@ def stream_reports(trial: Trial) -> tuple[list[StreamReport], list[Finding]]:
     for names in shared.values():
         report = _report(trial, tuple(names))
         reports.append(report)
-        for one in _sampling(report):
-            of.setdefault(one, []).extend(names)
+        for entry in _sampling(report):
+            of.setdefault(entry, []).extend(names)
         for name in names:
-            for one in _values(trial, name):
-                of.setdefault(one, []).append(name)
-    findings += [one.about(listed(columns, 4)) for one, columns in of.items()]
+            for entry in _values(trial, name):
+                of.setdefault(entry, []).append(name)
+    findings += [entry.about(listed(columns, 4)) for entry, columns in of.items()]
     few = [name for name in trial.channels if not trial.has(name)]
     if few:
         findings.append(finding("few_samples", columns=tuple(few)))
@@ -407,20 +407,20 @@ def _report(trial: Trial, names: tuple[str, ...]) -> StreamReport:
 
 def _sampling(report: StreamReport) -> list[Finding]:
     """What is wrong with the times of a stream."""
-    found = []
+    findings = []
     much = report.missing > LONGEST_MISSING
     if report.gaps == 1:
-        found.append(finding("gap", severity="care" if much else "note", longest=report.longest_gap))
+        findings.append(finding("gap", severity="care" if much else "note", longest=report.longest_gap))
     elif report.gaps:
         severity = "care" if much else None
-        found.append(finding("gaps", severity=severity, gaps=report.gaps, longest=report.longest_gap))
+        findings.append(finding("gaps", severity=severity, gaps=report.gaps, longest=report.longest_gap))
     elif much:
-        found.append(finding("ends_missing", share=report.missing))
+        findings.append(finding("ends_missing", share=report.missing))
     if report.jitter > 0.5:
-        found.append(finding("jitter", share=report.jitter))
+        findings.append(finding("jitter", share=report.jitter))
     if report.rate < FEW_HERTZ and report.group in ("velocity", "rates"):
-        found.append(finding("slow", rate=report.rate))
-    return found
+        findings.append(finding("slow", rate=report.rate))
+    return findings
 
 
 def _values(trial: Trial, name: str) -> list[Finding]:
@@ -435,9 +435,9 @@ def _values(trial: Trial, name: str) -> list[Finding]:
         return [finding("constant", value=y[0])]
     if _coarse(y):
         return []
-    found = []
+    findings = []
     if name in ("z", "depth") and (above := float(np.percentile(y if name == "z" else -y, 99.0))) > FLYING:
-        found.append(
+        findings.append(
             finding("above_surface", height=above)
             if name == "z"
             else finding("depth_above_surface", height=above)
@@ -447,21 +447,21 @@ def _values(trial: Trial, name: str) -> list[Finding]:
     usual = float(np.median(lengths))
     rate = 1.0 / float(np.median(np.diff(t)))
     if usual >= 2.0:
-        found.append(finding("values_held", rows=usual, rate=rate / usual, row_rate=rate))
+        findings.append(finding("values_held", rows=usual, rate=rate / usual, row_rate=rate))
     longest = int(np.argmax(lengths))
     span = float(t[min(begins[longest] + lengths[longest], len(t) - 1)] - t[begins[longest]])
     if span > STUCK and lengths[longest] > 10.0 * usual:
         at = begins[longest]
-        found.append(finding("stuck", value=y[at], span=span, start=t[at]))
+        findings.append(finding("stuck", value=y[at], span=span, start=t[at]))
     for extreme, highest in ((y.max(), True), (y.min(), False)):
         # A signal that passes through its extreme touches it once.
         runs = lengths[y[begins] == extreme]
         if runs.sum() >= max(10.0, 0.02 * len(y)) and runs.max() >= 4.0 * usual:
             fields = {"value": extreme, "samples": runs.sum()}
-            found.append(
+            findings.append(
                 finding("clipped_above", **fields) if highest else finding("clipped_below", **fields)
             )
-    return found
+    return findings
 
 
 def _coarse(y: Array) -> bool:
@@ -478,22 +478,24 @@ OFTEN = 0.05
 
 def input_findings(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
     """What was assumed of the inputs, time at the limits, in the dead zones and beyond what the thrusters can give."""
-    found = list(inputs.findings)
+    findings = list(inputs.findings)
     if inputs.source == "passive":
-        return found
+        return findings
     if not np.any(inputs.force):
-        return [*found, finding("pulses_dead") if inputs.source == "pwm" else finding("inputs_zero")]
-    found += _wrench_beyond(vehicle, inputs) if not inputs.thrusters else _thrusters(trial, vehicle, inputs)
+        return [*findings, finding("pulses_dead") if inputs.source == "pwm" else finding("inputs_zero")]
+    findings += (
+        _wrench_beyond(vehicle, inputs) if not inputs.thrusters else _thrusters(trial, vehicle, inputs)
+    )
     if inputs.end is not None:
         rest = trial.t[-1] - inputs.end
-        found.append(finding("inputs_end", rest=rest, end=inputs.end - trial.t[0]))
+        findings.append(finding("inputs_end", rest=rest, end=inputs.end - trial.t[0]))
     if inputs.source == "pwm" and not trial.has("voltage") and trial.header.voltage is None:
-        found.append(finding("voltage_missing"))
-    return found
+        findings.append(finding("voltage_missing"))
+    return findings
 
 
 def _wrench_beyond(vehicle: Vehicle, inputs: Drive) -> list[Finding]:
-    found = []
+    findings = []
     for i, (axis, limit) in enumerate(zip(AXES, vehicle.wrench_limits, strict=True)):
         tau = np.abs(inputs.force[:, i])
         if not tau.any() or limit == 0.0:
@@ -508,20 +510,20 @@ def _wrench_beyond(vehicle: Vehicle, inputs: Drive) -> list[Finding]:
                 "share": beyond,
                 "axis": str(axis),
             }
-            found.append(
+            findings.append(
                 finding("command_beyond", **fields)
                 if inputs.commanded
                 else finding("wrench_beyond", **fields)
             )
-    return found
+    return findings
 
 
 def _thrusters(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
-    found = []
+    findings = []
     at_limit: list[str] = []
     slow: list[str] = []
     still: list[str] = []
-    asked = inputs.commanded and inputs.source != "pwm"
+    requested = inputs.commanded and inputs.source != "pwm"
     for name, force in zip(inputs.names, inputs.force.T, strict=True):
         thruster = vehicle.thrusters[name]
         driven = np.abs(force) > 0.0
@@ -536,15 +538,15 @@ def _thrusters(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
             at_limit.append(name)
         # Of measured speeds and of pulses the thrust is known down to nothing.
         rpm = thruster.speed(force) * 30.0 / np.pi
-        if asked and _in_dead_zone(rpm, thruster.dead_rpm_minus, thruster.dead_rpm_plus) > 0.2:
+        if requested and _in_dead_zone(rpm, thruster.dead_rpm_minus, thruster.dead_rpm_plus) > 0.2:
             slow.append(name)
     if at_limit:
-        found.append(finding("saturated", thrusters=tuple(at_limit), share=OFTEN))
+        findings.append(finding("saturated", thrusters=tuple(at_limit), share=OFTEN))
     if slow:
-        found.append(finding("in_dead_zone", thrusters=tuple(slow)))
+        findings.append(finding("in_dead_zone", thrusters=tuple(slow)))
     if still:
-        found.append(finding("never_pushed", thrusters=tuple(still)))
-    return found
+        findings.append(finding("never_pushed", thrusters=tuple(still)))
+    return findings
 
 
 def _in_dead_zone(rpm: Array, lowest: float, highest: float) -> float:
@@ -574,16 +576,16 @@ SLOW = 8.0
 
 def with_tells(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> AxisReport:
     """The report with what the axis tells."""
-    own = {"k": ("roll", "pitch"), "buoyancy": ("heave",)}
-    names = [name for name in PARAMETERS if report.axis in own.get(name, AXES)]
+    specific = {"k": ("roll", "pitch"), "buoyancy": ("heave",)}
+    names = [name for name in PARAMETERS if report.axis in specific.get(name, AXES)]
     if blocked := _blocked(report, inputs):
         return replace(report, tells={name: Told(can=False, why=blocked) for name in names})
-    tells = (
+    verdicts = (
         _passive_tells(report)
         if inputs.source == "passive"
         else _driven_tells(report, motion, inputs, vehicle)
     )
-    return replace(report, tells={name: Told(can=tells[name][0], why=tells[name][1]) for name in names})
+    return replace(report, tells={name: Told(can=verdicts[name][0], why=verdicts[name][1]) for name in names})
 
 
 def _blocked(report: AxisReport, inputs: Drive) -> str:
@@ -656,12 +658,12 @@ def _driven_tells(
         bias = "driven both ways"
     elif report.rests >= 1.0:
         bias = f"{report.rests:.1f} s of rest"
-    known = np.isfinite(q).all(axis=1)
+    valid = np.isfinite(q).all(axis=1)
     # Small angles about the mean.
-    angle = 2.0 * float(np.std(q[known, 0 if report.axis == "roll" else 1])) if known.sum() >= 10 else 0.0
+    angle = 2.0 * float(np.std(q[valid, 0 if report.axis == "roll" else 1])) if valid.sum() >= 10 else 0.0
     k = (
         f"{report.axis} angle varies by {np.degrees(angle):.2g}°"
-        if known.sum() >= 10
+        if valid.sum() >= 10
         else "no roll and pitch"
     )
     weighed = report.axis in ("heave", "roll", "pitch")
@@ -683,7 +685,7 @@ def _driven_tells(
         ),
         **_damping(report),
         "bias": (report.both_directions or report.rests >= 1.0, bias),
-        "k": (angle >= LEAST_TILT, k if angle >= LEAST_TILT or known.sum() < 10 else f"{k} only"),
+        "k": (angle >= LEAST_TILT, k if angle >= LEAST_TILT or valid.sum() < 10 else f"{k} only"),
         "thrust_scale": (
             weighed,
             "against the weight and centres of the vehicle file, if those are right"
@@ -720,17 +722,17 @@ GYRO_BIAS = 0.03
 
 def unit_findings(trial: Trial) -> list[Finding]:
     """Angles in degrees, told from values that radians cannot have."""
-    found = []
-    for name, most in (("roll", 1.05 * np.pi), ("pitch", 0.55 * np.pi)):
+    findings = []
+    for name, limit in (("roll", 1.05 * np.pi), ("pitch", 0.55 * np.pi)):
         _, y = trial.series(name)
-        if len(y) and np.abs(y).max() > most:
-            found.append(_degrees(name, float(np.abs(y).max()), "rad"))
+        if len(y) and np.abs(y).max() > limit:
+            findings.append(_degrees(name, float(np.abs(y).max()), "rad"))
     _, yaw = trial.series("yaw")
     if len(yaw) > 1:
         jumps = np.abs(np.diff(yaw))
         if np.abs(yaw).max() > 2.5 * np.pi and (np.any(np.abs(jumps - 360.0) < 30.0) or not trial.has("r")):
-            found.append(_degrees("yaw", float(np.abs(yaw).max()), "rad"))
-    return found
+            findings.append(_degrees("yaw", float(np.abs(yaw).max()), "rad"))
+    return findings
 
 
 def _degrees(name: str, value: float, unit: str) -> Finding:
@@ -780,20 +782,20 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
     cosine = float(middle @ expected / (np.linalg.norm(middle) * np.linalg.norm(expected)))
     if cosine < -0.5:
         return [finding("gravity_wrong_way", az=middle[2])]
-    found = []
+    findings = []
     if cosine < np.cos(np.radians(15.0)):
         against = "the attitude" if attitude.tilt else "level"
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        found.append(finding("accelerometer_turned", angle=angle, reference=against))
+        findings.append(finding("accelerometer_turned", angle=angle, reference=against))
     for i, angle_name in ((0, "pitch"), (1, "roll")):
         swing = g * np.std(up[:, i])
         if swing > 0.4 and _correlation(f[:, i], up[:, i]) < AGAINST:
-            found.append(finding("acceleration_sign", column=f"a{'xy'[i]}", angle=angle_name))
-    return found
+            findings.append(finding("acceleration_sign", column=f"a{'xy'[i]}", angle=angle_name))
+    return findings
 
 
 def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
-    found = []
+    findings = []
     gyro, _ = on_grid(trial, ("p", "q", "r"), t)
     for i, (rate, angle) in enumerate((("p", "roll"), ("q", "pitch"), ("r", "yaw"))):
         derived = attitude.rates[:, i]
@@ -807,19 +809,19 @@ def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
         x, y = derived[moving], gyro[moving, i] - bias
         correlation, ratio = float(_cosine(x, y)), float(np.sum(x * y) / np.sum(x * x))
         if correlation < AGAINST:
-            found.append(finding("rate_sign", column=rate, other=angle))
+            findings.append(finding("rate_sign", column=rate, other=angle))
         elif correlation > WITH and 0.6 * DEGREES < ratio < 1.6 * DEGREES:
-            found.append(_degrees(rate, float(np.abs(gyro[:, i][moving]).max()), "rad/s"))
+            findings.append(_degrees(rate, float(np.abs(gyro[:, i][moving]).max()), "rad/s"))
         elif correlation > WITH and 0.6 < ratio * DEGREES < 1.6:
-            found.append(_degrees(angle, float(np.nanmax(np.abs(trial.channels.get(angle, x)))), "rad"))
-    return found
+            findings.append(_degrees(angle, float(np.nanmax(np.abs(trial.channels.get(angle, x)))), "rad"))
+    return findings
 
 
 def _heading(trial: Trial, late: float) -> list[Finding]:
     """The heading against the integrated gyro, psi_dot = (q sin(roll) + r cos(roll)) / cos(pitch)."""
     t, r = trial.series("r")
-    at, q, given = attitude_samples(trial)
-    if len(t) < FEWEST or "yaw" not in given or len(at) < FEWEST:
+    at, q, named = attitude_samples(trial)
+    if len(t) < FEWEST or "yaw" not in named or len(at) < FEWEST:
         return []
     at, (roll, pitch, yaw) = at - late, quat_to_euler(q)
     inside = (t >= at[0]) & (t <= at[-1])
@@ -833,21 +835,21 @@ def _heading(trial: Trial, late: float) -> list[Finding]:
     step = np.diff(t)
     wide = step > longest_step(t)
     turned = np.concatenate([[0.0], np.cumsum(np.where(wide, 0.0, 0.5 * (rate[1:] + rate[:-1]) * step))])
-    apart = np.interp(t, at, np.unwrap(yaw)) - turned
+    difference = np.interp(t, at, np.unwrap(yaw)) - turned
     for edge in np.flatnonzero(wide):
-        apart[edge + 1 :] += apart[edge] - apart[edge + 1]
-    bias, _ = np.polyfit(t - t[0], apart, 1) if t[-1] - t[0] > 5.0 else (0.0, 0.0)
-    rest = apart - bias * (t - t[0])
-    noise = 1.4826 * float(np.median(np.abs(np.diff(apart)))) * 6.0
+        difference[edge + 1 :] += difference[edge] - difference[edge + 1]
+    bias, _ = np.polyfit(t - t[0], difference, 1) if t[-1] - t[0] > 5.0 else (0.0, 0.0)
+    rest = difference - bias * (t - t[0])
+    noise = 1.4826 * float(np.median(np.abs(np.diff(difference)))) * 6.0
     wander = float(np.ptp(rest)) - noise
     if wander < DRIFTS and abs(bias) < GYRO_BIAS:
         return []
-    drift = float(np.ptp(apart)) - noise
+    drift = float(np.ptp(difference)) - noise
     return [finding("heading_drift", drift=drift)]
 
 
 def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
-    found = []
+    findings = []
     _, up = on_grid(trial, ("z", "depth"), t, 3)
     both = np.isfinite(up).all(axis=1)
     if (
@@ -855,17 +857,17 @@ def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]
         and np.std(up[both, 0]) > 0.01
         and _correlation(up[both, 0], up[both, 1]) > -AGAINST
     ):
-        found.append(finding("z_down"))
-        return found
+        findings.append(finding("z_down"))
+        return findings
     rising = np.where(np.isfinite(up[:, 0]), up[:, 0], -up[:, 1])
     through = _through_world(trial, t, attitude)[:, 2]
     good = np.isfinite(rising) & np.isfinite(through)
     if good.sum() >= FEWEST and min(np.std(rising[good]), np.std(through[good])) > 0.015:
         correlation = _correlation(rising[good], through[good])
-        what = "z" if trial.has("z") else "depth"
+        vertical = "z" if trial.has("z") else "depth"
         if correlation < AGAINST:
-            found.append(finding("rate_sign", column="w", other=what))
-    return found
+            findings.append(finding("rate_sign", column="w", other=vertical))
+    return findings
 
 
 def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
@@ -892,10 +894,10 @@ def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Findin
 
 def _through_world(trial: Trial, t: Array, attitude: AttitudeSignal) -> Array:
     nu, _ = on_grid(trial, ("u", "v", "w"), t)
-    known = np.isfinite(attitude.turn).all(axis=1)
-    through = quat_rotate(np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0]), np.nan_to_num(nu))
+    valid = np.isfinite(attitude.turn).all(axis=1)
+    through = quat_rotate(np.where(valid[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0]), np.nan_to_num(nu))
     if attitude.heading:
-        through[~known] = np.nan
+        through[~valid] = np.nan
     through[~np.isfinite(nu[:, :2]).all(axis=1), :2] = np.nan
     through[~np.isfinite(nu[:, 2]), 2] = np.nan
     return np.asarray(through)
@@ -939,11 +941,11 @@ def axis_reports(motion: Motion, inputs: Drive, vehicle: Vehicle) -> list[AxisRe
 
 def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle) -> AxisReport:
     nu, tau, dt = motion.nu[:, i], motion.tau[:, i], 1.0 / motion.rate
-    known = np.isfinite(nu) & np.isfinite(tau)
+    valid = np.isfinite(nu) & np.isfinite(tau)
     blank = AxisReport(axis=AXES[i], source=motion.nu_source[i])
-    if known.sum() < 10:
+    if valid.sum() < 10:
         return blank
-    speed, wrench = np.abs(nu[known]), np.abs(tau[known])
+    speed, wrench = np.abs(nu[valid]), np.abs(tau[valid])
     noise = float(np.nan_to_num(motion.noise_std[i]))
     floor = max(STANDS_OUT * noise, LEAST_SPEED)
     # Most of a trial may be rest: percentiles are of the times that are not.
@@ -959,11 +961,11 @@ def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle) -> AxisReport
         noise=noise,
         decades=float(max(0.0, np.log10(max(fastest, 1e-9) / max(slowest, noise, 1e-9)))),
         strongest=strongest,
-        work=0.0 if passive else float(np.sum((tau * nu)[known]) * dt),
-        both_directions=bool(min((nu[known] > floor).sum(), (nu[known] < -floor).sum()) * dt > HOLD),
-        driven=float((known & ~quiet).sum() * dt),
-        coasts=float((known & quiet & moving).sum() * dt),
-        rests=float((known & quiet & ~moving).sum() * dt),
+        work=0.0 if passive else float(np.sum((tau * nu)[valid]) * dt),
+        both_directions=bool(min((nu[valid] > floor).sum(), (nu[valid] < -floor).sum()) * dt > HOLD),
+        driven=float((valid & ~quiet).sum() * dt),
+        coasts=float((valid & quiet & moving).sum() * dt),
+        rests=float((valid & quiet & ~moving).sum() * dt),
         excited=bool(fastest > floor and (driven or passive)),
     )
 
@@ -979,7 +981,7 @@ def work_findings(reports: list[AxisReport], motion: Motion, named: tuple[str, .
 
     On roll and pitch the restoring moment gives back what it took; along heave the weight does work too.
     """
-    found = []
+    findings = []
     for i, report in enumerate(reports):
         both = np.isfinite(motion.nu[:, i]) & np.isfinite(motion.tau[:, i])
         effort = float(np.sum(np.abs(motion.tau[both, i] * motion.nu[both, i])) / motion.rate)
@@ -989,7 +991,7 @@ def work_findings(reports: list[AxisReport], motion: Motion, named: tuple[str, .
         if ratio < -0.4:
             held = np.abs(motion.tau[both, i]) > QUIET * report.strongest
             sure = report.axis in named or (not named and held.sum() / motion.rate > LONG_PUSH)
-            found.append(
+            findings.append(
                 finding(
                     "energy_taken",
                     severity="refused" if sure and ratio < -0.6 and report.axis != "heave" else "care",
@@ -999,7 +1001,7 @@ def work_findings(reports: list[AxisReport], motion: Motion, named: tuple[str, .
                     velocity=NU[i],
                 )
             )
-    return found
+    return findings
 
 
 LATE = 0.03
@@ -1025,20 +1027,22 @@ def check(
         CalibrationError: There is no trial at a path.
         VehicleError: No such vehicle.
     """
-    given = load_vehicle(vehicle) if vehicle is not None else None
+    loaded = load_vehicle(vehicle) if vehicle is not None else None
     trials: list[Trial | TrialReport] = []
-    for place in [place for path in paths for place in trials_at(Path(path))]:
+    for location in [location for path in paths for location in trials_at(Path(path))]:
         try:
-            trials.append(load_trial(place))
+            trials.append(load_trial(location))
         except CalibrationError as error:
-            if len(paths) == 1 and place == Path(paths[0]):
+            if len(paths) == 1 and location == Path(paths[0]):
                 raise
-            trials.append(TrialReport(name=place.name, findings=(finding("unusable", reason=str(error)),)))
-    reports = check_trials(trials, given)
+            trials.append(TrialReport(name=location.name, findings=(finding("unusable", reason=str(error)),)))
+    reports = check_trials(trials, loaded)
     common = together(reports)
     if as_json:
-        found = [one.as_json() for one in reports], [one.as_json() for one in common]
-        print(json.dumps(dict(zip(("trials", "together"), found, strict=True)), indent=2, ensure_ascii=False))
+        records = [entry.as_json() for entry in reports], [entry.as_json() for entry in common]
+        print(
+            json.dumps(dict(zip(("trials", "together"), records, strict=True)), indent=2, ensure_ascii=False)
+        )
         return
     from rich.console import Console
 
@@ -1052,24 +1056,24 @@ def check_trials(trials: Sequence[Trial | TrialReport], vehicle: Vehicle | None 
         trials: In the order of the reports.
         vehicle: That made them; without it each trial's header names its own.
     """
-    seen: dict[str, str] = {}
+    first_names: dict[str, str] = {}
     reports = []
     for trial in trials:
         report = trial if isinstance(trial, TrialReport) else _one(trial, vehicle)
-        if report.sha256 and report.sha256 in seen:
-            twice = finding("duplicate", other=seen[report.sha256])
+        if report.sha256 and report.sha256 in first_names:
+            twice = finding("duplicate", other=first_names[report.sha256])
             report = replace(report, findings=(*report.findings, twice))
-        seen.setdefault(report.sha256, report.name)
+        first_names.setdefault(report.sha256, report.name)
         reports.append(report)
     return reports
 
 
-def _one(trial: Trial, given: Vehicle | None) -> TrialReport:
+def _one(trial: Trial, user_vehicle: Vehicle | None) -> TrialReport:
     streams, findings = stream_reports(trial)
     findings += unit_findings(trial)
     report = TrialReport(
         name=trial.name,
-        vehicle=given.name if given is not None else trial.header.vehicle,
+        vehicle=user_vehicle.name if user_vehicle is not None else trial.header.vehicle,
         role=trial.header.role,
         duration=trial.duration,
         rows=len(trial.t),
@@ -1077,7 +1081,7 @@ def _one(trial: Trial, given: Vehicle | None) -> TrialReport:
         findings=tuple(findings),
         sha256=trial.sha256,
     )
-    vehicle = given or _own_vehicle(trial, findings)
+    vehicle = user_vehicle or _own_vehicle(trial, findings)
     findings += implausible(trial, vehicle)
     if vehicle is None:
         return replace(report, findings=tuple(findings))
@@ -1117,17 +1121,21 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
         findings.append(finding("unusable", reason=error.reason))
         # The motion can be looked at without its cause.
         trial = replace(trial, header=trial.header.model_copy(update={"passive": True}))
-        seen = motion(trial, vehicle)
+        trial_motion = motion(trial, vehicle)
         unknown = [
-            replace(axis, excited=False) for axis in axis_reports(seen, drive(trial, vehicle), vehicle)
+            replace(axis, excited=False)
+            for axis in axis_reports(trial_motion, drive(trial, vehicle), vehicle)
         ]
         return "", unknown
     findings += input_findings(trial, vehicle, inputs)
-    seen = motion(trial, vehicle)
-    findings += [one for one in seen.findings if one not in findings]
-    axes = [with_tells(axis, seen, inputs, vehicle) for axis in axis_reports(seen, inputs, vehicle)]
-    findings += work_findings(axes, seen, trial.header.axis)
-    if not any(told.can for axis in axes for told in axis.tells.values()):
+    trial_motion = motion(trial, vehicle)
+    findings += [entry for entry in trial_motion.findings if entry not in findings]
+    axes = [
+        with_tells(axis, trial_motion, inputs, vehicle)
+        for axis in axis_reports(trial_motion, inputs, vehicle)
+    ]
+    findings += work_findings(axes, trial_motion, trial.header.axis)
+    if not any(axes_told.can for axis in axes for axes_told in axis.tells.values()):
         moved = any(axis.source for axis in axes)
         findings.append(finding("nothing_excited") if moved else finding("nothing_measured"))
     for named in trial.header.axis:

@@ -34,9 +34,9 @@ class _Template(string.Formatter):
         return listed([format(item, format_spec) for item in value], MOST_NAMES)
 
 
-def listed(words: Sequence[str], most: int) -> str:
-    """Words after one another, and how many more than `most` there are."""
-    return ", ".join(words[:most]) + (f" and {len(words) - most} more" if len(words) > most else "")
+def listed(texts: Sequence[str], limit: int) -> str:
+    """Words after one another, and how many more than `limit` there are."""
+    return ", ".join(texts[:limit]) + (f" and {len(texts) - limit} more" if len(texts) > limit else "")
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ def finding(code: str, subject: str = "", /, *, severity: Severity | None = None
 def sentences(findings: Iterable[Finding]) -> list[str]:
     """Sentences in their order; what holds for several subjects is one sentence."""
     subjects: dict[tuple[str, str], list[str]] = {}
-    for one in findings:
-        named = subjects.setdefault((one.code, one.text), [])
-        if one.subject not in named:
-            named.append(one.subject)
+    for item in findings:
+        named = subjects.setdefault((item.code, item.text), [])
+        if item.subject not in named:
+            named.append(item.subject)
     return [
         f"{listed(named, MOST_SUBJECTS)}: {text}" if any(named) else text
         for (_, text), named in subjects.items()

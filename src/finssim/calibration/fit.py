@@ -45,8 +45,8 @@ class Estimate:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; a number that is not finite becomes None."""
-        kept = {key: getattr(self, key) for key in ("estimate", "ci95", "unit", "identifiable", "note")}
-        return dict(plain(kept))
+        values = {key: getattr(self, key) for key in ("estimate", "ci95", "unit", "identifiable", "note")}
+        return dict(plain(values))
 
 
 @dataclass(frozen=True, kw_only=True)

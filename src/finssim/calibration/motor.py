@@ -89,17 +89,17 @@ def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Log | No
     columns = _columns(trial, name)
     if columns is None:
         return None
-    asked, measured = columns
+    column, measured = columns
     findings: list[Finding] = []
-    times, raw = trial.series(asked)
+    times, raw = trial.series(column)
     same_unit, held = True, raw
-    if asked.startswith("pwm_") and thruster.esc is None:
+    if column.startswith("pwm_") and thruster.esc is None:
         command, same_unit = raw - 1500.0, False
         findings.append(finding("pulses_raw"))
-    elif asked.startswith("pwm_"):
+    elif column.startswith("pwm_"):
         voltage = np.interp(times, *trial.series("voltage")) if trial.has("voltage") else trial.header.voltage
         command = _as(domain, thruster.shaft_speed(raw, voltage), thruster, "speed")
-    elif asked.startswith("rpm_"):
+    elif column.startswith("rpm_"):
         command = _as(domain, raw * RPM, thruster, "speed")
     else:
         # Small steps of a force are as plain as large ones in the speed.
@@ -177,8 +177,8 @@ def _as(domain: str, values: Array, thruster: Thruster, unit: str) -> Array:
 def _last_sign(command: Array) -> Array:
     """Sign of the last command that was not zero, at every sample; until the first one, the first's."""
     sign = np.sign(command)
-    known = np.flatnonzero(sign)
-    index = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), known[0]))
+    nonzero = np.flatnonzero(sign)
+    index = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), nonzero[0]))
     return np.asarray(sign[index])
 
 
@@ -251,17 +251,17 @@ def fit_response(records: Sequence[StepRecord]) -> Response:
     low, high = np.array([0.0, math.log(0.1 * sample)]), np.array([longest, math.log(duration)])
     corners = np.stack(np.meshgrid(*np.linspace(low, high, GRID).T), axis=-1).reshape(-1, 2)
     power = np.array([float(np.var(record.y)) * len(record.y) for record in records])
-    left = np.array([[float(np.sum(_misfit(one, x) ** 2)) for one in records] for x in corners])
-    explained = 1.0 - left.min(axis=0) / np.maximum(power, 1e-300)
+    remainder = np.array([[float(np.sum(_misfit(record, x) ** 2)) for record in records] for x in corners])
+    explained = 1.0 - remainder.min(axis=0) / np.maximum(power, 1e-300)
     moved = (explained > 0.5) & (power > 0.0)
     first = moved if moved.any() else np.arange(len(records)) == np.argmax(explained)
-    spread = (left / np.maximum(power, 1e-300))[:, first].sum(axis=1)
+    spread = (remainder / np.maximum(power, 1e-300))[:, first].sum(axis=1)
     x = _solved(records, first, corners[np.argmin(spread)], low, high)
-    nrmse, overshoot = np.array([_figures(one, x) for one in records]).T
+    nrmse, overshoot = np.array([_figures(record, x) for record in records]).T
     accepted = moved & (nrmse <= NRMSE) & (overshoot <= OVERSHOOT)
     used = accepted if accepted.any() else first
     x = _solved(records, used, x, low, high)
-    nrmse, overshoot = np.array([_figures(one, x) for one in records]).T
+    nrmse, overshoot = np.array([_figures(record, x) for record in records]).T
     chosen = [record for record, on in zip(records, used, strict=True) if on]
     ends = intervals(x, trial_covariance(_evidence(chosen, x)))
     blur = 0.5 * float(np.median([record.sample for record in chosen]))
@@ -313,7 +313,7 @@ def _solved(
     scale = [max(float(np.std(record.y)), 1e-300) for record in chosen]
 
     def residual(x: Array) -> Array:
-        return np.concatenate([_misfit(one, x) / s for one, s in zip(chosen, scale, strict=True)])
+        return np.concatenate([_misfit(record, x) / s for record, s in zip(chosen, scale, strict=True)])
 
     start = np.clip(x, low + 1e-6, high - 1e-6)
     return np.asarray(
@@ -417,8 +417,8 @@ class Study:
         if len(u) < 3:
             return float(u @ y / (u @ u)), math.inf
         others = [np.arange(len(u)) != i for i in range(len(u))]
-        left_out = np.array([[u[rows] @ y[rows] / (u[rows] @ u[rows])] for rows in others])
-        return float(u @ y / (u @ u)), float(jackknife(left_out)[0])
+        jackknifed = np.array([[u[rows] @ y[rows] / (u[rows] @ u[rows])] for rows in others])
+        return float(u @ y / (u @ u)), float(jackknife(jackknifed)[0])
 
 
 def study(name: str, trials: Sequence[Trial], thruster: Thruster) -> Study | None:
@@ -433,10 +433,12 @@ def study(name: str, trials: Sequence[Trial], thruster: Thruster) -> Study | Non
     logs = {
         d: [log for trial in trials if (log := log_of(trial, name, thruster, d)) is not None] for d in DOMAINS
     }
-    records = {d: [record for log in found for record in log.records] for d, found in logs.items()}
+    records = {
+        d: [record for log in logs_of_domain for record in log.records] for d, logs_of_domain in logs.items()
+    }
     if not records[chosen]:
         return None
-    responses = {d: fit_response(found) for d, found in records.items() if found}
+    responses = {d: fit_response(logs_of_domain) for d, logs_of_domain in records.items() if logs_of_domain}
     other = responses.get(DOMAINS[1 - DOMAINS.index(chosen)])
     return Study(
         name=name, domain=chosen, logs=tuple(logs[chosen]), response=responses[chosen],
@@ -444,42 +446,42 @@ def study(name: str, trials: Sequence[Trial], thruster: Thruster) -> Study | Non
     )  # fmt: skip
 
 
-def estimates_of(found: Study, thruster: Thruster) -> list[Estimate]:
+def estimates_of(result: Study, thruster: Thruster) -> list[Estimate]:
     """K, T_d, τ and the dead zone of one thruster."""
-    response, name = found.response, found.name
+    response, name = result.response, result.name
     count = int(response.used.sum())
     rests = f"{count} step{'s' if count != 1 else ''} sampled every {response.sample:.3g} s"
-    if not found.sure:
+    if not result.sure:
         rests += ": no step follows first order plus dead time within 10 %"
     if response.hidden:
         rests += "; below half a sample, the log cannot tell it from 0"
     late = "the command's change is known to one sample of its log, which is in the interval"
     if response.delay < response.sample:
         late = f"delay {response.delay:.3g} s is below one sample of {response.sample:.3g} s"
-    gain, half = found.gain
+    gain, half = result.gain
     estimates = [
         Estimate(
             name=f"{name}.time_constant", estimate=response.time_constant, ci95=response.time_constant_interval,
-            unit="s", identifiable=found.sure and not response.hidden, note=rests,
+            unit="s", identifiable=result.sure and not response.hidden, note=rests,
             path=f"thrusters.{name}.time_constant",
         ),
         Estimate(
             name=f"{name}.delay", estimate=response.delay, ci95=response.delay_interval, unit="s",
-            identifiable=found.sure, note=late,
+            identifiable=result.sure, note=late,
         ),
         Estimate(
             name=f"{name}.gain", estimate=gain, ci95=(gain - half, gain + half),
-            unit="-" if found.same_unit else f"{UNIT[found.domain]}/µs",
+            unit="-" if result.same_unit else f"{UNIT[result.domain]}/µs",
             identifiable=math.isfinite(half) and half < abs(gain),
-            note=f"steady {'thrust' if found.domain == 'force' else 'speed'} over what was asked",
+            note=f"steady {'thrust' if result.domain == 'force' else 'speed'} over what was asked",
         ),
     ]  # fmt: skip
-    return estimates + (_dead_zones(found, thruster) if found.same_unit else [])
+    return estimates + (_dead_zones(result, thruster) if result.same_unit else [])
 
 
-def _dead_zones(found: Study, thruster: Thruster) -> list[Estimate]:
+def _dead_zones(result: Study, thruster: Thruster) -> list[Estimate]:
     """The slowest speed that turns the shaft either way, between two commands that were tried."""
-    pairs, moving = found.levels
+    pairs, moving = result.levels
     estimates = []
     for side, sign in (("plus", 1.0), ("minus", -1.0)):
         turn = [sign * u for u, _ in moving if sign * u > 0.0]
@@ -487,69 +489,69 @@ def _dead_zones(found: Study, thruster: Thruster) -> list[Estimate]:
             continue
         stand = [sign * u for u, y in pairs if sign * u > 0.0 and (u, y) not in moving]
         low, high = max([u for u in stand if u < min(turn)], default=0.0), min(turn)
-        if found.domain == "force":
+        if result.domain == "force":
             low, high = (abs(float(thruster.speed(sign * force))) for force in (low, high))
-        known = low > 0.0 and high <= NARROW_DEAD_ZONE * low
+        bracketed = low > 0.0 and high <= NARROW_DEAD_ZONE * low
         note = "no commands were tried between the last that stands and the first that turns"
-        if known:
+        if bracketed:
             note = "between the last command that leaves the shaft standing and the first that turns it"
         elif low == 0.0:
             note = f"the smallest command tried, {high / RPM:.0f} rpm, already turns the shaft"
         ends = sorted((sign * low / RPM + 0.0, sign * high / RPM + 0.0))
         estimates.append(
             Estimate(
-                name=f"{found.name}.dead_rpm_{side}", ci95=(ends[0], ends[1]), unit="rpm", identifiable=known,
+                name=f"{result.name}.dead_rpm_{side}", ci95=(ends[0], ends[1]), unit="rpm", identifiable=bracketed,
                 estimate=sign * (0.5 * (low + high) if low > 0.0 else 0.0) / RPM + 0.0, note=note,
-                path=f"thrusters.{found.name}.dead_rpm_{side}",
+                path=f"thrusters.{result.name}.dead_rpm_{side}",
             )
         )  # fmt: skip
     return estimates
 
 
-def quality_of(found: Study) -> dict[str, float]:
+def quality_of(result: Study) -> dict[str, float]:
     """Figures of the fit: overshoot and steady error of the steps, error over their height."""
-    response, (_, moving) = found.response, found.levels
+    response, (_, moving) = result.response, result.levels
     errors = [abs(y - u) / abs(u) for u, y in moving]
     return {
         "nrmse": response.error,
         "overshoot": float(response.overshoot[response.used].max(initial=0.0)),
-        "steady_error": float(np.mean(errors)) if errors and found.same_unit else math.nan,
+        "steady_error": float(np.mean(errors)) if errors and result.same_unit else math.nan,
         "steps": float(len(response.nrmse)),
         "accepted": float(response.accepted.sum()),
         "sample": response.sample,
-        "nrmse_other_domain": found.other_error,
+        "nrmse_other_domain": result.other_error,
     }
 
 
-def findings_of(found: Study) -> list[Finding]:
+def findings_of(result: Study) -> list[Finding]:
     """What a reader of the numbers must know."""
-    response, (gain, half) = found.response, found.gain
-    out = [one.about(log.records[0].trial) for log in found.logs for one in log.findings if log.records]
+    response, (gain, half) = result.response, result.gain
+    out = [item.about(log.records[0].trial) for log in result.logs for item in log.findings if log.records]
     accepted, moved = int(response.accepted.sum()), int(response.moved.sum())
     if moved == 0:
-        out.append(finding("not_followed", found.name, column=found.logs[0].measured))
+        out.append(finding("not_followed", result.name, column=result.logs[0].measured))
     elif accepted == 0:
-        out.append(finding("steps_refused", found.name, limit=NRMSE, error=response.error))
+        out.append(finding("steps_refused", result.name, limit=NRMSE, error=response.error))
     elif accepted < moved:
-        out.append(finding("steps_left_out", found.name, steps=moved - accepted, total=moved, limit=NRMSE))
-    if found.other_error < 0.5 * response.error and response.error > 0.02:
-        other = DOMAINS[1 - DOMAINS.index(found.domain)]
+        out.append(finding("steps_left_out", result.name, steps=moved - accepted, total=moved, limit=NRMSE))
+    if result.other_error < 0.5 * response.error and response.error > 0.02:
+        other = DOMAINS[1 - DOMAINS.index(result.domain)]
         out.append(
-            finding("other_domain", found.name, domain=other, other=found.other_error, error=response.error)
+            finding("other_domain", result.name, domain=other, other=result.other_error, error=response.error)
         )
-    if found.same_unit and abs(gain - 1.0) > 0.1 + half:
-        out.append(finding("steady_gain", found.name, gain=gain))
+    if result.same_unit and abs(gain - 1.0) > 0.1 + half:
+        out.append(finding("steady_gain", result.name, gain=gain))
     return out
 
 
-def curve_of(found: Study) -> Curve:
+def curve_of(result: Study) -> Curve:
     """Steps used, one after the other, with the common response at each step's own levels."""
-    parameters, parts = np.array([found.response.delay, math.log(found.response.time_constant)]), []
-    for record in np.array(found.records, dtype=object)[found.response.used]:
+    parameters, parts = np.array([result.response.delay, math.log(result.response.time_constant)]), []
+    for record in np.array(result.records, dtype=object)[result.response.used]:
         level, rows = _levels(record, parameters)
         parts.append((record.t, record.y, rows @ level))
-    unit = "thrust [N]" if found.domain == "force" else "shaft speed [rad/s]"
-    return Curve.joined(f"{found.name}: steps", unit, parts)
+    unit = "thrust [N]" if result.domain == "force" else "shaft speed [rad/s]"
+    return Curve.joined(f"{result.name}: steps", unit, parts)
 
 
 def fit_motor(
@@ -577,20 +579,20 @@ def fit_motor(
     trials = list(trials)
     studies, findings = [], list[Finding]()
     for name in _names(trials, vehicle):
-        found = study(name, trials, vehicle.thrusters[name])
-        if found is None:
+        result = study(name, trials, vehicle.thrusters[name])
+        if result is None:
             findings.append(finding("no_steps", name))
             continue
-        studies.append(found)
-        findings += findings_of(found)
+        studies.append(result)
+        findings += findings_of(result)
     if not studies:
         raise CalibrationError(
             f"{', '.join(trial.name for trial in trials)}: no command holds a level and changes: log steps of at least "
             "0.5 s, such as those of 'finssim excite'"
         )
-    estimates = [e for found in studies for e in estimates_of(found, vehicle.thrusters[found.name])]
+    estimates = [e for result in studies for e in estimates_of(result, vehicle.thrusters[result.name])]
     changes = {e.path: e.estimate for e in estimates if e.path is not None and e.identifiable}
-    sure = [found for found in studies if found.sure]
+    sure = [result for result in studies if result.sure]
     if sure:
         estimates.insert(0, _common_delay(sure))
         changes["thrusters.*.delay"] = estimates[0].estimate
@@ -601,8 +603,8 @@ def fit_motor(
         vehicle=vehicle,
         estimates={e.name: e for e in estimates},
         changes=changes,
-        quality={found.name: quality_of(found) for found in studies},
-        curves=tuple(curve_of(found) for found in studies),
+        quality={result.name: quality_of(result) for result in studies},
+        curves=tuple(curve_of(result) for result in studies),
         findings=tuple(dict.fromkeys(findings)),
         trials={trial.name: trial.sha256 for trial in trials},
         settings={"seed": seed},
@@ -612,18 +614,18 @@ def fit_motor(
 def _names(trials: Sequence[Trial], vehicle: Vehicle) -> list[str]:
     names = [name for name in vehicle.thrusters if any(_columns(trial, name) for trial in trials)]
     if not names:
-        shown = ", ".join(trial.name for trial in trials) or "no trial"
+        trial_names = ", ".join(trial.name for trial in trials) or "no trial"
         raise CalibrationError(
-            f"{shown}: no thruster of {vehicle.name} has a command (rpm_command_NAME, command_NAME or pwm_NAME) and a "
-            f"response (rpm_NAME or force_NAME); its thrusters are {', '.join(vehicle.thrusters)}"
+            f"{trial_names}: no thruster of {vehicle.name} has a command (rpm_command_NAME, command_NAME or pwm_NAME) "
+            f"and a response (rpm_NAME or force_NAME); its thrusters are {', '.join(vehicle.thrusters)}"
         )
     return names
 
 
 def _common_delay(studies: Sequence[Study]) -> Estimate:
     """The delay of the link that all thrusters share."""
-    delays = [found.response.delay for found in studies]
-    ends = [found.response.delay_interval for found in studies]
+    delays = [result.response.delay for result in studies]
+    ends = [result.response.delay_interval for result in studies]
     middle = float(np.median(delays))
     note = f"median of {len(delays)} thrusters, which share one link"
     if any(high < middle or low > middle for low, high in ends):
@@ -640,11 +642,11 @@ def _untested(
 ) -> dict[str, float]:
     """Time constants of the thrusters that no trial steps, from those of their group."""
     groups: dict[str, list[float]] = {}
-    for found in studies:
-        if f"thrusters.{found.name}.time_constant" in changes:
-            group = vehicle.thrusters[found.name].group
-            groups.setdefault(group, []).append(found.response.time_constant)
-    tested = {found.name for found in studies}
+    for result in studies:
+        if f"thrusters.{result.name}.time_constant" in changes:
+            group = vehicle.thrusters[result.name].group
+            groups.setdefault(group, []).append(result.response.time_constant)
+    tested = {result.name for result in studies}
     out = {}
     for name, thruster in vehicle.thrusters.items():
         if name not in tested and thruster.group in groups:

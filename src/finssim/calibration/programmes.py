@@ -247,28 +247,28 @@ class Programme:
         return hashlib.sha256(self.tau_desired.tobytes() + "".join(self.phase).encode()).hexdigest()
 
 
-def which_axes(words: str | Sequence[str], vehicle: Vehicle) -> tuple[Axis, ...]:
+def which_axes(names: str | Sequence[str], vehicle: Vehicle) -> tuple[Axis, ...]:
     """Axes from words.
 
     Args:
-        words: `all`, a comma-separated list such as `surge,yaw`, or a sequence of names.
+        names: `all`, a comma-separated list such as `surge,yaw`, or a sequence of names.
         vehicle: Its `controlled_axes` are what `all` means.
 
     Raises:
         CalibrationError: A word is no axis, is given twice, or the vehicle cannot control it.
     """
-    given = [w.strip() for w in words.split(",")] if isinstance(words, str) else list(words)
-    if given == ["all"]:
+    requested = [w.strip() for w in names.split(",")] if isinstance(names, str) else list(names)
+    if requested == ["all"]:
         return vehicle.controlled_axes
-    for word in given:
+    for word in requested:
         if word not in AXES:
             raise CalibrationError(f"unknown axis '{word}'; available: all, {', '.join(AXES)}")
         if word not in vehicle.controlled_axes:
             able = ", ".join(vehicle.controlled_axes)
             raise CalibrationError(f"{vehicle.name} cannot control {word}: its thrusters control {able}")
-    if len(set(given)) < len(given) or not given:
-        raise CalibrationError(f"axes are '{','.join(given)}', expected each axis once")
-    return tuple(axis for axis in AXES if axis in given)
+    if len(set(requested)) < len(requested) or not requested:
+        raise CalibrationError(f"axes are '{','.join(requested)}', expected each axis once")
+    return tuple(axis for axis in AXES if axis in requested)
 
 
 def programmes(
@@ -330,8 +330,8 @@ def programmes(
     out = []
     for axis in chosen:
         if room is not None and AXES.index(axis) < 3:
-            given = levels.get(axis) if isinstance(levels, Mapping) else levels
-            by_axis[axis] = _in_room(room, by_axis[axis], given is not None, axis, vehicle)
+            requested = levels.get(axis) if isinstance(levels, Mapping) else levels
+            by_axis[axis] = _in_room(room, by_axis[axis], requested is not None, axis, vehicle)
         for level in by_axis[axis]:
             for sign in (1.0, -1.0):
                 out += [_step(axis, sign * level, kind, coast, r, repeats) for r in range(repeats)]
@@ -353,8 +353,8 @@ def _levels(
     """Magnitudes for one axis, ascending."""
     limit = float(vehicle.wrench_limits[AXES.index(axis)])
     unit = "N" if AXES.index(axis) < 3 else "N m"
-    given = levels.get(axis) if isinstance(levels, Mapping) else levels
-    if given is None:
+    requested = levels.get(axis) if isinstance(levels, Mapping) else levels
+    if requested is None:
         if kind == "multisine":
             return (0.5 * limit,)
         limit = min(limit, _level_limit(axis, vehicle))
@@ -363,9 +363,9 @@ def _levels(
         if abs(scale - 1.0) < 0.01:
             scale = 1.0
         return tuple(sorted({min(_two_digits(scale * x), limit) for x in table[axis]}))
-    if not given:
+    if not requested:
         raise CalibrationError(f"levels of {axis}: none given, expected at least one in {unit}")
-    for value in given:
+    for value in requested:
         if not (math.isfinite(value) and value > 0.0):
             raise CalibrationError(
                 f"levels of {axis}: {value:g} {unit} cannot be, expected magnitudes above 0 {unit} "
@@ -375,16 +375,16 @@ def _levels(
             raise CalibrationError(
                 f"levels of {axis}: {value:g} {unit} is beyond {vehicle.name}'s limit of {limit:.4g} {unit}"
             )
-    return tuple(sorted({float(x) for x in given}))
+    return tuple(sorted({float(x) for x in requested}))
 
 
 def _in_room(
-    room: float, levels: tuple[float, ...], given: bool, axis: Axis, vehicle: Vehicle
+    room: float, levels: tuple[float, ...], requested: bool, axis: Axis, vehicle: Vehicle
 ) -> tuple[float, ...]:
     """Levels of a linear axis that stay within `room`; given ones are refused rather than changed."""
     hold, after = (np.full(round(seconds * RATE), x) for seconds, x in ((9.0, levels[-1]), (3.0, 0.0)))
     force = np.concatenate([hold, after])
-    if not given:
+    if not requested:
         factor = within(room, force, RATE, axis, vehicle)
         return levels if factor == 1.0 else tuple(sorted({float(f"{factor * x:.2g}") for x in levels}))
     way = travel(force, RATE, axis, vehicle)

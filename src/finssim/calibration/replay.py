@@ -120,8 +120,8 @@ def excited_axes(tau: Array, limits: Array, named: Sequence[Axis] = ()) -> tuple
         limits > 0.0, limits, max(float(limits.max(initial=0.0)), 1.0) * np.repeat([1.0, 0.1], 3)
     )
     share = np.sqrt(np.nanmean(np.square(tau / scale), axis=0)) if len(tau) else np.zeros(6)
-    most = float(share.max(initial=0.0))
-    return tuple(a for a, x in zip(AXES, share, strict=True) if most > 1e-9 and x >= EXCITED * most)
+    largest = float(share.max(initial=0.0))
+    return tuple(a for a, x in zip(AXES, share, strict=True) if largest > 1e-9 and x >= EXCITED * largest)
 
 
 def find_phases(
@@ -166,23 +166,23 @@ def _active(tau: Array, axes: Sequence[Axis]) -> NDArray[np.bool_]:
 
 def models_of(pairs: Sequence[Pair]) -> tuple[str, ...]:
     """The replayed models, in their order."""
-    found: Mapping[str, None] = {model: None for pair in pairs for model in pair.simulated}
-    return tuple(found)
+    models: Mapping[str, None] = {model: None for pair in pairs for model in pair.simulated}
+    return tuple(models)
 
 
-def resampled(t: Array, values: Array, wanted: Array) -> Array:
+def resampled(t: Array, values: Array, times: Array) -> Array:
     """Linear interpolation that leaves holes holes: NaN where a neighbour is, or is far, or there is none."""
     if values.ndim == 2:
-        return np.stack([resampled(t, column, wanted) for column in values.T], axis=-1)
+        return np.stack([resampled(t, column, times) for column in values.T], axis=-1)
     good = np.isfinite(values)
     if not good.any():
-        return np.full(len(wanted), np.nan)
+        return np.full(len(times), np.nan)
     t, values = t[good], values[good]
-    out = np.interp(wanted, t, values, left=np.nan, right=np.nan)
-    right = np.clip(np.searchsorted(t, wanted), 0, len(t) - 1)
-    left = np.maximum(np.searchsorted(t, wanted, side="right") - 1, 0)
+    out = np.interp(times, t, values, left=np.nan, right=np.nan)
+    right = np.clip(np.searchsorted(t, times), 0, len(t) - 1)
+    before = np.maximum(np.searchsorted(t, times, side="right") - 1, 0)
     usual = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
-    out[t[right] - t[left] > max(3.0 * usual, 0.1)] = np.nan
+    out[t[right] - t[before] > max(3.0 * usual, 0.1)] = np.nan
     return np.asarray(out)
 
 
@@ -215,16 +215,16 @@ def span(values: ArrayLike) -> float:
     return float(np.subtract(*np.percentile(x, (95.0, 5.0)))) if len(x) else float("nan")
 
 
-def nrmse(measured: Array, simulated: Array, scale: float, where: NDArray[np.bool_] | None = None) -> Score:
+def nrmse(measured: Array, simulated: Array, scale: float, mask: NDArray[np.bool_] | None = None) -> Score:
     """RMSE / (P95 - P5 of the measurement)                                            (paper, section IV-B)
 
     Args:
         measured: (n,), NaN where there is no measurement.
         simulated: (n,), same unit.
         scale: P95 - P5 of the measurement over the scored part of the trial, same unit.
-        where: Samples to take; all if None.
+        mask: Samples to take; all if None.
     """
-    error = (simulated - measured)[where if where is not None else slice(None)]
+    error = (simulated - measured)[mask if mask is not None else slice(None)]
     error = error[np.isfinite(error)]
     if len(error) < FEWEST:
         return Score(None, f"too short: {len(error)} samples compared, at least {FEWEST} are needed")
@@ -271,14 +271,14 @@ def score(pair: Pair, model: str, response: str, *, raw: bool = False) -> Score:
 
 def phase_score(pair: Pair, model: str, response: str, phase: str) -> Score:
     """NRMSE in one phase; the RMSE is of the phase, the span is that of the trial, so that phases can be compared."""
-    where = pair.phase == phase
-    if not where.any():
+    mask = pair.phase == phase
+    if not mask.any():
         return Score(None, f"the trial has no {phase}")
-    return _scored(pair, model, response, where, pair.measured)
+    return _scored(pair, model, response, mask, pair.measured)
 
 
 def _scored(
-    pair: Pair, model: str, response: str, where: NDArray[np.bool_], measured: Mapping[str, Array]
+    pair: Pair, model: str, response: str, mask: NDArray[np.bool_], measured: Mapping[str, Array]
 ) -> Score:
     width = response_span(pair, response)
     if width.value is None:
@@ -287,7 +287,7 @@ def _scored(
         return Score(
             None, f"the simulation does not stay finite: it ends {pair.diverged[model]:.2f} s into the trial"
         )
-    return nrmse(measured[response], pair.simulated[model][response], width.value, where)
+    return nrmse(measured[response], pair.simulated[model][response], width.value, mask)
 
 
 class Aggregate(NamedTuple):
@@ -382,19 +382,21 @@ def error_ahead(
         width: Span that `nrmse` is relative to [unit of the response], of all or for each prediction, (S,).
         seconds: Times of interest [s], (H,); the nearest of `ahead` is taken.
     """
-    wanted = np.asarray(seconds, dtype=np.float64)
-    rows = np.abs(ahead[:, None] - wanted).argmin(axis=0)
+    horizons = np.asarray(seconds, dtype=np.float64)
+    rows = np.abs(ahead[:, None] - horizons).argmin(axis=0)
     ours, theirs = simulated[rows] - measured[rows], starts - measured[rows]
     both = np.isfinite(ours) & np.isfinite(theirs)
     count = both.sum(axis=1)
 
     def rms(x: Array) -> Array:
         total = np.sum(np.square(x), axis=1, where=both)
-        return np.asarray(np.sqrt(np.divide(total, count, out=np.full(len(wanted), np.nan), where=count > 0)))
+        return np.asarray(
+            np.sqrt(np.divide(total, count, out=np.full(len(horizons), np.nan), where=count > 0))
+        )
 
     rmse = rms(ours)
     scale = np.asarray(width, dtype=np.float64)
-    return Ahead(wanted, rmse, rms(theirs), rms(ours / scale), rms(theirs / scale), count)
+    return Ahead(horizons, rmse, rms(theirs), rms(ours / scale), rms(theirs / scale), count)
 
 
 # Drive models with the recorded inputs of trials, from their recorded initial states.
@@ -452,16 +454,16 @@ def replay_pairs(
     """
     prepared: list[Streams] = []
     cut: list[Segment] = []
-    left_out: list[Finding] = []
+    excluded: list[Finding] = []
     for trial in trials:
         try:
             s = streams(trial, vehicle)
             parts = segments(s, vehicle, step=STEP, index=len(prepared))
         except CalibrationError as error:
-            left_out.append(finding("unusable", trial.name, reason=error.reason))
+            excluded.append(finding("unusable", trial.name, reason=error.reason))
             continue
         if not parts:
-            left_out.append(finding("nothing_to_replay", trial.name))
+            excluded.append(finding("nothing_to_replay", trial.name))
             continue
         prepared.append(s)
         cut += parts
@@ -471,9 +473,9 @@ def replay_pairs(
             progress(model)
         response = Rollouts(vehicle, cut, hydrodynamics=model).run()
         for i, pair in enumerate(pairs):
-            own = [k for k, segment in enumerate(cut) if segment.index == i]
-            _add(pair, model, [cut[k] for k in own], response, own, vehicle)
-    return [_axes_of_passive(pair) for pair in pairs], left_out
+            segments_of_trial = [k for k, segment in enumerate(cut) if segment.index == i]
+            _add(pair, model, [cut[k] for k in segments_of_trial], response, segments_of_trial, vehicle)
+    return [_axes_of_passive(pair) for pair in pairs], excluded
 
 
 def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
@@ -534,12 +536,17 @@ def _axes_of_passive(pair: Pair) -> Pair:
 
 
 def _add(
-    pair: Pair, model: str, own: Sequence[Segment], response: Response, which: Sequence[int], vehicle: Vehicle
+    pair: Pair,
+    model: str,
+    segments: Sequence[Segment],
+    response: Response,
+    which: Sequence[int],
+    vehicle: Vehicle,
 ) -> None:
     """Write what a model made of a trial's segments into its pair."""
     n = len(pair.t)
     pieces = []
-    for number, (segment, k) in enumerate(zip(own, which, strict=True)):
+    for number, (segment, k) in enumerate(zip(segments, which, strict=True)):
         since = pair.t + pair.t0 - segment.t0
         inside = (since >= -1e-9) & (since <= segment.duration + 1e-9)
         assert pair.segment is not None
@@ -547,19 +554,21 @@ def _add(
         rows = slice(0, segment.steps + 1)
         t = response.t[rows]
         if not response.finite[0, k]:
-            whole = np.isfinite(response.nu[rows, 0, k]).all(axis=1)
-            pair.diverged.setdefault(model, float(segment.t0 - pair.t0 + t[int(np.argmin(whole))]))
+            finite = np.isfinite(response.nu[rows, 0, k]).all(axis=1)
+            pair.diverged.setdefault(model, float(segment.t0 - pair.t0 + t[int(np.argmin(finite))]))
         pieces.append((inside, since[inside], t, _responses(segment, response, rows, k)))
 
     def at(late: float) -> dict[str, Array]:
         values = {name: np.full(n, np.nan) for name in RESPONSES}
-        for inside, since, t, found in pieces:
-            for name, x in found.items():
+        for inside, since, t, pieces_of_response in pieces:
+            for name, x in pieces_of_response.items():
                 values[name][inside] = np.interp(since - late, t, x)
         return values
 
     late = (
-        _late(pair, at) if all(segment.commanded for segment in own) and model not in pair.diverged else 0.0
+        _late(pair, at)
+        if all(segment.commanded for segment in segments) and model not in pair.diverged
+        else 0.0
     )
     if late:
         pair.late[model] = late
@@ -732,16 +741,16 @@ class Replay:
             in_sample: Of the in-sample or the held-out trials; the held-out ones where there are any if None.
             statistic: `np.nanmedian` or `np.nanmean`, over the trials of an axis.
         """
-        wanted = self.in_sample if in_sample is None else in_sample
+        requested = self.in_sample if in_sample is None else in_sample
         chosen = [
-            (p, s) for p, s in zip(self.pairs, self.scores[model], strict=True) if p.in_sample == wanted
+            (p, s) for p, s in zip(self.pairs, self.scores[model], strict=True) if p.in_sample == requested
         ]
         broken = [p.name for p, _ in chosen if model in p.diverged]
         if broken:
             return Aggregate(
                 None, None, {}, len(chosen), f"the simulation of {broken[0]} does not stay finite"
             )
-        rows = [{axis: one.value for axis, one in scores.items()} for _, scores in chosen]
+        rows = [{axis: score.value for axis, score in scores.items()} for _, scores in chosen]
         return aggregate(rows, statistic, seed=self.seed)
 
     def as_json(self) -> dict[str, Any]:
@@ -785,9 +794,9 @@ def replay(
         raise CalibrationError("no trial to replay: give at least one")
     if out is not None:
         refuse_unwritable(atomic_directory(out, replaces=REPLAY_FILE))
-    pairs, left_out = replay_pairs(trials, vehicle, models, progress)
+    pairs, excluded = replay_pairs(trials, vehicle, models, progress)
     if not pairs:
-        raise CalibrationError(f"no trial could be replayed: {left_out[0]}")
+        raise CalibrationError(f"no trial could be replayed: {excluded[0]}")
     ahead: dict[Axis, dict[str, Ahead]] = {}
     if horizon is not None:
         named = {trial.name: trial for trial in trials}
@@ -796,7 +805,7 @@ def replay(
         vehicle=vehicle,
         models=models,
         pairs=tuple(pairs),
-        left_out=tuple(left_out),
+        left_out=tuple(excluded),
         horizon=horizon,
         ahead=ahead,
         seed=seed,
@@ -808,10 +817,10 @@ def replay(
 
 def _seconds(horizon: float) -> Array:
     """1, 2, ... s up to the horizon; quarters of it where it is below 2 s."""
-    whole = np.arange(1.0, np.floor(horizon + 1e-9) + 1.0)
-    if len(whole) < 2:
+    full = np.arange(1.0, np.floor(horizon + 1e-9) + 1.0)
+    if len(full) < 2:
         return np.asarray(horizon * np.arange(1, 5) / 4.0)
-    return whole if abs(whole[-1] - horizon) < 1e-6 else np.append(whole, horizon)
+    return full if abs(full[-1] - horizon) < 1e-6 else np.append(full, horizon)
 
 
 def run_replay(
@@ -922,17 +931,17 @@ def draw_response_envelopes(pairs: Sequence[Pair], title: str = "") -> Figure:
         ValueError: No trial has a response that could be drawn.
     """
     held_out = [pair for pair in pairs if not pair.in_sample]
-    shown = held_out or list(pairs)
+    drawn = held_out or list(pairs)
 
     def drawable(pair: Pair, axis: Axis) -> bool:
         return axis in pair.axes and response_span(pair, pair.response(axis)).value is not None
 
-    panels = {axis: chosen for axis in AXES if (chosen := [p for p in shown if drawable(p, axis)])}
+    panels = {axis: chosen for axis in AXES if (chosen := [p for p in drawn if drawable(p, axis)])}
     if not panels:
         raise ValueError(
             "no trial has a response that could be drawn: nothing was measured on an excited axis"
         )
-    models = models_of(shown)
+    models = models_of(drawn)
     columns = 1 if len(panels) == 1 else 2
     rows = -(-len(panels) // columns)
     figure, axes_of = _panels(len(panels), rows, columns, (3.6 * columns, 2.15 * rows + 0.55))
@@ -1005,8 +1014,8 @@ def draw_ahead(ahead: Mapping[Axis, Mapping[str, Ahead]]) -> Figure:
     for axes, (axis, by_model) in zip(axes_of.flat, ahead.items(), strict=False):
         for model, a in by_model.items():
             label, color = _label(model), _color(model, tuple(by_model))
-            look = {"color": color, "linestyle": _style(model), "linewidth": 1.4}
-            axes.plot(a.seconds, a.nrmse, marker="o", markersize=3, label=label, **look)
+            style = {"color": color, "linestyle": _style(model), "linewidth": 1.4}
+            axes.plot(a.seconds, a.nrmse, marker="o", markersize=3, label=label, **style)
         first = next(iter(by_model.values()))
         axes.plot(first.seconds, first.nrmse_persistence, "s-", color=GRAY, ms=3, lw=1.2, label="persistence")
         axes.set_title(axis, fontsize=9, loc="left")
@@ -1047,10 +1056,12 @@ def _envelope_panel(axes: Any, axis: Axis, pairs: Sequence[Pair], models: Sequen
         scores = [{axis: score(p, model, p.response(axis)).value} for p in pairs if model in p.simulated]
         value = aggregate(scores, resamples=1).value
         if value is not None:
-            place = (1.0 - 0.14 * (len(models) - 1 - k), 1.03)
-            axes.text(*place, f"{value:.3f}", transform=axes.transAxes, color=color, fontsize=8, ha="right")
-    place = (1.0 - 0.14 * len(models), 1.03)
-    axes.text(*place, "NRMSE", transform=axes.transAxes, color="0.45", fontsize=7, ha="right")
+            position = (1.0 - 0.14 * (len(models) - 1 - k), 1.03)
+            axes.text(
+                *position, f"{value:.3f}", transform=axes.transAxes, color=color, fontsize=8, ha="right"
+            )
+    position = (1.0 - 0.14 * len(models), 1.03)
+    axes.text(*position, "NRMSE", transform=axes.transAxes, color="0.45", fontsize=7, ha="right")
     coast = [p.t[np.argmax(p.phase == "coast")] - p.t[onset(p, axis) or 0] for p in pairs if _coasts(p, axis)]
     if coast:
         axes.axvspan(float(np.median(coast)), grid[-1], color="0.945", zorder=0, linewidth=0.0)
@@ -1175,7 +1186,7 @@ def replay_json(replay: Replay) -> dict[str, Any]:
         "models": models,
         "horizon": replay.horizon,
         "trials": {pair.name: _trial(replay, i, pair) for i, pair in enumerate(replay.pairs)},
-        "left_out": [one.as_json() for one in replay.left_out],
+        "left_out": [item.as_json() for item in replay.left_out],
         "bootstrap": {"resamples": RESAMPLES, "seed": replay.seed, "unit": "trial"},
         "provenance": provenance(),
     }
@@ -1227,7 +1238,7 @@ def _trial(replay: Replay, i: int, pair: Pair) -> dict[str, Any]:
         "duration_s": float(pair.t[-1]),
         "source": {r: pair.source.get(r, "") for r in pair.measured},
         "noise_std": {r: x for r, x in pair.noise.items() if r in pair.measured and math.isfinite(x)},
-        "findings": [one.as_json() for one in pair.findings],
+        "findings": [item.as_json() for item in pair.findings],
         "models": {
             model: {
                 "nrmse": {a: s.value for a, s in replay.scores[model][i].items()},
@@ -1321,16 +1332,16 @@ def _axis_table(replay: Replay) -> tuple[list[str], Rows]:
     kinds = [k for k in (False, True) if any(p.in_sample == k for p in replay.pairs)]
     rows: Rows = []
     for kind in kinds:
-        found = {m: replay.aggregate(m, in_sample=kind) for m in replay.models}
+        aggregates = {m: replay.aggregate(m, in_sample=kind) for m in replay.models}
         mark = " in-sample" if kind else ""
         for axis in AXES:
             count = sum(axis in p.axes and p.in_sample == kind for p in replay.pairs)
             if count:
-                values = [_number(found[m].by_axis.get(axis)) for m in replay.models]
+                values = [_number(aggregates[m].by_axis.get(axis)) for m in replay.models]
                 rows.append([axis, f"{count}{mark}", *values])
         count = sum(p.in_sample == kind for p in replay.pairs)
-        rows.append(["aggregate", f"{count}{mark}", *(_number(found[m].value) for m in replay.models)])
-        rows.append(["95 % interval", "", *(_interval(found[m]) for m in replay.models)])
+        rows.append(["aggregate", f"{count}{mark}", *(_number(aggregates[m].value) for m in replay.models)])
+        rows.append(["95 % interval", "", *(_interval(aggregates[m]) for m in replay.models)])
     return ["NRMSE", "trials", *(_label(m) for m in replay.models)], rows
 
 
@@ -1339,10 +1350,10 @@ def _trial_table(replay: Replay) -> tuple[list[str], Rows]:
     model = replay.models[0]
     rows: Rows = []
     for pair, scores in zip(replay.pairs, replay.scores[model], strict=True):
-        for axis, one in scores.items():
+        for axis, score in scores.items():
             phases = [_number(phase_score(pair, model, pair.response(axis), p).value) for p in PHASES]
             kind = "in-sample" if pair.in_sample else "held-out"
-            rows.append([pair.name, axis, kind, _number(one.value), *phases])
+            rows.append([pair.name, axis, kind, _number(score.value), *phases])
     return ["trial", "axis", "", "NRMSE", "excitation", "coast"], rows
 
 
@@ -1362,23 +1373,25 @@ def _ahead_table(replay: Replay) -> tuple[list[str], Rows]:
 
 def _remarks(replay: Replay) -> list[str]:
     """What could not be scored or replayed, what was derived, and why there is no interval; equal ones together."""
-    found: list[Finding] = [*replay.left_out]
+    findings: list[Finding] = [*replay.left_out]
     for model in replay.models:
-        why = replay.aggregate(model).why
-        found += [finding("no_interval", _label(model), reason=why)] if why else []
+        reason = replay.aggregate(model).why
+        findings += [finding("no_interval", _label(model), reason=reason)] if reason else []
     for pair, scores in zip(replay.pairs, replay.scores[replay.models[0]], strict=True):
-        for axis, one in scores.items():
-            if one.why:
-                found.append(finding("not_scored", pair.name, axis=str(axis), reason=one.why))
+        for axis, score in scores.items():
+            if score.why:
+                findings.append(finding("not_scored", pair.name, axis=str(axis), reason=score.why))
             source = pair.source.get(pair.response(axis), "")
             if source not in ("", "measured"):
-                found.append(finding("velocity_derived", pair.name, axis=str(axis), source=source))
+                findings.append(finding("velocity_derived", pair.name, axis=str(axis), source=source))
         if not scores:
-            found.append(finding("no_axis", pair.name))
+            findings.append(finding("no_axis", pair.name))
         for model, late in pair.late.items():
             sense = "lags" if late > 0.0 else "leads"
-            found.append(finding("clocks_apart", pair.name, model=_label(model), sense=sense, late=abs(late)))
-    return sentences(found)
+            findings.append(
+                finding("clocks_apart", pair.name, model=_label(model), sense=sense, late=abs(late))
+            )
+    return sentences(findings)
 
 
 def _label(model: str) -> str:

@@ -71,15 +71,15 @@ def publish(
 
 def command_line(kind: str, inputs: Iterable[Path], options: Mapping[str, Any]) -> str:
     """The command line that does this again; options that are None, False or empty are left out."""
-    words = ["finssim", "calibrate", kind, *map(str, inputs)]
+    tokens = ["finssim", "calibrate", kind, *map(str, inputs)]
     for name, value in options.items():
         option = f"--{name.replace('_', '-')}"
         for item in value if isinstance(value, (list, tuple)) else [value]:
             if item is True:
-                words.append(option)
+                tokens.append(option)
             elif item is not None and item is not False and item != "":
-                words += [option, str(item)]
-    return shlex.join(words)
+                tokens += [option, str(item)]
+    return shlex.join(tokens)
 
 
 @contextmanager
@@ -91,7 +91,7 @@ def progress_bar() -> Iterator[Callable[..., None]]:
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bars:
         bar = bars.add_task("fit", total=1.0)
-        yield lambda part, words="fit": bars.update(bar, completed=part, description=words)
+        yield lambda part, text="fit": bars.update(bar, completed=part, description=text)
 
 
 BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
@@ -104,15 +104,15 @@ WIDE = 1.0
 
 def fit_pictures(fit: Fit) -> dict[str, tuple[str, bytes]]:
     """File name -> what the picture shows, and the PNG; equal fits give equal pictures."""
-    found: dict[str, tuple[str, Figure]] = {}
+    pictures: dict[str, tuple[str, Figure]] = {}
     estimates = draw_estimates(list(fit.estimates.values()))
     if estimates is not None:
-        found["estimates.png"] = ("95 % intervals relative to the estimates", estimates)
+        pictures["estimates.png"] = ("95 % intervals relative to the estimates", estimates)
     if fit.correlation is not None and len(fit.correlation.names) > 1:
-        found["correlation.png"] = ("Correlation of the errors", draw_correlation(fit.correlation))
+        pictures["correlation.png"] = ("Correlation of the errors", draw_correlation(fit.correlation))
     for i, figure in enumerate(draw_curves(fit.curves), start=1):
-        found[f"curves_{i}.png"] = ("Measured and fitted, and the residual", figure)
-    return {name: (text, png(figure)) for name, (text, figure) in found.items()}
+        pictures[f"curves_{i}.png"] = ("Measured and fitted, and the residual", figure)
+    return {name: (text, png(figure)) for name, (text, figure) in pictures.items()}
 
 
 def draw_estimates(estimates: Sequence[Estimate]) -> Figure | None:
@@ -120,19 +120,19 @@ def draw_estimates(estimates: Sequence[Estimate]) -> Figure | None:
 
     Biases, which should be nothing, have no place in it.
     """
-    shown = [
+    drawn = [
         e
         for e in estimates
         if e.estimate != 0.0
         and not e.name.endswith("bias")
         and all(map(math.isfinite, (e.estimate, *e.ci95)))
     ]
-    if not shown:
+    if not drawn:
         return None
-    figure = new_figure(7.2, 0.9 + 0.27 * len(shown))
+    figure = new_figure(7.2, 0.9 + 0.27 * len(drawn))
     axes = figure.subplots()
-    rows = np.arange(len(shown))[::-1]
-    for row, estimate in zip(rows, shown, strict=True):
+    rows = np.arange(len(drawn))[::-1]
+    for row, estimate in zip(rows, drawn, strict=True):
         low, high = sorted(x / estimate.estimate - 1.0 for x in estimate.ci95)
         color = BLUE if estimate.identifiable else ORANGE
         axes.plot(np.clip([low, high], -WIDE, WIDE), [row, row], color=color, linewidth=3, alpha=0.6)
@@ -140,10 +140,10 @@ def draw_estimates(estimates: Sequence[Estimate]) -> Figure | None:
         for end, mark in ((low, "<"), (high, ">")):
             if abs(end) > WIDE:
                 axes.plot([math.copysign(WIDE, end)], [row], mark, color=color, markersize=6)
-    axes.set_yticks(rows, [f"{e.name}  {e.estimate:.4g} {e.unit}" for e in shown], fontsize=8)
-    axes.set_ylim(-0.8, len(shown) - 0.2)
+    axes.set_yticks(rows, [f"{e.name}  {e.estimate:.4g} {e.unit}" for e in drawn], fontsize=8)
+    axes.set_ylim(-0.8, len(drawn) - 0.2)
     axes.axvline(0.0, color=GRAY, linewidth=0.8)
-    reach = max(abs(x / e.estimate - 1.0) for e in shown for x in e.ci95)
+    reach = max(abs(x / e.estimate - 1.0) for e in drawn for x in e.ci95)
     axes.set_xlim(-1.05 * min(reach, WIDE), 1.05 * min(reach, WIDE))
     axes.xaxis.set_major_formatter(lambda x, _: f"{100 * x:+.3g} %" if x else "0")
     axes.set_xlabel("95 % interval relative to the estimate; crosses: not identified")
@@ -324,7 +324,7 @@ def fit_json(
         "kept": kept(fit, vehicle),
         "quality": plain(fit.quality),
         "correlation": None if fit.correlation is None else fit.correlation.as_json(),
-        "findings": [one.as_json() for one in findings],
+        "findings": [item.as_json() for item in findings],
         "trials": dict(fit.trials),
         "settings": vehicle.calibrations[-1].settings,
         "interrupted": fit.interrupted,
@@ -380,15 +380,15 @@ def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
     return "file kept"
 
 
-def quality_text(figures: Mapping[str, float], *, whole: bool = True) -> str:
+def quality_text(figures: Mapping[str, float], *, every: bool = True) -> str:
     """`R² 0.998, NRMSE 0.021, samples 1204`.
 
     Args:
         figures: By key.
-        whole: All of them, or those of `QUALITY` alone.
+        every: All of them, or those of `QUALITY` alone.
     """
     keys = [key for key in QUALITY if key in figures]
-    keys += [key for key in figures if key not in QUALITY] if whole or not keys else []
+    keys += [key for key in figures if key not in QUALITY] if every or not keys else []
     return ", ".join(f"{QUALITY.get(key, key.replace('_', ' '))} {number_text(figures[key])}" for key in keys)
 
 
@@ -424,12 +424,12 @@ class Report:
     @property
     def notes(self) -> list[str]:
         """Remarks, and findings worth knowing."""
-        return [*self.remarks, *sentences(one for one in self.findings if one.severity == "note")]
+        return [*self.remarks, *sentences(item for item in self.findings if item.severity == "note")]
 
     @property
     def advice(self) -> list[str]:
         """Findings that ask for something."""
-        return sentences(one for one in self.findings if one.severity != "note")
+        return sentences(item for item in self.findings if item.severity != "note")
 
     def show(self, console: Console) -> None:
         """Print estimates, figures and findings; fits 100 columns."""
@@ -501,7 +501,7 @@ def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> 
         vehicle: `calibrated(fit)`.
         findings: The fit's and those about the calibrated vehicle.
     """
-    told = sum(e.identifiable for e in fit.estimates.values())
+    identified = sum(e.identifiable for e in fit.estimates.values())
     interrupted = " The fit was interrupted before it converged." if fit.interrupted else ""
     notes: dict[str, list[str]] = {}
     for name, estimate in fit.estimates.items():
@@ -517,8 +517,8 @@ def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> 
         estimates=list(fit.estimates.values()),
         cells=lambda e: _cells(e, fit, vehicle),
         summary=[
-            f"{told} of {len(fit.estimates)} parameters are determined by the data.{interrupted}",
-            *(f"{what}: {quality_text(figures, whole=False)}" for what, figures in fit.quality.items()),
+            f"{identified} of {len(fit.estimates)} parameters are determined by the data.{interrupted}",
+            *(f"{subject}: {quality_text(figures, every=False)}" for subject, figures in fit.quality.items()),
         ],
         findings=findings,
         reading=READING,
@@ -554,7 +554,7 @@ def write_report(
         OutputError: The directory holds other files, or cannot be written.
     """
     record = vehicle.calibrations[-1]
-    quality = [(what, quality_text(figures)) for what, figures in fit.quality.items()]
+    quality = [(subject, quality_text(figures)) for subject, figures in fit.quality.items()]
     trials = list(fit.trials.items())
     tables: dict[str, ExtraTable] = {"Quality": (("", ""), quality, [""] * len(quality))} if quality else {}
     tables["Trials"] = (("name", "SHA-256 of its numbers"), trials, [""] * len(trials))
@@ -579,18 +579,18 @@ def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:
         CalibrationError: None is left.
     """
     used = [trial for trial in trials if trial.header.role != "held-out"]
-    left = [finding("held_out", trial.name) for trial in trials if trial.header.role == "held-out"]
+    excluded = [finding("held_out", trial.name) for trial in trials if trial.header.role == "held-out"]
     if not used:
         raise CalibrationError("every trial is marked held-out: a fit needs trials of role 'fit' or of none")
-    return used, left
+    return used, excluded
 
 
 def usable_trials(paths: Sequence[Path]) -> list[Trial]:
     """Load, and say on standard error what is left out of each trial and why."""
-    used, left = usable(load_trials(paths))
+    used, excluded = usable(load_trials(paths))
     screen = Console(stderr=True)
-    left += [one.about(trial.name) for trial in used for one in trial.findings]
-    for sentence in sentences(left):
+    excluded += [item.about(trial.name) for trial in used for item in trial.findings]
+    for sentence in sentences(excluded):
         screen.print(sentence, highlight=False, markup=False, soft_wrap=True)
     return used
 
@@ -612,8 +612,8 @@ def finish(kind: str, fit: Fit, options: Mapping[str, Any]) -> Vehicle:
     findings = all_findings(fit, vehicle)
     write_vehicle(vehicle, out)
     if report is not None:
-        given = {name: value for name, value in rest if name != "as_json"}
-        command = command_line(kind, [inputs] if isinstance(inputs, Path) else inputs, given)
+        arguments = {name: value for name, value in rest if name != "as_json"}
+        command = command_line(kind, [inputs] if isinstance(inputs, Path) else inputs, arguments)
         write_report(fit, report, vehicle, command=command, findings=findings, out=out)
     if ranges is not None:
         write_ranges(fit, ranges, vehicle)

@@ -148,16 +148,16 @@ def record(
 
 
 def _longest_delay(vehicle: Vehicle, plant: Mapping[str, ArrayLike] | None) -> float:
-    own = max(t.delay for t in vehicle.thrusters.values())
-    return max(own, float(np.max((plant or {}).get("delay", 0.0))))
+    longest = max(t.delay for t in vehicle.thrusters.values())
+    return max(longest, float(np.max((plant or {}).get("delay", 0.0))))
 
 
 def _override(simulator: Simulator, plant: Mapping[str, ArrayLike]) -> None:
     """Write fields of the plant and refresh what follows from them."""
     for name, value in plant.items():
         if name not in simulator.plant.fields or name in DERIVED:
-            known = ", ".join(f for f in simulator.plant.fields if f not in DERIVED)
-            raise CalibrationError(f"plant has no field '{name}'; available: {known}")
+            available = ", ".join(f for f in simulator.plant.fields if f not in DERIVED)
+            raise CalibrationError(f"plant has no field '{name}'; available: {available}")
         view = simulator.plant.fields[name].numpy()[:, 0]
         try:
             view[...] = np.asarray(value)
@@ -398,7 +398,7 @@ Input = Literal["rpm", "force", "wrench", "pwm", "command"]
 
 
 def simulate_programme(
-    programmes: Sequence[Programme], vehicle: Vehicle, *, seed: int = 0, **how: Any
+    programmes: Sequence[Programme], vehicle: Vehicle, *, seed: int = 0, **options: Any
 ) -> list[Trial]:
     """Trials of a vehicle, one for each programme: `record` and then `trials_of`.
 
@@ -406,15 +406,15 @@ def simulate_programme(
         programmes: What to run.
         vehicle: The vehicle, whose file says what it believes of itself.
         seed: Of initial conditions and noise; equal seeds give equal trials.
-        how: Arguments of `trials_of` (noise, rate, columns, inputs, sampling) and of `record` (hydrodynamics, plant,
-            disturbance, water, pool, tether, depth, spread, threads).
+        options: Arguments of `trials_of` (noise, rate, columns, inputs, sampling) and of `record` (hydrodynamics,
+            plant, disturbance, water, pool, tether, depth, spread, threads).
 
     Raises:
         CalibrationError: An argument that cannot be.
     """
-    measured = {name: how.pop(name) for name in MEASURED & how.keys()}
-    recording = record(programmes, vehicle, seed=seed, **how)
-    if (water := how.get("water")) is not None and any(water.current):
+    measured = {name: options.pop(name) for name in MEASURED & options.keys()}
+    recording = record(programmes, vehicle, seed=seed, **options)
+    if (water := options.get("water")) is not None and any(water.current):
         measured["current"] = tuple(water.current)
     return trials_of(recording, programmes, vehicle, seed=seed, **measured)
 
@@ -524,7 +524,7 @@ def _inputs(
     thrusters = list(enumerate(vehicle.thrusters.items()))
     if "rpm" in inputs:
         turns = 60.0 / (2.0 * np.pi)
-        out |= {f"rpm_{name}": one.speed(thrust[..., k]) * turns for k, (name, one) in thrusters}
+        out |= {f"rpm_{name}": thruster.speed(thrust[..., k]) * turns for k, (name, thruster) in thrusters}
     if "force" in inputs:
         out |= {f"force_{name}": thrust[..., k] for k, (name, _) in thrusters}
     if "wrench" in inputs:
@@ -533,7 +533,10 @@ def _inputs(
     if "command" in inputs:
         out |= {f"command_{name}": command[..., k] for k, (name, _) in thrusters}
     if "pwm" in inputs:
-        out |= {f"pwm_{name}": one.pulse(one.speed(command[..., k])) for k, (name, one) in thrusters}
+        out |= {
+            f"pwm_{name}": thruster.pulse(thruster.speed(command[..., k]))
+            for k, (name, thruster) in thrusters
+        }
     return out
 
 
@@ -547,5 +550,5 @@ def _end(programme: Programme, recording: Recording, world: int) -> float:
         np.gradient(recording.position[:, world, 2].astype(float), recording.step) > programme.ascent_speed
     )
     since = np.where((t >= coasting[0]) & rising, t, np.inf)
-    found = float(since.min()) + programme.ascent_time
-    return min(programme.duration, found)
+    settled = float(since.min()) + programme.ascent_time
+    return min(programme.duration, settled)

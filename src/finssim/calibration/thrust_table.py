@@ -202,19 +202,19 @@ class Source(NamedTuple):
     """To rad/s, N, µs, V or s; NaN where the header names no unit."""
 
 
-def find_columns(headers: list[str], used: list[bool], shown: str) -> dict[str, Source]:
+def find_columns(headers: list[str], used: list[bool], label: str) -> dict[str, Source]:
     """The column of every quantity that the table has.
 
     Args:
         headers: The header line's cells.
         used: Whether a column holds any number but zero; others are passed over.
-        shown: How messages call the table.
+        label: How messages call the table.
 
     Raises:
         CalibrationError: Two columns could be meant, or a unit is missing.
     """
     names = [header.strip() for header in headers]
-    found: dict[str, Source] = {}
+    columns: dict[str, Source] = {}
     candidates: dict[str, list[Source]] = {}
     for column, header in enumerate(names):
         guess = _recognised(header)
@@ -227,26 +227,26 @@ def find_columns(headers: list[str], used: list[bool], shown: str) -> dict[str, 
         if len(sources) > 1:
             listed = " or ".join(f"'{source.header}'" for source in sources)
             raise CalibrationError(
-                f"{shown}: {quantity} could be {listed}: rename the column that is not meant, or remove it"
+                f"{label}: {quantity} could be {listed}: rename the column that is not meant, or remove it"
             )
-        found[quantity] = sources[0]
-    for quantity, source in found.items():
+        columns[quantity] = sources[0]
+    for quantity, source in columns.items():
         if math.isnan(source.factor):
             raise CalibrationError(
-                f"{shown}: column '{source.header}' has no unit: write it into the header, one of {_SHOWN[quantity]}, "
+                f"{label}: column '{source.header}' has no unit: write it into the header, one of {_SHOWN[quantity]}, "
                 f"such as '{source.header} ({_SHOWN[quantity].split(',')[0]})'"
             )
-    return found
+    return columns
 
 
 def _recognised(header: str) -> tuple[str, float] | None:
     """Quantity and factor that a header names; the factor is NaN where it gives no unit."""
     label, unit = _split(header)
-    words = set(re.findall(r"[a-z]+", label.lower()))
+    tokens = set(re.findall(r"[a-z]+", label.lower()))
     for word, (quantity, factor) in _IMPLIED.items():
-        if word in words and _plain(unit) in ("", word):
+        if word in tokens and _plain(unit) in ("", word):
             return quantity, factor
-    matches = [quantity for quantity, known in _WORDS.items() if words & known]
+    matches = [quantity for quantity, keywords in _WORDS.items() if tokens & keywords]
     if unit:
         matches = [quantity for quantity in matches if _plain(unit) in _UNITS[quantity]]
         if not label and not matches:
@@ -263,11 +263,11 @@ def _split(header: str) -> tuple[str, str]:
     brackets = re.fullmatch(r"(.*?)[\s_]*[(\[{](.*)[)\]}]", text)
     if brackets:
         return brackets[1], brackets[2]
-    known = {unit for units in _UNITS.values() for unit in units}
+    all_units = {unit for units in _UNITS.values() for unit in units}
     parts = re.split(r"[\s_]+", text)
     for start in range(1, len(parts)):
         tail = "/".join(parts[start:]) if len(parts) - start == 2 else "".join(parts[start:])
-        if _plain(tail) in known:
+        if _plain(tail) in all_units:
             return " ".join(parts[:start]), tail
     return text, ""
 
@@ -284,12 +284,10 @@ STANDING = 0.01
 """Share of the fastest speed below which a shaft counts as standing."""
 
 
-def without_offset(
-    full: dict[str, Array], speed_known: bool, neutral: float, findings: list[Finding]
-) -> Array:
+def without_offset(full: dict[str, Array], has_speed: bool, neutral: float, findings: list[Finding]) -> Array:
     """Forces less the median reading at standstill."""
     force = full["force"]
-    if speed_known:
+    if has_speed:
         standing = np.abs(full["speed"]) <= STANDING * np.nanmax(np.abs(full["speed"]))
     else:
         standing = np.abs(full["pulse"] - neutral) <= 0.02 * neutral / 3.0
@@ -311,31 +309,31 @@ PLAUSIBLE = {
 """What a column of a table may hold: least, most, unit."""
 
 
-def check_values(full: Mapping[str, Array], shown: str) -> None:
+def check_values(full: Mapping[str, Array], label: str) -> None:
     """Refuse numbers that cannot be what their column says.
 
     Args:
         full: Columns of `PLAUSIBLE`, (n,) each; NaN and 0 are passed over.
-        shown: Name of the table, for messages.
+        label: Name of the table, for messages.
 
     Raises:
         CalibrationError: A number is beyond its limits.
     """
-    for key, (least, most, unit) in PLAUSIBLE.items():
-        known = full[key][np.isfinite(full[key]) & (full[key] != 0.0)]
-        if known.size and (known.min() < least or known.max() > most):
+    for key, (least, greatest, unit) in PLAUSIBLE.items():
+        values = full[key][np.isfinite(full[key]) & (full[key] != 0.0)]
+        if values.size and (values.min() < least or values.max() > greatest):
             raise CalibrationError(
-                f"{shown}: {key}s run from {known.min():g} to {known.max():g} {unit}, expected {least:g} to {most:g} "
-                f"{unit}: check the column's name and unit"
+                f"{label}: {key}s run from {values.min():g} to {values.max():g} {unit}, expected {least:g} to "
+                f"{greatest:g} {unit}: check the column's name and unit"
             )
 
 
 def signed(
     full: dict[str, Array],
-    speed_known: bool,
+    has_speed: bool,
     neutral: float,
     sources: Mapping[str, Source],
-    shown: str,
+    label: str,
     findings: list[Finding],
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Speed and force with the sign of rotation, and the rows whose sign is known."""
@@ -346,8 +344,8 @@ def signed(
     if sign_pulse.any() and np.nanmin(sign_pulse) < 0 < np.nanmax(sign_pulse) and not force_signed:
         findings.append(finding("force_sign", source="pulse"))
         force, force_signed = np.abs(force) * np.nan_to_num(sign_pulse), True
-    if not speed_known:
-        _same_way(sign_pulse, force, small, ("pulse", "force"), sources, shown)
+    if not has_speed:
+        _same_way(sign_pulse, force, small, ("pulse", "force"), sources, label)
         return speed, force, np.ones(force.shape, bool)
     fastest = np.max(np.abs(speed))
     turning = np.abs(speed) > STANDING * fastest
@@ -355,7 +353,7 @@ def signed(
         if not force_signed and not sign_pulse.any():
             findings.append(finding("force_sign", source="speed"))
             force = np.abs(force) * np.sign(speed)
-        _same_way(np.sign(speed) * turning, force, small, ("speed", "force"), sources, shown)
+        _same_way(np.sign(speed) * turning, force, small, ("speed", "force"), sources, label)
         return speed, force, np.ones(force.shape, bool)
     sign = np.where(
         np.isfinite(sign_pulse) & (sign_pulse != 0.0), sign_pulse, np.sign(force) * (np.abs(force) > small)
@@ -363,7 +361,7 @@ def signed(
     if np.any(sign < 0.0):
         findings.append(finding("speed_sign"))
     if sign_pulse.any():
-        _same_way(sign_pulse, force, small, ("pulse", "force"), sources, shown)
+        _same_way(sign_pulse, force, small, ("pulse", "force"), sources, label)
     keep = ~turning | (sign != 0.0)
     if not keep.all():
         findings.append(finding("rows_unsigned", rows=np.count_nonzero(~keep)))
@@ -371,7 +369,7 @@ def signed(
 
 
 def _same_way(
-    sign: Array, force: Array, small: float, names: tuple[str, str], sources: Mapping[str, Source], shown: str
+    sign: Array, force: Array, small: float, names: tuple[str, str], sources: Mapping[str, Source], label: str
 ) -> None:
     """Refuse a table in which most forces point against the speed or pulse."""
     clear = (np.abs(force) > 5.0 * small) & (np.nan_to_num(sign) != 0.0)
@@ -379,7 +377,7 @@ def _same_way(
     if against > 0.5 * np.count_nonzero(clear):
         header = sources[names[1]].header if names[1] in sources else names[1]
         raise CalibrationError(
-            f"{shown}: {names[1]} is negative where {names[0]} is positive: turn the sign of the "
+            f"{label}: {names[1]} is negative where {names[0]} is positive: turn the sign of the "
             f"column '{header}'"
         )
 
@@ -428,22 +426,22 @@ def read_table(path: str | os.PathLike[str], *, neutral: float = 1500.0) -> Thru
     Raises:
         CalibrationError: Not a table of thrusts, or it can be read in two ways; the sentence says how to decide.
     """
-    shown = os.fspath(path)
-    headers, rows = _cells(Path(path), shown)
+    label = os.fspath(path)
+    headers, rows = _cells(Path(path), label)
     used = [bool(np.any(np.nan_to_num(rows[:, i]) != 0.0)) for i in range(len(headers))]
-    sources = find_columns(headers, used, shown)
+    sources = find_columns(headers, used, label)
     missing = [
-        what
-        for what, need in (("force", {"force"}), ("speed or pulse", {"speed", "pulse"}))
+        quantities
+        for quantities, need in (("force", {"force"}), ("speed or pulse", {"speed", "pulse"}))
         if not need & set(sources)
     ]
     if missing:
         raise CalibrationError(
-            f"{shown}: no column of {' and none of '.join(missing)} among {', '.join(h.strip() for h in headers)}: "
+            f"{label}: no column of {' and none of '.join(missing)} among {', '.join(h.strip() for h in headers)}: "
             f"rename one, such as '{EXAMPLES[missing[0].split()[0]]}' (columns of nothing but zeros are passed over)"
         )
     values = {quantity: rows[:, source.column] * source.factor for quantity, source in sources.items()}
-    return _table(Path(path).stem, values, sources, shown, neutral)
+    return _table(Path(path).stem, values, sources, label, neutral)
 
 
 def tables_of_trial(
@@ -494,39 +492,39 @@ def _table(
     name: str,
     values: dict[str, Array],
     sources: Mapping[str, Source],
-    shown: str,
+    label: str,
     neutral: float,
 ) -> ThrustTable:
     """Steady rows, with signs and without the load cell's offset."""
     findings: list[Finding] = []
     if "time" in values:
-        values, kept = last_parts(values)
-        findings.append(kept)
+        values, remark = last_parts(values)
+        findings.append(remark)
     count = len(values["force"])
     full = {key: values.get(key, np.full(count, np.nan)) for key in QUANTITIES}
-    speed_known = "speed" in values
-    good = np.isfinite(full["force"]) & np.isfinite(full["speed"] if speed_known else full["pulse"])
+    has_speed = "speed" in values
+    good = np.isfinite(full["force"]) & np.isfinite(full["speed"] if has_speed else full["pulse"])
     if np.count_nonzero(good) < 3:
-        raise CalibrationError(f"{shown}: {np.count_nonzero(good)} rows hold numbers, expected at least 3")
+        raise CalibrationError(f"{label}: {np.count_nonzero(good)} rows hold numbers, expected at least 3")
     full = {key: value[good] for key, value in full.items()}
-    check_values(full, shown)
-    full["force"] = without_offset(full, speed_known, neutral, findings)
-    full["speed"], full["force"], keep = signed(full, speed_known, neutral, sources, shown, findings)
+    check_values(full, label)
+    full["force"] = without_offset(full, has_speed, neutral, findings)
+    full["speed"], full["force"], keep = signed(full, has_speed, neutral, sources, label, findings)
     columns: dict[str, Any] = {key: value[keep] for key, value in full.items()}
     numbers = (np.ascontiguousarray(columns[key] + 0.0).tobytes() for key in sorted(columns))
     digest = hashlib.sha256(b"".join(numbers))
     return ThrustTable(name=name, **columns, sha256=digest.hexdigest(), findings=tuple(findings))
 
 
-def _cells(path: Path, shown: str) -> tuple[list[str], Array]:
+def _cells(path: Path, label: str) -> tuple[list[str], Array]:
     """Headers and numbers of a file; a second header line of units is joined to the first."""
     table = read_text_table(path, CalibrationError)
     headers, rows = table.names, table.rows
     if not rows:
-        raise CalibrationError(f"{shown}: no rows below a header line: give a CSV table of speeds and forces")
+        raise CalibrationError(f"{label}: no rows below a header line: give a CSV table of speeds and forces")
     if not any(math.isnan(_number(table, cell)) for cell in headers):
         raise CalibrationError(
-            f"{shown}: the first line holds numbers, expected a header line that names the columns"
+            f"{label}: the first line holds numbers, expected a header line that names the columns"
         )
     if all(math.isnan(_number(table, cell)) for cell in rows[0]):
         units = [unit.strip(" ()[]") for unit in rows.pop(0)][: len(headers)]

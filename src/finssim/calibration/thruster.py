@@ -92,10 +92,10 @@ def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
     )
 
 
-def jackknife(leave_one_out: Array) -> Array:
+def jackknife(estimates: Array) -> Array:
     """Half-widths of 95 % intervals from estimates that each leave one of G blocks out, (G, P) -> (P,)."""
-    G = len(leave_one_out)
-    deviation = leave_one_out - np.mean(leave_one_out, axis=0)
+    G = len(estimates)
+    deviation = estimates - np.mean(estimates, axis=0)
     return t_quantile(G - 1) * np.sqrt((G - 1) / G * np.sum(deviation**2, axis=0))
 
 
@@ -250,12 +250,12 @@ def fit_esc(
         law = (throw[turning] / span, voltage[side][turning], omega[turning], weight[side][turning])
         zero, emf, load = _law(*law, edge / span)
         label = np.argsort(np.argsort(law[0], kind="stable")) * PULSE_BLOCKS // len(law[0])
-        left_out = [
+        jackknifed = [
             _law(*(column[label != i] for column in law), edge / span)
             for i in range(PULSE_BLOCKS)
             if np.any(label == i)
         ]
-        half = jackknife(np.array(left_out))
+        half = jackknife(np.array(jackknifed))
         numbers |= {f"dead_{name}": neutral + sign * edge, f"zero_{name}": neutral + sign * span * zero}
         numbers |= {f"emf_{name}": emf, f"load_{name}": load}
         ends = sorted(neutral + sign * x for x in edge_interval)
@@ -318,13 +318,13 @@ def _law(duty: Array, volts: Array, omega: Array, weight: Array, edge: float) ->
     first = np.clip(
         [min(start[2], 0.9 * edge), start[0], start[1]], 1e-3 * scale, [max(edge, 1e-3), np.inf, np.inf]
     )
-    found = least_squares(
+    solution = least_squares(
         partial(_residual, duty=duty, volts=volts, omega=omega, weight=weight),
         first,
         bounds=([0.0, 0.0, 0.0], [max(edge, 2e-3), np.inf, np.inf]),
         x_scale=scale,
     )
-    zero, emf, load = (float(x) for x in found.x)
+    zero, emf, load = (float(x) for x in solution.x)
     return min(zero, edge), emf, load
 
 
@@ -373,7 +373,7 @@ class Bench:
 def bench(
     tables: Sequence[ThrustTable],
     thruster: Thruster,
-    shown: str,
+    label: str,
     *,
     voltage: float | None,
     pool_voltages: bool,
@@ -383,7 +383,7 @@ def bench(
     Args:
         tables: At least one.
         thruster: As the vehicle file has it.
-        shown: How messages call the target.
+        label: How messages call the target.
         voltage: At which the numbers shall hold [V]; where not given, the only one of the tables, else that of the
             vehicle file's ESC, else the middle one.
         pool_voltages: Fit all voltages together, rather than this one alone.
@@ -397,15 +397,15 @@ def bench(
         tables = [table for table in tables if np.isfinite(table.speed).any()]
     else:
         tables = [_with_speeds(table, thruster) for table in tables]
-        findings.append(finding("no_shaft_speeds", shown))
+        findings.append(finding("no_shaft_speeds", label))
     levels = [level for table in tables for level in split_by_voltage(table)]
-    chosen = _reference([volts for volts, _ in levels], thruster, shown, voltage)
+    chosen = _reference([volts for volts, _ in levels], thruster, label, voltage)
     at = [table for volts, table in levels if not abs(volts - chosen) > SAME_VOLTAGE]
     others = sorted({round(volts, 1) for volts, table in levels if not any(table is t for t in at)})
     fitted = [table for _, table in levels] if pool_voltages else at
     if others and not pool_voltages:
         findings.append(
-            finding("voltage_chosen", shown, voltage=chosen, others=tuple(f"{v:g}" for v in others))
+            finding("voltage_chosen", label, voltage=chosen, others=tuple(f"{v:g}" for v in others))
         )
     sides, dead, fastest = {}, {}, {}
     for name, sign in SIDES:
@@ -419,11 +419,11 @@ def bench(
         fastest[name] = max(speeds, default=(0.0, False, 0.0))
     esc = None
     if any(np.isfinite(table.pulse).any() for table in tables):
-        esc = _esc(fitted, thruster, tables, shown, chosen, measured, findings)
+        esc = _esc(fitted, thruster, tables, label, chosen, measured, findings)
     if not sides and esc is None:
-        said = "; ".join(sentences(findings)) or f"{shown}: no row turns the shaft"
-        raise CalibrationError(f"{said}: nothing could be fitted")
-    findings += [one.about(table.name) for table in tables for one in table.findings]
+        reasons = "; ".join(sentences(findings)) or f"{label}: no row turns the shaft"
+        raise CalibrationError(f"{reasons}: nothing could be fitted")
+    findings += [item.about(table.name) for table in tables for item in table.findings]
     return Bench(
         levels=tuple(levels),
         voltage=chosen,
@@ -446,38 +446,38 @@ def turning(table: ThrustTable, sign: float) -> tuple[Array, Array]:
 
 def split_by_voltage(table: ThrustTable) -> list[tuple[float, ThrustTable]]:
     """The rows of every voltage level with its mean; (NaN, table) where no voltage is known."""
-    known = np.isfinite(table.voltage)
-    if not known.any():
+    valid = np.isfinite(table.voltage)
+    if not valid.any():
         return [(math.nan, table)]
-    values = np.sort(table.voltage[known])
+    values = np.sort(table.voltage[valid])
     cuts = values[:-1][np.diff(values) > SAME_VOLTAGE] + 0.5 * SAME_VOLTAGE
     label = np.searchsorted(cuts, table.voltage)
-    parts = [table.at(known & (label == i)) for i in range(len(cuts) + 1)]
+    parts = [table.at(valid & (label == i)) for i in range(len(cuts) + 1)]
     return [(float(np.mean(part.voltage)), part) for part in parts]
 
 
-def _reference(volts: Sequence[float], thruster: Thruster, shown: str, asked: float | None) -> float:
-    known = sorted(v for v in volts if not math.isnan(v))
-    if not known:
-        return math.nan if asked is None else asked
-    if asked is None:
-        wanted = thruster.esc.voltage if thruster.esc else math.nan
-        near = [v for v in known if abs(v - wanted) <= SAME_VOLTAGE]
-        return near[0] if near else known[len(known) // 2]
-    near = [v for v in known if abs(v - asked) <= SAME_VOLTAGE]
+def _reference(volts: Sequence[float], thruster: Thruster, label: str, requested: float | None) -> float:
+    available = sorted(v for v in volts if not math.isnan(v))
+    if not available:
+        return math.nan if requested is None else requested
+    if requested is None:
+        preferred = thruster.esc.voltage if thruster.esc else math.nan
+        near = [v for v in available if abs(v - preferred) <= SAME_VOLTAGE]
+        return near[0] if near else available[len(available) // 2]
+    near = [v for v in available if abs(v - requested) <= SAME_VOLTAGE]
     if not near:
-        listed = ", ".join(f"{v:g}" for v in dict.fromkeys(round(v, 2) for v in known))
-        raise CalibrationError(f"{shown}: no table at {asked:g} V; there are {listed} V")
-    return min(near, key=lambda v: abs(v - asked))
+        listed = ", ".join(f"{v:g}" for v in dict.fromkeys(round(v, 2) for v in available))
+        raise CalibrationError(f"{label}: no table at {requested:g} V; there are {listed} V")
+    return min(near, key=lambda v: abs(v - requested))
 
 
 def _together(zones: Sequence[DeadZone]) -> DeadZone:
     """One dead zone from those of several tables: their median, over all of their intervals."""
-    known = [zone for zone in zones if zone.known]
-    chosen = known or list(zones)
+    measured = [zone for zone in zones if zone.known]
+    chosen = measured or list(zones)
     ends = [end for zone in chosen for end in zone.interval]
     middle = float(np.median([zone.speed for zone in chosen]))
-    return DeadZone(speed=middle, interval=(min(ends), max(ends)), known=bool(known), note=chosen[0].note)
+    return DeadZone(speed=middle, interval=(min(ends), max(ends)), known=bool(measured), note=chosen[0].note)
 
 
 def _pulse_range(thruster: Thruster, tables: Sequence[ThrustTable]) -> tuple[float, float, float]:
@@ -513,7 +513,7 @@ def _esc(
     on: Sequence[ThrustTable],
     thruster: Thruster,
     tables: Sequence[ThrustTable],
-    shown: str,
+    label: str,
     volts: float,
     measured: bool,
     findings: list[Finding],
@@ -523,7 +523,7 @@ def _esc(
         np.concatenate([getattr(t, key) for t in on]) for key in ("pulse", "speed", "voltage")
     )
     if math.isnan(volts):
-        findings.append(finding("law_without_voltage", shown))
+        findings.append(finding("law_without_voltage", label))
         return None
     voltage = np.where(np.isfinite(voltage), voltage, volts)
     good = np.isfinite(pulse) & np.isfinite(speed) & (pulse > 0.0)
@@ -539,7 +539,7 @@ def _esc(
             at=volts,
         )
     except CalibrationError as error:
-        findings.append(finding("law_refused", shown, reason=str(error)))
+        findings.append(finding("law_refused", label, reason=str(error)))
         return None
 
 
@@ -573,16 +573,16 @@ def find_targets(
                 f"{vehicle.name} has no propeller group '{group}': it has {', '.join(sorted(groups)) or 'none'}"
             )
         return [Target(group, _members(vehicle, group), tuple(tables))], []
-    found: dict[str, list[ThrustTable]] = {}
+    by_name: dict[str, list[ThrustTable]] = {}
     for table in tables:
-        found.setdefault(_spoken_of(table, vehicle, groups), []).append(table)
-    if "" in found and len(found) > 1:
-        names = ", ".join(table.name for table in found[""])
+        by_name.setdefault(_spoken_of(table, vehicle, groups), []).append(table)
+    if "" in by_name and len(by_name) > 1:
+        names = ", ".join(table.name for table in by_name[""])
         raise CalibrationError(
             f"{names}: no thruster or group of {vehicle.name} is named, but other tables name theirs: put the name "
             "into the file's name, or fit these by themselves"
         )
-    if "" in found:
+    if "" in by_name:
         unnamed = []
         if len(groups) > 1:
             unnamed.append(finding("groups_unnamed", vehicle=vehicle.name, groups=tuple(sorted(groups))))
@@ -590,7 +590,7 @@ def find_targets(
         return [Target(name, vehicle.thruster_names, tuple(tables))], unnamed
     return [
         Target(name, _members(vehicle, name) if name in groups else (name,), tuple(of_name))
-        for name, of_name in found.items()
+        for name, of_name in by_name.items()
     ], []
 
 
@@ -607,14 +607,14 @@ def _spoken_of(table: ThrustTable, vehicle: Vehicle, groups: set[str]) -> str:
             f"{table.name}: {vehicle.name} has no thruster '{table.thruster}': its thrusters are "
             f"{', '.join(vehicle.thrusters)}: rename the columns"
         )
-    for known in (list(vehicle.thrusters), sorted(groups)):
-        said = [
+    for candidates in (list(vehicle.thrusters), sorted(groups)):
+        mentioned = [
             name
-            for name in known
+            for name in candidates
             if re.search(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])", table.name)
         ]
-        if said:
-            return max(said, key=len)
+        if mentioned:
+            return max(mentioned, key=len)
     return ""
 
 
@@ -655,12 +655,12 @@ def quality_of(name: str, result: Bench, before: Thruster) -> dict[str, dict[str
     if result.esc is not None:
         figures["esc_rmse"] = result.esc.rmse
         figures["esc_nrmse"] = result.esc.rmse / result.esc.fastest
-    found = {name: figures}
+    figures_by_name = {name: figures}
     volts = sorted({round(v, 1) for v, _ in result.levels if not math.isnan(v)})
     for volt in volts if len(volts) > 1 else []:
         level = _stack([table for v, table in result.levels if round(v, 1) == volt])
-        found[f"{name} at {volt:g} V"] = _at_voltage(result, before, level)
-    return found
+        figures_by_name[f"{name} at {volt:g} V"] = _at_voltage(result, before, level)
+    return figures_by_name
 
 
 def _at_voltage(result: Bench, before: Thruster, table: ThrustTable) -> dict[str, float]:
@@ -797,9 +797,9 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
             sure, note = math.isfinite(half), f"c_{name} at the speed limit"
         add(f"force_{end}", sign * force, _around(sign * force, half), "N", sure, note)
     units = {"dead": "µs", "zero": "µs", "emf": "V s/rad", "load": "V s²/rad²"}
-    together = "zero, emf and load of a direction vary together: the speed they give is surer than each"
+    caution = "zero, emf and load of a direction vary together: the speed they give is surer than each"
     for key, ends in result.esc.intervals.items() if result.esc is not None else ():
-        note = result.esc.unsure.get(key, "" if key.startswith("dead") else together)
+        note = result.esc.unsure.get(key, "" if key.startswith("dead") else caution)
         value, sure = float(getattr(result.esc.esc, key)), key not in result.esc.unsure
         add(f"esc.{key}", value, ends, units[key.partition("_")[0]], sure, note)
     return rows
@@ -842,17 +842,17 @@ def fit_thruster(
     if not read:
         raise CalibrationError("no table given: name at least one CSV file of speeds and thrusts")
     _refuse_duplicates(read)
-    found, findings = find_targets(read, vehicle, group)
+    targets, findings = find_targets(read, vehicle, group)
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
     quality: dict[str, dict[str, float]] = {}
     curves: list[Curve] = []
-    for target in found:
+    for target in targets:
         first = vehicle.thrusters[target.thrusters[0]]
         result = bench(target.tables, first, target.name, voltage=voltage, pool_voltages=pool_voltages)
-        own = estimates_of(target, result, vehicle)
-        estimates |= {estimate.name: estimate for estimate in own}
-        for estimate in own:
+        estimates_of_target = estimates_of(target, result, vehicle)
+        estimates |= {estimate.name: estimate for estimate in estimates_of_target}
+        for estimate in estimates_of_target:
             key = estimate.name.rpartition(".")[2]
             if estimate.identifiable and key.startswith(WRITTEN):
                 changes |= {f"thrusters.{name}.{key}": estimate.estimate for name in target.thrusters}
@@ -923,9 +923,9 @@ def _named_apart(read: Sequence[tuple[Any, ThrustTable]]) -> list[ThrustTable]:
 
 
 def _refuse_duplicates(tables: Sequence[ThrustTable]) -> None:
-    seen: dict[tuple[str, str | None], str] = {}
+    first_names: dict[tuple[str, str | None], str] = {}
     for table in tables:
-        first = seen.setdefault((table.sha256, table.thruster), table.name)
+        first = first_names.setdefault((table.sha256, table.thruster), table.name)
         if sum((t.sha256, t.thruster) == (table.sha256, table.thruster) for t in tables) > 1:
             names = table.name if first == table.name else f"{first} and {table.name}"
             raise CalibrationError(f"{names}: the same numbers are given twice: give every table once")

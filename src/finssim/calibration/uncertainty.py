@@ -87,9 +87,9 @@ def _whitener(normal: Array) -> tuple[Array, Array]:
     scale = np.sqrt(np.maximum(np.diagonal(normal), 0.0))
     safe = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(normal / np.outer(safe, safe))
-    known = values > FLOOR
-    T = vectors[:, known] / np.sqrt(values[known]) / safe[:, None]
-    unknown = (np.abs(vectors[:, ~known]) > 1e-6).any(axis=1) | (scale == 0.0)
+    determined = values > FLOOR
+    T = vectors[:, determined] / np.sqrt(values[determined]) / safe[:, None]
+    unknown = (np.abs(vectors[:, ~determined]) > 1e-6).any(axis=1) | (scale == 0.0)
     return T, unknown
 
 
@@ -125,8 +125,8 @@ def trial_covariance(evidence: Evidence) -> Covariance:
         )
     B = T.T @ N_g @ T  # leverage of each trial: the shares of the information, they add up to 1
     share, axes = np.linalg.eigh(B)
-    left = 1.0 - np.clip(share, 0.0, 1.0)
-    root = np.where(left > 1e-3, 1.0 / np.maximum(left, 1e-3), 0.0)
+    remaining = 1.0 - np.clip(share, 0.0, 1.0)
+    root = np.where(remaining > 1e-3, 1.0 / np.maximum(remaining, 1e-3), 0.0)
     A = np.einsum("gij,gj,gkj->gik", axes, root, axes)
     errors = np.einsum("pk,gkl,gl->gp", T, A, s_g @ T)
     trials = errors.T @ errors
@@ -236,7 +236,7 @@ def degeneracy(
     Returns:
         Correlation, and what trades off and what would settle it.
     """
-    found = correlation(names, covariance)
+    correlations = correlation(names, covariance)
     variance = np.diagonal(covariance)
     unknown = [name for name, v in zip(names, variance, strict=True) if not np.isfinite(v)]
     findings = [finding("undetermined", parameters=tuple(unknown))] if unknown else []
@@ -246,8 +246,8 @@ def degeneracy(
         loose &= std > LOOSE * np.abs(theta)
     index = np.flatnonzero(np.isfinite(variance) & (variance > 0.0))
     if len(index) < 2:
-        return found, findings
-    R = found.matrix[np.ix_(index, index)]
+        return correlations, findings
+    R = correlations.matrix[np.ix_(index, index)]
     values, vectors = np.linalg.eigh(R)
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
     multiple = np.sqrt(np.clip(1.0 - 1.0 / np.maximum(np.diagonal(inverse), 1.0), 0.0, 1.0))
@@ -263,7 +263,7 @@ def degeneracy(
         group = [names[i] for i in index[large]]
         ratio = 1.0 / np.sqrt(1.0 - multiple[large].max() ** 2 + 1e-24)
         findings.append(_traded(group, float(ratio)))
-    return found, findings
+    return correlations, findings
 
 
 def _traded(group: list[str], ratio: float) -> Finding:

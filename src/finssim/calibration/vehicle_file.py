@@ -60,7 +60,7 @@ def leaves(node: Any, path: Key = ()) -> Iterator[tuple[Key, float]]:
 
 def number_origins(vehicle: Vehicle) -> dict[Key, Provenance]:
     """Origin of every number of `file_tree(vehicle)`, by path; calibration records are not numbers of the vehicle."""
-    return {path: vehicle.origin_of(".".join(whole)) for path, whole, _ in numbers(vehicle)}
+    return {path: vehicle.origin_of(".".join(full_path)) for path, full_path, _ in numbers(vehicle)}
 
 
 def numbers(vehicle: Vehicle) -> Iterator[tuple[Key, Key, float]]:
@@ -68,36 +68,36 @@ def numbers(vehicle: Vehicle) -> Iterator[tuple[Key, Key, float]]:
 
     The two paths differ in a diagonal matrix, where the tree has one row; calibration records are left out.
     """
-    tree, whole = file_tree(vehicle), vehicle.values()
+    tree, values = file_tree(vehicle), vehicle.values()
     tree.pop("calibrations", None)
     for path, value in leaves(tree):
-        yield path, (*path, path[-1]) if isinstance(_at(whole, path), list) else path, value
+        yield path, (*path, path[-1]) if isinstance(_at(values, path), list) else path, value
 
 
 def folded(tree: Any, origins: Mapping[Key, Provenance]) -> dict[str, Provenance]:
     """Origins by dotted path, as reading the file gives them: one entry for a list whose numbers share theirs."""
-    found: dict[str, Provenance] = {}
-    _fold(tree, (), origins, found)
-    return found
+    folded_origins: dict[str, Provenance] = {}
+    _fold(tree, (), origins, folded_origins)
+    return folded_origins
 
 
 def _fold(
-    node: Any, path: Key, origins: Mapping[Key, Provenance], found: dict[str, Provenance]
+    node: Any, path: Key, origins: Mapping[Key, Provenance], result: dict[str, Provenance]
 ) -> Provenance | None:
     """Record what lies below; returns the common origin of a number or list, which the caller records."""
     if isinstance(node, Mapping):
         for key, value in node.items():
-            common = _fold(value, (*path, str(key)), origins, found)
+            common = _fold(value, (*path, str(key)), origins, result)
             if common is not None:
-                found[".".join((*path, str(key)))] = common
+                result[".".join((*path, str(key)))] = common
         return None
     if isinstance(node, list):
-        parts = [_fold(value, (*path, str(i)), origins, found) for i, value in enumerate(node)]
+        parts = [_fold(value, (*path, str(i)), origins, result) for i, value in enumerate(node)]
         if parts and parts[0] is not None and all(part == parts[0] for part in parts):
             return parts[0]
         for i, part in enumerate(parts):
             if part is not None:
-                found[".".join((*path, str(i)))] = part
+                result[".".join((*path, str(i)))] = part
         return None
     return origins.get(path)
 
@@ -195,12 +195,12 @@ def _annotated(node: Any, path: Key, inherited: Provenance | None, origins: Mapp
         common = _common(node, path, origins, inherited)
         inner = {key: _annotated(v, (*path, str(key)), common, origins) for key, v in node.items()}
         return _marks(common, inherited) | inner
-    own, value = origins.get(path, inherited), node
+    origin, value = origins.get(path, inherited), node
     if isinstance(node, list):
         each = {origins.get(leaf) for leaf, _ in leaves(node, path)}
-        own = inherited if len(each) > 1 else next(iter(each), None)
-        value = [_annotated(item, (*path, str(i)), own, origins) for i, item in enumerate(node)]
-    marks = _marks(own, inherited)
+        origin = inherited if len(each) > 1 else next(iter(each), None)
+        value = [_annotated(item, (*path, str(i)), origin, origins) for i, item in enumerate(node)]
+    marks = _marks(origin, inherited)
     return {"value": value} | marks if marks else value
 
 
@@ -251,11 +251,11 @@ def _common(
     Values of one origin and source that differ in their notes share the section's, each with its note alone.
     """
     notes: dict[tuple[Any, str], list[str]] = {}
-    seen: set[tuple[Key, Provenance]] = set()
+    counted: set[tuple[Key, Provenance]] = set()
     for leaf, _ in leaves(node, path):
         value = leaf[:-1] if leaf[-1].isdigit() else leaf
-        if leaf in origins and (value, origins[leaf]) not in seen:
-            seen.add((value, origins[leaf]))
+        if leaf in origins and (value, origins[leaf]) not in counted:
+            counted.add((value, origins[leaf]))
             notes.setdefault(origins[leaf][:2], []).append(origins[leaf].note)
     if not notes:
         return inherited
@@ -280,16 +280,16 @@ def _shared(notes: list[str]) -> str:
     return note if several and notes.count(note) > 2 * notes.count("") else ""
 
 
-def _marks(own: Provenance | None, inherited: Provenance | None) -> dict[str, str]:
+def _marks(origin: Provenance | None, inherited: Provenance | None) -> dict[str, str]:
     """What must be written so that a reader who inherits one origin finds the other."""
-    if own is None or own == inherited:
+    if origin is None or origin == inherited:
         return {}
-    if inherited is not None and own.origin == inherited.origin:
-        if own.source == inherited.source and own.note:
-            return {"note": own.note}
-        if own.source and own.source != inherited.source:
-            return {"source": own.source} | ({"note": own.note} if own.note else {})
-    marks = {"origin": str(own.origin), "source": own.source, "note": own.note}
+    if inherited is not None and origin.origin == inherited.origin:
+        if origin.source == inherited.source and origin.note:
+            return {"note": origin.note}
+        if origin.source and origin.source != inherited.source:
+            return {"source": origin.source} | ({"note": origin.note} if origin.note else {})
+    marks = {"origin": str(origin.origin), "source": origin.source, "note": origin.note}
     return {mark: text for mark, text in marks.items() if text}
 
 
@@ -486,11 +486,11 @@ def calibrated(fit: Fit) -> Vehicle:
     old_values = dict(leaves(before.values()))
     changed = [tuple(path.split(".")) for path in fit.changes]
     origins = {}
-    for path, whole, value in numbers(after):
+    for path, full_path, value in numbers(after):
         estimate = _estimate_of(path, fit.estimates, after) or _scale_of(path, fit.estimates)
-        told = estimate is not None and estimate.identifiable and _covers(changed, path, after)
-        if old_values.get(whole) == value and not told:
-            origins[path] = before.origin_of(".".join(whole))
+        determined = estimate is not None and estimate.identifiable and _covers(changed, path, after)
+        if old_values.get(full_path) == value and not determined:
+            origins[path] = before.origin_of(".".join(full_path))
         else:
             origins[path] = Provenance("measured", source, _note(estimate, value))
     tree = file_tree(after)
@@ -510,14 +510,14 @@ def kept(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
         fit: The fit.
         vehicle: `calibrated(fit)`.
     """
-    found = {}
+    retained = {}
     for name, estimate in fit.estimates.items():
         if estimate.path is None:
             continue
         before, after = number_in(fit.vehicle, estimate.path), number_in(vehicle, estimate.path)
         if before is not None and before == after and not estimate.identifiable:
-            found[name] = before
-    return found
+            retained[name] = before
+    return retained
 
 
 def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
@@ -529,26 +529,26 @@ def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
         vehicle: `calibrated(fit)`.
     """
     passed = {check.name for check in check_vehicle(fit.vehicle) if check.passed}
-    found = [*fit.findings]
-    found += [
+    findings = [*fit.findings]
+    findings += [
         finding("check_failed", check=check.name, sentence=check.sentence)
         for check in check_vehicle(vehicle)
         if not check.passed and check.name in passed
     ]
-    for what, figures in fit.quality.items():
+    for subject, figures in fit.quality.items():
         r2 = figures.get("r2", math.nan)
         if r2 < 0.0:
-            found.append(finding("further_than_mean", what, r2=r2))
-    return found if fit.changes else [*found, finding("nothing_determined")]
+            findings.append(finding("further_than_mean", subject, r2=r2))
+    return findings if fit.changes else [*findings, finding("nothing_determined")]
 
 
 def number_in(vehicle: Vehicle, path: str) -> float | None:
     """The number at a dotted path of the vehicle file, `*` and groups by their first thruster; None where none is."""
-    wanted = tuple(path.split("."))
-    for leaf, whole, value in numbers(vehicle):
-        if _same_place(wanted, leaf, vehicle) or wanted == whole:
+    keys = tuple(path.split("."))
+    for leaf, full_path, value in numbers(vehicle):
+        if _same_place(keys, leaf, vehicle) or keys == full_path:
             return value
-    return dict(leaves(vehicle.values())).get(wanted)  # a coupling of a matrix whose file gives the diagonal
+    return dict(leaves(vehicle.values())).get(keys)  # a coupling of a matrix whose file gives the diagonal
 
 
 def estimate_at(path: str, fit: Fit, vehicle: Vehicle) -> Estimate | None:
@@ -626,10 +626,10 @@ def _note(estimate: Estimate | None, value: float) -> str:
     if estimate is None:
         return ""
     low, high = estimate.ci95
-    words = f"95 % interval {low:.4g} to {high:.4g}" if math.isfinite(low) and math.isfinite(high) else ""
-    if words and not math.isclose(estimate.estimate, value, rel_tol=1e-6):
-        words = f"from {estimate.name} {estimate.estimate:.4g} {estimate.unit}, {words}"
-    return "; ".join(filter(None, [words, estimate.note]))
+    text = f"95 % interval {low:.4g} to {high:.4g}" if math.isfinite(low) and math.isfinite(high) else ""
+    if text and not math.isclose(estimate.estimate, value, rel_tol=1e-6):
+        text = f"from {estimate.name} {estimate.estimate:.4g} {estimate.unit}, {text}"
+    return "; ".join(filter(None, [text, estimate.note]))
 
 
 # Ranges of domain randomisation from the intervals of a calibration.
@@ -747,12 +747,12 @@ def _of_estimate(estimate: Estimate) -> Factor:
 def _around(factors: Iterable[Factor]) -> Factor:
     """The range that holds all of them."""
     every = list(factors)
-    why = ", ".join(dict.fromkeys(factor.why for factor in every))
-    return Factor(min(f.low for f in every), max(f.high for f in every), why)
+    reason = ", ".join(dict.fromkeys(factor.why for factor in every))
+    return Factor(min(f.low for f in every), max(f.high for f in every), reason)
 
 
 def _given(vehicle: Vehicle, path: str) -> bool:
-    return any(path == known or known.startswith(f"{path}.") for known in vehicle.provenance)
+    return any(path == stated or stated.startswith(f"{path}.") for stated in vehicle.provenance)
 
 
 def _ranges_text(fit: Fit, vehicle: Vehicle) -> str:

@@ -301,10 +301,10 @@ def allocation_data(
             f"allocation has {len(B)} matrices, {len(lower)} lower and {len(upper)} upper limits, "
             f"{len(weights)} weights: give one of each per vehicle type"
         )
-    types = [tables(*one, regularisation) for one in zip(B, lower, upper, weights, strict=True)]
+    types = [tables(*arguments, regularisation) for arguments in zip(B, lower, upper, weights, strict=True)]
     data = AllocationData()
     for name in Tables._fields:
-        stacked = np.stack([getattr(one, name) for one in types])
+        stacked = np.stack([getattr(arguments, name) for arguments in types])
         setattr(data, name, wp.array(stacked, dtype=vec8, device=device))
     return data
 
@@ -359,12 +359,12 @@ class Allocator:
         Raises:
             ControlError: The last axis is not 6 long, or a number is not finite.
         """
-        wanted = np.asarray(tau, float)
-        if wanted.shape[-1:] != (6,):
-            raise ControlError(f"wrench has shape {wanted.shape}, expected (..., 6)")
-        if not np.isfinite(wanted).all():
+        requested = np.asarray(tau, float)
+        if requested.shape[-1:] != (6,):
+            raise ControlError(f"wrench has shape {requested.shape}, expected (..., 6)")
+        if not np.isfinite(requested).all():
             raise ControlError("wrench is not finite: find where the NaN or infinity came from")
-        return self._launch(wanted)[..., : self.thrusters]
+        return self._launch(requested)[..., : self.thrusters]
 
     def achieved(self, f: npt.ArrayLike) -> Array:
         """Wrench B f that thrusts produce, about the point of B, body frame [N, N m], (..., n) -> (..., 6)."""

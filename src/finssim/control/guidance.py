@@ -189,8 +189,8 @@ class Station:
     def at(self, t: npt.ArrayLike) -> Reference:
         """The same at all times."""
         shape = np.shape(t)
-        place = np.broadcast_to(np.asarray(self.position, float), (*shape, 3))
-        return Reference(place, np.zeros((*shape, 3)), np.full(shape, self.yaw), np.zeros(shape))
+        position = np.broadcast_to(np.asarray(self.position, float), (*shape, 3))
+        return Reference(position, np.zeros((*shape, 3)), np.full(shape, self.yaw), np.zeros(shape))
 
 
 def goal_at(guide: Guide, t: float) -> Goal:

@@ -147,10 +147,10 @@ class Lqr:
         """The unknown wrench as the last period's change of momentum shows it, body frame [N, N m], (..., 6)."""
         before = np.concatenate([quat_inverse_rotate(q, memory.force), memory.moment], axis=-1)
         change = self.body.model.inertia * (nu - memory.nu) / self.period
-        left_over = np.where(np.isnan(change), before, change - memory.modelled)
+        unmodelled = np.where(np.isnan(change), before, change - memory.modelled)
         share = 1.0 - math.exp(-self.period / OBSERVER_TIME)
         bound = INTEGRAL_SHARE * self.body.wrench_limits
-        return np.asarray(np.clip(before + share * (left_over - before), -bound, bound))
+        return np.asarray(np.clip(before + share * (unmodelled - before), -bound, bound))
 
 
 def _gains(body: Pid, axis: int, scale: float, lag: float, delays: int, period: float) -> Array:

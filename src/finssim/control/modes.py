@@ -159,7 +159,7 @@ def mode_data(name: str, vehicles: Sequence[Any], scales: Sequence[Any], device:
     """
     kind, data = MODES[name], ModeData()
     limits = [vehicle.force_limits for vehicle in vehicles]
-    columns = [_columns(kind, *one) for one in zip(vehicles, scales, strict=True)]
+    columns = [_columns(kind, *arguments) for arguments in zip(vehicles, scales, strict=True)]
     data.columns = wp.array(_padded(columns), dtype=vec8, device=device)
     data.lower = wp.array(_padded([lower for lower, _ in limits]), dtype=vec8, device=device)
     data.upper = wp.array(_padded([upper for _, upper in limits]), dtype=vec8, device=device)

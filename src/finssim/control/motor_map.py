@@ -62,21 +62,21 @@ class Motor:
     lag: float
     """Time constant of the shaft speed [s]."""
 
-    def step(self, asked: float, memory: PulseMemory, dt: float) -> tuple[float, PulseMemory]:
+    def step(self, requested: float, memory: PulseMemory, dt: float) -> tuple[float, PulseMemory]:
         """The shaft speed to command until the next call.
 
         Args:
-            asked: Thrust within the limits [N].
+            requested: Thrust within the limits [N].
             memory: From the call before, or `AT_REST`.
             dt: How long the command will stand [s].
 
         Returns:
             Speed [rad/s]: exactly 0 for a thrust of 0, which also forgets what is owed; and the memory after.
         """
-        if asked == 0.0:
+        if requested == 0.0:
             return 0.0, AT_REST
-        direction, side = (1.0, self.plus) if asked > 0.0 else (-1.0, self.minus)
-        size = asked * direction
+        direction, side = (1.0, self.plus) if requested > 0.0 else (-1.0, self.minus)
+        size = requested * direction
         if size >= side.slowest:
             # How a held thrust builds up and dies away is the lag of any motor, and not owed to anybody.
             return direction * math.sqrt(size / side.c), PulseMemory(memory.owed, 0.0, 0.0)
@@ -86,7 +86,7 @@ class Motor:
         pulse = direction if on else 0.0
         target = pulse * math.sqrt(side.slowest / side.c)
         shaft, delivered = self._lagged(memory.shaft, target, dt)
-        return target, PulseMemory(memory.owed + asked * dt - delivered, pulse, shaft)
+        return target, PulseMemory(memory.owed + requested * dt - delivered, pulse, shaft)
 
     def _lagged(self, speed: float, target: float, dt: float) -> tuple[float, float]:
         """Shaft speed after dt of a first-order lag [rad/s], and the impulse of its thrust meanwhile [N s].
@@ -227,16 +227,16 @@ class MotorMap:
             Part of full scale per output, (outputs,), in [-1, 1]; the thrusts delivered on average [N], (n,), which
             are those asked for within the limits; and the memory after.
         """
-        asked = self.limited(force)
-        told = [0.0] * self.outputs
+        requested = self.limited(force)
+        outputs = [0.0] * self.outputs
         after = []
         for (output, per_speed, motor), thrust, before in zip(
-            self._channels, asked.tolist(), memory, strict=True
+            self._channels, requested.tolist(), memory, strict=True
         ):
-            speed, kept = motor.step(thrust, before, dt)
-            told[output] = speed * per_speed
-            after.append(kept)
-        return np.array(told), asked, tuple(after)
+            speed, memory_after = motor.step(thrust, before, dt)
+            outputs[output] = speed * per_speed
+            after.append(memory_after)
+        return np.array(outputs), requested, tuple(after)
 
     def _motor(self, k: int, lag: float) -> Motor:
         shortest = max(lag, SHORTEST_PULSE)

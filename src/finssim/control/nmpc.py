@@ -122,11 +122,11 @@ class Nmpc:
         """
         position = np.asarray(measured.position, float)
         shape = position.shape[:-1]
-        given = [position, measured.quaternion, measured.nu, goal.position, goal.quaternion, goal.velocity]
+        inputs = [position, measured.quaternion, measured.nu, goal.position, goal.quaternion, goal.velocity]
         sizes = (3, 4, 6, 3, 4, 3, 3)
         rows = [
             np.broadcast_to(np.asarray(x, float), (*shape, size)).reshape(-1, size)
-            for x, size in zip([*given, goal.acceleration], sizes, strict=True)
+            for x, size in zip([*inputs, goal.acceleration], sizes, strict=True)
         ]
         if not all(np.isfinite(x).all() for x in rows):
             raise ControlError("a state or a goal that is not finite cannot be planned with")
@@ -136,7 +136,7 @@ class Nmpc:
             for i in range(len(rows[0]))
         ]
         tau = np.reshape([wrench for wrench, _ in results], (*shape, 6))
-        after = map(np.stack, zip(*(one for _, one in results), strict=True))
+        after = map(np.stack, zip(*(after_one for _, after_one in results), strict=True))
         return tau, NmpcMemory(*(x.reshape(*shape, *x.shape[1:]) for x in after))
 
     def _one(
@@ -149,10 +149,10 @@ class Nmpc:
             q = -q
         observed = np.concatenate([quat_inverse_rotate(q, memory.force), memory.moment])
         if not np.isnan(memory.predicted).any():
-            left_over = self.mass @ (nu - memory.predicted) / self.period
+            unmodelled = self.mass @ (nu - memory.predicted) / self.period
             share = 1.0 - math.exp(-self.period / OBSERVER_TIME)
             bound = INTEGRAL_SHARE * self.body.wrench_limits
-            observed = np.clip(observed + share * left_over, -bound, bound)
+            observed = np.clip(observed + share * unmodelled, -bound, bound)
         force, moment = quat_rotate(q, observed[:3]), observed[3:]
         w = np.concatenate([force, moment])
 
@@ -213,8 +213,8 @@ def _model(vehicle: Vehicle, hydrodynamics: str, lag: float, period: float) -> A
     inverse = np.linalg.inv(M)
 
     x, u, w = ca.SX.sym("x", 13 + n), ca.SX.sym("u", n), ca.SX.sym("w", 6)
-    kept = math.exp(-period / lag)
-    mean = u + (x[13:] - u) * (lag / period * (1.0 - kept))
+    retained = math.exp(-period / lag)
+    mean = u + (x[13:] - u) * (lag / period * (1.0 - retained))
 
     def rate(y: Any) -> Any:
         q, nu = y[3:7], y[7:13]
@@ -235,7 +235,7 @@ def _model(vehicle: Vehicle, hydrodynamics: str, lag: float, period: float) -> A
     y = x[:13]
     y = y + period * rate(y + 0.5 * period * rate(y))
     y = ca.vertcat(y[:3], y[3:7] / ca.norm_2(y[3:7]), y[7:])
-    return ca.Function("advance", [x, u, w], [ca.vertcat(y, u + kept * (x[13:] - u))])
+    return ca.Function("advance", [x, u, w], [ca.vertcat(y, u + retained * (x[13:] - u))])
 
 
 def _rotate(q: Any, v: Any) -> Any:
@@ -252,25 +252,25 @@ def _problem(vehicle: Vehicle, advance: Any, limits: Array, period: float) -> tu
     """
     n = len(vehicle.thrusters)
     lower, upper = vehicle.force_limits
-    given = [ca.SX.sym(name, size) for name, size in
+    symbols = [ca.SX.sym(name, size) for name, size in
              (("x", 13 + n), ("w", 6), ("p", 3), ("q", 4), ("v", 3), ("a", 3), ("steady", n))]  # fmt: skip
-    start, w, place, attitude, velocity, acceleration, steady = given
+    start, w, position, attitude, velocity, acceleration, steady = symbols
     reach = np.maximum(upper, -lower)
     # An axis that the thrusters do not command is nobody's to hold.
     driven = (limits > 0.0).astype(float)
     turning = np.array([driven[3], driven[4], driven[5]]) / ANGLE_SCALE**2
 
     def cost(x: Any, t: Any) -> Any:
-        moved = place + t * velocity + 0.5 * t**2 * acceleration
+        moved = position + t * velocity + 0.5 * t**2 * acceleration
         speed = velocity + t * acceleration
         q = x[3:7]
-        apart = ca.vertcat(
+        rotation_error = ca.vertcat(
             q[3] * attitude[:3] - attitude[3] * q[:3] - ca.cross(q[:3], attitude[:3]),
             q[3] * attitude[3] + ca.dot(q[:3], attitude[:3]),
         )
         slip = _rotate(q, x[7:10]) - speed
         # The vector part is twice the half angle's sine: its sign is that of the short way round.
-        turn = 2.0 * ca.if_else(apart[3] < 0.0, -1.0, 1.0) * apart[:3]
+        turn = 2.0 * ca.if_else(rotation_error[3] < 0.0, -1.0, 1.0) * rotation_error[:3]
         return (
             ca.sumsqr(x[:3] - moved) / POSITION_SCALE**2
             + ca.sumsqr(slip) / (SPEED_SCALE * POSITION_SCALE) ** 2
@@ -306,7 +306,7 @@ def _problem(vehicle: Vehicle, advance: Any, limits: Array, period: float) -> tu
     }
     problem = {
         "x": ca.vertcat(*variables),
-        "p": ca.vertcat(*given),
+        "p": ca.vertcat(*symbols),
         "f": total,
         "g": ca.vertcat(*constraints),
     }

@@ -242,9 +242,9 @@ class Pid:
             raise ControlError(f"period is {period}, expected a positive time in seconds")
         model = axis_model(vehicle, hydrodynamics)
         thrusters = vehicle.thrusters.values()
-        own = float(np.mean([t.time_constant + t.delay for t in thrusters]))
-        lag = np.full(6, max(own, least_lag))
-        lag[3:5] = own  # roll and pitch come straight from the IMU
+        thruster_lag = float(np.mean([t.time_constant + t.delay for t in thrusters]))
+        lag = np.full(6, max(thruster_lag, least_lag))
+        lag[3:5] = thruster_lag  # roll and pitch come straight from the IMU
         lag += 0.5 * period
         placed = place_poles(model, lag, speed)
         limits = np.asarray(vehicle.wrench_limits, float)
@@ -287,21 +287,21 @@ class Pid:
         damping = self.model.damping(nu)
         integral = np.concatenate([quat_inverse_rotate(q, memory.force), memory.moment], axis=-1)
         steady = self.holding_wrench(q, goal.quaternion) + damping * error.velocity + self.model.coriolis(nu)
-        wanted = (
+        requested = (
             steady
             + self.accelerating_wrench(q, goal)
             + self.gains.kp * clipped
             - self.gains.kd * slip
             + integral
         )
-        tau = np.clip(wanted, -self.wrench_limits, self.wrench_limits)
+        tau = np.clip(requested, -self.wrench_limits, self.wrench_limits)
 
         thrusts = self.allocator.allocate(tau)
-        undelivered = self.allocator.achieved(thrusts) - wanted
+        undelivered = self.allocator.achieved(thrusts) - requested
         braking = self.gains.kd - self.model.inertia * self.gains.rate + damping
-        left_over = (self.gains.kp + self.model.stiffness) * clipped - braking * slip + undelivered
+        residual = (self.gains.kp + self.model.stiffness) * clipped - braking * slip + undelivered
         bound = INTEGRAL_SHARE * self.wrench_limits
-        integral = np.clip(integral + self.period * self.gains.rate * left_over, -bound, bound)
+        integral = np.clip(integral + self.period * self.gains.rate * residual, -bound, bound)
         return tau, PidMemory(quat_rotate(q, integral[..., :3]), integral[..., 3:])
 
     def accelerating_wrench(self, quaternion: Array, goal: Goal) -> Array:

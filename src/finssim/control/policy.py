@@ -160,31 +160,31 @@ def plain_data(value: Any) -> Any:
     return value
 
 
-def first_difference(trained: Any, given: Any, path: str, tolerance: float = 1e-9) -> str | None:
+def first_difference(trained: Any, actual: Any, path: str, tolerance: float = 1e-9) -> str | None:
     """Where two pieces of plain data first differ, as "PATH is A in the policy and B here", or None.
 
     Args:
         trained: What the policy has.
-        given: What there is.
+        actual: What there is.
         path: Name of both.
         tolerance: Relative difference of numbers that is none [-].
     """
-    if isinstance(trained, dict) and isinstance(given, dict):
-        for key in [*trained, *(key for key in given if key not in trained)]:
-            if key not in trained or key not in given:
+    if isinstance(trained, dict) and isinstance(actual, dict):
+        for key in [*trained, *(key for key in actual if key not in trained)]:
+            if key not in trained or key not in actual:
                 return f"{path}.{key} is {'only' if key in trained else 'not'} in the policy"
-            difference = first_difference(trained[key], given[key], f"{path}.{key}", tolerance)
+            difference = first_difference(trained[key], actual[key], f"{path}.{key}", tolerance)
             if difference:
                 return difference
         return None
-    if isinstance(trained, list) and isinstance(given, list) and len(trained) == len(given):
-        pairs = enumerate(zip(trained, given, strict=True))
-        found = (first_difference(a, b, f"{path}[{i}]", tolerance) for i, (a, b) in pairs)
-        return next(filter(None, found), None)
-    numbers = isinstance(trained, int | float) and isinstance(given, int | float)
-    if trained == given or (numbers and math.isclose(trained, given, rel_tol=tolerance)):
+    if isinstance(trained, list) and isinstance(actual, list) and len(trained) == len(actual):
+        pairs = enumerate(zip(trained, actual, strict=True))
+        here = (first_difference(a, b, f"{path}[{i}]", tolerance) for i, (a, b) in pairs)
+        return next(filter(None, here), None)
+    numbers = isinstance(trained, int | float) and isinstance(actual, int | float)
+    if trained == actual or (numbers and math.isclose(trained, actual, rel_tol=tolerance)):
         return None
-    return f"{path} is {trained!r} in the policy and {given!r} here"
+    return f"{path} is {trained!r} in the policy and {actual!r} here"
 
 
 OUTPUTS = ["action", "memory_after"]
@@ -298,11 +298,11 @@ class Policy:
         expected = (len(rows), k) if k else None
         shape = None if memory is None else np.shape(memory)
         if shape != expected:
-            said = [f"one of shape {s}" if s else "no memory" for s in (shape, expected)]
+            labels = [f"one of shape {s}" if s else "no memory" for s in (shape, expected)]
             raise PolicyError(
-                f"the policy is given {said[0]}, expected {said[1]}: begin with what reset gives"
+                f"the policy is given {labels[0]}, expected {labels[1]}: begin with what reset gives"
             )
-        given: dict[str, Any] = {"memory": np.asarray(memory, dtype=np.float32)} if k else {}
+        inputs: dict[str, Any] = {"memory": np.asarray(memory, dtype=np.float32)} if k else {}
         for name, about in self.description.pictures.items():
             picture = (pictures or {}).get(name)
             expected_shape = (len(rows), *about["shape"])
@@ -311,8 +311,8 @@ class Policy:
                 raise PolicyError(
                     f"the policy sees {name}: it is given {got}, expected uint8 {expected_shape}"
                 )
-            given[name] = picture
-        action, *after = self._session.run(OUTPUTS[: 1 + bool(k)], {"observation": rows, **given})
+            inputs[name] = picture
+        action, *after = self._session.run(OUTPUTS[: 1 + bool(k)], {"observation": rows, **inputs})
         return action.reshape(*x.shape[:-1], action.shape[-1]), after[0] if after else None
 
     def _checked(self, observation: ArrayLike) -> NDArray[np.float32]:
@@ -357,17 +357,17 @@ def _open_network(folder: Path, description: PolicyDescription) -> Any:
         reason = " ".join(str(error).split())
         raise PolicyError(f"{path}: not a network onnxruntime can run ({reason})") from error
     k = [description.memory] if description.memory else []
-    shapes: list[Any] = [tuple(one["shape"]) for one in description.pictures.values()]
+    shapes: list[Any] = [tuple(picture["shape"]) for picture in description.pictures.values()]
     described: list[list[Any]] = [[description.observation.size, *k, *shapes], [description.action_size, *k]]
-    found = [
+    maps = [
         [tensor.shape[-1] if len(tensor.shape) == 2 else tuple(tensor.shape[1:]) for tensor in side]
         for side in (session.get_inputs(), session.get_outputs())
     ]
-    if found != described:
-        told = [[" and ".join(map(str, side)) for side in sides] for sides in (found, described)]
+    if maps != described:
+        sides_text = [[" and ".join(map(str, side)) for side in sides] for sides in (maps, described)]
         raise PolicyError(
-            f"{path}: maps {told[0][0]} values to {told[0][1]}, but {DESCRIPTION_FILE} describes "
-            f"{told[1][0]} to {told[1][1]}"
+            f"{path}: maps {sides_text[0][0]} values to {sides_text[0][1]}, but {DESCRIPTION_FILE} describes "
+            f"{sides_text[1][0]} to {sides_text[1][1]}"
         )
     return session
 
@@ -377,8 +377,8 @@ def _check_task(folder: Path, description: PolicyDescription, task: Mapping[str,
         sentence = f"trained for task {description.task!r}, but this is {task['name']!r}"
         raise PolicyError(f"{folder}: {sentence}: give a policy trained for it")
     trained = description.observation.model_dump(mode="json")
-    given = ObservationSchema.model_validate(plain_data(task["observation"])).model_dump(mode="json")
-    difference = first_difference(trained, given, "observation")
+    current = ObservationSchema.model_validate(plain_data(task["observation"])).model_dump(mode="json")
+    difference = first_difference(trained, current, "observation")
     if difference:
         raise PolicyError(
             f"{folder}: observation schema does not fit: {difference}: train again with this task"

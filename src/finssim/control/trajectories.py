@@ -247,10 +247,10 @@ class Trajectory:
 
 
 def _catalogue() -> dict[str, Trajectory]:
-    left, right = (-1.0, -0.4, DEPTH), (1.0, 0.4, DEPTH)
-    corners = [left, right, (1.0, -0.4, DEPTH), (-1.0, 0.4, DEPTH), left]
+    near, right = (-1.0, -0.4, DEPTH), (1.0, 0.4, DEPTH)
+    corners = [near, right, (1.0, -0.4, DEPTH), (-1.0, 0.4, DEPTH), near]
     motions = {
-        "straight": polyline([left, right], [30.0]),
+        "straight": polyline([near, right], [30.0]),
         "broken": polyline(corners, [32.0, 13.0, 32.0, 13.0]),
         "ellipse": ellipse(1.0, 0.4, 92.70),
         "lemniscate": gerono(0.4, 0.2, 30.0),
@@ -293,8 +293,8 @@ def load_trajectory(
     elif Path(name_or_file).is_file():
         trajectory = read_trajectory(Path(name_or_file))
     else:
-        known = ", ".join(TRAJECTORIES)
-        raise ControlError(f"no trajectory '{name_or_file}': give a YAML or CSV file or one of {known}")
+        available = ", ".join(TRAJECTORIES)
+        raise ControlError(f"no trajectory '{name_or_file}': give a YAML or CSV file or one of {available}")
     if heading is not None:
         trajectory = replace(trajectory, heading=heading)
     if yaw is not None:
@@ -364,8 +364,8 @@ def read_trajectory(path: Path) -> Trajectory:
         data = read_mapping(path, ControlError, such_as="points: [[0, 0, 0, -0.5], [10, 1, 0, -0.5]]")
         return _from_mapping(path.stem, data)
     except ControlError as error:
-        said = str(error)
-        raise ControlError(said if said.startswith(str(path)) else f"{path}: {said}") from None
+        message = str(error)
+        raise ControlError(message if message.startswith(str(path)) else f"{path}: {message}") from None
 
 
 def through_points(name: str, points: npt.ArrayLike, **options: Any) -> Trajectory:
@@ -389,11 +389,11 @@ def through_points(name: str, points: npt.ArrayLike, **options: Any) -> Trajecto
     table[:, 4:] = np.unwrap(table[:, 4:], axis=0)
     slopes = PchipInterpolator(t, table[:, 1:]).derivative()(t)
     slopes[[0, -1]] = 0.0
-    place = CubicHermiteSpline(t, table[:, 1:4], slopes[:, :3])
-    drift = place.derivative()
+    position = CubicHermiteSpline(t, table[:, 1:4], slopes[:, :3])
+    drift = position.derivative()
 
     def motion(time: Array) -> tuple[Array, Array]:
-        return place(time), drift(time)
+        return position(time), drift(time)
 
     if table.shape[1] == 5:
         options["turning"] = CubicHermiteSpline(t, table[:, 4], slopes[:, 3])

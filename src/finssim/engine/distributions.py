@@ -35,9 +35,9 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-def unknown(key: object, known: Iterable[str]) -> str:
+def unknown(key: object, names_in_use: Iterable[str]) -> str:
     """The sentence about a key that does not exist, with the nearest that does."""
-    names = list(known)
+    names = list(names_in_use)
     close = difflib.get_close_matches(str(key), names, n=1)
     return f"unknown entry '{key}'; " + (
         f"did you mean '{close[0]}'?" if close else f"available: {', '.join(names)}"
@@ -47,17 +47,19 @@ def unknown(key: object, known: Iterable[str]) -> str:
 def sentence(error: ValidationError, model: type[BaseModel]) -> str:
     """The first error of a part of a ranges file: where, what, and what was expected."""
     first = error.errors()[0]
-    where = [
+    location = [
         str(x) for x in first["loc"] if not any(c in str(x) for c in "[(")
     ]  # not pydantic's names of types
     text = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
-        known = _keys(model, first["loc"][:-1])
-        return ": ".join(filter(None, [".".join(where[:-1]), unknown(where[-1], known)]))
-    if first["type"] == "literal_error" and where[-1:] == [str(first["input"])]:
-        known = [word.strip("'") for word in str(first["ctx"]["expected"]).replace(" or ", ", ").split(", ")]
-        text = unknown(where[-1], known)
-    return ": ".join(filter(None, [".".join(where), text]))
+        allowed = _keys(model, first["loc"][:-1])
+        return ": ".join(filter(None, [".".join(location[:-1]), unknown(location[-1], allowed)]))
+    if first["type"] == "literal_error" and location[-1:] == [str(first["input"])]:
+        allowed = [
+            word.strip("'") for word in str(first["ctx"]["expected"]).replace(" or ", ", ").split(", ")
+        ]
+        text = unknown(location[-1], allowed)
+    return ": ".join(filter(None, [".".join(location), text]))
 
 
 def _keys(model: type[BaseModel], path: tuple[Any, ...]) -> list[str]:
@@ -93,12 +95,12 @@ class Distribution(Part):
 
     @model_validator(mode="after")
     def _possible(self) -> Distribution:
-        given = [kind for kind in KINDS if getattr(self, kind) is not None]
-        if len(given) != 1:
+        kinds = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if len(kinds) != 1:
             raise ValueError(
-                f"gives {' and '.join(given) or 'no distribution'}, expected one of {', '.join(KINDS)}"
+                f"gives {' and '.join(kinds) or 'no distribution'}, expected one of {', '.join(KINDS)}"
             )
-        numbers = (*getattr(self, given[0]), *(self.within or ()), *(self.weights or ()))
+        numbers = (*getattr(self, kinds[0]), *(self.within or ()), *(self.weights or ()))
         if not all(math.isfinite(x) for x in numbers):
             raise ValueError("expected finite numbers")
         if (self.within is not None) > (self.normal is not None):
@@ -107,7 +109,7 @@ class Distribution(Part):
             raise ValueError("weights belong to choices: give one for each")
         if self.weights is not None and (min(self.weights) < 0.0 or sum(self.weights) <= 0.0):
             raise ValueError(f"weights are {list(self.weights)}, expected 0 or more, and not all 0")
-        self._check_ends(given[0])
+        self._check_ends(kinds[0])
         return self
 
     def _check_ends(self, kind: str) -> None:

@@ -167,15 +167,15 @@ def write_tether(tether: wp.array2d(dtype=Tether), x: wp.array3d(dtype=float), w
 
 
 @wp.func
-def write_sensors(seen: wp.array2d(dtype=Measurement), x: wp.array3d(dtype=float), w: int, v: int):
+def write_sensors(measurement: wp.array2d(dtype=Measurement), x: wp.array3d(dtype=float), w: int, v: int):
     """What a controller sees of a vehicle."""
-    seen[w, v].position_std = x[w, v, wp.static(COLUMN["sensors.position_std"])]
-    seen[w, v].yaw_std = x[w, v, wp.static(COLUMN["sensors.yaw_std"])]
-    seen[w, v].velocity_std = x[w, v, wp.static(COLUMN["sensors.velocity_std"])]
-    seen[w, v].rate_std = x[w, v, wp.static(COLUMN["sensors.rate_std"])]
-    seen[w, v].position_bias = x[w, v, wp.static(COLUMN["sensors.position_bias"])]
-    seen[w, v].yaw_bias = x[w, v, wp.static(COLUMN["sensors.yaw_bias"])]
-    seen[w, v].velocity_bias = x[w, v, wp.static(COLUMN["sensors.velocity_bias"])]
-    seen[w, v].rate_bias = x[w, v, wp.static(COLUMN["sensors.rate_bias"])]
-    seen[w, v].dropout = x[w, v, wp.static(COLUMN["sensors.dropout"])]
-    seen[w, v].delay = x[w, v, wp.static(COLUMN["sensors.delay"])]
+    measurement[w, v].position_std = x[w, v, wp.static(COLUMN["sensors.position_std"])]
+    measurement[w, v].yaw_std = x[w, v, wp.static(COLUMN["sensors.yaw_std"])]
+    measurement[w, v].velocity_std = x[w, v, wp.static(COLUMN["sensors.velocity_std"])]
+    measurement[w, v].rate_std = x[w, v, wp.static(COLUMN["sensors.rate_std"])]
+    measurement[w, v].position_bias = x[w, v, wp.static(COLUMN["sensors.position_bias"])]
+    measurement[w, v].yaw_bias = x[w, v, wp.static(COLUMN["sensors.yaw_bias"])]
+    measurement[w, v].velocity_bias = x[w, v, wp.static(COLUMN["sensors.velocity_bias"])]
+    measurement[w, v].rate_bias = x[w, v, wp.static(COLUMN["sensors.rate_bias"])]
+    measurement[w, v].dropout = x[w, v, wp.static(COLUMN["sensors.dropout"])]
+    measurement[w, v].delay = x[w, v, wp.static(COLUMN["sensors.delay"])]

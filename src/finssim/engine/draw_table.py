@@ -146,12 +146,12 @@ def draw_table(
     first_tie, ties, tied, weights = _flat(ties_of(ranges), n)
     t = DrawTable()
     t.count = len(drawn)
-    whole = {"drawn": [INDEX[name] for name in drawn], "kind": kind, "first_choice": first, "choices": choices,
+    integer = {"drawn": [INDEX[name] for name in drawn], "kind": kind, "first_choice": first, "choices": choices,
              "stream": [e.stream for e in ENTRIES],
              "first_tie": first_tie, "ties": ties, "tied": tied}  # fmt: skip
     real = {"probability": probability, "nominal": nominal, "choice": choice, "cumulative": cumulative,
             "tie_weight": weights}  # fmt: skip
-    for fields, dtype, plain in ((whole, wp.int32, np.int32), (real, wp.float32, np.float32)):
+    for fields, dtype, plain in ((integer, wp.int32, np.int32), (real, wp.float32, np.float32)):
         for name, values in fields.items():
             # No kernel reads beyond the counts: one element keeps empty columns valid.
             column = np.asarray(values if len(values) else [0], dtype=plain)

@@ -205,16 +205,16 @@ class Trace:
         if not lanes:
             return example
         operand = next((a.kind for a in lanes if a.kind != "M"), "M")
-        words = [a.name if isinstance(a, Lane) else _constant(operand, a) for a in arguments]
-        return self.line(kind, form.format(*words), example, max(a.level for a in lanes))
+        operands = [a.name if isinstance(a, Lane) else _constant(operand, a) for a in arguments]
+        return self.line(kind, form.format(*operands), example, max(a.level for a in lanes))
 
     def require(self, truth: Lane) -> None:
         """Leave the worlds to the kernel for one in which this is not as in the example."""
         self.sections[truth.level].append(f"ok &= {'' if truth.example else '~'}{truth.name};")
 
 
-def _eight(words: Sequence[str | None]) -> str:
-    return "Eight{{" + ", ".join(map(str, words)) + "}}"
+def _eight(elements: Sequence[str | None]) -> str:
+    return "Eight{{" + ", ".join(map(str, elements)) + "}}"
 
 
 def _word(number: Any) -> str:
@@ -238,8 +238,8 @@ def _each(form: str, function: Callable[..., Any], kind: str = "F") -> Callable[
         lane = next((a for a in arguments if isinstance(a, Lane)), None)
         if lane is None:
             return function(*arguments)
-        wanted = "I" if kind == "F" and lane.kind == "I" else kind
-        return lane.trace.apply(wanted, form, function, *arguments)
+        result_kind = "I" if kind == "F" and lane.kind == "I" else kind
+        return lane.trace.apply(result_kind, form, function, *arguments)
 
     return apply
 
@@ -281,10 +281,10 @@ class _Library:
         if not isinstance(truth, Lane):
             return a if truth else b
         kind = next((x.kind for x in (a, b) if isinstance(x, Lane)), "F" if isinstance(a, float) else "I")
-        words = [x.name if isinstance(x, Lane) else _constant(kind, x) for x in (a, b)]
+        operands = [x.name if isinstance(x, Lane) else _constant(kind, x) for x in (a, b)]
         examples = [x.example if isinstance(x, Lane) else x for x in (a, b)]
         level = max(x.level for x in (truth, a, b) if isinstance(x, Lane))
-        expression = f"choose({truth.name}, {words[0]}, {words[1]})"
+        expression = f"choose({truth.name}, {operands[0]}, {operands[1]})"
         return truth.trace.line(kind, expression, examples[0 if truth.example else 1], level)
 
     @classmethod
@@ -469,10 +469,10 @@ class StructArray:
 
     def stores(self) -> list[str]:
         """C++ that writes what was assigned, eight neighbours at once where there are so many."""
-        lines, words = [], dict(sorted(self._assigned.items()))
-        while words:
-            first = next(iter(words))
-            piece = [words.pop(first + i, None) for i in range(LANES)]
+        lines, assigned = [], dict(sorted(self._assigned.items()))
+        while assigned:
+            first = next(iter(assigned))
+            piece = [assigned.pop(first + i, None) for i in range(LANES)]
             if None not in piece:
                 lines.append(f"put({self._name}_at, {4 * first}, {_eight(piece)});")
                 continue
@@ -515,8 +515,8 @@ class VectorArray:
         row = Row(
             (self._size,), [self._trace.line("F", f"{name}[{i}]", 0.0, slot.level) for i in range(LANES)]
         )
-        for where, value in self._written:
-            row = _Library.where(slot == where, value, row)
+        for written_slot, value in self._written:
+            row = _Library.where(slot == written_slot, value, row)
         return row
 
     def __setitem__(self, index: Any, value: Row) -> None:

@@ -155,8 +155,8 @@ class Pipeline:
         for (offset, count), commands in zip(self.slices, last.recorded, strict=True):
             rows = count if block is None else -(-count // block)
             dim = rows if vehicles is None else (rows, vehicles)
-            given = [*inputs, offset] if block is None else [*inputs, count, offset]
-            command = wp.launch(kernel, dim=dim, inputs=given, device=self.device, record_cmd=True)
+            arguments = [*inputs, offset] if block is None else [*inputs, count, offset]
+            command = wp.launch(kernel, dim=dim, inputs=arguments, device=self.device, record_cmd=True)
             commands.append(command)
 
     def call(self, function: Callable[[], None]) -> None:

@@ -71,11 +71,11 @@ def stream(seed: int, w: int) -> int:
 
 
 @wp.func
-def draw_values(t: DrawTable, d: DrawnArrays, w: int, v: int, own: int, shared: int):
+def draw_values(t: DrawTable, d: DrawnArrays, w: int, v: int, vehicle_key: int, shared: int):
     """Every entry that varies."""
     for i in range(t.count):
         k = t.drawn[i]
-        key = own
+        key = vehicle_key
         if k >= WORLD and k < WORLD_END:
             key = shared
         d.values[w, v, k] = draw_entry(t, k, key)
@@ -114,7 +114,7 @@ def draw_episode(
     plant: wp.array2d(dtype=VehicleParameters),
     extra: wp.array3d(dtype=float),
     tether: wp.array2d(dtype=Tether),
-    seen: wp.array2d(dtype=Measurement),
+    measurement: wp.array2d(dtype=Measurement),
     water: WaterArrays,
     nominal: Nominal,
     table: DrawTable,
@@ -148,7 +148,7 @@ def draw_episode(
     if d.tether != 0:
         write_tether(tether, d.values, w, v)
     if d.sensors != 0:
-        write_sensors(seen, d.values, w, v)
+        write_sensors(measurement, d.values, w, v)
     if d.water != 0 and v == 0:
         write_water(water, nominal, d.values, w, d.drift)
     if v < d.agents:
@@ -226,7 +226,7 @@ class Randomization:
     def draws(
         self,
         simulator: "Simulator",
-        seen: Packed | None = None,
+        measurement: Packed | None = None,
         *,
         agents: int = 0,
         privileged: tuple[wp.array, wp.array] | None = None,
@@ -235,12 +235,12 @@ class Randomization:
 
         Args:
             simulator: The worlds.
-            seen: What the controllers see of the vehicles, by (world, vehicle), as it is without randomisation.
+            measurement: What the controllers see of the vehicles, by (world, vehicle), as it is without randomisation.
             agents: The first vehicles, which are told what was drawn.
             privileged: Where they are told it, and where that of the episode before is kept: (worlds, agents * P) with
                 P = `len(told(...))`.
         """
-        return Draws(self, simulator, seen, agents, privileged)
+        return Draws(self, simulator, measurement, agents, privileged)
 
     def told(self, thrusters: int) -> list[str]:
         """Names of the privileged numbers of an agent: the entries that vary, without directions and phases.
@@ -266,7 +266,7 @@ class Draws:
         self,
         randomization: Randomization,
         simulator: "Simulator",
-        seen: Packed | None,
+        measurement: Packed | None,
         agents: int,
         privileged: tuple[wp.array, wp.array] | None,
     ) -> None:
@@ -276,11 +276,11 @@ class Draws:
         self.distributions = drawn_entries(randomization.ranges, thrusters)
         self.names = list(self.distributions)
         device, shape = simulator.device, (simulator.worlds, len(simulator.vehicles))
-        self.nominal = _nominal_values(simulator, seen)
+        self.nominal = _nominal_values(simulator, measurement)
         self.table = draw_table(self.distributions, self.nominal, randomization.ranges, device)
         full = np.broadcast_to(self.nominal.astype(np.float32), (*shape, len(ENTRIES)))
         self.values = wp.array(np.ascontiguousarray(full), dtype=wp.float32, device=device)
-        self._seen = seen.array if seen else wp.zeros((1, 1), dtype=Measurement, device=device)
+        self._seen = measurement.array if measurement else wp.zeros((1, 1), dtype=Measurement, device=device)
         self._nominal = _nominal_vehicles(simulator)
         self._arrays = self._drawn_arrays(agents, privileged)
 
@@ -311,9 +311,9 @@ class Draws:
 
     def _scale(self, name: str) -> float:
         """One over the farthest that an entry may be from its nominal number."""
-        own = self.distributions["current" if name in ("current.x", "current.y") else name]
+        distribution = self.distributions["current" if name in ("current.x", "current.y") else name]
         nominal = float(self.nominal[INDEX[name]])
-        return 1.0 / (max(abs(end - nominal) for end in own.bounds()) or 1.0)
+        return 1.0 / (max(abs(end - nominal) for end in distribution.bounds()) or 1.0)
 
     def set_width(self, part: float, names: Sequence[str]) -> None:
         """Draw entries from a part of their full ranges from now on, in [0, 1]."""
@@ -344,14 +344,14 @@ class Draws:
         return np.asarray(self.values.numpy()[..., columns])
 
 
-def _nominal_values(simulator: "Simulator", seen: Packed | None) -> NDArray[np.float64]:
+def _nominal_values(simulator: "Simulator", measurement: Packed | None) -> NDArray[np.float64]:
     """Every entry where nothing is drawn: the given tether's and sensors' numbers among them."""
     out = np.array([entry.nominal for entry in ENTRIES])
     line = simulator.surroundings[2]
     for name in TETHER if line else ():
         out[INDEX[f"tether.{name}"]] = getattr(line, name)
-    for name in SENSORS if seen else ():
-        out[INDEX[f"sensors.{name}"]] = seen.fields[name].numpy()[0, 0]  # type: ignore[union-attr]
+    for name in SENSORS if measurement else ():
+        out[INDEX[f"sensors.{name}"]] = measurement.fields[name].numpy()[0, 0]  # type: ignore[union-attr]
     return out
 
 
@@ -373,6 +373,6 @@ def _nominal_vehicles(simulator: "Simulator") -> Nominal:
         M_A.append(back.T @ values["M_A"] @ back)
     out.H = wp.array(np.array(H), dtype=mat66, device=device)
     out.M_A = wp.array(np.array(M_A), dtype=mat66, device=device)
-    given = simulator.surroundings[0]
-    out.current, out.waves = wp.vec3(*given.current), len(given.waves)
+    nominal = simulator.surroundings[0]
+    out.current, out.waves = wp.vec3(*nominal.current), len(nominal.waves)
     return out

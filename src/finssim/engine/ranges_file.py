@@ -254,8 +254,10 @@ class Curriculum(Part):
             raise ValueError(f"narrow_at is {self.narrow_at}, expected at most widen_at, {self.widen_at}")
         low, high = self.over
         if not 0.0 <= low < high < float("inf") or (self.by == "progress" and high > 1.0):
-            most = "1" if self.by == "progress" else "any number of steps"
-            raise ValueError(f"over is {[low, high]}, expected [low, high] with 0 <= low < high up to {most}")
+            limit = "1" if self.by == "progress" else "any number of steps"
+            raise ValueError(
+                f"over is {[low, high]}, expected [low, high] with 0 <= low < high up to {limit}"
+            )
         return self
 
     def width(self, done: float) -> float:
@@ -318,8 +320,8 @@ class Ranges(Part):
             return data
         out, terms = dict(data), {}
         for entry, drawn in dict(out.pop("terms", {})).items():  # as a record of a training has them
-            name, _, own = entry.partition(".")
-            out[name] = {**out.get(name, {}), own: drawn} if own else drawn
+            name, _, parameter = entry.partition(".")
+            out[name] = {**out.get(name, {}), parameter: drawn} if parameter else drawn
         for name in [name for name in out if name not in cls.model_fields]:
             term = find_term(str(name))
             if term is not None:  # another is refused as an unknown entry
@@ -334,7 +336,7 @@ class Ranges(Part):
         return self
 
 
-def _of_term(term: Term, given: Any) -> dict[str, Any]:
+def _of_term(term: Term, stated: Any) -> dict[str, Any]:
     """What is drawn of a term, by entry.
 
     Raises:
@@ -344,13 +346,13 @@ def _of_term(term: Term, given: Any) -> dict[str, Any]:
 
     entries = {entry.name: entry for entry in term_entries(term)}
     if term.name in entries:
-        given = {term.name: given}
-    elif isinstance(given, Mapping):
-        given = {f"{term.name}.{key}": drawn for key, drawn in given.items()}
+        stated = {term.name: stated}
+    elif isinstance(stated, Mapping):
+        stated = {f"{term.name}.{key}": drawn for key, drawn in stated.items()}
     else:
-        raise ValueError(f"{term.name}: is {given!r}, expected ranges of {', '.join(entries)}")
+        raise ValueError(f"{term.name}: is {stated!r}, expected ranges of {', '.join(entries)}")
     out = {}
-    for name, drawn in given.items():
+    for name, drawn in stated.items():
         if name not in entries:
             raise ValueError(f"{term.name}: {unknown(name, entries)}")
         try:

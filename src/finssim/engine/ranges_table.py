@@ -122,12 +122,14 @@ def drawn_entries(ranges: Ranges, thrusters: int = MAX_THRUSTERS) -> dict[str, D
         ranges: The ranges.
         thrusters: Of the vehicle that has most; entries of further ones are left out.
     """
-    found = {name: distribution_of(drawn) for name, drawn in _given(ranges, thrusters) if drawn is not None}
+    distributions = {
+        name: distribution_of(drawn) for name, drawn in _given(ranges, thrusters) if drawn is not None
+    }
     return {
-        e.name: found[e.name]
+        e.name: distributions[e.name]
         for e in ENTRIES
-        if e.name in found
-        and (varies(found[e.name], e.nominal) or e.name.startswith(("tether.", "sensors.")))
+        if e.name in distributions
+        and (varies(distributions[e.name], e.nominal) or e.name.startswith(("tether.", "sensors.")))
     }
 
 

@@ -222,8 +222,8 @@ class Scene:
         mj.mj_factorM(m, d)
         qacc = mujoco_acceleration(nu_dot, nu, q)
         # Bias and passive forces hold MuJoCo's own weight and Coriolis force of its stand-in body: ours are in nu_dot.
-        own = d.qfrc_bias[dofs] - d.qfrc_passive[dofs]
-        d.qfrc_applied[dofs] = (M @ qacc[..., None])[..., 0] + own
+        of_stand_in = d.qfrc_bias[dofs] - d.qfrc_passive[dofs]
+        d.qfrc_applied[dofs] = (M @ qacc[..., None])[..., 0] + of_stand_in
         mj.mj_step2(m, d)
         self._touch[0] += wrench_from_mujoco(d.qfrc_constraint[dofs], q) / self.substeps
         self._views["acceleration"][:] += acceleration_from_mujoco(d.qacc[dofs], nu, q) - nu_dot
@@ -231,8 +231,8 @@ class Scene:
         self._views["pressed"][:] = -nu_dot
         self._views["position"][:] = d.qpos[self._qpos[:, :3]]
         self._views["quaternion"][:], self._views["velocity"][:] = self._attitude_and_twist()
-        whole = np.isfinite(d.qpos).all() and np.isfinite(d.qvel).all()
-        if not whole or self.state.frozen.numpy()[0]:
+        finite = np.isfinite(d.qpos).all() and np.isfinite(d.qvel).all()
+        if not finite or self.state.frozen.numpy()[0]:
             self._refuse()
 
     def _attitude_and_twist(self) -> tuple[Array, Array]:
@@ -279,15 +279,15 @@ class Scene:
     def contacts(self) -> list[Contact]:
         """Every point of contact of the last physics step."""
         mj, m, d = self._mujoco, self.model, self.data
-        found = []
+        result = []
         for i in range(d.ncon):
             c = d.contact[i]
             f = np.zeros(6)
             mj.mj_contactForce(m, d, i, f)
             first, second = (m.body(m.geom_bodyid[g]).name for g in c.geom)
             force = c.frame.reshape(3, 3).T @ f[:3]
-            found.append(Contact((first, second), c.pos.copy(), force))
-        return found
+            result.append(Contact((first, second), c.pos.copy(), force))
+        return result
 
     def pose(self, body: str) -> tuple[Array, Array]:
         """Pose of a body by its name, an object's or a vehicle's.
@@ -299,11 +299,11 @@ class Scene:
             SimulatorError: there is no such body.
         """
         try:
-            found = self.data.body(body)
+            body_data = self.data.body(body)
         except KeyError:
             have = ", ".join(self.model.body(i).name for i in range(self.model.nbody))
             raise SimulatorError(f"unknown body '{body}'; available: {have}") from None
-        return found.xpos.copy(), xyzw_from_wxyz(found.xquat)
+        return body_data.xpos.copy(), xyzw_from_wxyz(body_data.xquat)
 
     def render(self, camera: str = "overhead", width: int = 640, height: int = 480) -> NDArray[np.uint8]:
         """A picture of the present state.

@@ -230,15 +230,17 @@ def _add_vehicle(
     body.add_freejoint(name=name)
     _set_inertia(body, M)
     solid: dict[str, Any] = {"contype": 1, "conaffinity": 1, "mass": 0.0}
-    seen: dict[str, Any] = {"contype": 0, "conaffinity": 0, "mass": 0.0}
+    visual: dict[str, Any] = {"contype": 0, "conaffinity": 0, "mass": 0.0}
     meshed = vehicle.hull is not None or collision == "hull"
     if meshed:
         vertices, faces = vehicle.hull_mesh()
         mesh = spec.add_mesh(name=name)
         mesh.uservert, mesh.userface = vertices.ravel().tolist(), faces.ravel().tolist()
         mesh.inertia = mj.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        how = solid if collision == "hull" else seen
-        body.add_geom(name=f"{name}_hull", type=mj.mjtGeom.mjGEOM_MESH, meshname=name, rgba=colour, **how)
+        collision_options = solid if collision == "hull" else visual
+        body.add_geom(
+            name=f"{name}_hull", type=mj.mjtGeom.mjGEOM_MESH, meshname=name, rgba=colour, **collision_options
+        )
     if collision == "envelope":
         group = _UNSEEN if meshed else 0
         body.add_geom(
@@ -248,7 +250,7 @@ def _add_vehicle(
         middle, along = np.asarray(thruster.position), np.asarray(thruster.axis) * 0.08 * half.max()
         body.add_geom(
             name=f"{name}_{key}", type=mj.mjtGeom.mjGEOM_CYLINDER, size=[0.12 * half.max(), 0.0, 0.0],
-            fromto=[*(middle - along), *(middle + along)], rgba=[0.15, 0.15, 0.17, 1.0], **seen,
+            fromto=[*(middle - along), *(middle + along)], rgba=[0.15, 0.15, 0.17, 1.0], **visual,
         )  # fmt: skip
     # MuJoCo's cameras look along their -z with y up: x to the right is the body's -y, y its z.
     bow = body.add_camera(name=f"{name}_bow", pos=[half[0], 0.0, 0.0], fovy=60.0)

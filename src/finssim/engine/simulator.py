@@ -98,8 +98,8 @@ class Simulator:
         Raises:
             SimulatorError: a name or number is out of its range; it says which.
         """
-        given = [vehicles] if isinstance(vehicles, Vehicle | str) else list(vehicles)
-        self.vehicles = [v if isinstance(v, Vehicle) else load_vehicle(v) for v in given]
+        crew = [vehicles] if isinstance(vehicles, Vehicle | str) else list(vehicles)
+        self.vehicles = [v if isinstance(v, Vehicle) else load_vehicle(v) for v in crew]
         self.hydrodynamics = one_of(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
         self.integrator = one_of(integrator, INTEGRATORS, "integrator")
         if worlds < 1 or substeps < 1 or not self.vehicles:
@@ -309,8 +309,8 @@ class Simulator:
             SimulatorError: a number is not finite, a quaternion has no length, or a shape does not fit.
         """
         shape = (self.worlds, len(self.vehicles))
-        given = {"position": position, "quaternion": quaternion, "velocity": velocity}
-        for name, value in given.items():
+        values = {"position": position, "quaternion": quaternion, "velocity": velocity}
+        for name, value in values.items():
             getattr(self.state, name).assign(placed_at(name, value, shape))
         self.reset()
 
@@ -366,12 +366,12 @@ class Simulator:
 # What a simulator is given, checked: names, devices, vehicles that share a world.
 
 
-def one_of(value: str, available: Sequence[str], what: str) -> str:
+def one_of(value: str, available: Sequence[str], kind: str) -> str:
     """The value, if it is among the available ones; else a sentence that lists them."""
     if value not in available:
         close = difflib.get_close_matches(value, available, n=1)
         hint = f"; did you mean '{close[0]}'?" if close else ""
-        raise SimulatorError(f"unknown {what} '{value}'; available: {', '.join(sorted(available))}{hint}")
+        raise SimulatorError(f"unknown {kind} '{value}'; available: {', '.join(sorted(available))}{hint}")
     return value
 
 
@@ -399,13 +399,14 @@ def shared_water(vehicles: Sequence[Vehicle]) -> Fluid:
     return fluid
 
 
-def broadcast(array: NDArray[Any], shape: tuple[int, int, int], what: str) -> NDArray[Any]:
+def broadcast(array: NDArray[Any], shape: tuple[int, int, int], label: str) -> NDArray[Any]:
     """The array for every world and vehicle."""
     try:
         return np.broadcast_to(array, shape)
     except ValueError:
         raise SimulatorError(
-            f"{what} has shape {array.shape}, expected (worlds, vehicles, numbers) = {shape} or the last of these alone"
+            f"{label} has shape {array.shape}, expected (worlds, vehicles, numbers) = {shape} or the last of these "
+            "alone"
         ) from None
 
 
@@ -442,8 +443,8 @@ def thrust_table(force: ArrayLike, vehicles: Sequence[Vehicle], worlds: int) -> 
     n = max(len(v.thrusters) for v in vehicles)
     if f.ndim == 0 or f.shape[-1] != n:
         got = f.shape[-1] if f.ndim else 0
-        most = " of the vehicle that has most" if len(vehicles) > 1 else ""
-        raise SimulatorError(f"thrust command has {got} numbers, expected {n}: one per thruster{most}")
+        whose = " of the vehicle that has most" if len(vehicles) > 1 else ""
+        raise SimulatorError(f"thrust command has {got} numbers, expected {n}: one per thruster{whose}")
     if not np.isfinite(f).all():
         raise SimulatorError(
             "thrust command has a number that is not finite: send a force in N for every thruster"

@@ -149,11 +149,11 @@ def look_around(
     w = world_offset + i
     solids.force[w, v] = 0.0
     position = state.position[w, v]
-    known = state.clearing[w, v]
+    clearing = state.clearing[w, v]
     around = wp.length(plant[w, v].half_size)
     way = 2.0 * control_step * wp.length(linear(state.velocity[w, v])) + 0.02
-    end = wp.length(position - wp.vec3(known[0], known[1], known[2])) + way
-    if solids.drawn[w, v] != solids.draws[w] or not (end + around < known[3] or end < solids.reach[w, v]):
+    end = wp.length(position - wp.vec3(clearing[0], clearing[1], clearing[2])) + way
+    if solids.drawn[w, v] != solids.draws[w] or not (end + around < clearing[3] or end < solids.reach[w, v]):
         solids.drawn[w, v] = solids.draws[w]
         solids.reach[w, v] = way + 0.1
         free = free_water(solids, w, v, position, around + way + 0.1)

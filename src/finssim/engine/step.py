@@ -691,8 +691,8 @@ def lane_block(set_out: Any, substep: Any, arrive: Any, term_numbers: int) -> An
     )
     step, head, slot = (trace.symbol("I", name, 2) for name in ("step", "head", "place"))
     h, control_step = (trace.symbol("F", name, 0.1) for name in ("h", "control"))
-    given = command[0, 0].thrust.numbers + command[0, 0].disturbance.numbers
-    for number in given:
+    numbers = command[0, 0].thrust.numbers + command[0, 0].disturbance.numbers
+    for number in numbers:
         trace.require(trace.apply("M", "finite({})", math.isfinite, number))
     loop = Loop(trace, "course", lane_function(set_out)(state, command, commands, plant, 0, 0, head))
     trace.level = 1

@@ -102,7 +102,7 @@ def anatomy(
     steps: Annotated[int | None, (1, None)] = None,
     processes: Annotated[int | None, (1, None)] = None,
     address: str | None = None,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
     """How wrong may one thing be? Controllers of T1 in plants where it is wrong by growing amounts, and all at once.
 
@@ -130,7 +130,7 @@ def anatomy(
     folder, run_seeds = Path(out), range(seed, seed + seeds)
     controllers = controllers_of(
         "t1", {name: T1.rows[name] for name in names}, run_seeds, folder, vehicle, steps,
-        progress=lambda part, what: progress(TRAINING_SHARE * part, what), processes=processes, address=address,
+        progress=lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
     )  # fmt: skip
     plants = {
         (name, k): Plant(name=f"{name}-{k}", **CAUSES[name].plant(amount))
@@ -147,12 +147,12 @@ def anatomy(
     ]  # fmt: skip
     results = run_jobs(
         jobs, folder / "trials", play, processes=processes, address=address,
-        progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
+        progress=lambda part, text: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, text),
     )  # fmt: skip
 
     def figures(row: str, name: str, k: int) -> dict[str, Any]:
         pairs = zip(jobs, results, strict=True)
-        return _figures([one for job, one in pairs if (job.row, job.target, job.plant) == (row, name, k)])
+        return _figures([trial for job, trial in pairs if (job.row, job.target, job.plant) == (row, name, k)])
 
     body = load_vehicle(vehicle)
     result = {
@@ -186,12 +186,12 @@ def _figures(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def tolerated(cause: Mapping[str, Any], row: str) -> float | None:
     """The largest amount at which a row still holds `HELD` of its trials, and at all smaller ones; None: not even 0."""
-    most = None
+    largest = None
     for amount, figures in zip(cause["amounts"], cause["rows"][row], strict=True):
         if figures["success"]["value"] < HELD:
             break
-        most = float(amount)
-    return most
+        largest = float(amount)
+    return largest
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
@@ -200,8 +200,8 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     about = f"{vehicle['name']} {vehicle['sha256'][:12]}, seeds: {len(result['seeds'])}, setpoints in turn"
     lines = []
     for cause in result["causes"].values():
-        found = [tolerated(cause, row) for row in rows]
-        amounts = ["none" if x is None else f"{x:g}{'+' * (x == cause['amounts'][-1])}" for x in found]
+        limits = [tolerated(cause, row) for row in rows]
+        amounts = ["none" if x is None else f"{x:g}{'+' * (x == cause['amounts'][-1])}" for x in limits]
         lines.append([f"{cause['title']} [{cause['unit']}]", *amounts])
     return [
         Table(
@@ -232,12 +232,13 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
         for i, (row, title) in enumerate(rows.items()):
             figures, color = cause["rows"][row], COLORS[i % len(COLORS)]
             errors = [
-                max(1000.0 * one["e_p_m"]["value"], LEAST) if one["e_p_m"] else math.nan for one in figures
+                max(1000.0 * figure_["e_p_m"]["value"], LEAST) if figure_["e_p_m"] else math.nan
+                for figure_ in figures
             ]
             dash = "-" if i < len(COLORS) else "--"
             axes.plot(cause["amounts"], errors, dash, linewidth=1.3, color=color, label=title)
-            for amount, error, one in zip(cause["amounts"], errors, figures, strict=True):
-                inside = color if one["success"]["value"] >= HELD else "white"
+            for amount, error, figure_ in zip(cause["amounts"], errors, figures, strict=True):
+                inside = color if figure_["success"]["value"] >= HELD else "white"
                 axes.plot(amount, error, "o", markersize=4, color=color, markerfacecolor=inside)
         axes.set_xlabel(f"{cause['title']} [{cause['unit']}]", fontsize=8)
         axes.set_yscale("log")

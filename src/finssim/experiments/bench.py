@@ -140,7 +140,7 @@ def machine() -> dict[str, Any]:
     return {"processor": model, "threads": default_threads(), "load_1min": load, **provenance()}
 
 
-def bench(*, device: str = "cpu", progress: Progress = lambda part, what: None) -> dict[str, Any]:
+def bench(*, device: str = "cpu", progress: Progress = lambda part, text: None) -> dict[str, Any]:
     """Measure this machine's speed: physics steps/s, environment steps/s, mesh faces/s.
 
     Example: finssim bench --json > bench.json
@@ -154,8 +154,8 @@ def bench(*, device: str = "cpu", progress: Progress = lambda part, what: None) 
         for model in MODELS
         for worlds in WORLDS
     }
-    one_core = f"calibrated/{WORLDS[-1]}/1 thread"
-    plan["physics", one_core] = partial(physics_rate, "calibrated", WORLDS[-1], threads=1)
+    single_core = f"calibrated/{WORLDS[-1]}/1 thread"
+    plan["physics", single_core] = partial(physics_rate, "calibrated", WORLDS[-1], threads=1)
     for action in ACTIONS:
         for worlds in WORLDS:
             plan["T1", f"{action}/{worlds}"] = partial(environment_rate, action, worlds, device=device)

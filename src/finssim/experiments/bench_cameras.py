@@ -28,7 +28,7 @@ VEHICLE = "finsrov"
 
 
 def bench_cameras(
-    *, site: str = "pool", device: str = "cpu", progress: Progress = lambda part, what: None
+    *, site: str = "pool", device: str = "cpu", progress: Progress = lambda part, text: None
 ) -> dict[str, Any]:
     """Measure pictures per second: a vehicle's step, rays, water and noise, beside the bare rays; in processor-seconds.
 

@@ -75,7 +75,7 @@ def run_experiment(
     """
     start_warp()
     if {"progress", "options"} & set(inspect.signature(work).parameters):
-        with progress_bar(name, shown=bar) as progress:
+        with progress_bar(name, visible=bar) as progress:
             result = work(progress=progress, **options)
     else:
         result = work(**options)
@@ -90,12 +90,12 @@ def run_experiment(
 
 
 @contextmanager
-def progress_bar(name: str, *, shown: bool = True) -> Iterator[Progress]:
+def progress_bar(name: str, *, visible: bool = True) -> Iterator[Progress]:
     """A bar on standard error where that is a terminal; told the share that is done and, perhaps, what comes next."""
     screen = Console(stderr=True)
-    with Bar(console=screen, transient=True, disable=not shown or not screen.is_terminal) as bar:
+    with Bar(console=screen, transient=True, disable=not visible or not screen.is_terminal) as bar:
         task = bar.add_task(name, total=1.0)
-        yield lambda part, what=name: bar.update(task, completed=part, description=what)
+        yield lambda part, text=name: bar.update(task, completed=part, description=text)
 
 
 def check_choices(
@@ -208,7 +208,7 @@ def run_jobs(
     *,
     processes: int | None = None,
     address: str | None = None,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
     show: Show = lambda job, result: None,
 ) -> list[dict[str, Any]]:
     """Play what has no result yet; after Ctrl-C or a kill the next call goes on where this one was.
@@ -234,13 +234,13 @@ def run_jobs(
     else:
         work, items = partial(_play_away, play=play), [(k, j, _policy_files(j)) for k, j in missing.items()]
     with closing(spread(work, items, processes, address)) as played:
-        for left, ((key, job, *_), outcome) in zip(reversed(range(len(missing))), played, strict=True):
+        for remaining, ((key, job, *_), outcome) in zip(reversed(range(len(missing))), played, strict=True):
             result = outcome.result()
             if address is not None:
                 result = _come_back(job, folder / key, *result)
             if result is not None:
                 show(job, result)
-            progress(1.0 - left / len(files), f"{left} trials left")
+            progress(1.0 - remaining / len(files), f"{remaining} trials left")
     return [kept_result(files[job.key()]) for job in jobs if files[job.key()].is_file()]
 
 
@@ -394,8 +394,8 @@ def _play_away(
 ) -> tuple[dict[str, Any] | None, dict[str, bytes]]:
     """Play a job on another machine: its result, and the files that it left by name."""
     key, job, policy = sent
-    with tempfile.TemporaryDirectory() as place:
-        out, controller = Path(place) / "out", Path(place) / "policy"
+    with tempfile.TemporaryDirectory() as scratch:
+        out, controller = Path(scratch) / "out", Path(scratch) / "policy"
         for folder in (out, controller):
             folder.mkdir()
         for name, content in policy.items():

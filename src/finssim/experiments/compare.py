@@ -66,25 +66,25 @@ class Group:
     runs: tuple[Run, ...]
 
 
-def groups_of(words: Sequence[str]) -> list[Group]:
+def groups_of(arguments: Sequence[str]) -> list[Group]:
     """Load runs and put them together.
 
     Args:
-        words: Policy directories, each `DIR` or `NAME=DIR`; without a name, that of the folder less a number at its end
-            (`hold-seed3` belongs to `hold`).
+        arguments: Policy directories, each `DIR` or `NAME=DIR`; without a name, that of the folder less a number at its
+            end (`hold-seed3` belongs to `hold`).
 
     Raises:
         CompareError: Two runs of a name differ in more than the seed, or have one seed; no run is given, or they do
             different tasks.
         PolicyError: A directory is no policy.
     """
-    if not words:
+    if not arguments:
         raise CompareError("no run is given: name policy directories, each DIR or NAME=DIR")
     named: dict[str, list[Run]] = {}
-    for word in words:
-        name, given, place = word.rpartition("=")
-        folder = Path(place)
-        if not given:
+    for word in arguments:
+        name, label, path = word.rpartition("=")
+        folder = Path(path)
+        if not label:
             name = SEED_AT_END.sub("", folder.resolve().name) or folder.resolve().name
         named.setdefault(name, []).append(
             Run(folder, Policy.load(folder).description, _curves(folder / CURVES_FILE))
@@ -159,18 +159,20 @@ def less_is_better(measure: str) -> bool:
     return measure not in MORE_IS_BETTER
 
 
-def measures_of(task: str, trials: Sequence[Mapping[str, Any]], asked: Sequence[str] = ()) -> tuple[str, ...]:
+def measures_of(
+    task: str, trials: Sequence[Mapping[str, Any]], requested: Sequence[str] = ()
+) -> tuple[str, ...]:
     """The measures to compare.
 
     Raises:
         CompareError: One that is asked for is not measured.
     """
     have = [key for key, value in trials[0].items() if isinstance(value, bool | int | float) or value is None]
-    for name in asked:
+    for name in requested:
         if name not in have:
             raise CompareError(f"no measure '{name}' of task '{task}'; available: {', '.join(have)}")
     preferred = MEASURES.get(task, ("success", "return"))
-    return tuple(asked) or tuple(name for name in preferred if name in have) or tuple(have[:1])
+    return tuple(requested) or tuple(name for name in preferred if name in have) or tuple(have[:1])
 
 
 def scores_of(runs: Sequence[Sequence[Mapping[str, Any]]], measure: str) -> NDArray[np.float64]:
@@ -269,8 +271,8 @@ def curve_of(group: Group, name: str) -> tuple[NDArray[np.float64], NDArray[np.f
 
 def _at(steps: NDArray[np.float64], run: Run, name: str) -> NDArray[np.float64]:
     """A column between its rows; one without a number, as before the first episode ended, is left out."""
-    known = np.isfinite(run.curves[name])
-    return np.interp(steps, run.curves["steps"][known], run.curves[name][known])
+    finite = np.isfinite(run.curves[name])
+    return np.interp(steps, run.curves["steps"][finite], run.curves[name][finite])
 
 
 def _draw_curves(axes: Any, groups: Sequence[Group], name: str, *, legend: bool) -> None:
@@ -300,7 +302,7 @@ def compare(
     plant: str = "nominal",
     trials: Annotated[int | None, (1, 100_000)] = None,
     seed: int = 42,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
     """Compare trainings over seeds: interquartile means with intervals, who is likely better, learning curves.
 
@@ -344,24 +346,24 @@ def compare(
 
 def comparison(
     groups: Sequence[Group],
-    found: Mapping[tuple[str, int], Sequence[Mapping[str, Any]]],
-    asked: Sequence[str] = (),
+    trials: Mapping[tuple[str, int], Sequence[Mapping[str, Any]]],
+    requested: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Interquartile means over seeds and targets with intervals, and for each pair how likely one beats the other.
 
     Args:
         groups: Who is compared.
-        found: Trials by (group, seed).
-        asked: Measures; the task's own if none.
+        trials: Trials by (group, seed).
+        requested: Measures; the task's own if none.
 
     Returns:
         `task`, `measures` (name -> whether less is better), `groups` (name -> runs, seeds, steps, seconds, measures)
         and `pairs` (a, b, measure, probability that a is better, ci95, verdict: better, worse or open).
     """
     task = groups[0].runs[0].description.task
-    names = measures_of(task, next(iter(found.values())), asked)
+    names = measures_of(task, next(iter(trials.values())), requested)
     scores = {
-        (group.name, name): scores_of([found[group.name, run.seed] for run in group.runs], name)
+        (group.name, name): scores_of([trials[group.name, run.seed] for run in group.runs], name)
         for group in groups
         for name in names
     }

@@ -99,8 +99,8 @@ def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str
         else:
             speed = scale * theirs.terminal_speed(level[:, None])[:, i, None]
             level = (ours.damping(speed) * speed)[:, i]
-        most = SHARE * float(vehicle.wrench_limits[i])
-        scaled[axis] = list(dict.fromkeys(float(f"{min(x, most):.3g}") for x in level))
+        limit = SHARE * float(vehicle.wrench_limits[i])
+        scaled[axis] = list(dict.fromkeys(float(f"{min(x, limit):.3g}") for x in level))
     return scaled
 
 
@@ -200,8 +200,8 @@ def rough_vehicle(truth: Vehicle) -> Vehicle:
         f"{SET}.quadratic_damping": [50.0 * force] * 3 + [moment] * 3,
     }
     origin = Provenance("guessed", "", "the order of other small vehicles, before any trial")
-    words = "Hydrodynamics are guesses; the rest is the catalogue's."
-    return _named(truth.replace(guess, origin), f"{truth.name} before any trial", words)
+    description = "Hydrodynamics are guesses; the rest is the catalogue's."
+    return _named(truth.replace(guess, origin), f"{truth.name} before any trial", description)
 
 
 def _named(vehicle: Vehicle, title: str, description: str) -> Vehicle:
@@ -232,12 +232,12 @@ def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identific
     folders = record({role: folder / TRIALS / role for role in ("fit", "held-out")}, str(folder / start_file))
     recorded = {role: load_trials(paths) for role, paths in folders.items()}
     fit = regress(recorded["fit"], load_vehicle(folder / start_file), seed=seed)
-    found = calibrated(fit)
-    findings = tuple(all_findings(fit, found))
-    found = _named(
-        found, f"{name} as identified", "Hydrodynamics from trials where they tell it, else guesses."
+    identified = calibrated(fit)
+    findings = tuple(all_findings(fit, identified))
+    identified = _named(
+        identified, f"{name} as identified", "Hydrodynamics from trials where they tell it, else guesses."
     )
-    write_vehicle(found, folder / vehicle_file)
+    write_vehicle(identified, folder / vehicle_file)
     vehicle = load_vehicle(folder / vehicle_file)
     write_report(
         fit,
@@ -546,8 +546,8 @@ class _Demonstration:
         rows = {name: replace(T1.rows[name], changes={"duration": self.scope.duration}) for name in names}
         if self.robot is None and self.firmware == "mcu":
             title, changes = "The same, by pictures", {"duration": self.scope.duration, "camera": "pictures"}
-            seen = replace(rows[POLICY], title=title, changes=changes, targets=self.scope.pictures)
-            rows = {WITH_PICTURES: seen, **rows}
+            with_pictures = replace(rows[POLICY], title=title, changes=changes, targets=self.scope.pictures)
+            rows = {WITH_PICTURES: with_pictures, **rows}
         return replace(T1, rows=rows, targets=self.scope.setpoints, bases=(POLICY,))
 
     @property
@@ -565,7 +565,7 @@ class _Demonstration:
         text = f"{doing} {'in the virtual pool' if self.robot is None else 'on the robot'}"
         self.tell(text)
         with nullcontext() if self.robot is not None else self.console.status(text) as status:
-            yield lambda part, what: status.update(f"{text}: {what}") if status else None
+            yield lambda part, detail: status.update(f"{text}: {detail}") if status else None
 
     def _identified(self) -> Identification:
         """Trials, and the vehicle that they make identifiable."""

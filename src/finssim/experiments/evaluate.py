@@ -295,15 +295,15 @@ def evaluate(
     if truth is not None and not records:
         raise EvaluationError("--truth tells of records: a simulation knows its own")
     plants = [] if records else _plants([plant] if isinstance(plant, str | Path) else plant)
-    plants = plants if observe is None else [one.seen(observe) for one in plants]
+    plants = plants if observe is None else [plant_file.seen(observe) for plant_file in plants]
     with atomic_directory(out, replaces=EVALUATION_FILE) if out is not None else nullcontext() as folder:
         evaluations = [_recorded(records, task, vehicle, trajectories, truth)] if records else []
-        for one in plants:
-            place = folder and folder / TRAJECTORIES / (one.name if plants[1:] else "")
-            options = {"hydrodynamics": hydrodynamics, "trials": trials, "seed": seed, "record": place}
+        for plant_file in plants:
+            target = folder and folder / TRAJECTORIES / (plant_file.name if plants[1:] else "")
+            options = {"hydrodynamics": hydrodynamics, "trials": trials, "seed": seed, "record": target}
             evaluations.append(
                 evaluate_controller(
-                    names[0], one, task=task, vehicle=vehicle, trajectories=trajectories, **options
+                    names[0], plant_file, task=task, vehicle=vehicle, trajectories=trajectories, **options
                 )
             )
         results = [evaluation.result for evaluation in evaluations]
@@ -405,9 +405,9 @@ def evaluate_controller(
             measures = [trial.measures(task, limits) for trial in played]
         else:
             measures = run_episodes(agent, the_task, body, plant, **options)
-    where = plant.model_dump(mode="json", exclude_defaults=True)
+    plant_values = plant.model_dump(mode="json", exclude_defaults=True)
     about = {"hydrodynamics": plant.hydrodynamics or hydrodynamics, "seed": seed, **plant.told_of_sight(body)}
-    return evaluation(agent.describe(), task, body, where, measures, played, **about)
+    return evaluation(agent.describe(), task, body, plant_values, measures, played, **about)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -212,12 +212,12 @@ class Place:
     """Way after which the excitation ends [m]; None where it goes nowhere."""
 
 
-def box_of(where: Basin | Vehicle) -> Box:
+def box_of(surroundings: Basin | Vehicle) -> Box:
     """The water of a basin, or the workspace of a vehicle, which is taken for walls."""
-    if isinstance(where, Basin):
-        half = 0.5 * where.length, 0.5 * where.width
-        return (-half[0], -half[1], -where.depth), (*half, 0.0)
-    lower, upper = where.safety.workspace_lower, where.safety.workspace_upper
+    if isinstance(surroundings, Basin):
+        half = 0.5 * surroundings.length, 0.5 * surroundings.width
+        return (-half[0], -half[1], -surroundings.depth), (*half, 0.0)
+    lower, upper = surroundings.safety.workspace_lower, surroundings.safety.workspace_upper
     return tuple(map(float, lower)), tuple(map(float, upper))  # type: ignore[return-value]
 
 
@@ -266,30 +266,30 @@ ESTIMATOR = "error-state"
 
 
 def programme_trial(
-    programme: Programme, vehicle: Vehicle, place: Place, *, hold: str | None = "pid"
+    programme: Programme, vehicle: Vehicle, start: Place, *, hold: str | None = "pid"
 ) -> RobotTrial:
     """The trial that plays a programme, and ends with it; its record has the phases.
 
     Args:
         programme: What to play.
         vehicle: As the robot knows it.
-        place: Where it begins, and how far it may go.
+        start: Where it begins, and how far it may go.
         hold: PID that keeps the other axes; None leaves them alone.
     """
-    pilot = ProgrammePilot(programme, vehicle, room=place.room, hold=hold)
+    pilot = ProgrammePilot(programme, vehicle, room=start.room, hold=hold)
     return RobotTrial(
         name=programme.name,
         pilot=pilot,
-        guide=Station(place.position, place.yaw, name=programme.name),
+        guide=Station(start.position, start.yaw, name=programme.name),
         duration=programme.duration,
         over=lambda runtime: pilot.finished,
         watch=pilot.watch,
     )
 
 
-def about_programme(programme: Programme, where: str) -> dict[str, Any]:
+def about_programme(programme: Programme, label: str) -> dict[str, Any]:
     """What a record says of the trial that it makes."""
-    return {"trial": {"axis": list(programme.axes), "description": f"{where}: {programme.name}"}}
+    return {"trial": {"axis": list(programme.axes), "description": f"{label}: {programme.name}"}}
 
 
 def write_trial_of(record: Path, folder: Path, role: str) -> Trial:
@@ -343,12 +343,12 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     record.parent.mkdir(parents=True, exist_ok=True)
     record.unlink(missing_ok=True)
     vehicle, seed = load_vehicle(run.vehicle), noise_seed(run.seed, run.row, run.target)
-    place = place_of(run.programme, vehicle, run.water)
-    trial = programme_trial(run.programme, vehicle, place, hold=run.hold)
+    start = place_of(run.programme, vehicle, run.water)
+    trial = programme_trial(run.programme, vehicle, start, hold=run.hold)
     about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
     with Recorder(record, vehicle, about, pictures="none") as recorder:
         outcome = play_in_pool(
-            trial, Station(place.position, place.yaw), run.equipped(), run.plan(seed), seed=seed, recorder=recorder,
+            trial, Station(start.position, start.yaw), run.equipped(), run.plan(seed), seed=seed, recorder=recorder,
             mode=ESTIMATOR,
         )  # fmt: skip
     return {
@@ -397,8 +397,8 @@ def record_programmes(
         _in_pool(plans, folders, vehicle, **pool)
     else:
         _on_robot(plans, folders, load_vehicle(vehicle), robot, attendant, console)
-    made = {role: [folders[role] / programme.name for programme in plan] for role, plan in plans.items()}
-    return {role: [path for path in paths if path.is_dir()] for role, paths in made.items()}
+    planned = {role: [folders[role] / programme.name for programme in plan] for role, plan in plans.items()}
+    return {role: [path for path in paths if path.is_dir()] for role, paths in planned.items()}
 
 
 def _on_robot(
@@ -416,7 +416,7 @@ def _on_robot(
         if not (folders[role] / programme.name).is_dir()
     ]
     places = {path: place_of(programme, vehicle, box_of(vehicle)) for _, programme, path in remaining}
-    starts = {path: Station(place.position, place.yaw) for path, place in places.items()}
+    starts = {path: Station(start.position, start.yaw) for path, start in places.items()}
     check_starts({path.name: start for path, start in starts.items()}, vehicle)
     if not remaining:
         return
@@ -454,7 +454,7 @@ def _in_pool(
     *,
     leave_out: bool = False,
     processes: int | None = None,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
     show: Show = lambda job, result: None,
     **settings: Any,
 ) -> None:
@@ -488,10 +488,10 @@ def _in_pool(
                 raise CalibrationError(
                     f"{run.target} in the virtual pool: {result['fault']}: give lower levels, or fewer axes at once"
                 )
-            made, folder = Path(scratch) / result["key"], folders[run.row]
+            source, folder = Path(scratch) / result["key"], folders[run.row]
             (folder / RECORDS).mkdir(parents=True, exist_ok=True)
-            shutil.move(made / run.target, folder / run.target)
-            shutil.move(made / f"{run.target}.mcap", folder / RECORDS)
+            shutil.move(source / run.target, folder / run.target)
+            shutil.move(source / f"{run.target}.mcap", folder / RECORDS)
     for role, plan in plans.items():
         if not any((folders[role] / programme.name).is_dir() for programme in plan):
             raise CalibrationError(
@@ -595,10 +595,10 @@ def excite(
     return folders
 
 
-def _levels(words: Sequence[str]) -> dict[str, list[float]] | list[float] | None:
+def _levels(texts: Sequence[str]) -> dict[str, list[float]] | list[float] | None:
     """Levels by axis from `surge=5,10`, or for every axis from `5,10`."""
     named: dict[str, list[float]] = {}
-    for word in words:
+    for word in texts:
         axis, _, numbers = word.rpartition("=")
         try:
             values = [float(number) for number in numbers.split(",")]
@@ -652,13 +652,13 @@ def excite_on_robot(
 
 
 def _about(
-    vehicle: Vehicle, played: Sequence[Programme], seed: int, kind: str, where: Mapping[str, Any]
+    vehicle: Vehicle, played: Sequence[Programme], seed: int, kind: str, place_values: Mapping[str, Any]
 ) -> dict[str, Any]:
     """What the folder is of."""
     return {
         "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
         "kind": kind,
-        **where,
+        **place_values,
         "seed": seed,
         "programmes": [programme.name for programme in played],
         "sha256": [programme.sha256 for programme in played],

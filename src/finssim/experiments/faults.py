@@ -205,7 +205,9 @@ def pool_fault(pictures: float = 0.0, **fields: Any) -> Touch:
         vars(bench.pool.faults).update(fields)
         if pictures:
             random = np.random.default_rng([bench.pool.faults.seed, 0xB11D])
-            bench.wire.pictures = lambda found: [p for p in found if random.random() >= pictures]
+            bench.wire.pictures = lambda pictures_taken: [
+                p for p in pictures_taken if random.random() >= pictures
+            ]
 
     return begin
 
@@ -230,10 +232,10 @@ def stuck_pictures(bench: Bench) -> None:
     """The camera sends its last picture again and again, each with a new number and time."""
     last: list[Picture] = []
 
-    def change(found: Sequence[Picture]) -> Sequence[Picture]:
+    def change(pictures: Sequence[Picture]) -> Sequence[Picture]:
         if not last:
-            last.extend(found[-1:])
-        return [replace(p, image=last[0].image, tags=last[0].tags) for p in found] if last else found
+            last.extend(pictures[-1:])
+        return [replace(p, image=last[0].image, tags=last[0].tags) for p in pictures] if last else pictures
 
     bench.wire.pictures = change
 
@@ -280,8 +282,8 @@ UNWATCHED: Mapping[str, Any] = {
 def _scenario(title: str, faults: Touch | Fault | Mapping[str, Touch], **more: Any) -> Scenario:
     """A fault of one kind, or its variants by name; one that stays needs to say no more than how it begins."""
     variants = faults if isinstance(faults, Mapping) else {"": faults}
-    made = {name: x if isinstance(x, Fault) else Fault(begin=x) for name, x in variants.items()}
-    return Scenario(title=title, faults=made, **more)
+    by_name = {name: x if isinstance(x, Fault) else Fault(begin=x) for name, x in variants.items()}
+    return Scenario(title=title, faults=by_name, **more)
 
 
 def _lost(title: str, share: float) -> Scenario:
@@ -329,7 +331,7 @@ def another_station(
         from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
         mav = mavlink.MAVLink(None, system, 190)
-        made = getattr(mavlink, f"MAVLink_{message}_message")(*fields)
+        message_of_station = getattr(mavlink, f"MAVLink_{message}_message")(*fields)
         due, remaining = bench.pool.time, times
 
         def others(now: float) -> list[bytes]:
@@ -338,7 +340,7 @@ def another_station(
                 return []
             due, remaining = now + every, remaining - 1
             mav.seq = (mav.seq + 1) % 256
-            return [bytes(made.pack(mav))]
+            return [bytes(message_of_station.pack(mav))]
 
         bench.wire.others = others
 
@@ -494,8 +496,8 @@ def measured(course: Course, began: float, ended: float, box: tuple[Array, Array
 
 def passed(result: Mapping[str, Any]) -> bool:
     """Whether a trial fulfils the contract: stopped in time or inside, nothing raised, the record readable."""
-    gone, margin = result["thrust_gone_s"], result["margin_m"]
-    stopped = gone is not None and gone <= STOP_WITHIN
+    stopped_after, margin = result["thrust_gone_s"], result["margin_m"]
+    stopped = stopped_after is not None and stopped_after <= STOP_WITHIN
     inside = margin is not None and margin >= 0.0
     lost = result["record_lost_s"]
     recorded = not result["record_problem"] and lost is not None and lost <= LONGEST_LOSS
@@ -573,7 +575,7 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         steps = script.steps if script.fault.cuts_record else runtime.counters.steps
         # Each step of a run in lock-step leaves one state in the record.
         lost = _record_lost(
-            record, lambda found: (steps - sum(1 for _ in found.messages(("estimator_status",)))) / RATE
+            record, lambda log: (steps - sum(1 for _ in log.messages(("estimator_status",)))) / RATE
         )
     result = {
         **measured(course, script.began, ended, box),
@@ -590,9 +592,11 @@ def ended_as_told(scenario: Scenario, result: Mapping[str, Any]) -> bool:
     """Whether an autopilot's trial ended for the reason and in the time that its scenario names, or drove on."""
     if not scenario.ends:
         return bool(result["state"] == "armed")
-    gone = result["frames_off_s" if scenario.handed_over else "thrust_gone_s"]
+    ended_after = result["frames_off_s" if scenario.handed_over else "thrust_gone_s"]
     return (
-        gone is not None and gone <= scenario.limit and re.search(scenario.ends, result["reason"]) is not None
+        ended_after is not None
+        and ended_after <= scenario.limit
+        and re.search(scenario.ends, result["reason"]) is not None
     )
 
 
@@ -688,10 +692,10 @@ class ReliabilityError(ValueError):
 class Process:
     """A `finssim` command in a process of its own, its words kept in files."""
 
-    def __init__(self, words: Sequence[str], folder: Path, name: str) -> None:
+    def __init__(self, arguments: Sequence[str], folder: Path, name: str) -> None:
         """
         Args:
-            words: Of the command line, after `finssim`.
+            arguments: Of the command line, after `finssim`.
             folder: Takes NAME.out and NAME.err.
             name: Of its files.
         """
@@ -700,7 +704,7 @@ class Process:
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "finssim", *words], stdout=out, stderr=err, env=environment
+                [sys.executable, "-m", "finssim", *arguments], stdout=out, stderr=err, env=environment
             )
 
     @property
@@ -812,9 +816,9 @@ def pair(job: FaultJob, folder: Path) -> Iterator[Pair]:
             yield both_at_work
 
 
-def _words(*words: str, **options: Any) -> list[str]:
+def _words(*arguments: str, **options: Any) -> list[str]:
     """A command line: words, then options with their values."""
-    return [*words, *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
+    return [*arguments, *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
 
 
 def _await(ready: Callable[[], bool], failure: str, process: Process, poll: float = POLL) -> None:
@@ -989,13 +993,13 @@ def _longest(trials: Sequence[Mapping[str, Any]], key: str) -> str:
 
 def _complaint(trial: Mapping[str, Any]) -> str:
     """What was wrong with a trial that failed."""
-    job, gone, margin = trial["job"], trial["thrust_gone_s"], trial["margin_m"]
-    went = "thrust never ended" if gone is None else f"thrust ended after {gone:.2f} s"
-    where = "" if margin is None else f", inside by {margin:.2f} m"
+    job, ended_after, margin = trial["job"], trial["thrust_gone_s"], trial["margin_m"]
+    went = "thrust never ended" if ended_after is None else f"thrust ended after {ended_after:.2f} s"
+    margin_text = "" if margin is None else f", inside by {margin:.2f} m"
     lost = trial["record_lost_s"]
     record = trial["record_problem"] or ("" if lost is None else f"record lacks {lost:.2f} s")
     raised = f"; raised {trial['raised']}" if trial["raised"] else ""
-    return f"{job['row']} {job['target']}, pool {job['plant']}: {went}{where}; {record}{raised}"
+    return f"{job['row']} {job['target']}, pool {job['plant']}: {went}{margin_text}; {record}{raised}"
 
 
 def _control(name: str) -> bool:
@@ -1013,7 +1017,7 @@ def faults_experiment(
     firmware: Literal["mcu", "ardusub"] = "mcu",
     processes: Annotated[int | None, (1, None)] = None,
     address: str | None = None,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
     """Break one thing after another while a vehicle drives: time until thrust is gone [s], place in the workspace [m].
 
@@ -1061,11 +1065,11 @@ def faults_experiment(
     # A kill has the machine to itself.
     results = run_jobs(
         kills, folder / "trials", play_kill, processes=1,
-        progress=lambda part, what: progress(share * part, f"kills in real time: {what}"),
+        progress=lambda part, text: progress(share * part, f"kills in real time: {text}"),
     )  # fmt: skip
     results += run_jobs(
         jobs, folder / "trials", play, processes=processes, address=address,
-        progress=lambda part, what: progress(share + (1.0 - share) * part, what),
+        progress=lambda part, text: progress(share + (1.0 - share) * part, text),
     )  # fmt: skip
     rows = {name: [r for r in results if r["job"]["row"] == name] for name in names}
     result = {

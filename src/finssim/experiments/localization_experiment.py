@@ -160,7 +160,7 @@ def draw_campaign(
     pictures = np.full(count, images // count)
     pictures[random.permutation(count)[: images - pictures.sum()]] += 1
     visits = tuple(
-        _visit(place, n, conditions, truth, random) for place, n in zip(places, pictures, strict=True)
+        _visit(position, n, conditions, truth, random) for position, n in zip(places, pictures, strict=True)
     )
     half = np.zeros(count, bool)
     half[random.permutation(count)[: count // 2]] = True
@@ -190,9 +190,9 @@ def lifted(campaign: Campaign, height: float) -> Campaign:
 
 
 def _visit(
-    place: Array, images: int, conditions: Conditions, truth: Pool, random: np.random.Generator
+    spot: Array, images: int, conditions: Conditions, truth: Pool, random: np.random.Generator
 ) -> Visit:
-    nominal = np.array([*place, 0.0])
+    nominal = np.array([*spot, 0.0])
     position = nominal + random.normal(0.0, conditions.survey, 3)
     # It lies as flat as the floor; what its bearer reads of the tilt is off by the same spread again.
     roll, pitch = random.normal(0.0, conditions.tilt, 2)
@@ -236,12 +236,12 @@ def pictures(campaign: Campaign, renderer: str = "own") -> Iterator[Picture]:
         ValueError: There is no such renderer.
     """
     check_choices([renderer], RENDERERS, "renderer", ValueError)
-    look = _rendered(campaign, renderer)
+    render = _rendered(campaign, renderer)
     number = 0
     for k, visit in enumerate(campaign.visits):
         for _ in range(visit.images):
             seed = int(np.random.SeedSequence([campaign.seed, number]).generate_state(1)[0] % 2**31)
-            yield Picture(k, f"{number:04d}.png", look(visit, INTERVAL * number, seed))
+            yield Picture(k, f"{number:04d}.png", render(visit, INTERVAL * number, seed))
             number += 1
 
 
@@ -309,14 +309,14 @@ class Calibrated:
     """Where the tag was said to lie in each of them."""
 
 
-def calibrate(campaign: Campaign, seen: Sequence[Picture]) -> Calibrated:
+def calibrate(campaign: Campaign, observed: Sequence[Picture]) -> Calibrated:
     """Calibrate on the visits chosen for it; the truth is not looked at.
 
     Args:
         campaign: What was surveyed and read.
-        seen: Its pictures.
+        observed: Its pictures.
     """
-    chosen = [p for p in seen if campaign.calibrates[p.visit] and p.detection is not None]
+    chosen = [p for p in observed if campaign.calibrates[p.visit] and p.detection is not None]
     frames = [Frame(np.nan, p.name, (p.detection,)) for p in chosen if p.detection is not None]
     rows = survey_rows(campaign, chosen)
     settings = Settings(
@@ -435,20 +435,20 @@ class Scores:
 
 
 def locate(
-    campaign: Campaign, seen: Sequence[Picture], pool: Pool, method: str, *, pixel_std: float
+    campaign: Campaign, observed: Sequence[Picture], pool: Pool, method: str, *, pixel_std: float
 ) -> Scores:
     """Locate the tag in every picture of the held-out visits and average over each visit.
 
     Args:
         campaign: What lay where.
-        seen: Its pictures.
+        observed: Its pictures.
         pool: As calibrated.
         method: Key of `finssim.localization.poses.methods.METHODS`.
         pixel_std: Standard deviation of a corner, as the calibration found it [px].
     """
     places: dict[int, list[tuple[float, float]]] = {}
     reasons, water = Counter[str](), pool.interface  # depth is measured along its normal, which is up
-    held_out = [picture for picture in seen if not campaign.calibrates[picture.visit]]
+    held_out = [picture for picture in observed if not campaign.calibrates[picture.visit]]
     for picture in held_out:
         if picture.detection is None:
             reasons["tag not detected"] += 1
@@ -580,12 +580,12 @@ def _gain(result: Mapping[str, Any]) -> str:
         "pinhole, refractive pose": "pinhole PnP with the camera pose of the refractive calibration, as the paper's",
     }
     sentences = []
-    for rival, words in rivals.items():
+    for rival, rival_text in rivals.items():
         m = result["results"]["published"]
         if not (m["refractive"]["located"] and m[rival]["located"]):
             continue
         less = [100.0 * (1.0 - m["refractive"][key] / m[rival][key]) for key in ("rmse_cm", "p95_cm")]
-        sentences.append(f"Refractive below {words}: RMSE {less[0]:.1f} %, P95 {less[1]:.1f} %.")
+        sentences.append(f"Refractive below {rival_text}: RMSE {less[0]:.1f} %, P95 {less[1]:.1f} %.")
     return " ".join(sentences)
 
 
@@ -605,7 +605,7 @@ def localization_experiment(
     renderer: str = "own",
     seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
     **size: Any,
 ) -> dict[str, Any]:
     """Locate a tag at places that the calibration has not seen, by refractive and pinhole methods: RMSE, P95 [cm].
@@ -642,22 +642,25 @@ def localization_experiment(
         progress((k + 0.8) / seeds, f"seed {seed + k}, another depth")
         campaign = lifted(runs[k].campaign, LIFT)  # the same calibration, the tag at another depth
         higher.append(_scored(campaign, list(pictures(campaign, renderer)), runs[k].found))
-    scores = {**{name: [one.scores for one in each] for name, each in drawn.items()}, "lifted": higher}
+    scores = {
+        **{name: [seed_result.scores for seed_result in each] for name, each in drawn.items()},
+        "lifted": higher,
+    }
     visits = runs[0].campaign.visits
     result = {
         "experiment": "localization",
         "renderer": renderer,
-        "seeds": [one.campaign.seed for one in runs],
+        "seeds": [seed_result.campaign.seed for seed_result in runs],
         "places": len(visits),
         "pictures_per_seed": sum(visit.images for visit in visits),
         "conditions": {name: vars(CONDITIONS[name]) for name in CONDITIONS},
         "results": {
-            name: {method: pooled([one[method] for one in each]) for method in METHODS_SHOWN}
+            name: {method: pooled([seed_result[method] for seed_result in each]) for method in METHODS_SHOWN}
             for name, each in scores.items()
         },
         "lift_m": LIFT,
-        "pixel_std_px": [one.found.refractive.pixel_std for one in runs],
-        "calibration": [_errors(one) for one in runs],
+        "pixel_std_px": [seed_result.found.refractive.pixel_std for seed_result in runs],
+        "calibration": [_errors(seed_result) for seed_result in runs],
         "paper": {m: {"rmse_cm": r, "p95_cm": p} for m, (r, p) in PAPER_TABLE_2.items()},
         "provenance": provenance(),
     }
@@ -668,40 +671,40 @@ def localization_experiment(
 def _write(result: Mapping[str, Any], out: Path, first: SeedResult) -> None:
     """Write the directory: result, page, figures, and what a user needs to do the first seed by hand."""
     with atomic_directory(out, replaces=RESULT_FILE) as folder:
-        scores, found = first.scores, first.found
+        scores, calibration = first.scores, first.found
         _draw_error_map(first.campaign, scores["pinhole"], scores["refractive"], folder / "error_map.png")
         write_camera(folder / "camera.yaml", first.campaign.lens, {})
-        write_pool(found.refractive, folder / "pool.yaml")
-        write_pool(found.pinhole, folder / "pool_pinhole.yaml")
-        write_detections(found.frames, folder / "detections.csv")
-        write_survey(found.survey, folder / "survey.csv")
+        write_pool(calibration.refractive, folder / "pool.yaml")
+        write_pool(calibration.pinhole, folder / "pool_pinhole.yaml")
+        write_detections(calibration.frames, folder / "detections.csv")
+        write_survey(calibration.survey, folder / "survey.csv")
         write_json(folder / RESULT_FILE, result, tables_of(result))
 
 
 def _one(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedResult:
     campaign = draw_campaign(CONDITIONS[name], seed, **size)
-    seen = list(pictures(campaign, renderer))
-    found = calibrate(campaign, seen)
-    return SeedResult(campaign, found, _scored(campaign, seen, found))
+    observed = list(pictures(campaign, renderer))
+    calibration = calibrate(campaign, observed)
+    return SeedResult(campaign, calibration, _scored(campaign, observed, calibration))
 
 
-def _scored(campaign: Campaign, seen: Sequence[Picture], found: Calibrated) -> dict[str, Scores]:
-    pools = {"refractive": found.refractive, "pinhole": found.pinhole}
+def _scored(campaign: Campaign, observed: Sequence[Picture], calibration: Calibrated) -> dict[str, Scores]:
+    pools = {"refractive": calibration.refractive, "pinhole": calibration.pinhole}
     return {
-        row: locate(campaign, seen, pools[kind], method, pixel_std=found.refractive.pixel_std)
+        row: locate(campaign, observed, pools[kind], method, pixel_std=calibration.refractive.pixel_std)
         for row, (method, kind) in METHODS_SHOWN.items()
     }
 
 
-def _errors(one: SeedResult) -> dict[str, Any]:
+def _errors(seed_result: SeedResult) -> dict[str, Any]:
     """What the calibration of one seed got wrong, the truth being known here."""
-    true, fit = one.campaign.truth, one.found.refractive
+    true, fit = seed_result.campaign.truth, seed_result.found.refractive
     (x, y, height), (x_fit, y_fit, height_fit) = true.camera.position, fit.camera.position
     over = height - true.interface.height(x, y)
     over_fit = height_fit - fit.interface.height(x_fit, y_fit)
     lean = float(np.clip(true.interface.normal @ fit.interface.normal, -1.0, 1.0))
     return {
-        "seed": one.campaign.seed,
+        "seed": seed_result.campaign.seed,
         "camera_height_mm": 1000.0 * float(height_fit - height),
         "water_height_mm": 1000.0 * float(fit.interface.height(x, y) - true.interface.height(x, y)),
         "camera_over_water_mm": 1000.0 * float(over_fit - over),

@@ -50,9 +50,9 @@ def from_published(setpoint: tuple[float, float, float, float]) -> NDArray[np.fl
     Returns:
         [x, y left, z up [m], yaw in (-pi, pi] [rad]] in the world frame, z = 0 at the surface, shape (4,).
     """
-    x, up, left, yaw_deg = setpoint
+    x, up, y, yaw_deg = setpoint
     yaw = -math.radians(yaw_deg)
-    return np.array([x, left, up, math.pi if yaw == -math.pi else yaw])
+    return np.array([x, y, up, math.pi if yaw == -math.pi else yaw])
 
 
 T1_SETPOINTS = MappingProxyType({name: from_published(setpoint) for name, setpoint in T1_PUBLISHED.items()})
@@ -238,8 +238,8 @@ def resample(t: ArrayLike, position: ArrayLike, yaw: ArrayLike) -> tuple[Array, 
         )
     if np.any(np.diff(t) <= 0.0):
         raise ValueError("sample times do not increase: sort the samples and drop repeated ones")
-    known = np.isfinite(position).all(axis=-1) & np.isfinite(yaw)
-    t, position, yaw = t[known], position[known], np.unwrap(yaw[known])
+    finite = np.isfinite(position).all(axis=-1) & np.isfinite(yaw)
+    t, position, yaw = t[finite], position[finite], np.unwrap(yaw[finite])
     end = max(EVALUATION_WINDOW[1], t[-1] if len(t) else 0.0)
     grid = np.arange(math.floor(end * RATE + 1e-6) + 1) / RATE
     if len(t) == 0:
@@ -327,17 +327,17 @@ def measure_tracking(
     if np.any(np.diff(t) <= 0.0):
         raise ValueError("sample times do not increase: sort the samples and drop repeated ones")
     during = (t >= 0.0) & (t <= guide.duration + 1e-6)
-    known = during & np.isfinite(position).all(axis=-1)
+    valid = during & np.isfinite(position).all(axis=-1)
     measures: dict[str, Any] = dict.fromkeys(MEASURES)
-    measures["valid"] = float(known.sum() / max(during.sum(), 1))
+    measures["valid"] = float(valid.sum() / max(during.sum(), 1))
     measures["complete"] = False
     if measures["valid"] >= MIN_VALID:
-        measures |= _errors(t[known], position[known], guide)
+        measures |= _errors(t[valid], position[valid], guide)
     if quaternion is not None:
-        up = quat_rotate(np.asarray(quaternion, np.float64)[known], [0.0, 0.0, 1.0])[:, 2]
+        up = quat_rotate(np.asarray(quaternion, np.float64)[valid], [0.0, 0.0, 1.0])[:, 2]
         measures["max_tilt_deg"] = math.degrees(np.arccos(np.clip(up.min(initial=1.0), -1.0, 1.0)))
-    if thrust is not None and limits is not None and known.sum() > 1:
-        measures |= effort_measures(t[known], np.asarray(thrust, np.float64)[known], limits)
+    if thrust is not None and limits is not None and valid.sum() > 1:
+        measures |= effort_measures(t[valid], np.asarray(thrust, np.float64)[valid], limits)
     return measures
 
 

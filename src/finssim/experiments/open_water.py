@@ -173,7 +173,7 @@ def open_water(
     seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
     severity: Severity = "realistic",
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
     """Drift of Doppler log, depth, IMU and compass in open water [m], and whether the estimator's ellipse holds it.
 

@@ -154,8 +154,8 @@ def load_plant(name_or_path: str | Path) -> Plant:
     if not path.is_file():
         close = difflib.get_close_matches(str(name_or_path), available_plants(), n=1)
         hint = f"; did you mean '{close[0]}'?" if close else ""
-        known = ", ".join(available_plants())
-        raise PlantError(f"no plant '{name_or_path}': give a YAML file or one of {known}{hint}")
+        available = ", ".join(available_plants())
+        raise PlantError(f"no plant '{name_or_path}': give a YAML file or one of {available}{hint}")
     data = read_mapping(path, PlantError, such_as="hydrodynamics: mesh")
     try:
         return Plant.model_validate({"name": path.stem, **data})

@@ -106,9 +106,9 @@ def read_drive(path: Path, vehicle: Vehicle) -> Drive:
         pilot = _mapping(record, "pilot")
         teleop = record.metadata.get("command") == TELEOP
         columns = {name: {e.time: e.message for e in record.messages((name,))} for name in TOPICS}
-        told = [(event["time"], event) for event in events_of(record)]
+        events = [(event["time"], event) for event in events_of(record)]
     steps = np.array(sorted(columns["thruster_state"]))
-    numbers = dict(zip(steps.tolist(), _stretches(steps, columns, _helm(steps, told, teleop)), strict=True))
+    numbers = dict(zip(steps.tolist(), _stretches(steps, columns, _helm(steps, events, teleop)), strict=True))
     complete = [t for t in sorted(columns["thruster_cmd"]) if all(t in columns[name] for name in TOPICS)]
     if not complete:
         raise DriveError(f"{path}: no decision at which there was an estimate: nothing to learn from")
@@ -116,7 +116,7 @@ def read_drive(path: Path, vehicle: Vehicle) -> Drive:
     stretch = np.array([numbers[t] for t in complete])
     first = rows["policy_info"][int(np.argmax(stretch >= 0))]
     began, guide = next(
-        ((t, str(event["text"])) for t, event in told if event["kind"] == "trial_start"), (math.nan, "")
+        ((t, str(event["text"])) for t, event in events if event["kind"] == "trial_start"), (math.nan, "")
     )
     poses, twists = ([getattr(m, k) for m in rows["odom"]] for k in ("pose", "twist"))
     goals = [message.pose for message in rows["goal"]]
@@ -172,11 +172,11 @@ def _mapping(record: Record, key: str) -> dict[str, Any]:
         ) from None
 
 
-def _helm(steps: Array, told: list[tuple[float, Any]], teleop: bool) -> NDArray[np.bool_]:
+def _helm(steps: Array, events: list[tuple[float, Any]], teleop: bool) -> NDArray[np.bool_]:
     """Whether the one who is to be learnt from steers at each step: of a drive by hand the person."""
     if not teleop:
         return np.ones(len(steps), dtype=np.bool_)
-    changes = [(t, event["text"] == PERSON) for t, event in told if event["kind"] == "mode"]
+    changes = [(t, event["text"] == PERSON) for t, event in events if event["kind"] == "mode"]
     times = np.array([-math.inf, *(t for t, _ in changes)])
     # A press changes who decides from the next step on.
     index = np.searchsorted(times, steps, side="left") - 1
@@ -187,11 +187,11 @@ def _stretches(
     steps: Array, columns: Mapping[str, Mapping[float, Any]], helm: NDArray[np.bool_]
 ) -> list[int]:
     """Number of each step's stretch, which every step that may not be learnt from ends; negative there."""
-    states, ready, known = columns["thruster_state"], columns["estimator_status"], columns["odom"]
+    states, ready, poses = columns["thruster_state"], columns["estimator_status"], columns["odom"]
     armed = STATES.index("armed")
     fit = helm & np.array(
         [
-            states[t].state == armed and t in known and t in ready and bool(ready[t].ready)
+            states[t].state == armed and t in poses and t in ready and bool(ready[t].ready)
             for t in steps.tolist()
         ],
         dtype=np.bool_,
@@ -293,14 +293,14 @@ def episodes_of(
         actions = actions_of(motion.thrust[np.concatenate(stretches)], mode, vehicle)
     except DriveError as error:
         raise DriveError(f"{drive.path}: {error}") from None
-    found, first = [], 0
+    episodes, first = [], 0
     for rows in stretches:
         guide = guide_of(rows)
         observer.restart()
-        seen = [Track(motion.position[i], motion.quaternion[i], motion.nu[i]) for i in rows]
+        tracks = [Track(motion.position[i], motion.quaternion[i], motion.nu[i]) for i in rows]
         times = np.nan_to_num(motion.t[rows])
-        observation = [observer.observe(s, guide, float(t)) for s, t in zip(seen, times, strict=True)]
-        found.append(
+        observation = [observer.observe(s, guide, float(t)) for s, t in zip(tracks, times, strict=True)]
+        episodes.append(
             Episode(
                 observation=np.array(observation, dtype=np.float32),
                 action=actions[first : first + len(rows) - 1],
@@ -310,7 +310,7 @@ def episodes_of(
             )
         )
         first += len(rows)
-    return found
+    return episodes
 
 
 def indices_of(drive: Drive, period: float, *, split_goals: bool) -> list[Indices]:
@@ -334,10 +334,10 @@ def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
     """The decisions nearest to a grid of times that begins with the first; a new grid after every gap."""
     t = time[run]
     pieces, piece = [], [0]
-    while (wanted := t[piece[0]] + len(piece) * period) <= t[-1] + 1e-6:
-        after = int(np.searchsorted(t, wanted))
-        near = max(after - 1, 0) if after == len(t) or wanted - t[after - 1] < t[after] - wanted else after
-        if abs(t[near] - wanted) <= NEAR * period:
+    while (due := t[piece[0]] + len(piece) * period) <= t[-1] + 1e-6:
+        after = int(np.searchsorted(t, due))
+        near = max(after - 1, 0) if after == len(t) or due - t[after - 1] < t[after] - due else after
+        if abs(t[near] - due) <= NEAR * period:
             piece.append(near)
         else:
             pieces.append(piece)
@@ -355,8 +355,8 @@ def _guides(
     if isinstance(goal, Station):
         return lambda rows: goal
     if goal == END:
-        where = drive.motion.between
-        return lambda rows: station_at((*where(rows).position[-1], float(where(rows).yaw[-1])))
+        between = drive.motion.between
+        return lambda rows: station_at((*between(rows).position[-1], float(between(rows).yaw[-1])))
     if not drive.has_goal:
         raise DriveError(
             f"{drive.path}: was driven by hand to no goal: give --goal x,y,z,yaw_deg, where to, or --goal {END}: where "
@@ -386,8 +386,8 @@ def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Gu
         DriveError: The record does not tell, or its goals are not on the trajectory.
     """
     name = name or drive.guide
-    known = name in TRAJECTORIES or name in PUBLISHED_NAMES
-    if name == drive.guide and not known:  # what a record names is no path
+    named = name in TRAJECTORIES or name in PUBLISHED_NAMES
+    if name == drive.guide and not named:  # what a record names is no path
         raise DriveError(
             f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: {GIVE}"
         )
@@ -414,7 +414,7 @@ def collect(
     disturb: float = 0.0,
     goal: str | None = None,
     seed: int = 42,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
     """Keep episodes of a task as a Minari data set: let an expert do it, or take what was done with a vehicle.
 
@@ -463,15 +463,15 @@ def datasets(places: Sequence[Path], *, lerobot: Path | None = None) -> dict[str
         places (PATH...): Data sets, or folders that hold some.
         lerobot (DIR): Folder for a LeRobot data set (format 3.0) of the one data set that is named.
     """
-    found = [path for place in places for path in found_in(place)]
+    paths = [path for location in places for path in found_in(location)]
     if lerobot is None:
-        return {str(path): about(path) for path in found}
-    if len(found) != 1:
-        raise DatasetError(f"--lerobot {lerobot}: {len(found)} data sets are named, expected one")
+        return {str(path): about(path) for path in paths}
+    if len(paths) != 1:
+        raise DatasetError(f"--lerobot {lerobot}: {len(paths)} data sets are named, expected one")
     return {
-        str(found[0]): {
-            **about(found[0]),
-            "lerobot": {"written": str(lerobot), **export_lerobot(found[0], lerobot)},
+        str(paths[0]): {
+            **about(paths[0]),
+            "lerobot": {"written": str(lerobot), **export_lerobot(paths[0], lerobot)},
         }
     }
 
@@ -482,8 +482,8 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         means = {name: x for name, x in result.get("metrics", {}).items() if x is not None}
         text = f"{result['episodes']} episodes, {result['steps']:,} steps{'; means: ' * bool(means)}"
         sources = [
-            f"{one['file']}: {one['driver']}, {one['episodes']} episodes, {one['steps']:,} steps"
-            for one in result.get("records", ())
+            f"{record['file']}: {record['driver']}, {record['episodes']} episodes, {record['steps']:,} steps"
+            for record in result.get("records", ())
         ]
         title = text + ", ".join(f"{name} {x:.4g}" for name, x in means.items())
         return [Table(title=title, sentences=sources)]
@@ -533,11 +533,11 @@ def collect_records(
     the_task = watch.task
     mode = action_mode(action or the_task.action, body)
     to = station_of(goal) if goal is not None and not the_task.moving and goal != END else goal
-    found, sources = [], []
+    demonstrations, sources = [], []
     for path in records:
         drive = read_drive(path, body)
         episodes = episodes_of(drive, watch, mode, body, goal=to)
-        found += episodes
+        demonstrations += episodes
         steps = sum(len(e.action) for e in episodes)
         sources.append(
             {
@@ -548,7 +548,7 @@ def collect_records(
                 "steps": steps,
             }  # fmt: skip
         )
-    if not found:
+    if not demonstrations:
         names = ", ".join(str(path) for path in records)
         raise DriveError(
             f"{names}: nowhere was the robot armed, its estimate ready and its driver at the helm for two decisions "
@@ -567,8 +567,8 @@ def collect_records(
         "records": sources,
         "provenance": provenance(),
     }
-    save(out, found, described)
-    return {**described, "episodes": len(found), "steps": sum(len(e.action) for e in found)}
+    save(out, demonstrations, described)
+    return {**described, "episodes": len(demonstrations), "steps": sum(len(e.action) for e in demonstrations)}
 
 
 # A record as a trial, and its scores.
@@ -713,12 +713,12 @@ def _goal_history(drive: Drive, steered: NDArray[np.bool_], duration: float) -> 
         DriveError: There was no goal.
     """
     goals, t = _goals(drive, steered), drive.motion.t[steered & (drive.motion.t >= 0.0)]
-    place, yaw = goals[:, :3], np.unwrap(goals[:, 3])
-    rates = np.gradient(place, t, axis=0) if len(t) > 1 else np.zeros_like(place)
+    position, yaw = goals[:, :3], np.unwrap(goals[:, 3])
+    rates = np.gradient(position, t, axis=0) if len(t) > 1 else np.zeros_like(position)
     return Trajectory(
         name="recorded",
         duration=duration,
-        motion=lambda at: (interpolated(at, t, place), interpolated(at, t, rates)),
+        motion=lambda at: (interpolated(at, t, position), interpolated(at, t, rates)),
         turning=lambda at: np.interp(at, t, yaw),
     )
 

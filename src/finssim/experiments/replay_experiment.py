@@ -91,8 +91,8 @@ class ReplayPlant:
         p = SimpleNamespace(**self.spec["propellers"])
         thrusters = list(vehicle.thrusters.values())
         axis = np.array([t.axis for t in thrusters])
-        place = np.array([t.position for t in thrusters])
-        distance = np.linalg.norm(place[:, None] - place, axis=-1)
+        position = np.array([t.position for t in thrusters])
+        distance = np.linalg.norm(position[:, None] - position, axis=-1)
         share = p.induced_share * np.exp(-distance / p.induced_reach) * (1.0 - np.eye(len(thrusters)))
         disc = 0.25 * math.pi * p.diameter**2
         c_plus = np.array([t.c_plus for t in thrusters])
@@ -105,8 +105,8 @@ class ReplayPlant:
             thrust = simulator.numpy("actuator")[:, 0, :n].astype(float)
             turns = np.sqrt(np.abs(thrust) / np.where(thrust >= 0.0, c_plus, c_minus)) / (2.0 * math.pi)
             induced = np.sqrt(np.abs(thrust) / (2.0 * vehicle.water.density * disc)) @ share.T
-            own = nu[:, :3] @ axis.T + np.einsum("wi,ki->wk", nu[:, 3:], np.cross(place, axis))
-            inflow = np.sign(thrust) * own + induced
+            flow = nu[:, :3] @ axis.T + np.einsum("wi,ki->wk", nu[:, 3:], np.cross(position, axis))
+            inflow = np.sign(thrust) * flow + induced
             loss = inflow / (p.advance_at_zero_thrust * np.maximum(turns, SLOWEST) * p.diameter)
             simulator.plant.gain.numpy()[:, 0, :n] = 1.0 - loss
 
@@ -157,9 +157,9 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 def _headline(result: Mapping[str, Any]) -> str:
     counts = result["trials_per_seed"]
     seeds = len(result["seeds"])
-    who = f"{result['vehicle']['name']}, {seeds} seed{'s' if seeds != 1 else ''}"
+    subject = f"{result['vehicle']['name']}, {seeds} seed{'s' if seeds != 1 else ''}"
     return (
-        f"{who}: fitted on {counts['fitted']} trials each, replayed on {counts['same_levels']} others of the same "
+        f"{subject}: fitted on {counts['fitted']} trials each, replayed on {counts['same_levels']} others of the same "
         f"levels and {counts['other_levels']} of other levels"
     )
 
@@ -199,7 +199,7 @@ def replay_experiment(
     vehicle: Annotated[str, "python"] = "finsrov",
     repeats: Annotated[int, "python"] = REPEATS,
     axes: Annotated[Sequence[str], "python"] = AXES,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
     """Identify on half of the trials of a plant outside the model class, replay three models on the other half.
 
@@ -236,36 +236,36 @@ def replay_experiment(
         "experiment": "replay",
         "vehicle": {"name": body.name, "sha256": body.sha256},
         "plant": dict(water.spec),
-        "seeds": [one.seed for one in done],
+        "seeds": [seed_result.seed for seed_result in done],
         "trials_per_seed": {
             "fitted": len(done[0].fit.trials),
             "same_levels": len(done[0].same_levels.pairs),
             "other_levels": len(done[0].other_levels.pairs),
         },
-        "same_levels": pooled([one.same_levels for one in done]),
-        "other_levels": pooled([one.other_levels for one in done]),
+        "same_levels": pooled([seed_result.same_levels for seed_result in done]),
+        "other_levels": pooled([seed_result.other_levels for seed_result in done]),
         "fits": [
             {
-                "seed": one.seed,
-                "method": one.fit.method,
-                "vehicle_sha256": one.vehicle.sha256,
-                "parameters": {name: e.as_json() for name, e in one.fit.estimates.items()},
-                "findings": [finding.as_json() for finding in one.fit.findings],
-                "trials": dict(one.fit.trials),
-                "held_out": {p.name: p.sha256 for p in one.same_levels.pairs},
+                "seed": seed_result.seed,
+                "method": seed_result.fit.method,
+                "vehicle_sha256": seed_result.vehicle.sha256,
+                "parameters": {name: e.as_json() for name, e in seed_result.fit.estimates.items()},
+                "findings": [finding.as_json() for finding in seed_result.fit.findings],
+                "trials": dict(seed_result.fit.trials),
+                "held_out": {p.name: p.sha256 for p in seed_result.same_levels.pairs},
             }
-            for one in done
+            for seed_result in done
         ],
         "paper": {m: {"aggregate": v, "ci95": list(ci)} for m, (v, ci) in PAPER_TABLE_3.items()},
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "unit": "seed, then trial"},
         "provenance": provenance(),
     }
     with atomic_directory(out, replaces=RESULT_FILE) as folder:
-        pairs = [pair for one in done for pair in one.same_levels.pairs]
+        pairs = [pair for seed_result in done for pair in seed_result.same_levels.pairs]
         save_figure(draw_response_envelopes(pairs), folder / "envelope.png")
         (folder / "vehicles").mkdir()
-        for one in done:
-            write_vehicle(one.vehicle, folder / "vehicles" / f"seed_{one.seed}.yaml")
+        for seed_result in done:
+            write_vehicle(seed_result.vehicle, folder / "vehicles" / f"seed_{seed_result.seed}.yaml")
         write_json(folder / RESULT_FILE, result, tables_of(result))
     return result
 
@@ -292,7 +292,7 @@ def pooled(replays: Sequence[Replay]) -> dict[str, Any]:
     """
     models: dict[str, Any] = {}
     for model in replays[0].models:
-        by_seed = [_values(one, model) for one in replays]
+        by_seed = [_values(seed_replay, model) for seed_replay in replays]
         axes = [axis for axis in AXES if any(axis in values for values in by_seed)]
         by_axis = {a: float(np.median(np.concatenate([v[a] for v in by_seed]))) for a in axes}
 
@@ -306,17 +306,17 @@ def pooled(replays: Sequence[Replay]) -> dict[str, Any]:
             "ci95": bootstrap(redraw).tolist(),
             "by_axis": by_axis,
             "aggregate_mean": float(np.mean([np.concatenate([v[a] for v in by_seed]).mean() for a in axes])),
-            "per_seed": [one.aggregate(model).value for one in replays],
-            "diverged": sum(model in pair.diverged for one in replays for pair in one.pairs),
+            "per_seed": [seed_replay.aggregate(model).value for seed_replay in replays],
+            "diverged": sum(model in pair.diverged for seed_replay in replays for pair in seed_replay.pairs),
         }
     best = min(models, key=lambda model: float(models[model]["aggregate"]))
     return {"models": models, "best": best}
 
 
-def _values(one: Replay, model: str) -> dict[str, NDArray[np.float64]]:
+def _values(seed_replay: Replay, model: str) -> dict[str, NDArray[np.float64]]:
     """NRMSE of every trial by axis."""
     values: dict[str, list[float]] = {}
-    for scores in one.scores[model]:
+    for scores in seed_replay.scores[model]:
         for axis, s in scores.items():
             if s.value is not None:
                 values.setdefault(axis, []).append(s.value)

@@ -45,11 +45,11 @@ def report(results: Sequence[Path], *, into: Annotated[Sequence[Path], "--into"]
     Raises:
         ReportError: A file is no result of such an experiment, or a page asks for what there is not.
     """
-    known = {path.stem: _read(path) for path in results}
+    by_name = {path.stem: _read(path) for path in results}
     stale = []
     for page in into:
         text = page.read_text(encoding="utf-8")
-        new = filled(text, known, str(page))
+        new = filled(text, by_name, str(page))
         if new == text:
             continue
         stale.append(page)
@@ -85,16 +85,16 @@ def filled(page: str, results: Mapping[str, Mapping[str, Any]], name: str) -> st
         ReportError: It asks for what there is not.
     """
 
-    def made(found: re.Match[str]) -> str:
-        wanted, *options = found["what"].split(" ", 1)
+    def made(match: re.Match[str]) -> str:
+        name_of_result, *options = match["what"].split(" ", 1)
         try:
-            if wanted not in results:
-                raise ReportError(f"no result '{wanted}.json' was given")
-            result = results[wanted]
+            if name_of_result not in results:
+                raise ReportError(f"no result '{name_of_result}.json' was given")
+            result = results[name_of_result]
             text = _table(TABLES[result["experiment"]](result), options[0] if options else "")
         except ReportError as error:
-            raise ReportError(f"{name}: <!-- finssim report: {found['what']} -->: {error}") from None
-        return f"<!-- finssim report: {found['what']} -->\n{text}\n<!-- end -->"
+            raise ReportError(f"{name}: <!-- finssim report: {match['what']} -->: {error}") from None
+        return f"<!-- finssim report: {match['what']} -->\n{text}\n<!-- end -->"
 
     return BLOCK.sub(made, page)
 
@@ -104,23 +104,27 @@ def _table(tables: Sequence[Table], options: str) -> str:
     number = int(chosen.get("table", "1"))
     if not 1 <= number <= len(tables):
         raise ReportError(f"table {number}: the result has {len(tables)}")
-    shown = tables[number - 1]
+    selected = tables[number - 1]
     if "rows" in chosen:
-        by_name = {row[0].strip(): row for row in shown.rows if row}
+        by_name = {row[0].strip(): row for row in selected.rows if row}
         names = chosen["rows"].split(";")
         missing = [row for row in names if row not in by_name]
         if missing:
             raise ReportError(f"no row '{missing[0]}'; there are: {'; '.join(by_name)}")
-        shown = replace(shown, rows=[by_name[row] for row in names])
+        selected = replace(selected, rows=[by_name[row] for row in names])
     if "columns" in chosen:
         columns = [int(word) for word in chosen["columns"].split(",")]
-        if max(columns) >= len(shown.heads):
-            raise ReportError(f"no column {max(columns)}: the table has 0 to {len(shown.heads) - 1}")
-        shown = replace(
-            shown,
-            heads=[shown.heads[k] for k in columns],
-            rows=[[row[k] for k in columns] for row in shown.rows if row],
+        if max(columns) >= len(selected.heads):
+            raise ReportError(f"no column {max(columns)}: the table has 0 to {len(selected.heads) - 1}")
+        selected = replace(
+            selected,
+            heads=[selected.heads[k] for k in columns],
+            rows=[[row[k] for k in columns] for row in selected.rows if row],
         )
-    rows = [[row[0].strip(), *row[1:]] for row in shown.rows if row]
-    table = markdown_table(shown.heads, rows) if rows else "\n".join(f"- {text}" for text in shown.sentences)
-    return f"{shown.headline}:\n\n{table}" if chosen.get("headline") == "yes" else table
+    rows = [[row[0].strip(), *row[1:]] for row in selected.rows if row]
+    table = (
+        markdown_table(selected.heads, rows)
+        if rows
+        else "\n".join(f"- {text}" for text in selected.sentences)
+    )
+    return f"{selected.headline}:\n\n{table}" if chosen.get("headline") == "yes" else table

@@ -181,8 +181,8 @@ class Stages:
             return self._end("fault")
         return self._stage(runtime, runtime.reading, now)
 
-    def _end(self, how: Ended, reason: str = "") -> bool:
-        self._ended, self._reason = how, reason
+    def _end(self, kind: Ended, reason: str = "") -> bool:
+        self._ended, self._reason = kind, reason
         return True
 
     def _keys(self) -> Sequence[str]:
@@ -235,10 +235,11 @@ class Stages:
         if self.there(reading, now):
             self._begin(runtime, now)
         elif now - self._since > APPROACH:
-            why = runtime.refusal or self._way(reading)
+            reason = runtime.refusal or self._way(reading)
             return self._end(
                 "not there",
-                f"not at its start after {APPROACH:g} s: {why}; is something in its way, or was it let in elsewhere?",
+                f"not at its start after {APPROACH:g} s: {reason}; is something in its way, or was it let in "
+                "elsewhere?",
             )
         return False
 
@@ -322,12 +323,12 @@ class OnRobot:
     def options(self) -> str:
         """Words of a command line that name it."""
         wiring = self.wiring
-        words = ["--robot", wiring.robot, "--pool-file", str(self.pool_file or "none")]
-        words += ["--site", self.site] if self.site != "pool" else []
-        words += ["--let-in", ",".join(f"{x:g}" for x in self.let_in)] if self.let_in is not None else []
-        words += ["--bind", wiring.bind] if wiring.bind != DEFAULT_BIND else []
-        words += ["--pictures", wiring.pictures] if wiring.pictures else []
-        return shlex.join([*words, *(["--lockstep"] if wiring.lockstep else [])])
+        tokens = ["--robot", wiring.robot, "--pool-file", str(self.pool_file or "none")]
+        tokens += ["--site", self.site] if self.site != "pool" else []
+        tokens += ["--let-in", ",".join(f"{x:g}" for x in self.let_in)] if self.let_in is not None else []
+        tokens += ["--bind", wiring.bind] if wiring.bind != DEFAULT_BIND else []
+        tokens += ["--pictures", wiring.pictures] if wiring.pictures else []
+        return shlex.join([*tokens, *(["--lockstep"] if wiring.lockstep else [])])
 
 
 def robot_or_none(
@@ -368,8 +369,8 @@ def robot_or_none(
         RobotError: Something tells of a robot and none is named, or it has no pool file.
     """
     if robot is None:
-        told = (arm, by_hand, unattended, lockstep, pool_file, pictures, site, let_in)
-        if any(x is not None and x is not False for x in told):
+        stated = (arm, by_hand, unattended, lockstep, pool_file, pictures, site, let_in)
+        if any(x is not None and x is not False for x in stated):
             raise RobotError(
                 "--arm, --by-hand, --unattended, --lockstep, --pool-file, --site, --let-in and --pictures tell of a "
                 "robot: name one with --robot"
@@ -475,16 +476,16 @@ class Session:
                 "pilot": trial.pilot.describe(), "guide": trial.guide.name, "armed": True, "robot": wiring.robot,
                 "site": self.robot.site, **({"pool_sha256": self.site.sha256} if self.site else {}), **(about or {}),
             }  # fmt: skip
-            kept = recording(
+            context = recording(
                 partial, self.vehicle, meta, pool_file=self.robot.pool_file, lockstep=wiring.lockstep, pictures="none"
             )  # fmt: skip
-            with kept as recorder:
+            with context as recorder:
                 stages = Stages(
                     trial, self.equipped, start, start_bounds(self.robot.site, exact), by_hand=self.robot.by_hand,
                     attendant=self.attendant, recorder=recorder,
                 )  # fmt: skip
-                known = self._reckoning if self.robot.let_in is not None else perception and perception()
-                outcome = stages.play(self.drive, self.site, known)
+                prior = self._reckoning if self.robot.let_in is not None else perception and perception()
+                outcome = stages.play(self.drive, self.site, prior)
             if recorder is not None and recorder.problem and outcome.ended == "over":
                 raise RobotError(f"{record}: {recorder.problem}")
             stopped = (
@@ -675,9 +676,9 @@ class Job(PoolJob):
         return "t1" if self.target in T1_SETPOINTS else "t2"
 
 
-def noise_seed(*words: Any) -> int:
+def noise_seed(*labels: Any) -> int:
     """A seed of what a trial is called: trials of other names never share noise."""
-    return zlib.crc32(" ".join(map(str, words)).encode()) & 0x7FFFFFFF
+    return zlib.crc32(" ".join(map(str, labels)).encode()) & 0x7FFFFFFF
 
 
 def play_in_pool(
@@ -734,7 +735,7 @@ def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial,
     standing = load_vehicle(job.pool_vehicle)
     guide = guide_of(job.target, standing, site=job.site)
     first = guide.at(0.0)
-    *place, yaw = (
+    *position, yaw = (
         in_room(T1_START, standing, job.site) if job.task == "t1" else (*first.position, float(first.yaw))
     )
     duration = guide.duration if math.isfinite(guide.duration) else job.duration
@@ -749,7 +750,7 @@ def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial,
         over=lambda runtime: runtime.t >= duration,
         watch=_Estimates(),
     )
-    return trial, Station(tuple(map(float, place)), float(yaw))  # type: ignore[arg-type]
+    return trial, Station(tuple(map(float, position)), float(yaw))  # type: ignore[arg-type]
 
 
 class _Estimates:
@@ -918,5 +919,5 @@ def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | No
     except DriveError:  # stopped before its first decision
         nowhere = np.full((2, 4), np.nan)
         motion = Motion(t=np.array([0.0, 0.1]), position=nowhere[:, :3], quaternion=nowhere)
-    where = {"robot": opened.robot.title, "record": record.name}
-    return _result(job, path, motion, outcome, began) | where
+    origin = {"robot": opened.robot.title, "record": record.name}
+    return _result(job, path, motion, outcome, began) | origin

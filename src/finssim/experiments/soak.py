@@ -41,7 +41,7 @@ def soak(
     seed: int = 1,
     severity: str = "realistic",
     vehicle: str = "finsrov",
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
     """Keep a station for hours in lock-step and watch the memory [MiB]. Ctrl-C ends it with what is known until then.
 
@@ -118,11 +118,11 @@ def verdict(vehicle_s: Array, memory: Array) -> dict[str, Any]:
     Returns:
         `verdict`: flat, grows, or too short to tell; `slope_mib_per_h`, None if too short; `first_mib`, `last_mib`.
     """
-    kept = vehicle_s >= vehicle_s[-1] * WARM
+    selected = vehicle_s >= vehicle_s[-1] * WARM
     ends = {"first_mib": float(memory[0]), "last_mib": float(memory[-1])}
-    if kept.sum() < 10:
+    if selected.sum() < 10:
         return {"verdict": "too short to tell", "slope_mib_per_h": None, **ends}
-    slope = 3600.0 * float(np.polyfit(vehicle_s[kept], memory[kept], 1)[0])
+    slope = 3600.0 * float(np.polyfit(vehicle_s[selected], memory[selected], 1)[0])
     return {"verdict": "flat" if slope < FLAT else "grows", "slope_mib_per_h": slope, **ends}
 
 
@@ -130,8 +130,8 @@ def memory_mib() -> float:
     """Memory of this process that is in use now [MiB]; the most it ever was where the system tells no more."""
     try:
         # Not statm, which on a machine of many processors may be tens of MiB behind.
-        told = Path("/proc/self/smaps_rollup").read_text(encoding="ascii")
-        return int(re.search(r"^Rss:\s+(\d+) kB", told, re.MULTILINE)[1]) / 1024.0  # type: ignore[index]
+        rollup = Path("/proc/self/smaps_rollup").read_text(encoding="ascii")
+        return int(re.search(r"^Rss:\s+(\d+) kB", rollup, re.MULTILINE)[1]) / 1024.0  # type: ignore[index]
     except OSError:
         import resource
 

@@ -34,7 +34,7 @@ ROWS = "episodes.json"
 
 def site_of(
     task: str | Task,
-    who: str,
+    controller: str,
     vehicles: Sequence[Vehicle],
     *,
     seed: int = 0,
@@ -51,7 +51,7 @@ def site_of(
 
     Args:
         task: A task, its name, or FILE.py:CLASS of one's own.
-        who: A policy's directory, or a baseline of the task.
+        controller: A policy's directory, or a baseline of the task.
         vehicles: One for each of its places.
         seed: Of the episode, of noise and of what is lost.
         plant: Seed of every vehicle's plant.
@@ -65,15 +65,17 @@ def site_of(
     """
     fitted = fitted_task(task, vehicles)
     pool = fitted.arena() is not None and fitted.dock() is None
-    one = vehicles[0]
-    site, known, settings = camera_of(one, plant, severity)
-    words: Any = task if isinstance(task, str) else fitted.name
+    vehicle = vehicles[0]
+    site, state_sources, settings = camera_of(vehicle, plant, severity)
+    task_argument: Any = task if isinstance(task, str) else fitted.name
     return TaskSite(
         task,
         vehicles,
         lambda v: plant_at("pool" if pool else "open-water", draw_plant(v, plant, severity)),
-        lambda name: make_pilot(who, vehicles[fitted.vehicles.index(name)], task=words, agent=name),
-        known if pool else None,
+        lambda name: make_pilot(
+            controller, vehicles[fitted.vehicles.index(name)], task=task_argument, agent=name
+        ),
+        state_sources if pool else None,
         seed=seed,
         guide=guide,
         communication=communication or getattr(fitted, "communication", None),
@@ -133,8 +135,10 @@ def play(
         "plant": plant, "severity": severity, "seed": seed,
     }  # fmt: skip
     file = None if out is None else out / ROWS
-    kept = kept_result(file) if file is not None and file.is_file() else {}
-    rows = list(kept["episodes"]) if kept and kept == {**about, "episodes": kept["episodes"]} else []
+    earlier = kept_result(file) if file is not None and file.is_file() else {}
+    rows = (
+        list(earlier["episodes"]) if earlier and earlier == {**about, "episodes": earlier["episodes"]} else []
+    )
     for k in range(len(rows), episodes):
         guide = list(TRAJECTORIES.values())[k % len(TRAJECTORIES)] if follows(fitted) else None
         record = out / f"episode_{k}" if out is not None and records else None
@@ -159,7 +163,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     title = f"{result['task']}, {result['controller']}"
     heads = [title, f"stack, {stack['trials']}", f"batch, {batch['trials']}"]
     rows = [
-        [name, *(figure_text(one["metrics"].get(name), ".3g") for one in (stack, batch))]
+        [name, *(figure_text(entry["metrics"].get(name), ".3g") for entry in (stack, batch))]
         for name in stack["metrics"]
     ]
     return [Table(title=title, heads=heads, rows=rows, left=(0, 1, 2), intervals=True)]

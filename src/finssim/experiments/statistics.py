@@ -111,8 +111,8 @@ def with_bootstrap(scores: Sequence[Array], statistic: Statistic, resamples: int
     """
 
     def redraw(random: np.random.Generator) -> float:
-        rows = (random.integers(0, len(one), one.shape) for one in scores)
-        drawn = [np.take_along_axis(one, row, axis=0) for one, row in zip(scores, rows, strict=True)]
+        rows = (random.integers(0, len(score), score.shape) for score in scores)
+        drawn = [np.take_along_axis(score, row, axis=0) for score, row in zip(scores, rows, strict=True)]
         return float(statistic(*drawn))
 
     return _figure(statistic(*scores), bootstrap(redraw, resamples), sum(map(len, scores)))
@@ -123,6 +123,6 @@ def probability_of_improvement(a: Array, b: Array, less_is_better: bool) -> floa
 
     It is the Mann-Whitney statistic over the product of the counts.
     """
-    left, right = a[:, None, :], b[None, :, :]
-    wins = (left < right) if less_is_better else (left > right)
-    return float(np.mean(wins + 0.5 * (left == right)))
+    a_runs, right = a[:, None, :], b[None, :, :]
+    wins = (a_runs < right) if less_is_better else (a_runs > right)
+    return float(np.mean(wins + 0.5 * (a_runs == right)))

@@ -110,8 +110,8 @@ class Span(BaseModel):
 
         if self.choice:
             return CategoricalDistribution(self.choice)
-        whole = isinstance(self.low, int) and isinstance(self.high, int)
-        return (IntDistribution if whole else FloatDistribution)(self.low, self.high, log=self.log)
+        integral = isinstance(self.low, int) and isinstance(self.high, int)
+        return (IntDistribution if integral else FloatDistribution)(self.low, self.high, log=self.log)
 
 
 class Search(BaseModel):
@@ -170,22 +170,24 @@ class Sweep(BaseModel):
             raise ValueError(f"task is '{self.task}', expected one of {', '.join(TASKS)}")
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds are {list(self.seeds)}, expected at least one, each once")
-        known = [name for name in inspect.signature(train).parameters if name not in SAME_FOR_ALL]
+        available = [name for name in inspect.signature(train).parameters if name not in SAME_FOR_ALL]
         if self.search is not None and (self.settings or self.grid):
             raise ValueError("a search proposes the settings itself: leave 'settings' and 'grid' out")
         searched = {name.partition(".")[0]: None for name in self.search.options} if self.search else {}
         for options in (self.train, self.grid, searched, *self.settings.values()):
             for name in options:
-                if name not in known:
-                    raise ValueError(f"'{name}' is no option of a training; available: {', '.join(known)}")
+                if name not in available:
+                    raise ValueError(
+                        f"'{name}' is no option of a training; available: {', '.join(available)}"
+                    )
         return self
 
     def jobs(self) -> list[Job]:
         """Every setting with every seed; seed by seed, so that each setting has some results early."""
         combinations = [dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())]
         variants = [
-            (_named(name, combination), {**self.train, **own, **combination})
-            for name, own in (self.settings or {"": {}}).items()
+            (_named(name, combination), {**self.train, **setting, **combination})
+            for name, setting in (self.settings or {"": {}}).items()
             for combination in combinations
         ]
         return self.jobs_of(dict(variants))
@@ -238,9 +240,9 @@ def load_sweep(path: str | Path) -> Sweep:
 def _placed(value: Any, folder: Path, key: Any = "") -> Any:
     """What a sweep file holds, with files beside it by their whole paths."""
     if isinstance(value, dict):
-        return {name: _placed(one, folder, key if key in FILES else name) for name, one in value.items()}
+        return {name: _placed(item, folder, key if key in FILES else name) for name, item in value.items()}
     if isinstance(value, list):
-        return [_placed(one, folder, key) for one in value]
+        return [_placed(item, folder, key) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         raise SweepError(f"{key} is {value}, expected a finite number")
     beside = folder / value if isinstance(value, str) and key in FILES else None
@@ -262,7 +264,7 @@ def play(job: Job) -> tuple[dict[str, Any], dict[str, bytes]]:
         evaluations = (
             evaluate_controller(out, load_plant(x), trials=job.trials, **about) for x in job.plants
         )
-        row["plants"] = {one.result["plant"]["name"]: one.result for one in evaluations}
+        row["plants"] = {evaluation.result["plant"]["name"]: evaluation.result for evaluation in evaluations}
         return row, {path.name: path.read_bytes() for path in out.iterdir()}
 
 
@@ -272,7 +274,7 @@ def sweep(
     out: Path,
     address: str | None = None,
     processes: Annotated[int | None, (1, None)] = None,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
     """Train every setting with every seed on one machine or many, and evaluate each policy; goes on where it was.
 
@@ -352,16 +354,18 @@ def _searched(
     space = {name: span.distribution() for name, span in search.options.items()}
     variants: dict[str, Mapping[str, Any]] = {}
     for first in range(0, search.trials, search.batch):
-        asked = [study.ask(space) for _ in range(min(search.batch, search.trials - first))]
-        names = [f"try-{trial.number:04d}" for trial in asked]
-        variants |= {name: _with(plan.train, trial.params) for name, trial in zip(names, asked, strict=True)}
-        made = played(plan.jobs_of({name: variants[name] for name in names}))
-        for name, trial in zip(names, asked, strict=True):
+        proposed = [study.ask(space) for _ in range(min(search.batch, search.trials - first))]
+        names = [f"try-{trial.number:04d}" for trial in proposed]
+        variants |= {
+            name: _with(plan.train, trial.params) for name, trial in zip(names, proposed, strict=True)
+        }
+        results = played(plan.jobs_of({name: variants[name] for name in names}))
+        for name, trial in zip(names, proposed, strict=True):
             values = [
-                _value(one, str(measure)) for row in made if row["name"] == name
-                for one in row.get("plants", {}).values()
+                _value(entry, str(measure)) for row in results if row["name"] == name
+                for entry in row.get("plants", {}).values()
             ]  # fmt: skip
-            failed = not values or None in values or any("error" in r for r in made if r["name"] == name)
+            failed = not values or None in values or any("error" in r for r in results if r["name"] == name)
             state = optuna.trial.TrialState.FAIL if failed else None
             study.tell(trial, None if failed else float(np.mean(np.array(values, float))), state=state)
     done = study.get_trials(states=[optuna.trial.TrialState.COMPLETE])
@@ -373,11 +377,11 @@ def _searched(
 
 def _with(options: Mapping[str, Any], proposed: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a training with what is proposed; settings.NAME goes to its learner."""
-    own = {name: value for name, value in proposed.items() if "." not in name}
+    top_level = {name: value for name, value in proposed.items() if "." not in name}
     inner = {name.partition(".")[2]: value for name, value in proposed.items() if "." in name}
     return {
         **options,
-        **own,
+        **top_level,
         **({"settings": {**dict(options.get("settings", {})), **inner}} if inner else {}),
     }
 
@@ -388,8 +392,8 @@ def _value(result: Mapping[str, Any], measure: str) -> float | None:
     Raises:
         SweepError: It is not measured.
     """
-    have = {key: one["value"] for key, one in result.get("metrics", {}).items()} or {
-        key: one for key, one in result.items() if isinstance(one, int | float) or one is None
+    have = {key: entry["value"] for key, entry in result.get("metrics", {}).items()} or {
+        key: entry for key, entry in result.items() if isinstance(entry, int | float) or entry is None
     }
     if measure not in have:
         raise SweepError(f"search: no measure '{measure}'; available: {', '.join(have)}")
@@ -412,7 +416,7 @@ def _keep(job: Job, outcome: Any, runs: Path) -> dict[str, Any]:
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
     """A row for each run and plant: its measures, or what went wrong."""
-    evaluated = [one for row in result["rows"] for one in row.get("plants", {}).values()]
+    evaluated = [entry for row in result["rows"] for entry in row.get("plants", {}).values()]
     first: dict[str, Any] = evaluated[0] if evaluated else {}
     measures = list(first.get("metrics", ())) or [
         name for name in MEASURES.get(str(first.get("task")), ()) if name in first
@@ -424,8 +428,8 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         if "error" in row:
             texts = [row["error"], *[""] * len(measures)][: len(measures)]
             rows.append([row["name"], str(row["seed"]), "–", "–", *texts])
-        for plant, one in row.get("plants", {}).items():
-            texts = cells(one.get("metrics", one), columns)
+        for plant, entry in row.get("plants", {}).items():
+            texts = cells(entry.get("metrics", entry), columns)
             rows.append([row["name"], str(row["seed"]), plant, f"{row['training_s']:.0f}", *texts])
     heads = ["run", "seed", "plant", "time [s]", *measures]
     tables = [Table(title="Sweep", heads=heads, rows=rows, left=(0, 2))]

@@ -79,8 +79,8 @@ def describe_task(
         "name": the_task.name,
         "title": the_task.title or (inspect.getdoc(type(the_task)) or "").partition("\n")[0].rstrip("."),
         "vehicles": {
-            place: {"name": one.name, "sha256": one.sha256}
-            for place, one in zip(the_task.vehicles, vehicles, strict=True)
+            role: {"name": item.name, "sha256": item.sha256}
+            for role, item in zip(the_task.vehicles, vehicles, strict=True)
         },
         "agents": list(the_task.agents),
         "others": list(the_task.others),
@@ -91,9 +91,9 @@ def describe_task(
         "time_limit_s": the_task.time_limit,
         "reward": _reward(the_task),
         "ends": [
-            {"name": one.name, "reward": one.reward, "told": _text(the_task, one)} for one in terms.ends
+            {"name": item.name, "reward": item.reward, "told": _text(the_task, item)} for item in terms.ends
         ],
-        "totals": [{"name": one.name, "told": _text(the_task, one)} for one in terms.totals],
+        "totals": [{"name": item.name, "told": _text(the_task, item)} for item in terms.totals],
         "success": the_task.success_rule(),
         "settings": _settings(the_task),
         "training_noise": seen_with(the_task.training_noise, vehicles[0]),
@@ -102,18 +102,18 @@ def describe_task(
     }
 
 
-def _text(task: Task, one: ObservationPart | RewardTerm | End | Total) -> str:
+def _text(task: Task, part: ObservationPart | RewardTerm | End | Total) -> str:
     """What the task says of a term; otherwise the docstring of the function, also of one that is shared by name.
 
     An expression of which nothing is said is its own text, but in an observation, whose part is named by what it is.
     """
-    terms, term = task.terms(), one.term
+    terms, term = task.terms(), part.term
     shared = {**terms.shared, **terms.seen}
     while isinstance(term, str) and (term in shared or hasattr(library, term)):
         term = shared.get(term, getattr(library, term, None))
-    expression = "" if isinstance(one, ObservationPart) or term is None else str(one.term)
+    expression = "" if isinstance(part, ObservationPart) or term is None else str(part.term)
     text = (inspect.getdoc(term.func) or "") if hasattr(term, "func") else expression
-    return terms.meanings.get(one.name) or " ".join(text.split())
+    return terms.meanings.get(part.name) or " ".join(text.split())
 
 
 def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
@@ -128,13 +128,13 @@ def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
 
 def _reward(task: Task) -> dict[str, Any]:
     """Terms with their weights, and what is written of them all; of a task in torch, of its function."""
-    own: Any = getattr(task, "reward", None)
-    weights = asdict(own) if is_dataclass(own) and not isinstance(own, type) else {}
-    told = inspect.getdoc(type(own) if weights else own) if weights or callable(own) else ""
+    reward: Any = getattr(task, "reward", None)
+    weights = asdict(reward) if is_dataclass(reward) and not isinstance(reward, type) else {}
+    text = inspect.getdoc(type(reward) if weights else reward) if weights or callable(reward) else ""
     terms = [
-        {"name": one.name, "weight": one.weight, "told": _text(task, one)} for one in task.terms().rewards
+        {"name": term.name, "weight": term.weight, "told": _text(task, term)} for term in task.terms().rewards
     ]
-    return {"terms": terms, "weights": weights, "told": told or ""}
+    return {"terms": terms, "weights": weights, "told": text or ""}
 
 
 def _settings(task: Task) -> list[dict[str, Any]]:
@@ -147,9 +147,9 @@ def _settings(task: Task) -> list[dict[str, Any]]:
 def _limited(value: Any) -> Any:
     """None for a limit that is infinite, such as the level speed of a vehicle that never tips over: JSON has no inf."""
     if isinstance(value, dict):
-        return {name: _limited(one) for name, one in value.items()}
+        return {name: _limited(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_limited(one) for one in value]
+        return [_limited(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -182,10 +182,10 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     if "observation" not in result:
         rows = [
             [
-                name, str(len(one["agents"])), str(one["observation"]["size"]), str(one["action"]["size"]),
-                f"{one['period_s']:g}", f"{one['time_limit_s']:g}", ", ".join(one["baselines"]), one["title"],
+                name, str(len(task["agents"])), str(task["observation"]["size"]), str(task["action"]["size"]),
+                f"{task['period_s']:g}", f"{task['time_limit_s']:g}", ", ".join(task["baselines"]), task["title"],
             ]
-            for name, one in result.items()
+            for name, task in result.items()
         ]  # fmt: skip
         heads = ("task", "agents", "sees", "does", "every [s]", "for [s]", "baseline", "what is to be done")
         return [Table(title="", heads=heads, rows=rows, left=(0, 6, 7), whole=(0, 6))]
@@ -216,8 +216,8 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 def _head(result: Mapping[str, Any]) -> list[str]:
     crew = {
-        place: ", ".join(f"{name} ({result['vehicles'][name]['name']})" for name in result[place])
-        for place in ("agents", "others")
+        role: ", ".join(f"{name} ({result['vehicles'][name]['name']})" for name in result[role])
+        for role in ("agents", "others")
     }
     lines = {
         result["name"]: result["title"],
@@ -228,7 +228,7 @@ def _head(result: Mapping[str, Any]) -> list[str]:
         f"{result['time_limit_s']:g} s",
         "baselines": ", ".join(result["baselines"]) or "none",
         "noise in training": _value(result["training_noise"]) or "none",
-        **{f"seen with sensors, {name}": _value(one) for name, one in result["sensors"].items()},
+        **{f"seen with sensors, {name}": _value(sensor) for name, sensor in result["sensors"].items()},
     }
     return [f"{name}: {text}" for name, text in lines.items() if text]
 
@@ -237,7 +237,7 @@ def _value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {_value(one)}" for name, one in value.items())
+        return ", ".join(f"{name} {_value(item)}" for name, item in value.items())
     if isinstance(value, list | tuple):
         return ", ".join(map(_value, value))
     return "none" if value is None else str(value)

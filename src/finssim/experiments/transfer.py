@@ -127,7 +127,7 @@ class Spec:
         return {
             key: float(np.mean([a[key] - b[key] for a, b in pairs]))
             for key in self.differences
-            if all(one.get(key) is not None for pair in pairs for one in pair)
+            if all(figures_of_row.get(key) is not None for pair in pairs for figures_of_row in pair)
         }
 
     def tables(self, result: Mapping[str, Any]) -> list[Table]:
@@ -198,7 +198,7 @@ def transfer_experiment(
     attendant: Attendant | None = None,
     pool_vehicle: Annotated[str | None, "python"] = None,
     console: Console | None = None,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
     show: Show = lambda job, result: None,
 ) -> dict[str, Any]:
     """Train what the rows need, play every target in every plant with every seed, and write the table.
@@ -256,7 +256,7 @@ def transfer_experiment(
     action, site, sees = FIRMWARES[firmware]
     controllers = controllers_of(
         spec.name, chosen, run_seeds, folder, vehicle, steps, action,
-        lambda part, what: progress(TRAINING_SHARE * part, what), processes=processes, address=address,
+        lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
     )  # fmt: skip
     if robot is not None:  # there is one plant, and nobody chose its severity
         pools, severity, camera = range(1), HARDWARE, HARDWARE
@@ -273,7 +273,7 @@ def transfer_experiment(
     ]  # fmt: skip
     results = play_jobs(
         jobs, folder / "trials", robot, attendant=attendant, console=console, processes=processes, address=address,
-        show=show, progress=lambda part, what: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
+        show=show, progress=lambda part, text: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, text),
     )  # fmt: skip
     by_row = {name: [r for r in results if r["job"]["row"] == name] for name in chosen}
     by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
@@ -297,7 +297,7 @@ def controllers_of(
     vehicle: str,
     steps: int | None = None,
     action: str | None = None,
-    progress: Progress = lambda part, what: None,
+    progress: Progress = lambda part, text: None,
     *,
     processes: int | None = None,
     address: str | None = None,
@@ -333,11 +333,11 @@ def controllers_of(
     with closing(
         spread(_trained, list(missing.items()), 1 if len(missing) == 1 else processes, address)
     ) as done:
-        for left, ((policy, _), outcome) in zip(reversed(range(len(missing))), done, strict=True):
-            with atomic_directory(policy, replaces=DESCRIPTION_FILE) as place:
+        for remaining, ((policy, _), outcome) in zip(reversed(range(len(missing))), done, strict=True):
+            with atomic_directory(policy, replaces=DESCRIPTION_FILE) as scratch:
                 for name, content in outcome.result().items():
-                    (place / plain_name(name, "file of a policy", PolicyError)).write_bytes(content)
-            progress(1.0 - left / len(missing), f"{left} trainings left")
+                    (scratch / plain_name(name, "file of a policy", PolicyError)).write_bytes(content)
+            progress(1.0 - remaining / len(missing), f"{remaining} trainings left")
     return controllers
 
 
@@ -349,15 +349,15 @@ def _trained(policy: tuple[Path, Mapping[str, Any]]) -> dict[str, bytes]:
         return {path.name: path.read_bytes() for path in out.iterdir()}
 
 
-def finished(place: Path, vehicle: Vehicle | None = None) -> bool:
+def finished(directory: Path, vehicle: Vehicle | None = None) -> bool:
     """Whether a whole policy lies there: not one that was interrupted, or cut short while it was written.
 
     Args:
-        place: Directory.
+        directory: Directory.
         vehicle: That it must be for; any if None.
     """
     try:
-        return bool(Policy.load(place, vehicle=vehicle).description.training.get("complete"))
+        return bool(Policy.load(directory, vehicle=vehicle).description.training.get("complete"))
     except PolicyError:
         return False
 
@@ -439,10 +439,10 @@ T2_DRAWN = 4
 """Rows that are drawn, at most: more cannot be told apart."""
 
 
-def played_in(result: Mapping[str, Any], what: str) -> str:
+def played_in(result: Mapping[str, Any], targets_name: str) -> str:
     """In what an experiment was played, and with which vehicle."""
     plants, seeds = len(result["plants"]), len(result["seeds"])
-    of = f"{what}: {len(result['targets'])}; {result['vehicle']['name']} {result['vehicle']['sha256'][:12]}"
+    of = f"{targets_name}: {len(result['targets'])}; {result['vehicle']['name']} {result['vehicle']['sha256'][:12]}"
     if result.get("robot"):
         return f"on hardware, robot {result['robot']}, by its own estimate; seeds: {seeds}, {of}"
     filtered = result.get("estimator", "constant-velocity")

@@ -176,13 +176,13 @@ class Trial:
         """
         motion = self.motion
         if task == "t1":
-            *place, yaw = self.goal.tolist()
+            *position, yaw = self.goal.tolist()
             measures = measure_trial(motion.t, motion.position, motion.yaw, self.goal)
             if motion.thrust is not None and not stopped:
-                known = np.isfinite(motion.thrust).all(axis=1)
-                if known.sum() > 1:
-                    measures |= effort_measures(motion.t[known], motion.thrust[known], limits)
-            return {"goal": [*place, math.degrees(yaw)], **measures}
+                valid = np.isfinite(motion.thrust).all(axis=1)
+                if valid.sum() > 1:
+                    measures |= effort_measures(motion.t[valid], motion.thrust[valid], limits)
+            return {"goal": [*position, math.degrees(yaw)], **measures}
         attitude = None if motion.heading_only else motion.quaternion
         measures = measure_tracking(
             motion.t, motion.position, self.guide, quaternion=attitude, thrust=motion.thrust, limits=limits

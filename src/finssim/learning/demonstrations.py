@@ -131,43 +131,45 @@ def _buffers(episodes: Iterable[Episode]) -> Iterable[Any]:
         )
 
 
-def load(place: str | Path) -> Demonstrations:
+def load(folder: str | Path) -> Demonstrations:
     """Read a data set.
 
     Raises:
         DatasetError: There is none, or it was not made by FinsSim.
     """
-    described, found = about(place), list(read_episodes(place))
+    described, episodes = about(folder), list(read_episodes(folder))
     return Demonstrations(
-        observation=np.concatenate([e.observation[:-1] for e in found]),
-        action=np.concatenate([e.action for e in found]),
-        following=np.concatenate([e.observation[1:] for e in found]),
-        episodes=len(found),
-        mean_return=float(np.mean([np.sum(e.reward) for e in found])),
+        observation=np.concatenate([e.observation[:-1] for e in episodes]),
+        action=np.concatenate([e.action for e in episodes]),
+        following=np.concatenate([e.observation[1:] for e in episodes]),
+        episodes=len(episodes),
+        mean_return=float(np.mean([np.sum(e.reward) for e in episodes])),
         about=described,
-        pictures={name: np.concatenate([e.pictures[name][:-1] for e in found]) for name in found[0].pictures},
+        pictures={
+            name: np.concatenate([e.pictures[name][:-1] for e in episodes]) for name in episodes[0].pictures
+        },
     )
 
 
-def read_episodes(place: str | Path) -> Iterator[Episode]:
+def read_episodes(folder: str | Path) -> Iterator[Episode]:
     """The episodes of a data set, one after another."""
     import minari
 
-    dataset = minari.MinariDataset(Path(place))
+    dataset = minari.MinariDataset(Path(folder))
     measured = dataset.storage.get_episode_metadata(dataset.episode_indices)
     for e, metrics in zip(dataset.iterate_episodes(), measured, strict=True):
-        seen = dict(e.observations) if isinstance(e.observations, dict) else {STATE: e.observations}
+        views = dict(e.observations) if isinstance(e.observations, dict) else {STATE: e.observations}
         yield Episode(
-            observation=seen.pop(STATE).astype(np.float32),
+            observation=views.pop(STATE).astype(np.float32),
             action=e.actions.astype(np.float32),
             reward=e.rewards.astype(np.float32),
             terminated=bool(e.terminations[-1]),
             metrics={name: float(x) for name, x in metrics.items() if isinstance(x, int | float)},
-            pictures=seen,
+            pictures=views,
         )
 
 
-def about(place: str | Path) -> dict[str, Any]:
+def about(folder: str | Path) -> dict[str, Any]:
     """What a data set is of: task, observation, action, vehicle, expert, seed, provenance, episodes and steps.
 
     Raises:
@@ -176,32 +178,32 @@ def about(place: str | Path) -> dict[str, Any]:
     from minari.dataset.minari_storage import MinariStorage
 
     try:
-        found = MinariStorage.read_raw_metadata(Path(place))
+        metadata = MinariStorage.read_raw_metadata(Path(folder))
     except (ValueError, OSError) as error:
-        raise DatasetError(f"{place}: no data set there: make one with finssim collect") from error
-    if OURS not in found:
+        raise DatasetError(f"{folder}: no data set there: make one with finssim collect") from error
+    if OURS not in metadata:
         raise DatasetError(
-            f"{place}: not a data set of FinsSim: it does not say of which task and vehicle it is"
+            f"{folder}: not a data set of FinsSim: it does not say of which task and vehicle it is"
         )
-    described: dict[str, Any] = json_value(found[OURS], DatasetError, str(place))
-    return {**described, "episodes": found["total_episodes"], "steps": found["total_steps"]}
+    described: dict[str, Any] = json_value(metadata[OURS], DatasetError, str(folder))
+    return {**described, "episodes": metadata["total_episodes"], "steps": metadata["total_steps"]}
 
 
-def found_in(place: str | Path) -> list[Path]:
+def found_in(folder: str | Path) -> list[Path]:
     """The data sets at a place: itself, or those right under it.
 
     Raises:
         DatasetError: There is none.
     """
-    here = Path(place)
-    found = (
+    here = Path(folder)
+    data_sets = (
         [here]
         if (here / DATASET_FILE).is_file()
         else sorted(p.parent for p in here.glob(f"*/{DATASET_FILE}"))
     )
-    if not found:
-        raise DatasetError(f"{place}: no data set there: make one with finssim collect")
-    return found
+    if not data_sets:
+        raise DatasetError(f"{folder}: no data set there: make one with finssim collect")
+    return data_sets
 
 
 def _word(name: str) -> str:
@@ -263,13 +265,13 @@ def collect(
         randomize=randomize, observe=observe, seed=seed,
     )  # fmt: skip
     body = environment.simulator.vehicles[0]
-    who = expert_for(expert, body, environment.task, environment.action_mode)
-    found = record_episodes(environment, who, episodes, disturb=disturb, seed=seed, show=show)
+    driver = expert_for(expert, body, environment.task, environment.action_mode)
+    recorded = record_episodes(environment, driver, episodes, disturb=disturb, seed=seed, show=show)
     described = {
         "task": environment.task.name,
         "title": environment.task.title,
         "period": environment.task.control_step,
-        "expert": who.name,
+        "expert": driver.name,
         "observation": environment.task.schema.model_dump(mode="json"),
         "action": action_mode(environment.action_mode, body).describe(),
         "vehicle": {"name": body.name, "sha256": body.sha256},
@@ -280,15 +282,15 @@ def collect(
         "seed": seed,
         "provenance": provenance(),
     }
-    save(out, found, plain_data(described))
+    save(out, recorded, plain_data(described))
     means = {
         name: float(np.nanmean(values))
-        if np.isfinite(values := np.array([e.metrics[name] for e in found])).any()
+        if np.isfinite(values := np.array([e.metrics[name] for e in recorded])).any()
         else None
-        for name in found[0].metrics
+        for name in recorded[0].metrics
     }
-    steps = sum(len(e.action) for e in found)
-    return {**described, "episodes": len(found), "steps": steps, "metrics": means}
+    steps = sum(len(e.action) for e in recorded)
+    return {**described, "episodes": len(recorded), "steps": steps, "metrics": means}
 
 
 def record_episodes(
@@ -321,21 +323,21 @@ def record_episodes(
     quota = np.full(worlds, count // rows)
     quota[: -(-(count - int(quota.sum()) * agents) // agents)] += 1
     fresh = expert.reset(rows)
-    memory, (seen, pictures) = fresh, _apart(environment.reset(seed=environment.seed), rows)
+    memory, (observed, pictures) = fresh, _apart(environment.reset(seed=environment.seed), rows)
     running: list[list[Any]] = [[] for _ in range(rows)]
-    found: list[Episode] = []
+    episodes: list[Episode] = []
     broken = 0
-    while len(found) < count and quota.any():
-        wanted, memory = expert.act(memory, Known(seen, pictures=pictures or None), NOWHERE)
-        wanted = np.clip(wanted, -1.0, 1.0)
-        done = np.clip(wanted + disturb * rng.standard_normal(wanted.shape), -1.0, 1.0).astype(np.float32)
+    while len(episodes) < count and quota.any():
+        action, memory = expert.act(memory, Known(observed, pictures=pictures or None), NOWHERE)
+        action = np.clip(action, -1.0, 1.0)
+        done = np.clip(action + disturb * rng.standard_normal(action.shape), -1.0, 1.0).astype(np.float32)
         shape = (worlds, -1) if agents == 1 else (worlds, agents, -1)
         step = environment.step(done.reshape(shape))
         reward = step.reward.reshape(rows)
         for i in range(rows):
             if quota[i // agents]:
                 views = {name: x[i].copy() for name, x in pictures.items()}
-                running[i].append((seen[i], views, wanted[i], float(reward[i])))
+                running[i].append((observed[i], views, action[i], float(reward[i])))
         ended = step.terminated | step.truncated
         if ended.any():
             last, final_pictures = _apart(step.final_observation, rows)
@@ -346,21 +348,23 @@ def record_episodes(
             broken += int(np.count_nonzero(broke & (quota > 0)))
             if broken > 10 * (count + rows):
                 raise DatasetError(
-                    f"{broken} episodes ended in a number that is not finite, {len(found)} did not: narrow the ranges, "
-                    "or check the vehicle file"
+                    f"{broken} episodes ended in a number that is not finite, {len(episodes)} did not: narrow the "
+                    "ranges, or check the vehicle file"
                 )
             for w in np.flatnonzero(ended & (quota > 0)):
                 quota[w] -= not broke[w]
-                whole = {name: float(values[w]) for name, values in measured.items()}
+                complete = {name: float(values[w]) for name, values in measured.items()}
                 for i in range(w * agents, (w + 1) * agents):
                     if not broke[w]:
                         views = {name: x[i] for name, x in final_pictures.items()}
-                        found.append(_episode(running[i], last[i], views, bool(step.terminated[w]), whole))
+                        episodes.append(
+                            _episode(running[i], last[i], views, bool(step.terminated[w]), complete)
+                        )
                     running[i] = []
             memory = restarted(memory, fresh, np.repeat(ended, agents))
-        seen, pictures = _apart(step.observation, rows)
-        show(min(len(found) / count, 1.0))
-    return found[:count]
+        observed, pictures = _apart(step.observation, rows)
+        show(min(len(episodes) / count, 1.0))
+    return episodes[:count]
 
 
 def _apart(observation: Any, rows: int) -> tuple[NDArray[np.float32], dict[str, NDArray[np.uint8]]]:
@@ -385,5 +389,8 @@ def _episode(
         reward=np.array(reward, dtype=np.float32),
         terminated=terminated,
         metrics=metrics,
-        pictures={name: np.stack([*(one[name] for one in pictures), x]) for name, x in views.items()},
+        pictures={
+            name: np.stack([*(views_of_step[name] for views_of_step in pictures), x])
+            for name, x in views.items()
+        },
     )

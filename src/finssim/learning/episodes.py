@@ -48,14 +48,14 @@ class EpisodeEnds:
         """Where an episode ended in the step just done, bool, (worlds,)."""
         return (self._terminated | self._truncated) != 0
 
-    def look(self, where: Any) -> None:
-        """Keep how the episodes went that ended in the step just done, in the worlds `where`, bool, (worlds,)."""
-        if self._arrays.device is None and not where.any():
+    def look(self, worlds: Any) -> None:
+        """Keep how the episodes went that ended in the step just done, in the worlds `worlds`, bool, (worlds,)."""
+        if self._arrays.device is None and not worlds.any():
             return
-        self.ended |= where
-        for source, kept in zip(self._sources, self._kept, strict=True):
-            mask = where[:, None] if kept.ndim == 2 else where
-            kept[...] = self._arrays.xp.where(mask, source, kept)
+        self.ended |= worlds
+        for source, target in zip(self._sources, self._kept, strict=True):
+            mask = worlds[:, None] if target.ndim == 2 else worlds
+            target[...] = self._arrays.xp.where(mask, source, target)
 
     def clear(self) -> None:
         """Forget them."""
@@ -203,5 +203,5 @@ class HeldEvaluation:
 
 
 def _mean(values: NDArray[np.float64]) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else np.nan
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else np.nan

@@ -135,8 +135,8 @@ class _Graph:
         near = self.node("Exp", [self.node("Mul", [steepness, self.node("Mul", [e, e])])])
         gain = self.node("Mul", [rate, self.node("Mul", [e, near])])
         z = self.node("Clip", [self.node("Add", [before, gain]), low, high])
-        where = np.eye(n, dtype=np.float32)[list(errors)]
-        return self.node("Add", ["observation", self.node("MatMul", [z, self.weight(where)])]), z
+        selection = np.eye(n, dtype=np.float32)[list(errors)]
+        return self.node("Add", ["observation", self.node("MatMul", [z, self.weight(selection)])]), z
 
     def cell(self, cell: Cell, x: str, memory: str) -> tuple[str, str]:
         """One step of an LSTM or a GRU, as `Cell.step` has it: its outputs and its memory after."""
@@ -394,7 +394,7 @@ def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> 
     n, m = description.observation.size, description.action_size
     try:
         pictures = {
-            name: np.zeros((2, *one["shape"]), np.uint8) for name, one in description.pictures.items()
+            name: np.zeros((2, *picture["shape"]), np.uint8) for name, picture in description.pictures.items()
         }
         memory = _memory(network, 2)
         shape = _answer(network, np.zeros((2, n)), memory, np.float32, pictures, limited=False).shape
@@ -462,8 +462,8 @@ def _check_agreement(network: nn.Module | Network, policy: Policy, tolerance: fl
     k = policy.description.memory
     memory = rng.uniform(-1.0, 1.0, size=(512, k)) if k else None
     pictures = {
-        name: rng.integers(0, 256, (512, *one["shape"]), dtype=np.uint8)
-        for name, one in policy.description.pictures.items()
+        name: rng.integers(0, 256, (512, *picture["shape"]), dtype=np.uint8)
+        for name, picture in policy.description.pictures.items()
     }
     single = _answer(network, observation, memory, np.float32, pictures)
     double = _answer(network, observation, memory, np.float64, pictures)
@@ -492,16 +492,16 @@ def _answer(
     limited: bool = True,
 ) -> NDArray[Any]:
     """Action, in [-1, 1] if `limited`, and, beside it, the memory after, (N, m + k), computed with that type."""
-    given = [None if x is None else np.asarray(x, dtype=kind) for x in (observation, memory)]
+    inputs = [None if x is None else np.asarray(x, dtype=kind) for x in (observation, memory)]
     if isinstance(network, Network):
-        action, after = network.as_type(kind).step(*given)
+        action, after = network.as_type(kind).step(*inputs)
     else:
         import torch
 
         copy = deepcopy(network).cpu().eval().to(torch.float64 if kind is np.float64 else torch.float32)
         with torch.no_grad():
-            seen = {name: torch.from_numpy(x) for name, x in pictures.items()}
-            parts = asked(copy, *(None if x is None else torch.from_numpy(x) for x in given), seen)
+            tensors = {name: torch.from_numpy(x) for name, x in pictures.items()}
+            parts = asked(copy, *(None if x is None else torch.from_numpy(x) for x in inputs), tensors)
         action, after = (None if x is None else x.numpy() for x in parts)
     action = np.clip(action, -1.0, 1.0) if limited else action
     return action if after is None else np.concatenate([action, after], axis=1)

@@ -30,7 +30,7 @@ def observation_space(environment: Environment) -> spaces.Box | spaces.Dict:
     state = spaces.Box(-high.astype(np.float32), high.astype(np.float32), dtype=np.float32)
     if environment.sight is None:
         return state
-    shapes = {name: one["shape"] for name, one in environment.sight.describe().items()}
+    shapes = {name: picture["shape"] for name, picture in environment.sight.describe().items()}
     pictures = {name: spaces.Box(0, 255, tuple(shape), np.uint8) for name, shape in shapes.items()}
     return spaces.Dict({"state": state, **pictures})
 

@@ -138,8 +138,8 @@ class Parameters:
             views: list[list[Array]] = [[], []]
             for shape in network.shapes():
                 size = math.prod(shape)
-                for row, found in zip((self.values, self.gradient), views, strict=True):
-                    found.append(row[first : first + size].reshape(shape))
+                for row, arrays_of_network in zip((self.values, self.gradient), views, strict=True):
+                    arrays_of_network.append(row[first : first + size].reshape(shape))
                 first += size
             network.bind(*views)
 

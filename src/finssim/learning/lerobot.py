@@ -30,7 +30,7 @@ PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 
 
-def export_lerobot(place: str | Path, out: str | Path) -> dict[str, Any]:
+def export_lerobot(source: str | Path, out: str | Path) -> dict[str, Any]:
     """Write a data set of `finssim collect` once more, as LeRobot reads it.
 
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -43,7 +43,7 @@ def export_lerobot(place: str | Path, out: str | Path) -> dict[str, Any]:
     data set.
 
     Args:
-        place: The data set.
+        source: The data set.
         out: Folder to write; an earlier LeRobot data set there is replaced.
 
     Returns:
@@ -55,10 +55,10 @@ def export_lerobot(place: str | Path, out: str | Path) -> dict[str, Any]:
     """
     import pandas as pd
 
-    described = about(place)
-    fps, title = _rate(described, place), str(described.get("title") or described["task"])
+    described = about(source)
+    fps, title = _rate(described, source), str(described.get("title") or described["task"])
     with atomic_directory(out, replaces=INFO_FILE) as folder:
-        rows, parts = _frames(folder, place, fps, title)
+        rows, parts = _frames(folder, source, fps, title)
         features = _features({key: x[0] for key, x in parts.items()}, described)
         episodes = folder / "meta/episodes" / f"{_place(0)}.parquet"
         episodes.parent.mkdir(parents=True)
@@ -86,7 +86,7 @@ def export_lerobot(place: str | Path, out: str | Path) -> dict[str, Any]:
 
 
 def _frames(
-    folder: Path, place: str | Path, fps: int, title: str
+    folder: Path, source: str | Path, fps: int, title: str
 ) -> tuple[list[dict[str, Any]], dict[str, list[NDArray[Any]]]]:
     """Write the files of frames: the row of each episode in the table of episodes, and all columns by episode."""
     import pyarrow.parquet as pq
@@ -94,7 +94,7 @@ def _frames(
     rows: list[dict[str, Any]] = []
     parts: dict[str, list[NDArray[Any]]] = {}
     began, file, size, writer = 0, 0, 0, None
-    for i, episode in enumerate(read_episodes(place)):
+    for i, episode in enumerate(read_episodes(source)):
         columns = _columns(episode, i, began, fps)
         table = _table(columns)
         if writer is not None and size >= FILE_MIB * 2**20:
@@ -138,15 +138,15 @@ def _episode_row(
     }
 
 
-def _rate(described: Mapping[str, Any], place: str | Path) -> int:
+def _rate(described: Mapping[str, Any], source: str | Path) -> int:
     """Frames in a second [Hz]."""
     period = described.get("period")
     if not period:
-        raise DatasetError(f"{place}: does not tell its period: collect it again with this version")
+        raise DatasetError(f"{source}: does not tell its period: collect it again with this version")
     fps = round(1.0 / period)
     if abs(fps * period - 1.0) > 1e-6:
         raise DatasetError(
-            f"{place}: a step takes {period:g} s, expected a whole number of steps in a second"
+            f"{source}: a step takes {period:g} s, expected a whole number of steps in a second"
         )
     return fps
 

@@ -190,9 +190,9 @@ def with_integrals(
     e = observation[:, index]
     z = integral + INTEGRAL_RATE * e * xp.exp(-((e / INTEGRAL_REACH) ** 2))
     z = xp.clip(z, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
-    seen = observation + 0.0
-    seen[:, index] = e + z
-    return seen, z
+    augmented = observation + 0.0
+    augmented[:, index] = e + z
+    return augmented, z
 
 
 def first_memory(network: Any, rows: int, device: str | None = None) -> Array | None:

@@ -43,9 +43,9 @@ class PettingZooEnv(ParallelEnv[str, Observation, Observation]):
         # PettingZoo asks for the same object every time: it has the random stream of sampled actions.
         self.observation_spaces = {name: observation_space(environment) for name in self.possible_agents}
         self.action_spaces = {name: action_space(environment) for name in self.possible_agents}
-        whole = observation_space(environment)
+        space = observation_space(environment)
         self.state_space = spaces.Box(
-            np.tile(whole.low, environment.agents), np.tile(whole.high, environment.agents), dtype=np.float32
+            np.tile(space.low, environment.agents), np.tile(space.high, environment.agents), dtype=np.float32
         )
 
     def observation_space(self, agent: str) -> spaces.Box:

@@ -29,9 +29,9 @@ class RecurrentNetwork(nn.Module):
 
     def forward(self, observation: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Action (N, m) and memory (N, 2 k) for observations (N, n) and memory (N, 2 k); 0 at an episode's start."""
-        said, cells = (part.unsqueeze(0).contiguous() for part in memory.chunk(2, dim=1))
-        answer, (said, cells) = self.lstm(observation.unsqueeze(0), (said, cells))
-        return self.layers(answer[0]), torch.cat([said[0], cells[0]], dim=1)
+        hidden, cells = (part.unsqueeze(0).contiguous() for part in memory.chunk(2, dim=1))
+        answer, (hidden, cells) = self.lstm(observation.unsqueeze(0), (hidden, cells))
+        return self.layers(answer[0]), torch.cat([hidden[0], cells[0]], dim=1)
 
 
 class SeeingNetwork(nn.Module):

@@ -26,9 +26,9 @@ class ResumeError(ValueError):
 def random_state() -> dict[str, Any]:
     """The global random streams of Python, NumPy, and torch where it was imported."""
     name, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002  SB3 draws from it
-    version, words, extra = random.getstate()
+    version, state, extra = random.getstate()
     streams: dict[str, Any] = {
-        "python": [version, list(words), extra],
+        "python": [version, list(state), extra],
         "numpy": [name, keys, position, has_gauss, gauss],
     }
     if torch := sys.modules.get("torch"):
@@ -39,8 +39,8 @@ def random_state() -> dict[str, Any]:
 
 def set_random_state(state: dict[str, Any]) -> None:
     """Set the streams to where `random_state` found them."""
-    version, words, extra = state["python"]
-    random.setstate((version, tuple(words), extra))
+    version, numbers, extra = state["python"]
+    random.setstate((version, tuple(numbers), extra))
     np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
     if "torch" in state:
         import torch

@@ -35,8 +35,8 @@ class RslRlVecEnv(VecEnv):
         self.environment = environment = served(task, options)
         self._tensors = Tensors(environment)
         self._steps = wp.to_torch(environment.simulator.state.steps)
-        a, told = environment.arrays, bool(environment.privileged_names)
-        self._drawn = (wp.to_torch(a.privileged), wp.to_torch(a.final_privileged)) if told else None
+        a, privileged = environment.arrays, bool(environment.privileged_names)
+        self._drawn = (wp.to_torch(a.privileged), wp.to_torch(a.final_privileged)) if privileged else None
         self.device = str(self._tensors.device)
         self.num_envs = environment.worlds * environment.agents
         self.num_actions = environment.action_size
@@ -87,11 +87,13 @@ class RslRlVecEnv(VecEnv):
         )
 
     def _groups(self, observation: torch.Tensor, final: bool = False) -> TensorDict:
-        seen = observation.reshape(self.num_envs, -1).clone()
-        known = seen
+        policy = observation.reshape(self.num_envs, -1).clone()
+        critic = policy
         if self._drawn is not None:
-            known = torch.cat([seen, self._drawn[final].reshape(self.num_envs, -1)], dim=1)
-        return TensorDict({"policy": seen, "critic": known}, batch_size=[self.num_envs], device=self.device)
+            critic = torch.cat([policy, self._drawn[final].reshape(self.num_envs, -1)], dim=1)
+        return TensorDict(
+            {"policy": policy, "critic": critic}, batch_size=[self.num_envs], device=self.device
+        )
 
     def _metrics(self, done: torch.Tensor) -> dict[str, float]:
         ended = done.cpu().numpy()

@@ -65,10 +65,10 @@ class Sb3VecEnv(VecEnv):
         """Observations, rewards, ends and infos; new arrays, which SB3 keeps and changes."""
         assert self._actions is not None, "step_wait without step_async"
         agents = self.environment.agents
-        whole = (
+        joint = (
             self._actions if agents == 1 else self._actions.reshape(-1, agents, self.environment.action_size)
         )
-        step = self.environment.step(whole)
+        step = self.environment.step(joint)
         done = step.terminated | step.truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(done)

@@ -103,10 +103,10 @@ class SkrlEnv(Wrapper):
         self, actions: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Act for one control step; actions (rows, size). Rewards and ends are (rows, 1)."""
-        seen, last, reward, terminated, truncated = self._worlds.step(actions)
+        observation, last, reward, terminated, truncated = self._worlds.step(actions)
         ends = [end.repeat_interleave(self.environment.agents)[:, None] for end in (terminated, truncated)]
         infos = {"final_observations": last.flatten(0, 1), **self._worlds.episode(terminated | truncated)}
-        return seen.flatten(0, 1), reward.flatten()[:, None], *ends, infos
+        return observation.flatten(0, 1), reward.flatten()[:, None], *ends, infos
 
     def state(self) -> None:
         """None."""
@@ -132,11 +132,13 @@ class SkrlTeamEnv(MultiAgentEnvWrapper):
         self.environment = self._worlds.environment
         super().__init__(self.environment)
         self._device = self._worlds.tensors.device
-        names, one = self.environment.task.agents, observation_space(self.environment)
-        whole = spaces.Box(np.tile(one.low, len(names)), np.tile(one.high, len(names)), dtype=np.float32)
-        self._observation_spaces = dict.fromkeys(names, one)
+        names, local_space = self.environment.task.agents, observation_space(self.environment)
+        joint_space = spaces.Box(
+            np.tile(local_space.low, len(names)), np.tile(local_space.high, len(names)), dtype=np.float32
+        )
+        self._observation_spaces = dict.fromkeys(names, local_space)
         self._action_spaces = dict.fromkeys(names, action_space(self.environment))
-        self._state_spaces = dict.fromkeys(names, whole)
+        self._state_spaces = dict.fromkeys(names, joint_space)
 
     @property
     def num_envs(self) -> int:
@@ -178,15 +180,15 @@ class SkrlTeamEnv(MultiAgentEnvWrapper):
         dict[str, torch.Tensor], dict[str, torch.Tensor], dict[str, Any], dict[str, Any], dict[str, Any]
     ]:
         """Act for one control step; actions (worlds, size) by agent. Rewards and ends are (worlds, 1)."""
-        together = torch.stack([actions[name] for name in self.possible_agents], dim=1)
-        seen, last, reward, terminated, truncated = self._worlds.step(together)
+        joint = torch.stack([actions[name] for name in self.possible_agents], dim=1)
+        observation, last, reward, terminated, truncated = self._worlds.step(joint)
         infos = {
             "final_observations": self._by_agent(last),
             "final_states": dict.fromkeys(self.possible_agents, last.flatten(1)),
             **self._worlds.episode(terminated | truncated),
         }
         ends = [dict.fromkeys(self.possible_agents, end[:, None]) for end in (terminated, truncated)]
-        return self._by_agent(seen), self._by_agent(reward[:, :, None]), *ends, infos
+        return self._by_agent(observation), self._by_agent(reward[:, :, None]), *ends, infos
 
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that the agents see, (worlds, agents * size), the same for each."""

@@ -101,11 +101,11 @@ class TorchRlEnv(EnvBase):
                 age_episodes(self.environment)
             self._begun = torch.zeros_like(self._begun)
         else:
-            asked = mask.view(-1)
-            left = asked & ~self._begun
-            if left.any():
-                self.environment.reset(mask=left.cpu().numpy())
-            self._begun = self._begun & ~asked
+            requested = mask.view(-1)
+            remaining = requested & ~self._begun
+            if remaining.any():
+                self.environment.reset(mask=remaining.cpu().numpy())
+            self._begun = self._begun & ~requested
         return self._by_group(self._tensors.observation.clone())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:

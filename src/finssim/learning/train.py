@@ -177,12 +177,14 @@ def train(
                 f"no checkpoint in {side} yet: starting from the beginning", soft_wrap=True, markup=False
             )
         stopped = loop.run()
-    place = (interrupted or _place_beside(Path(out), side)) if stopped else Path(out)
-    _finish(loop, place, stopped, console, place if stopped else shown or place, time.perf_counter() - began)
-    return place
+    folder = (interrupted or _place_beside(Path(out), side)) if stopped else Path(out)
+    _finish(
+        loop, folder, stopped, console, folder if stopped else shown or folder, time.perf_counter() - began
+    )
+    return folder
 
 
-def _taught(values: Any, init: str | Path | None, learner: str, own_action: bool) -> Any:
+def _taught(values: Any, init: str | Path | None, learner: str, default_action: bool) -> Any:
     """The settings with whom to imitate first; the task's own teacher acts in the task's own action mode alone."""
     if not hasattr(values, "teacher"):
         if init is None:
@@ -192,17 +194,17 @@ def _taught(values: Any, init: str | Path | None, learner: str, own_action: bool
         )
     if init is not None:
         return replace(values, teacher="" if str(init) == "none" else str(init))
-    return values if own_action else replace(values, teacher="")
+    return values if default_action else replace(values, teacher="")
 
 
-def settings_of_words(words: Sequence[str]) -> dict[str, Any]:
+def settings_of_words(texts: Sequence[str]) -> dict[str, Any]:
     """Changes of settings from NAME=VALUE; a value with commas is a list.
 
     Raises:
         TrainingError: A word has no name or no value.
     """
     changes: dict[str, Any] = {}
-    for word in words:
+    for word in texts:
         name, _, value = word.partition("=")
         if not name or not value:
             raise TrainingError(f"setting '{word}': expected NAME=VALUE, such as learning_rate=1e-3")
@@ -210,7 +212,7 @@ def settings_of_words(words: Sequence[str]) -> dict[str, Any]:
     return changes
 
 
-def _finish(loop: Any, place: Path, stopped: bool, console: Console, where: Path, took: float) -> None:
+def _finish(loop: Any, folder: Path, stopped: bool, console: Console, label: Path, took: float) -> None:
     """Write the policy, or the policy so far; after Ctrl-C the interrupt goes on."""
     from finssim.learning.export import export_policy
     from finssim.learning.training_loop import after
@@ -220,13 +222,13 @@ def _finish(loop: Any, place: Path, stopped: bool, console: Console, where: Path
         raise KeyboardInterrupt
     done = loop.curves[-1]["steps"]
     best = loop.best
-    what = "policy so far" if stopped else "policy"
+    title = "policy so far" if stopped else "policy"
     export_policy(
-        best.network, place, after(loop.description, done, not stopped, best.steps), curves=loop.curves
+        best.network, folder, after(loop.description, done, not stopped, best.steps), curves=loop.curves
     )
-    kept = f", best after {best.steps:,}" if best.steps < done else ""
-    told = f"{what}: {where}  ({done:,} steps in {took:.1f} s{kept})"
-    console.print(told, highlight=False, soft_wrap=True, markup=False)
+    best_text = f", best after {best.steps:,}" if best.steps < done else ""
+    message = f"{title}: {label}  ({done:,} steps in {took:.1f} s{best_text})"
+    console.print(message, highlight=False, soft_wrap=True, markup=False)
     if stopped:
         raise KeyboardInterrupt
 
@@ -238,8 +240,8 @@ def _place_beside(out: Path, side: Path) -> Path:
 
 def _identity(description: PolicyDescription) -> dict[str, Any]:
     """What must be equal for a training to go on to the same result, by the name it has in a sentence."""
-    said = plain_data(
+    described = plain_data(
         description.model_dump(mode="json", include={"task", "action", "hydrodynamics", "seed"})
     )
     training = plain_data(description.training)
-    return {**said, "vehicle": description.vehicle.sha256[:12], **training}
+    return {**described, "vehicle": description.vehicle.sha256[:12], **training}

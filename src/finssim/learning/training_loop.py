@@ -49,9 +49,9 @@ def summary(row: Mapping[str, Any]) -> str:
     if not row.get("steps_per_s"):
         return ""
     rate, held = row["steps_per_s"] / 1e3, 100.0 * row["held"]
-    words = f"{rate:.0f} k steps/s  return {row['mean_return']:.1f}  held {held:.0f} %"
+    text = f"{rate:.0f} k steps/s  return {row['mean_return']:.1f}  held {held:.0f} %"
     success = row.get("evaluation_success")
-    return words if success is None else f"{words}  evaluated {100.0 * success:.0f} %"
+    return text if success is None else f"{text}  evaluated {100.0 * success:.0f} %"
 
 
 class TrainingView:
@@ -96,9 +96,9 @@ class TrainingView:
         if not self._live and part >= self._next:
             elapsed = time.perf_counter() - self._start
             done = max(row["steps"] - self._first, 1)
-            left = elapsed * max(self.total - row["steps"], 0) / done
+            remaining = elapsed * max(self.total - row["steps"], 0) / done
             self.console.print(
-                f"training {min(part, 1.0):4.0%}  {summary(row)}  {left:.0f} s left", highlight=False
+                f"training {min(part, 1.0):4.0%}  {summary(row)}  {remaining:.0f} s left", highlight=False
             )
             self._next = (int(part * 10.0) + 1) / 10.0
 
@@ -243,17 +243,17 @@ class Loop:
             if self.best
             else None,
         }
-        place = self.side / f"checkpoint-{steps:09d}"
+        checkpoint = self.side / f"checkpoint-{steps:09d}"
         export_policy(
             self.learner.network(),
-            place,
+            checkpoint,
             after(self.description, steps, False, steps),
             curves=self.curves,
             also=lambda folder: write_state(state, folder / RESUME_FILE),
         )
-        found = _checkpoints(self.side)
-        after_this = found.index(place) + 1
-        for other in (*found[: max(after_this - KEPT, 0)], *found[after_this:]):
+        checkpoints = _checkpoints(self.side)
+        after_this = checkpoints.index(checkpoint) + 1
+        for other in (*checkpoints[: max(after_this - KEPT, 0)], *checkpoints[after_this:]):
             shutil.rmtree(other)
 
     def resume(self, state: Mapping[str, Any]) -> None:
@@ -263,10 +263,10 @@ class Loop:
             ResumeError: It is of another training.
         """
         for name, value in self.identity.items():
-            found = state["identity"].get(name)
-            if found != value:
+            saved = state["identity"].get(name)
+            if saved != value:
                 raise ResumeError(
-                    f"cannot go on in {self.side}: {name} was {found!r} and is {value!r} now: "
+                    f"cannot go on in {self.side}: {name} was {saved!r} and is {value!r} now: "
                     "give what the training began with, or leave out --resume"
                 )
         if "best" not in state:

@@ -20,15 +20,15 @@ from finssim.yaml_file import read_mapping, yaml_text
 class Fields:
     """One section of a file; what was not asked for is refused by `finish`."""
 
-    def __init__(self, values: Mapping[Any, Any], where: str) -> None:
+    def __init__(self, values: Mapping[Any, Any], label: str) -> None:
         """
         Args:
             values: The section.
-            where: File and section, as messages call it.
+            label: File and section, as messages call it.
         """
         self._values = dict(values)
         self._known: list[str] = []
-        self.where = where
+        self.where = label
 
     def has(self, key: str) -> bool:
         """Whether the key is given, and not null."""
@@ -190,17 +190,17 @@ def lens_values(lens: Lens) -> dict[str, Any]:
     }
 
 
-def lens_from(values: Mapping[Any, Any], where: str) -> Lens:
+def lens_from(values: Mapping[Any, Any], label: str) -> Lens:
     """The lens of a `lens:` section.
 
     Args:
         values: The section.
-        where: File and section, as messages call it.
+        label: File and section, as messages call it.
 
     Raises:
         LocalizationError: A key is missing, unknown, or refused by the lens.
     """
-    fields = Fields(values, where)
+    fields = Fields(values, label)
     fx = fields.number("fx")
     arguments = {
         "width": int(fields.number("width")),
@@ -213,14 +213,14 @@ def lens_from(values: Mapping[Any, Any], where: str) -> Lens:
         "distortion": fields.numbers("distortion", None, ()),
     }
     fields.finish()
-    return _lens(arguments, where)
+    return _lens(arguments, label)
 
 
-def _lens(arguments: dict[str, Any], where: str) -> Lens:
+def _lens(arguments: dict[str, Any], label: str) -> Lens:
     try:
         return Lens(**arguments)
     except OpticsError as error:
-        raise LocalizationError(f"{where}: {error}") from None
+        raise LocalizationError(f"{label}: {error}") from None
 
 
 def _standard(text: str) -> str:
@@ -229,15 +229,15 @@ def _standard(text: str) -> str:
     return re.sub(r"!!opencv-[\w-]+", "", text)
 
 
-def _foreign(tree: Mapping[str, Any], where: str) -> Lens:
+def _foreign(tree: Mapping[str, Any], label: str) -> Lens:
     """The lens in other people's words."""
     for key in _SECTIONS:
         inner = tree.get(key)
         if isinstance(inner, Mapping) and _first(inner, (*_MATRIX, "fx")) is not None:
-            return _foreign({**{k: v for k, v in tree.items() if k != key}, **inner}, f"{where}: {key}")
-    width, height = _size(tree, where)
-    fx, fy, cx, cy = _focal(tree, where)
-    distortion = _distortion(tree, where)
+            return _foreign({**{k: v for k, v in tree.items() if k != key}, **inner}, f"{label}: {key}")
+    width, height = _size(tree, label)
+    fx, fy, cx, cy = _focal(tree, label)
+    distortion = _distortion(tree, label)
     word = next((str(tree[key]).lower() for key in _MODEL if isinstance(tree.get(key), str)), "")
     return _lens(
         {
@@ -247,10 +247,10 @@ def _foreign(tree: Mapping[str, Any], where: str) -> Lens:
             "fy": fy,
             "cx": cx,
             "cy": cy,
-            "model": _model(tree, word, distortion, where),
+            "model": _model(tree, word, distortion, label),
             "distortion": distortion,
         },
-        where,
+        label,
     )
 
 
@@ -258,64 +258,64 @@ def _first(tree: Mapping[str, Any], names: tuple[str, ...]) -> Any:
     return next((tree[name] for name in names if tree.get(name) is not None), None)
 
 
-def _flat(value: Any, where: str) -> tuple[float, ...]:
+def _flat(value: Any, label: str) -> tuple[float, ...]:
     """Numbers of a list, of nested lists, or of OpenCV's and ROS's {rows, cols, data}."""
     if isinstance(value, Mapping):
         value = value.get("data")
     if isinstance(value, (list, tuple)):
-        return tuple(x for item in value for x in _flat(item, where))
-    return Fields({"it": value}, where).numbers("it", None, ()) if value is None else (_number(value, where),)
+        return tuple(x for item in value for x in _flat(item, label))
+    return Fields({"it": value}, label).numbers("it", None, ()) if value is None else (_number(value, label),)
 
 
-def _number(value: Any, where: str) -> float:
-    return Fields({"a coefficient": value}, where).number("a coefficient")
+def _number(value: Any, label: str) -> float:
+    return Fields({"a coefficient": value}, label).number("a coefficient")
 
 
-def _size(tree: Mapping[str, Any], where: str) -> tuple[int, int]:
+def _size(tree: Mapping[str, Any], label: str) -> tuple[int, int]:
     size = _first(tree, _SIZE)
     width, height = _first(tree, _WIDTH), _first(tree, _HEIGHT)
     if width is None and size is not None:
-        width, height = _flat(size, where)[:2]
+        width, height = _flat(size, label)[:2]
     if width is None or height is None:
         raise LocalizationError(
-            f"{where}: the size of the image is missing: add image_width and image_height"
+            f"{label}: the size of the image is missing: add image_width and image_height"
         )
-    return int(_number(width, where)), int(_number(height, where))
+    return int(_number(width, label)), int(_number(height, label))
 
 
-def _focal(tree: Mapping[str, Any], where: str) -> tuple[float, float, float, float]:
+def _focal(tree: Mapping[str, Any], label: str) -> tuple[float, float, float, float]:
     value = _first(tree, _MATRIX)
     if value is None and tree.get("fx") is not None:
-        fields = Fields(tree, where)
+        fields = Fields(tree, label)
         fx = fields.number("fx")
         return fx, fields.number("fy", fx), fields.number("cx"), fields.number("cy")
-    numbers = _flat(value, where)
+    numbers = _flat(value, label)
     if len(numbers) == 4:
         return numbers[0], numbers[1], numbers[2], numbers[3]
     if len(numbers) == 9:
         if abs(numbers[1]) > 1e-6 * abs(numbers[0]):
             raise LocalizationError(
-                f"{where}: the camera matrix has a skew of {numbers[1]:.4g} px, expected 0: calibrate without skew"
+                f"{label}: the camera matrix has a skew of {numbers[1]:.4g} px, expected 0: calibrate without skew"
             )
         return numbers[0], numbers[4], numbers[2], numbers[5]
     raise LocalizationError(
-        f"{where}: no camera matrix found: give fx, fy, cx, cy [px], or camera_matrix with 9 numbers"
+        f"{label}: no camera matrix found: give fx, fy, cx, cy [px], or camera_matrix with 9 numbers"
     )
 
 
-def _distortion(tree: Mapping[str, Any], where: str) -> tuple[float, ...]:
+def _distortion(tree: Mapping[str, Any], label: str) -> tuple[float, ...]:
     value = _first(tree, _DISTORTION)
     if value is not None:
-        return _flat(value, where)
+        return _flat(value, label)
     names = [name for name in ("k1", "k2", "p1", "p2", "k3", "k4") if tree.get(name) is not None]
     if "p1" not in names and ("k3" in names or "k4" in names):
-        return tuple(_number(tree.get(name, 0.0), where) for name in ("k1", "k2", "k3", "k4"))
+        return tuple(_number(tree.get(name, 0.0), label) for name in ("k1", "k2", "k3", "k4"))
     return tuple(
-        _number(tree.get(name, 0.0), where) for name in ("k1", "k2", "p1", "p2", "k3")[: 5 if names else 0]
+        _number(tree.get(name, 0.0), label) for name in ("k1", "k2", "p1", "p2", "k3")[: 5 if names else 0]
     )
 
 
-def _model(tree: Mapping[str, Any], word: str, distortion: tuple[float, ...], where: str) -> str:
+def _model(tree: Mapping[str, Any], word: str, distortion: tuple[float, ...], label: str) -> str:
     fisheye = any(tree.get(key) is True for key in ("fisheye", "is_fisheye")) or word in _FISHEYE
     four_radial = "p1" not in tree and tree.get("k4") is not None and not _first(tree, _DISTORTION)
     if fisheye or four_radial:
@@ -323,5 +323,5 @@ def _model(tree: Mapping[str, Any], word: str, distortion: tuple[float, ...], wh
     if word.startswith("rational") or len(distortion) == 8:
         return "rational"
     if len(distortion) > 8 and not any(distortion[8:]):
-        raise LocalizationError(f"{where}: {len(distortion)} distortion coefficients: keep the first 8")
+        raise LocalizationError(f"{label}: {len(distortion)} distortion coefficients: keep the first 8")
     return "plumb_bob"

@@ -122,10 +122,10 @@ def known_of(
     up, surface = _vertical(pool)
     sensor = vehicle.sensors.depth
     port = (0.0, 0.0, 0.0) if sensor is None else tuple(float(x) for x in sensor.position)
-    known_std = DEPTH_STD if sensor is None else math.hypot(sensor.noise_std, sensor.bias_initial)
+    sensor_std = DEPTH_STD if sensor is None else math.hypot(sensor.noise_std, sensor.bias_initial)
     base = Constraints(
         math.nan,
-        z_std=_spread("depth_std", depth_std, known_std),
+        z_std=_spread("depth_std", depth_std, sensor_std),
         tilt_std=_spread("tilt_std", tilt_std, LEVEL_STD if imu is None else TILT_STD),
         up=up,
         port=(port[0], port[1], port[2]),
@@ -165,7 +165,7 @@ def _depth(depth: str | float | Path | None, longest_gap: float) -> Series | flo
             raise LocalizationError(
                 f"{depth}: no column 'depth' with numbers: expected t [s] and depth [m], positive down"
             ) from None
-        return series("depth", table.t, table.columns("depth"), longest_gap, where=str(depth))
+        return series("depth", table.t, table.columns("depth"), longest_gap, label=str(depth))
     if not math.isfinite(number):
         raise LocalizationError(
             f"depth is {depth}, expected metres below the surface, or a file with t, depth"
@@ -184,7 +184,7 @@ def _tilt(imu: str | Path | None, longest_gap: float) -> Series | None:
             f"{imu}: no attitude: expected columns roll, pitch [rad] or qx, qy, qz, qw; of gyro and accelerometer "
             "alone `finssim fuse` makes one"
         )
-    return series("attitude", table.t, up, longest_gap, where=str(imu))
+    return series("attitude", table.t, up, longest_gap, label=str(imu))
 
 
 def _spread(name: str, value: float | None, default: float) -> float:
@@ -205,7 +205,7 @@ class Locator:
         self,
         pool: Pool,
         vehicle: Vehicle,
-        known: Known,
+        prior: Known,
         *,
         method: str = "refractive",
         pixel_std: float = 0.5,
@@ -215,7 +215,7 @@ class Locator:
         Args:
             pool: Camera and water.
             vehicle: Its tags.
-            known: Height and tilt over time.
+            prior: Height and tilt over time.
             method: A name of `METHODS`.
             pixel_std: Standard deviation of a corner, per axis [px].
             family: Of the tags; None: that of the vehicle file.
@@ -224,29 +224,31 @@ class Locator:
             LocalizationError: As of `TagLocator`, or no depth where the method needs one.
         """
         self._locate = TagLocator(pool, vehicle.file_tags, method=method, pixel_std=pixel_std)
-        if self._locate.needs_height and known.depth is None:
+        if self._locate.needs_height and prior.depth is None:
             raise LocalizationError(
                 f"method {method} needs --depth FILE (columns t, depth) or --depth METRES, the depth of the pressure "
                 "port; --method refractive-6dof does without"
             )
-        self.known, self.tags = known, tuple(self._locate.tags_b)
+        self.known, self.tags = prior, tuple(self._locate.tags_b)
         """Ids of the vehicle's tags."""
         self.family = family_named(family or self._locate.family).name
 
     def locate(self, frame: Frame) -> Measurement:
         """The pose in one picture, or why there is none."""
         locate = self._locate
-        seen = [found for found in frame.detections if _name(found.family) in ("", self.family)]
+        of_family = [
+            detection for detection in frame.detections if _name(detection.family) in ("", self.family)
+        ]
         constraints = None
-        if seen:
-            known = self.known.at(frame.time - locate.pool.latency, needs_height=locate.needs_height)
-            if isinstance(known, str):
-                return refused(locate.method, known)
-            constraints = known
+        if of_family:
+            prior = self.known.at(frame.time - locate.pool.latency, needs_height=locate.needs_height)
+            if isinstance(prior, str):
+                return refused(locate.method, prior)
+            constraints = prior
         elif frame.detections:
-            other = ", ".join(sorted({found.family for found in frame.detections}))
+            other = ", ".join(sorted({detection.family for detection in frame.detections}))
             return refused(locate.method, f"no tag of family {self.family} seen: {other}")
-        return locate(seen, constraints)
+        return locate(of_family, constraints)
 
 
 @cache
@@ -277,36 +279,45 @@ def write_rows(rows: Sequence[Row], out: Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    write_csv(out, COLUMNS, (_cells(frame, found) for frame, found in rows))
+    write_csv(out, COLUMNS, (_cells(frame, measurement) for frame, measurement in rows))
 
 
-def _cells(frame: Frame, found: Measurement) -> list[Any]:
+def _cells(frame: Frame, measurement: Measurement) -> list[Any]:
     time = "" if math.isnan(frame.time) else repr(float(frame.time))
-    tags = " ".join(map(str, found.tags))
-    if not found.ok:
-        return [time, frame.image, *[""] * (len(COLUMNS) - 7), tags, "", "", "refused", found.reason]
-    C = found.covariance
-    numbers = [found.x, found.y, found.z, found.yaw, *found.std, found.roll, found.pitch, *found.quaternion]
-    numbers += [C[0, 1], C[0, 2], C[1, 2], found.residual_px]
-    words = [f"{float(x):.9g}" for x in numbers]
-    return [time, frame.image, *words, tags, found.corners, found.medium, "ok", ""]
+    tags = " ".join(map(str, measurement.tags))
+    if not measurement.ok:
+        return [time, frame.image, *[""] * (len(COLUMNS) - 7), tags, "", "", "refused", measurement.reason]
+    C = measurement.covariance
+    numbers = [
+        measurement.x,
+        measurement.y,
+        measurement.z,
+        measurement.yaw,
+        *measurement.std,
+        measurement.roll,
+        measurement.pitch,
+        *measurement.quaternion,
+    ]
+    numbers += [C[0, 1], C[0, 2], C[1, 2], measurement.residual_px]
+    texts = [f"{float(x):.9g}" for x in numbers]
+    return [time, frame.image, *texts, tags, measurement.corners, measurement.medium, "ok", ""]
 
 
 def summary_of(rows: Sequence[Row]) -> dict[str, Any]:
     """Figures of a run, as plain values."""
-    located = [found for _, found in rows if found.ok]
-    reasons = Counter(counted(found.reason) for _, found in rows if not found.ok)
+    located = [measurement for _, measurement in rows if measurement.ok]
+    reasons = Counter(counted(measurement.reason) for _, measurement in rows if not measurement.ok)
     rejected: Counter[str] = Counter()
-    for _, found in rows:
-        rejected.update(found.rejected)
+    for _, measurement in rows:
+        rejected.update(measurement.rejected)
     return {
         "frames": len(rows),
         "located": len(located),
         "refused": dict(reasons.most_common()),
         "corners_rejected": dict(rejected.most_common()),
-        "median_residual_px": _median([found.residual_px for found in located]),
-        "median_std_m": _median([float(np.hypot(*found.std[:2])) for found in located]),
-        "median_std_yaw_deg": _median([math.degrees(found.std[2]) for found in located]),
+        "median_residual_px": _median([measurement.residual_px for measurement in located]),
+        "median_std_m": _median([float(np.hypot(*measurement.std[:2])) for measurement in located]),
+        "median_std_yaw_deg": _median([math.degrees(measurement.std[2]) for measurement in located]),
     }
 
 
@@ -315,8 +326,8 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     lines = [f"{summary['located']} of {summary['frames']} pictures located with method {summary['method']}"]
     lines += [f"refused {n:5d}: {reason}" for reason, n in summary["refused"].items()]
     if summary["corners_rejected"]:
-        words = ", ".join(f"{n} {reason}" for reason, n in summary["corners_rejected"].items())
-        lines.append(f"corners not used: {words}")
+        text = ", ".join(f"{n} {reason}" for reason, n in summary["corners_rejected"].items())
+        lines.append(f"corners not used: {text}")
     if summary["located"]:
         lines.append(
             f"median residual {summary['median_residual_px']:.2f} px; standard deviations "
@@ -324,11 +335,11 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         )
     truth = summary.get("truth")
     if truth:
-        words = f"against the truth, {truth['compared']} pictures: RMSE {100 * truth['rmse_m']:.2f} cm, "
-        words += f"P95 {100 * truth['p95_m']:.2f} cm"
+        text = f"against the truth, {truth['compared']} pictures: RMSE {100 * truth['rmse_m']:.2f} cm, "
+        text += f"P95 {100 * truth['p95_m']:.2f} cm"
         if "rmse_yaw_deg" in truth:
-            words += f"; yaw RMSE {truth['rmse_yaw_deg']:.2f} degrees"
-        lines.append(words)
+            text += f"; yaw RMSE {truth['rmse_yaw_deg']:.2f} degrees"
+        lines.append(text)
     return lines
 
 
@@ -348,12 +359,12 @@ class Truth:
 
     def of(self, image: str, exposure: float) -> Array | None:
         """x, y [m] and yaw [rad] (or NaN), (3,); None where they are not known."""
-        found: Array | str | None = self._by_image.get(PurePath(image).name) if image else None
-        if found is None and self._by_time is not None:
-            found = self._by_time.at(exposure)
-        if found is None or isinstance(found, str):
+        pose: Array | str | None = self._by_image.get(PurePath(image).name) if image else None
+        if pose is None and self._by_time is not None:
+            pose = self._by_time.at(exposure)
+        if pose is None or isinstance(pose, str):
             return None
-        return np.array([found[0], found[1], math.atan2(found[3], found[2])])
+        return np.array([pose[0], pose[1], math.atan2(pose[3], pose[2])])
 
     def figures(self, rows: Sequence[Row], latency: float) -> dict[str, Any] | None:
         """RMSE and 95th percentile of the horizontal distance [m], RMSE of yaw [degrees]; None without any picture.
@@ -363,10 +374,16 @@ class Truth:
             latency: Time stamp of a picture minus its exposure [s].
         """
         errors = []
-        for frame, found in rows:
+        for frame, measurement in rows:
             true = self.of(frame.image, frame.time - latency)
-            if found.ok and true is not None:
-                errors.append([found.x - true[0], found.y - true[1], float(wrap_angle(found.yaw - true[2]))])
+            if measurement.ok and true is not None:
+                errors.append(
+                    [
+                        measurement.x - true[0],
+                        measurement.y - true[1],
+                        float(wrap_angle(measurement.yaw - true[2])),
+                    ]
+                )
         if not errors:
             return None
         e = np.array(errors)
@@ -399,7 +416,7 @@ def load_truth(path: str | Path, longest_gap: float = 1.0) -> Truth:
     values = np.column_stack([table.columns("x", "y"), np.cos(yaw), np.sin(yaw)])
     images = zip(table.words.get("image", ()), values, strict=False)
     by_image = {PurePath(name).name: value for name, value in images if name and np.isfinite(value[:2]).all()}
-    return Truth(by_image, series("truth", table.t, values, longest_gap, where=str(path)) if timed else None)
+    return Truth(by_image, series("truth", table.t, values, longest_gap, label=str(path)) if timed else None)
 
 
 # Pictures with the tags found in them: from pictures and videos, or from detection files.
@@ -548,7 +565,7 @@ def run(
             f"longest_gap is {longest_gap}, expected a time in seconds that is not negative"
         )
     site, body = load_pool(pool), load_vehicle(str(vehicle))
-    known = known_of(
+    prior = known_of(
         site,
         body,
         depth=depth,
@@ -559,37 +576,37 @@ def run(
         longest_gap=longest_gap,
     )
     pixel_std = site.pixel_std if pixel_std is None else pixel_std
-    locator = Locator(site, body, known, method=method, pixel_std=pixel_std, family=family)
+    locator = Locator(site, body, prior, method=method, pixel_std=pixel_std, family=family)
     surveyed = None if truth is None else load_truth(truth, longest_gap)
     find = detector(locator.family, refine=refine, gamma=gamma)
     stamps = None if times is None else Path(times)
     notes: list[str] = []
     frames, count = frames_of(paths, site.camera.lens, find, locator.tags, stamps, notes)
-    found = _measure(frames, count, locator)
-    write_rows(found.rows, out)
-    found.summary = {
+    result = _measure(frames, count, locator)
+    write_rows(result.rows, out)
+    result.summary = {
         "method": method,
-        **summary_of(found.rows),
-        **({} if surveyed is None else {"truth": surveyed.figures(found.rows, site.latency)}),
-        "assumed": list(known.assumed) if method in NEEDS_DEPTH else [],
+        **summary_of(result.rows),
+        **({} if surveyed is None else {"truth": surveyed.figures(result.rows, site.latency)}),
+        "assumed": list(prior.assumed) if method in NEEDS_DEPTH else [],
         "notes": notes,
         "out": str(out),
-        "interrupted": found.interrupted,
+        "interrupted": result.interrupted,
     }
     if as_json:
         sources = {"depth": None if depth is None else str(depth), "imu": None if imu is None else str(imu)}
-        settings = {**sources, "pixel_std": pixel_std, **known.settings}
-        print(json.dumps(_document(found.summary, site, str(pool), body, settings), allow_nan=False))
+        settings = {**sources, "pixel_std": pixel_std, **prior.settings}
+        print(json.dumps(_document(result.summary, site, str(pool), body, settings), allow_nan=False))
     else:
-        _print(found.summary)
-    if found.interrupted:
+        _print(result.summary)
+    if result.interrupted:
         raise KeyboardInterrupt
-    return found
+    return result
 
 
 def _measure(frames: Iterator[Frame], count: int | None, locator: Locator) -> Run:
     """Measure one frame after the other, until the end or Ctrl-C."""
-    found = Run()
+    result = Run()
     screen = Console(stderr=True)
     columns = (TextColumn("localize"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
     bars = Progress(
@@ -601,12 +618,12 @@ def _measure(frames: Iterator[Frame], count: int | None, locator: Locator) -> Ru
             located = 0
             for frame in frames:
                 measured = locator.locate(frame)
-                found.rows.append((frame, measured))
+                result.rows.append((frame, measured))
                 located += measured.ok
                 bars.update(bar, advance=1, description=f"{located} located")
     except KeyboardInterrupt:
-        found.interrupted = True
-    return found
+        result.interrupted = True
+    return result
 
 
 def _document(

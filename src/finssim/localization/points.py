@@ -47,7 +47,7 @@ class PointTable:
         return [*names, *columns], [[*row, *more] for row, more in zip(self.rows, cells, strict=True)]
 
 
-def read_points(path: Path, wanted: Sequence[str], optional: Sequence[str] = ()) -> PointTable:
+def read_points(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> PointTable:
     """Read a table of numbers.
 
     Columns may stand in any order, in capitals, with a unit (`x [m]`, `u_px`). Without a header the columns are those
@@ -56,37 +56,37 @@ def read_points(path: Path, wanted: Sequence[str], optional: Sequence[str] = ())
 
     Args:
         path: The file; `-` is the standard input.
-        wanted: Columns that must be there.
+        required: Columns that must be there.
         optional: Columns that may be there.
 
     Raises:
         LocalizationError: A column is missing, or cells are not numbers: the lines are named.
     """
-    where = "standard input" if str(path) == "-" else str(path)
+    label = "standard input" if str(path) == "-" else str(path)
     text = sys.stdin.read() if str(path) == "-" else read_text(path, LocalizationError)[0]
     table = text_table(text, names=(), spaces=None)
     if not table.texts:
-        raise LocalizationError(f"{where}: holds no rows, expected columns {', '.join(wanted)}")
+        raise LocalizationError(f"{label}: holds no rows, expected columns {', '.join(required)}")
     rows = list(zip(table.lines, table.rows, strict=True))
     names = rows[0][1]
     if all(table.number(cell) is not None for cell in names):
-        if not len(wanted) <= len(names) <= len(wanted) + len(optional):
+        if not len(required) <= len(names) <= len(required) + len(optional):
             raise LocalizationError(
-                f"{where}: has {len(names)} columns without a header, expected {', '.join(wanted)}: name the columns "
+                f"{label}: has {len(names)} columns without a header, expected {', '.join(required)}: name the columns "
                 "in the first line"
             )
-        names = [*wanted, *optional][: len(names)]
+        names = [*required, *optional][: len(names)]
     else:
         rows = rows[1:]
     plain = [_plain(name) for name in names]
-    for name in (*wanted, *optional):
-        if plain.count(name) > 1 or (name in wanted and name not in plain):
+    for name in (*required, *optional):
+        if plain.count(name) > 1 or (name in required and name not in plain):
             there = "twice" if name in plain else "not"
             raise LocalizationError(
-                f"{where}: column {name} is {there} there among {', '.join(names)}: name the columns "
-                f"{', '.join(wanted)} in the first line"
+                f"{label}: column {name} is {there} there among {', '.join(names)}: name the columns "
+                f"{', '.join(required)} in the first line"
             )
-    places = {name: plain.index(name) for name in (*wanted, *optional) if name in plain}
+    places = {name: plain.index(name) for name in (*required, *optional) if name in plain}
     numbers: dict[str, list[float]] = {name: [] for name in places}
     bad = []
     for line, row in rows:
@@ -101,9 +101,9 @@ def read_points(path: Path, wanted: Sequence[str], optional: Sequence[str] = ())
             numbers[name].append(math.nan if value is None else value)
     if bad:
         more = f"; and {len(bad) - _BAD_ROWS_NAMED} more lines" if len(bad) > _BAD_ROWS_NAMED else ""
-        raise LocalizationError(f"{where}: {'; '.join(bad[:_BAD_ROWS_NAMED])}{more}")
+        raise LocalizationError(f"{label}: {'; '.join(bad[:_BAD_ROWS_NAMED])}{more}")
     columns = {name: np.array(values, float) for name, values in numbers.items()}
-    return PointTable(where, names, [row for _, row in rows], columns)
+    return PointTable(label, names, [row for _, row in rows], columns)
 
 
 def _plain(name: str) -> str:
@@ -148,13 +148,13 @@ def run_project(
         refuse_unwritable(atomic_write(out))
     scene = load_pool(pool)
     table = read_points(points, ("x", "y", "z"))
-    seen = project(scene.camera, scene.interface, np.stack([table.numbers[c] for c in "xyz"], axis=-1))
+    projection = project(scene.camera, scene.interface, np.stack([table.numbers[c] for c in "xyz"], axis=-1))
     columns = {
-        "u": _cells(seen.pixels[:, 0], 6),
-        "v": _cells(seen.pixels[:, 1], 6),
-        "status": _words(seen.status),
+        "u": _cells(projection.pixels[:, 0], 6),
+        "v": _cells(projection.pixels[:, 1], 6),
+        "status": _words(projection.status),
     }
-    _give(table, columns, seen.status, "project", "points have a pixel in the image", out, as_json)
+    _give(table, columns, projection.status, "project", "points have a pixel in the image", out, as_json)
 
 
 def run_backproject(

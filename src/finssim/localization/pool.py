@@ -72,8 +72,8 @@ class Pool:
     def pixel_std(self) -> float:
         """Standard deviation of a corner, per axis [px]: what the calibration's residuals told, otherwise 0.5."""
         residual = self.record.get("residual")
-        found = residual.get("pixel_sigma") if isinstance(residual, Mapping) else None
-        return max(float(found), SUREST_PIXEL) if isinstance(found, (int, float)) else USUAL_PIXEL
+        value = residual.get("pixel_sigma") if isinstance(residual, Mapping) else None
+        return max(float(value), SUREST_PIXEL) if isinstance(value, (int, float)) else USUAL_PIXEL
 
     @property
     def sha256(self) -> str:

@@ -104,8 +104,8 @@ def funnel_within(funnel: Funnel, w: int, position: wp.vec3, half_size: wp.vec3,
     """
     long = 0.5 * (funnel.cone_length + funnel.tube_length + funnel.back)
     middle = wp.quat_rotate(funnel.quaternion[w], wp.vec3(long - funnel.cone_length, 0.0, 0.0))
-    most = wp.sqrt(long * long + funnel.outer_radius * funnel.outer_radius) + wp.length(half_size) + reach
-    return wp.length_sq(position - funnel.position[w] - middle) <= most * most
+    limit = wp.sqrt(long * long + funnel.outer_radius * funnel.outer_radius) + wp.length(half_size) + reach
+    return wp.length_sq(position - funnel.position[w] - middle) <= limit * limit
 
 
 @wp.func

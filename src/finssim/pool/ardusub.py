@@ -859,9 +859,9 @@ class ArduSub:
             round(1000.0 * self._altitude),
             round(100.0 * math.degrees(self._attitude[2])) % 36000,
         )
-        place = _int32(latitude + north), _int32(longitude + east), height, height
+        position = _int32(latitude + north), _int32(longitude + east), height, height
         speed = [_int16(100.0 * v) for v in (*self._velocity, -self._climb)]
-        return (self._milliseconds, *place, *speed, heading)
+        return (self._milliseconds, *position, *speed, heading)
 
     def _report_ekf_status_report(self) -> tuple[Any, ...]:
         flags = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
@@ -878,8 +878,8 @@ class ArduSub:
     def _power(self) -> tuple[int, int, int]:
         """Voltage [mV], current [cA] and what is left of the charge [%]."""
         voltage, current = self._battery
-        left = max(0.0, 1.0 - self._used / max(self.parameters["BATT_CAPACITY"], 1.0))
-        return round(1000.0 * voltage), _int16(100.0 * current), round(100.0 * left)
+        remaining = max(0.0, 1.0 - self._used / max(self.parameters["BATT_CAPACITY"], 1.0))
+        return round(1000.0 * voltage), _int16(100.0 * current), round(100.0 * remaining)
 
     def _report_sys_status(self) -> tuple[Any, ...]:
         present = SENSORS | (mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG if self._has_compass else 0)
@@ -890,8 +890,8 @@ class ArduSub:
         return (present, enabled, healthy, 100, *self._power(), *[0] * 6)
 
     def _report_battery_status(self) -> tuple[Any, ...]:
-        voltage, current, left = self._power()
-        return 0, 0, 0, 32767, [voltage, *[65535] * 9], current, round(self._used), -1, left
+        voltage, current, remaining = self._power()
+        return 0, 0, 0, 32767, [voltage, *[65535] * 9], current, round(self._used), -1, remaining
 
     def _report_system_time(self) -> tuple[Any, ...]:
         return 0, self._milliseconds

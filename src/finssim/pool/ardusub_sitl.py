@@ -369,10 +369,10 @@ class SitlServer:
         self._answer = self.world.answer()
         return self._answer
 
-    def _note(self, what: str, sentence: str, *values: Any) -> None:
+    def _note(self, kind: str, sentence: str, *values: Any) -> None:
         """Count, and log the first of its kind; the end tells how many there were."""
-        self.counts[what] += 1
-        if self.counts[what] == 1 or what == "restarts":
+        self.counts[kind] += 1
+        if self.counts[kind] == 1 or kind == "restarts":
             _LOG.warning(sentence, *values)
 
     def close(self) -> None:
@@ -455,8 +455,8 @@ def run(
             server.serve(math.inf if duration is None else duration)
         except KeyboardInterrupt:
             pass
-        told = ", ".join(f"{count} {what}" for what, count in sorted(server.counts.items()) if count)
-        print(f"ended after {world.time:.1f} s: {told or 'SITL sent nothing'}")
+        summary = ", ".join(f"{count} {kind}" for kind, count in sorted(server.counts.items()) if count)
+        print(f"ended after {world.time:.1f} s: {summary or 'SITL sent nothing'}")
 
 
 def _three(text: str, option: str) -> tuple[float, float, float]:

@@ -80,14 +80,18 @@ class CornerFit:
         with np.errstate(all="ignore"):
             square = [_from_square(tag) for tag in pixels[:, self._at_corner].tolist()]
             H, back = np.array(square), np.array([_adjugate(tag) for tag in square])
-            seen = pixels @ back[:, :, :2].transpose(0, 2, 1) + back[:, None, :, 2]
-            moved = (seen[..., :2] / seen[..., 2:] - self._square).transpose(0, 2, 1).reshape(len(H), -1)
+            projected = pixels @ back[:, :, :2].transpose(0, 2, 1) + back[:, None, :, 2]
+            moved = (
+                (projected[..., :2] / projected[..., 2:] - self._square)
+                .transpose(0, 2, 1)
+                .reshape(len(H), -1)
+            )
             change = (self._matrix @ moved[..., None])[..., 0]
             warp = np.zeros((len(H), 9))
             warp[:, :8] = change[:, :8]
             image = HOMOGENEOUS @ (H @ (warp.reshape(-1, 3, 3) + _UNITY)).transpose(0, 2, 1)
-            left = change[:, 8:]
-            bend = np.sqrt(2.0 * (left * left).sum(axis=1) / left.shape[1])
+            bending = change[:, 8:]
+            bend = np.sqrt(2.0 * (bending * bending).sum(axis=1) / bending.shape[1])
             return image[..., :2] / image[..., 2:], bend
 
 
@@ -99,8 +103,8 @@ def _fit_matrix(family: str, tag: int, along: Array, square: Array) -> Array:
     u, v = np.where(across[:, None], there, 0.0), np.where(across[:, None], 0.0, there)
     warp = np.linalg.pinv(rows) @ np.concatenate([u, v], axis=1)
     at_nodes = _warp_columns(square)
-    left = np.eye(2 * len(square)) - np.concatenate([at_nodes[:, 0], at_nodes[:, 1]]) @ warp
-    return np.concatenate([warp, left])
+    remainder = np.eye(2 * len(square)) - np.concatenate([at_nodes[:, 0], at_nodes[:, 1]]) @ warp
+    return np.concatenate([warp, remainder])
 
 
 def _cell_edges(family: str, tag: int) -> tuple[Array, npt.NDArray[np.bool_]]:
@@ -117,11 +121,11 @@ def _cell_edges(family: str, tag: int) -> tuple[Array, npt.NDArray[np.bool_]]:
 def _warp_columns(points: Array) -> Array:
     """d(x, y)/d(h) of the homography I + [[h0, h1, h2], [h3, h4, h5], [h6, h7, 0]] at points, (E, 2, 8)."""
     x, y = points.T
-    one, zero = np.ones_like(x), np.zeros_like(x)
+    ones, zero = np.ones_like(x), np.zeros_like(x)
     return np.stack(
         [
-            np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=-1),
-            np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=-1),
+            np.stack([x, y, ones, zero, zero, zero, -x * x, -x * y], axis=-1),
+            np.stack([zero, zero, zero, x, y, ones, -x * y, -y * y], axis=-1),
         ],
         axis=1,
     )
@@ -129,8 +133,8 @@ def _warp_columns(points: Array) -> Array:
 
 def _interpolation(along: Array, points: Array) -> Array:
     """Weights of the nodes of a square grid in the polynomial through them, at points, (E, N)."""
-    one = np.vander(along, len(along))
-    by_x, by_y = (np.vander(x, len(along)) @ np.linalg.inv(one) for x in points.T)
+    vandermonde = np.vander(along, len(along))
+    by_x, by_y = (np.vander(x, len(along)) @ np.linalg.inv(vandermonde) for x in points.T)
     return np.asarray((by_y[:, :, None] * by_x[:, None, :]).reshape(len(points), -1))
 
 
@@ -199,8 +203,8 @@ class RippledView:
         with np.errstate(all="ignore"):
             x, y, height = self._crossing(points[:, 0], points[:, 1], -points[:, 2], time)
             direction[:, 0], direction[:, 1], direction[:, 2] = x, y, height - self._frame.camera_height
-            pixels, seen = self.camera.lens.project(direction @ self._R_sc)
-        return pixels, seen & (points[:, 2] < height) & np.isfinite(x)
+            pixels, visible = self.camera.lens.project(direction @ self._R_sc)
+        return pixels, visible & (points[:, 2] < height) & np.isfinite(x)
 
     def _crossing(
         self, px: Array, py: Array, depth: Array, time: float
@@ -228,7 +232,7 @@ class RippledView:
 
     def _rippled(
         self,
-        place: tuple[Array, Array],
+        still: tuple[Array, Array],
         target: tuple[Array, Array],
         depth: Array,
         flat: tuple[Array, Array, Array],
@@ -237,7 +241,7 @@ class RippledView:
         """From the place on still water to that on ripples. `flat`: d landing / d place along the radius and across it
         on still water, and by how much curvature adds to them."""
         assert self._surface is not None
-        x, y = place
+        x, y = still
         along, across, by_curvature = flat
         height, sx, sy, hxx, hxy, hyy = self._surface.at(x, y, time)
         pull = (along - across) / np.maximum(x * x + y * y, 1e-12)
@@ -350,18 +354,20 @@ class CornerCamera:
         """
         q = start[1] + math.copysign(1.0, float(start[1] @ end[1])) * end[1]
         position, R = 0.5 * (start[0] + end[0]), quat_to_matrix(q / np.linalg.norm(q))
-        pixels, seen = self._view.pixels(position + self._nodes_b @ R.T, middle)
+        pixels, visible = self._view.pixels(position + self._nodes_b @ R.T, middle)
         shape = len(self._ids), -1
-        seen = seen.reshape(shape).all(axis=1)
+        visible = visible.reshape(shape).all(axis=1)
         corners, bend = self._fit.corners(pixels.reshape(*shape, 2))
         rim = self._inside(corners + RIM * (corners - corners[:, OPPOSITE])).all(axis=1)
         noise = np.random.default_rng([self._seed, sequence]).standard_normal(corners.shape)
-        found = [
+        tags = [
             TagCorners(tag, reported)
-            for tag, there, c, b, e in zip(self._ids, seen & rim, corners, bend.tolist(), noise, strict=True)
+            for tag, there, c, b, e in zip(
+                self._ids, visible & rim, corners, bend.tolist(), noise, strict=True
+            )
             if there and (reported := _reported(c, b, self._noise, e)) is not None
         ]
-        return Picture(middle, sequence, tags=tuple(found))
+        return Picture(middle, sequence, tags=tuple(tags))
 
 
 def _reported(corners: Array, bend: float, pixel_noise: float, noise: Array) -> Array | None:
@@ -506,8 +512,8 @@ def camera_of(
     if vehicle.tags is None:
         raise PlantSpecError(f"vehicle {vehicle.name} has no tags: a camera cannot find it, run without one")
     errors, random = ERRORS[severity], np.random.default_rng([seed, 0x517E])
-    own = basin_of(vehicle)
-    true = true_site(basin or own, finer=max(_height(basin or own) / _height(own), 1.0))
+    nominal = basin_of(vehicle)
+    true = true_site(basin or nominal, finer=max(_height(basin or nominal) / _height(nominal), 1.0))
     late = float(random.normal(0.0, errors.latency))
     settings = CameraSettings(
         latency=max(LATENCY + late, 0.01),

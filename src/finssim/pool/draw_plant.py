@@ -195,33 +195,33 @@ def steady_share(vehicle: Vehicle, panels: Array, propellers: Mapping[str, float
     thrusters = list(vehicle.thrusters.values())
     B = vehicle.thruster_matrix()
     axis = np.array([t.axis for t in thrusters])
-    place = np.array([t.position for t in thrusters])
-    taken = panels.copy()
+    position = np.array([t.position for t in thrusters])
+    drag = panels.copy()
     for i in np.flatnonzero(v > 0.0):
         T = np.linalg.pinv(B) @ (F[i] * np.eye(6)[i])
         speed = np.array([abs(t.speed(f)) for t, f in zip(thrusters, T, strict=True)])
-        motion = np.eye(3)[i] if i < 3 else np.cross(np.eye(3)[i - 3], place)
-        own = v[i] * np.sum(axis * motion, axis=1)
+        motion = np.eye(3)[i] if i < 3 else np.cross(np.eye(3)[i - 3], position)
+        along = v[i] * np.sum(axis * motion, axis=1)
         stall = p.advance_at_zero_thrust * p.diameter / (2.0 * math.pi) * np.maximum(speed, 20.0)
-        taken[i] += B[i] @ (np.abs(T) * p.own_share * own / stall)
-    return np.where(v > 0.0, taken + deduction * F, 0.0)
+        drag[i] += B[i] @ (np.abs(T) * p.own_share * along / stall)
+    return np.where(v > 0.0, drag + deduction * F, 0.0)
 
 
-def less_share(vehicle: Vehicle, D1: Array, D2: Array, taken: Array) -> tuple[Array, Array]:
+def less_share(vehicle: Vehicle, D1: Array, D2: Array, drag: Array) -> tuple[Array, Array]:
     """Damping that is left when a part of the drag is made by something else; a third always stays.
 
     Args:
         vehicle: Its file.
         D1: Linear [N s/m, N m s], (6, 6).
         D2: Quadratic [N s²/m², N m s²], (6, 6).
-        taken: Drag when cruising, by axis [N, N m], (6,): out of the linear part first.
+        drag: Drag when cruising, by axis [N, N m], (6,): out of the linear part first.
 
     Returns:
         D1 and D2 with smaller diagonals.
     """
     _, v = cruise(vehicle)
-    first = np.minimum(taken, LARGEST * np.diag(D1) * v)
-    second = np.minimum(taken - first, LARGEST * np.diag(D2) * v * v)
+    first = np.minimum(drag, LARGEST * np.diag(D1) * v)
+    second = np.minimum(drag - first, LARGEST * np.diag(D2) * v * v)
     safe = np.where(v > 0.0, v, 1.0)
     return D1 - np.diag(first / safe), D2 - np.diag(second / safe**2)
 
@@ -316,8 +316,8 @@ def _water(
     drag = panel_drag(vehicle)
     hull = hull_share(vehicle, spread.hull_share, drag)
     panels = hull["form_drag"] * drag
-    taken = steady_share(vehicle, panels, sections["propellers"], sum(spread.deduction) / 2.0)
-    D1, D2 = less_share(vehicle, D1, D2, taken)
+    outer_drag = steady_share(vehicle, panels, sections["propellers"], sum(spread.deduction) / 2.0)
+    D1, D2 = less_share(vehicle, D1, D2, outer_drag)
     axes = [
         {
             "center": tuple((np.asarray(hydro.reference_point) + draw.around(spread.center, 3)).tolist()),

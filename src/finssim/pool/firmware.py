@@ -120,17 +120,17 @@ class PoolSensors:
 
     def aids(self, delay: float) -> list[NavigationAid]:
         """What Doppler log and compass have delivered at the newest `sample`, as it leaves a delay [s] later."""
-        found = []
+        readings = []
         for kind, fresh, stamp, reading in self._aids:
             if not fresh[0]:
                 continue
             values = [*reading[0].tolist(), 0.0, 0.0]
             age = max(float(self._count[0]) * self.period - float(stamp[0]), 0.0) + delay
             self._sent += 1
-            found.append(
+            readings.append(
                 NavigationAid(self._sent & 0xFFFF, kind, age, (values[0], values[1], values[2]), (0.0, 0.0))
             )
-        return found
+        return readings
 
 
 def with_instruments(vehicle: Vehicle, instruments: Instruments) -> Vehicle:
@@ -361,8 +361,8 @@ class Firmware:
 
     def _aim(self, normalised: Array) -> None:
         """Target speeds of a command, by motor output and with the motors' signs."""
-        wanted = self._sign * normalised[self._output] * self._full
-        self.target = np.where((wanted < self._slow_plus) & (wanted > -self._slow_minus), 0.0, wanted)
+        speeds = self._sign * normalised[self._output] * self._full
+        self.target = np.where((speeds < self._slow_plus) & (speeds > -self._slow_minus), 0.0, speeds)
         self._aiming = bool(self.target.any())
 
     def _echo(self, now: float, command: ThrusterCommand, accepted: bool, refused: int) -> bytes:

@@ -102,9 +102,9 @@ class Fleet:
 
 def one_picture(pictures: Iterable[Picture]) -> list[Picture]:
     """Corners of each vehicle, of the same exposures, as the one camera has them: a picture with all tags."""
-    found: dict[tuple[str, int], Picture] = {}
+    by_exposure: dict[tuple[str, int], Picture] = {}
     for picture in pictures:
         key = picture.source, picture.sequence
-        before = found.get(key)
-        found[key] = picture if before is None else replace(before, tags=before.tags + picture.tags)
-    return [found[key] for key in sorted(found)]
+        before = by_exposure.get(key)
+        by_exposure[key] = picture if before is None else replace(before, tags=before.tags + picture.tags)
+    return [by_exposure[key] for key in sorted(by_exposure)]

@@ -44,12 +44,12 @@ class Shutters:
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Exposure]:
         """As of one `Shutter`, by time; each exposure with the sensor's name."""
-        made = [
+        exposures = [
             replace(exposure, source=name)
             for name, shutter in self._shutters.items()
             for exposure in shutter.advance(t0, t1, pose_at)
         ]
-        return sorted(made, key=lambda exposure: exposure.middle)
+        return sorted(exposures, key=lambda exposure: exposure.middle)
 
 
 class OnboardSensors:
@@ -106,9 +106,9 @@ class OnboardSensors:
         sensor = self.sensors[exposure.source]
         pose = wp.array([np.concatenate(exposure.start)], dtype=wp.transform, device=self.batch.device)
         seed = (self._seed + zlib.crc32(exposure.source.encode())) % 2**31
-        made = sensor.update(pose, seed=seed, time=exposure.middle).numpy()[0].copy()
+        developed = sensor.update(pose, seed=seed, time=exposure.middle).numpy()[0].copy()
         picture = Picture(exposure.arrival, exposure.sequence, source=exposure.source)
-        return replace(picture, **{"ranges" if isinstance(sensor, RangeBatch) else "image": made})
+        return replace(picture, **{"ranges" if isinstance(sensor, RangeBatch) else "image": developed})
 
 
 class Cameras:

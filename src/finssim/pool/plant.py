@@ -152,8 +152,8 @@ def delivered_thrust(propellers: PropellerBank, speed: wp.array(dtype=float), nu
         V = float(0.0)
         for j in range(propellers.count):
             V += propellers.share[k, j] * wp.sqrt(wp.abs(bollard[j]) / propellers.disc)
-        own = wp.dot(propellers.axis[k], linear(nu_r) + wp.cross(angular(nu_r), propellers.place[k]))
-        V += propellers.own_share * wp.sign(bollard[k]) * own
+        inflow = wp.dot(propellers.axis[k], linear(nu_r) + wp.cross(angular(nu_r), propellers.place[k]))
+        V += propellers.own_share * wp.sign(bollard[k]) * inflow
         slowest = wp.static(2.0 * math.pi * SLOWEST)
         loss = V / (propellers.stall * wp.max(wp.abs(speed[k]), slowest))
         T[k] = bollard[k] * (1.0 - wp.clamp(loss, -1.0, 1.0))
@@ -163,8 +163,8 @@ def delivered_thrust(propellers: PropellerBank, speed: wp.array(dtype=float), nu
 def induced_shares(vehicle: Vehicle, spec: PlantSpec) -> Array:
     """Part of neighbour j's induced speed that enters propeller k, (n, n)."""
     p = spec.propellers
-    place = np.array([t.position for t in vehicle.thrusters.values()])
-    distance = np.linalg.norm(place[:, None] - place, axis=-1)
+    position = np.array([t.position for t in vehicle.thrusters.values()])
+    distance = np.linalg.norm(position[:, None] - position, axis=-1)
     return np.asarray(
         p.induced_share * np.exp(-distance / p.induced_reach) * (1.0 - np.eye(len(vehicle.thrusters)))
     )
@@ -172,13 +172,13 @@ def induced_shares(vehicle: Vehicle, spec: PlantSpec) -> Array:
 
 def propeller_bank(vehicle: Vehicle, spec: PlantSpec, device: Any = "cpu") -> PropellerBank:
     """The propellers of a vehicle as one plant has them."""
-    told = list(vehicle.thrusters.values())
+    nominal = list(vehicle.thrusters.values())
     true = [spec.thrusters[name] for name in vehicle.thruster_names]
     bank = PropellerBank()
-    bank.count = len(told)
-    bank.axis = wp.array(np.array([t.axis for t in told]), dtype=wp.vec3, device=device)
-    bank.place = wp.array(np.array([t.position for t in told]), dtype=wp.vec3, device=device)
-    built = list(zip(told, true, strict=True))
+    bank.count = len(nominal)
+    bank.axis = wp.array(np.array([t.axis for t in nominal]), dtype=wp.vec3, device=device)
+    bank.place = wp.array(np.array([t.position for t in nominal]), dtype=wp.vec3, device=device)
+    built = list(zip(nominal, true, strict=True))
     with_arrays(
         bank,
         device,
@@ -403,7 +403,7 @@ def motor_bank(
         speed_loop: Whether the firmware holds speeds; if not, a target is what it expects at full voltage.
     """
     true = [spec.thrusters[name] for name in vehicle.thruster_names]
-    told = list(vehicle.thrusters.values())
+    nominal = list(vehicle.thrusters.values())
     firmware = spec.firmware
     bank = MotorBank()
     n = bank.count = len(true)
@@ -411,14 +411,14 @@ def motor_bank(
     bank.loop_steps = max(1, round(firmware.loop_period / dt))
     bank.loop_period = bank.loop_steps * dt
     delay = [round(t.delay / dt) for t in true]
-    lag = np.array([t.time_constant + t.delay for t in told])
+    lag = np.array([t.time_constant + t.delay for t in nominal])
     arrays = {
         "alpha": 1.0 - np.exp(-dt / np.array([t.time_constant for t in true])),
         "full": [t.full_rpm * RPM for t in true],
         "dead_plus": [t.dead_rpm_plus * RPM for t in true],
         "dead_minus": [t.dead_rpm_minus * RPM for t in true],
-        "rated": [HEADROOM * max(t.rpm_max, -t.rpm_min) * RPM for t in told],
-        "scale": [max(t.rpm_max, -t.rpm_min) * RPM / firmware.feed_forward for t in told],
+        "rated": [HEADROOM * max(t.rpm_max, -t.rpm_min) * RPM for t in nominal],
+        "scale": [max(t.rpm_max, -t.rpm_min) * RPM / firmware.feed_forward for t in nominal],
         "model_alpha": 1.0 - np.exp(-bank.loop_period / lag),
         **{name: np.zeros(n) for name in ("target", "speed", "measured", "smooth", "expected")},
         **{name: np.zeros(n) for name in ("integral", "throttle")},

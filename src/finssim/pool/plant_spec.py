@@ -419,5 +419,5 @@ def load_plant_spec(path: str | Path) -> PlantSpec:
         return PlantSpec.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(x) for x in first["loc"])
-        raise PlantSpecError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}") from None
+        key = ".".join(str(x) for x in first["loc"])
+        raise PlantSpecError(f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}") from None

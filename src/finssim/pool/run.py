@@ -89,9 +89,9 @@ class Pace:
     @property
     def sentence(self) -> str:
         """What a person wants to know."""
-        kept = f"gave up {self.given_up:.2f} s" if self.given_up else "kept real time"
+        pace_text = f"gave up {self.given_up:.2f} s" if self.given_up else "kept real time"
         return (
-            f"{self.duration:.1f} s, {kept}, at most {1e3 * self.late:.0f} ms late; "
+            f"{self.duration:.1f} s, {pace_text}, at most {1e3 * self.late:.0f} ms late; "
             f"{self.received} frames in, {self.sent} out"
         )
 
@@ -325,7 +325,7 @@ def serve_realtime(
     pace, start, now = Pace(), clock(), 0.0
     sent: dict[str, list[bytes]] = {name: [] for name in site.runtimes}
     frames: dict[str, list[tuple[float, bytes]]] = {name: [] for name in site.runtimes}
-    steps, told = 0, False
+    steps, announced = 0, False
     while now < duration and not until(pace):
         behind = clock() - start - now
         if behind > MOST_BEHIND:
@@ -359,8 +359,8 @@ def serve_realtime(
         if messages is not None:
             messages.poll(now)
         site.turn(now, due)
-        if site.over and not told:
-            told = True
+        if site.over and not announced:
+            announced = True
             over()
         pace.duration, done = now, clock() - start
         pace.late = max(pace.late, done - now) if now > 1.0 else pace.late
@@ -455,8 +455,10 @@ def make_plan(
     """
     ours = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
-    own = world is not None and site is None
-    spec = site_of_world(world, spec) if own and world is not None else site_of(site or "pool", spec)
+    world_is_site = world is not None and site is None
+    spec = (
+        site_of_world(world, spec) if world_is_site and world is not None else site_of(site or "pool", spec)
+    )
     site = site or ("pool" if world is None else "open-water")
     ours = vehicle_at(site, ours, navigation=firmware == "ardusub")
     if site == "open-water" and camera != "none":
@@ -467,7 +469,9 @@ def make_plan(
         raise PlantSpecError(f"unknown firmware '{firmware}'; available: mcu, ardusub")
     if camera not in ("pictures", "corners", "none"):
         raise PlantSpecError(f"unknown camera '{camera}'; available: pictures, corners, none")
-    onboard = None if world is None else OnboardPlan(vehicle=ours, world=world, seed=seed, solid=own)
+    onboard = (
+        None if world is None else OnboardPlan(vehicle=ours, world=world, seed=seed, solid=world_is_site)
+    )
     plan = PoolPlan(vehicle=ours, spec=spec, camera=None, calibrated=None, firmware=firmware, onboard=onboard)
     if camera == "none":
         return plan
@@ -558,13 +562,13 @@ def run(
         bodies = [load_vehicle(name.strip()) for name in (team or vehicle).split(",")]
         calibrated = None
         if task is None:
-            made, calibrated = swimming(
+            fleet, calibrated = swimming(
                 bodies, int(plant), severity, camera or ("none" if site == "open-water" else "corners"), site,
                 positioning, truth=truth, seed=seed,
             )  # fmt: skip
         else:
-            made = _playing(task, bodies, int(plant), severity, positioning, seed)
-        _serve_team(made, calibrated, (bind, port), host_port(robot, "--robot"), pool_file, duration)
+            fleet = _playing(task, bodies, int(plant), severity, positioning, seed)
+        _serve_team(fleet, calibrated, (bind, port), host_port(robot, "--robot"), pool_file, duration)
         return
     usual: Any = {"pool": "pictures", "tank": "corners"}.get(
         site or ("pool" if world is None else ""), "none"
@@ -611,7 +615,7 @@ def run(
 
 
 def _serve_team(
-    made: Fleet,
+    fleet: Fleet,
     calibrated: Pool | None,
     ours: tuple[str, int],
     theirs: tuple[str, int],
@@ -620,14 +624,14 @@ def _serve_team(
 ) -> None:
     """Serve several vehicles, each to a robot of its own, from their first addresses on ten ports apart."""
     (bind, port), (host, first) = ours, theirs
-    names = made.task.agents if isinstance(made, TaskSite) else tuple(made.worlds)
+    names = fleet.task.agents if isinstance(fleet, TaskSite) else tuple(fleet.worlds)
     if not 0 < port <= 65535 - 10 * len(names):
         raise LinkError(f"port {port}: expected room for ten ports to each of {len(names)} vehicles after it")
-    with _stoppable() as asked, ExitStack() as stack:
-        stack.callback(made.close)
+    with _stoppable() as stop_requested, ExitStack() as stack:
+        stack.callback(fleet.close)
         messages, sinks = None, []
-        if isinstance(made, TaskSite):
-            messages = MediumServer((bind, port + MESSAGES), made.carrier, names)
+        if isinstance(fleet, TaskSite):
+            messages = MediumServer((bind, port + MESSAGES), fleet.carrier, names)
             stack.callback(messages.close)
         transports = {}
         for i, name in enumerate(names):
@@ -640,16 +644,16 @@ def _serve_team(
         if calibrated is not None and pool_file is not None:
             write_pool(calibrated, pool_file)
             _say(f"pool file: {pool_file}")
-        if messages is not None and isinstance(made, TaskSite):
-            _tell_goal(made)
+        if messages is not None and isinstance(fleet, TaskSite):
+            _tell_goal(fleet)
             _say(f"messages: {_name(messages.address)}")
         longest = math.inf if duration is None else duration
-        tell = partial(_tell_episode, made)
+        notify = partial(_tell_episode, fleet)
         pace = serve_realtime(
-            made, transports, messages, sinks=sinks, duration=longest, until=asked, over=tell
+            fleet, transports, messages, sinks=sinks, duration=longest, until=stop_requested, over=notify
         )
-    if not made.over:
-        _tell_episode(made)
+    if not fleet.over:
+        _tell_episode(fleet)
     _say(f"ended after {pace.duration:.1f} s")
 
 
@@ -709,29 +713,29 @@ def swimming(
     ours = [numbered(vehicle_at(site, body), i) for i, body in enumerate(bodies)]
     specs = [site_of(site, draw_plant(v, plant + i, severity)) for i, v in enumerate(ours)]
     basin = specs[0].basin
-    apart = ROOM * max(max(v.body.size) for v in ours)
-    if apart * len(ours) > basin.length:
+    spacing = ROOM * max(max(v.body.size) for v in ours)
+    if spacing * len(ours) > basin.length:
         raise PlantSpecError(
-            f"{len(ours)} vehicles {apart:.1f} m apart have no room in {basin.length:g} m: take a larger --site"
+            f"{len(ours)} vehicles {spacing:.1f} m apart have no room in {basin.length:g} m: take a larger --site"
         )
     eyes: list[PoolCamera | None] = [None] * len(ours)
     calibrated = None
     if camera == "corners":
         true, calibrated, settings = camera_of(ours[0], plant, severity, basin=basin)
         for i, v in enumerate(ours):
-            own = camera_of(v, plant, severity, basin=basin)[2]
+            robot_settings = camera_of(v, plant, severity, basin=basin)[2]
             eyes[i] = PoolCamera(
                 v,
                 true,
                 mode="corners",
-                settings=replace(settings, mounts=own.mounts),
+                settings=replace(settings, mounts=robot_settings.mounts),
                 seed=seed,
                 noise_seed=seed + 1000 * (i + 1),
             )
     worlds = {}
     for i, (v, spec, eye) in enumerate(zip(ours, specs, eyes, strict=True)):
         name = f"robot_{i + 1}"
-        x = apart * (i - 0.5 * (len(ours) - 1))
+        x = spacing * (i - 0.5 * (len(ours) - 1))
         worlds[name] = VirtualPool(
             v,
             spec,
@@ -780,11 +784,11 @@ def _lockstep(
         stack.callback(server.close)
         world = make_world(plan.eye())
         stack.callback(world.close)
-        why = "stopped"
+        reason = "stopped"
         _say(f"lock-step: {_name(server.address)}")
         with suppress(KeyboardInterrupt), _stoppable(at_once=True):
-            why = server.serve(world, duration=duration)
-    _say(f"{why} at {world.time:.1f} s")
+            reason = server.serve(world, duration=duration)
+    _say(f"{reason} at {world.time:.1f} s")
 
 
 def _realtime(
@@ -795,7 +799,7 @@ def _realtime(
     duration: float,
     links: Callable[[], GroundLinks] | None,
 ) -> None:
-    with _stoppable() as asked, ExitStack() as stack:
+    with _stoppable() as stop_requested, ExitStack() as stack:
         transport = UdpTransport(bind, robot) if links is None else links()
         stack.callback(transport.close)
         drawn, sink, eye = _camera(plan, _next(bind), _next(robot))
@@ -813,7 +817,9 @@ def _realtime(
             _say(f"pictures: {_name(_next(bind))}, for {_name(_next(robot))}")
         site, sinks = Fleet({plan.vehicle.name: world}), [] if sink is None else [sink]
         transports = {plan.vehicle.name: transport}
-        pace = serve_realtime(site, transports, sinks=sinks, camera=drawn, duration=duration, until=asked)
+        pace = serve_realtime(
+            site, transports, sinks=sinks, camera=drawn, duration=duration, until=stop_requested
+        )
         _say(pace.sentence)
         if drawn is not None and drawn.dropped:
             _say(drawn.complaint)
@@ -823,7 +829,9 @@ def _camera(
     plan: PoolPlan, bind: tuple[str, int], peer: tuple[str, int]
 ) -> tuple[PictureProcess | None, UdpSender | None, Any]:
     """The process that draws, or the sink for what is computed here, and the camera for the world."""
-    plans: list[Plan] = [one for one in (plan.camera, plan.onboard) if one is not None]
+    plans: list[Plan] = [
+        plan_or_none for plan_or_none in (plan.camera, plan.onboard) if plan_or_none is not None
+    ]
     if not plans:
         return None, None, None
     if plan.onboard is None and plan.camera is not None and plan.camera.mode == "corners":
@@ -835,19 +843,19 @@ def _camera(
 @contextmanager
 def _stoppable(*, at_once: bool = False) -> Iterator[Callable[..., bool]]:
     """Let Ctrl-C and SIGTERM ask for the end, or end a wait at once; gives whether they did. The second ends all."""
-    asked = False
+    requested = False
     before: dict[int, Any] = {}
 
     def stop(number: int, frame: object) -> None:
-        nonlocal asked
-        if asked or at_once:
+        nonlocal requested
+        if requested or at_once:
             raise KeyboardInterrupt
-        asked = True
+        requested = True
 
     for number in (signal.SIGINT, signal.SIGTERM):
         before[number] = signal.signal(number, stop)
     try:
-        yield lambda *_: asked
+        yield lambda *_: requested
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -132,11 +132,11 @@ class ScriptedPilot:
         """Wanted thrusts in canonical order [N], (n,)."""
         everybody = self._truth()
         for v, name in enumerate(self.task.vehicles):
-            one = everybody[name]
+            track = everybody[name]
             for row, value in (
-                ("position", one.position),
-                ("quaternion", one.quaternion),
-                ("velocity", one.nu),
+                ("position", track.position),
+                ("quaternion", track.quaternion),
+                ("velocity", track.nu),
             ):
                 getattr(self._state, row).numpy()[0, v] = value
         self._state.steps.numpy()[0] = max(round(t / self.period), 0)
@@ -168,8 +168,8 @@ def _told(kind: type[Task]) -> type[Task]:
     """A task whose start is told instead of drawn, and its goal's motion instead of made."""
 
     def terms(task: Task) -> Terms:
-        made = kind.terms(task)
-        return replace(made, start=as_told, advance=None if task.moving else made.advance)
+        declared = kind.terms(task)
+        return replace(declared, start=as_told, advance=None if task.moving else declared.advance)
 
     return type(kind.__name__, (kind,), {"terms": terms, "__module__": kind.__module__})
 
@@ -211,7 +211,7 @@ class Referee:
         """
         self.task = task = fitted_task(task, vehicles)
         if start is not None:
-            task = _told(type(task))(**{one.name: getattr(task, one.name) for one in fields(task)})
+            task = _told(type(task))(**{field.name: getattr(task, field.name) for field in fields(task)})
         size = action_size or len(action_mode(task.action, vehicles[0]).labels)
         self._state, self.arrays = one_world(task, size)
         device = self._state.steps.device
@@ -273,11 +273,11 @@ class Referee:
     def _put(self, truth: Mapping[str, Track]) -> None:
         """Where everybody is, by place."""
         for v, name in enumerate(self.task.vehicles):
-            one = truth[name]
+            track = truth[name]
             for row, value in (
-                ("position", one.position),
-                ("quaternion", one.quaternion),
-                ("velocity", one.nu),
+                ("position", track.position),
+                ("quaternion", track.quaternion),
+                ("velocity", track.nu),
             ):
                 getattr(self._state, row).numpy()[0, v] = value
 
@@ -310,9 +310,9 @@ class _Goal:
         moving = a.target.velocity is not None
         velocity = a.target.velocity.numpy()[0].astype(float) if moving else np.zeros(3)
         since = np.asarray(t, float) - self._referee.time
-        place = a.goal_position.numpy()[0].astype(float) + since[..., None] * velocity
+        position = a.goal_position.numpy()[0].astype(float) + since[..., None] * velocity
         yaw = float(quat_yaw(a.goal_quaternion.numpy()[0].astype(float)))
-        rows = (np.broadcast_to(row, (*shape, 3)).copy() for row in (place, velocity))
+        rows = (np.broadcast_to(row, (*shape, 3)).copy() for row in (position, velocity))
         return Reference(*rows, np.full(shape, yaw), np.zeros(shape))
 
 
@@ -378,12 +378,12 @@ class TaskSite(Fleet):
                 spec(vehicle),
                 camera=camera(vehicle) if camera else self._eyes(vehicle, seed),
                 positioning=positioning_of(positioning, seed + i) if name in self.task.agents else None,
-                start=place,
+                start=start,
                 seed=seed + i,
                 truth=record / f"{name}.truth" if record is not None and name in steering else None,
                 dock=self.task.dock(),
             )
-            for i, (name, vehicle, place) in enumerate(zip(names, vehicles, referee.places(), strict=True))
+            for i, (name, vehicle, start) in enumerate(zip(names, vehicles, referee.places(), strict=True))
         }
         if self.task.dock() is not None:
             for world in worlds.values():
@@ -488,7 +488,7 @@ class TaskSite(Fleet):
             self.tell_target()
         # A robot that has just decided acts from now on: what is scored is what was done until now.
         self._actions = {
-            name: getattr(one.pilot, "action", np.zeros(0)) for name, one in self.runtimes.items()
+            name: getattr(runtime.pilot, "action", np.zeros(0)) for name, runtime in self.runtimes.items()
         }
 
     def _target(self) -> Track | None:

@@ -160,15 +160,15 @@ class BridgeSettings:
         Raises:
             BridgeError: A limit that cannot be kept, or no field of that name.
         """
-        known = {field.name for field in fields(cls)}
-        if not changes.keys() <= known:
-            unknown = sorted(changes.keys() - known)
+        names = {field.name for field in fields(cls)}
+        if not changes.keys() <= names:
+            unknown = sorted(changes.keys() - names)
             raise BridgeError(
-                f"no bridge setting {', '.join(unknown)}; available: {', '.join(sorted(known))}"
+                f"no bridge setting {', '.join(unknown)}; available: {', '.join(sorted(names))}"
             )
-        own: dict[str, Any] = {"slew": _slew(vehicle)}
-        own.update({name: getattr(vehicle.safety, name) for name in FROM_FILE})
-        return replace(cls(**own), **changes) if changes else cls(**own)
+        limits: dict[str, Any] = {"slew": _slew(vehicle)}
+        limits.update({name: getattr(vehicle.safety, name) for name in FROM_FILE})
+        return replace(cls(**limits), **changes) if changes else cls(**limits)
 
 
 FROM_FILE = (
@@ -196,8 +196,8 @@ DURATIONS = (
 def _slew(vehicle: Vehicle) -> Array:
     """Fastest change of each thrust [N/s], (n,): the file's own where it limits thrust, else from range and time."""
     lower, upper = vehicle.force_limits
-    own = np.array([t.slew if t.domain == "force" else math.inf for t in vehicle.thrusters.values()])
-    return np.where(np.isfinite(own), own, (upper - lower) / FULL_RANGE)
+    stated = np.array([t.slew if t.domain == "force" else math.inf for t in vehicle.thrusters.values()])
+    return np.where(np.isfinite(stated), stated, (upper - lower) / FULL_RANGE)
 
 
 # Who commands a robot, and the newest command that was fit to be used.
@@ -250,19 +250,19 @@ class Commander:
             stamp: Time of what its sender knew, robot's clock [s]; None: it does not tell.
         """
         try:
-            wanted = np.array(force, float)
+            requested = np.array(force, float)
         except (TypeError, ValueError):
             return "command is no list of numbers"
-        if wanted.shape != (self._thrusters,):
-            return f"command has shape {wanted.shape}, expected {self._thrusters} thrusts"
-        if not np.isfinite(wanted).all():
+        if requested.shape != (self._thrusters,):
+            return f"command has shape {requested.shape}, expected {self._thrusters} thrusts"
+        if not np.isfinite(requested).all():
             return "command is not finite"
         if stamp is not None:
             if not -EARLY <= now - stamp <= self._timeout:
                 return f"command is stamped {stamp:.3f} s, received at {now:.3f} s"
             if source == self.source and stamp < self._stamp:
                 return "command is older than the one before"
-        self.force, self.source, self.received = wanted, source, now
+        self.force, self.source, self.received = requested, source, now
         self._stamp = -math.inf if stamp is None else stamp
         return ""
 
@@ -653,23 +653,23 @@ class Supervision:
                 degrees = math.degrees(limits.max_tilt)
                 return f"tilted beyond {degrees:.0f} degrees for {limits.max_tilt_duration:g} s, says the {source}"
         pose = self.state.pose(now)
-        left = "" if pose is None else self.workspace.left(pose[0])
-        return left and f"left the workspace: {left}"
+        side = "" if pose is None else self.workspace.left(pose[0])
+        return side and f"left the workspace: {side}"
 
     def want(self, now: float, since: float) -> str:
         """What thrust has to wait for: the estimator, or a command, counted from `since` [s] at the earliest."""
         # The estimator first: a controller that is not told where it is falls silent for that very reason.
-        why = self._estimator(now)
-        if why:
-            return why
+        reason = self._estimator(now)
+        if reason:
+            return reason
         late = now - max(self.commander.received, since) > self.settings.command_timeout
         return f"no command for {self.settings.command_timeout:g} s" if late else ""
 
     def unfit(self, now: float) -> str:
         """What stands against arming."""
-        why = self.danger(now) or self._estimator(now)
-        if why:
-            return why
+        reason = self.danger(now) or self._estimator(now)
+        if reason:
+            return reason
         rivals = self.commander.sources(now)
         if len(rivals) > 1:
             return f"two publishers command the thrusters: {' and '.join(rivals)}"
@@ -751,11 +751,11 @@ class Bridge:
     def arm(self, now: float, source: str) -> str:
         """Let commands through from now on. Returns "" or, in one sentence, why it is refused."""
         refusal = self._refusal(now)
-        why = refusal or (self.autopilot.prepare(now) if self.autopilot is not None else "")
-        self.getting_ready = bool(why) and not refusal
-        if why:
-            self.log.repeat(self._clock.now, "refused", f"{source} may not arm: {why}")
-            return why
+        reason = refusal or (self.autopilot.prepare(now) if self.autopilot is not None else "")
+        self.getting_ready = bool(reason) and not refusal
+        if reason:
+            self.log.repeat(self._clock.now, "refused", f"{source} may not arm: {reason}")
+            return reason
         self._commander.forget()
         self._watchdogs.echo.forget()
         self._watchdogs.deaf.forget()
@@ -769,10 +769,10 @@ class Bridge:
         if self.state in RUNNING:
             self._enter("disarmed", "", "disarmed")
 
-    def stop(self, now: float, why: str) -> None:
+    def stop(self, now: float, reason: str) -> None:
         """Emergency stop, in every state."""
         self._at(now)
-        self._fault(why or "stopped")
+        self._fault(reason or "stopped")
 
     def acknowledge(self, now: float) -> None:
         """End a fault; the bridge is disarmed then."""
@@ -812,18 +812,18 @@ class Bridge:
         rival = self._commander.rival(now, source)
         if rival and self.state in RUNNING:
             self._fault(f"two publishers command the thrusters: {rival} and {source}")
-        why = self._commander.accept(now, force, source, stamp)
-        if why:
-            self.log.repeat(now, "command refused", f"{source}: {why}")
-        return self._limited(now) if self.state == "armed" and not why else unused
+        reason = self._commander.accept(now, force, source, stamp)
+        if reason:
+            self.log.repeat(now, "command refused", f"{source}: {reason}")
+        return self._limited(now) if self.state == "armed" and not reason else unused
 
     def telemetry(self, now: float, telemetry: Telemetry) -> None:
         """A message from the motor controller."""
         if not self._at(now):
             return
-        why = self._watchdogs.telemetry.malformed(telemetry)
-        if why:
-            self.log.repeat(now, "telemetry refused", why)
+        reason = self._watchdogs.telemetry.malformed(telemetry)
+        if reason:
+            self.log.repeat(now, "telemetry refused", reason)
         elif self._watchdogs.take_telemetry(now, telemetry, self.state == "armed"):
             self._alarm("restart", f"the {self._watchdogs.peer} restarted: its clock went back")
 
@@ -854,8 +854,8 @@ class Bridge:
             return self._off
         step = self.settings.slew * dt
         change = np.minimum(np.maximum(self._limited(now) - self.force, -step), step)
-        told, self.force, self._memory = self.motors.normalised(self.force + change, self._memory, dt)
-        return ThrusterCommand(True, tuple(told.tolist()))
+        normalised, self.force, self._memory = self.motors.normalised(self.force + change, self._memory, dt)
+        return ThrusterCommand(True, tuple(normalised.tolist()))
 
     @property
     def source(self) -> str:
@@ -912,9 +912,9 @@ class Bridge:
         elif now - self._held_at > self.settings.hold_limit:
             self._fault(f"held longer than {self.settings.hold_limit:g} s: {self.reason}")
 
-    def _hold(self, why: str) -> None:
+    def _hold(self, reason: str) -> None:
         self._held_at = self._clock.now
-        self._enter("hold", why, why)
+        self._enter("hold", reason, reason)
 
     def _period(self, now: float) -> float:
         """Time since the last tick [s], 0 at the first."""
@@ -944,12 +944,12 @@ class Bridge:
         else:
             self.log.repeat(self._clock.now, kind, text)
 
-    def _fault(self, why: str) -> None:
+    def _fault(self, reason: str) -> None:
         """Stop; the first reason stands until it is acknowledged."""
         if self.state == "fault":
-            self.log.repeat(self._clock.now, "also", why)
+            self.log.repeat(self._clock.now, "also", reason)
         else:
-            self._enter("fault", why, why)
+            self._enter("fault", reason, reason)
 
     def _enter(self, state: str, reason: str, text: str) -> None:
         """Changes state; no thrust is carried over."""

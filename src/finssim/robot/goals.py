@@ -109,9 +109,9 @@ def check_reachable(guide: Guide, vehicle: Vehicle) -> None:
     lower, upper = vehicle.safety.workspace_lower, vehicle.safety.workspace_upper
     outside = np.any((places < lower) | (places > upper), axis=1)
     if outside.any():
-        place = np.round(places[outside][0], 3).tolist()
+        point = np.round(places[outside][0], 3).tolist()
         raise GoalError(
-            f"{guide.name} leads to {place}, outside the workspace {lower.tolist()} to {upper.tolist()} of "
+            f"{guide.name} leads to {point}, outside the workspace {lower.tolist()} to {upper.tolist()} of "
             f"{vehicle.name} (world frame, z = 0 on the water): choose another, or change safety in the vehicle file"
         )
 
@@ -123,14 +123,14 @@ def _goal_in(path: Path) -> list[object]:
     return goal
 
 
-def _numbers(where: str, values: list[object] | list[str]) -> Station:
+def _numbers(label: str, values: list[object] | list[str]) -> Station:
     try:
         x, y, z, yaw_deg = (float(str(v)) for v in values)
     except ValueError:
         x = y = z = yaw_deg = math.nan
     if not all(map(math.isfinite, (x, y, z, yaw_deg))):
         raise GoalError(
-            f"{where}: expected four numbers x,y,z,yaw_deg: metres in the world frame (z = 0 on the water, negative "
+            f"{label}: expected four numbers x,y,z,yaw_deg: metres in the world frame (z = 0 on the water, negative "
             "below) and degrees"
         )
     return Station((x, y, z), math.radians(yaw_deg))

@@ -415,16 +415,16 @@ class Perception:
             return self.estimator.refuse(
                 "vision", "duplicate" if time == self._last_picture else "out of order"
             )
-        found = self._detections(picture, time)
-        if found is None:
+        detections = self._detections(picture, time)
+        if detections is None:
             return self.estimator.refuse("vision", "not a picture of this camera")
         if math.isfinite(time):
             self._last_picture = time
-        seen = tuple(tuple(d.corners.ravel().tolist()) for d in found)
-        if seen and self._pictures.look(seen, time):
+        corners = tuple(tuple(d.corners.ravel().tolist()) for d in detections)
+        if corners and self._pictures.look(corners, time):
             return self.estimator.refuse("vision", "frozen")
         assert self.fixes is not None  # found is None without a pool
-        fix = self.fixes.fix(Frame(time, "", tuple(found)), self.estimator)
+        fix = self.fixes.fix(Frame(time, "", tuple(detections)), self.estimator)
         if not isinstance(fix, VisionSample):
             return self.estimator.refuse("vision", fix)
         if self.unfused is not None:
@@ -572,6 +572,6 @@ def _why(health: Health, camera: bool) -> str:
             else "no position fix yet, and where it was let in is not given"
         )
     if health.vision_mode in ("hold", "lost"):
-        what = "not seen by the camera" if camera else "no position fix or velocity"
-        return f"{what} for {health.age_vision:.1f} s"
+        lack = "not seen by the camera" if camera else "no position fix or velocity"
+        return f"{lack} for {health.age_vision:.1f} s"
     return "position or heading too uncertain"

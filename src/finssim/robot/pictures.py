@@ -159,13 +159,13 @@ def decode_picture(data: bytes) -> Posted | None:
 
 
 def _tags(data: bytes, n: int) -> tuple[TagCorners, ...] | None:
-    found = []
+    tags = []
     for i in range(n):
         tag, *corners = _TAG.unpack_from(data, i * _TAG.size)
         if not all(map(math.isfinite, corners)):
             return None
-        found.append(TagCorners(tag, np.array(corners).reshape(4, 2)))
-    return tuple(found)
+        tags.append(TagCorners(tag, np.array(corners).reshape(4, 2)))
+    return tuple(tags)
 
 
 def _image(
@@ -313,11 +313,11 @@ class UdpPictures:
 
     def receive(self, now: float) -> list[Picture]:
         """Pictures since the last call, oldest first, with times on the clock of `now` [s]."""
-        found, later = [], time.monotonic() - now
+        received, later = [], time.monotonic() - now
         while self._waiting:
             came, picture = self._waiting.popleft()
-            found.append(replace(picture, time=came - later))
-        return found
+            received.append(replace(picture, time=came - later))
+        return received
 
     def close(self) -> None:
         """Let go of the socket."""
@@ -335,12 +335,12 @@ class UdpPictures:
     def _listen(self) -> None:
         while self._open:
             for data in self._wire.receive(wait=0.2):
-                whole = self.assembler.add(data)
-                if whole is not None:
-                    self._take(time.monotonic(), whole)
+                complete = self.assembler.add(data)
+                if complete is not None:
+                    self._take(time.monotonic(), complete)
 
-    def _take(self, came: float, whole: bytes) -> None:
-        posted = decode_picture(whole)
+    def _take(self, came: float, data: bytes) -> None:
+        posted = decode_picture(data)
         if posted is None or not 0.0 <= posted.late < _LATEST:
             self.not_understood += 1
             return
@@ -448,10 +448,10 @@ class TagFinder:
 
     def receive(self, now: float) -> list[Picture]:
         """What has been looked at since the last call."""
-        found = []
+        pictures = []
         while self._found:
-            found.append(self._found.popleft())
-        return found
+            pictures.append(self._found.popleft())
+        return pictures
 
     def describe(self) -> str:
         """The source and how it fares, in a few words."""
@@ -478,11 +478,11 @@ class TagFinder:
         if image is None or picture.tags or image.shape != self._size or image.dtype != np.uint8:
             return picture
         try:
-            found = self._tracker.detect(image, picture.time)
+            detections = self._tracker.detect(image, picture.time)
         except Exception as error:  # whatever it is: the next picture may be better
             if not self.problem:
                 self.problem = f"tags cannot be sought: {type(error).__name__}: {error}"
                 _TAGS_LOG.warning(self.problem)
             return replace(picture, image=None)
-        tags = tuple(TagCorners(d.tag, d.corners) for d in found)
+        tags = tuple(TagCorners(d.tag, d.corners) for d in detections)
         return replace(picture, tags=tags, image=image if tags else None)

@@ -155,7 +155,7 @@ class AgentPilot:
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
         """Wanted thrusts in canonical order [N], (n,)."""
-        seen = {
+        pictures = {
             name: resized(reading.pictures[name].image, shape)[None]  # type: ignore[attr-defined]
             for name, shape in self.pictures.items()
             if shape
@@ -171,12 +171,12 @@ class AgentPilot:
                 reading, guide, t, previous, self.reach, self.turn, ranges
             )
         rows = [self.observation[None], *(np.asarray(x, float)[None] for x in _state(reading))]
-        known = Known(*rows, pictures=seen or None)
+        knowledge = Known(*rows, pictures=pictures or None)
         goal = goal_at(guide, t)
         aims = (goal.position, goal.quaternion, goal.velocity, goal.acceleration)
         began = time.perf_counter()
         action, self._memory = self.agent.act(
-            self._memory, known, Goal(*(np.asarray(x, float)[None] for x in aims))
+            self._memory, knowledge, Goal(*(np.asarray(x, float)[None] for x in aims))
         )
         self.took = time.perf_counter() - began
         self.action = np.clip(action[0], -1.0, 1.0)
@@ -309,24 +309,26 @@ def make_pilot(
     from finssim.tasks.agents import BASELINES, TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
     from finssim.tasks.observer import Observer
 
-    who = str(name_or_directory)
-    if who in CONTROLLERS and task in (None, *TASKS_OF_PIDS):
-        return AgentPilot(PidAgent(who, vehicle, task or "t1"), vehicle)
-    if not Path(who).exists():
-        known = BASELINES.get(task or "", {})
-        if who not in known:
-            names = dict.fromkeys([*(CONTROLLERS if task in (None, *TASKS_OF_PIDS) else ()), *known])
+    controller = str(name_or_directory)
+    if controller in CONTROLLERS and task in (None, *TASKS_OF_PIDS):
+        return AgentPilot(PidAgent(controller, vehicle, task or "t1"), vehicle)
+    if not Path(controller).exists():
+        baselines = BASELINES.get(task or "", {})
+        if controller not in baselines:
+            names = dict.fromkeys([*(CONTROLLERS if task in (None, *TASKS_OF_PIDS) else ()), *baselines])
             raise PolicyError(
-                f"{who}: neither {' nor '.join(names)} nor a policy directory: give one of these"
+                f"{controller}: neither {' nor '.join(names)} nor a policy directory: give one of these"
             )
-        seen = Observer(str(task), vehicle, agent=agent)
-        shapes = {picture.name: picture.shape(vehicle) for picture in seen.task.pictures}
-        return AgentPilot(BaselineAgent(who, vehicle, seen.task), vehicle, seen, shapes)
-    trained = read_description(Path(who))
+        observed = Observer(str(task), vehicle, agent=agent)
+        shapes = {picture.name: picture.shape(vehicle) for picture in observed.task.pictures}
+        return AgentPilot(BaselineAgent(controller, vehicle, observed.task), vehicle, observed, shapes)
+    trained = read_description(Path(controller))
     mode = mode_from_dict(trained.action, vehicle)
-    seen = Observer(task or trained.task, vehicle, agent=agent, action=mode.name)
+    observed = Observer(task or trained.task, vehicle, agent=agent, action=mode.name)
     shapes = {name: about["shape"] for name, about in trained.pictures.items()}
-    return AgentPilot(PolicyAgent(who, vehicle, seen.task, period=period), vehicle, seen, shapes)
+    return AgentPilot(
+        PolicyAgent(controller, vehicle, observed.task, period=period), vehicle, observed, shapes
+    )
 
 
 def _state(reading: Measured) -> tuple[Any, Any, Any]:

@@ -387,8 +387,10 @@ class Messages:
             level = np.diag([UNKNOWN, UNKNOWN, self._compass_std**2]).ravel()
             heading = self.quaternion(quat_from_yaw(x))
             rest = self.vector((0.0, 0.0, 0.0))
-            made = of["sensor_msgs/msg/Imu"](self.header(stamp, BASE), heading, level, rest, none, rest, none)
-            return "compass", made
+            message = of["sensor_msgs/msg/Imu"](
+                self.header(stamp, BASE), heading, level, rest, none, rest, none
+            )
+            return "compass", message
         if aid.kind not in (POSITION, POSE):
             return None
         posed = aid.kind == POSE
@@ -436,15 +438,15 @@ class Messages:
         pose = of["geometry_msgs/msg/Transform"](
             self.vector(reading.position), self.quaternion(reading.quaternion)
         )
-        one = of["geometry_msgs/msg/TransformStamped"](self.header(stamp, MAP), self.frame(BASE), pose)
-        return of["tf2_msgs/msg/TFMessage"]([one])
+        stamped = of["geometry_msgs/msg/TransformStamped"](self.header(stamp, MAP), self.frame(BASE), pose)
+        return of["tf2_msgs/msg/TFMessage"]([stamped])
 
     def estimator(self, stamp: int, reading: Reading, health: Mapping[str, Any]) -> Any:
         """Whether the estimate may be acted on; what `health` does not tell is NaN, 0 or empty."""
         std = np.asarray(reading.std, float)
         judged = {"position_std": std[:3], "velocity_std": std[3:6], "yaw_std": std[6]}
-        told = {"ready": reading.ready, "mode": reading.mode, "reason": reading.reason}
-        return self.filled("EstimatorStatus", stamp, MAP, {**health, **told, **judged})
+        status = {"ready": reading.ready, "mode": reading.mode, "reason": reading.reason}
+        return self.filled("EstimatorStatus", stamp, MAP, {**health, **status, **judged})
 
     def goal(self, stamp: int, position: Any, yaw: float) -> Any:
         """A level pose in the map.
@@ -469,8 +471,8 @@ class Messages:
 
     def thrusters(self, stamp: int, state: str, values: Mapping[str, Any]) -> Any:
         """What the bridge made of commands."""
-        known = {"state": STATES.index(state), "names": self.names}
-        return self.filled("ThrusterState", stamp, BASE, {**values, **known})
+        values_of_bridge = {"state": STATES.index(state), "names": self.names}
+        return self.filled("ThrusterState", stamp, BASE, {**values, **values_of_bridge})
 
     def policy(self, stamp: int, pilot: str, values: Mapping[str, Any]) -> Any:
         """One decision of a controller."""
@@ -499,13 +501,13 @@ class Messages:
         """A camera's calibration."""
         K = [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0]
         P = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
-        whole = self._of["sensor_msgs/msg/RegionOfInterest"](
+        full_region = self._of["sensor_msgs/msg/RegionOfInterest"](
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
         )
         return self._of["sensor_msgs/msg/CameraInfo"](
             header=self.header(stamp, frame), height=lens.height, width=lens.width,
             distortion_model=LENS_MODELS[lens.model], d=floats(lens.distortion or (0.0,) * 5), k=floats(K),
-            r=np.eye(3).ravel(), p=floats(P), binning_x=0, binning_y=0, roi=whole,
+            r=np.eye(3).ravel(), p=floats(P), binning_x=0, binning_y=0, roi=full_region,
         )  # fmt: skip
 
     def of_own(self, stamp: int, picture: Picture) -> dict[str, Callable[[], Any]]:
@@ -526,8 +528,8 @@ class Messages:
         if isinstance(device, SonarDevice) and image is not None and image.ndim == 2:
 
             def fan() -> Any:
-                seen = np.nan_to_num(fan_picture(image, device.sector, FAN_ROWS)).astype(np.uint8)
-                return self.picture(stamp, jpeg(seen), f"{name}_link")
+                echoes = np.nan_to_num(fan_picture(image, device.sector, FAN_ROWS)).astype(np.uint8)
+                return self.picture(stamp, jpeg(echoes), f"{name}_link")
 
             return {f"{name}/sonar": lambda: self._sonar(stamp, device, picture), f"{name}/picture": fan}
         if isinstance(device, RangeDevice) and picture.ranges is not None:
@@ -635,17 +637,17 @@ def count(number: Any) -> int:
 def fields_of(kind: str) -> list[tuple[str, Callable[[Any], Any], Any]]:
     """Fields of a message of ours after its header: name, what makes its value, and the value where there is none."""
     numbers = {"float64": (float, math.nan), "string": (str, ""), "bool": (bool, False)}
-    made: list[tuple[str, Callable[[Any], Any], Any]] = []
+    fields: list[tuple[str, Callable[[Any], Any], Any]] = []
     for name, (_, detail) in types().fielddefs[f"finssim_msgs/msg/{kind}"][1][1:]:
         element, length = detail if isinstance(detail, tuple) else (detail, 0)
         if isinstance(element, tuple):  # a sequence or an array
             listed = list if element[1][0] == "string" else floats
-            made.append((name, listed, (math.nan,) * length))
+            fields.append((name, listed, (math.nan,) * length))
         elif isinstance(detail, tuple):
-            made.append((name, *numbers.get(element, (count, 0))))
+            fields.append((name, *numbers.get(element, (count, 0))))
         else:  # a message, which is given as one
-            made.append((name, lambda value: value, None))
-    return made
+            fields.append((name, lambda value: value, None))
+    return fields
 
 
 def floats(values: Any) -> npt.NDArray[np.float64]:

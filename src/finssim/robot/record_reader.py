@@ -59,8 +59,8 @@ def repair_record(path: Path, out: Path) -> list[str]:
     if out.resolve() == path.resolve():
         raise RecordError(f"{path}: cannot be repaired into itself: give another file with --out")
     notes: list[str] = []
-    with whole_mcap(path, notes) as whole, atomic_write(out) as temporary:
-        write_whole(whole, temporary, notes)
+    with whole_mcap(path, notes) as complete, atomic_write(out) as temporary:
+        write_whole(complete, temporary, notes)
     return notes
 
 
@@ -86,32 +86,36 @@ def write_whole(source: Path, target: Path, notes: list[str]) -> None:
     from mcap.writer import CompressionType, Writer
 
     schemas, channels, started = {0: 0}, dict[int, int](), False  # numbered anew
-    with source.open("rb") as given, target.open("wb") as made:
-        writer = Writer(made, compression=CompressionType.LZ4)
+    with source.open("rb") as reading, target.open("wb") as writing:
+        writer = Writer(writing, compression=CompressionType.LZ4)
         try:
-            for one in StreamReader(given, validate_crcs=True).records:
+            for record in StreamReader(reading, validate_crcs=True).records:
                 if not started:  # a header comes first, unless it was damaged
-                    header = one if isinstance(one, records.Header) else records.Header("", "")
+                    header = record if isinstance(record, records.Header) else records.Header("", "")
                     writer.start(header.profile, header.library)
                     started = True
-                match one:
-                    case records.Schema() if one.id not in schemas:
-                        schemas[one.id] = writer.register_schema(one.name, one.encoding, one.data)
-                    case records.Channel() if one.id not in channels:
-                        kind, schema = one.message_encoding, schemas[one.schema_id]
-                        channels[one.id] = writer.register_channel(one.topic, kind, schema, one.metadata)
-                    case records.Message() if one.channel_id in channels:
-                        channel = channels[one.channel_id]
-                        writer.add_message(channel, one.log_time, one.data, one.publish_time, one.sequence)
+                match record:
+                    case records.Schema() if record.id not in schemas:
+                        schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+                    case records.Channel() if record.id not in channels:
+                        kind, schema = record.message_encoding, schemas[record.schema_id]
+                        channels[record.id] = writer.register_channel(
+                            record.topic, kind, schema, record.metadata
+                        )
+                    case records.Message() if record.channel_id in channels:
+                        channel = channels[record.channel_id]
+                        writer.add_message(
+                            channel, record.log_time, record.data, record.publish_time, record.sequence
+                        )
                     case records.Metadata():
-                        writer.add_metadata(one.name, one.metadata)
+                        writer.add_metadata(record.name, record.metadata)
                     case records.Attachment():
                         writer.add_attachment(
-                            one.create_time, one.log_time, one.name, one.media_type, one.data
+                            record.create_time, record.log_time, record.name, record.media_type, record.data
                         )
         except Exception as error:  # damage shows in whatever layer meets it
-            why = str(error).partition("\n")[0] or type(error).__name__
-            notes.append(f"{source.name} is damaged and was read up to there: {why}")
+            reason = str(error).partition("\n")[0] or type(error).__name__
+            notes.append(f"{source.name} is damaged and was read up to there: {reason}")
         if not started:
             writer.start()
         writer.finish()
@@ -176,8 +180,8 @@ class Record:
         Raises:
             RecordError: There is no such topic, or one of a type that cannot be decoded.
         """
-        wanted = None if topics is None else [self._known(self.topic(topic)) for topic in topics]
-        for schema, channel, message in self._reader.iter_messages(topics=wanted):
+        selected = None if topics is None else [self._known(self.topic(topic)) for topic in topics]
+        for schema, channel, message in self._reader.iter_messages(topics=selected):
             time = self._seconds(message.log_time)
             if start is not None and time < start:
                 continue
@@ -215,11 +219,11 @@ def open_record(path: Path | str) -> Iterator[Record]:
     refuse_foreign(path)
     notes: list[str] = []
     with ExitStack() as stack:
-        whole = stack.enter_context(whole_mcap(path, notes))
-        file = stack.enter_context(whole.open("rb"))
+        complete = stack.enter_context(whole_mcap(path, notes))
+        file = stack.enter_context(complete.open("rb"))
         if not _indexed(file):
             copy = Path(stack.enter_context(TemporaryDirectory())) / path.name
-            write_whole(whole, copy, notes)
+            write_whole(complete, copy, notes)
             file = stack.enter_context(copy.open("rb"))
         yield Record(path, make_reader(file), tuple(notes))
 
@@ -292,15 +296,17 @@ def describe_record(record: Record) -> dict[str, Any]:
 def events_of(record: Record) -> list[dict[str, Any]]:
     """Events in their order: time [s], kind, text; words that are no event of ours are passed over."""
     topic = record.topic("events")
-    found = []
+    events = []
     for entry in record.messages([topic]) if topic in record.topics else ():
         try:
             event = json_value(entry.message.data, RecordError, "event")
         except ValueError:
             continue
         if isinstance(event, dict) and "kind" in event:
-            found.append({"time": entry.time, "kind": str(event["kind"]), "text": str(event.get("text", ""))})
-    return found
+            events.append(
+                {"time": entry.time, "kind": str(event["kind"]), "text": str(event.get("text", ""))}
+            )
+    return events
 
 
 # Records played: their messages one after the other, in the time in which they were recorded.
@@ -377,11 +383,11 @@ def info(path: Path, *, as_json: bool = False) -> None:
         RecordError: Not a record.
     """
     with open_record(path) as record:
-        found = describe_record(record)
+        description = describe_record(record)
     if as_json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(description, indent=2))
         return
-    for line in _lines(found):
+    for line in _lines(description):
         print(line)
 
 
@@ -418,24 +424,26 @@ def play_record(
             print(json_line(entry), flush=True)
 
 
-def _lines(found: dict[str, Any]) -> list[str]:
-    about = found["metadata"]
+def _lines(description: dict[str, Any]) -> list[str]:
+    about = description["metadata"]
     lines = [
-        f"{found['file']}: {found['duration_s']:.2f} s, {found['messages']} messages"
+        f"{description['file']}: {description['duration_s']:.2f} s, {description['messages']} messages"
         + (f", vehicle {about['vehicle']} ({about['vehicle_sha256'][:12]})" if "vehicle" in about else "")
     ]
-    lines += [f"  {note}" for note in found["notes"]]
-    told = {k: v for k, v in about.items() if k not in ("vehicle", "vehicle_sha256", "provenance")}
-    lines += [f"  {key}: {value if len(value) <= 90 else value[:90] + ' ...'}" for key, value in told.items()]
-    lines += [f"  keeps {', '.join(found['files'])}"] if found["files"] else []
+    lines += [f"  {note}" for note in description["notes"]]
+    remaining = {k: v for k, v in about.items() if k not in ("vehicle", "vehicle_sha256", "provenance")}
+    lines += [
+        f"  {key}: {value if len(value) <= 90 else value[:90] + ' ...'}" for key, value in remaining.items()
+    ]
+    lines += [f"  keeps {', '.join(description['files'])}"] if description["files"] else []
     lines.append(f"{'topic':36}{'messages':>9}{'rate [Hz]':>11}{'gaps':>6}{'longest [s]':>13}  type")
-    for topic, told_of in found["topics"].items():
+    for topic, topic_info in description["topics"].items():
         lines.append(
-            f"{topic:36}{told_of['messages']:9}{told_of['rate_hz']:11.2f}{told_of['gaps']:6}"
-            f"{told_of['longest_gap_s']:13.2f}  {told_of['type']}"
+            f"{topic:36}{topic_info['messages']:9}{topic_info['rate_hz']:11.2f}{topic_info['gaps']:6}"
+            f"{topic_info['longest_gap_s']:13.2f}  {topic_info['type']}"
         )
-    events = found["events"]
-    start = found["start_s"]
+    events = description["events"]
+    start = description["start_s"]
     lines += [f"{e['time'] - start:10.3f} s  {e['kind']}: {e['text']}" for e in events[:EVENTS_SHOWN]]
     if len(events) > EVENTS_SHOWN:
         lines.append(

@@ -261,8 +261,10 @@ class Recorder:
             "epoch": repr(float(epoch)),
             "provenance": json.dumps(provenance()),
         }
-        given = {k: v if isinstance(v, str) else json.dumps(v, default=str) for k, v in (meta or {}).items()}
-        self._sink.writer.add_metadata(METADATA, {**given, **about})
+        meta_texts = {
+            k: v if isinstance(v, str) else json.dumps(v, default=str) for k, v in (meta or {}).items()
+        }
+        self._sink.writer.add_metadata(METADATA, {**meta_texts, **about})
         for name, text in texts.items():
             self._sink.writer.add_attachment(0, 0, name, "text/plain", text)
         self._sink.start()
@@ -346,9 +348,9 @@ class Recorder:
 
     def aid(self, now: float, aid: NavigationAid) -> None:
         """A fix, velocity or heading of a navigation instrument that came now [s], stamped with its measurement."""
-        made = self._messages.aid(self._ns(now - aid.age), aid)
-        if made is not None:
-            self._put(made[0], self._ns(now), made[1])
+        message = self._messages.aid(self._ns(now - aid.age), aid)
+        if message is not None:
+            self._put(message[0], self._ns(now), message[1])
 
     def policy(self, now: float, pilot: str, **values: Any) -> None:
         """One decision of a controller; fields of `finssim_msgs/PolicyInfo`."""

@@ -82,8 +82,8 @@ class _Monitor:
         if reading is None:
             return
         now = reading.time
-        known = not math.isnan(runtime.started) and reading.ready and runtime.guide is not _SEEN
-        if known and now >= self._next:
+        located = not math.isnan(runtime.started) and reading.ready and runtime.guide is not _SEEN
+        if located and now >= self._next:
             self._next = now + EVERY - 1e-6
             goal = runtime.guide.at(runtime.t)
             turn = float(wrap_angle(quat_yaw(reading.quaternion) - goal.yaw))
@@ -140,41 +140,43 @@ AIDS = {"vision": "position fixes", "velocity": "velocities", "heading": "compas
 """Streams of the filter that a site may have in place of pictures, and what their samples are called."""
 
 
-def _used(told: Mapping[str, Any]) -> dict[str, str]:
+def _used(report: Mapping[str, Any]) -> dict[str, str]:
     """How many pictures became part of the state, and how many of what came in their place."""
     rows = {}
     for stream, name in AIDS.items():
-        verdicts = told["samples"].get(stream)
-        if verdicts and not (stream == "vision" and told["pictures"]):
+        verdicts = report["samples"].get(stream)
+        if verdicts and not (stream == "vision" and report["pictures"]):
             used = sum(n for verdict, n in verdicts.items() if verdict in USED)
             rows[f"{name} used"] = f"{used} of {sum(verdicts.values())}"
-    pictures = {"pictures used": f"{told['fixes']} of {told['pictures']}"}
-    return pictures | rows if told["pictures"] else rows or pictures
+    pictures = {"pictures used": f"{report['fixes']} of {report['pictures']}"}
+    return pictures | rows if report["pictures"] else rows or pictures
 
 
-def show(told: dict[str, Any], console: Console) -> None:
+def show(report: dict[str, Any], console: Console) -> None:
     """Print what `_Monitor.report` told as a table."""
     table = Table(show_header=False, box=None)
-    latency = told["latency_s"]
-    position, yaw = told["position_rms_m"], told["yaw_rms_deg"]
+    latency = report["latency_s"]
+    position, yaw = report["position_rms_m"], report["yaw_rms_deg"]
     off = "no error to a goal is known" if position is None else f"{100.0 * position:.1f} cm, {yaw:.2f} deg"
     rows = {
-        "state": told["state"] + (f": {told['reason']}" if told["reason"] else ""),
-        "time": f"{told['duration_s']:.1f} s",
+        "state": report["state"] + (f": {report['reason']}" if report["reason"] else ""),
+        "time": f"{report['duration_s']:.1f} s",
         f"off the goal, rms of the last {LAST:g} s": off,
-        **_used(told),
-        "decisions missed": f"{told['missed']} of {told['decisions'] + told['missed']}",
-        "late steps": f"{told['overruns']} of {told['steps']}",
+        **_used(report),
+        "decisions missed": f"{report['missed']} of {report['decisions'] + report['missed']}",
+        "late steps": f"{report['overruns']} of {report['steps']}",
         "picture to command": "no picture"
         if latency["p50"] is None
         else f"{1e3 * latency['p50']:.0f} ms, 99 % within {1e3 * latency['p99']:.0f} ms",
-        "faults": "; ".join(told["faults"]) or "none",
+        "faults": "; ".join(report["faults"]) or "none",
     }
-    if "onboard" in told:
-        rows["own sensors"] = ", ".join(f"{name} {count}" for name, count in told["onboard"].items())
-    if "exposure_to_command_s" in told:
-        seen, decided = told["exposure_to_command_s"], told["inference_s"]
-        rows["exposure to command"] = f"{1e3 * seen['p50']:.0f} ms, 99 % within {1e3 * seen['p99']:.0f} ms"
+    if "onboard" in report:
+        rows["own sensors"] = ", ".join(f"{name} {count}" for name, count in report["onboard"].items())
+    if "exposure_to_command_s" in report:
+        figures_of_pictures, decided = report["exposure_to_command_s"], report["inference_s"]
+        rows["exposure to command"] = (
+            f"{1e3 * figures_of_pictures['p50']:.0f} ms, 99 % within {1e3 * figures_of_pictures['p99']:.0f} ms"
+        )
         rows["inference"] = f"{1e3 * decided['p50']:.1f} ms, 99 % within {1e3 * decided['p99']:.1f} ms"
     for name, value in rows.items():
         table.add_row(name, Text(value))
@@ -225,20 +227,22 @@ def run_team(
     """
     from finssim.tasks.observer import fitted_task
 
-    words = task or (read_description(Path(policy)).task if Path(policy).is_dir() else None)
-    if words is None:
+    task_argument = task or (read_description(Path(policy)).task if Path(policy).is_dir() else None)
+    if task_argument is None:
         raise ControlError(f"--team {policy} is a baseline: give its task with --task")
-    agents = fitted_task(words, load_vehicle(vehicle)).agents
+    agents = fitted_task(task_argument, load_vehicle(vehicle)).agents
     if len(agents) < 2:
-        raise ControlError(f"task '{words}' has one agent: run it with --policy {policy}, and --messages")
+        raise ControlError(
+            f"task '{task_argument}' has one agent: run it with --policy {policy}, and --messages"
+        )
     kind, _, address = (POOL_ADDRESS if robot == "pool" else robot).rpartition("//")
     if kind not in ("", "udp:"):
         raise ControlError(
             f"--robot {robot}: a team's motor controllers are at udp://HOST:PORT, ten ports apart"
         )
-    (theirs, port), (host, own) = host_port(address, "--robot"), host_port(bind, "--bind")
+    (theirs, port), (host, own_port) = host_port(address, "--robot"), host_port(bind, "--bind")
     alike = [
-        *("--policy", policy, "--task", words, "--vehicle", vehicle, "--json"),
+        *("--policy", policy, "--task", task_argument, "--vehicle", vehicle, "--json"),
         *("--messages", messages or f"{theirs}:{port + MESSAGES}"),
         *options,
     ]
@@ -248,10 +252,15 @@ def run_team(
         try:
             for i, agent in enumerate(agents):
                 further = APART * i
-                ends = ["--robot", f"udp://{theirs}:{port + further}", "--bind", f"{host}:{own + further}"]
-                kept = [] if record is None else ["--record", str(record / f"{agent}.mcap")]
+                ends = [
+                    "--robot",
+                    f"udp://{theirs}:{port + further}",
+                    "--bind",
+                    f"{host}:{own_port + further}",
+                ]
+                context = [] if record is None else ["--record", str(record / f"{agent}.mcap")]
                 children[agent] = subprocess.Popen(
-                    [sys.executable, "-m", "finssim", "run", "--agent", agent, *ends, *kept, *alike],
+                    [sys.executable, "-m", "finssim", "run", "--agent", agent, *ends, *context, *alike],
                     env=environment,
                     start_new_session=True,  # Ctrl-C reaches us alone, and we tell them once
                     stdout=subprocess.PIPE,
@@ -263,21 +272,21 @@ def run_team(
             for child in children.values():
                 if child.poll() is None:
                     child.send_signal(signal.SIGINT)
-            said = {agent: child.communicate()[0] for agent, child in children.items()}
-    _tell({agent: json.loads(text) if text.strip() else None for agent, text in said.items()}, as_json)
+            outcome = {agent: child.communicate()[0] for agent, child in children.items()}
+    _tell({agent: json.loads(text) if text.strip() else None for agent, text in outcome.items()}, as_json)
     return max(abs(child.returncode) for child in children.values())
 
 
-def _tell(told: dict[str, Any], as_json: bool) -> None:
+def _tell(report: dict[str, Any], as_json: bool) -> None:
     """How each went."""
     if as_json:
-        print(json.dumps(told))
+        print(json.dumps(report))
         return
     console = Console()
-    for agent, one in told.items():
-        console.print(agent if one is not None else f"{agent}: did not run, see above", highlight=False)
-        if one is not None:
-            show(one, console)
+    for agent, result in report.items():
+        console.print(agent if result is not None else f"{agent}: did not run, see above", highlight=False)
+        if result is not None:
+            show(result, console)
 
 
 FAULT = 3
@@ -381,9 +390,9 @@ def run(
             "--mode": mode,
             "--duration": duration,
         }
-        words = [word for name, x in options.items() if x is not None for word in (name, str(x))]
+        tokens = [word for name, x in options.items() if x is not None for word in (name, str(x))]
         return run_team(
-            team, [*words, *(["--arm"] if arm else [])], task=task, vehicle=vehicle, robot=robot, bind=bind,
+            team, [*tokens, *(["--arm"] if arm else [])], task=task, vehicle=vehicle, robot=robot, bind=bind,
             messages=messages, record=record, as_json=as_json,
         )  # fmt: skip
     assert policy is not None
@@ -423,8 +432,8 @@ def run(
         "armed": arm,
     }
     meta |= {"pool_sha256": pool.sha256} if pool else {}
-    kept = recording(record, filed, meta, pool_file=file, lockstep=lockstep)
-    with _opened(connected(wiring, ours, pool), kept) as (drive, recorder):
+    context = recording(record, filed, meta, pool_file=file, lockstep=lockstep)
+    with _opened(connected(wiring, ours, pool), context) as (drive, recorder):
         if not arm:
             console.print("dry run: thrusters will not turn without --arm")
         runtime = Runtime(
@@ -441,11 +450,11 @@ def run(
         with line if console.is_terminal else nullcontext() as monitor.status:
             longest = math.inf if duration is None else duration
             took = drive(runtime, duration=longest, show=look, until=monitor.over)
-    told = monitor.report(runtime, took)
+    report = monitor.report(runtime, took)
     if as_json:
-        print(json.dumps(told))
+        print(json.dumps(report))
     else:
-        show(told, Console())
+        show(report, Console())
     if monitor.state == "fault":
         return FAULT
     return UNHEARD if runtime.counters.steps and not runtime.counters.telemetry else 0

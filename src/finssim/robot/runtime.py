@@ -127,18 +127,18 @@ class Counters:
     def summary(self) -> dict[str, Any]:
         """Totals as plain data; percentiles of the latency [s], None where there was none."""
         names = ("steps", "telemetry", "pictures", "fixes", "decisions", "missed", "overruns")
-        told = {name: getattr(self, name) for name in names} | {"latency_s": _percentiles(self.latencies)}
+        totals = {name: getattr(self, name) for name in names} | {"latency_s": _percentiles(self.latencies)}
         if self.onboard:
-            told["onboard"] = dict(self.onboard)
+            totals["onboard"] = dict(self.onboard)
         if self.sight:
-            told["exposure_to_command_s"] = _percentiles(self.sight)
-            told["inference_s"] = _percentiles(self.inference)
-        return told
+            totals["exposure_to_command_s"] = _percentiles(self.sight)
+            totals["inference_s"] = _percentiles(self.inference)
+        return totals
 
 
 def _percentiles(times: deque[float]) -> dict[str, float | None]:
-    kept = np.array(times)
-    return {f"p{p}": float(np.percentile(kept, p)) if kept.size else None for p in (50, 95, 99)}
+    values = np.array(times)
+    return {f"p{p}": float(np.percentile(values, p)) if values.size else None for p in (50, 95, 99)}
 
 
 # Everything that arrives: decoded, put on the robot's clock, and given to perception, bridge and record.
@@ -361,7 +361,7 @@ class Runtime:
         self.bridge.disarm(now)
         last = [self.link.encode(now, self.bridge.tick(now), self.bridge.state) for _ in range(frames)]
         self._record_events()
-        return [frame for made in last for frame in made]
+        return [frame for frames_of_tick in last for frame in frames_of_tick]
 
     @property
     def t(self) -> float:
@@ -407,8 +407,8 @@ class Runtime:
         if force is None:
             return
         self.counters.decisions += 1
-        seen = [self._exposed(name) for name in getattr(self.pilot, "pictures", ())]
-        self.counters.decided(min(seen, default=math.nan), getattr(self.pilot, "took", math.nan))
+        exposures = [self._exposed(name) for name in getattr(self.pilot, "pictures", ())]
+        self.counters.decided(min(exposures, default=math.nan), getattr(self.pilot, "took", math.nan))
         self.force = self.bridge.command(now, force, self.pilot.name, stamp=reading.time)
         if self.recorder is not None:
             goal = self.guide.at(now - self.started)

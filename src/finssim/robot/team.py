@@ -65,8 +65,8 @@ def decode_track(data: bytes, now: float) -> tuple[str, Track] | None:
     values = np.array(numbers)
     quaternion = values[3:7]
     length = float(np.linalg.norm(quaternion))
-    whole = np.isfinite(values).all() and np.abs(values).max() <= FARTHEST and abs(length - 1.0) < 1e-3
-    if magic != MAGIC or not whole or not 0.0 <= age <= OLDEST:
+    plausible = np.isfinite(values).all() and np.abs(values).max() <= FARTHEST and abs(length - 1.0) < 1e-3
+    if magic != MAGIC or not plausible or not 0.0 <= age <= OLDEST:
         return None
     try:
         name = whose.rstrip(b"\0").decode("utf-8")
@@ -108,8 +108,8 @@ class Team:
                 self.refused += 1
                 continue
             name, track = heard
-            known = self.tracks.get(name)
-            if known is None or track.time > known.time:
+            previous = self.tracks.get(name)
+            if previous is None or track.time > previous.time:
                 self.tracks[name] = track
 
     def known(self, reading: Reading) -> Reading:
@@ -130,5 +130,5 @@ class Team:
         due, _ = self._ticks.due(now, self._period)
         if not due or not np.isfinite(reading.position).all() or not np.isfinite(reading.nu).all():
             return []
-        own = Track(reading.position, reading.quaternion, reading.nu, reading.time)
-        return [encode_track(self.name, own, now)]
+        track = Track(reading.position, reading.quaternion, reading.nu, reading.time)
+        return [encode_track(self.name, track, now)]

@@ -83,10 +83,10 @@ def run_realtime(
             while not interrupted() and (now := clock()) - start < duration:
                 frames = [(now, data) for data in transport.receive()]
                 heard = mates.receive() if mates is not None else ()
-                made = runtime.step(now, frames, pictures.receive(now) if pictures else (), heard)
+                outgoing = runtime.step(now, frames, pictures.receive(now) if pictures else (), heard)
                 # Where the process stood still within the step, what it decided is old; the next step will see that.
                 if clock() - now < runtime.bridge.settings.command_timeout:
-                    for data in made:
+                    for data in outgoing:
                         transport.send(data)
                 for data in runtime.told if mates is not None else ():
                     mates.send(data)
@@ -203,10 +203,10 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[D
             world = stack.enter_context(LockstepClient(_lockstep_address(wiring)))
             clock = 0.0
 
-            def take_turns(runtime: Runtime, **how: Any) -> float:
+            def take_turns(runtime: Runtime, **options: Any) -> float:
                 nonlocal clock
                 runtime.attach(link)
-                began, clock = clock, run_lockstep(runtime, world, start=clock, gentle=True, **how)
+                began, clock = clock, run_lockstep(runtime, world, start=clock, gentle=True, **options)
                 return clock - began
 
             yield take_turns
@@ -220,12 +220,12 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[D
             mates = UdpTransport((host_port(wiring.bind, "--bind")[0], 0), host_port(wiring.team, "--team"))
             stack.callback(mates.close)
 
-        def run(runtime: Runtime, **how: Any) -> float:
+        def run(runtime: Runtime, **options: Any) -> float:
             while transport.receive():
                 pass
             camera.receive(time.monotonic())
             runtime.attach(link)
-            return run_realtime(runtime, transport, camera, mates=mates, **how)
+            return run_realtime(runtime, transport, camera, mates=mates, **options)
 
         yield run
 

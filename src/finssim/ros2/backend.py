@@ -46,15 +46,15 @@ def activate(interfaces: Sequence[Path] = (), *, announce: bool = True) -> Backe
         Ros2Error: `PLATFORM_ROS` asks for what is not there, or a setting of the wire is malformed.
     """
     if not _active:
-        asked = os.environ.get("PLATFORM_ROS", "")
-        if asked not in ("", "native", "dds"):
-            raise Ros2Error(f"PLATFORM_ROS is '{asked}': expected native or dds")
-        missing = "PLATFORM_ROS=dds" if asked == "dds" else _why_not_native()
-        if missing and asked == "native":
+        requested = os.environ.get("PLATFORM_ROS", "")
+        if requested not in ("", "native", "dds"):
+            raise Ros2Error(f"PLATFORM_ROS is '{requested}': expected native or dds")
+        missing = "PLATFORM_ROS=dds" if requested == "dds" else _why_not_native()
+        if missing and requested == "native":
             raise Ros2Error(
                 f"PLATFORM_ROS=native, but rclpy cannot be imported ({missing}): source a ROS 2 first"
             )
-        _active.append(_shim(interfaces, missing) if missing else _native(asked))
+        _active.append(_shim(interfaces, missing) if missing else _native(requested))
         if announce:
             print(f"ROS 2: {_active[0].description}", file=sys.stderr, flush=True)
     return _active[0]
@@ -72,13 +72,13 @@ def _why_not_native() -> str:
     return ""
 
 
-def _native(asked: str) -> Backend:
+def _native(requested: str) -> Backend:
     distro, middleware = (
         os.environ.get("ROS_DISTRO", "unknown"),
         os.environ.get("RMW_IMPLEMENTATION", "default"),
     )
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
-    reason = "PLATFORM_ROS=native" if asked else "it can be imported"
+    reason = "PLATFORM_ROS=native" if requested else "it can be imported"
     return Backend("native", f"rclpy of {distro}, middleware {middleware}, domain {domain} ({reason})")
 
 
@@ -96,8 +96,8 @@ def _shim(interfaces: Sequence[Path], reason: str) -> Backend:
     settings = wire_settings()
     named = [Path(p) for p in os.environ.get("FINSSIM_ROS_INTERFACES", "").split(os.pathsep) if p]
     install([*interfaces, *named])
-    where = f"domain {settings.domain}, {settings.interface}, as {settings.distro.name}"
-    return Backend("dds", f"built-in rclpy over Cyclone DDS, {where} ({reason})")
+    domain_text = f"domain {settings.domain}, {settings.interface}, as {settings.distro.name}"
+    return Backend("dds", f"built-in rclpy over Cyclone DDS, {domain_text} ({reason})")
 
 
 # What lets `import rclpy`, `import nav_msgs.msg` and `import std_srvs.srv` find the shim and the codec's classes.
@@ -176,11 +176,11 @@ class _Types(ModuleType):
         if name.startswith("_") or name not in self.__all__:
             raise AttributeError(f"{self.__name__} has no type '{name}'")
         try:
-            made = self._codec.service(full) if self._kind == "srv" else self._codec.message(full)
+            message_type = self._codec.service(full) if self._kind == "srv" else self._codec.message(full)
         except Ros2Error as error:
             raise AttributeError(str(error)) from None
-        setattr(self, name, made)
-        return made
+        setattr(self, name, message_type)
+        return message_type
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *self.__all__]

@@ -188,10 +188,10 @@ def _without_char(definition: Any) -> Any:
     constants, fields = definition
 
     def plain(described: Any) -> Any:
-        kind, what = described
+        kind, detail = described
         if kind == Nodetype.BASE:
-            return (kind, ("uint8", what[1])) if what[0] == "char" else described
-        return described if kind == Nodetype.NAME else (kind, (plain(what[0]), what[1]))
+            return (kind, ("uint8", detail[1])) if detail[0] == "char" else described
+        return described if kind == Nodetype.NAME else (kind, (plain(detail[0]), detail[1]))
 
     return constants, [(name, plain(described)) for name, described in fields]
 
@@ -258,12 +258,12 @@ def check_of(described: Any, nested: Callable[[str], type]) -> Check:
         described: The field, as rosbags has it.
         nested: Gives the class of a type that is a field.
     """
-    kind, what = described
+    kind, detail = described
     if kind == Nodetype.NAME:
-        return _instance(nested(what))
+        return _instance(nested(detail))
     if kind == Nodetype.BASE:
-        return _base(*what)
-    (inner_kind, inner), count = what
+        return _base(*detail)
+    (inner_kind, inner), count = detail
     fixed = kind == Nodetype.ARRAY
     if inner_kind == Nodetype.BASE and inner[0] in DTYPES:
         return _numbers(inner[0], count, fixed)
@@ -286,12 +286,12 @@ def _base(base: str, bound: int) -> Check:
         return _real(base)
     if base in ("byte", "octet"):
         return _octet
-    wanted = bool if base == "bool" else str
+    expected = bool if base == "bool" else str
 
     def check(value: Any) -> Any:
-        if not isinstance(value, wanted) or (bound and len(value) > bound):
+        if not isinstance(value, expected) or (bound and len(value) > bound):
             limit = f" of at most {bound} characters" if bound else ""
-            raise MessageError(f"expected a {wanted.__name__}{limit}, found {_shown(value)}")
+            raise MessageError(f"expected a {expected.__name__}{limit}, found {_shown(value)}")
         return value
 
     return check
@@ -365,9 +365,9 @@ def _objects(single: Check, count: int, fixed: bool) -> Check:
     return check
 
 
-def _check_count(found: int, count: int, fixed: bool) -> None:
-    if (found != count) if fixed else (count and found > count):
-        raise MessageError(f"expected {'' if fixed else 'at most '}{count} elements, found {found}")
+def _check_count(actual: int, count: int, fixed: bool) -> None:
+    if (actual != count) if fixed else (count and actual > count):
+        raise MessageError(f"expected {'' if fixed else 'at most '}{count} elements, found {actual}")
 
 
 def _shown(value: Any) -> str:
@@ -377,15 +377,15 @@ def _shown(value: Any) -> str:
 
 def spelled(described: Any) -> str:
     """The field's type as ROS 2 spells it in `get_fields_and_field_types`."""
-    kind, what = described
+    kind, detail = described
     if kind == Nodetype.NAME:
-        package, _, short = what.split("/")
+        package, _, short = detail.split("/")
         return f"{package}/{short}"
     if kind == Nodetype.BASE:
-        base, bound = what
-        words = {"bool": "boolean", "float32": "float", "float64": "double", "byte": "octet"}
-        return f"string<{bound}>" if base == "string" and bound else words.get(base, base)
-    inner, count = what
+        base, bound = detail
+        spelling = {"bool": "boolean", "float32": "float", "float64": "double", "byte": "octet"}
+        return f"string<{bound}>" if base == "string" and bound else spelling.get(base, base)
+    inner, count = detail
     if kind == Nodetype.ARRAY:
         return f"{spelled(inner)}[{count}]"
     return f"sequence<{spelled(inner)}, {count}>" if count else f"sequence<{spelled(inner)}>"
@@ -431,8 +431,8 @@ class Message:
 
     def __repr__(self) -> str:
         package, kind, short = self.TYPE.split("/")
-        shown = ", ".join(f"{n}={getattr(self, n)!r}" for n in self._zeros)
-        return f"{package}.{kind}.{short}({shown})"
+        values = ", ".join(f"{n}={getattr(self, n)!r}" for n in self._zeros)
+        return f"{package}.{kind}.{short}({values})"
 
     @classmethod
     def get_fields_and_field_types(cls) -> dict[str, str]:
@@ -473,13 +473,13 @@ def _maker(cls: type[Message], described: Mapping[str, Any]) -> Callable[..., Me
     """Make a message from values that need no check: the slots are set directly, which is several times faster."""
     names = list(described)
     lines = [f"def make({', '.join(f'v{i}' for i in range(len(names)))}):", "    m = new(cls)"]
-    for i, (kind, what) in enumerate(described.values()):
-        kept = f"v{i}"
-        if kind == Nodetype.BASE and what[0] in ("byte", "octet"):
-            kept = f"octet(v{i})"
-        elif kind == Nodetype.SEQUENCE and what[0][0] == Nodetype.BASE and what[0][1][0] in DTYPES:
-            kept = f"v{i}.view(numbers)"
-        lines.append(f"    set{i}(m, {kept})")
+    for i, (kind, detail) in enumerate(described.values()):
+        expression = f"v{i}"
+        if kind == Nodetype.BASE and detail[0] in ("byte", "octet"):
+            expression = f"octet(v{i})"
+        elif kind == Nodetype.SEQUENCE and detail[0][0] == Nodetype.BASE and detail[0][1][0] in DTYPES:
+            expression = f"v{i}.view(numbers)"
+        lines.append(f"    set{i}(m, {expression})")
     scope: dict[str, Any] = {f"set{i}": cls.__dict__[n].__set__ for i, n in enumerate(names)}
     scope |= {"new": object.__new__, "cls": cls, "octet": Octet.of, "numbers": Numbers}
     exec("\n".join([*lines, "    return m"]), scope)
@@ -488,16 +488,16 @@ def _maker(cls: type[Message], described: Mapping[str, Any]) -> Callable[..., Me
 
 def _zero(described: Any, nested: Callable[[str], type[Message]], default: Any) -> Callable[[], Any]:
     """What makes a field's default: zero, empty, or as its definition says."""
-    kind, what = described
+    kind, detail = described
     if default is not None:
         check = check_of(described, nested)
         return lambda: check(default)
     if kind == Nodetype.NAME:
-        cls = nested(what)
+        cls = nested(detail)
         return lambda: cls()
     if kind == Nodetype.BASE:
-        return _base_zero(what[0])
-    (inner_kind, inner), length = what
+        return _base_zero(detail[0])
+    (inner_kind, inner), length = detail
     count = length if kind == Nodetype.ARRAY else 0
     if inner_kind == Nodetype.BASE and inner[0] in DTYPES:
         dtype = DTYPES[inner[0]]
@@ -577,8 +577,8 @@ class Codec:
 
     def names(self, package: str, kind: str) -> list[str]:
         """Short names of a package's types; `kind` is "msg" or "srv"."""
-        found = self.definitions.services if kind == "srv" else self.definitions.known()
-        return sorted(name.rsplit("/", 1)[1] for name in found if name.startswith(f"{package}/{kind}/"))
+        available = self.definitions.services if kind == "srv" else self.definitions.known()
+        return sorted(name.rsplit("/", 1)[1] for name in available if name.startswith(f"{package}/{kind}/"))
 
     def packages(self) -> set[str]:
         """Names of all packages with a type."""

@@ -46,14 +46,14 @@ class Child:
 class Supervisor:
     """Runs the nodes of a plan. Use it as a context: whatever happens, no process is left."""
 
-    def __init__(self, plan: Plan, parameters: Path, say: Callable[[str], None]) -> None:
+    def __init__(self, plan: Plan, parameters: Path, notify: Callable[[str], None]) -> None:
         """
         Args:
             plan: Nodes and namespace.
             parameters: File that `plan.write` wrote.
-            say: Takes a sentence for the person who watches.
+            notify: Takes a sentence for the person who watches.
         """
-        self._plan, self._parameters, self._say = plan, parameters, say
+        self._plan, self._parameters, self._say = plan, parameters, notify
         self.children: list[Child] = []
 
     def __enter__(self) -> Supervisor:
@@ -65,11 +65,11 @@ class Supervisor:
     def start(self, name: str) -> Child:
         """Start a node; it ends with this process even if that is killed."""
         ros = ["--ros-args", "-r", f"__ns:=/{self._plan.namespace}", "--params-file", str(self._parameters)]
-        words = [sys.executable, "-m", "finssim", "ros2", "node", name, *ros]
+        command = [sys.executable, "-m", "finssim", "ros2", "node", name, *ros]
         environment = {**os.environ, PARENT: str(os.getpid())}
         # In a session of its own: Ctrl-C reaches us alone, and the nodes end in our order.
         process = subprocess.Popen(
-            words,
+            command,
             env=environment,
             start_new_session=True,
             stdin=subprocess.DEVNULL if name != "teleop" else None,
@@ -247,7 +247,7 @@ def _wire(plan: Plan, o: Options) -> None:
     plan.set("camera", pictures=camera, pictures_bind=f"{host}:{int(port) + 1}")
 
 
-def up(graph: str, *, options: Options, say: Callable[[str], None] = print) -> int:
+def up(graph: str, *, options: Options, notify: Callable[[str], None] = print) -> int:
     """Start a graph of nodes as processes, print its topics and what happens, and end it with Ctrl-C.
 
     Exit status 1: a node died. 3: the bridge ended in a fault.
@@ -257,7 +257,7 @@ def up(graph: str, *, options: Options, say: Callable[[str], None] = print) -> i
     Args:
         graph (sim|pool|robot): sim (a vehicle of the engine), pool (the virtual pool and a robot in it) or robot.
         options: As the person chose.
-        say: Takes a sentence.
+        notify: Takes a sentence.
 
     Returns:
         Exit status: 0, `DIED` or `FAULT`.
@@ -275,15 +275,17 @@ def up(graph: str, *, options: Options, say: Callable[[str], None] = print) -> i
         plan, parameters = plan_of(graph, options, pool_file), Path(folder) / "parameters.yaml"
         plan.write(parameters)
         for name, topic in topics_of(plan):
-            say(f"  {name}  {topic.type}  {topic.meaning}")
+            notify(f"  {name}  {topic.type}  {topic.meaning}")
         with interruptible() as interrupted:
-            told = plan.parameters["/**"]
-            own = (f"{name}:='{told[name]}'" for name in ("vehicle", "site", "frame_prefix") if name in told)
-            words = [word for setting in own for word in ("-p", setting)]
-            rclpy.init(args=["--ros-args", "-r", f"__ns:=/{plan.namespace}", *words])
+            shared = plan.parameters["/**"]
+            settings = (
+                f"{name}:='{shared[name]}'" for name in ("vehicle", "site", "frame_prefix") if name in shared
+            )
+            arguments = [word for setting in settings for word in ("-p", setting)]
+            rclpy.init(args=["--ros-args", "-r", f"__ns:=/{plan.namespace}", *arguments])
             try:
                 watcher = Watcher(plan.nodes, arm=options.arm)
-                with Supervisor(plan, parameters, say) as nodes:
+                with Supervisor(plan, parameters, notify) as nodes:
                     if graph == "pool":
                         nodes.start("virtual_pool")
                         if not plan.blind:
@@ -291,7 +293,7 @@ def up(graph: str, *, options: Options, say: Callable[[str], None] = print) -> i
                     for name in plan.nodes:
                         if name != "virtual_pool":
                             nodes.start(name)
-                    return _watch(watcher, options, nodes, interrupted, say)
+                    return _watch(watcher, options, nodes, interrupted, notify)
             finally:
                 rclpy.try_shutdown()
 
@@ -312,11 +314,13 @@ def _watch(
     options: Options,
     nodes: Supervisor,
     interrupted: Callable[[], bool],
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
 ) -> int:
     died = False
     if not options.arm:
-        say("disarmed: thrusters will not turn until somebody publishes true on the topic arm, or with --arm")
+        notify(
+            "disarmed: thrusters will not turn until somebody publishes true on the topic arm, or with --arm"
+        )
     end = time.monotonic() + (float("inf") if options.duration is None else options.duration)
     while not interrupted() and time.monotonic() < end:
         watcher.turn(0.2)
@@ -381,13 +385,13 @@ class Plan:
     @property
     def nodes(self) -> tuple[str, ...]:
         """In the order of their start."""
-        left_out = (("localizer",) if self.sees else ("camera", "localizer")) if self.blind else ()
-        return (*(name for name in GRAPHS[self.graph] if name not in left_out), *self.extra)
+        excluded = (("localizer",) if self.sees else ("camera", "localizer")) if self.blind else ()
+        return (*(name for name in GRAPHS[self.graph] if name not in excluded), *self.extra)
 
     def set(self, node: str, **values: Any) -> None:
         """Give parameters; None leaves a node's own default."""
-        known = {name: value for name, value in values.items() if value is not None}
-        self.parameters.setdefault(node, {}).update(known)
+        stated = {name: value for name, value in values.items() if value is not None}
+        self.parameters.setdefault(node, {}).update(stated)
 
     def write(self, path: Path) -> None:
         """The parameters as a ROS 2 parameter file."""
@@ -399,7 +403,7 @@ class Plan:
         path.write_text(yaml.dump(tree, Dumper=_Quoting, sort_keys=False), encoding="utf-8")
 
 
-def run_node(name: str, *words: str) -> int:
+def run_node(name: str, *arguments: str) -> int:
     """Run one node in this process, until Ctrl-C; its parameters come after --ros-args, or from a file there.
 
     Example: finssim ros2 node state_estimation
@@ -407,7 +411,7 @@ def run_node(name: str, *words: str) -> int:
     Args:
         name (NAME): camera, controller, hardware_bridge, localizer, recorder, sim, state_estimation, teleop or
             virtual_pool; after it --ros-args as for any ROS 2 node.
-        words: What follows it on the command line.
+        arguments: What follows it on the command line.
 
     Returns:
         The exit status.
@@ -417,7 +421,7 @@ def run_node(name: str, *words: str) -> int:
     """
     from finssim.quiet import start_warp
 
-    sys.argv = [name, *words]
+    sys.argv = [name, *arguments]
     if name not in NODES:
         raise Ros2Error(f"unknown node '{name}'; available: {', '.join(NODES)}")
     start_warp()

@@ -136,13 +136,13 @@ class Quality:
 LATCHED = Quality(depth=1, transient_local=True)
 
 
-def dds_qos(quality: Quality, user_data: bytes = b"", *, ignore_own: bool = False) -> Qos:
+def dds_qos(quality: Quality, user_data: bytes = b"", *, ignore_local: bool = False) -> Qos:
     """Cyclone's form.
 
     Args:
         quality: The policies.
         user_data: What the endpoint tells its peers, e.g. the hash of its type.
-        ignore_own: For readers: do not match writers of the same process.
+        ignore_local: For readers: do not match writers of the same process.
     """
     history = Policy.History.KeepLast(quality.depth) if quality.depth else Policy.History.KeepAll
     policies = [
@@ -159,7 +159,7 @@ def dds_qos(quality: Quality, user_data: bytes = b"", *, ignore_own: bool = Fals
         policies.append(Policy.Lifespan(round(quality.lifespan * 1e9)))
     if user_data:
         policies.append(Policy.Userdata(user_data))
-    if ignore_own:
+    if ignore_local:
         policies.append(Policy.IgnoreLocal.Participant)
     return Qos(*policies)
 
@@ -210,13 +210,13 @@ class DdsTypes:
             )
         return self._made[name, service]
 
-    def _field(self, kind: Any, what: Any) -> Any:
+    def _field(self, kind: Any, detail: Any) -> Any:
         if kind == Nodetype.NAME:
-            return self.type_of(what)
+            return self.type_of(detail)
         if kind == Nodetype.BASE:
-            base, bound = what
+            base, bound = detail
             return idl.bounded_str[bound] if base == "string" and bound else PRIMITIVES[base]
-        inner, count = what
+        inner, count = detail
         if kind == Nodetype.ARRAY:
             return idl.array[self._field(*inner), count]
         return idl.sequence[self._field(*inner), count] if count else idl.sequence[self._field(*inner)]
@@ -296,10 +296,10 @@ class Writer(Endpoint):
 
     def peers(self) -> list[Any]:
         """What is known of those readers."""
-        found = (
+        matched = (
             self.entity.get_matched_subscription_data(h) for h in self.entity.get_matched_subscriptions()
         )
-        return [peer for peer in found if peer is not None]
+        return [peer for peer in matched if peer is not None]
 
     def incompatible(self) -> str:
         """Name of the policy by which a reader newly turned out not to fit; empty if none did."""
@@ -319,10 +319,10 @@ class Reader(Endpoint):
     def take(self) -> tuple[bytes, Any] | None:
         """The oldest waiting sample, and what DDS says of it; None without one."""
         while True:
-            taken = ddspy_take(self.entity._ref, ANY, 1)
-            if isinstance(taken, int) or not taken:
+            samples = ddspy_take(self.entity._ref, ANY, 1)
+            if isinstance(samples, int) or not samples:
                 return None
-            data, info = taken[0]
+            data, info = samples[0]
             if info.valid_data:  # else only the news that a writer left
                 return data, info
 
@@ -350,8 +350,10 @@ class Reader(Endpoint):
 
     def peers(self) -> list[Any]:
         """What is known of those writers."""
-        found = (self.entity.get_matched_publication_data(h) for h in self.entity.get_matched_publications())
-        return [peer for peer in found if peer is not None]
+        matched = (
+            self.entity.get_matched_publication_data(h) for h in self.entity.get_matched_publications()
+        )
+        return [peer for peer in matched if peer is not None]
 
     def incompatible(self) -> str:
         """Name of the policy by which a writer newly turned out not to fit; empty if none did."""
@@ -639,13 +641,13 @@ class Waiter:
 
     def watch(self, endpoints: Iterable[Endpoint]) -> None:
         """Watch exactly these from now on."""
-        wanted = set(endpoints)
-        for endpoint in self._watched - wanted:
+        required = set(endpoints)
+        for endpoint in self._watched - required:
             if not endpoint.closed:  # DDS itself lets go of a closed one
                 self._each(endpoint, self._set.detach)
-        for endpoint in wanted - self._watched:
+        for endpoint in required - self._watched:
             self._each(endpoint, self._set.attach)
-        self._watched = wanted
+        self._watched = required
 
     def wait(self, timeout: float) -> bool:
         """Sleep at most `timeout` [s]; whether anything happened."""

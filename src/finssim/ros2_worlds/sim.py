@@ -89,12 +89,12 @@ class Sim(RobotNode):
         self.topics.tell(self.time, normalised=normalised)
 
     def _reading(self) -> Reading:
-        place, q, nu = (
+        position, q, nu = (
             np.array(self.sim.numpy(name)[0, 0], float) for name in ("position", "quaternion", "velocity")
         )
-        whole = bool(np.isfinite([*place, *q, *nu]).all())
-        reason = "" if whole else "the simulation has come to grief: reset it"
-        return Reading(self.time, place, q / np.linalg.norm(q), nu, whole, "fresh", reason, np.zeros(7))
+        valid = bool(np.isfinite([*position, *q, *nu]).all())
+        reason = "" if valid else "the simulation has come to grief: reset it"
+        return Reading(self.time, position, q / np.linalg.norm(q), nu, valid, "fresh", reason, np.zeros(7))
 
     def _reset(self) -> None:
         self.sim.place(self.start.position, quat_from_yaw(self.start.yaw))

@@ -37,9 +37,9 @@ class VirtualPoolNode(RobotNode):
 
     def spin(self) -> None:
         """Be the pool until SIGINT or SIGTERM."""
-        own = self.plan["world"] is not None and self._site == "open-water"  # as deep as the world
-        where = {"bind": "127.0.0.1", "site": None if own else self._site, **self.plan}
-        serve(vehicle=self._vehicle_name, **where)
+        world_is_site = self.plan["world"] is not None and self._site == "open-water"  # as deep as the world
+        options = {"bind": "127.0.0.1", "site": None if world_is_site else self._site, **self.plan}
+        serve(vehicle=self._vehicle_name, **options)
 
 
 def _path(text: str) -> Path | None:

@@ -133,7 +133,7 @@ class SensorBatch:
         table = self.parameters.numpy()  # type: ignore[no-untyped-call]
         for name, value in values.items():
             if name not in table.dtype.names:
-                known = ", ".join(table.dtype.names)
-                raise SensorError(f"no {self.kind} parameter '{name}'; available: {known}")
+                available = ", ".join(table.dtype.names)
+                raise SensorError(f"no {self.kind} parameter '{name}'; available: {available}")
             table[name][:, vehicle] = value
         self.parameters.assign(table)  # type: ignore[no-untyped-call]

@@ -182,16 +182,16 @@ def arrival(sampling: Sampling, w: int, v: int, step: int, restarting: bool) -> 
         step: Control steps since the reset.
         restarting: The sample taken at a reset arrives at once, as if the sensor had been running before.
     """
-    taken = step
+    sampled = step
     if not restarting:
-        taken = step - sampling.timing[v].latency
-    if taken < 0:
+        sampled = step - sampling.timing[v].latency
+    if sampled < 0:
         return -1
-    slot = slot_of(sampling, taken)
+    slot = slot_of(sampling, sampled)
     if not sampling.sent[w, v, slot]:
         return -1
     sampling.sent[w, v, slot] = False
-    sampling.stamp[w, v] = float(taken) * sampling.control_step
+    sampling.stamp[w, v] = float(sampled) * sampling.control_step
     sampling.fresh[w, v] = True
     return slot
 

@@ -102,7 +102,7 @@ class SensorSuite:
             return kind(entries, worlds, control_step, seed, device) if any(entries) else None
 
         self.by_kind: dict[str, SensorBatch] = {
-            name: made for name, kind in KINDS.items() if (made := batch(kind)) is not None
+            name: batch_of_kind for name, kind in KINDS.items() if (batch_of_kind := batch(kind)) is not None
         }
         """The kinds of sensor that at least one vehicle has, one's own among them."""
         for name in ("imu", "depth", "dvl", "compass"):
@@ -113,10 +113,10 @@ class SensorSuite:
                 density=vehicle.water.density if density is None else density,
                 floor_depth=math.inf if floor_depth is None else floor_depth,
             )
-            for name, made in self.by_kind.items():
+            for name, batch_of_kind in self.by_kind.items():
                 entry = getattr(vehicle.sensors, name, None)
                 if entry is not None:
-                    made.use(v, entry, site)
+                    batch_of_kind.use(v, entry, site)
 
     @property
     def batches(self) -> tuple[SensorBatch, ...]:

@@ -98,9 +98,9 @@ class WrenchPid:
         """Empty integrals."""
         return self.pid.reset(n)
 
-    def command(self, memory: PidMemory, seen: Measured, goal: Goal) -> tuple[Rows, PidMemory]:
+    def command(self, memory: PidMemory, measured: Measured, goal: Goal) -> tuple[Rows, PidMemory]:
         """Actions (n, 6), as parts of each axis' limit within ±1, and the memory after."""
-        tau, memory = self.pid.command(memory, seen, goal)
+        tau, memory = self.pid.command(memory, measured, goal)
         return part_of_limits(tau, np.asarray(self.pid.wrench_limits)), memory
 
 
@@ -119,9 +119,9 @@ class StationPid(WrenchPid):
 
     def act(self, memory: PidMemory, observation: Rows) -> tuple[Rows, PidMemory]:
         """Actions for observations of T1."""
-        seen = seen_from_goal(observation)
-        here = Goal(np.zeros_like(seen.position), np.broadcast_to(LEVEL, seen.quaternion.shape))
-        return self.command(memory, seen, here)
+        measured = seen_from_goal(observation)
+        here = Goal(np.zeros_like(measured.position), np.broadcast_to(LEVEL, measured.quaternion.shape))
+        return self.command(memory, measured, here)
 
 
 def seen_from_goal(observation: Rows) -> Track:
@@ -252,9 +252,9 @@ class DriveBaseline:
     def act(self, memory: None, observation: Rows) -> tuple[Rows, None]:
         """Actions for observations, (n, numbers)."""
         o = np.asarray(observation, dtype=float)
-        wanted, turn = self.wanted(o)
+        target, turn = self.wanted(o)
         velocity = np.column_stack([o[:, 0:3], o[:, 5]])
-        action = self.drive.action(velocity, np.column_stack([wanted, self.drive.turned(turn)]))
+        action = self.drive.action(velocity, np.column_stack([target, self.drive.turned(turn)]))
         action[np.abs(turn) > self.turn_first, :2] = 0.0
         return action, None
 
@@ -281,12 +281,12 @@ class LeadPursuit(DriveBaseline):
 
     def wanted(self, o: Array) -> tuple[Array, Array]:
         """See `DriveBaseline`."""
-        own, gap, relative = o[:, 0:3], CHASE_SCALE * o[:, 6:9], o[:, 9:12]
+        velocity, gap, relative = o[:, 0:3], CHASE_SCALE * o[:, 6:9], o[:, 9:12]
         aim = gap + self.lead * relative
         distance = np.maximum(np.linalg.norm(gap, axis=1, keepdims=True), 1e-6)
-        wanted = own + relative + self.approach * (distance - self.stand_off) * aim / distance
+        target = velocity + relative + self.approach * (distance - self.stand_off) * aim / distance
         top = np.array([self.drive.top, *self.drive.terminal[1:3]])
-        return np.clip(wanted, -top, top), np.arctan2(aim[:, 1], aim[:, 0])
+        return np.clip(target, -top, top), np.arctan2(aim[:, 1], aim[:, 0])
 
 
 # The classical controller of formation keeping: a consensus on the shape, and a state machine for where to go.
@@ -386,13 +386,13 @@ class FormationPursuit(DriveBaseline):
 
     def wanted(self, o: Array) -> tuple[Array, Array]:
         """See `DriveBaseline`; of observations (n, 30)."""
-        wanted = o[:, 0:3] + o[:, 9:12] + self.gain * self.places(o)
+        target = o[:, 0:3] + o[:, 9:12] + self.gain * self.places(o)
         # Faster than the vehicle goes is the same direction as fast as it goes.
-        level = np.maximum(np.linalg.norm(wanted[:, :2], axis=1, keepdims=True) / self.drive.top, 1.0)
-        wanted[:, :2] /= level
-        wanted[:, 2] = np.clip(wanted[:, 2], -self.drive.terminal[2], self.drive.terminal[2])
-        moving = np.linalg.norm(wanted[:, :2], axis=1) > 0.05
-        return wanted, np.where(moving, np.arctan2(wanted[:, 1], wanted[:, 0]), 0.0)
+        level = np.maximum(np.linalg.norm(target[:, :2], axis=1, keepdims=True) / self.drive.top, 1.0)
+        target[:, :2] /= level
+        target[:, 2] = np.clip(target[:, 2], -self.drive.terminal[2], self.drive.terminal[2])
+        moving = np.linalg.norm(target[:, :2], axis=1) > 0.05
+        return target, np.where(moving, np.arctan2(target[:, 1], target[:, 0]), 0.0)
 
 
 # The classical way into a dock: come before its mouth, turn to it, and go in as far as the nose is on the axis.
@@ -466,11 +466,11 @@ class DockingPid(WrenchPid):
             nu: Twist, body frame [m/s, rad/s], (n, 6).
         """
         arm = np.array([self.nose, 0.0, 0.0])
-        place = np.zeros_like(nose)
-        place[..., 0] = self._ahead(nose, quat_rotate(q, [1.0, 0.0, 0.0]))
+        aim = np.zeros_like(nose)
+        aim[..., 0] = self._ahead(nose, quat_rotate(q, [1.0, 0.0, 0.0]))
         level = np.broadcast_to(LEVEL, q.shape)
-        seen = Track(nose - quat_rotate(q, arm), q, nu)
-        return self.command(memory, seen, Goal(place - arm, level))
+        track = Track(nose - quat_rotate(q, arm), q, nu)
+        return self.command(memory, track, Goal(aim - arm, level))
 
     def _ahead(self, nose: Array, forward: Array) -> Array:
         """Where on the axis the nose is to go next [m], (n,), from where it is and points, dock axes, (n, 3)."""
@@ -547,18 +547,20 @@ class LightServo(DockingPid):
         dock = memory.dock.copy()
         dock[fresh, 2] = position[fresh, 2]
         bearing, heading, visible = self.measure(next(iter(pictures.values())), up)
-        found = np.column_stack([position + quat_rotate(q, bearing + self.eye), memory.heading + heading])
-        looks = memory.looks + visible
-        share = np.where(visible, 1.0 / np.clip(looks, 1.0, 12.0), 0.0)[:, None]
-        dock += share * np.where(visible[:, None], found - dock, 0.0)
+        measured_dock = np.column_stack(
+            [position + quat_rotate(q, bearing + self.eye), memory.heading + heading]
+        )
+        count = memory.looks + visible
+        share = np.where(visible, 1.0 / np.clip(count, 1.0, 12.0), 0.0)[:, None]
+        dock += share * np.where(visible[:, None], measured_dock - dock, 0.0)
         q_dock = quat_from_yaw(dock[:, 3])
-        throat = dock[:, :3] + quat_rotate(q_dock, [self.before, 0.0, 0.0]) * (looks > 0.0)[:, None]
+        throat = dock[:, :3] + quat_rotate(q_dock, [self.before, 0.0, 0.0]) * (count > 0.0)[:, None]
         nose = position + quat_rotate(q, [self.nose, 0.0, 0.0]) - throat
         own = quat_multiply(quat_conjugate(q_dock), q)
         action, pid = self.steer(memory.pid, quat_rotate(quat_conjugate(q_dock), nose), own, nu)
         moved = position + self.period * quat_rotate(q, nu[:, :3])
         turned = memory.heading + self.period * heading_rate(up, nu)
-        return action, SightMemory(moved, turned, dock, looks, pid)
+        return action, SightMemory(moved, turned, dock, count, pid)
 
     def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, Mask]:
         """The square of lights in pictures.
@@ -580,10 +582,10 @@ class LightServo(DockingPid):
             count = np.maximum(lit.sum((1, 2)), 1)
             middle = (lit * columns).sum((1, 2)) / count
             for side in (columns < middle[:, None, None], columns > middle[:, None, None]):
-                own = lit & side
-                number = np.maximum(own.sum((1, 2)), 1)
-                corners.append([(own * grid).sum((1, 2)) / number for grid in (columns, rows)])
-                visible &= own.any((1, 2))
+                of_side = lit & side
+                number = np.maximum(of_side.sum((1, 2)), 1)
+                corners.append([(of_side * grid).sum((1, 2)) / number for grid in (columns, rows)])
+                visible &= of_side.any((1, 2))
         return self.locate(np.array(corners), visible, red.shape[1:])
 
     def locate(self, corners: Array, visible: Mask, shape: Sequence[int]) -> tuple[Array, Array, Mask]:
@@ -599,12 +601,12 @@ class LightServo(DockingPid):
         """
         x, y = np.moveaxis(corners, 1, 0)
         focal = self.focal_share * shape[1]
-        left, right = (focal * self.side / np.maximum(y[i + 2] - y[i], 0.5) for i in (0, 1))
+        y0, right = (focal * self.side / np.maximum(y[i + 2] - y[i], 0.5) for i in (0, 1))
         visible = visible & (y[2] - y[0] > 3.0) & (y[3] - y[1] > 3.0) & (x[1] - x[0] > 3.0)
-        ahead = 0.5 * (left + right)
+        ahead = 0.5 * (y0 + right)
         aside = (0.5 * (shape[1] - 1) - x.mean(0)) / focal
         above = (0.5 * (shape[0] - 1) - y.mean(0)) / focal
-        heading = np.arcsin(np.clip((right - left) / self.side, -0.7, 0.7))
+        heading = np.arcsin(np.clip((right - y0) / self.side, -0.7, 0.7))
         return ahead[:, None] * np.column_stack([np.ones_like(aside), aside, above]), heading, visible
 
 
@@ -658,8 +660,8 @@ class PostServo(LightServo):
             visible &= (total > self.least) & (top > 0) & (foot < height - 1)
             column = (share * near).sum(1) / np.maximum(total, 1e-9)
             ends.append([[column, top - 0.5], [column, foot + 0.5]])
-        (left, right) = ends
-        return self.locate(np.array([left[0], right[0], left[1], right[1]]), visible, (height, width))
+        (first, right) = ends
+        return self.locate(np.array([first[0], right[0], first[1], right[1]]), visible, (height, width))
 
 
 # Following a pipeline the classical way: a line through what is yellower than its surroundings, and steer along it.
@@ -712,7 +714,7 @@ class LineFollower(DriveBaseline):
         share = np.where(enough, 1.0 - self.memory_share, 0.0)[:, None]
         line = memory + share * (line - memory)
         turn = np.arctan(line[:, 1] + 0.5 * line[:, 0])
-        wanted = np.column_stack(
+        target = np.column_stack(
             [
                 self.cruise * np.clip(1.5 - 1.5 * np.abs(turn), 0.2, 1.0),
                 np.clip(self.gain * line[:, 0], -0.1, 0.1),
@@ -720,7 +722,7 @@ class LineFollower(DriveBaseline):
                 self.drive.turned(turn),
             ]
         )
-        return self.drive.action(o[:, [3, 4, 5, 8]], wanted), line
+        return self.drive.action(o[:, [3, 4, 5, 8]], target), line
 
     def line(self, picture: NDArray[np.uint8], up: Array, above: Array) -> tuple[Array, Mask]:
         """The pipe in pictures.
@@ -856,7 +858,7 @@ class WallFollower(DriveBaseline):
         slant = self.height + RANGE_SCALE * o[:, 9] + self.tube
         above = np.sqrt(np.maximum(slant**2 - away**2, 0.0)) + self.under - self.height
         towards = np.clip(self.gain * (away - self.distance), -0.15, 0.15)
-        wanted = np.column_stack(
+        target = np.column_stack(
             [
                 towards * np.cos(turn) - self.speed * np.sin(turn),
                 towards * np.sin(turn) + self.speed * np.cos(turn),
@@ -864,7 +866,7 @@ class WallFollower(DriveBaseline):
                 self.drive.turned(turn),
             ]
         )
-        return self.drive.action(o[:, [3, 4, 5, 8]], wanted), memory
+        return self.drive.action(o[:, [3, 4, 5, 8]], target), memory
 
     def nearest(self, picture: NDArray[np.uint8], before: Array) -> tuple[Array, Mask]:
         """The net in pings.
@@ -1060,7 +1062,7 @@ class Agent(Protocol):
     def reset(self, n: int) -> Any:
         """Memory before the first of n episodes' actions: arrays with n rows, in tuples; or None."""
 
-    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[Rows, Any]:
+    def act(self, memory: Any, reading: Known, goal: Goal) -> tuple[Rows, Any]:
         """Actions (n, size) and the memory after."""
 
     def describe(self) -> dict[str, Any]:
@@ -1085,8 +1087,8 @@ class PolicyAgent:
             PolicyError, ControlError: It was trained for another vehicle, task, observation or other limits.
         """
         schema = task.schema.model_dump(mode="json")
-        known = {"name": task.name, "observation": schema}
-        policy = Policy.load(directory, vehicle=vehicle, task=known, control_period=period)
+        task_data = {"name": task.name, "observation": schema}
+        policy = Policy.load(directory, vehicle=vehicle, task=task_data, control_period=period)
         mode = mode_from_dict(policy.description.action, vehicle)
         self.period = policy.description.control_period
         self.action = mode.name
@@ -1098,9 +1100,9 @@ class PolicyAgent:
         """Memory of the policy, if it has one."""
         return self.policy.reset(n)
 
-    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[Rows, Any]:
+    def act(self, memory: Any, reading: Known, goal: Goal) -> tuple[Rows, Any]:
         """Actions for the environment's observations, a row for each agent of each world."""
-        return self.policy.step(memory, known.observation, known.pictures)
+        return self.policy.step(memory, reading.observation, reading.pictures)
 
     def describe(self) -> dict[str, Any]:
         """Name, network, and what it was trained in."""
@@ -1134,9 +1136,9 @@ class PidAgent:
         """Memory before the first of n episodes' actions: empty integrals."""
         return self.controller.reset(n)
 
-    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[Rows, Any]:
+    def act(self, memory: Any, reading: Known, goal: Goal) -> tuple[Rows, Any]:
         """Wrench of each world, as a part of the limits; more than a limit is limited axis by axis."""
-        tau, memory = self.controller.command(memory, known, goal)
+        tau, memory = self.controller.command(memory, reading, goal)
         return part_of_limits(tau, self._limits), memory
 
     def describe(self) -> dict[str, Any]:
@@ -1155,10 +1157,10 @@ class BaselineAgent(PidAgent):
         self.controller = baseline(task.name, name, vehicle)
         self.period = self.controller.period
 
-    def act(self, memory: Any, known: Known, goal: Goal) -> tuple[Rows, Any]:
+    def act(self, memory: Any, reading: Known, goal: Goal) -> tuple[Rows, Any]:
         """Actions, a row for each agent of each world."""
-        seen = () if known.pictures is None else (known.pictures,)
-        action, memory = self.controller.act(memory, known.observation, *seen)
+        pictures = () if reading.pictures is None else (reading.pictures,)
+        action, memory = self.controller.act(memory, reading.observation, *pictures)
         return np.clip(action / self.scale, -1.0, 1.0).astype(np.float32), memory
 
 
@@ -1205,8 +1207,8 @@ def expert_for(
         AgentError: There is neither, or it acts in another mode than `action`.
         PolicyError: The policy was trained for another vehicle or task.
     """
-    known = BASELINES.get(task.name, {})
-    if str(name_or_directory) in known:
+    baselines = BASELINES.get(task.name, {})
+    if str(name_or_directory) in baselines:
         if action != task.action:
             raise AgentError(
                 f"baseline '{name_or_directory}' acts by {task.action}, expected {action}: leave --action out"
@@ -1215,7 +1217,7 @@ def expert_for(
     if not (Path(name_or_directory) / DESCRIPTION_FILE).is_file():
         raise AgentError(
             f"expert '{name_or_directory}' is neither a policy directory nor a baseline of task '{task.name}'; "
-            f"baselines: {', '.join(known) or 'none'}"
+            f"baselines: {', '.join(baselines) or 'none'}"
         )
     expert = PolicyAgent(name_or_directory, vehicle, task)
     if expert.action != action:

@@ -81,7 +81,7 @@ def check_task(
     otherwise[:EPISODE] *= -1.0
     past = _play(environment(WORLDS), otherwise)
 
-    found = [
+    mistakes = [
         *_observation(first, short, env.agents),
         *_ends(first),
         *_repeats(first, again, many),
@@ -89,8 +89,8 @@ def check_task(
         *_starts(first),
         *_metrics(first),
     ]
-    if found:
-        raise TaskError(f"task '{task.name}': " + "; ".join(found))
+    if mistakes:
+        raise TaskError(f"task '{task.name}': " + "; ".join(mistakes))
 
 
 def _play(environment: Environment, actions: NDArray[np.float32]) -> Played:

@@ -134,8 +134,8 @@ def send(state: State, arrays: TaskArrays, w: int, b: int, step: int):
     for a in range(agents):
         way = wp.length(state.position[w, a] - state.position[w, b])
         delay = (way / m.speed_of_sound + m.processing) / m.control_step
-        own = wp.rand_init(wp.randi(wp.rand_init(m.key[w], w)), (step * agents + b) * agents + a)
-        lost = wp.randf(own) < m.loss
+        sender_state = wp.rand_init(wp.randi(wp.rand_init(m.key[w], w)), (step * agents + b) * agents + a)
+        lost = wp.randf(sender_state) < m.loss
         m.arrival[w, k, a] = wp.where(lost or a == b, -1, step + int(wp.ceil(delay - 1.0e-3)))
 
 

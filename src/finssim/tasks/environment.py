@@ -144,7 +144,10 @@ class Environment:
         self.nominal = vehicles if nominal is None else crew(nominal, task, self.action_mode)
         refuse_other_thrusters(vehicles, self.nominal)
         self.task = task = task.fitted(self.nominal)
-        longest = max((t.delay for one in vehicles for t in one.thrusters.values()), default=0.0)
+        longest = max(
+            (t.delay for vehicle_of_world in vehicles for t in vehicle_of_world.thrusters.values()),
+            default=0.0,
+        )
         extra = randomization.simulator_arguments(longest, tether) if randomization else {"tether": tether}
         self.simulator = Simulator(
             vehicles, worlds=worlds, hydrodynamics=hydrodynamics, control_step=task.control_step,
@@ -204,15 +207,15 @@ class Environment:
                 "privileged numbers are what is drawn: give randomization, or leave privileged out"
             )
         if privileged and randomization is not None:
-            most = max(len(vehicle.thrusters) for vehicle in self.simulator.vehicles)
-            self.privileged_names = randomization.told(most)
+            max_thrusters = max(len(vehicle.thrusters) for vehicle in self.simulator.vehicles)
+            self.privileged_names = randomization.told(max_thrusters)
         shape, arrays = (self.worlds, self.agents * len(self.privileged_names)), self.arrays
         for name in ("privileged", "final_privileged"):
             setattr(arrays, name, wp.zeros(shape, dtype=wp.float32, device=self.device))
         if randomization is None:
             return
-        told = (arrays.privileged, arrays.final_privileged) if privileged else None
-        self.draws = randomization.draws(self.simulator, self._seen, agents=self.agents, privileged=told)
+        outputs = (arrays.privileged, arrays.final_privileged) if privileged else None
+        self.draws = randomization.draws(self.simulator, self._seen, agents=self.agents, privileged=outputs)
         if randomization.ranges.curriculum is not None:
             self.schedule = Schedule(randomization.ranges.curriculum, self.draws, self.task)
 
@@ -228,8 +231,8 @@ class Environment:
             self.task.add_command(self._step, batch)
         # Controllers know the nominal limits and allocation; what the simulated thrusters deliver may differ. What the
         # task commands is in parts of all of the limits, however gently the agents are to act.
-        own = self.wrench_scale if MODES[self.action_mode].wrench else 1.0
-        scales = [own if v < self.agents else 1.0 for v in range(len(self.nominal))]
+        agent_scale = self.wrench_scale if MODES[self.action_mode].wrench else 1.0
+        scales = [agent_scale if v < self.agents else 1.0 for v in range(len(self.nominal))]
         modes = mode_data(self.action_mode, self.nominal, scales, self.device)
         command = self.simulator.command.array
         self._step.add(act, [self.arrays, command, modes, self.agents], vehicles=len(self.nominal))
@@ -292,9 +295,9 @@ class Environment:
                 self.sight.restart(self.seed, None if mask is None else np.asarray(mask, dtype=bool))
             if mask is None and self.schedule is not None:
                 self.schedule.restart()
-        where = np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
-        self._mask.assign(where)
-        self._begin(self._start, where != 0)
+        starts = np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
+        self._mask.assign(starts)
+        self._begin(self._start, starts != 0)
         return self._observed("")
 
     def _begin(self, pipeline: Pipeline, mask: NDArray[np.bool_]) -> None:
@@ -373,8 +376,8 @@ class Environment:
                 if self.auto_reset:
                     self._begin(self._restart, ended)
         # On a GPU the look costs a copy, so frozen worlds wait there for a while, reported as terminated meanwhile.
-        look = self.device.is_cpu or self._steps % GPU_FROZEN_CHECK == 0
-        if look and self.simulator.state.frozen.numpy().any():
+        inspect = self.device.is_cpu or self._steps % GPU_FROZEN_CHECK == 0
+        if inspect and self.simulator.state.frozen.numpy().any():
             self._revive()
 
     def set_progress(self, done: float) -> None:
@@ -473,11 +476,11 @@ def refuse_other_thrusters(vehicles: Sequence[Vehicle], nominal: Sequence[Vehicl
     Raises:
         EnvironmentSetupError: They differ in number, name or order.
     """
-    for one, known in zip(vehicles, nominal, strict=True):
-        if one.thruster_names != known.thruster_names:
+    for vehicle, expected in zip(vehicles, nominal, strict=True):
+        if vehicle.thruster_names != expected.thruster_names:
             raise EnvironmentSetupError(
-                f"{one.name} has thrusters {', '.join(one.thruster_names)}, "
-                f"expected those that its controller commands: {', '.join(known.thruster_names)}"
+                f"{vehicle.name} has thrusters {', '.join(vehicle.thruster_names)}, "
+                f"expected those that its controller commands: {', '.join(expected.thruster_names)}"
             )
 
 
@@ -501,8 +504,8 @@ def checked_action(action: ArrayLike, worlds: int, agents: int, size: int) -> ND
     a = np.asarray(action, dtype=np.float32)
     expected = (worlds, size) if agents == 1 else (worlds, agents, size)
     if a.shape != expected:
-        who = "world" if agents == 1 else "agent"
-        raise EnvironmentSetupError(f"action has shape {a.shape}, expected {expected}: one row per {who}")
+        row_of = "world" if agents == 1 else "agent"
+        raise EnvironmentSetupError(f"action has shape {a.shape}, expected {expected}: one row per {row_of}")
     a = a.reshape(worlds, -1)
     if not np.isfinite(a).all():
         world = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])

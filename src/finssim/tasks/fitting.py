@@ -62,9 +62,9 @@ def authority(vehicle: Vehicle) -> Array:
     gains are learnt that ring on estimates, which lag.
     """
     limits = np.asarray(vehicle.wrench_limits)
-    most = np.array([ACCELERATION * room(vehicle.body.size)] * 3 + [TURNING] * 3)
+    limit = np.array([ACCELERATION * room(vehicle.body.size)] * 3 + [TURNING] * 3)
     inertia = axis_model(vehicle, coefficients_of(vehicle)).inertia
-    return np.asarray(np.minimum(1.0, np.divide(most * inertia, limits, out=np.ones(6), where=limits > 0.0)))
+    return np.asarray(np.minimum(1.0, np.divide(limit * inertia, limits, out=np.ones(6), where=limits > 0.0)))
 
 
 def driven_axes(vehicle: Vehicle) -> tuple[int, ...]:
@@ -76,7 +76,7 @@ def driven_axes(vehicle: Vehicle) -> tuple[int, ...]:
 
 def coefficients_of(vehicle: Vehicle) -> str:
     """Name of the hydrodynamic set whose coefficients stand for the vehicle: the calibrated one, if its file has it."""
-    sets = [name for name, one in vehicle.hydrodynamics.items() if isinstance(one, HydrodynamicSet)]
+    sets = [name for name, model in vehicle.hydrodynamics.items() if isinstance(model, HydrodynamicSet)]
     return sets[0] if sets and "calibrated" not in sets else "calibrated"
 
 

@@ -80,8 +80,8 @@ def triangle_distance(x: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
         return wp.length(x - a - (d2 / (d2 - d6)) * ac)
     if va <= 0.0 and d4 >= d3 and d5 >= d6:
         return wp.length(x - b - ((d4 - d3) / ((d4 - d3) + (d5 - d6))) * (c - b))
-    whole = va + vb + vc
-    return wp.length(x - a - (vb / whole) * ab - (vc / whole) * ac)
+    total = va + vb + vc
+    return wp.length(x - a - (vb / total) * ab - (vc / total) * ac)
 
 
 @wp.func
@@ -91,8 +91,8 @@ def sorted_edges(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
     bc = wp.length(c - b)
     ca = wp.length(a - c)
     least = wp.min(ab, wp.min(bc, ca))
-    most = wp.max(ab, wp.max(bc, ca))
-    return wp.vec3(least, ab + bc + ca - least - most, most)
+    longest = wp.max(ab, wp.max(bc, ca))
+    return wp.vec3(least, ab + bc + ca - least - longest, longest)
 
 
 @wp.func
@@ -272,10 +272,10 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     turn = wp.randf(rng, -PI, PI)
     away = p.spawn_radius * wp.sqrt(wp.randf(rng)) * level_direction(wp.randf(rng, -PI, PI))
     middle = wp.vec3(away[0], away[1], wp.randf(rng, p.low, p.high))
-    most = wp.vec3(p.jitter, p.jitter, p.jitter)
+    bound = wp.vec3(p.jitter, p.jitter, p.jitter)
     for a in range(AGENTS):
         angle = turn + float(a) * 2.0 * PI / 3.0
-        shift = uniform3(wp.rand_init(wp.randi(rng)), -most, most)
+        shift = uniform3(wp.rand_init(wp.randi(rng)), -bound, bound)
         x = middle + p.side / wp.sqrt(3.0) * level_direction(angle) + shift
         place_at_rest(state, w, a, x, angle + wp.randf(rng, -0.5, 0.5))
     target = away_from(p, wp.rand_init(wp.randi(rng)), middle)

@@ -63,11 +63,11 @@ def clearance(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) 
     """Between the vehicle's envelope and the nearest bar [m]; negative where it touches."""
     q = wp.quat_inverse(arrays.goal_quaternion[w]) * state.quaternion[w, 0]
     foot = wp.quat_rotate_inv(q, wp.vec3(0.0, HALF, -HALF) - place)
-    left = wp.quat_rotate_inv(q, wp.vec3(0.0, HALF, HALF) - place)
+    port_top = wp.quat_rotate_inv(q, wp.vec3(0.0, HALF, HALF) - place)
     right = wp.quat_rotate_inv(q, wp.vec3(0.0, -HALF, HALF) - place)
     other = wp.quat_rotate_inv(q, wp.vec3(0.0, -HALF, -HALF) - place)
-    posts = wp.min(from_bar(foot, left, p.half), from_bar(other, right, p.half))
-    return wp.min(posts, from_bar(left, right, p.half))
+    posts = wp.min(from_bar(foot, port_top, p.half), from_bar(other, right, p.half))
+    return wp.min(posts, from_bar(port_top, right, p.half))
 
 
 @wp.func

@@ -20,26 +20,29 @@ def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: s
         EnvironmentSetupError: Another number than the task has places, a vehicle with too few controlled axes, or
             thrusters that do not fit the action mode.
     """
-    given = [vehicle] * len(task.vehicles) if isinstance(vehicle, Vehicle | str) else list(vehicle)
-    if len(given) != len(task.vehicles):
+    stated = [vehicle] * len(task.vehicles) if isinstance(vehicle, Vehicle | str) else list(vehicle)
+    if len(stated) != len(task.vehicles):
         names = ", ".join(task.vehicles)
         raise EnvironmentSetupError(
-            f"{len(given)} vehicles are given, expected {len(task.vehicles)} for task '{task.name}': {names}"
+            f"{len(stated)} vehicles are given, expected {len(task.vehicles)} for task '{task.name}': {names}"
         )
-    vehicles = [one if isinstance(one, Vehicle) else load_vehicle(one) for one in given]
-    for one in vehicles:
-        missing = [axis for axis in task.needs if axis not in one.controlled_axes]
+    vehicles = [
+        vehicle_or_name if isinstance(vehicle_or_name, Vehicle) else load_vehicle(vehicle_or_name)
+        for vehicle_or_name in stated
+    ]
+    for vehicle_or_name in vehicles:
+        missing = [axis for axis in task.needs if axis not in vehicle_or_name.controlled_axes]
         if missing:
             raise EnvironmentSetupError(
-                f"vehicle '{one.name}' does not control {', '.join(missing)}, which task '{task.name}' needs: its "
-                f"thrusters control {', '.join(one.controlled_axes)}; take another vehicle"
+                f"vehicle '{vehicle_or_name.name}' does not control {', '.join(missing)}, which task '{task.name}' "
+                f"needs: its thrusters control {', '.join(vehicle_or_name.controlled_axes)}; take another vehicle"
             )
     if mode == "thruster8" and task.others:
         raise EnvironmentSetupError(
             f"actions of task '{task.name}' are by thruster, expected wrench4 or wrench6: {', '.join(task.others)} is "
             "commanded by wrench"
         )
-    counts = {len(one.thrusters) for one in vehicles}
+    counts = {len(vehicle_or_name.thrusters) for vehicle_or_name in vehicles}
     if mode == "thruster8" and len(counts) > 1:
         raise EnvironmentSetupError(
             f"vehicles have {', '.join(map(str, sorted(counts)))} thrusters, expected equal numbers for actions by "

@@ -45,75 +45,76 @@ TASKS: dict[str, type[Task]] = {
 # Tasks of one's own by name: `path/to/file.py:ClassName`, or `package.module:ClassName` of what Python can import.
 
 
-def own_task(words: str, **settings: Any) -> Task:
+def own_task(reference: str, **settings: Any) -> Task:
     """The task that a class (or any other callable) of a file or module makes.
 
     Args:
-        words: FILE.py:NAME or MODULE:NAME.
+        reference: FILE.py:NAME or MODULE:NAME.
         settings: Its arguments.
 
     Raises:
         EnvironmentSetupError: There is no such file, module or name; its code fails; or it makes no task.
     """
-    made = own_class(words, Task, "task")
+    factory = own_class(reference, Task, "task")
     try:
-        task = made(**settings)
+        task = factory(**settings)
     except TypeError as error:
-        raise EnvironmentSetupError(f"task '{words}' cannot be made: {error}") from error
+        raise EnvironmentSetupError(f"task '{reference}' cannot be made: {error}") from error
     if not isinstance(task, Task):
         raise EnvironmentSetupError(
-            f"'{words}' makes a {type(task).__name__}, expected a Task: derive it from finssim.tasks.Task or TorchTask"
+            f"'{reference}' makes a {type(task).__name__}, expected a Task: derive it from finssim.tasks.Task or "
+            "TorchTask"
         )
     return task
 
 
-def own_class(words: str, base: type, what: str) -> Any:
+def own_class(reference: str, base: type, kind: str) -> Any:
     """A class (or any other callable) of somebody's own file or module.
 
     Args:
-        words: FILE.py:NAME or MODULE:NAME.
+        reference: FILE.py:NAME or MODULE:NAME.
         base: Class whose subclasses are listed where there is no such name.
-        what: What it is, in messages.
+        kind: What it is, in messages.
 
     Raises:
         EnvironmentSetupError: There is no such file, module or name, or its code fails.
     """
-    place, _, name = words.rpartition(":")
-    module = _of_file(Path(place)) if place.endswith(".py") else _of_import(place)
-    found = getattr(module, name, None)
-    if not callable(found):
+    module_path, _, name = reference.rpartition(":")
+    module = _of_file(Path(module_path)) if module_path.endswith(".py") else _of_import(module_path)
+    result = getattr(module, name, None)
+    if not callable(result):
         have = [
             key
             for key, value in vars(module).items()
             if isinstance(value, type) and issubclass(value, base) and value.__module__ == module.__name__
         ]
         raise EnvironmentSetupError(
-            f"{place} has no {what} '{name}'; {what}s there: {', '.join(have) or 'none'}"
+            f"{module_path} has no {kind} '{name}'; {kind}s there: {', '.join(have) or 'none'}"
         )
-    return found
+    return result
 
 
 def _of_file(path: Path) -> ModuleType:
     """The module of a file, run once; files beside it can be imported by it."""
     if not path.is_file():
         raise EnvironmentSetupError(f"there is no file {path}: give FILE.py:CLASS")
-    whole = path.resolve()
+    full_path = path.resolve()
     # A name of its own: two files of one name are two modules, and Warp keeps kernels by module.
-    name = f"{whole.stem}_{hashlib.sha256(str(whole).encode()).hexdigest()[:8]}"
+    name = f"{full_path.stem}_{hashlib.sha256(str(full_path).encode()).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, whole)
+    spec = importlib.util.spec_from_file_location(name, full_path)
     if spec is None or spec.loader is None:
         raise EnvironmentSetupError(f"{path} cannot be read as Python")
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(whole.parent))
+    sys.path.insert(0, str(full_path.parent))
     try:
         spec.loader.exec_module(module)
     except Exception as error:  # somebody's own file may raise anything as it is imported
         del sys.modules[name]
         raise EnvironmentSetupError(f"{path} fails: {type(error).__name__}: {error}") from error
     finally:
-        sys.path.remove(str(whole.parent))
+        sys.path.remove(str(full_path.parent))
     return module
 
 
@@ -147,14 +148,14 @@ def observed(name: str, task: Task | None = None) -> MeasurementNoise | Sensing:
     Raises:
         EnvironmentSetupError: There is no such name, or the file is wrong.
     """
-    known = {**OBSERVED, **({} if task is None else {"training": task.training_noise})}
-    if name not in known and name.endswith((".yaml", ".yml")):
+    available = {**OBSERVED, **({} if task is None else {"training": task.training_noise})}
+    if name not in available and name.endswith((".yaml", ".yml")):
         return load_sensing(name)
-    if name not in known:
+    if name not in available:
         raise EnvironmentSetupError(
-            f"observe is '{name}', expected {', '.join(known)} or a file of fixes (.yaml)"
+            f"observe is '{name}', expected {', '.join(available)} or a file of fixes (.yaml)"
         )
-    return known[name]
+    return available[name]
 
 
 def task_named(task: str | Task, **settings: Any) -> Task:
@@ -172,8 +173,8 @@ def task_named(task: str | Task, **settings: Any) -> Task:
         raise EnvironmentSetupError(
             f"unknown task '{task}'; available: {', '.join((*TASKS, *SEEING))}; or one's own: FILE.py:CLASS"
         )
-    made: Task = tasks[task](**settings)
-    return made
+    named: Task = tasks[task](**settings)
+    return named
 
 
 def make(

@@ -87,18 +87,18 @@ def connect_measured(present: bool, state: State, arrays: TaskArrays) -> None:
 
 def measurements(noise: MeasurementNoise, shape: tuple[int, int], device: wp.Device) -> Packed:
     """The errors of every vehicle of every world, (worlds, vehicles); randomisation writes others."""
-    seen = Packed(Measurement, shape, device)
+    packed = Packed(Measurement, shape, device)
     part = np.linspace(0.0, 1.0, shape[0])[:, None] if noise.graded and shape[0] > 1 else 1.0
-    for name, array in seen.fields.items():
+    for name, array in packed.fields.items():
         array.assign(np.full(shape, getattr(noise, name) * part, dtype=np.float32))
-    return seen
+    return packed
 
 
 @wp.kernel(enable_backward=False)
 def measure(
     state: State,
     arrays: TaskArrays,
-    seen: wp.array2d(dtype=Measurement),
+    measurement: wp.array2d(dtype=Measurement),
     control_step: float,
     seed: int,
     world_offset: int,
@@ -106,7 +106,7 @@ def measure(
     """What is seen of every vehicle; the draw depends on seed, world, vehicle, episode and step alone."""
     i, v = wp.tid()
     w = world_offset + i
-    m = seen[w, v]
+    m = measurement[w, v]
     x = state.position[w, v]
     q = state.quaternion[w, v]
     nu = state.velocity[w, v]
@@ -120,9 +120,9 @@ def measure(
         for k in range(6):
             nu[k] = past[7 + k]
     # Wrapping around at 32 bits is what makes streams of neighbours differ.
-    own = wp.rand_init(seed + 104729 * state.episode[w] + 1 + 15485867 * v, w)
-    bias = wp.rand_init(wp.randi(own), -1)
-    rng = wp.rand_init(wp.randi(own), step)
+    vehicle_seed = wp.rand_init(seed + 104729 * state.episode[w] + 1 + 15485867 * v, w)
+    bias = wp.rand_init(wp.randi(vehicle_seed), -1)
+    rng = wp.rand_init(wp.randi(vehicle_seed), step)
     n = wp.vec3(wp.randn(rng), wp.randn(rng), wp.randn(rng))
     angle = m.yaw_std * wp.randn(rng)
     for k in range(3):

@@ -91,17 +91,17 @@ def move_target(arrays: TaskArrays, p: Any, w: int):
     if t >= arrays.target.until[w]:
         new_course(arrays, p, w, t)
     x = arrays.goal_position[w]
-    wanted = arrays.target.wanted[w]
+    target_velocity = arrays.target.wanted[w]
     for k in range(3):
         if x[k] > p.fit.size * p.high[k]:
-            wanted[k] = -wp.abs(wanted[k])
+            target_velocity[k] = -wp.abs(target_velocity[k])
         if x[k] < p.fit.size * p.low[k]:
-            wanted[k] = wp.abs(wanted[k])
-    arrays.target.wanted[w] = wanted
+            target_velocity[k] = wp.abs(target_velocity[k])
+    arrays.target.wanted[w] = target_velocity
     v = arrays.target.velocity[w]
-    change = wanted - v
-    most = p.fit.pace * p.acceleration * p.control_step
-    v += change * wp.min(1.0, most / wp.max(wp.length(change), 1.0e-9))
+    change = target_velocity - v
+    limit = p.fit.pace * p.acceleration * p.control_step
+    v += change * wp.min(1.0, limit / wp.max(wp.length(change), 1.0e-9))
     arrays.target.velocity[w] = v
     arrays.goal_position[w] = x + p.control_step * v
 

@@ -43,8 +43,8 @@ def fitted_task(
         ControlError: There is no such task, or the vehicle cannot do it.
     """
     try:
-        made = task_named(task)
-        return made.fitted(crew(vehicle, made, action or made.action))
+        named = task_named(task)
+        return named.fitted(crew(vehicle, named, action or named.action))
     except EnvironmentSetupError as error:
         raise ControlError(str(error)) from None
 
@@ -157,11 +157,11 @@ class Observer:
 
     def _remember(self, action: Array) -> None:
         """What was done last, as the observation finds it: one in torch is asked before the step is taken down."""
-        own = slice(self._place * self._action_size, (self._place + 1) * self._action_size)
+        columns = slice(self._place * self._action_size, (self._place + 1) * self._action_size)
         a = self._arrays
-        done = a.action.numpy()[0, own].copy()
-        a.action.numpy()[0, own] = action
-        a.previous_action.numpy()[0, own] = done if self._in_torch else action
+        done = a.action.numpy()[0, columns].copy()
+        a.action.numpy()[0, columns] = action
+        a.previous_action.numpy()[0, columns] = done if self._in_torch else action
 
     def _build(self, task: Task) -> None:
         """Arrays of one world, and what observes it; nothing is scored there."""

@@ -58,7 +58,7 @@ ROWS = [0, 1, 2, 5]
 
 
 @wp.func
-def drive(d: Any, q: wp.quat, nu: vec6, wanted: wp.vec4) -> wp.vec4:
+def drive(d: Any, q: wp.quat, nu: vec6, target: wp.vec4) -> wp.vec4:
     """Action that brings the velocity to a wanted one.
 
     tau = d1 v* + d2 |v*| v* + RATE m (v* - v) + (weight - buoyancy) up,  action = shared(tau / limit)
@@ -67,7 +67,7 @@ def drive(d: Any, q: wp.quat, nu: vec6, wanted: wp.vec4) -> wp.vec4:
         d: The vehicle's `DriveNumbers`.
         q: Body to world.
         nu: Velocity, body frame [m/s, rad/s].
-        wanted: v*: surge, sway, heave and yaw rate, body frame [m/s, rad/s].
+        target: v*: surge, sway, heave and yaw rate, body frame [m/s, rad/s].
 
     Returns:
         Parts of the limits on surge, sway, heave and yaw, each in [-1, 1].
@@ -77,8 +77,8 @@ def drive(d: Any, q: wp.quat, nu: vec6, wanted: wp.vec4) -> wp.vec4:
     tau = d.sink * wp.vec4(up[0], up[1], up[2], 0.0)
     a = wp.vec4()
     for i in range(4):
-        tau[i] = tau[i] + (d.d1[i] + d.d2[i] * wp.abs(wanted[i])) * wanted[i]
-        tau[i] = tau[i] + wp.where(i == 3, YAW_RATE, RATE) * d.mass[i] * (wanted[i] - v[i])
+        tau[i] = tau[i] + (d.d1[i] + d.d2[i] * wp.abs(target[i])) * target[i]
+        tau[i] = tau[i] + wp.where(i == 3, YAW_RATE, RATE) * d.mass[i] * (target[i] - v[i])
         a[i] = tau[i] / d.limit[i]
     return shared(a)
 
@@ -147,7 +147,7 @@ class DriveNumbers:
         Raises:
             EnvironmentSetupError: It has no coefficients.
         """
-        sets = [name for name, one in vehicle.hydrodynamics.items() if isinstance(one, HydrodynamicSet)]
+        sets = [name for name, model in vehicle.hydrodynamics.items() if isinstance(model, HydrodynamicSet)]
         if not sets:
             raise EnvironmentSetupError(
                 f"vehicle '{vehicle.name}' has no damping coefficients, which pursuit and formation need: take another "
@@ -161,24 +161,24 @@ class DriveNumbers:
         rows = (tuple(column[ROWS].tolist()) for column in columns)
         return cls(*rows, sink=vehicle.weight - vehicle.buoyancy, level=level_speed(vehicle, sets[0]))
 
-    def action(self, velocity: Array, wanted: Array) -> NDArray[np.float32]:
+    def action(self, velocity: Array, target: Array) -> NDArray[np.float32]:
         """As `drive`, of a level vehicle.
 
         Args:
             velocity: Surge, sway, heave, yaw rate [m/s, rad/s], (n, 4).
-            wanted: The same, wanted.
+            target: The same, wanted.
 
         Returns:
             Parts of the limits on the four axes, (n, 4), each in [-1, 1].
         """
         d1, d2, mass, limit = (np.array(row) for row in (self.d1, self.d2, self.mass, self.limit))
         rate = np.array([RATE, RATE, RATE, YAW_RATE])
-        tau = (d1 + d2 * np.abs(wanted)) * wanted + rate * mass * (wanted - velocity)
+        tau = (d1 + d2 * np.abs(target)) * target + rate * mass * (target - velocity)
         tau[:, 2] += self.sink
         a = tau / limit
         a[:, 2:] = np.clip(a[:, 2:], [-1.0, -0.5], [1.0, 0.5])
-        left = 1.0 - np.abs(a[:, 3])
-        a[:, :2] *= np.minimum(1.0, left / np.maximum(np.abs(a[:, :2]).sum(axis=1), 1e-6))[:, None]
+        remaining = 1.0 - np.abs(a[:, 3])
+        a[:, :2] *= np.minimum(1.0, remaining / np.maximum(np.abs(a[:, :2]).sum(axis=1), 1e-6))[:, None]
         return a.astype(np.float32)
 
     def turned(self, error: Array) -> Array:
@@ -349,15 +349,15 @@ def kept_inside(p: Any, x: wp.vec3, v: wp.vec3) -> wp.vec3:
     r = wp.sqrt(x[0] * x[0] + x[1] * x[1])
     out = wp.vec3(x[0], x[1], 0.0) / wp.max(r, 1.0e-6)
     radial = v[0] * out[0] + v[1] * out[1]
-    kept = v
+    inside = v
     if r > p.prey.range and radial > 0.0:
         around = wp.vec3(-out[1], out[0], 0.0)
         side = wp.where(wp.dot(around, v) < 0.0, -1.0, 1.0)
-        kept = pace * wp.normalize(side * around - 0.2 * out) + wp.vec3(0.0, 0.0, v[2])
-    climb = wp.clamp(kept[2], -most_climb(p), most_climb(p))
+        inside = pace * wp.normalize(side * around - 0.2 * out) + wp.vec3(0.0, 0.0, v[2])
+    climb = wp.clamp(inside[2], -most_climb(p), most_climb(p))
     climb = wp.where(x[2] > p.prey.high, -0.5 * most_climb(p), climb)
     climb = wp.where(x[2] < p.prey.low, 0.5 * most_climb(p), climb)
-    return wp.vec3(kept[0], kept[1], climb)
+    return wp.vec3(inside[0], inside[1], climb)
 
 
 @wp.func
@@ -389,8 +389,8 @@ def command_prey(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     """Write the action of the prey, which is the vehicle after the pursuers; it sees the truth."""
     pursuers = arrays.agent_reward.shape[1]
     q = state.quaternion[w, pursuers]
-    wanted = towards(q, prey_velocity(state, arrays, p, key + 7, w))
-    write_scripted(arrays, w, drive(p.prey_drive, q, state.velocity[w, pursuers], wanted))
+    target = towards(q, prey_velocity(state, arrays, p, key + 7, w))
+    write_scripted(arrays, w, drive(p.prey_drive, q, state.velocity[w, pursuers], target))
 
 
 # What the tasks in open water have in common: where episodes start and end, the prey, and the team.
@@ -880,9 +880,9 @@ class TeamPursuit(Team, Chase):
     @property
     def rules(self) -> Level:
         """The level's rules, with what this task says otherwise."""
-        given = {one.name: getattr(self, one.name, None) for one in fields(Level)}
+        stated = {setting.name: getattr(self, setting.name, None) for setting in fields(Level)}
         return replace(
-            LEVELS[self.level], **{name: value for name, value in given.items() if value is not None}
+            LEVELS[self.level], **{name: value for name, value in stated.items() if value is not None}
         )
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "TeamPursuit":

@@ -99,9 +99,9 @@ class Schedule:
         yield from (("ends", table.ends), ("probability", table.probability))
 
     def _judge(self) -> None:
-        tried, succeeded = (x.numpy().sum() for x in (self.counts.tried, self.counts.succeeded))
-        if tried >= self.plan.episodes:
-            share, step = succeeded / tried, self.plan.step
+        episodes, succeeded = (x.numpy().sum() for x in (self.counts.tried, self.counts.succeeded))
+        if episodes >= self.plan.episodes:
+            share, step = succeeded / episodes, self.plan.step
             move = step if share >= self.plan.widen_at else -step if share < self.plan.narrow_at else 0.0
             self._set(min(max(self.width + move, 0.0), 1.0))
             self._forget()

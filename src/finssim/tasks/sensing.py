@@ -108,10 +108,10 @@ def load_sensing(path: str | Path) -> Sensing:
     fixes = data.get("fixes", {})
     if not isinstance(fixes, Mapping):
         raise EnvironmentSetupError(f"{path}: fixes is {fixes!r}, expected keys such as position_std: 0.2")
-    for given, known in ((data, ("rate", "fixes")), (fixes, PER_FIX)):
-        for key, value in given.items():
-            if key not in known:
-                raise EnvironmentSetupError(f"{path}: unknown key '{key}', expected {', '.join(known)}")
+    for stated, allowed in ((data, ("rate", "fixes")), (fixes, PER_FIX)):
+        for key, value in stated.items():
+            if key not in allowed:
+                raise EnvironmentSetupError(f"{path}: unknown key '{key}', expected {', '.join(allowed)}")
             if key != "fixes" and (isinstance(value, bool) or not isinstance(value, int | float)):
                 raise EnvironmentSetupError(f"{path}: {key} is {value!r}, expected a number")
     if "rate" not in data:
@@ -132,9 +132,9 @@ def seen_with(noise: MeasurementNoise | Sensing, vehicle: Vehicle) -> dict[str, 
     return {
         "fixes": fixes,
         **{
-            kind: {name: x for name, x in given.items() if name not in MOUNT and x and x != math.inf}
-            for kind, given in vehicle.sensors.model_dump(mode="json").items()
-            if given
+            kind: {name: x for name, x in values.items() if name not in MOUNT and x and x != math.inf}
+            for kind, values in vehicle.sensors.model_dump(mode="json").items()
+            if values
         },
     }
 
@@ -257,20 +257,20 @@ def begin(
 ):
     """Start where the filter would be had it run before: off by its settled doubt and by what lasts."""
     key = sample_key(seed, FIX, w, v, state.episode[w], 0)
-    known = e.aboard[v]
+    aboard = e.aboard[v]
     x = state.position[w, v]
     q = state.quaternion[w, v]
     a = normal3(key, WHITE)
     b = normal3(key, WALK)
-    px = doubted(known.plane, a[0], b[0])
-    py = doubted(known.plane, a[1], b[1])
-    pz = doubted(known.height, a[2], b[2])
-    turn = doubted(known.yaw, normal(key, WHITE_2), normal(key, WALK_2))
+    px = doubted(aboard.plane, a[0], b[0])
+    py = doubted(aboard.plane, a[1], b[1])
+    pz = doubted(aboard.height, a[2], b[2])
+    turn = doubted(aboard.yaw, normal(key, WHITE_2), normal(key, WALK_2))
     lasting = wp.vec3()
     if has_fixes:
         lasting = m.position_bias * normal3(key, TURN_ON)
         turn[0] = turn[0] + m.yaw_bias * normal(key, TURN_ON_2)
-    if known.gauge:
+    if aboard.gauge:
         lasting[2] = -r.gauge.bias[w, v]
     imu = r.imu_errors[w, v]
     up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
@@ -282,9 +282,9 @@ def begin(
     e.velocity[w, v, k] = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2])) + wp.vec3(px[1], py[1], pz[1])
     e.bias[w, v] = wp.quat_rotate(imu.orientation, r.imu.gyro_bias[w, v]) - turn[1] * up
     e.rate[w, v] = wp.quat_rotate(imu.orientation, r.imu.gyro[w, v]) - e.bias[w, v]
-    e.plane[w, v] = known.plane
-    e.height[w, v] = known.height
-    e.yaw[w, v] = known.yaw
+    e.plane[w, v] = aboard.plane
+    e.height[w, v] = aboard.height
+    e.yaw[w, v] = aboard.yaw
 
 
 @wp.func
@@ -400,8 +400,10 @@ def take_velocity(r: Readings, e: Estimates, step: int, dt: float, w: int, v: in
     at = measured_at(e, r.dvl_samples.timing[v].latency, step)
     k = at % e.position.shape[2]
     dvl = r.dvl_errors[w, v]
-    own = wp.quat_rotate(dvl.orientation, r.dvl.velocity[w, v]) - wp.cross(e.rate[w, v], dvl.position)
-    off = wp.quat_rotate(e.quaternion[w, v, k], own) - e.velocity[w, v, k]
+    body_velocity = wp.quat_rotate(dvl.orientation, r.dvl.velocity[w, v]) - wp.cross(
+        e.rate[w, v], dvl.position
+    )
+    off = wp.quat_rotate(e.quaternion[w, v, k], body_velocity) - e.velocity[w, v, k]
     R = counted(dvl.noise_std, dvl.quantisation) + dvl.bias_initial * dvl.bias_initial
     A = rate_gain(e.plane[w, v], R)
     B = rate_gain(e.height[w, v], R)
@@ -413,7 +415,7 @@ def take_velocity(r: Readings, e: Estimates, step: int, dt: float, w: int, v: in
 
 @wp.kernel(enable_backward=False)
 def estimate(
-    state: State, arrays: TaskArrays, seen: wp.array2d(dtype=Measurement), r: Readings, e: Estimates, rate: wp.float64,
+    state: State, arrays: TaskArrays, noise: wp.array2d(dtype=Measurement), r: Readings, e: Estimates, rate: wp.float64,
     dt: float, seed: int, mask: wp.array(dtype=int), starting: bool, world_offset: int,
 ):  # fmt: skip
     """What is known of every vehicle: after a control step of all, or where an episode starts and mask is not 0."""
@@ -424,11 +426,11 @@ def estimate(
     step = state.steps[w]
     has_fixes = rate > wp.float64(0.0)
     if starting:
-        begin(state, seen[w, v], r, e, has_fixes, seed, w, v)
+        begin(state, noise[w, v], r, e, has_fixes, seed, w, v)
     else:
         go_on(r, e, step, dt, w, v)
         if has_fixes:
-            take_fix(state, seen[w, v], e, rate, dt, seed, w, v)
+            take_fix(state, noise[w, v], e, rate, dt, seed, w, v)
         if r.gauge_errors.shape[0] > 0 and r.gauge_samples.fresh[w, v]:
             take_depth(r, e, step, dt, w, v)
         if r.dvl_errors.shape[0] > 0 and r.dvl_samples.fresh[w, v]:
@@ -448,7 +450,7 @@ class SensingBatch:
         sensing: Sensing,
         simulator: Simulator,
         arrays: TaskArrays,
-        seen: Packed,
+        measurement: Packed,
         floor_depth: float | None,
         seed: int,
         drawn: bool,
@@ -458,7 +460,7 @@ class SensingBatch:
             sensing: The fixes.
             simulator: The worlds.
             arrays: Where what is known goes.
-            seen: Noise of the fixes by (world, vehicle).
+            measurement: Noise of the fixes by (world, vehicle).
             floor_depth: Of the water, for a DVL [m]; None is out of reach of nothing.
             seed: Of all errors.
             drawn: Whether noise and delay of the fixes are drawn.
@@ -472,7 +474,7 @@ class SensingBatch:
                     f"vehicle {vehicle.name} has no IMU, and nothing else tells its attitude: give sensors.imu in its "
                     "file, or observe otherwise"
                 )
-        self._simulator, self._arrays, self._seen = simulator, arrays, seen
+        self._simulator, self._arrays, self._seen = simulator, arrays, measurement
         dt = simulator.control_step
         self.suite = SensorSuite(
             simulator.vehicles, worlds=simulator.worlds, control_step=dt, seed=seed, device=simulator.device,
@@ -494,7 +496,7 @@ class SensingBatch:
             Estimates, simulator.worlds, simulator.device, position=past, velocity=past, quaternion=past,
             bias=vehicles, rate=vehicles, plane=vehicles, height=vehicles, yaw=vehicles,
         )  # fmt: skip
-        aboard = [_aboard(one, sensing, dt) for one in simulator.vehicles]
+        aboard = [_aboard(vehicle, sensing, dt) for vehicle in simulator.vehicles]
         self.estimates.aboard = wp.array(aboard, dtype=Aboard, device=simulator.device)
 
     def add(self, pipeline: Pipeline, seed: int, mask: wp.array | None = None) -> None:
@@ -506,12 +508,12 @@ class SensingBatch:
         stages = self.suite.reset_stages(state, mask) if starting else self.suite.update_stages(state)
         for kernel, inputs in stages:
             pipeline.add(kernel, inputs, vehicles=count)
-        where = mask if starting else self._simulator._all
+        worlds_mask = mask if starting else self._simulator._all
         pipeline.add(
             estimate,
             [
                 state, self._arrays, self._seen.array, self.readings, self.estimates, self._rate,
-                self._simulator.control_step, seed, where, starting,
+                self._simulator.control_step, seed, worlds_mask, starting,
             ],
             vehicles=count,
         )  # fmt: skip
@@ -524,8 +526,8 @@ class SensingBatch:
 def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
     """What the filter knows of a vehicle; its doubt is that after many control steps."""
     sensors, fixes = vehicle.sensors, sensing.fixes
-    known = Aboard()
-    known.gauge = sensors.depth is not None
+    aboard = Aboard()
+    aboard.gauge = sensors.depth is not None
     start = (0.0, 0.0, FASTEST**2)
     plane, height = (wp.vec3(*start) for _ in range(2))
     yaw = wp.vec3(0.0, 0.0, sensors.imu.gyro_bias_initial**2 if sensors.imu else 0.0)
@@ -537,7 +539,7 @@ def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
         if came:
             R = counted(fixes.position_std, 0.0) / came
             plane = value_known(plane, R)
-            height = height if known.gauge else value_known(height, R)
+            height = height if aboard.gauge else value_known(height, R)
             yaw = value_known(yaw, counted(fixes.yaw_std, 0.0) / came)
         if sensors.depth is not None and _due(sensors.depth.rate, step, dt):
             height = value_known(height, counted(sensors.depth.noise_std, sensors.depth.quantisation))
@@ -546,10 +548,10 @@ def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
             plane, height = rate_known(plane, R), rate_known(height, R)
     if not sensing.rate:  # nothing says where it is: it starts where it is known to be
         plane, yaw = wp.vec3(0.0, 0.0, min(plane[2], FASTEST**2)), wp.vec3(0.0, 0.0, yaw[2])
-        if not known.gauge:
+        if not aboard.gauge:
             height = wp.vec3(0.0, 0.0, min(height[2], FASTEST**2))
-    known.plane, known.height, known.yaw = plane, height, yaw
-    return known
+    aboard.plane, aboard.height, aboard.yaw = plane, height, yaw
+    return aboard
 
 
 def _due(rate: float, step: int, dt: float) -> int:

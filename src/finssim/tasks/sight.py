@@ -139,10 +139,10 @@ class Sight:
         self._poses = wp.zeros(simulator.worlds, dtype=wp.transform, device=simulator.device)
         self._mask = wp.zeros(simulator.worlds, dtype=int, device=simulator.device)
         sensors: dict[str, Any] = {}
-        for one in task.pictures:
-            device = one.device(self._vehicle)
-            sensors[one.name] = (
-                CameraBatch(self.batch, device, width=one.width)
+        for picture_spec in task.pictures:
+            device = picture_spec.device(self._vehicle)
+            sensors[picture_spec.name] = (
+                CameraBatch(self.batch, device, width=picture_spec.width)
                 if isinstance(device, CameraDevice)
                 else SonarBatch(self.batch, device)
             )
@@ -156,9 +156,11 @@ class Sight:
             sensors[name] = RangeBatch(self.batch, ranger)
         self._sensors = {name: self._delivered(name, sensor) for name, sensor in sensors.items()}
         self.pictures = {}
-        for one in task.pictures:
-            reading = self._sensors[one.name].reading
-            self.pictures[one.name] = reading.reshape((simulator.worlds, *one.shape(self._vehicle)))
+        for picture_spec in task.pictures:
+            reading = self._sensors[picture_spec.name].reading
+            self.pictures[picture_spec.name] = reading.reshape(
+                (simulator.worlds, *picture_spec.shape(self._vehicle))
+            )
         self.final_pictures = {name: wp.zeros_like(picture) for name, picture in self.pictures.items()}
         self._episodes = np.zeros(simulator.worlds, np.int64)
 

@@ -98,8 +98,8 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     size = p.fit.size
     arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), size * p.goal_low, size * p.goal_high)
     state.position[w, 0] = uniform3(wp.rand_init(key, 4 * w + 1), size * p.spawn_low, size * p.spawn_high)
-    most = wp.vec3(p.tilt, p.tilt, pi)
-    angles = uniform3(wp.rand_init(key, 4 * w + 2), -most, most)
+    bound = wp.vec3(p.tilt, p.tilt, pi)
+    angles = uniform3(wp.rand_init(key, 4 * w + 2), -bound, bound)
     rng = wp.rand_init(key, 4 * w + 3)
     arrays.goal_quaternion[w] = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), wp.randf(rng, -pi, pi))
     state.quaternion[w, 0] = tilted(angles[0], angles[1], angles[2])

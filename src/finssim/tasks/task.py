@@ -145,7 +145,11 @@ class Task:
                 return tuple(plain(item) for item in v)
             return asdict(v) if is_dataclass(v) and not isinstance(v, type) else v
 
-        return {one.name: plain(getattr(self, one.name)) for one in fields(self) if one.name != "observation"}
+        return {
+            setting.name: plain(getattr(self, setting.name))
+            for setting in fields(self)
+            if setting.name != "observation"
+        }
 
     @property
     def vehicles(self) -> tuple[str, ...]:
@@ -201,10 +205,10 @@ class Task:
 
     def add_evaluate(self, pipeline: Pipeline, batch: Batch) -> None:
         """Append what comes after each step: reward, ends, observation."""
-        made, terms = kernels_of(self), self.terms()
+        kernels, terms = kernels_of(self), self.terms()
         weights = [reward.weight for reward in terms.rewards] + [end.reward for end in terms.ends]
-        inputs = [batch.state, batch.arrays, settings_of(self), made.weights(*(weights or [0.0]))]
-        pipeline.add(made.evaluate, inputs)
+        inputs = [batch.state, batch.arrays, settings_of(self), kernels.weights(*(weights or [0.0]))]
+        pipeline.add(kernels.evaluate, inputs)
 
     def add_spawn(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
         """Append the start of an episode where mask (by world, int32) is not 0."""
@@ -331,54 +335,54 @@ class _Writer:
         sources = [_function(f"{name}({STAGES[name]})", lines) for name, lines in stages.items() if lines]
         return "\n".join([_function("look(arrays: TaskArrays, p: P, w: int)", self._look()), *sources])
 
-    def _value(self, term: Any, role: str, **known: str) -> str:
+    def _value(self, term: Any, role: str, **scope: str) -> str:
         """A term in the source: a call with what it takes by name, or the expression."""
-        known = {name: name for name in ("arrays", "p", "w", "a")} | known
+        scope = {name: name for name in ("arrays", "p", "w", "a")} | scope
 
         def value(name: str, whose: str) -> str:
-            if name not in known:
+            if name not in scope:
                 raise EnvironmentSetupError(
-                    f"task '{self.task.name}': {role}{whose} takes '{name}', expected of: {', '.join(known)}"
+                    f"task '{self.task.name}': {role}{whose} takes '{name}', expected of: {', '.join(scope)}"
                 )
-            return known[name]
+            return scope[name]
 
         def call(function: Any) -> str:
             names = inspect.signature(function.func).parameters
-            taken = ", ".join(value(name, f" ({function.key})") for name in names)
+            arguments = ", ".join(value(name, f" ({function.key})") for name in names)
             label = next(
                 (n for n, f in self.functions.items() if f is function),
                 f"t{len(self.functions)}_{function.key}",
             )
             self.functions[label] = function
-            return f"{label}({taken})"
+            return f"{label}({arguments})"
 
         if not isinstance(term, str):
             return call(term)
         tree = ast.parse(term, mode="eval")
         for node in ast.walk(tree):
             if isinstance(node, ast.Name) and node.id not in ("wp", "float", "int"):
-                function = None if node.id in known else getattr(library, node.id, None)
+                function = None if node.id in scope else getattr(library, node.id, None)
                 node.id = value(node.id, "") if function is None else call(function)
         return f"({ast.unparse(tree)})"
 
-    def _shared(self, terms: Mapping[str, Any], known: dict[str, str]) -> tuple[list[str], dict[str, str]]:
+    def _shared(self, terms: Mapping[str, Any], scope: dict[str, str]) -> tuple[list[str], dict[str, str]]:
         """Lines that compute what terms share, and what is known with it."""
-        lines, known = [], dict(known)
+        lines, scope = [], dict(scope)
         for name, term in terms.items():
-            lines.append(f"s_{name} = {self._value(term, f'shared {name!r}', **known)}")
-            known[name] = f"s_{name}"
-        return lines, known
+            lines.append(f"s_{name} = {self._value(term, f'shared {name!r}', **scope)}")
+            scope[name] = f"s_{name}"
+        return lines, scope
 
     def _look(self) -> list[str]:
         """The observation of every agent."""
-        values, seen = self._shared(self.terms.seen, {})
+        values, shared = self._shared(self.terms.seen, {})
         writes: list[str] = []
         rows = {"observation": self.task.observation if self.terms.shown else (), "taught": self.task.teacher}
-        parts = [(row, part) for row, own in rows.items() for part in own]
-        sizes = {row: sum(part.size for part in own) for row, own in rows.items()}
+        parts = [(row, part) for row, parts_of_row in rows.items() for part in parts_of_row]
+        sizes = {row: sum(part.size for part in parts_of_row) for row, parts_of_row in rows.items()}
         first = dict.fromkeys(rows, 0)
         for i, (row, part) in enumerate(parts):
-            value = self._value(part.term, f"observation '{part.name}'", **seen, k=str(part.index))
+            value = self._value(part.term, f"observation '{part.name}'", **shared, k=str(part.index))
             number = f"x{i}" if part.size == 1 else f"x{i}[i]"
             if part.scale != 1.0:
                 number = f"{number} / {float(part.scale)!r}"
@@ -392,16 +396,16 @@ class _Writer:
 
     def _evaluate(self) -> list[str]:
         """All terms are computed before anything is written, so that the compiler does what they share only once."""
-        terms, known = self.terms, {"state": "state", **self._totals}
-        advance = [] if terms.advance is None else [self._value(terms.advance, "advance", **known)]
-        shared, known = self._shared(terms.shared, known)
-        inside = "False" if terms.inside is None else self._value(terms.inside, "inside", **known)
-        known["held"] = "held"
+        terms, scope = self.terms, {"state": "state", **self._totals}
+        advance = [] if terms.advance is None else [self._value(terms.advance, "advance", **scope)]
+        shared, scope = self._shared(terms.shared, scope)
+        inside = "False" if terms.inside is None else self._value(terms.inside, "inside", **scope)
+        scope["held"] = "held"
         ends = [
-            f"e{i} = {self._value(end.term, f'end {end.name!r}', **known)} and not ended\nended = ended or e{i}"
+            f"e{i} = {self._value(end.term, f'end {end.name!r}', **scope)} and not ended\nended = ended or e{i}"
             for i, end in enumerate(terms.ends)
         ]
-        counts, counted = self._counts(known)
+        counts, counted = self._counts(scope)
         return [
             "w = world_offset + wp.tid()",
             "if state.frozen[w] != 0:",
@@ -416,7 +420,7 @@ class _Writer:
             *"\n".join(ends).splitlines(),
             "late = t >= p.time_limit - 0.5 * p.control_step",
             *counts,
-            *self._rewards(known),
+            *self._rewards(scope),
             *counted,
             "arrays.held[w] = held",
             "arrays.terminated[w] = wp.where(ended, 1, 0)",
@@ -429,9 +433,9 @@ class _Writer:
             "    close_episode(state, arrays, w)",
         ]
 
-    def _rewards(self, known: Mapping[str, str]) -> list[str]:
+    def _rewards(self, scope: Mapping[str, str]) -> list[str]:
         """Every term once, for all agents or for each; what they add up to, and each by itself over the episode."""
-        values = [self._value(term.term, f"reward {term.name!r}", **known) for term in self.terms.rewards] + [
+        values = [self._value(term.term, f"reward {term.name!r}", **scope) for term in self.terms.rewards] + [
             f"wp.where(e{i}, 1.0, 0.0)" for i, _ in enumerate(self.terms.ends)
         ]
         numbers, count = range(len(values)), float(len(self.task.agents))
@@ -457,7 +461,7 @@ class _Writer:
             "arrays.reward[w] = reward",
         ]
 
-    def _counts(self, known: Mapping[str, str]) -> tuple[list[str], list[str]]:
+    def _counts(self, scope: Mapping[str, str]) -> tuple[list[str], list[str]]:
         """The totals, each from what all were before; then how they are written."""
         values, writes, totals = [], [], self._totals
         if self.task.succeeds == "once":
@@ -468,22 +472,22 @@ class _Writer:
             ]
         for i, total in enumerate(self.terms.totals):
             local = {"was": totals[total.name], "k": str(total.index)}
-            values.append(f"n{i} = {self._value(total.term, f'total {total.name!r}', **known, **local)}")
+            values.append(f"n{i} = {self._value(total.term, f'total {total.name!r}', **scope, **local)}")
             writes.append(f"{totals[total.name]} = n{i}")
         ends = enumerate(self.terms.ends)
         writes += [f"{totals[end.name]} = wp.where(e{i}, 1.0, 0.0)" for i, end in ends if end.name in totals]
         return values, writes
 
     def _spawn(self) -> list[str]:
-        known = {"state": "state", "seed": "seed", "key": "key"}
-        start = self._value(self.terms.start, "start", **known)
-        firsts = {one.name: one.first for one in self.terms.totals if one.first != 0.0}
+        scope = {"state": "state", "seed": "seed", "key": "key"}
+        start = self._value(self.terms.start, "start", **scope)
+        firsts = {total.name: total.first for total in self.terms.totals if total.first != 0.0}
         shared: list[str] = []
         if not all(isinstance(first, int | float) for first in firsts.values()):
-            shared, known = self._shared(self.terms.shared, known)
+            shared, scope = self._shared(self.terms.shared, scope)
         for name, first in firsts.items():
             term = repr(float(first)) if isinstance(first, int | float) else first
-            shared.append(f"{self._totals[name]} = {self._value(term, f'first of total {name!r}', **known)}")
+            shared.append(f"{self._totals[name]} = {self._value(term, f'first of total {name!r}', **scope)}")
         head = ["w = world_offset + wp.tid()", "if mask[w] == 0:", "    return"]
         return [*head, f"key = {KEY}", "open_episode(arrays, w)", start, *shared]
 
@@ -494,8 +498,8 @@ class _Writer:
     def _command(self) -> list[str]:
         if self.terms.command is None:
             return []
-        known = {"state": "state", "seed": "seed", "key": f"({KEY})"}
-        return ["w = world_offset + wp.tid()", self._value(self.terms.command, "command", **known)]
+        scope = {"state": "state", "seed": "seed", "key": f"({KEY})"}
+        return ["w = world_offset + wp.tid()", self._value(self.terms.command, "command", **scope)]
 
 
 def _indented(lines: Iterable[str]) -> list[str]:
@@ -529,10 +533,10 @@ def _compiled(task: Task, text: str, functions: Mapping[str, Any]) -> Kernels:
     exec(compile(text, path, "exec"), space)
     module = wp.get_module(name)
     space["look"] = wp.func(space["look"], module=module)
-    made = [
+    compiled = [
         wp.kernel(space[stage], enable_backward=False, module=module) for stage in STAGES if stage in space
     ]
-    return Kernels(W, *made)
+    return Kernels(W, *compiled)
 
 
 def settings_of(task: Task) -> Any:
@@ -547,11 +551,11 @@ def settings_of(task: Task) -> Any:
     return _filled(task, task.settings_class(), f"task '{task.name}'")
 
 
-def _filled(one: Any, kind: type, owner: str) -> Any:
+def _filled(owner_value: Any, kind: type, owner: str) -> Any:
     struct = _struct(kind)
     out = struct()
     for name, variable in struct.vars.items():
-        value = getattr(one, name)
+        value = getattr(owner_value, name)
         if value is None:
             raise EnvironmentSetupError(f"{owner} is not fitted to vehicles: call fitted([...]) first")
         if is_dataclass(value):
@@ -563,26 +567,28 @@ def _filled(one: Any, kind: type, owner: str) -> Any:
 @cache
 def _struct(kind: type) -> Any:
     """Warp's struct of what kernels can take of a dataclass; None if that is nothing."""
-    own = _hints(kind)
-    hints = {one.name: own.get(one.name) for one in fields(kind) if one.name not in APART}
-    for name, value in inspect.getmembers(kind, lambda one: isinstance(one, property)):
+    annotations = _hints(kind)
+    hints = {member.name: annotations.get(member.name) for member in fields(kind) if member.name not in APART}
+    for name, value in inspect.getmembers(kind, lambda member: isinstance(member, property)):
         if not hasattr(Task, name) and value.fget is not None:
             hints[name] = _hints(value.fget).get("return")
-    types = {name: taken for name, hint in hints.items() if (taken := _kernel_type(hint)) is not None}
+    types = {
+        name: kernel_type for name, hint in hints.items() if (kernel_type := _kernel_type(hint)) is not None
+    }
     if not types:
         return None
-    made = type(kind.__name__, (), {"__annotations__": types, "__module__": kind.__module__})
+    struct = type(kind.__name__, (), {"__annotations__": types, "__module__": kind.__module__})
     # Classes of one name that functions make are not one class.
-    made.__qualname__ = f"{kind.__qualname__}Settings" + (
+    struct.__qualname__ = f"{kind.__qualname__}Settings" + (
         str(next(_numbers)) if "<" in kind.__qualname__ else ""
     )
-    return wp.struct(made)
+    return wp.struct(struct)
 
 
-def _hints(one: Any) -> dict[str, Any]:
+def _hints(annotated: Any) -> dict[str, Any]:
     """Annotations of a class or function; none where they name what is imported for type checkers alone."""
     try:
-        return get_type_hints(one)
+        return get_type_hints(annotated)
     except NameError:
         return {}
 
@@ -591,7 +597,7 @@ def _kernel_type(hint: Any) -> Any:
     """The type in a kernel, of a dataclass also where it may be None; None where kernels cannot take it."""
     parts = get_args(hint)
     if get_origin(hint) in (Union, UnionType):
-        rest = [one for one in parts if one is not type(None)]
+        rest = [part for part in parts if part is not type(None)]
         return _struct(rest[0]) if len(rest) == 1 and is_dataclass(rest[0]) else None
     if get_origin(hint) is tuple:
         return VECTORS.get((parts[0], len(parts))) if len(set(parts)) == 1 else None

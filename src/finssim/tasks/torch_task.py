@@ -44,8 +44,8 @@ def draw(
 ):
     """Fill rows with draws from [0, 1), or of a standard normal: by seed, world, episode, step and place alone."""
     w = wp.tid()
-    own = wp.rand_init(seed + 15485863 * episode[w], w)
-    rng = wp.rand_init(wp.randi(own) + 104729 * steps[w], place)
+    world_seed = wp.rand_init(seed + 15485863 * episode[w], w)
+    rng = wp.rand_init(wp.randi(world_seed) + 104729 * steps[w], place)
     for i in range(out.shape[1]):
         out[w, i] = wp.where(normal != 0, wp.randn(rng), wp.randf(rng))
 
@@ -98,8 +98,8 @@ class Worlds:
         self._held = wp.to_torch(arrays.held, requires_grad=False)
         self.memory: Mapping[str, Tensor] = _Unknown()
         if arrays.answers.memory is not None:
-            kept = wp.to_torch(arrays.answers.memory, requires_grad=False)
-            self.memory = dict(zip(memory, kept.split(list(memory.values()), dim=1), strict=True))
+            memory_rows = wp.to_torch(arrays.answers.memory, requires_grad=False)
+            self.memory = dict(zip(memory, memory_rows.split(list(memory.values()), dim=1), strict=True))
         self._action, self._previous = (
             wp.to_torch(x, requires_grad=False) for x in (arrays.action, arrays.previous_action)
         )
@@ -301,13 +301,13 @@ class TorchTask(Task):
 
     def add_evaluate(self, pipeline: Pipeline, batch: Batch) -> None:
         """Append reward, ends and observation."""
-        true, seen = self._worlds(batch, SCORE), self._worlds(batch, OBSERVE, measured=True)
+        true, measured = self._worlds(batch, SCORE), self._worlds(batch, OBSERVE, measured=True)
 
         frozen = wp.to_torch(batch.state.frozen, requires_grad=False)[:, None, None]
 
         def score() -> None:
             self._score(true.begin(), batch.arrays)
-            self._look(seen.begin(), batch.arrays, frozen == 0)
+            self._look(measured.begin(), batch.arrays, frozen == 0)
 
         pipeline.call(partial(_run, batch, score))
         super().add_evaluate(pipeline, batch)
@@ -320,18 +320,20 @@ class TorchTask(Task):
 
     def add_observe(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
         """Append the first observation where mask is not 0."""
-        seen = self._worlds(batch, OBSERVE, measured=True)
+        measured = self._worlds(batch, OBSERVE, measured=True)
         starts = wp.to_torch(mask, requires_grad=False)[:, None, None]
-        pipeline.call(partial(_run, batch, lambda: self._look(seen.begin(), batch.arrays, starts != 0), mask))
+        pipeline.call(
+            partial(_run, batch, lambda: self._look(measured.begin(), batch.arrays, starts != 0), mask)
+        )
 
     def _worlds(self, batch: Batch, stage: int, measured: bool = False) -> Worlds:
         return Worlds(batch, self.memory, self.control_step, stage=stage, measured=measured)
 
     def _score(self, w: Worlds, arrays: TaskArrays) -> None:
-        given = arrays.answers
-        self._answer("reward", self.reward(w), given.reward)
-        self._answer("terminated", self.terminated(w), given.terminated)
-        self._answer("inside", self.inside(w), given.inside)
+        answers = arrays.answers
+        self._answer("reward", self.reward(w), answers.reward)
+        self._answer("terminated", self.terminated(w), answers.terminated)
+        self._answer("inside", self.inside(w), answers.inside)
         counted = self.counted(w)
         if counted.keys() != set(self.totals):
             raise EnvironmentSetupError(
@@ -340,10 +342,10 @@ class TorchTask(Task):
             )
         if counted:
             rows = [counted[name].reshape(w.count, 1) for name in self.totals]
-            self._answer("counted", torch.cat(rows, dim=1), given.counted)
+            self._answer("counted", torch.cat(rows, dim=1), answers.counted)
 
-    def _look(self, w: Worlds, arrays: TaskArrays, where: Tensor) -> None:
-        """Write the observation of the worlds `where`, bool, (worlds, 1, 1)."""
+    def _look(self, w: Worlds, arrays: TaskArrays, mask: Tensor) -> None:
+        """Write the observation of the worlds `mask`, bool, (worlds, 1, 1)."""
         parts, agents = self.observe(w), len(self.agents)
         if len(parts) != len(self.observation):
             raise EnvironmentSetupError(
@@ -352,23 +354,23 @@ class TorchTask(Task):
             )
         rows = wp.to_torch(arrays.observation, requires_grad=False).view(w.count, agents, -1)
         first = 0
-        for part, given in zip(self.observation, parts, strict=True):
-            if given.numel() != w.count * agents * part.size or given.shape[0] != w.count:
+        for part, part_value in zip(self.observation, parts, strict=True):
+            if part_value.numel() != w.count * agents * part.size or part_value.shape[0] != w.count:
                 raise EnvironmentSetupError(
-                    f"task '{self.name}': observe gives '{part.name}' of shape {tuple(given.shape)}, expected "
+                    f"task '{self.name}': observe gives '{part.name}' of shape {tuple(part_value.shape)}, expected "
                     f"{_shape(w.count, agents, part.size)}"
                 )
-            values = given.reshape(w.count, agents, part.size)
+            values = part_value.reshape(w.count, agents, part.size)
             values = values if part.scale == 1.0 else values / part.scale
             values = values if part.clip is None else values.clamp(-part.clip, part.clip)
             old = rows[..., first : first + part.size]
-            old[:] = torch.where(where, values, old)
+            old[:] = torch.where(mask, values, old)
             first += part.size
 
     def _begin(self, w: Worlds, arrays: TaskArrays) -> None:
-        given, start = arrays.answers, self.reset(w)
+        answers, start = arrays.answers, self.reset(w)
         for name in ("position", "quaternion", "velocity", "goal_position", "goal_quaternion"):
-            value, out = getattr(start, name), getattr(given, name)
+            value, out = getattr(start, name), getattr(answers, name)
             if value is not None:
                 self._answer(f"reset: {name}", value, out)
             elif name.endswith("quaternion"):
@@ -383,21 +385,23 @@ class TorchTask(Task):
             )
         if self.memory:
             rows = [start.memory.get(name, w.zeros(size)) for name, size in self.memory.items()]
-            whole = torch.cat([row.reshape(w.count, -1) for row in rows], dim=1)
-            self._answer("reset: memory", whole, given.begun)
+            full = torch.cat([row.reshape(w.count, -1) for row in rows], dim=1)
+            self._answer("reset: memory", full, answers.begun)
 
     def _answer(self, name: str, value: Any, out: wp.array) -> None:
         """Copy what a function gave to where the kernels look for it."""
-        place = wp.to_torch(out, requires_grad=False)
+        target = wp.to_torch(out, requires_grad=False)
         if (
             not isinstance(value, Tensor)
-            or value.numel() != place.numel()
-            or value.shape[0] != place.shape[0]
+            or value.numel() != target.numel()
+            or value.shape[0] != target.shape[0]
         ):
             got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-            wanted = tuple(n for i, n in enumerate(place.shape) if n > 1 or i != 1)
-            raise EnvironmentSetupError(f"task '{self.name}': {name} gives {got}, expected a tensor {wanted}")
-        place.copy_(value.reshape(place.shape))
+            expected = tuple(n for i, n in enumerate(target.shape) if n > 1 or i != 1)
+            raise EnvironmentSetupError(
+                f"task '{self.name}': {name} gives {got}, expected a tensor {expected}"
+            )
+        target.copy_(value.reshape(target.shape))
 
 
 def _shape(worlds: int, agents: int, size: int) -> tuple[int, ...]:

@@ -110,7 +110,9 @@ def follow(environment: Environment, guides: Sequence[Guide]) -> np.ndarray:
             "make the task with a longer one"
         )
     places = fill_table(table, guides)
-    position, yaw = (np.stack([getattr(place, name)[0] for place in places]) for name in ("position", "yaw"))
+    position, yaw = (
+        np.stack([getattr(reference, name)[0] for reference in places]) for name in ("position", "yaw")
+    )
     q = quat_from_yaw(yaw)
     return environment.start(position, q, position, q)
 
@@ -124,10 +126,12 @@ def fill_table(table: ReferenceTable, guides: Sequence[Guide]) -> list[Reference
     t = table.spacing * np.arange(table.position.shape[1])
     ends = [np.minimum(t, guide.duration) for guide in guides]
     places = [guide.at(time) for guide, time in zip(guides, ends, strict=True)]
-    velocity = np.stack([place.velocity for place in places])
+    velocity = np.stack([reference.velocity for reference in places])
     # Past its end a motion goes on in the table, so that the piece with the end in it is followed; none reads further.
     beyond = (t - np.stack(ends))[..., None] * velocity
-    table.position.assign((np.stack([place.position for place in places]) + beyond).astype(np.float32))
+    table.position.assign(
+        (np.stack([reference.position for reference in places]) + beyond).astype(np.float32)
+    )
     table.velocity.assign(velocity.astype(np.float32))
     table.duration.assign(np.array([min(guide.duration, ENDLESS) for guide in guides], np.float32))
     table.offset.zero_()
@@ -240,8 +244,8 @@ REST = 1.0e-6
 @wp.func
 def reference_offset(arrays: TaskArrays, w: int, k: int) -> wp.vec3:
     """From the vehicle to where the reference is k `LOOK_AHEAD` from now, body frame [m]."""
-    place = reference_position(arrays.reference, w, arrays.time[w] + LOOK_AHEAD * float(k))
-    return wp.quat_rotate_inv(arrays.quaternion[w, 0], place - arrays.position[w, 0])
+    ahead = reference_position(arrays.reference, w, arrays.time[w] + LOOK_AHEAD * float(k))
+    return wp.quat_rotate_inv(arrays.quaternion[w, 0], ahead - arrays.position[w, 0])
 
 
 @wp.func

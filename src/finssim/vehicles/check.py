@@ -120,7 +120,7 @@ def _allocation(vehicle: Vehicle) -> Finding:
 
 
 def _thrust_curves(vehicle: Vehicle) -> Iterator[Finding]:
-    worst, where = 0.0, ""
+    worst, of_which = 0.0, ""
     for name, thruster in vehicle.thrusters.items():
         for side, force, c, rpm in (
             ("forward", thruster.force_max, thruster.c_plus, thruster.rpm_max),
@@ -128,11 +128,11 @@ def _thrust_curves(vehicle: Vehicle) -> Iterator[Finding]:
         ):
             excess = force / (c * (rpm * math.pi / 30.0) ** 2) - 1.0
             if excess > worst:
-                worst, where = excess, f" ({name}, {side})"
+                worst, of_which = excess, f" ({name}, {side})"
     yield Finding(
         "thrust curves",
         worst <= CURVE_TOLERANCE,
-        f"force limits exceed the curve at the speed limit by at most {100.0 * worst:.2g} %{where}, expected <= 1 %",
+        f"force limits exceed the curve at the speed limit by at most {100.0 * worst:.2g} %{of_which}, expected <= 1 %",
     )
 
 
@@ -143,13 +143,13 @@ def _trim(vehicle: Vehicle) -> Finding:
     sentence = f"it {drift} with {abs(net):.3g} N; level at rest needs {_wrench(level.wrench)}"
     if level.forces is None:
         return Finding("trim", False, f"{sentence}, more than the thrusters give")
-    left = [
+    uncontrolled = [
         a
         for a, x in zip(AXES, level.wrench, strict=True)
         if a not in vehicle.controlled_axes and abs(x) > 1e-6
     ]
-    if left:
-        sentence += f"; {', '.join(left)} is not controlled and left to the water"
+    if uncontrolled:
+        sentence += f"; {', '.join(uncontrolled)} is not controlled and left to the water"
     lower, upper = vehicle.force_limits
     share = float(np.max(np.where(level.forces > 0.0, level.forces / upper, level.forces / lower)))
     return Finding(
@@ -188,11 +188,11 @@ def _hull(vehicle: Vehicle) -> Iterator[Finding]:
         yield Finding("hull", False, str(error))
         return
     yield Finding("hull", True, f"the hull of {len(faces)} faces is closed and its normals point outward")
-    volume, given = mesh_volume(vertices, faces), vehicle.body.displaced_volume
+    volume, stated = mesh_volume(vertices, faces), vehicle.body.displaced_volume
     yield Finding(
         "hull volume",
-        abs(volume / given - 1.0) <= VOLUME_TOLERANCE,
-        f"the hull encloses {volume:.6g} m³, the displaced volume is {given:.6g} m³, "
+        abs(volume / stated - 1.0) <= VOLUME_TOLERANCE,
+        f"the hull encloses {volume:.6g} m³, the displaced volume is {stated:.6g} m³, "
         f"expected within {100.0 * VOLUME_TOLERANCE:g} %",
     )
     gap = float(np.linalg.norm(mesh_centroid(vertices, faces) - vehicle.body.center_of_buoyancy))

@@ -94,13 +94,13 @@ def default_sensors() -> Sensors:
     )
 
 
-def default_perception(given: Mapping[str, Any]) -> dict[str, RaySensor]:
+def default_perception(values: Mapping[str, Any]) -> dict[str, RaySensor]:
     """Camera, sonar and altimeter on the envelope: what a small ROV carries; one that does not hover has no camera.
 
     Devices are those of the catalogue; pictures are as coarse as policies take them, delays and losses are guesses.
     """
-    middle = np.asarray(given["body"].center_of_buoyancy)
-    length, _, height = given["body"].size
+    middle = np.asarray(values["body"].center_of_buoyancy)
+    length, _, height = values["body"].size
     nose, under = middle + [0.5 * length, 0.0, 0.0], middle - [0.0, 0.0, 0.5 * height]
     camera = RaySensor(
         device="low_light_camera", position=nose, width=48, rate=10.0, latency=0.1, dropout=0.01
@@ -114,14 +114,14 @@ def default_perception(given: Mapping[str, Any]) -> dict[str, RaySensor]:
         latency=0.1,
     )
     altimeter = RaySensor(device="ping", position=under, rate=10.0, latency=0.05)
-    hovers = "heave" in given["controlled_axes"]
+    hovers = "heave" in values["controlled_axes"]
     return {**({"front_camera": camera} if hovers else {}), "sonar": sonar, "altimeter": altimeter}
 
 
-def default_tags(given: Mapping[str, Any]) -> Tags:
+def default_tags(values: Mapping[str, Any]) -> Tags:
     """Two tags on top of the envelope, about the centre of buoyancy, which is the middle of the hull."""
-    length, width, height = given["body"].size
-    x, y, z = given["body"].center_of_buoyancy
+    length, width, height = values["body"].size
+    x, y, z = values["body"].center_of_buoyancy
     top = float(z + 0.5 * height)
     mounts = {
         tag: Mount(position=np.array([x + side * APART * length, y, top]), orientation=np.array(QUARTER_TURN))
@@ -148,8 +148,8 @@ def with_navigation(vehicle: Vehicle) -> Vehicle:
         noise_std=math.radians(0.4),
         bias_initial=math.radians(0.3),
     )
-    own = vehicle.sensors
-    fitted = own.model_copy(update={"dvl": own.dvl or dvl, "compass": own.compass or compass})
+    sensors = vehicle.sensors
+    fitted = sensors.model_copy(update={"dvl": sensors.dvl or dvl, "compass": sensors.compass or compass})
     return vehicle.model_copy(update={"sensors": fitted})
 
 
@@ -189,18 +189,18 @@ def numbered(vehicle: Vehicle, number: int) -> Vehicle:
     return vehicle.model_copy(update={"tags": tags.model_copy(update={"mounts": mounts})})
 
 
-def default_mcu(given: Mapping[str, Any]) -> Mcu:
+def default_mcu(values: Mapping[str, Any]) -> Mcu:
     """Outputs enough for the motors that the thrusters name, or for one each."""
-    thrusters = given["thrusters"].values()
+    thrusters = values["thrusters"].values()
     named = [t.motor_index + 1 for t in thrusters if t.motor_index is not None]
     fastest = max(max(t.rpm_max, -t.rpm_min) for t in thrusters)
     return Mcu(rpm_full_scale=fastest, command_timeout=0.5, outputs=max(len(thrusters), *named, 1))
 
 
-def default_safety(given: Mapping[str, Any]) -> Safety:
+def default_safety(values: Mapping[str, Any]) -> Safety:
     """Limits by class: a vehicle that hovers, or one that needs way on to dive and may pitch further for it."""
-    hovers = "heave" in given["controlled_axes"]
-    length, width, depth = (room(given["body"].size) * side for side in POOL)
+    hovers = "heave" in values["controlled_axes"]
+    length, width, depth = (room(values["body"].size) * side for side in POOL)
     return Safety(
         command_timeout=0.5,
         telemetry_timeout=0.5,

@@ -128,14 +128,14 @@ class Sensors(Part):
     def _known_keys_only(cls, data: Any) -> Any:
         if not isinstance(data, dict):
             return data
-        own = {key: OWN_SENSORS[key].model_validate(data[key]) for key in data if key in OWN_SENSORS}
+        extra = {key: OWN_SENSORS[key].model_validate(data[key]) for key in data if key in OWN_SENSORS}
         for key in data:
-            if key not in own and key not in cls.model_fields:
-                known = [*cls.model_fields, *OWN_SENSORS]
+            if key not in extra and key not in cls.model_fields:
+                allowed = [*cls.model_fields, *OWN_SENSORS]
                 raise refuse_section(
-                    f"unknown key '{key}'{did_you_mean(str(key), known)} known keys: {', '.join(known)}"
+                    f"unknown key '{key}'{did_you_mean(str(key), allowed)} known keys: {', '.join(allowed)}"
                 )
-        return {**data, **own}
+        return {**data, **extra}
 
     imu: Imu | None = None
     depth: DepthSensor | None = None

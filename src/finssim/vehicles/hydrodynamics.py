@@ -49,17 +49,17 @@ class HydrodynamicSet(Part):
         for key in [key for key in data if key not in cls.model_fields]:
             term = find_term(str(key))
             if term is None:
-                known = [*cls.model_fields, *term_names()]
+                allowed = [*cls.model_fields, *term_names()]
                 raise refuse_section(
-                    f"unknown key '{key}'{did_you_mean(str(key), known)} known keys: {', '.join(known)}"
+                    f"unknown key '{key}'{did_you_mean(str(key), allowed)} known keys: {', '.join(allowed)}"
                 )
             out[key] = term.read(data[key])
         return out
 
     @model_serializer(mode="wrap")
     def _plain(self, handler: Any) -> dict[str, Any]:
-        own = {key: TERMS[key].plain(value) for key, value in self.terms.items()}
-        return {key: own.get(key, value) for key, value in handler(self).items()}
+        of_terms = {key: TERMS[key].plain(value) for key, value in self.terms.items()}
+        return {key: of_terms.get(key, value) for key, value in handler(self).items()}
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -77,8 +77,8 @@ class HydrodynamicSet(Part):
     @property
     def term_parameters(self) -> dict[str, Any]:
         """Path -> number or array of every parameter of its terms, such as `lift.coefficient`."""
-        given = self.terms.items()
-        return {path: x for name, value in given for path, x in TERMS[name].numbers(value).items()}
+        items = self.terms.items()
+        return {path: x for name, value in items for path, x in TERMS[name].numbers(value).items()}
 
     @property
     def term_scalars(self) -> dict[str, tuple[float, float]]:

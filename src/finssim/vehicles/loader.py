@@ -37,30 +37,30 @@ def load_vehicle(name_or_path: str | os.PathLike[str]) -> Vehicle:
     Raises:
         VehicleError: Unknown name, or a file that is refused; the message says where, what and what to do.
     """
-    path, shown = _locate(name_or_path)
-    values, origins = _with_parents(path, shown, ())
-    values, origins = _expand_groups(values, origins, shown)
-    vehicle = _checked(values, origins, path.stem, path, shown)
+    path, label = _locate(name_or_path)
+    values, origins = _with_parents(path, label, ())
+    values, origins = _expand_groups(values, origins, label)
+    vehicle = _checked(values, origins, path.stem, path, label)
     if vehicle.hull is not None and vehicle.hull.file is not None:
         try:
             vehicle.hull_mesh()
         except VehicleError as error:
-            raise VehicleError(f"{shown}: hull: {error}") from None
+            raise VehicleError(f"{label}: hull: {error}") from None
     return vehicle
 
 
-def catalogue_vehicle(name: str, where: str) -> Vehicle:
+def catalogue_vehicle(name: str, source: str) -> Vehicle:
     """The vehicle of the catalogue that data names: such a name is never a path.
 
     Args:
         name: From a record or another file.
-        where: Who names it, for messages.
+        source: Who names it, for messages.
 
     Raises:
         VehicleError: No plain name, or none of the catalogue.
     """
-    if plain_name(name, f"{where}: vehicle", VehicleError) not in catalogue():
-        raise VehicleError(f"{where}: {_unknown(name)}")
+    if plain_name(name, f"{source}: vehicle", VehicleError) not in catalogue():
+        raise VehicleError(f"{source}: {_unknown(name)}")
     return load_vehicle(name)
 
 
@@ -110,11 +110,11 @@ def _available() -> str:
     return ", ".join(catalogue())
 
 
-def _with_parents(path: Path, shown: str, children: tuple[Path, ...]) -> tuple[Tree, Origins]:
+def _with_parents(path: Path, label: str, children: tuple[Path, ...]) -> tuple[Tree, Origins]:
     """Values and origins of a file merged onto the file it extends."""
     if path.resolve() in children:
-        raise VehicleError(f"{shown}: extends itself through {' -> '.join(child.stem for child in children)}")
-    values, origins = read_file(path, shown)
+        raise VehicleError(f"{label}: extends itself through {' -> '.join(child.stem for child in children)}")
+    values, origins = read_file(path, label)
     hull = values.get("hull")
     if isinstance(hull, dict) and isinstance(hull.get("file"), str):
         hull["file"] = path.parent.resolve() / hull["file"]
@@ -125,7 +125,7 @@ def _with_parents(path: Path, shown: str, children: tuple[Path, ...]) -> tuple[T
             file = path.parent.resolve() / device
             if not file.is_file():
                 raise VehicleError(
-                    f"{shown}: perception.{name}: no file {device} beside it: give a sensor's file, or a name of "
+                    f"{label}: perception.{name}: no file {device} beside it: give a sensor's file, or a name of "
                     "'finssim worlds'"
                 )
             entry["device"] = str(file)
@@ -133,10 +133,10 @@ def _with_parents(path: Path, shown: str, children: tuple[Path, ...]) -> tuple[T
     if parent is None:
         return values, origins
     try:
-        parent_path, parent_shown = _locate(parent, beside=path.parent)
+        parent_path, parent_label = _locate(parent, beside=path.parent)
     except VehicleError as error:
-        raise VehicleError(f"{shown}: extends: {error}") from None
-    base_values, base_origins = _with_parents(parent_path, parent_shown, (*children, path.resolve()))
+        raise VehicleError(f"{label}: extends: {error}") from None
+    base_values, base_origins = _with_parents(parent_path, parent_label, (*children, path.resolve()))
     return _merged(base_values, values, (), base_origins), base_origins | origins
 
 
@@ -176,7 +176,7 @@ def _forget(path: tuple[str, ...], origins: Origins) -> None:
         del origins[key]
 
 
-def _expand_groups(values: Tree, origins: Origins, shown: str) -> tuple[Tree, Origins]:
+def _expand_groups(values: Tree, origins: Origins, label: str) -> tuple[Tree, Origins]:
     """Give every thruster the numbers of its group; its own come first."""
     groups = values.pop("thruster_groups", {})
     thrusters = values.get("thrusters")
@@ -188,7 +188,7 @@ def _expand_groups(values: Tree, origins: Origins, shown: str) -> tuple[Tree, Or
         group = str(thruster["group"])
         if group not in groups:
             raise VehicleError(
-                f"{shown}: thrusters.{name}: group is '{group}'{did_you_mean(group, list(groups))} "
+                f"{label}: thrusters.{name}: group is '{group}'{did_you_mean(group, list(groups))} "
                 f"expected one of {', '.join(groups) or 'thruster_groups, which the file does not give'}"
             )
         for key in groups[group]:
@@ -201,43 +201,43 @@ def _expand_groups(values: Tree, origins: Origins, shown: str) -> tuple[Tree, Or
     return values, {key: value for key, value in origins.items() if not key.startswith("thruster_groups.")}
 
 
-def _checked(values: Tree, origins: Origins, name: str, path: Path | None, shown: str) -> Vehicle:
+def _checked(values: Tree, origins: Origins, name: str, path: Path | None, label: str) -> Vehicle:
     """The vehicle, with every refusal told as one sentence."""
     for key in ("name", "path", "provenance"):
         if key in values:
-            raise VehicleError(f"{shown}: unknown key '{key}': the name is that of the file")
+            raise VehicleError(f"{label}: unknown key '{key}': the name is that of the file")
     try:
         return Vehicle(**values, name=name, path=path, provenance=origins)
     except ValidationError as error:
         sentences = [
-            sentence_of(detail, shown)
+            sentence_of(detail, label)
             for detail in error.errors()
             if detail["type"] != "default_factory_not_called"
         ]
         raise VehicleError("\n".join(sentences)) from None
 
 
-def _set(tree: Any, path: list[str], value: Any, shown: str, done: tuple[str, ...] = ()) -> list[str]:
+def _set(tree: Any, path: list[str], value: Any, label: str, done: tuple[str, ...] = ()) -> list[str]:
     """Assign at a dotted path in plain values; `*` is every key. Returns the full paths assigned."""
     key, rest = path[0], path[1:]
     if isinstance(tree, list):
         if not key.isdigit() or int(key) >= len(tree):
-            raise VehicleError(f"{shown}: {'.'.join(done)}: no element '{key}' in a list of {len(tree)}")
+            raise VehicleError(f"{label}: {'.'.join(done)}: no element '{key}' in a list of {len(tree)}")
         index: Any = int(key)
     elif isinstance(tree, dict):
         if key == "*":
-            return [full for name in tree for full in _set(tree, [str(name), *rest], value, shown, done)]
+            return [full for name in tree for full in _set(tree, [str(name), *rest], value, label, done)]
         names = {str(name): name for name in tree}  # ids of tags are numbers
         index = names.get(key, key)
         if rest and key not in names:
             raise VehicleError(
-                f"{shown}: {'.'.join(done) or 'top level'}: no '{key}'{did_you_mean(key, list(names))} "
+                f"{label}: {'.'.join(done) or 'top level'}: no '{key}'{did_you_mean(key, list(names))} "
                 f"there are {', '.join(names)}"
             )
     else:
-        raise VehicleError(f"{shown}: {'.'.join(done)} is a value, it has no '{key}'")
+        raise VehicleError(f"{label}: {'.'.join(done)} is a value, it has no '{key}'")
     if rest:
-        return _set(tree[index], rest, value, shown, (*done, key))
+        return _set(tree[index], rest, value, label, (*done, key))
     tree[index] = value.tolist() if isinstance(value, np.ndarray) else copy.deepcopy(value)
     return [".".join((*done, key))]
 
@@ -245,78 +245,78 @@ def _set(tree: Any, path: list[str], value: Any, shown: str, done: tuple[str, ..
 _MARKS = ("origin", "source", "note")
 
 
-def read_file(path: Path, shown: str) -> tuple[dict[str, Any], dict[str, Provenance]]:
+def read_file(path: Path, label: str) -> tuple[dict[str, Any], dict[str, Provenance]]:
     """Plain values of a vehicle file, and the origin of its numbers by dotted path.
 
     Args:
         path: The file.
-        shown: How messages call it.
+        label: How messages call it.
 
     Raises:
         VehicleError: Unreadable, malformed, or a number without an origin.
     """
-    tree = read_mapping(path, VehicleError, such_as="body: {mass: 11.2}", shown=shown)
+    tree = read_mapping(path, VehicleError, such_as="body: {mass: 11.2}", label=label)
     if not isinstance(tree.get("extends"), str | None):
         raise VehicleError(
-            f"{shown}: extends is {tree['extends']!r}, expected the name or path of a vehicle, such as finsrov"
+            f"{label}: extends is {tree['extends']!r}, expected the name or path of a vehicle, such as finsrov"
         )
     records = tree.pop(
         "calibrations", None
     )  # what a fit did, not numbers of the vehicle: they need no origin
     provenance: dict[str, Provenance] = {}
-    values = _plain(tree, (), None, provenance, shown)
+    values = _plain(tree, (), None, provenance, label)
     if records is not None:
         values["calibrations"] = records
     return values, provenance
 
 
 def _plain(
-    node: Any, path: tuple[str, ...], inherited: Provenance | None, found: dict[str, Provenance], shown: str
+    node: Any, path: tuple[str, ...], inherited: Provenance | None, origins: dict[str, Provenance], label: str
 ) -> Any:
     """Strip the origin marks from a tree, recording what they say about the numbers below them."""
     if isinstance(node, dict):
-        here = _marked(node, path, inherited, shown)
+        here = _marked(node, path, inherited, label)
         if "value" in node:
             for key in node:
                 if key not in ("value", *_MARKS):
-                    raise VehicleError(f"{shown}: {_where(path)}: unknown key '{key}' beside 'value'")
-            return _plain(node["value"], path, here, found, shown)
+                    raise VehicleError(f"{label}: {_where(path)}: unknown key '{key}' beside 'value'")
+            return _plain(node["value"], path, here, origins, label)
         return {
-            str(key): _plain(value, (*path, str(key)), here, found, shown)
+            str(key): _plain(value, (*path, str(key)), here, origins, label)
             for key, value in node.items()
             if key not in _MARKS
         }
     if isinstance(node, list):
-        items = [_plain(item, (*path, str(i)), inherited, found, shown) for i, item in enumerate(node)]
-        _fold(path, len(items), found)
+        items = [_plain(item, (*path, str(i)), inherited, origins, label) for i, item in enumerate(node)]
+        _fold(path, len(items), origins)
         return items
     if isinstance(node, (int, float)) and not isinstance(node, bool):
         if inherited is None:
             if not math.isfinite(node):
                 raise VehicleError(
-                    f"{shown}: {_where(path[:-1])}: {path[-1]} is {node}, expected a finite number"
+                    f"{label}: {_where(path[:-1])}: {path[-1]} is {node}, expected a finite number"
                 )
             raise VehicleError(
-                f"{shown}: {_where(path[:-1])}: {path[-1]} has no origin: write "
+                f"{label}: {_where(path[:-1])}: {path[-1]} has no origin: write "
                 f"{{value: {node}, origin: measured, source: ...}} or give 'origin:' to its section or to the file"
             )
-        found[".".join(path)] = inherited
+        origins[".".join(path)] = inherited
     return node
 
 
 def _marked(
-    node: dict[Any, Any], path: tuple[str, ...], inherited: Provenance | None, shown: str
+    node: dict[Any, Any], path: tuple[str, ...], inherited: Provenance | None, label: str
 ) -> Provenance | None:
     """Origin in force inside a mapping: a new `origin` starts afresh, a new `source` or `note` refines."""
     for mark in _MARKS:
         if mark in node and not isinstance(node[mark], str):
-            raise VehicleError(f"{shown}: {_where(path)}: {mark} is {node[mark]!r}, expected words")
+            raise VehicleError(f"{label}: {_where(path)}: {mark} is {node[mark]!r}, expected words")
     source, note = node.get("source", ""), node.get("note", "")
     if "origin" in node:
         origin = node["origin"]
         if origin not in ORIGINS:
             raise VehicleError(
-                f"{shown}: {_where(path)}: origin is '{origin}'{did_you_mean(origin, list(ORIGINS))} "
+                f"{label}: {_where(path)}: origin is '{origin}'{did_you_mean(origin, list(ORIGINS))} "
                 f"expected one of {', '.join(ORIGINS)}"
             )
         return Provenance(origin, source, note)
@@ -327,13 +327,13 @@ def _marked(
     )
 
 
-def _fold(path: tuple[str, ...], length: int, found: dict[str, Provenance]) -> None:
+def _fold(path: tuple[str, ...], length: int, origins: dict[str, Provenance]) -> None:
     """One entry for a list whose elements share their origin."""
     keys = [".".join((*path, str(i))) for i in range(length)]
-    if keys and all(key in found for key in keys) and len({found[key] for key in keys}) == 1:
-        found[".".join(path)] = found[keys[0]]
+    if keys and all(key in origins for key in keys) and len({origins[key] for key in keys}) == 1:
+        origins[".".join(path)] = origins[keys[0]]
         for key in keys:
-            del found[key]
+            del origins[key]
 
 
 def _where(path: tuple[str, ...]) -> str:

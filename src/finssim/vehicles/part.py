@@ -29,9 +29,9 @@ def refuse_section(message: str) -> PydanticCustomError:
     return PydanticCustomError("section", "{message}", {"message": message})
 
 
-def did_you_mean(word: str, known: list[str]) -> str:
+def did_you_mean(word: str, available: list[str]) -> str:
     """`, did you mean 'x'?` for the nearest known word, or `;` where none is near."""
-    close = difflib.get_close_matches(word, known, n=1)
+    close = difflib.get_close_matches(word, available, n=1)
     return f", did you mean '{close[0]}'?" if close else ";"
 
 
@@ -44,11 +44,11 @@ class Part(BaseModel):
     @classmethod
     def _known_keys_only(cls, data: Any) -> Any:
         if isinstance(data, dict):
-            known = [name for name, field in cls.model_fields.items() if not field.exclude]
+            allowed = [name for name, field in cls.model_fields.items() if not field.exclude]
             for key in data:
                 if key not in cls.model_fields:
                     raise refuse_section(
-                        f"unknown key '{key}'{did_you_mean(str(key), known)} known keys: {', '.join(known)}"
+                        f"unknown key '{key}'{did_you_mean(str(key), allowed)} known keys: {', '.join(allowed)}"
                     )
         return data
 
@@ -110,10 +110,10 @@ def _positive3(value: Any) -> NDArray[np.float64]:
     return array
 
 
-def _unit(array: NDArray[np.float64], what: str) -> NDArray[np.float64]:
+def _unit(array: NDArray[np.float64], remedy: str) -> NDArray[np.float64]:
     length = float(np.linalg.norm(array))
     if abs(length - 1.0) > UNIT_TOLERANCE:
-        raise refuse_value(f"has length {length:.7g}, expected 1: give a {what}")
+        raise refuse_value(f"has length {length:.7g}, expected 1: give a {remedy}")
     # A vector that was normalised before stays bit by bit what it is, so that its file keeps its hash.
     return _frozen(array if abs(length - 1.0) < 4.0 * np.finfo(np.float64).eps else array / length)
 
@@ -187,18 +187,18 @@ def identity_quaternion() -> NDArray[np.float64]:
     return _frozen(np.array([0.0, 0.0, 0.0, 1.0]))
 
 
-def sentence_of(detail: Any, shown: str, missing: str = "add it, with its origin") -> str:
+def sentence_of(detail: Any, label: str, missing: str = "add it, with its origin") -> str:
     """One pydantic complaint in the form `file: section: key value, expectation: what to do`.
 
     Args:
         detail: One of `ValidationError.errors()`.
-        shown: What to call the file.
+        label: What to call the file.
         missing: What to do about a key that is not there.
     """
-    where = [str(item) for item in detail["loc"] if not str(item).startswith("<")]
-    kind, given, context = detail["type"], detail.get("input"), detail.get("ctx", {})
+    location = [str(item) for item in detail["loc"] if not str(item).startswith("<")]
+    kind, value, context = detail["type"], detail.get("input"), detail.get("ctx", {})
     if kind == "section":
-        return ": ".join(filter(None, [shown, ".".join(where), context["message"]]))
+        return ": ".join(filter(None, [label, ".".join(location), context["message"]]))
     bounds = {
         "greater_than": ("gt", ">"),
         "greater_than_equal": ("ge", ">="),
@@ -211,18 +211,18 @@ def sentence_of(detail: Any, shown: str, missing: str = "add it, with its origin
         problem = f"is missing: {missing}"
     elif kind in bounds:
         key, sign = bounds[kind]
-        problem = f"is {given}, expected {sign} {context[key]:g}"
+        problem = f"is {value}, expected {sign} {context[key]:g}"
     elif kind == "finite_number":
-        problem = f"is {given}, expected a finite number"
+        problem = f"is {value}, expected a finite number"
     elif kind in ("float_type", "int_type", "float_parsing", "int_parsing"):
-        problem = f"is {given!r}, expected {'a whole' if kind.startswith('int') else 'a'} number"
+        problem = f"is {value!r}, expected {'a whole' if kind.startswith('int') else 'a'} number"
     elif kind == "literal_error":
-        problem = f"is {given!r}, expected {context['expected']}"
+        problem = f"is {value!r}, expected {context['expected']}"
     elif kind in ("model_type", "model_attributes_type", "dict_type"):
-        problem = f"is {given!r}, expected a section of keys"
+        problem = f"is {value!r}, expected a section of keys"
     else:
-        problem = f"is {given!r}: {detail['msg']}"
-    return ": ".join(filter(None, [shown, ".".join(where[:-1]), f"{where[-1]} {problem}"]))
+        problem = f"is {value!r}: {detail['msg']}"
+    return ": ".join(filter(None, [label, ".".join(location[:-1]), f"{location[-1]} {problem}"]))
 
 
 class VehicleError(ValueError):

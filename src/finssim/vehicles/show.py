@@ -168,11 +168,11 @@ def _terms(vehicle: Vehicle, name: str, chosen: HydrodynamicSet) -> Table:
             full = f"hydrodynamics.{name}.{path}"
             rows = np.atleast_2d(number)
             for i, row in enumerate(rows):
-                given = any(
+                stated = any(
                     f"{full}.".startswith(f"{key}.") or key.startswith(f"{full}.")
                     for key in vehicle.provenance
                 )
-                marks = _mark(vehicle, f"{full}.{i}" if len(rows) > 1 else full) if given else ""
+                marks = _mark(vehicle, f"{full}.{i}" if len(rows) > 1 else full) if stated else ""
                 table.add_row(path if i == 0 else "", _numbers(row) + marks, next(units) if i == 0 else "")
     return table
 
@@ -255,8 +255,8 @@ def _sources(vehicle: Vehicle) -> Table:
     for path, provenance in vehicle.provenance.items():
         entries.setdefault((provenance.origin, provenance.source, provenance.note), []).append(path)
     for (origin, source, note), paths in entries.items():
-        shown = paths[0] if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
-        table.add_row(escape(shown), origin, escape("; ".join(filter(None, [source, note]))))
+        text = paths[0] if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+        table.add_row(escape(text), origin, escape("; ".join(filter(None, [source, note]))))
     return table
 
 
@@ -295,12 +295,12 @@ def draw_vehicle(vehicle: Vehicle, picture: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 5.2), layout="constrained")
-    above, left = figure.subplots(1, 2)
+    above, side = figure.subplots(1, 2)
     # Forward points up the page from above and to the left from the left side: both axes across run backwards.
     _draw_view(above, vehicle, across=1, up=0)
     above.set(title="from above", xlabel="y, left [m]", ylabel="x, forward [m]")
-    _draw_view(left, vehicle, across=0, up=2)
-    left.set(title="from the left", xlabel="x, forward [m]", ylabel="z, up [m]")
+    _draw_view(side, vehicle, across=0, up=2)
+    side.set(title="from the left", xlabel="x, forward [m]", ylabel="z, up [m]")
     handles, labels = above.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     figure.suptitle(vehicle.title)
@@ -339,13 +339,13 @@ def _draw_view(axes: Axes, vehicle: Vehicle, across: int, up: int) -> None:
             axes.plot(
                 x, y, "o" if thruster.axis[3 - across - up] > 0.0 else "x", ms=11, mfc="none", color="C0"
             )
-        place = (round(x / length), round(y / length))
+        cell = (round(x / length), round(y / length))
         below = dy >= 0.0
-        offset = (0.0, -15.0 - 10.0 * named[place] if below else 8.0 + 10.0 * named[place])
+        offset = (0.0, -15.0 - 10.0 * named[cell] if below else 8.0 + 10.0 * named[cell])
         axes.annotate(
             name, (x, y), xytext=offset, textcoords="offset points", ha="center", fontsize=8, color="0.2"
         )
-        named[place] += 1
+        named[cell] += 1
     axes.plot(*vehicle.body.center_of_gravity[[across, up]], "k+", ms=11, mew=2, label="centre of gravity")
     axes.plot(
         *vehicle.body.center_of_buoyancy[[across, up]], "r^", ms=7, mfc="none", label="centre of buoyancy"

@@ -123,7 +123,7 @@ def term_names() -> list[str]:
 def find_term(name: str) -> Term | None:
     """The term of that key, whose file is imported now if it was not; None where there is none."""
     if name not in TERMS:
-        place = SHIPPED.get(name) or next((p.value for p in entry_points(group=GROUP, name=name)), None)
-        if place is not None:
-            import_module(place)
+        module = SHIPPED.get(name) or next((p.value for p in entry_points(group=GROUP, name=name)), None)
+        if module is not None:
+            import_module(module)
     return TERMS.get(name)

@@ -72,14 +72,14 @@ class Esc(Part):
             "dead_plus",
             "pulse_max",
         )
-        given = [getattr(self, key) for key in keys]
+        pulses = [getattr(self, key) for key in keys]
         if (
-            sorted(given) != given
+            sorted(pulses) != pulses
             or not self.dead_minus > self.pulse_min
             or not self.dead_plus < self.pulse_max
         ):
             raise refuse_section(
-                f"pulse widths {', '.join(f'{k} {v:g}' for k, v in zip(keys, given, strict=True))} µs "
+                f"pulse widths {', '.join(f'{k} {v:g}' for k, v in zip(keys, pulses, strict=True))} µs "
                 "must rise in this order"
             )
         for side in ("minus", "plus"):
@@ -133,11 +133,11 @@ class Esc(Part):
             [µs], (...,).
         """
         omega = np.asarray(shaft_speed, dtype=np.float64)
-        found = self._inverse(omega, self._volts(voltage, omega.shape))
+        unlimited = self._inverse(omega, self._volts(voltage, omega.shape))
         slow_minus, slow_plus = self.slowest
         rounding = 1e-9 * (slow_plus - slow_minus)
         standing = (omega > slow_minus + rounding) & (omega < slow_plus - rounding)
-        return np.where(standing, self.pulse_neutral, np.clip(found, self.pulse_min, self.pulse_max))
+        return np.where(standing, self.pulse_neutral, np.clip(unlimited, self.pulse_min, self.pulse_max))
 
     def _volts(self, voltage: ArrayLike | None, shape: tuple[int, ...]) -> Array:
         volts = np.asarray(self.voltage if voltage is None else voltage, dtype=np.float64)
@@ -234,9 +234,9 @@ class Thruster(Part):
         Args:
             force: Along `axis`, body frame [N], (...,).
         """
-        wanted = np.asarray(force, dtype=np.float64)
-        c = np.where(wanted >= 0.0, self.c_plus, self.c_minus)
-        return np.sign(wanted) * np.sqrt(np.abs(wanted) / c)
+        target = np.asarray(force, dtype=np.float64)
+        c = np.where(target >= 0.0, self.c_plus, self.c_minus)
+        return np.sign(target) * np.sqrt(np.abs(target) / c)
 
     def shaft_speed(self, pulse_us: ArrayLike, voltage: ArrayLike | None = None) -> Array:
         """Steady shaft speed at a pulse width; where `motor_sign` is -1, small pulses are positive thrust.

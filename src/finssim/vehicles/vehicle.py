@@ -125,8 +125,8 @@ class CalibrationRecord(Part):
         """`hydrodynamics by regression on 24 trials`, for lists and notes."""
         count = len(self.trials)
         noun = {"thruster": "table", "mounts": "recording"}.get(self.kind, "trial")
-        words = f"{self.kind} by {self.method} on {count} {noun}{'' if count == 1 else 's'}"
-        return f"{words} (interrupted)" if self.interrupted else words
+        text = f"{self.kind} by {self.method} on {count} {noun}{'' if count == 1 else 's'}"
+        return f"{text} (interrupted)" if self.interrupted else text
 
 
 Axis = Literal["surge", "sway", "heave", "roll", "pitch", "yaw"]
@@ -373,9 +373,9 @@ class Vehicle(Part):
         """
         parts = path.split(".")
         for length in range(len(parts), 0, -1):
-            found = self.provenance.get(".".join(parts[:length]))
-            if found is not None:
-                return found
+            origin = self.provenance.get(".".join(parts[:length]))
+            if origin is not None:
+                return origin
         raise VehicleError(f"{self.name}: no number at '{path}'{did_you_mean(path, list(self.provenance))}")
 
     def replace(self, changes: Mapping[str, Any], provenance: Provenance | None = None) -> Vehicle:

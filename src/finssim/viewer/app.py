@@ -91,8 +91,8 @@ class Scene:
         self._place("truth", frame.truth, ghost=False)
         self._place("estimate", frame.estimate, ghost=frame.truth is not None)
         self._show(self._goal, frame.goal)
-        shown = frame.truth or frame.estimate
-        arrows = force_arrows(self.stage.vehicle, frame.force, shown) if shown else np.zeros((0, 2, 3))
+        pose = frame.truth or frame.estimate
+        arrows = force_arrows(self.stage.vehicle, frame.force, pose) if pose else np.zeros((0, 2, 3))
         _set_points(self._arrows, arrows)
         _set_points(self._trail, line_of(frame.trail))
 
@@ -104,10 +104,10 @@ class Scene:
             hull.wireframe = ghost
 
     def _show(self, node: Any, pose: Pose | None) -> None:
-        known = pose is not None and bool(np.isfinite(pose.position).all())
-        if known and pose is not None:
+        visible = pose is not None and bool(np.isfinite(pose.position).all())
+        if visible and pose is not None:
             node.position, node.wxyz = tuple(pose.position), wxyz(pose.quaternion)
-        node.visible = known
+        node.visible = visible
 
     def _vehicle(self, name: str) -> tuple[Any, Any]:
         """The body's node and its hull."""
@@ -210,8 +210,8 @@ class Plot:
 
         The browser's plot takes its scales from the first values, and draws nothing where one of these is NaN.
         """
-        known = np.all([np.isfinite(curve.value) for curve in self.curves], axis=0)
-        begin = int(np.argmax(known))
+        finite = np.all([np.isfinite(curve.value) for curve in self.curves], axis=0)
+        begin = int(np.argmax(finite))
         time = self.curves[0].time[begin:]
         past = time <= max(now, float(time[0])) + 1e-9
         columns = [time]
@@ -323,13 +323,13 @@ def draw_picture(picture: Picture) -> Image:
         full = np.full((rows, columns, 3), DARK, np.uint8)
     else:
         full = np.repeat(picture.image[:, :, None], 3, axis=2)
-    shown = np.ascontiguousarray(full[::every, ::every])
+    canvas = np.ascontiguousarray(full[::every, ::every])
     outlines = [np.asarray(tag.corners, float) for tag in picture.tags]
     for corners in outlines:
-        _outline(shown, corners / every, reach=0)
+        _outline(canvas, corners / every, reach=0)
     if outlines:
-        _inset(shown, full, outlines)
-    return shown
+        _inset(canvas, full, outlines)
+    return canvas
 
 
 def draw_own(image: Image) -> Image:
@@ -340,17 +340,17 @@ def draw_own(image: Image) -> Image:
     return np.ascontiguousarray(image.repeat(times, axis=0).repeat(times, axis=1))
 
 
-def _inset(shown: Image, full: Image, outlines: list[Array]) -> None:
+def _inset(canvas: Image, full: Image, outlines: list[Array]) -> None:
     """Put the surroundings of the tags, enlarged, into the lower left corner."""
     middle = np.concatenate(outlines).mean(axis=0)
-    size = min(round(2 * INSET * ENLARGED), shown.shape[0], shown.shape[1])
+    size = min(round(2 * INSET * ENLARGED), canvas.shape[0], canvas.shape[1])
     first = middle - 0.5 * size / ENLARGED
     x, y = ((first[:, None] + (np.arange(size) + 0.5) / ENLARGED).round().astype(int)).clip(0)
     part = full[np.minimum(y, full.shape[0] - 1)][:, np.minimum(x, full.shape[1] - 1)].copy()
     for corners in outlines:
         _outline(part, (corners - first) * ENLARGED, reach=1)
     part[:2], part[:, -2:] = 255, 255
-    shown[-size:, :size] = part
+    canvas[-size:, :size] = part
 
 
 def _outline(image: Image, corners: Array, reach: int) -> None:

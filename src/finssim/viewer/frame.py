@@ -158,8 +158,8 @@ def box_of(
         if np.isfinite([lower, upper]).all():
             upper[2] = 0.0
             return lower, upper
-    known = positions[np.isfinite(positions).all(axis=1)] if len(positions) else np.zeros((1, 3))
-    lower, upper = known.min(axis=0) - MARGIN, known.max(axis=0) + MARGIN
+    finite = positions[np.isfinite(positions).all(axis=1)] if len(positions) else np.zeros((1, 3))
+    lower, upper = finite.min(axis=0) - MARGIN, finite.max(axis=0) + MARGIN
     upper[2] = 0.0
     return lower, upper
 

@@ -69,8 +69,8 @@ class PoseSeries:
         if not len(self):
             return np.full((len(time), 3), np.nan), np.full(len(time), np.nan)
         columns = [*self.position.T, np.unwrap(quat_yaw(self.quaternion))]
-        found = [np.interp(time, self.time, column, np.nan, np.nan) for column in columns]
-        return np.stack(found[:3], axis=1), found[3]
+        interpolated = [np.interp(time, self.time, column, np.nan, np.nan) for column in columns]
+        return np.stack(interpolated[:3], axis=1), interpolated[3]
 
 
 def errors_between(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -90,10 +90,10 @@ class Errors:
         """Keep a moment, its time in [s], if the last one that was kept is old enough."""
         if self._rows and time < self._rows[-1][0] + SAMPLE - 1e-9:
             return
-        seen = true or estimate
-        if seen is not None:
-            self._trail.append(np.array(seen.position, float))
-        self._rows.append((time, *_error(seen, goal), *_error(estimate, true)))
+        pose = true or estimate
+        if pose is not None:
+            self._trail.append(np.array(pose.position, float))
+        self._rows.append((time, *_error(pose, goal), *_error(estimate, true)))
 
     @property
     def trail(self) -> Array:
@@ -162,8 +162,8 @@ def offset_between(estimate: PoseSeries, time: Array, position: Array) -> float:
     """
     chosen = np.unique(np.linspace(0, len(estimate) - 1, SAMPLES).round().astype(int))
     t, x = estimate.time[chosen], estimate.position[chosen]
-    known = np.isfinite(x).all(axis=1)
-    t, x = t[known], x[known]
+    finite = np.isfinite(x).all(axis=1)
+    t, x = t[finite], x[finite]
     first, last = t[0] - time[-1], t[-1] - time[0]
 
     def error(offset: float) -> float:

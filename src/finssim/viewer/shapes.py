@@ -87,8 +87,8 @@ def tag_plates(vehicle: Vehicle) -> tuple[Mesh, Mesh] | None:
 def wall_mesh(lower: Array, upper: Array) -> Mesh:
     """Floor and four walls of a box, seen from inside alone: those between the eye and the water vanish."""
     box = _box(lower, upper)
-    kept = np.r_[0:2, 4:12]  # without the lid
-    return Mesh(box.vertices, box.faces[kept][:, ::-1])
+    open_faces = np.r_[0:2, 4:12]  # without the lid
+    return Mesh(box.vertices, box.faces[open_faces][:, ::-1])
 
 
 def force_arrows(vehicle: Vehicle, force: Array, pose: Pose) -> Array:
@@ -105,8 +105,8 @@ def force_arrows(vehicle: Vehicle, force: Array, pose: Pose) -> Array:
     at = np.array([t.position for t in vehicle.thrusters.values()], float)
     reach = length * np.sign(part) * np.sqrt(np.abs(part))
     along = np.array([t.axis for t in vehicle.thrusters.values()], float)
-    seen = np.isfinite(part) & (np.abs(part) > FAINT)
-    ends = np.stack([at, at + reach[:, None] * along], axis=1)[seen]
+    visible = np.isfinite(part) & (np.abs(part) > FAINT)
+    ends = np.stack([at, at + reach[:, None] * along], axis=1)[visible]
     return np.asarray(ends @ quat_to_matrix(pose.quaternion).T + pose.position)
 
 

@@ -195,8 +195,8 @@ class PoolSource:
 
     def _status(self, runtime: Runtime) -> dict[str, str]:
         bridge, reading, plant = runtime.bridge, runtime.reading, self._world.plant
-        why = bridge.reason or runtime.refusal
-        status: dict[str, Any] = {"bridge": bridge.state + (f" ({why})" if why else "")}
+        reason = bridge.reason or runtime.refusal
+        status: dict[str, Any] = {"bridge": bridge.state + (f" ({reason})" if reason else "")}
         if reading is not None:
             status["vision"] = reading.mode
             status["state"] = "ready" if reading.ready else f"not ready: {reading.reason}"
@@ -404,14 +404,14 @@ class RecordSource:
         at = self.begin + time
         thrusters = self._thrusters.at(at)
         force = np.zeros(0) if thrusters is None else np.asarray(thrusters.force, float)
-        shown = self._truth if self._truth is not None else self._odom
+        poses = self._truth if self._truth is not None else self._odom
         return Frame(
             time=time,
             truth=None if self._truth is None else self._truth.at(at),
             estimate=self._odom.at(at),
             goal=self._goal.at(at),
             force=force,
-            trail=shown.trail(at),
+            trail=poses.trail(at),
             picture=self._picture(at),
             pictures={name: image for name in self._eyes if (image := self._own(name, at)) is not None},
             status=self._status(at, thrusters),
@@ -431,35 +431,37 @@ class RecordSource:
 
     def _read(self, record: Record) -> None:
         """Sort the record's messages by what they are."""
-        own = [
+        perceived = [
             f"{name}/{kind}" for name in self._vehicle.perception for kind in ("image/compressed", "range")
         ]
-        known = {record.topic(name): name for name in (*TOPICS, *own) if record.topic(name) in record.topics}
-        if not known:
+        topics = {
+            record.topic(name): name for name in (*TOPICS, *perceived) if record.topic(name) in record.topics
+        }
+        if not topics:
             raise ViewError(f"{record.path}: no topic to show; one of {', '.join(TOPICS)} is needed")
         times: defaultdict[str, list[float]] = defaultdict(list)
-        found: defaultdict[str, list[Any]] = defaultdict(list)
-        for entry in record.messages(known):
-            times[known[entry.topic]].append(entry.time)
-            found[known[entry.topic]].append(entry.message)
+        by_name: defaultdict[str, list[Any]] = defaultdict(list)
+        for entry in record.messages(topics):
+            times[topics[entry.topic]].append(entry.time)
+            by_name[topics[entry.topic]].append(entry.message)
         self.begin = min(t[0] for t in times.values())
         self.duration = max(t[-1] for t in times.values()) - self.begin
-        self._odom = _poses(times["odom"], [m.pose.pose for m in found["odom"]])
-        self._goal = _poses(times["goal"], [m.pose for m in found["goal"]])
-        self._health = Series(times["estimator_status"], found["estimator_status"])
-        self._thrusters = Series(times["thruster_state"], found["thruster_state"])
-        self._shafts = Series(times["joint_states"], found["joint_states"])
-        self._pictures = Series(times["camera/image/compressed"], found["camera/image/compressed"])
-        self._tags = Series(times["camera/tags"], found["camera/tags"])
+        self._odom = _poses(times["odom"], [m.pose.pose for m in by_name["odom"]])
+        self._goal = _poses(times["goal"], [m.pose for m in by_name["goal"]])
+        self._health = Series(times["estimator_status"], by_name["estimator_status"])
+        self._thrusters = Series(times["thruster_state"], by_name["thruster_state"])
+        self._shafts = Series(times["joint_states"], by_name["joint_states"])
+        self._pictures = Series(times["camera/image/compressed"], by_name["camera/image/compressed"])
+        self._tags = Series(times["camera/tags"], by_name["camera/tags"])
         self._eyes, self._ranges = (
             {
-                name.removesuffix(kind): Series(times[name], found[name])
-                for name in own
-                if name.endswith(kind) and found[name]
+                name.removesuffix(kind): Series(times[name], by_name[name])
+                for name in perceived
+                if name.endswith(kind) and by_name[name]
             }
             for kind in ("/image/compressed", "/range")
         )
-        self._events = Series(times["events"], [_event(m.data) for m in found["events"]])
+        self._events = Series(times["events"], [_event(m.data) for m in by_name["events"]])
 
     def _add_truth(self, truth: Truth, offset: float | None) -> None:
         if offset is None:
@@ -469,12 +471,12 @@ class RecordSource:
 
     def _picture(self, at: float) -> Picture | None:
         tags = self._tags.at(at) if _age(self._tags, at) < FRESH else None
-        found = _tags_in(tags.data) if tags is not None else ()
+        tags_of_picture = _tags_in(tags.data) if tags is not None else ()
         if _age(self._pictures, at) >= FRESH:
-            return Picture(None, found, self._size) if found else None
+            return Picture(None, tags_of_picture, self._size) if tags_of_picture else None
         i = int(np.searchsorted(self._pictures.time, at, side="right")) - 1
         if self._shown is None or self._shown[0] != i:
-            self._shown = i, self._developed(i, at, found)
+            self._shown = i, self._developed(i, at, tags_of_picture)
         return self._shown[1]
 
     def _own(self, name: str, at: float) -> Any:
@@ -487,12 +489,12 @@ class RecordSource:
             self._developed_own[name] = message, picture_of(message.data, colour=colour)
         return self._developed_own[name][1]
 
-    def _developed(self, i: int, at: float, found: tuple[TagCorners, ...]) -> Picture:
+    def _developed(self, i: int, at: float, tags: tuple[TagCorners, ...]) -> Picture:
         image = picture_of(self._pictures.values[i].data)
         # The tags of a record came with pictures of their own: those of another picture are not this one's.
         if image is not None and abs(_age(self._tags, at) - _age(self._pictures, at)) > 1e-3:
-            found = self._look.find(image, at)
-        return Picture(image, found, self._size)
+            tags = self._look.find(image, at)
+        return Picture(image, tags, self._size)
 
     def _status(self, at: float, thrusters: Any) -> dict[str, str]:
         health, shafts = self._health.at(at), self._shafts.at(at)
@@ -747,8 +749,8 @@ class TagLook:
             self._tracker = RegionTracker(detector(self._tags.family), set(self._tags.mounts))
         self._last = time
         try:
-            found = self._tracker.detect(image, time)
+            detections = self._tracker.detect(image, time)
         except ImportError:  # a view without the extra `vision` shows the picture alone
             self._tags = None
             return ()
-        return tuple(TagCorners(d.tag, d.corners) for d in found)
+        return tuple(TagCorners(d.tag, d.corners) for d in detections)

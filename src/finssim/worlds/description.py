@@ -462,7 +462,9 @@ class World(Part):
         if (count := sum(len(item.positions) for item in self.objects.values())) > LARGEST:
             raise refuse_section(f"objects: {count} shapes with their copies, expected at most {LARGEST}")
         surfaces = [*earlier, *(name for name in ("basin", "seabed") if getattr(self, name) is not None)]
-        for look, name in ((look, name) for look, one in self.looks.items() for name in one.surfaces):
+        for look, name in (
+            (look, name) for look, appearance in self.looks.items() for name in appearance.surfaces
+        ):
             if name not in surfaces:
                 raise refuse_section(
                     f"looks.{look}.surfaces: '{name}' is no object of this world{did_you_mean(name, surfaces)} "
@@ -748,9 +750,9 @@ def load_world(name_or_path: str | os.PathLike[str]) -> World:
     Raises:
         WorldError: Unknown name, or a file that is refused; the message says where, what and what to do.
     """
-    path, shown = _locate(name_or_path, SITES, sites(), "site")
-    tree = _read(path, shown, such_as="water: {attenuation: [0.4, 0.1, 0.08]}")
-    world = _checked(World, {**tree, "name": path.stem, "path": path}, shown)
+    path, label = _locate(name_or_path, SITES, sites(), "site")
+    tree = _read(path, label, such_as="water: {attenuation: [0.4, 0.1, 0.08]}")
+    world = _checked(World, {**tree, "name": path.stem, "path": path}, label)
     for name, item in world.objects.items():
         if item.file is not None:
             world.mesh(name)
@@ -767,12 +769,12 @@ def load_device(name_or_path: str | os.PathLike[str]) -> Device:
     Raises:
         WorldError: Unknown name, or a file that is refused; the message says where, what and what to do.
     """
-    path, shown = _locate(name_or_path, DEVICES, devices(), "sensor")
-    tree = _read(path, shown, such_as="kind: camera")
+    path, label = _locate(name_or_path, DEVICES, devices(), "sensor")
+    tree = _read(path, label, such_as="kind: camera")
     kind = tree.pop("kind", None)
     if not isinstance(kind, str) or kind not in KINDS:
-        raise WorldError(f"{shown}: kind is {kind!r}, expected one of {', '.join(KINDS)}")
-    return _checked(KINDS[kind], tree, shown)
+        raise WorldError(f"{label}: kind is {kind!r}, expected one of {', '.join(KINDS)}")
+    return _checked(KINDS[kind], tree, label)
 
 
 def device_of(vehicle: Vehicle, name: str) -> Device:
@@ -785,18 +787,18 @@ def device_of(vehicle: Vehicle, name: str) -> Device:
     Raises:
         WorldError: The vehicle has no such entry, or its device is refused.
     """
-    where = f"{vehicle.name}: perception.{name}"
+    label = f"{vehicle.name}: perception.{name}"
     if name not in vehicle.perception:
-        known = list(vehicle.perception)
+        names = list(vehicle.perception)
         raise WorldError(
-            f"{vehicle.name} has no sensor '{name}'{did_you_mean(name, known)} its perception has "
-            f"{', '.join(known) or 'none'}"
+            f"{vehicle.name} has no sensor '{name}'{did_you_mean(name, names)} its perception has "
+            f"{', '.join(names) or 'none'}"
         )
     entry = vehicle.perception[name]
     try:
         device = load_device(entry.device)
     except WorldError as error:
-        raise WorldError(f"{where}: device: {error}") from None
+        raise WorldError(f"{label}: device: {error}") from None
     orientation = device.mount.quaternion if entry.orientation is None else entry.orientation
     changes: dict[str, Any] = {
         "mount": Mount(position=entry.position, orientation=orientation),
@@ -810,7 +812,7 @@ def device_of(vehicle: Vehicle, name: str) -> Device:
         changes["beams"], changes["bins"] = entry.width or device.beams, entry.bins or device.bins
     for key, kinds in {"width": (CameraDevice, SonarDevice), "bins": (SonarDevice,)}.items():
         if getattr(entry, key) is not None and not isinstance(device, kinds):
-            raise WorldError(f"{where}: {entry.device} has no {key}: remove it")
+            raise WorldError(f"{label}: {entry.device} has no {key}: remove it")
     return device.model_copy(update=changes)
 
 
@@ -830,20 +832,20 @@ def _locate(
     return catalogue / f"{text}.yaml", f"{catalogue.name}/{text}.yaml"
 
 
-def _read(path: Path, shown: str, such_as: str) -> dict[Any, Any]:
-    tree = read_mapping(path, WorldError, such_as=such_as, shown=shown)
+def _read(path: Path, label: str, such_as: str) -> dict[Any, Any]:
+    tree = read_mapping(path, WorldError, such_as=such_as, label=label)
     for key in ("name", "path"):
         if key in tree:
-            raise WorldError(f"{shown}: unknown key '{key}': the name is that of the file")
+            raise WorldError(f"{label}: unknown key '{key}': the name is that of the file")
     return tree
 
 
 P = TypeVar("P", bound=Part)
 
 
-def _checked(kind: type[P], tree: dict[Any, Any], shown: str) -> P:
+def _checked(kind: type[P], tree: dict[Any, Any], label: str) -> P:
     try:
         return kind(**{str(key): value for key, value in tree.items()})
     except ValidationError as error:
         problems = [e for e in error.errors() if e["type"] != "default_factory_not_called"]
-        raise WorldError("\n".join(sentence_of(e, shown, "add it") for e in problems)) from None
+        raise WorldError("\n".join(sentence_of(e, label, "add it") for e in problems)) from None

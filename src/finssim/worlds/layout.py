@@ -89,8 +89,8 @@ class WorldLayout:
         seeds = np.broadcast_to(np.asarray(seed), self.worlds)[rows]
         numbers = _uniform(seeds, rows, self._drawn.shape[1] + 1)
         self._drawn[rows] = 2.0 * numbers[:, :-1] - 1.0
-        looks = np.flatnonzero([look is not None and look.held_out == held_out for look in self.looks])
-        choice = looks if held_out else np.concatenate([[0], looks])
+        candidates = np.flatnonzero([look is not None and look.held_out == held_out for look in self.looks])
+        choice = candidates if held_out else np.concatenate([[0], candidates])
         choice = choice if len(choice) else np.zeros(1, int)
         self._look[rows] = choice[(numbers[:, -1] * len(choice)).astype(int)]
         self._place(rows)
@@ -139,9 +139,9 @@ class WorldLayout:
         frames = np.zeros((len(self._varied) + 1, n, 7))
         frames[:, :, 6] = 1.0  # the last is the world's
         for i, (item, anchor, rest) in enumerate(self._varied):
-            own = drawn[:, 1 + 4 * i : 5 + 4 * i]
+            drawn_pose = drawn[:, 1 + 4 * i : 5 + 4 * i]
             shift = np.concatenate(
-                [own[:, :3] * item.vary.position, quat_from_yaw(own[:, 3] * item.vary.yaw)], 1
+                [drawn_pose[:, :3] * item.vary.position, quat_from_yaw(drawn_pose[:, 3] * item.vary.yaw)], 1
             )
             frames[i] = _compose(_compose(frames[anchor], rest), shift)
             if i in self._moved:

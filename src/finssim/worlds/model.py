@@ -96,7 +96,10 @@ class WorldBatch(WorldLayout):
         """Set water, surfaces and poses of some worlds, (k,), from what is drawn of them; see `WorldLayout`."""
         super()._place(rows)
         drawn, look = self._drawn[rows], self._look[rows]
-        waters = [self.world.water if one is None or one.water is None else one.water for one in self.looks]
+        waters = [
+            self.world.water if look_or_none is None or look_or_none.water is None else look_or_none.water
+            for look_or_none in self.looks
+        ]
         factor = np.exp(drawn[:, :1] * np.log([[water.vary] for water in waters])[look])
         for array, name, scale in (
             (self.optics.attenuation, "attenuation", factor),

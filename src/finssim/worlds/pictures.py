@@ -51,7 +51,7 @@ def _tag(cv2, world: World, texture: Texture) -> np.ndarray:
     code = getattr(cv2.aruco, f"DICT_{texture.family.upper()}".replace("APRILTAG_36H", "APRILTAG_36h"), None)
     dictionary = cv2.aruco.getPredefinedDictionary(code) if code is not None else None
     if dictionary is None or texture.tag >= len(dictionary.bytesList):
-        what = "no such family" if dictionary is None else f"it has {len(dictionary.bytesList)} tags"
-        raise WorldError(f"{world.path}: texture: tag {texture.tag} of {texture.family}: {what}")
+        lack = "no such family" if dictionary is None else f"it has {len(dictionary.bytesList)} tags"
+        raise WorldError(f"{world.path}: texture: tag {texture.tag} of {texture.family}: {lack}")
     n = dictionary.markerSize + 2
     return cv2.aruco.generateImageMarker(dictionary, texture.tag, n) > 127

@@ -36,7 +36,7 @@ def camera_rays(lens: Lens, port: Port | None = None, samples: int = 1) -> Array
     )  # pixel centres are integers
     pixels = np.stack(np.meshgrid(u, v), axis=-1)
     if port is None:
-        directions, seen = lens.rays(pixels)
+        directions, valid = lens.rays(pixels)
         origins = np.zeros_like(directions)
     else:
         interface = Interface(
@@ -46,9 +46,9 @@ def camera_rays(lens: Lens, port: Port | None = None, samples: int = 1) -> Array
             window=(Layer(port.thickness, port.index),),
         )
         water = back_project(Camera(lens, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])), interface, pixels)
-        origins, directions, seen = water.origin, water.direction, water.status == 0
+        origins, directions, valid = water.origin, water.direction, water.status == 0
     bundle = np.stack([FROM_OPTICAL.vector(origins), FROM_OPTICAL.vector(directions)], axis=2)
-    return np.where(seen[..., None, None], bundle, 0.0)
+    return np.where(valid[..., None, None], bundle, 0.0)
 
 
 def fan(device: SonarDevice, beams: int | None = None) -> Array:

@@ -219,9 +219,9 @@ def mottled(local: wp.vec3, grain: wp.array2d(dtype=float)) -> float:
     c = wp.where(a + 1 == n, 0, a + 1)
     d = wp.where(b + 1 == n, 0, b + 1)
     fy = y - float(b)
-    left = grain[a, b] + fy * (grain[a, d] - grain[a, b])
+    lower = grain[a, b] + fy * (grain[a, d] - grain[a, b])
     right = grain[c, b] + fy * (grain[c, d] - grain[c, b])
-    return left + (x - float(a)) * (right - left)
+    return lower + (x - float(a)) * (right - lower)
 
 
 @wp.func
@@ -434,9 +434,9 @@ def snow_seen(
                     lit = daylight
                     for k in range(lamps.shape[0]):
                         lamp = lamps[k]
-                        place = wp.transform_point(pose, lamp.position)
+                        lamp_position = wp.transform_point(pose, lamp.position)
                         axis = wp.transform_vector(pose, lamp.axis)
-                        lit += rgb(lamp_light(particle, lamp, place, axis, c))
+                        lit += rgb(lamp_light(particle, lamp, lamp_position, axis, c))
                     light += (0.4 * clear * cover) * through_water(lit, c, wp.vec3(0.0), way)
                     clear = clear * (1.0 - cover)
     return wp.vec4(light[0], light[1], light[2], 1.0 - clear)
@@ -875,8 +875,8 @@ def _cut_images(
         return
     for j in range(block * span, wp.min(block * span + span, depth.shape[2])):
         ray = rays[i, j, 0, 1]
-        own = depth[v, i, j] * wp.vec3(ray[0], -ray[1], ray[2])
-        below = shape_index[v, i, j] != MISS and wp.transform_point(views[v], own)[2] < 0.0
+        end = depth[v, i, j] * wp.vec3(ray[0], -ray[1], ray[2])
+        below = shape_index[v, i, j] != MISS and wp.transform_point(views[v], end)[2] < 0.0
         point = wp.transform_point(images[v], depth_image[v, i, j] * ray)
         above = index_image[v, i, j] != MISS and point[2] >= 0.0
         if below or above:
@@ -948,9 +948,9 @@ def _reflect_echoes(
         met = other_index[v, row, beam]
         if met != MISS and (end <= 0.0 or (met != shape_index[v, i, j] and end < 0.95 * other - 0.05)):
             continue
-        own = wp.max(wp.abs(wp.dot(n, ray)), 1.0e-3)
+        cosine = wp.max(wp.abs(wp.dot(n, ray)), 1.0e-3)
         longer = 0.5 * (other - r)
-        share = loss * pattern[row] / pattern[i] * k / own * r * r / (other * other)
+        share = loss * pattern[row] / pattern[i] * k / cosine * r * r / (other * other)
         echoes[v, i, j] = share * wp.exp(-0.2 * wp.log(10.0) * absorption * longer) * energy[v, i, j]
         shift = bins_per_metre * longer
         spreads[v, i, j] = spread[v, i, j] + wp.vec2(shift, shift)
@@ -1176,12 +1176,19 @@ class SonarBatch(RayBatch):
         self._echo(image, self._image_weight, 1)
         sides = int(self.sonar.mode == "side_scan")
         # The image's own echoes have lost by two reflections already.
-        for part, own, other, loss in (
+        for part, outward, other, loss in (
             (2, self, image, self._reflected),
             (3, image, self, 1.0 / self._reflected),
         ):
-            inputs = [self.worlds, own.rays, own.views, own.depth, own.shape_index, own.normal]
-            inputs += [*self._part(int(own is image)), other.views, other.depth, other.shape_index]
+            inputs = [
+                self.worlds,
+                outward.rays,
+                outward.views,
+                outward.depth,
+                outward.shape_index,
+                outward.normal,
+            ]
+            inputs += [*self._part(int(outward is image)), other.views, other.depth, other.shape_index]
             inputs += [1.0 if other is self else -1.0, self._pattern, self._first, self._steps, sides, loss]
             inputs += [self.absorption, 1.0 / self.bin_length, span, *self._part(part)]
             wp.launch(_reflect_echoes, blocks, inputs, device=self.device)

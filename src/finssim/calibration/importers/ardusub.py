@@ -146,13 +146,13 @@ class _Clock:
         return {kind: np.array(stamps) for kind, stamps in self.stamps.items()}
 
     def times(self) -> dict[str, Array]:
-        found = {}
+        by_kind = {}
         for kind, receipts in self.receipts.items():
             receipt = np.array(receipts)
             stamped = np.array(self.stamps[kind]) + np.array(self.offsets)[self.boots[kind]]
             ours = np.isfinite(stamped) & (np.abs(stamped - receipt) < WRONG_CLOCK) & (not self.received)
-            found[kind] = np.where(ours, stamped, receipt)
-        return found
+            by_kind[kind] = np.where(ours, stamped, receipt)
+        return by_kind
 
 
 def _stamp(message: dict[str, Any]) -> float:
@@ -212,7 +212,7 @@ def _recorded(path: Path, kinds: frozenset[str]) -> Iterator[tuple[str, dict[str
     from mcap.reader import NonSeekingReader
 
     systems: set[int] = set()
-    with whole_mcap(path, []) as whole, whole.open("rb") as file:
+    with whole_mcap(path, []) as complete, complete.open("rb") as file:
         messages = NonSeekingReader(file).iter_messages(log_time_order=False)
         while True:
             try:
@@ -295,17 +295,17 @@ LEAST_USABLE = 0.2
 """Part of the estimates that must rest on a measurement of position or velocity."""
 
 
-def velocity_stream(log: Log, asked: Literal["auto", "ekf", "vision", "none"]) -> Stream | None:
+def velocity_stream(log: Log, source: Literal["auto", "ekf", "vision", "none"]) -> Stream | None:
     """Velocity from position deltas if there are any, else velocity and position from the autopilot's estimate.
 
     The estimate is left out where the filter had no measurement of horizontal position or velocity: what it says then
     is that the vehicle stands still.
     """
-    if asked == "none":
+    if source == "none":
         return None
-    if asked in ("auto", "vision"):
+    if source in ("auto", "vision"):
         deltas = _position_deltas(log)
-        if deltas is not None or asked == "vision":
+        if deltas is not None or source == "vision":
             return deltas
     return _estimate(log)
 
@@ -378,13 +378,13 @@ ARMED_FLAG = 128
 
 
 def read_ardusub(
-    path: Path, asked: ArduSubMap, vehicle: Vehicle | None, *, pulses: bool = True
+    path: Path, requested: ArduSubMap, vehicle: Vehicle | None, *, pulses: bool = True
 ) -> list[Stream]:
     """What an ArduSub log says, one stream for each kind of message.
 
     Args:
         path: `.BIN`, `.tlog`, or `.mcap` of BlueOS.
-        asked: What is taken.
+        requested: What is taken.
         vehicle: Whose thrusters the outputs drive; without it the pulses keep the numbers of the outputs.
         pulses: Whether the outputs are wanted; they are not of a passive trial.
 
@@ -392,22 +392,22 @@ def read_ardusub(
         CalibrationError: Not a log, or outputs that cannot be told apart.
         ModuleNotFoundError: pymavlink is not installed.
     """
-    log = read_log(path, KINDS, received=asked.stamps == "received")
+    log = read_log(path, KINDS, received=requested.stamps == "received")
     streams = [
         _attitude(log),
-        _inertial(log, asked),
-        _depth(log, asked),
+        _inertial(log, requested),
+        _depth(log, requested),
         _voltage(log),
         _arming(log),
-        velocity_stream(log, asked.velocity),
-        *(_pulses(log, asked, vehicle) if pulses else ()),
+        velocity_stream(log, requested.velocity),
+        *(_pulses(log, requested, vehicle) if pulses else ()),
     ]
-    found = [stream for stream in streams if stream is not None and len(stream.t) >= 2]
-    if pulses and vehicle is not None and not any("pwm_" in name for s in found for name in s.channels):
-        found = _driven_by_sticks(log, asked, vehicle, found)
-    if not any(stream.channels for stream in found):
+    usable = [stream for stream in streams if stream is not None and len(stream.t) >= 2]
+    if pulses and vehicle is not None and not any("pwm_" in name for s in usable for name in s.channels):
+        usable = _driven_by_sticks(log, requested, vehicle, usable)
+    if not any(stream.channels for stream in usable):
         raise CalibrationError(f"{path.name}: holds no attitude, rates, depth, velocity or outputs")
-    return found
+    return usable
 
 
 def _attitude(log: Log) -> Stream | None:
@@ -430,18 +430,24 @@ def _attitude(log: Log) -> Stream | None:
     return replace(stream, channels={**stream.channels, **wrapped})
 
 
-def _inertial(log: Log, asked: ArduSubMap) -> Stream | None:
+def _inertial(log: Log, requested: ArduSubMap) -> Stream | None:
     """Specific force, and in DataFlash logs the rates."""
     if not log.telemetry:
-        kind = "IMU" if asked.imu == 0 or not log.has(f"IMU{asked.imu + 1}") else f"IMU{asked.imu + 1}"
+        kind = (
+            "IMU"
+            if requested.imu == 0 or not log.has(f"IMU{requested.imu + 1}")
+            else f"IMU{requested.imu + 1}"
+        )
         if not log.has(kind):
             return None
-        one = log.some(kind, "I", asked.imu)
-        if not one.has(kind):
-            raise CalibrationError(f"{log.shown}: holds no IMU {asked.imu}: give 'ardusub: {{imu: 0}}'")
-        channels = {f"a{axis.lower()}": one.numbers(kind, f"Acc{axis}") for axis in "XYZ"}
-        channels |= {name: one.numbers(kind, f"Gyr{axis}") for name, axis in zip("pqr", "XYZ", strict=True)}
-        return in_our_axes(one.stream(kind, channels), FRD)
+        instance = log.some(kind, "I", requested.imu)
+        if not instance.has(kind):
+            raise CalibrationError(f"{log.shown}: holds no IMU {requested.imu}: give 'ardusub: {{imu: 0}}'")
+        channels = {f"a{axis.lower()}": instance.numbers(kind, f"Acc{axis}") for axis in "XYZ"}
+        channels |= {
+            name: instance.numbers(kind, f"Gyr{axis}") for name, axis in zip("pqr", "XYZ", strict=True)
+        }
+        return in_our_axes(instance.stream(kind, channels), FRD)
     for kind in INERTIAL:
         if log.has(kind) and np.any(log.numbers(kind, "zacc")):
             # [milli-g], and zero in every field of a chip that has no such sensor
@@ -450,20 +456,20 @@ def _inertial(log: Log, asked: ArduSubMap) -> Stream | None:
     return None
 
 
-def _depth(log: Log, asked: ArduSubMap) -> Stream | None:
+def _depth(log: Log, requested: ArduSubMap) -> Stream | None:
     """Depth of the pressure sensor that the autopilot takes for outside."""
     primary = int(log.parameters.get("BARO_PRIMARY", log.parameters.get("GND_PRIMARY", 1)))
-    chosen = primary if asked.barometer is None else asked.barometer
+    chosen = primary if requested.barometer is None else requested.barometer
     if log.telemetry:
         return _depth_from_pressure(log, chosen)
     kind = "BARO" if chosen == 0 or not log.has(f"BAR{chosen + 1}") else f"BAR{chosen + 1}"
     if not log.has(kind):
         return None
-    one = log.some(kind, "I", chosen)
-    if not one.has(kind):
+    instance = log.some(kind, "I", chosen)
+    if not instance.has(kind):
         return None
     of = finding("depth_of_barometer", number=chosen)
-    return one.stream(kind, {"depth": -one.numbers(kind, "Alt")}, of)
+    return instance.stream(kind, {"depth": -instance.numbers(kind, "Alt")}, of)
 
 
 def _depth_from_pressure(log: Log, chosen: int) -> Stream | None:
@@ -488,11 +494,11 @@ def _voltage(log: Log) -> Stream | None:
     ):
         if not log.has(kind):
             continue
-        one = log.some(kind, "Instance", 0)
-        volts = unit * one.numbers(kind, name)
+        instance = log.some(kind, "Instance", 0)
+        volts = unit * instance.numbers(kind, name)
         measured = (volts > 1.0) & (volts < 65.0)  # 0 and 65.535 V stand for "not measured"
         if measured.sum() >= 2:
-            return one.stream(kind, {"voltage": volts}).taken(measured)
+            return instance.stream(kind, {"voltage": volts}).taken(measured)
     return None
 
 
@@ -516,29 +522,29 @@ def _arming(log: Log) -> Stream | None:
 
 
 def _words(log: Log, kind: str, times: list[float], armed: list[bool]) -> Stream:
-    said = np.array(["armed" if on else "disarmed" for on in armed], dtype=np.str_)
-    return Stream(source=f"{log.shown} {kind}", t=np.array(times), words={"arming": said})
+    labels = np.array(["armed" if on else "disarmed" for on in armed], dtype=np.str_)
+    return Stream(source=f"{log.shown} {kind}", t=np.array(times), words={"arming": labels})
 
 
-def _pulses(log: Log, asked: ArduSubMap, vehicle: Vehicle | None) -> list[Stream]:
+def _pulses(log: Log, requested: ArduSubMap, vehicle: Vehicle | None) -> list[Stream]:
     """pwm_NAME of each thruster, turned about the neutral pulse where needed: longer pulses push along its axis."""
     kind, field = ("SERVO_OUTPUT_RAW", "servo{}_raw") if log.telemetry else ("RCOU", "C{}")
-    one = log.some(kind, "port", 0)
-    if not one.has(kind):
+    port = log.some(kind, "port", 0)
+    if not port.has(kind):
         return []
     if vehicle is not None:
         try:
-            outputs, of = outputs_of(vehicle, log.parameters, asked.outputs)
+            outputs, of = outputs_of(vehicle, log.parameters, requested.outputs)
         except CalibrationError as error:
             raise CalibrationError(f"{log.shown}: {error}") from None
     else:
-        outputs = {n: (f"C{n}", 1) for n in range(1, 17) if np.any(one.numbers(kind, field.format(n)) > 0.0)}
+        outputs = {n: (f"C{n}", 1) for n in range(1, 17) if np.any(port.numbers(kind, field.format(n)) > 0.0)}
         of = finding("pulses_unnamed")
     channels = {}
     for output, (name, sign) in outputs.items():
-        pulse = one.numbers(kind, field.format(output))
+        pulse = port.numbers(kind, field.format(output))
         channels[f"pwm_{name}"] = np.where(pulse > 0.0, NEUTRAL + sign * (pulse - NEUTRAL), np.nan)
-    return [one.stream(kind, channels, of)]
+    return [port.stream(kind, channels, of)]
 
 
 MANUAL = 19
@@ -549,14 +555,16 @@ USUAL_YAW = 3.375
 """ACRO_YAW_P at which the yaw axis is passed on as it is."""
 
 
-def _driven_by_sticks(log: Log, asked: ArduSubMap, vehicle: Vehicle, streams: list[Stream]) -> list[Stream]:
+def _driven_by_sticks(
+    log: Log, requested: ArduSubMap, vehicle: Vehicle, streams: list[Stream]
+) -> list[Stream]:
     """The streams with pwm_NAME from the pilot's axes, where the log has no outputs, and without what other modes did.
 
     Raises:
         CalibrationError: The frame's motors do not fit the vehicle's thrusters.
     """
-    axes = _axes(log, asked)
-    named = [number for number, (name, _) in FRAMES.items() if name == _frame_name(asked, vehicle)]
+    axes = _axes(log, requested)
+    named = [number for number, (name, _) in FRAMES.items() if name == _frame_name(requested, vehicle)]
     config = int(log.parameters.get("FRAME_CONFIG", named[0] if named else -1))
     if axes is None or config not in FRAMES:
         return streams
@@ -567,28 +575,28 @@ def _driven_by_sticks(log: Log, asked: ArduSubMap, vehicle: Vehicle, streams: li
     signs = tuple(int(sign) for sign in directions.values())
     standing = np.where(_armed(log, t)[:, None], demands, 0.0)
     try:
-        channels, mapped = mixed_pulses(vehicle, standing, parameters, signs, asked.outputs)
+        channels, mapped = mixed_pulses(vehicle, standing, parameters, signs, requested.outputs)
     except CalibrationError as error:
         raise CalibrationError(f"{log.shown}: {error}") from None
     note = finding("sticks_mixed", frame=FRAMES[config][0], gain=1.0)
     pulses = log.stream(kind, channels, note, mapped)
     # A held command knows no gap but one of the whole recording.
-    kept, other = [], 0
+    manual_streams, other = [], 0
     for stream in (*streams, pulses):
         manual = (_mode(log, stream.t) == MANUAL) | ~_armed(log, stream.t)
         other += int((~manual).sum())
-        kept.append(stream.taken(manual))
+        manual_streams.append(stream.taken(manual))
     if other:
         share = other / sum(len(stream.t) for stream in (*streams, pulses))
-        kept[-1] = kept[-1].noting(finding("other_modes_left_out", share=share))
-    return [stream for stream in kept if len(stream.t) >= 2]
+        manual_streams[-1] = manual_streams[-1].noting(finding("other_modes_left_out", share=share))
+    return [stream for stream in manual_streams if len(stream.t) >= 2]
 
 
-def _frame_name(asked: ArduSubMap, vehicle: Vehicle) -> Any:
-    return asked.frame or (vehicle.autopilot.frame if vehicle.autopilot is not None else None)
+def _frame_name(requested: ArduSubMap, vehicle: Vehicle) -> Any:
+    return requested.frame or (vehicle.autopilot.frame if vehicle.autopilot is not None else None)
 
 
-def _axes(log: Log, asked: ArduSubMap) -> tuple[str, Array, Array] | None:
+def _axes(log: Log, requested: ArduSubMap) -> tuple[str, Array, Array] | None:
     """Kind of message, times and demands in the order of `DEMANDS`, (n, 6), from channels or from the joystick."""
     kind, name = ("RC_CHANNELS", "chan{}_raw") if log.telemetry else ("RCIN", "C{}")
     if log.has(kind):
@@ -597,14 +605,14 @@ def _axes(log: Log, asked: ArduSubMap) -> tuple[str, Array, Array] | None:
     elif log.has("MANUAL_CONTROL"):
         kind = "MANUAL_CONTROL"
         x, y, z, r, s, t = (np.nan_to_num(log.numbers(kind, name)) for name in "xyzrst")
-        gain = _held(_gains(log), "NAMED_VALUE_FLOAT", "value", log.times[kind], asked.gain)
+        gain = _held(_gains(log), "NAMED_VALUE_FLOAT", "value", log.times[kind], requested.gain)
         scaled = gain * np.stack([(z - 500.0) / 500.0, r / 1000.0, x / 1000.0, y / 1000.0])
         axes = np.concatenate([np.stack([s, t]) / FULL, scaled])
     else:
         return None
-    given = dict(zip(STICK_CHANNELS, axes.clip(-1.0, 1.0), strict=True))
-    given["yaw"] = given["yaw"] * log.parameters.get("ACRO_YAW_P", USUAL_YAW) / USUAL_YAW
-    return kind, log.times[kind], np.stack([given[demand] for demand in DEMANDS], axis=-1)
+    sticks = dict(zip(STICK_CHANNELS, axes.clip(-1.0, 1.0), strict=True))
+    sticks["yaw"] = sticks["yaw"] * log.parameters.get("ACRO_YAW_P", USUAL_YAW) / USUAL_YAW
+    return kind, log.times[kind], np.stack([sticks[demand] for demand in DEMANDS], axis=-1)
 
 
 def _gains(log: Log) -> Log:

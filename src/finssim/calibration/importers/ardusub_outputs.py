@@ -27,39 +27,39 @@ LEAST_LIKENESS = 1.4
 
 
 def outputs_of(
-    vehicle: Vehicle, parameters: Mapping[str, float], given: Mapping[str, str]
+    vehicle: Vehicle, parameters: Mapping[str, float], requested: Mapping[str, str]
 ) -> tuple[dict[int, tuple[str, int]], Finding]:
     """Output (from 1) -> thruster, and -1 where its pulses have to be turned about neutral; and what that rests on.
 
     Turned pulses are as the vehicle file has the thruster wired: longer ones push along its axis, or against it where
     its motor_sign is -1.
 
-    From `given` (`C1: T1`, `C2: -T2`), else from the vehicle's motor_index, else from the frame and the motor
+    From `requested` (`C1: T1`, `C2: -T2`), else from the vehicle's motor_index, else from the frame and the motor
     directions that the autopilot's parameters name, matched with where the vehicle's thrusters sit.
 
     Raises:
         CalibrationError: Outputs or thrusters that do not exist, or nothing to go by.
     """
-    if given:
-        found = _given(vehicle, given)
-        how = "as the map says"
+    if requested:
+        outputs = _given(vehicle, requested)
+        basis = "as the map says"
     elif all(thruster.motor_index is not None for thruster in vehicle.thrusters.values()):
-        found = {
+        outputs = {
             _output_of(int(thruster.motor_index or 0) + 1, parameters): (name, thruster.motor_sign or 1)
             for name, thruster in vehicle.thrusters.items()
         }  # the motor_sign is the vehicle file's, so that no pulse is turned below
-        how = "by the motor_index of the vehicle file"
+        basis = "by the motor_index of the vehicle file"
     else:
-        found, frame = _by_frame(vehicle, parameters)
-        how = f"by the frame {frame} of the log"
-    found = {
+        outputs, frame = _by_frame(vehicle, parameters)
+        basis = f"by the frame {frame} of the log"
+    outputs = {
         output: (name, sign * (vehicle.thrusters[name].motor_sign or 1))
-        for output, (name, sign) in found.items()
+        for output, (name, sign) in outputs.items()
     }
     pairs = tuple(
-        f"C{output} {'-' if sign < 0 else ''}{name}" for output, (name, sign) in sorted(found.items())
+        f"C{output} {'-' if sign < 0 else ''}{name}" for output, (name, sign) in sorted(outputs.items())
     )
-    return found, finding("outputs_mapped", how=how, pairs=pairs, neutral=NEUTRAL)
+    return outputs, finding("outputs_mapped", how=basis, pairs=pairs, neutral=NEUTRAL)
 
 
 def mixed_pulses(
@@ -67,7 +67,7 @@ def mixed_pulses(
     demands: Array,
     parameters: Mapping[str, float],
     directions: Sequence[int],
-    given: Mapping[str, str],
+    requested: Mapping[str, str],
 ) -> tuple[dict[str, Array], Finding]:
     """pwm_NAME of each thruster [µs] from demands, by ArduSub's mixer, and which output drives which thruster.
 
@@ -76,27 +76,27 @@ def mixed_pulses(
         demands: In the order of `STICKS` [-1, 1], (n, 6); rows that are not all known give NaN.
         parameters: FRAME_CONFIG, one of `FRAMES`, and MOT_n_DIRECTION as `outputs_of` takes it.
         directions: MOT_n_DIRECTION as the mixer takes it; 1 where not given.
-        given: As of `outputs_of`.
+        requested: As of `outputs_of`.
 
     Raises:
         CalibrationError: The motors do not fit the thrusters.
     """
-    outputs, mapped = outputs_of(vehicle, parameters, given)
-    known = np.isfinite(demands).all(axis=-1)
+    outputs, mapped = outputs_of(vehicle, parameters, requested)
+    valid = np.isfinite(demands).all(axis=-1)
     frame, _ = FRAMES[int(parameters["FRAME_CONFIG"])]
-    mixed = Mixer.of_frame(frame, directions).pulses(np.where(known[:, None], demands, 0.0))
+    mixed = Mixer.of_frame(frame, directions).pulses(np.where(valid[:, None], demands, 0.0))
     pulses = {
         f"pwm_{thruster}": np.where(
-            known, NEUTRAL + sign * (mixed[:, _motor(output, parameters)] - NEUTRAL), np.nan
+            valid, NEUTRAL + sign * (mixed[:, _motor(output, parameters)] - NEUTRAL), np.nan
         )
         for output, (thruster, sign) in outputs.items()
     }
     return pulses, mapped
 
 
-def _given(vehicle: Vehicle, given: Mapping[str, str]) -> dict[int, tuple[str, int]]:
-    found = {}
-    for output, target in given.items():
+def _given(vehicle: Vehicle, requested: Mapping[str, str]) -> dict[int, tuple[str, int]]:
+    outputs = {}
+    for output, target in requested.items():
         number = output.upper().removeprefix("SERVO").removeprefix("C")
         if not number.isdigit() or int(number) < 1:
             raise CalibrationError(f"ardusub.outputs names '{output}', expected C1, C2, ...")
@@ -106,8 +106,8 @@ def _given(vehicle: Vehicle, given: Mapping[str, str]) -> dict[int, tuple[str, i
                 f"ardusub.outputs.{output}: {vehicle.name} has no thruster '{name}'"
                 f"{did_you_mean(name, list(vehicle.thrusters))} it has {', '.join(vehicle.thrusters)}"
             )
-        found[int(number)] = (name, sign)
-    return found
+        outputs[int(number)] = (name, sign)
+    return outputs
 
 
 def _output_of(motor: int, parameters: Mapping[str, float]) -> int:
@@ -129,13 +129,13 @@ def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[i
     way_out = "say it in a map: 'ardusub: {outputs: {C1: THRUSTER, C2: -THRUSTER, ...}}'"
     config = parameters.get("FRAME_CONFIG")
     if config is None or int(config) not in FRAMES:
-        what = (
+        lack = (
             "does not name its frame"
             if config is None
             else f"has FRAME_CONFIG {int(config)}, which is not known here"
         )
         raise CalibrationError(
-            f"the log {what}, so nothing tells which output drives which thruster: {way_out}"
+            f"the log {lack}, so nothing tells which output drives which thruster: {way_out}"
         )
     frame, factors = FRAMES[int(config)]
     names = list(vehicle.thrusters)
@@ -154,14 +154,14 @@ def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[i
         raise CalibrationError(
             f"frame {frame} of the log does not fit the thrusters of {vehicle.name}: {way_out}"
         )
-    found = {}
+    outputs = {}
     for motor, thruster in zip(*chosen, strict=True):
         direction = parameters.get(f"MOT_{motor + 1}_DIRECTION")
         if direction not in (1.0, -1.0):
             raise CalibrationError(f"the log does not say MOT_{motor + 1}_DIRECTION: {way_out}")
         sign = int(np.sign(likeness[motor, thruster]) * direction)
-        found[_output_of(int(motor) + 1, parameters)] = (names[thruster], sign)
-    return found, frame
+        outputs[_output_of(int(motor) + 1, parameters)] = (names[thruster], sign)
+    return outputs, frame
 
 
 def _likeness(motor: np.ndarray, column: np.ndarray) -> float:

@@ -114,13 +114,13 @@ class PhaseColumn(Part):
 
     @field_validator("words")
     @classmethod
-    def _known(cls, words: dict[str, str]) -> dict[str, str]:
-        for word in words.values():
+    def _known(cls, labels: dict[str, str]) -> dict[str, str]:
+        for word in labels.values():
             if word not in PHASES:
                 raise refuse_value(
                     f"holds '{word}'{did_you_mean(word, list(PHASES))} expected {', '.join(PHASES)}"
                 )
-        return words
+        return labels
 
 
 class Frame(Part):
@@ -190,12 +190,12 @@ class SourceMap(Part):
     @field_validator("columns")
     @classmethod
     def _known(cls, columns: dict[str, ColumnSource]) -> dict[str, ColumnSource]:
-        known = [*COLUMNS, *EXTRA_COLUMNS]
+        allowed = [*COLUMNS, *EXTRA_COLUMNS]
         for name, source in columns.items():
             if name not in EXTRA_COLUMNS and column_of(name) is None:
                 inputs = ", ".join(f"{prefix}NAME" for prefix in INPUT_PREFIXES)
                 raise refuse_value(
-                    f"names '{name}'{did_you_mean(name, known)} columns of a trial are {', '.join(known)}, {inputs}"
+                    f"names '{name}'{did_you_mean(name, allowed)} columns of a trial are {', '.join(allowed)}, {inputs}"
                 )
             try:
                 factor(source.unit, name)
@@ -300,9 +300,9 @@ class ColumnMap(Part):
         header = {key: data.pop(key) for key in list(data) if key in HEADER_KEYS}
         for key in data:
             if key not in cls.model_fields:
-                known = [*cls.model_fields, *HEADER_KEYS, *SourceMap.model_fields]
+                allowed = [*cls.model_fields, *HEADER_KEYS, *SourceMap.model_fields]
                 raise refuse_section(
-                    f"unknown key '{key}'{did_you_mean(str(key), known)} known keys: {', '.join(known)}"
+                    f"unknown key '{key}'{did_you_mean(str(key), allowed)} known keys: {', '.join(allowed)}"
                 )
         return {**data, "header": {**data.get("header", {}), **header}}
 
@@ -335,13 +335,13 @@ def read_map(path: Path) -> ColumnMap:
     """
     tree = read_mapping(path, CalibrationError, such_as="files: {log.csv: {time: t, columns: {u: vel_x}}}")
     try:
-        found = ColumnMap.model_validate(tree)
-        found.header_of("", None)
+        column_map = ColumnMap.model_validate(tree)
+        column_map.header_of("", None)
     except ValidationError as error:
         raise CalibrationError(sentence_of(error.errors()[0], str(path), "add it")) from None
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
-    return found
+    return column_map
 
 
 def split_rule(text: str) -> SplitRule:
@@ -419,12 +419,12 @@ def _labels(name: str, table: Table, rule: SplitRule) -> NDArray[np.int64]:
     column, missing = WORDED[rule.by]
     if column not in table.words:
         raise CalibrationError(f"{name}: cannot be split by {column}: {missing}")
-    words = table.words[column]
-    changes = np.concatenate([[True], words[1:] != words[:-1]])
+    texts = table.words[column]
+    changes = np.concatenate([[True], texts[1:] != texts[:-1]])
     if rule.by == "phase":
-        opening = "baseline" if (words == "baseline").any() else "excitation"
-        return np.cumsum(changes & (words == opening)) - 1
-    inside = words == "armed" if rule.by == "arming" else ~np.isin(words, ("", "nan", "None"))
+        opening = "baseline" if (texts == "baseline").any() else "excitation"
+        return np.cumsum(changes & (texts == opening)) - 1
+    inside = texts == "armed" if rule.by == "arming" else ~np.isin(texts, ("", "nan", "None"))
     return np.where(inside, np.cumsum(changes & inside) - 1, -1)
 
 
@@ -506,7 +506,7 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
     if len(stream.t) < 2:
         raise CalibrationError(f"{stream.source}: {len(stream.t)} samples, expected at least two")
     t, rows, repaired = ordered(stream.t, stream.channels)
-    jumps = [one.values for one in repaired if one.code == "clock_jump"]
+    jumps = [item.values for item in repaired if item.code == "clock_jump"]
     if not alone and jumps:
         raise CalibrationError(
             f"the clock jumps back from {jumps[0]['before']:.6g} s to {jumps[0]['after']:.6g} s at row "
@@ -523,7 +523,7 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
         raise CalibrationError(
             f"{stream.source}: the time never increases: name the column that holds the time"
         )
-    return stream.noting(*(one.about(stream.source) for one in (*untimed, *repaired)))
+    return stream.noting(*(item.about(stream.source) for item in (*untimed, *repaired)))
 
 
 def moved_in_time(streams: Sequence[Stream], offsets: Mapping[str, float]) -> list[Stream]:
@@ -536,11 +536,11 @@ def moved_in_time(streams: Sequence[Stream], offsets: Mapping[str, float]) -> li
     Raises:
         CalibrationError: A key that is neither a group nor a column of these streams.
     """
-    known = [*GROUPS, *(name for stream in streams for name in stream.channels)]
+    movable = [*GROUPS, *(name for stream in streams for name in stream.channels)]
     for key in offsets:
-        if key not in known:
+        if key not in movable:
             raise CalibrationError(
-                f"time_offsets: '{key}' is neither a group nor a column of this log{did_you_mean(key, known)} "
+                f"time_offsets: '{key}' is neither a group nor a column of this log{did_you_mean(key, movable)} "
                 f"groups are {', '.join(GROUPS)}"
             )
     out = []
@@ -551,8 +551,8 @@ def moved_in_time(streams: Sequence[Stream], offsets: Mapping[str, float]) -> li
             [*([] if stream.channels and not stream.words else [0.0]), *by.values()]
         ):
             part = {name: values for name, values in stream.channels.items() if by[name] == seconds}
-            words = stream.words if seconds == 0.0 else {}
-            out.append(replace(stream, t=stream.t + seconds, channels=part, words=words))
+            texts = stream.words if seconds == 0.0 else {}
+            out.append(replace(stream, t=stream.t + seconds, channels=part, words=texts))
     return out
 
 
@@ -569,27 +569,27 @@ def merge(streams: Sequence[Stream]) -> Table:
     # On whole microseconds, so that a written and read trial has the same times.
     each = [replace(stream, t=np.round(stream.t - start, 6)) for stream in each]
     columns = {name: (stream.t, values) for stream in each for name, values in stream.channels.items()}
-    spoken = {name: (stream.t, words) for stream in each for name, words in stream.words.items()}
+    spoken = {name: (stream.t, texts) for stream in each for name, texts in stream.words.items()}
     t, channels = merged(columns)
-    words = {}
-    for name, (times, said) in spoken.items():
+    texts = {}
+    for name, (times, labels) in spoken.items():
         held = np.searchsorted(times, t, side="right") - 1
-        words[name] = np.where(held >= 0, said[np.maximum(held, 0)], "")
-    findings = [one for stream in each for one in stream.findings]
+        texts[name] = np.where(held >= 0, labels[np.maximum(held, 0)], "")
+    findings = [item for stream in each for item in stream.findings]
     if start > 1e8:
         findings.append(finding("clock_origin", start=start))
-    return Table(start=start, t=t, channels=channels, words=words, findings=tuple(dict.fromkeys(findings)))
+    return Table(start=start, t=t, channels=channels, words=texts, findings=tuple(dict.fromkeys(findings)))
 
 
 def _refuse_doubles(streams: Sequence[Stream]) -> None:
-    seen: dict[str, str] = {}
+    sources: dict[str, str] = {}
     for stream in streams:
         for name in (*stream.channels, *stream.words):
-            if name in seen:
+            if name in sources:
                 raise CalibrationError(
-                    f"{name} comes from {seen[name]} and from {stream.source}: take it from one of them in the map"
+                    f"{name} comes from {sources[name]} and from {stream.source}: take it from one of them in the map"
                 )
-            seen[name] = stream.source
+            sources[name] = stream.source
 
 
 def _refuse_apart(streams: Sequence[Stream]) -> None:
@@ -653,8 +653,8 @@ def trial_of(name: str, table: Table, header: Header, column_map: ColumnMap) -> 
 def _phase(table: Table) -> np.ndarray | None:
     if "phase" not in table.words:
         return None
-    said = table.words["phase"]
-    return np.where(np.isin(said, PHASES), said, "").astype(np.str_)
+    labels = table.words["phase"]
+    return np.where(np.isin(labels, PHASES), labels, "").astype(np.str_)
 
 
 def _body_velocity(name: str, t: Array, channels: dict[str, Array]) -> dict[str, Array]:
@@ -676,26 +676,26 @@ def _body_velocity(name: str, t: Array, channels: dict[str, Array]) -> dict[str,
             f"{name}: vx, vy, vz are velocities in the world, and without an attitude they cannot become u, v, w: "
             "map roll pitch yaw or qx qy qz qw"
         )
-    known = np.isfinite(q).all(axis=-1) & (np.linalg.norm(np.nan_to_num(q), axis=-1) > 0.5)
+    valid = np.isfinite(q).all(axis=-1) & (np.linalg.norm(np.nan_to_num(q), axis=-1) > 0.5)
     velocity = np.stack([channels[c] for c in WORLD_VELOCITY], axis=-1)
-    if known.sum() < 2:
+    if valid.sum() < 2:
         raise CalibrationError(f"{name}: the attitude that turns vx, vy, vz holds fewer than two samples")
-    times = t[known]
+    times = t[valid]
     after = np.clip(np.searchsorted(times, t), 1, len(times) - 1)
     near = (t >= times[0]) & (t <= times[-1]) & (times[after] - times[after - 1] <= LONGEST_BRIDGE)
     usable = near & np.isfinite(velocity).all(axis=-1)
     body = np.full_like(velocity, np.nan)
     if usable.any():
-        attitude = Slerp(times, Rotation.from_quat(q[known]))(t[usable]).as_quat()
+        attitude = Slerp(times, Rotation.from_quat(q[valid]))(t[usable]).as_quat()
         body[usable] = quat_inverse_rotate(attitude, velocity[usable])
     return dict(zip(NU[:3], body.T, strict=True))
 
 
 def _pulses(
-    name: str, channels: dict[str, Array], header: Header, asked: ArduSubMap
+    name: str, channels: dict[str, Array], header: Header, requested: ArduSubMap
 ) -> tuple[dict[str, Array], list[Finding]]:
     """Pulse widths of the vehicle's thrusters [µs] from the sticks, by ArduSub's mixer; and findings."""
-    if asked.frame is None or header.vehicle is None:
+    if requested.frame is None or header.vehicle is None:
         raise CalibrationError(
             f"{name}: stick_* columns go through ArduSub's mixer: give its frame in the map, "
             "'ardusub: {frame: VECTORED_6DOF}' or VECTORED, and the vehicle"
@@ -705,23 +705,23 @@ def _pulses(
         raise CalibrationError(
             f"{name}: expected stick_* or pwm_* columns, not both: {pulses[0]} is there as well"
         )
-    given = [channels[c] for c in STICKS if c in channels]
-    known = np.all([np.isfinite(v) for v in given], axis=0)
-    demands = np.stack([channels.get(c, np.zeros(len(known))) for c in STICKS], axis=-1)
-    beyond = float(np.abs(demands[known]).max(initial=0.0))
+    sticks = [channels[c] for c in STICKS if c in channels]
+    valid = np.all([np.isfinite(v) for v in sticks], axis=0)
+    demands = np.stack([channels.get(c, np.zeros(len(valid))) for c in STICKS], axis=-1)
+    beyond = float(np.abs(demands[valid]).max(initial=0.0))
     if beyond > 1.01:
         raise CalibrationError(
             f"{name}: stick_* reach {beyond:g}, expected demands in [-1, 1]: "
             "give scale and offset in the map, scale: 0.0025 and offset: -3.75 for channels of 1100 to 1900 µs"
         )
     vehicle = load_vehicle(header.vehicle)
-    config = next(number for number, (frame, _) in FRAMES.items() if frame == asked.frame)
+    config = next(number for number, (frame, _) in FRAMES.items() if frame == requested.frame)
     parameters = {"FRAME_CONFIG": float(config)}
     parameters |= {f"MOT_{motor + 1}_DIRECTION": 1.0 for motor in range(len(FRAMES[config][1]))}
-    found, mapped = mixed_pulses(
-        vehicle, asked.gain * demands, parameters, asked.motor_directions, asked.outputs
+    findings, mapped = mixed_pulses(
+        vehicle, requested.gain * demands, parameters, requested.motor_directions, requested.outputs
     )
-    return found, [finding("sticks_mixed", frame=asked.frame, gain=asked.gain), mapped]
+    return findings, [finding("sticks_mixed", frame=requested.frame, gain=requested.gain), mapped]
 
 
 def _depth(pressure: Array, header: Header, column_map: ColumnMap) -> tuple[Array, list[Finding]]:

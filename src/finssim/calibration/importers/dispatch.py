@@ -53,26 +53,26 @@ def read_stream(path: Path, source: SourceMap | None) -> Stream:
     Raises:
         CalibrationError: Unreadable, or a column that it has not.
     """
-    shown = path.name
-    how = source or SourceMap()
-    table = read_table(path, skip=how.skip_rows, names=how.names, spaces=how.spaces)
-    findings = tuple(one.about(shown) for one in table.findings)
+    label = path.name
+    mapping = source or SourceMap()
+    table = read_table(path, skip=mapping.skip_rows, names=mapping.names, spaces=mapping.spaces)
+    findings = tuple(item.about(label) for item in table.findings)
     if source is None:
-        source = _by_names(table, shown)
+        source = _by_names(table, label)
     if source.time is None:
-        raise CalibrationError(f"{shown}: no time: give 'time: COLUMN' of its columns {_column_list(table)}")
+        raise CalibrationError(f"{label}: no time: give 'time: COLUMN' of its columns {_column_list(table)}")
     if not source.columns and source.phase is None:
         raise CalibrationError(
-            f"{shown}: no columns: give 'columns: {{u: NAME, ...}}' of its columns {_column_list(table)}"
+            f"{label}: no columns: give 'columns: {{u: NAME, ...}}' of its columns {_column_list(table)}"
         )
-    t = _time(table, source.time, shown)
+    t = _time(table, source.time, label)
     numbers = {
-        name: _numbers(table, spec.column, shown)
+        name: _numbers(table, spec.column, label)
         for name, spec in source.columns.items()
         if spec.column is not None
     }
-    words = {name: _text(table, column, shown) for name, column in worded(source).items()}
-    return _stream(shown, source.columns, source, t, numbers, words).noting(*findings)
+    texts = {name: _text(table, column, label) for name, column in worded(source).items()}
+    return _stream(label, source.columns, source, t, numbers, texts).noting(*findings)
 
 
 def worded(source: SourceMap) -> dict[str, str]:
@@ -87,7 +87,7 @@ def _stream(
     source: SourceMap,
     times: Array | list[float],
     numbers: Mapping[str, Array | list[float]],
-    words: Mapping[str, list[str]],
+    texts: Mapping[str, list[str]],
 ) -> Stream:
     """A stream of raw numbers and words, by canonical column, at times of the log's clock [s]."""
     t = np.asarray(times) + source.time_offset
@@ -95,65 +95,68 @@ def _stream(
     for column, spec in columns.items():
         # The last message of a damaged bag may lack its last fields.
         raw = np.full(len(t), np.nan if spec.value is None else spec.value)
-        given = numbers.get(column, ())
-        raw[: len(given)] = given
+        values = numbers.get(column, ())
+        raw[: len(values)] = values
         channels[column] = spec.sign * (spec.scale * raw + spec.offset) * factor(spec.unit, column)
-    known = source.phase.words if source.phase is not None else {}
-    said = {
+    translation = source.phase.words if source.phase is not None else {}
+    labels = {
         key: np.array(
-            [known.get(word, "") if known and key == "phase" else word for word in of], dtype=np.str_
+            [translation.get(word, "") if translation and key == "phase" else word for word in of],
+            dtype=np.str_,
         )
-        for key, of in words.items()
+        for key, of in texts.items()
     }
-    return in_our_axes(Stream(source=name, t=t, channels=channels, words=said), source.frame)
+    return in_our_axes(Stream(source=name, t=t, channels=channels, words=labels), source.frame)
 
 
-def _by_names(table: Table, shown: str) -> SourceMap:
+def _by_names(table: Table, label: str) -> SourceMap:
     """A map of the columns that have canonical names."""
     time = next((name for name in TIME_NAMES if name in table.numbers), None)
-    known = [name for name in table.numbers if column_of(name) is not None]
-    if time is None or not known:
-        what = "time" if time is None else "column with the name of a trial's column"
+    recognised = [name for name in table.numbers if column_of(name) is not None]
+    if time is None or not recognised:
+        missing = "time" if time is None else "column with the name of a trial's column"
         raise CalibrationError(
-            f"{shown}: no {what}; its columns are {_column_list(table)}: write a map file and give it with --map"
+            f"{label}: no {missing}; its columns are {_column_list(table)}: write a map file and give it with --map"
         )
     phase = "phase" if "phase" in table.words else None
-    return SourceMap.model_validate({"time": time, "columns": {name: name for name in known}, "phase": phase})
+    return SourceMap.model_validate(
+        {"time": time, "columns": {name: name for name in recognised}, "phase": phase}
+    )
 
 
-def _known(table: Table, name: str, shown: str) -> None:
+def _known(table: Table, name: str, label: str) -> None:
     if name not in table.columns:
         raise CalibrationError(
-            f"{shown}: no column '{name}'{did_you_mean(name, table.columns)} its columns are {_column_list(table)}"
+            f"{label}: no column '{name}'{did_you_mean(name, table.columns)} its columns are {_column_list(table)}"
         )
 
 
-def _numbers(table: Table, name: str, shown: str) -> Array:
-    _known(table, name, shown)
+def _numbers(table: Table, name: str, label: str) -> Array:
+    _known(table, name, label)
     if name not in table.numbers:
         example = next((word for word in table.words[name] if word), "")
-        raise CalibrationError(f"{shown}: column '{name}' holds no numbers, for instance '{example}'")
+        raise CalibrationError(f"{label}: column '{name}' holds no numbers, for instance '{example}'")
     return table.numbers[name]
 
 
-def _text(table: Table, name: str, shown: str) -> list[str]:
-    _known(table, name, shown)
+def _text(table: Table, name: str, label: str) -> list[str]:
+    _known(table, name, label)
     return table.words[name] if name in table.words else [f"{x:g}" for x in table.numbers[name]]
 
 
-def _time(table: Table, time: TimeColumn, shown: str) -> Array:
+def _time(table: Table, time: TimeColumn, label: str) -> Array:
     """Seconds on the clock of the log."""
-    _known(table, time.column, shown)
+    _known(table, time.column, label)
     if time.unit != "date" and time.column in table.numbers:
         return table.numbers[time.column] * TIME_UNITS[time.unit]
     try:
         dates = np.array(
-            [_date(word) for word in _text(table, time.column, shown)],
+            [_date(word) for word in _text(table, time.column, label)],
             dtype="datetime64[us]",
         )
     except ValueError:
         raise CalibrationError(
-            f"{shown}: column '{time.column}' holds neither numbers nor dates such as 2026-05-31 12:30:00.25: "
+            f"{label}: column '{time.column}' holds neither numbers nor dates such as 2026-05-31 12:30:00.25: "
             "give a column that does"
         ) from None
     seconds = dates.astype(np.int64) * 1e-6
@@ -192,17 +195,17 @@ THRUSTERS: dict[str, dict[str, tuple[str, str]]] = {
 """Type -> prefix of a trial's columns -> list of the message and its unit, one number a thruster."""
 
 
-def own_topics(known: Mapping[str, str]) -> dict[str, SourceMap]:
+def own_topics(types: Mapping[str, str]) -> dict[str, SourceMap]:
     """Topics of ours that make a trial; none of a bag without a type of ours.
 
     Args:
-        known: Topic -> type, all that the bag has.
+        types: Topic -> type, all that the bag has.
     """
-    if not any(kind.startswith(OWN) for kind in known.values()):
+    if not any(kind.startswith(OWN) for kind in types.values()):
         return {}
     return {
         topic: SourceMap()
-        for topic in sorted(known)
+        for topic in sorted(types)
         if topic.rsplit("/", 1)[-1] in TAKEN and not topic.endswith(COMPASS)
     }
 
@@ -222,16 +225,16 @@ def _names(message: Any) -> list[str]:
     return [str(name) for name in getattr(message, "names", getattr(message, "name", ()))]
 
 
-def spoken_events(topic: str, said: Iterable[tuple[float, str]], start: float) -> Stream | None:
+def spoken_events(topic: str, events: Iterable[tuple[float, str]], start: float) -> Stream | None:
     """Phases and arming that the events of a record tell; None where they tell neither.
 
     Args:
         topic: Of the events.
-        said: Time [s] and JSON of each, in order.
+        events: Time [s] and JSON of each, in order.
         start: Of the record [s]; before the first event there is no phase, and the vehicle is disarmed.
     """
     times, phase, arming = [start], [""], ["disarmed"]
-    for time, text in said:
+    for time, text in events:
         try:
             event = json_value(text, CalibrationError, topic)
             kind, word = str(event["kind"]), str(event.get("text", ""))
@@ -242,8 +245,8 @@ def spoken_events(topic: str, said: Iterable[tuple[float, str]], start: float) -
         times.append(time)
         phase.append(word if kind == "phase" else phase[-1])
         arming.append(ARMING.get(kind, arming[-1]))
-    words = {"phase": phase, "arming": arming}
-    spoken = {name: np.array(list_, dtype=np.str_) for name, list_ in words.items() if len(set(list_)) > 1}
+    labels = {"phase": phase, "arming": arming}
+    spoken = {name: np.array(list_, dtype=np.str_) for name, list_ in labels.items() if len(set(list_)) > 1}
     return Stream(source=topic, t=np.array(times), words=spoken) if spoken else None
 
 
@@ -255,22 +258,22 @@ def recorded_header(path: Path) -> tuple[dict[str, Any], list[Finding]]:
     """
     about = mcap_metadata(path, "finssim")
     try:
-        told = dict(json_value(about.get("trial", "{}"), CalibrationError, path.name))
+        header = dict(json_value(about.get("trial", "{}"), CalibrationError, path.name))
     except (ValueError, TypeError):
         raise CalibrationError(
             f"{path.name}: the record's 'trial' is {about['trial']!r}, expected a mapping"
         ) from None
-    name = told.pop("vehicle", about.get("vehicle"))
+    name = header.pop("vehicle", about.get("vehicle"))
     if name is None:
-        return told, []
+        return header, []
     plain_name(str(name), f"{path.name}: vehicle", CalibrationError)
     try:
         vehicle = catalogue_vehicle(str(name), path.name)
     except VehicleError:
-        return told, [finding("vehicle_unknown", path.name, vehicle=name)]
+        return header, [finding("vehicle_unknown", path.name, vehicle=name)]
     changed = name == about.get("vehicle") and vehicle.sha256 != about.get("vehicle_sha256")
     remarks = [finding("vehicle_changed", path.name, vehicle=name)] if changed else []
-    return {"vehicle": name, **told}, remarks
+    return {"vehicle": name, **header}, remarks
 
 
 # ROS 2 bags, sqlite3 or MCAP, and ROS 1 bags, without ROS: topics as streams.
@@ -361,13 +364,13 @@ def _value_at(message: Any, path: str, topic: str) -> Any:
             continue
         key = index or name
         names = _names(message)
-        place = int(key) if key.lstrip("-").isdigit() else names.index(key) if key in names else None
-        if place is None:
+        position = int(key) if key.lstrip("-").isdigit() else names.index(key) if key in names else None
+        if position is None:
             raise CalibrationError(
                 f"{topic}: '{path}' asks for '{key}', and the message names {', '.join(names) or 'none'}"
             )
         try:
-            value = value[place]
+            value = value[position]
         except (IndexError, TypeError):
             if hasattr(value, "__len__") and len(value) == 0:
                 return math.nan  # an array left empty holds no sample
@@ -401,32 +404,32 @@ def read_bag(path: Path, topics: Mapping[str, SourceMap]) -> list[Stream]:
         ModuleNotFoundError: rosbags is not installed.
     """
     with _opened(path) as (reader, findings):
-        known = {c.topic: c.msgtype for c in reader.connections}
-        own = {} if topics else own_topics(known)
-        topics = topics or own
+        types = {c.topic: c.msgtype for c in reader.connections}
+        native = {} if topics else own_topics(types)
+        topics = topics or native
         if not topics:
-            topics = {topic: SourceMap() for topic, kind in sorted(known.items()) if kind in USUAL}
+            topics = {topic: SourceMap() for topic, kind in sorted(types.items()) if kind in USUAL}
         if not topics:
             raise CalibrationError(
-                f"{path.name}: no topic of a usual type: write a map; its topics are {_listed(known)}"
+                f"{path.name}: no topic of a usual type: write a map; its topics are {_listed(types)}"
             )
         sources = {}
         for topic, source in topics.items():
-            if topic not in known:
+            if topic not in types:
                 raise CalibrationError(
-                    f"{path.name}: no topic '{topic}'{did_you_mean(topic, list(known))} its topics are {_listed(known)}"
+                    f"{path.name}: no topic '{topic}'{did_you_mean(topic, list(types))} its topics are {_listed(types)}"
                 )
-            sources[topic] = _columns(reader, topic, known[topic], source)
-        _choose(sources, known, [topic for topic in topics if not topics[topic].columns], findings)
+            sources[topic] = _columns(reader, topic, types[topic], source)
+        _choose(sources, types, [topic for topic in topics if not topics[topic].columns], findings)
         collected = _collect(reader, sources, topics, findings)
-        events = _events(reader) if own else []
+        events = _events(reader) if native else []
     streams = [_stream(topic, sources[topic], topics[topic], *collected[topic]) for topic in topics]
-    found = [stream for stream in streams if len(stream.t) >= 2 and (stream.channels or stream.words)]
-    if not found:
+    usable = [stream for stream in streams if len(stream.t) >= 2 and (stream.channels or stream.words)]
+    if not usable:
         raise CalibrationError(f"{path.name}: {', '.join(topics)} hold fewer than two messages each")
     findings += [finding("topic_short", topic=t) for t in topics if len(collected[t][0]) < 2]
-    found[0] = found[0].noting(*findings)
-    return found + events
+    usable[0] = usable[0].noting(*findings)
+    return usable + events
 
 
 def bag_files(path: Path) -> list[Path]:
@@ -500,14 +503,14 @@ def _messages(reader: Any, connections: Sequence[Any]) -> Iterator[tuple[int, An
 def _events(reader: Any) -> list[Stream]:
     """What the events of our own records say."""
     connections = [c for c in reader.connections if c.topic.endswith("/events") and c.msgtype == WORDS]
-    said = ((time * 1e-9, message.data) for time, message in _messages(reader, connections))
-    stream = spoken_events("events", said, reader.start_time * 1e-9) if connections else None
+    texts = ((time * 1e-9, message.data) for time, message in _messages(reader, connections))
+    stream = spoken_events("events", texts, reader.start_time * 1e-9) if connections else None
     return [] if stream is None else [stream]
 
 
 def _choose(
     sources: dict[str, dict[str, ColumnSource]],
-    known: Mapping[str, str],
+    types: Mapping[str, str],
     usual: list[str],
     findings: list[Finding],
 ) -> None:
@@ -516,7 +519,7 @@ def _choose(
     Two topics of one type keep it, and are refused where the streams are put together.
     """
     order = [*THRUSTERS, *USUAL]
-    rank = {topic: order.index(known[topic]) for topic in usual if known[topic] in order}
+    rank = {topic: order.index(types[topic]) for topic in usual if types[topic] in order}
     if any("depth" in columns for columns in sources.values()):
         for topic in rank:
             if sources[topic].pop("pressure", None) is not None:
@@ -525,12 +528,12 @@ def _choose(
         better = {
             name: other for other in sources for name in sources[other] if rank.get(other, -1) < rank[topic]
         }
-        left = [name for name in sources[topic] if name in better]
-        for name in left:
+        excluded = [name for name in sources[topic] if name in better]
+        for name in excluded:
             del sources[topic][name]
-        if left:
+        if excluded:
             findings.append(
-                finding("columns_left_out", columns=tuple(left), topic=topic, better=better[left[0]])
+                finding("columns_left_out", columns=tuple(excluded), topic=topic, better=better[excluded[0]])
             )
 
 
@@ -550,14 +553,14 @@ def _collect(
         for connection, received, raw in reader.messages(connections=connections):
             message = reader.deserialize(raw, connection.msgtype)
             topic = connection.topic
-            times, numbers, words = collected[topic]
+            times, numbers, texts = collected[topic]
             stamp = stamp_of(message) if topics[topic].stamps == "header" else None
             times.append((received if stamp is None else stamp) * 1e-9)
             for name, spec in sources[topic].items():
                 if spec.column is not None:
                     numbers[name].append(number_at(message, spec.column, topic))
-            for name, said in words.items():
-                said.append(word_at(message, worded(topics[topic])[name], topic))
+            for name, labels in texts.items():
+                labels.append(word_at(message, worded(topics[topic])[name], topic))
     except CalibrationError:
         raise
     except Exception as error:  # a damaged bag breaks in whatever layer reads it
@@ -569,8 +572,8 @@ def _collect(
     return collected
 
 
-def _listed(known: Mapping[str, str]) -> str:
-    return ", ".join(f"{topic} ({kind.replace('/msg/', '/')})" for topic, kind in sorted(known.items()))
+def _listed(types: Mapping[str, str]) -> str:
+    return ", ".join(f"{topic} ({kind.replace('/msg/', '/')})" for topic, kind in sorted(types.items()))
 
 
 Format = Literal["auto", "csv", "ardupilot", "rosbag"]
@@ -622,8 +625,8 @@ def import_trials(
     for trial in read_trials(logs, column_map=column_map, format=format, vehicle=vehicle, split=split):
         folders.append(Path(out) / trial.name)
         write_trial(trial, folders[-1])
-        for one in trial.findings:
-            print(one.about(trial.name), file=sys.stderr)
+        for item in trial.findings:
+            print(item.about(trial.name), file=sys.stderr)
     print_folders(folders, as_json)
     return folders
 
@@ -722,7 +725,7 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
         raise CalibrationError(
             f"the map says nothing about files such as {paths[0].name}: give 'files:' or 'columns:'"
         )
-    found: dict[str, list[tuple[str, Path, SourceMap | None]]] = {}
+    by_trial: dict[str, list[tuple[str, Path, SourceMap | None]]] = {}
     unread = []
     for path in paths:
         hits = [
@@ -736,11 +739,11 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
             )
         else:
             pattern, trial = hits[0] if hits else ("", path.stem)
-            found.setdefault(trial, []).append((pattern, path, mapped.files.get(pattern)))
-    if not found and unread:
+            by_trial.setdefault(trial, []).append((pattern, path, mapped.files.get(pattern)))
+    if not by_trial and unread:
         raise CalibrationError(f"{unread[0]} fits none of the files of the map: {', '.join(mapped.files)}")
     groups: list[Group] = []
-    for trial, sources in found.items():
+    for trial, sources in by_trial.items():
         if len(paths) == 1 and sources[0][0] in mapped.files and not set("*{") & set(sources[0][0]):
             trial = paths[0].stem  # a single file has a name of its own
         patterns = [pattern for pattern, _, _ in sources]
@@ -753,8 +756,8 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
         missing = [pattern for pattern in mapped.files if pattern not in patterns]
         streams = [read_stream(path, source) for _, path, source in sources]
         streams[0] = streams[0].noting(*(finding("file_missing", pattern=p) for p in missing))
-        left_out = [name for name in unread if len(found) == 1 or name.startswith(trial)]
-        streams[0] = streams[0].noting(*(finding("file_left_out", file=name) for name in left_out))
+        excluded = [name for name in unread if len(by_trial) == 1 or name.startswith(trial)]
+        streams[0] = streams[0].noting(*(finding("file_left_out", file=name) for name in excluded))
         groups.append((trial, streams, {}))
     return groups
 
@@ -778,11 +781,11 @@ def _expression(pattern: str) -> str:
 
 def _check_names(trials: list[Trial]) -> None:
     """Each name is a folder's, and no other trial's: maps and patterns make them as well as names of logs."""
-    seen = set()
+    names = set()
     for trial in trials:
         plain_name(trial.name, "trial", CalibrationError)
-        if trial.name in seen:
+        if trial.name in names:
             raise CalibrationError(
                 f"two logs make a trial '{trial.name}': import them one by one, or rename a file"
             )
-        seen.add(trial.name)
+        names.add(trial.name)

@@ -118,13 +118,13 @@ def factor(unit: str | None, canonical: str) -> float:
             f"unit of {canonical} is '{unit}'{did_you_mean(unit, list(_DIMENSION))} "
             f"expected {_like(target)}: or give a scale to {target}"
         )
-    dimension, wanted = _DIMENSION[unit], _DIMENSION[target]
-    if dimension != wanted:
+    dimension, target_dimension = _DIMENSION[unit], _DIMENSION[target]
+    if dimension != target_dimension:
         article = "an" if dimension[0] == "a" else "a"
         raise CalibrationError(
             f"unit of {canonical} is '{unit}', {article} {dimension}, expected {_like(target)}"
         )
-    return UNITS[wanted][unit] / UNITS[wanted][target]
+    return UNITS[target_dimension][unit] / UNITS[target_dimension][target]
 
 
 def _like(target: str) -> str:
@@ -235,22 +235,22 @@ def sampled(
         Times, strictly increasing (m,), columns (m,), the row each came from (m,), and findings.
     """
     starts = np.concatenate([[True], np.diff(t) > 0.0])
-    kept = np.flatnonzero(starts)
-    if len(kept) == len(t):
-        return t, dict(columns), kept, []
+    selected = np.flatnonzero(starts)
+    if len(selected) == len(t):
+        return t, dict(columns), selected, []
     row_of = np.cumsum(starts) - 1
-    merged_columns, conflicts = {}, np.zeros(len(kept), bool)
+    merged_columns, conflicts = {}, np.zeros(len(selected), bool)
     for name, values in columns.items():
         good = np.flatnonzero(np.isfinite(values))
-        merged_columns[name] = np.full(len(kept), np.nan)
+        merged_columns[name] = np.full(len(selected), np.nan)
         merged_columns[name][row_of[good]] = values[good]  # NumPy keeps the last of equal indices
         conflicts[row_of[good][values[good] != merged_columns[name][row_of[good]]]] = True
     findings = []
     if conflicts.any():
-        findings.append(finding("times_conflict", times=conflicts.sum(), first=t[kept][conflicts][0]))
+        findings.append(finding("times_conflict", times=conflicts.sum(), first=t[selected][conflicts][0]))
     elif len(columns):
-        findings.append(finding("times_repeat", rows=len(t) - len(kept)))
-    return t[kept], merged_columns, kept, findings
+        findings.append(finding("times_repeat", rows=len(t) - len(selected)))
+    return t[selected], merged_columns, selected, findings
 
 
 Channels = dict[str, Array]
@@ -304,25 +304,25 @@ def _attitude_of_one_side(channels: Channels, body: bool) -> Channels:
     if all(name in channels for name in QUATERNION):
         q = turned(np.stack([channels[name] for name in QUATERNION], axis=-1))
         result.update(zip(QUATERNION, np.moveaxis(q, -1, 0), strict=True))
-    given = [name for name in EULER if name in channels]
-    if given == ["yaw"]:  # the heading of the x axis, which both conventions share
+    angles_present = [name for name in EULER if name in channels]
+    if angles_present == ["yaw"]:  # the heading of the x axis, which both conventions share
         return result if body else result | {"yaw": FROM_FOSSEN.yaw(channels["yaw"])}
-    if given:
-        missing = np.zeros(len(channels[given[0]]))
+    if angles_present:
+        missing = np.zeros(len(channels[angles_present[0]]))
         angles = quat_to_euler(turned(quat_from_euler(*(channels.get(name, missing) for name in EULER))))
-        result.update({name: a for name, a in zip(EULER, angles, strict=True) if name in given})
+        result.update({name: a for name, a in zip(EULER, angles, strict=True) if name in angles_present})
     return result
 
 
 def tidy_quaternions(channels: Channels) -> list[Finding]:
     """Give quaternions unit length and a continuous sign, in place; findings on what could not be used."""
-    given = [name for name in QUATERNION if name in channels]
-    if not given:
+    present = [name for name in QUATERNION if name in channels]
+    if not present:
         return []
-    if len(given) < 4:
-        for name in given:
+    if len(present) < 4:
+        for name in present:
             del channels[name]
-        return [finding("quaternion_incomplete", columns=tuple(given))]
+        return [finding("quaternion_incomplete", columns=tuple(present))]
     q = np.stack([channels[name] for name in QUATERNION], axis=-1)
     length = np.linalg.norm(q, axis=-1)
     useless = np.isfinite(length) & (length < 0.5)

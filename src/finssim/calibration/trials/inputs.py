@@ -57,8 +57,8 @@ def require_fittable(trials: Sequence[Trial], vehicle: Vehicle) -> None:
             raise CalibrationError(
                 f"{trial.name}: its header says that it is held out: fit on other trials and replay this one"
             )
-        for one in implausible(trial, vehicle):
-            raise CalibrationError(f"{trial.name}: {one}")
+        for item in implausible(trial, vehicle):
+            raise CalibrationError(f"{trial.name}: {item}")
 
 
 def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
@@ -70,20 +70,20 @@ def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
     """
     fastest = {name: _fastest(trial, name) for name in ("u", "v", "w", "p", "q", "r")}
     limits = dict.fromkeys("uvw", FASTEST) | dict.fromkeys("pqr", FASTEST_TURN)
-    found = [
+    findings = [
         finding("speed_unit", column=name, value=speed)
         if name in "uvw"
         else finding("degrees", column=name, value=speed, unit="rad/s")
         for name, speed in fastest.items()
         if speed > limits[name]
     ]
-    if found or vehicle is None or trial.header.passive:
-        return found
+    if findings or vehicle is None or trial.header.passive:
+        return findings
     if isinstance(vehicle.hydrodynamics.get("calibrated"), HydrodynamicSet):
         for name, reach in zip("uvw", terminal_speeds(vehicle)[:3].tolist(), strict=True):
             if 0.0 < reach and BEYOND * reach + ADRIFT < fastest[name]:
-                found.append(finding("speed_beyond", column=name, value=fastest[name], reach=reach))
-    return found or _unearned(trial, vehicle)
+                findings.append(finding("speed_beyond", column=name, value=fastest[name], reach=reach))
+    return findings or _unearned(trial, vehicle)
 
 
 def _fastest(trial: Trial, name: str) -> float:
@@ -184,15 +184,15 @@ def wrench_motors(vehicle: Vehicle) -> Motors:
     Exact while all thrusters are equal, lag in force and keep away from their limits; who allocated the wrench, and
     how, is not in the log.
     """
-    own = thruster_motors(vehicle)
+    motors = thruster_motors(vehicle)
     six = np.ones(6)
     return Motors(
         lower=-NO_LIMIT * six,
         upper=NO_LIMIT * six,
         dead_minus=0.0 * six,
         dead_plus=0.0 * six,
-        delay=own.delay.mean() * six,
-        time_constant=own.time_constant.mean() * six,
+        delay=motors.delay.mean() * six,
+        time_constant=motors.time_constant.mean() * six,
         slew=NO_LIMIT * six,
         speed=np.zeros(6, bool),
         c_plus=six,
@@ -254,8 +254,8 @@ def _followed(t: Array, u: Array, at: Array, time_constant: float, slew: float) 
     since = np.maximum(at - t[last], 0.0)
     ways = u[last] - x[last]
     ramps = np.minimum(np.maximum(np.abs(ways) - slew * time_constant, 0.0) / slew, since)
-    left = ways - np.sign(ways) * slew * ramps
-    return np.asarray(u[last] - left * np.exp(-(since - ramps) / time_constant))
+    remaining = ways - np.sign(ways) * slew * ramps
+    return np.asarray(u[last] - remaining * np.exp(-(since - ramps) / time_constant))
 
 
 # Which columns of a trial tell what drove the vehicle.
@@ -293,7 +293,9 @@ def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
     names = {c.removeprefix(kind): c for c in trial.channels if c.startswith(kind)}
     for name, column in names.items():
         if name not in vehicle.thrusters:
-            meant = next((own for own in vehicle.thrusters if own.lower() == name.lower()), name)
+            meant = next(
+                (thruster for thruster in vehicle.thrusters if thruster.lower() == name.lower()), name
+            )
             raise CalibrationError(
                 f"{column}: {vehicle.name} has no thruster '{name}'"
                 f"{did_you_mean(meant, list(vehicle.thrusters))} it has {', '.join(vehicle.thrusters)}",
@@ -475,8 +477,8 @@ def applied_wrench(drive: Drive, vehicle: Vehicle, t: Array) -> Array:
         force = drive.at(t)
     tau = force @ drive.B.T
     slack = 0.5 * float(np.median(np.diff(drive.t)))
-    known = np.any((t >= drive.spans[:, :1] - slack) & (t <= drive.spans[:, 1:] + slack), axis=0)
-    tau[~known] = np.nan
+    covered = np.any((t >= drive.spans[:, :1] - slack) & (t <= drive.spans[:, 1:] + slack), axis=0)
+    tau[~covered] = np.nan
     return np.asarray(tau)
 
 

@@ -25,8 +25,8 @@ Array = NDArray[np.float64]
 
 def _point(value: Any) -> Any:
     numbers = value if isinstance(value, (list, tuple)) else ()
-    known = [isinstance(x, (int, float)) and not isinstance(x, bool) and math.isfinite(x) for x in numbers]
-    if len(known) != 3 or not all(known):
+    finite = [isinstance(x, (int, float)) and not isinstance(x, bool) and math.isfinite(x) for x in numbers]
+    if len(finite) != 3 or not all(finite):
         raise refuse_value(f"is {value!r}, expected 3 numbers [x, y, z]")
     return value
 

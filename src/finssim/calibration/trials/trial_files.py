@@ -103,8 +103,8 @@ def write_table(path: Path, numbers: dict[str, Array], phase: NDArray[np.str_] |
     write_csv(path, names, zip(*cells, strict=True))
 
 
-def _read_csv(path: Path, **how: Any) -> Table:
-    text = read_text_table(path, CalibrationError, **how)
+def _read_csv(path: Path, **options: Any) -> Table:
+    text = read_text_table(path, CalibrationError, **options)
     table, names = Table(), text.names
     if text.zeros:
         table.findings.append(finding("zero_bytes"))
@@ -170,17 +170,21 @@ def _keep(table: Table, name: str, column: list[Any]) -> None:
     """File a column under numbers or words."""
     if not name:
         return
-    words = [i for i, cell in enumerate(column) if isinstance(cell, str)]
-    if name == "phase" or (words and all(isinstance(c, str) or math.isnan(c) for c in column)):
+    text_rows = [i for i, cell in enumerate(column) if isinstance(cell, str)]
+    if name == "phase" or (text_rows and all(isinstance(c, str) or math.isnan(c) for c in column)):
         table.words[name] = [cell if isinstance(cell, str) else "" for cell in column]
         return
-    if words:
+    if text_rows:
         table.findings.append(
             finding(
-                "not_numbers", column=name, cells=len(words), cell=column[words[0]][:40], row=words[0] + 1
+                "not_numbers",
+                column=name,
+                cells=len(text_rows),
+                cell=column[text_rows[0]][:40],
+                row=text_rows[0] + 1,
             )
         )
-        for i in words:
+        for i in text_rows:
             column[i] = math.nan
     table.numbers[name] = np.array(column, dtype=float)
 
@@ -298,12 +302,12 @@ def trial_from_table(name: str, table: Table, header: Header, path: Path | None 
     Raises:
         CalibrationError: No time, fewer than two rows, or no usable column.
     """
-    findings, numbers, words = list(table.findings), dict(table.numbers), dict(table.words)
+    findings, numbers, texts = list(table.findings), dict(table.numbers), dict(table.words)
     if "t" not in table.columns:
         raise CalibrationError(_no_time(table.columns))
-    t = _seconds(numbers.pop("t", None), words.pop("t", None), findings)
-    phase = _phases(words.pop("phase", None), findings)
-    channels = _canonical(numbers, list(words), findings)
+    t = _seconds(numbers.pop("t", None), texts.pop("t", None), findings)
+    phase = _phases(texts.pop("phase", None), findings)
+    channels = _canonical(numbers, list(texts), findings)
     for column, values in channels.items():
         infinite = np.isinf(values)
         if infinite.any():
@@ -333,30 +337,30 @@ def _no_time(columns: list[str]) -> str:
     )
 
 
-def _seconds(numbers: Array | None, words: list[str] | None, findings: list[Finding]) -> Array:
+def _seconds(numbers: Array | None, texts: list[str] | None, findings: list[Finding]) -> Array:
     """Times in s from numbers or dates; those that count from 1970 begin at 0."""
     if numbers is None:
         try:
-            dates = np.array([w.removesuffix("Z") or "NaT" for w in words or []], dtype="datetime64[ns]")
+            dates = np.array([w.removesuffix("Z") or "NaT" for w in texts or []], dtype="datetime64[ns]")
         except ValueError:
             raise CalibrationError(
-                f"t holds '{(words or [''])[0]}', expected seconds or dates like 2024-05-01T12:00:00.25"
+                f"t holds '{(texts or [''])[0]}', expected seconds or dates like 2024-05-01T12:00:00.25"
             ) from None
-        known = dates[~np.isnat(dates)]
-        start = known[0] if len(known) else np.datetime64("NaT", "ns")
+        valid = dates[~np.isnat(dates)]
+        start = valid[0] if len(valid) else np.datetime64("NaT", "ns")
         findings.append(finding("dates", start=str(start)))
         return np.where(np.isnat(dates), np.nan, (dates - start) / np.timedelta64(1, "s"))
-    known = numbers[np.isfinite(numbers)]
-    if len(known) and abs(known[0]) > EPOCH:
-        findings.append(finding("epoch", start=known[0]))
-        return numbers - known[0]
+    valid = numbers[np.isfinite(numbers)]
+    if len(valid) and abs(valid[0]) > EPOCH:
+        findings.append(finding("epoch", start=valid[0]))
+        return numbers - valid[0]
     return numbers
 
 
-def _phases(words: list[str] | None, findings: list[Finding]) -> NDArray[np.str_] | None:
-    if words is None:
+def _phases(texts: list[str] | None, findings: list[Finding]) -> NDArray[np.str_] | None:
+    if texts is None:
         return None
-    table = {word: word.strip().lower() for word in set(words)}
+    table = {word: word.strip().lower() for word in set(texts)}
     unknown = sorted(word for word in table.values() if word not in PHASES and word)
     if unknown:
         findings.append(
@@ -368,16 +372,16 @@ def _phases(words: list[str] | None, findings: list[Finding]) -> NDArray[np.str_
                 count=len(unknown),
             )
         )
-    return np.array([table[w] if table[w] in PHASES else "" for w in words], dtype=np.str_)
+    return np.array([table[w] if table[w] in PHASES else "" for w in texts], dtype=np.str_)
 
 
-def _canonical(numbers: dict[str, Array], words: list[str], findings: list[Finding]) -> dict[str, Array]:
+def _canonical(numbers: dict[str, Array], texts: list[str], findings: list[Finding]) -> dict[str, Array]:
     """The columns of a trial among those of the log."""
     channels = {column: values for column, values in numbers.items() if column_of(column)}
-    for column in words:
+    for column in texts:
         if column_of(column):
             findings.append(finding("column_kind", column=column, kind="words"))
-    unknown = [column for column in [*numbers, *words] if not column_of(column)]
+    unknown = [column for column in [*numbers, *texts] if not column_of(column)]
     for column in unknown[:5]:
         close = did_you_mean(column.lower(), [c for c in COLUMNS if c not in channels]).rstrip(";")
         findings.append(finding("unknown_column", column=column, hint=close))
@@ -397,14 +401,14 @@ def _in_order(
         phase = None if phase is None else phase[timed]
     if len(t) < 2:
         raise CalibrationError(f"{len(t)} rows with a time, expected at least 2")
-    t, rows, said = ordered(t, channels)
-    findings += said
+    t, rows, remarks = ordered(t, channels)
+    findings += remarks
     phase = None if phase is None else phase[rows]
-    t, channels, kept, said = sampled(t, {column: values[rows] for column, values in channels.items()})
-    findings += said
+    t, channels, selected, remarks = sampled(t, {column: values[rows] for column, values in channels.items()})
+    findings += remarks
     if len(t) < 2:
         raise CalibrationError(f"all rows have the time {t[0]:.6g} s: expected times that increase")
-    return t, channels, None if phase is None else phase[kept]
+    return t, channels, None if phase is None else phase[selected]
 
 
 # Reading and writing `trial.yaml`.
@@ -422,7 +426,9 @@ def read_header(path: Path) -> Header:
     try:
         return Header.model_validate(tree)
     except ValidationError as error:
-        raise CalibrationError("\n".join(sentence_of(one, str(path)) for one in error.errors())) from None
+        raise CalibrationError(
+            "\n".join(sentence_of(detail, str(path)) for detail in error.errors())
+        ) from None
 
 
 def header_text(header: Header) -> str:
@@ -471,11 +477,11 @@ def load_trials(paths: Iterable[str | os.PathLike[str]]) -> list[Trial]:
     Raises:
         CalibrationError: One cannot be used, there are none, or one is there twice.
     """
-    found = [trial for path in paths for trial in trials_at(Path(path))]
-    trials = [load_trial(path) for path in found]
-    seen: dict[str, Path] = {}
-    for path, trial in zip(found, trials, strict=True):
-        first = seen.setdefault(trial.sha256, path)
+    locations = [trial for path in paths for trial in trials_at(Path(path))]
+    trials = [load_trial(path) for path in locations]
+    first_paths: dict[str, Path] = {}
+    for path, trial in zip(locations, trials, strict=True):
+        first = first_paths.setdefault(trial.sha256, path)
         if first is not path:
             raise CalibrationError(
                 f"{path}: holds the same numbers as {first}: a trial given twice would count as two measurements; "
@@ -485,7 +491,7 @@ def load_trials(paths: Iterable[str | os.PathLike[str]]) -> list[Trial]:
         raise CalibrationError(
             "no trial given: give folders that hold data.csv or data.parquet, or such files"
         )
-    names = _unique_names(trials, found)
+    names = _unique_names(trials, locations)
     return [
         replace(trial, name=name) if name != trial.name else trial
         for trial, name in zip(trials, names, strict=True)
@@ -527,8 +533,8 @@ def _locate(path: Path) -> tuple[str, Path, Path | None]:
     if path.is_dir():
         data = [path / file for file in DATA if (path / file).is_file()]
         if len(data) != 1:
-            found = "both data.csv and data.parquet" if data else "neither data.csv nor data.parquet"
-            raise CalibrationError(f"{path}: holds {found}, expected one of them")
+            holding = "both data.csv and data.parquet" if data else "neither data.csv nor data.parquet"
+            raise CalibrationError(f"{path}: holds {holding}, expected one of them")
         header = path / HEADER
         return path.resolve().name, data[0], header if header.exists() else None
     if not path.exists():

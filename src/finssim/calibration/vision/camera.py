@@ -96,8 +96,8 @@ class Board:
     def words(self) -> str:
         """`chessboard of 9x6 inner corners, squares of 25 mm`."""
         kind = "chessboard" if self.marker is None else "ChArUco board"
-        what = "inner corners" if self.marker is None else f"squares, markers of {1e3 * self.marker:g} mm"
-        return f"{kind} of {self.columns}x{self.rows} {what}, squares of {1e3 * self.square:g} mm"
+        pattern = "inner corners" if self.marker is None else f"squares, markers of {1e3 * self.marker:g} mm"
+        return f"{kind} of {self.columns}x{self.rows} {pattern}, squares of {1e3 * self.square:g} mm"
 
     @property
     def corners(self) -> Array:
@@ -122,15 +122,15 @@ class BoardView:
     """The same corners on the board, board frame, z = 0 [m], (n, 3)."""
 
 
-def parse_size(words: str, option: str) -> tuple[int, int]:
+def parse_size(text: str, option: str) -> tuple[int, int]:
     """`9x6` as two numbers.
 
     Raises:
         CalibrationError: It reads otherwise.
     """
-    parts = words.lower().replace("×", "x").split("x")
+    parts = text.lower().replace("×", "x").split("x")
     if len(parts) != 2 or not all(part.strip().isdigit() for part in parts):
-        raise CalibrationError(f"{option} is '{words}', expected columns x rows such as 9x6")
+        raise CalibrationError(f"{option} is '{text}', expected columns x rows such as 9x6")
     return int(parts[0]), int(parts[1])
 
 
@@ -148,10 +148,12 @@ def see_board(image: NDArray[np.uint8], board: Board) -> tuple[Array, Array] | N
     Raises:
         CalibrationError: OpenCV has no such dictionary.
     """
-    found = _chessboard(image, board.columns, board.rows) if board.marker is None else _charuco(image, board)
-    if found is None:
+    detection = (
+        _chessboard(image, board.columns, board.rows) if board.marker is None else _charuco(image, board)
+    )
+    if detection is None:
         return None
-    pixels, index = found
+    pixels, index = detection
     return pixels, board.corners[index]
 
 
@@ -166,13 +168,13 @@ def board_found(images: Iterable[tuple[str, NDArray[np.uint8]]], square: float) 
         CalibrationError: None is seen.
     """
     some = [image for _, image in zip(range(5), (picture for _, picture in images), strict=False)]
-    seen = {size: sum(_chessboard(image, *size) is not None for image in some) for size in COMMON_SIZES}
+    counts = {size: sum(_chessboard(image, *size) is not None for image in some) for size in COMMON_SIZES}
     # A board shows smaller ones too: of those seen as often the largest is meant.
-    best = max(seen, key=lambda size: (seen[size], size[0] * size[1]))
-    if not seen[best]:
-        tried = ", ".join(f"{c}x{r}" for c, r in COMMON_SIZES)
+    best = max(counts, key=lambda size: (counts[size], size[0] * size[1]))
+    if not counts[best]:
+        candidates = ", ".join(f"{c}x{r}" for c, r in COMMON_SIZES)
         raise CalibrationError(
-            f"no chessboard found in the first {len(some)} pictures (inner corners tried: {tried}): "
+            f"no chessboard found in the first {len(some)} pictures (inner corners tried: {candidates}): "
             "give --board COLUMNSxROWS, or --charuco for a ChArUco board"
         )
     return Board(columns=best[0], rows=best[1], square=square)
@@ -183,14 +185,14 @@ def _chessboard(image: NDArray[np.uint8], columns: int, rows: int) -> tuple[Arra
     import cv2
 
     size = (columns, rows)
-    found, corners = cv2.findChessboardCorners(
+    success, corners = cv2.findChessboardCorners(
         image,
         size,
         flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK,
     )
-    if not found:
-        found, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-    if not found:
+    if not success:
+        success, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not success:
         return None
     pixels = np.asarray(corners, float).reshape(-1, 2)
     return _refined(image, pixels), np.arange(columns * rows)
@@ -406,9 +408,9 @@ def evidence(bundle: Bundle, views: Sequence[BoardView]) -> Evidence:
     for view, pose, residual in zip(views, bundle.poses, bundle.residuals, strict=True):
         points_c = pose.at(view.points)
         J = bundle.lens.project_jacobian(points_c)
-        own = np.concatenate([-J @ skew(points_c - pose.t), J], axis=-1).reshape(-1, 6)
-        shared = bundle.lens.parameter_jacobian(points_c).reshape(len(own), -1)
-        blocks.append(block_of(*(x / bundle.sigma for x in (shared, own, residual.ravel()))))
+        pose_jacobian = np.concatenate([-J @ skew(points_c - pose.t), J], axis=-1).reshape(-1, 6)
+        shared = bundle.lens.parameter_jacobian(points_c).reshape(len(pose_jacobian), -1)
+        blocks.append(block_of(*(x / bundle.sigma for x in (shared, pose_jacobian, residual.ravel()))))
     return arrow_evidence(blocks, lens_names(bundle.lens.model), "views")
 
 
@@ -582,9 +584,9 @@ def _views(views: Sequence[BoardView], used: Mapping[str, int], bundle: Bundle) 
             continue
         residual = _residual(bundle.lens, pose, view)
         reason = f"its corners miss by {rms(residual):.2f} px, those of the others by {median:.2f} px"
-        left_out = "" if view.name in used else reason
+        exclusion = "" if view.name in used else reason
         every.append(
-            View(name=view.name, pixels=view.pixels, residuals=residual, pose=pose, left_out=left_out)
+            View(name=view.name, pixels=view.pixels, residuals=residual, pose=pose, left_out=exclusion)
         )
     return tuple(every)
 
@@ -705,7 +707,7 @@ def camera_record(fit: CameraFit) -> dict[str, Any]:
         "held_out_rms_px": fit.held_out_rms,
         "views": len(fit.used),
         "left_out": {view.name: view.left_out for view in fit.views if view.left_out},
-        "findings": [one.as_json() for one in fit.findings],
+        "findings": [item.as_json() for item in fit.findings],
         "settings": fit.settings,
         "provenance": provenance(),
     }
@@ -891,15 +893,15 @@ def run(
     fit = calibrate_camera(views, model=model, seed=seed)
     fit.settings.update(board=chosen.words, square=chosen.square)
     write_camera(out, fit.lens, {**camera_record(fit), "without_board": without})
-    words = camera_report(fit)
+    summary = camera_report(fit)
     if report is not None:
         kind = {"board": board}
         if charuco is not None:
             kind = {"charuco": charuco, "dictionary": dictionary, "marker": marker}
         options = {"out": out, "square": square, **kind, "model": model, "seed": seed}
         repeat = [command_line("camera", images, options)]
-        words.write(report, camera_json(fit), camera_pictures(fit), repeat, {"Views": _views_table(fit)})
-    publish(camera_json(fit, out) if as_json else None, words.show, (out, report))
+        summary.write(report, camera_json(fit), camera_pictures(fit), repeat, {"Views": _views_table(fit)})
+    publish(camera_json(fit, out) if as_json else None, summary.show, (out, report))
     return fit
 
 
@@ -929,12 +931,14 @@ def _board_views(images: Sequence[Path], board: Board, screen: Console) -> tuple
             _, is_video, number = name.partition("#")
             if is_video and int(number) % OF_A_VIDEO:
                 continue
-            seen = see_board(image, board)
-            if seen is None:
+            detection = see_board(image, board)
+            if detection is None:
                 without.append(name)
                 continue
             height, width = image.shape
-            views.append(BoardView(name=name, width=width, height=height, pixels=seen[0], points=seen[1]))
+            views.append(
+                BoardView(name=name, width=width, height=height, pixels=detection[0], points=detection[1])
+            )
     except KeyboardInterrupt:
         screen.print(f"stopped after {len(views) + len(without)} pictures; fitting to those", highlight=False)
     return views, without

@@ -136,15 +136,17 @@ class Block(NamedTuple):
     """Right side of the own, (Q,)."""
 
 
-def block_of(shared: Array, own: Array, residual: Array) -> Block:
+def block_of(shared: Array, local: Array, residual: Array) -> Block:
     """From whitened rows.
 
     Args:
         shared: Derivatives of the prediction with respect to the shared unknowns, (n, P).
-        own: And to the group's own, (n, Q).
+        local: And to the group's own, (n, Q).
         residual: Measured less predicted, (n,).
     """
-    return Block(shared.T @ shared, shared.T @ own, own.T @ own, shared.T @ residual, own.T @ residual)
+    return Block(
+        shared.T @ shared, shared.T @ local, local.T @ local, shared.T @ residual, local.T @ residual
+    )
 
 
 def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Array]]:

@@ -125,7 +125,7 @@ class MountState:
         return self.reference if tag == reference else self.reference.then(self.others[tag])
 
 
-def moved(state: MountState, shared: Array, own: Sequence[Array]) -> MountState:
+def moved(state: MountState, shared: Array, pose_steps: Sequence[Array]) -> MountState:
     """After a step of the shared unknowns, in the order of `names`, and of each moment's pose."""
     return replace(
         state,
@@ -134,7 +134,7 @@ def moved(state: MountState, shared: Array, own: Sequence[Array]) -> MountState:
             tag: pose.stepped(shared[6 + 6 * i : 12 + 6 * i])
             for i, (tag, pose) in enumerate(state.others.items())
         },
-        poses=[pose.stepped(step) for pose, step in zip(state.poses, own, strict=True)],
+        poses=[pose.stepped(step) for pose, step in zip(state.poses, pose_steps, strict=True)],
     )
 
 
@@ -152,14 +152,14 @@ def residuals(
     rig: Rig, state: MountState, moments: Sequence[Moment]
 ) -> tuple[Array, NDArray[np.int64], list[Array]]:
     """Measured less predicted corners [px] (n, 4, 2), NaN out of sight, their moments (n,), and the whitened rest."""
-    seen = np.array([pixels for m in moments for pixels in m.corners.values()])
+    observed = np.array([pixels for m in moments for pixels in m.corners.values()])
     owner = np.repeat(np.arange(len(moments)), [len(m.corners) for m in moments])
     predicted = project(rig.pool.camera, rig.pool.interface, corner_points(rig, state, moments)).pixels
     rest = [
         np.concatenate([np.zeros(0), *(r for _, _, r in _others(rig, state, pose, m))])
         for pose, m in zip(state.poses, moments, strict=True)
     ]
-    return seen - predicted, owner, rest
+    return observed - predicted, owner, rest
 
 
 def moment_blocks(rig: Rig, state: MountState, moments: Sequence[Moment]) -> list[Block]:
@@ -185,7 +185,7 @@ def _corner_rows(rig: Rig, state: MountState, pose: Pose, tag: int, J: Array) ->
     with respect to its corners in the pool, J (4, 2, 3)."""
     in_reference = rig.corners_t if tag == rig.reference else state.others[tag].at(rig.corners_t)
     in_body = state.reference.at(in_reference)
-    own = np.concatenate([-J @ skew(in_body @ pose.R.T), J], axis=-1)
+    of_pose = np.concatenate([-J @ skew(in_body @ pose.R.T), J], axis=-1)
     A = np.zeros((4, 2, len(state.names)))
     J_b = J @ pose.R
     A[..., 0:3] = -J_b @ skew(in_reference @ state.reference.R.T)
@@ -194,7 +194,7 @@ def _corner_rows(rig: Rig, state: MountState, pose: Pose, tag: int, J: Array) ->
         J_r, start = J_b @ state.reference.R, 6 + 6 * list(state.others).index(tag)
         A[..., start : start + 3] = -J_r @ skew(rig.corners_t @ state.others[tag].R.T)
         A[..., start + 3 : start + 6] = J_r
-    return A, own
+    return A, of_pose
 
 
 def _others(rig: Rig, state: MountState, pose: Pose, moment: Moment) -> list[tuple[Array, Array, Array]]:
@@ -232,8 +232,8 @@ def rotation_between(a: Array, b: Array) -> Array:
         xyzw, (4,).
     """
     B = a.T @ b
-    left, _, right = np.linalg.svd(B + 1e-6 * np.linalg.norm(B) * np.eye(3))
-    return matrix_to_quat(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)
+    U, _, right = np.linalg.svd(B + 1e-6 * np.linalg.norm(B) * np.eye(3))
+    return matrix_to_quat(U @ np.diag([1.0, 1.0, np.linalg.det(U @ right)]) @ right)
 
 
 def start_state(
@@ -246,14 +246,14 @@ def start_state(
     mounts = dict(mounts)
     _place_unknown(rig, mounts, moments)
     reference = mounts[rig.reference]
-    poses, kept = [], []
+    poses, selected = [], []
     for i, moment in enumerate(moments):
         pose = start_pose(rig, mounts, moment)
         if pose is not None:
             poses.append(pose)
-            kept.append(i)
+            selected.append(i)
     others = {tag: reference.inverse.then(mounts[tag]) for tag in sorted(mounts) if tag != rig.reference}
-    return MountState(reference=reference, others=others, poses=poses), kept
+    return MountState(reference=reference, others=others, poses=poses), selected
 
 
 def start_pose(rig: Rig, mounts: Mapping[int, Pose], moment: Moment) -> Pose | None:
@@ -296,15 +296,15 @@ def level_tag(rig: Rig, pixels: Array) -> Pose | None:
 
 
 def _place_unknown(rig: Rig, mounts: dict[int, Pose], moments: Sequence[Moment]) -> None:
-    seen = {tag for moment in moments for tag in moment.corners}
-    for tag in sorted(seen - mounts.keys()):
+    visible = {tag for moment in moments for tag in moment.corners}
+    for tag in sorted(visible - mounts.keys()):
         for moment in moments:
             beside = [other for other in moment.corners if other in mounts]
             if tag not in moment.corners or not beside:
                 continue
-            known, new = level_tag(rig, moment.corners[beside[0]]), level_tag(rig, moment.corners[tag])
-            if known is not None and new is not None:
-                mounts[tag] = mounts[beside[0]].then(known.inverse.then(new))
+            reference, new = level_tag(rig, moment.corners[beside[0]]), level_tag(rig, moment.corners[tag])
+            if reference is not None and new is not None:
+                mounts[tag] = mounts[beside[0]].then(reference.inverse.then(new))
                 break
 
 
@@ -336,8 +336,8 @@ def minimise(
 
         def stepped(damping: float) -> MountState:
             shared = np.zeros(len(state.names))
-            shared[index], own = arrow_step(blocks, damping)
-            return moved(state, shared, own)
+            shared[index], local = arrow_step(blocks, damping)
+            return moved(state, shared, local)
 
         return stepped
 
@@ -430,9 +430,9 @@ def reference_tag(moments: Sequence[Moment], mounts: Mapping[int, Pose]) -> int:
     counts = {tag: sum(tag in moment.corners for moment in moments) for tag in mounts}
     best = max(counts, key=lambda tag: (counts[tag], -tag), default=None)
     if best is None or not counts[best]:
-        seen = sorted({tag for moment in moments for tag in moment.corners})
+        visible = sorted({tag for moment in moments for tag in moment.corners})
         raise CalibrationError(
-            f"none of the vehicle file's tags {sorted(mounts)} is seen, only {seen}: give the file the right ids"
+            f"none of the vehicle file's tags {sorted(mounts)} is seen, only {visible}: give the file the right ids"
         )
     return best
 
@@ -460,8 +460,8 @@ def fit_mounts(
         CalibrationError: Too few moments show a tag in the water.
     """
     some = _spread([moment for moment in moments if moment.corners])
-    state, kept = start_state(rig, mounts, some)
-    used = [some[i] for i in kept]
+    state, selected = start_state(rig, mounts, some)
+    used = [some[i] for i in selected]
     if len(used) < FEWEST_MOMENTS:
         raise CalibrationError(
             f"{len(used)} pictures show a tag of the vehicle under water, expected at least {FEWEST_MOMENTS}: record a "
@@ -471,10 +471,10 @@ def fit_mounts(
     used = [replace(m, corners={t: c for t, c in m.corners.items() if t not in unknown}) for m in used]
     origin = state
     state = _by_vision(rig, state, used)
-    state, used, left_out = _without_far(rig, state, used)
-    wanted = _wanted(state, used)
-    free = _hopeful(rig, state, used, wanted)
-    state = as_before(state, origin, [name for name in wanted if name not in free])
+    state, used, excluded = _without_far(rig, state, used)
+    candidates = _wanted(state, used)
+    free = _hopeful(rig, state, used, candidates)
+    state = as_before(state, origin, [name for name in candidates if name not in free])
     while True:
         state = minimise(rig, state, used, free)
         blocks = [restricted(block, state, free) for block in moment_blocks(rig, state, used)]
@@ -483,18 +483,18 @@ def fit_mounts(
         if worst is None:
             break
         free = tuple(name for name in free if name != worst)
-        state = as_before(state, origin, [name for name in wanted if name not in free])
+        state = as_before(state, origin, [name for name in candidates if name not in free])
     corner, _, _ = residuals(rig, state, used)
     return MountFit(
         state=state,
         rig=rig,
         moments=tuple(used),
         free=free,
-        frozen=tuple(name for name in wanted if name not in free),
+        frozen=tuple(name for name in candidates if name not in free),
         covariance=covariance,
         rms=float(np.sqrt(np.nanmean(np.sum(corner**2, axis=-1)))),
         held_out_rms=_held_out(rig, state, used, free) if held_out else math.nan,
-        left_out=left_out,
+        left_out=excluded,
     )
 
 
@@ -524,9 +524,9 @@ def _spread(moments: Sequence[Moment]) -> list[Moment]:
 def _wanted(state: MountState, moments: Sequence[Moment]) -> tuple[str, ...]:
     """Shared unknowns that the sensors at hand could tell."""
     up, depth = any(m.up is not None for m in moments), any(m.depth is not None for m in moments)
-    told = {"turn_x": up, "turn_y": up, "turn_z": up, "z": depth, "x": depth and up, "y": depth and up}
-    wanted = [f"reference.{axis}" for axis, is_told in told.items() if is_told]
-    return (*wanted, *_of_others(state))
+    observable = {"turn_x": up, "turn_y": up, "turn_z": up, "z": depth, "x": depth and up, "y": depth and up}
+    candidates = [f"reference.{axis}" for axis, available in observable.items() if available]
+    return (*candidates, *_of_others(state))
 
 
 def _of_others(state: MountState) -> tuple[str, ...]:
@@ -577,13 +577,13 @@ def _by_vision(rig: Rig, state: MountState, moments: Sequence[Moment]) -> MountS
     """
     blind = [replace(moment, up=None) for moment in moments]
     state = minimise(rig, state, blind, _of_others(state), steps=15)
-    known = [i for i, moment in enumerate(moments) if moment.up is not None]
-    if not known:
+    with_up = [i for i, moment in enumerate(moments) if moment.up is not None]
+    if not with_up:
         return state
-    seen = np.array([state.poses[i].R.T @ rig.pool.interface.normal for i in known])
-    felt = np.array([moments[i].up for i in known])
-    q = rotation_between(felt, seen)
-    better = np.sum((felt - quat_rotate(q, seen)) ** 2) < BETTER * np.sum((felt - seen) ** 2)
+    observed = np.array([state.poses[i].R.T @ rig.pool.interface.normal for i in with_up])
+    felt = np.array([moments[i].up for i in with_up])
+    q = rotation_between(felt, observed)
+    better = np.sum((felt - quat_rotate(q, observed)) ** 2) < BETTER * np.sum((felt - observed) ** 2)
     if 2.0 * math.acos(min(1.0, abs(float(q[3])))) >= TURNED and better:
         # The body turns about the reference tag, so that every tag stays where it is seen.
         mount = Pose(quat_to_matrix(q) @ state.reference.R, state.reference.t)
@@ -637,13 +637,13 @@ class MountLog:
 
 
 def _up_at(up: Series | None, time: float) -> Array | None:
-    found = None if up is None else up.at(time)
-    return found / np.linalg.norm(found) if isinstance(found, np.ndarray) else None
+    vector = None if up is None else up.at(time)
+    return vector / np.linalg.norm(vector) if isinstance(vector, np.ndarray) else None
 
 
 def _depth_at(depth: Series | None, time: float) -> float | None:
-    found = None if depth is None else depth.at(time)
-    return float(found[0]) if isinstance(found, np.ndarray) else None
+    value = None if depth is None else depth.at(time)
+    return float(value[0]) if isinstance(value, np.ndarray) else None
 
 
 def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog:
@@ -700,15 +700,15 @@ def _read_imu(path: Path, vehicle: Vehicle, findings: list[Finding]) -> tuple[Se
     if up is None or not np.isfinite(up).any():
         findings.append(finding("tilt_unknown", file=IMU))
         return None, None
-    tilt = series("attitude", table.t, up, LONGEST_AGE, where=str(path))
+    tilt = series("attitude", table.t, up, LONGEST_AGE, label=str(path))
     if not rated or len(tilt.t) < 2:
         return tilt, None
-    rate = series("rate", table.t, omega, math.inf, where=str(path))
+    rate = series("rate", table.t, omega, math.inf, label=str(path))
     within = (rate.t >= tilt.t[0]) & (rate.t <= tilt.t[-1])
     t, about = rate.t[within], np.zeros(int(within.sum()))
     for i in range(3):
         about += rate.values[within, i] * np.interp(t, tilt.t, tilt.values[:, i])
-    turning = series("turning", t, about[:, None], math.inf, where=str(path)) if len(t) > 2 else None
+    turning = series("turning", t, about[:, None], math.inf, label=str(path)) if len(t) > 2 else None
     return tilt, turning
 
 
@@ -744,7 +744,7 @@ def _read_depth(path: Path, findings: list[Finding]) -> Series | None:
         raise CalibrationError(
             f"{path}: no column 'depth': add the depth of the pressure port [m], positive down"
         )
-    return series("depth", table.t, table.columns("depth"), LONGEST_AGE, where=str(path))
+    return series("depth", table.t, table.columns("depth"), LONGEST_AGE, label=str(path))
 
 
 # The mounts, as estimates and as numbers of the vehicle file.
@@ -755,30 +755,30 @@ EDGE_STD = 0.25e-3
 KEPT = "the motion does not tell it: kept from the file"
 
 
-def distance_std(found: MountFit) -> float:
+def distance_std(fit: MountFit) -> float:
     """Error of every depth from an edge that is measured a little wrong: its share of the apparent distance [m]."""
-    interface = found.rig.pool.interface
-    above = float(interface.normal @ found.rig.pool.camera.position) + interface.offset
-    below = -float(np.median([interface.normal @ pose.t for pose in found.state.poses])) - interface.offset
-    return EDGE_STD / found.rig.edge * (above * interface.index_far / interface.index_near + below)
+    interface = fit.rig.pool.interface
+    above = float(interface.normal @ fit.rig.pool.camera.position) + interface.offset
+    below = -float(np.median([interface.normal @ pose.t for pose in fit.state.poses])) - interface.offset
+    return EDGE_STD / fit.rig.edge * (above * interface.index_far / interface.index_near + below)
 
 
 def tag_estimates(
-    found: MountFit, mounts: Mapping[int, Pose], vehicle: Vehicle
+    fit: MountFit, mounts: Mapping[int, Pose], vehicle: Vehicle
 ) -> tuple[list[Estimate], dict[str, Any]]:
     """Estimates of every tag, and the mounts to write; a tag of which nothing is told keeps the file's."""
-    estimates, written, told = [], {}, False
+    estimates, written, any_identified = [], {}, False
     for tag, mount in vehicle.tags.mounts.items():  # type: ignore[union-attr]
         written[tag] = {"position": list(mount.position), "orientation": list(mount.orientation)}
-    for tag in (found.rig.reference, *found.state.others):
-        pose, half = found.state.mount(tag, found.rig.reference), _half_widths(found, tag)
+    for tag in (fit.rig.reference, *fit.state.others):
+        pose, half = fit.state.mount(tag, fit.rig.reference), _half_widths(fit, tag)
         if not np.isfinite(half).any():
             continue
-        told = True
+        any_identified = True
         written[tag] = {"position": pose.t.tolist(), "orientation": matrix_to_quat(pose.R).tolist()}
         turn = quat_to_rotvec(matrix_to_quat(pose.R @ mounts.get(tag, pose).R.T))
         note = f"{KEPT}, and it defines the body's axes and origin"
-        if tag != found.rig.reference:
+        if tag != fit.rig.reference:
             note = "too few pictures show this tag together with others"
         for axis, value, width in zip(AXES, np.append(np.degrees(turn), pose.t), half, strict=True):
             unit, width = ("deg", math.degrees(width)) if "turn" in axis else ("m", width)
@@ -787,38 +787,38 @@ def tag_estimates(
             if unit == "m":
                 estimate = replace(estimate, path=f"tags.mounts.{tag}.position.{'xyz'.index(axis)}")
             estimates.append(estimate)
-    return estimates, {"tags.mounts": dict(sorted(written.items()))} if told else {}
+    return estimates, {"tags.mounts": dict(sorted(written.items()))} if any_identified else {}
 
 
-def _half_widths(found: MountFit, tag: int) -> Array:
+def _half_widths(fit: MountFit, tag: int) -> Array:
     """Half widths of a tag's 95 % intervals, turn about the body axes [rad] and position [m], (6,).
 
     What is kept from the file counts as exact for the other tags, which are told relative to it; for the reference tag
     itself it is infinite.
     """
-    own = np.array([found.half_width(f"reference.{axis}") for axis in AXES])
-    own[5] = np.hypot(own[5], 1.96 * distance_std(found))
-    if tag == found.rig.reference:
-        return own
-    R, arm = found.state.reference.R, found.state.reference.R @ found.state.others[tag].t
-    shared = np.where(np.isfinite(own), own, 0.0) ** 2
-    relative = np.array([found.half_width(f"{tag}.{axis}") for axis in AXES]) ** 2
+    half = np.array([fit.half_width(f"reference.{axis}") for axis in AXES])
+    half[5] = np.hypot(half[5], 1.96 * distance_std(fit))
+    if tag == fit.rig.reference:
+        return half
+    R, arm = fit.state.reference.R, fit.state.reference.R @ fit.state.others[tag].t
+    shared = np.where(np.isfinite(half), half, 0.0) ** 2
+    relative = np.array([fit.half_width(f"{tag}.{axis}") for axis in AXES]) ** 2
     turn = shared[:3] + R**2 @ relative[:3]
     position = shared[3:] + skew(arm) ** 2 @ shared[:3] + R**2 @ relative[3:]
     return np.sqrt(np.concatenate([turn, position]))
 
 
-def of_frozen(found: MountFit) -> list[Finding]:
+def of_frozen(fit: MountFit) -> list[Finding]:
     """What the motion does not tell of the tags."""
-    findings, tag = [], found.rig.reference
-    frozen = [name.partition(".")[2] for name in found.frozen if name.startswith("reference.")]
+    findings, tag = [], fit.rig.reference
+    frozen = [name.partition(".")[2] for name in fit.frozen if name.startswith("reference.")]
     turns = tuple(name[-1] for name in frozen if "turn" in name)
     lengths = tuple(name for name in frozen if "turn" not in name)
     if turns:
         findings.append(finding("tag_turn_unknown", tag=tag, axes=turns))
     if lengths:
         findings.append(finding("tag_place_unknown", tag=tag, axes=lengths, limit=UNSURE_LENGTH))
-    others = sorted({name.partition(".")[0] for name in found.frozen if name[0].isdigit()}, key=int)
+    others = sorted({name.partition(".")[0] for name in fit.frozen if name[0].isdigit()}, key=int)
     if others:
         findings.append(finding("tags_apart", tags=tuple(others)))
     return findings
@@ -860,14 +860,14 @@ def calibrate_mounts(log: MountLog, pool: Pool, vehicle: Vehicle, *, name: str, 
     )
     clock = _clock(rig, mounts, log)
     late = clock is not None and clock.identifiable and not clock.ci95[0] <= 0.0 <= clock.ci95[1]
-    found = fit_mounts(rig, mounts, log.moments(clock.estimate if clock is not None and late else 0.0))
-    rows, changes = tag_estimates(found, mounts, vehicle)
+    mount_fit = fit_mounts(rig, mounts, log.moments(clock.estimate if clock is not None and late else 0.0))
+    rows, changes = tag_estimates(mount_fit, mounts, vehicle)
     rows += [clock] if clock is not None else []
     figures = {
-        "rmse": found.rms,
-        "rmse_held_out": found.held_out_rms,
-        "samples": float(len(found.moments)),
-        "rejected": float(found.left_out),
+        "rmse": mount_fit.rms,
+        "rmse_held_out": mount_fit.held_out_rms,
+        "samples": float(len(mount_fit.moments)),
+        "rejected": float(mount_fit.left_out),
     }
     return Fit(
         kind="mounts",
@@ -876,10 +876,10 @@ def calibrate_mounts(log: MountLog, pool: Pool, vehicle: Vehicle, *, name: str, 
         estimates={row.name: row for row in rows},
         changes=changes,
         quality={"corners [px]": figures},
-        findings=(*log.findings, *of_frozen(found)),
-        curves=_curves(found),
+        findings=(*log.findings, *of_frozen(mount_fit)),
+        curves=_curves(mount_fit),
         trials={name: log.sha256},
-        settings={"seed": seed, "reference_tag": found.rig.reference},
+        settings={"seed": seed, "reference_tag": mount_fit.rig.reference},
     )
 
 
@@ -924,22 +924,22 @@ def imu_clock(
     t = np.arange(max(t_picture[0], t_imu[0]), min(t_picture[-1], t_imu[-1]), 1.0 / RATE)
     if len(turn) < FEWEST or len(t) < FEWEST:
         return None
-    seen = smooth(t_picture, heading[:, None], t, order=3).slope
-    found = offset("pictures", seen, smooth(t_imu, vertical_rate[:, None], t).value)
-    if found is None:
+    turn_rate = smooth(t_picture, heading[:, None], t, order=3).slope
+    lag = offset("pictures", turn_rate, smooth(t_imu, vertical_rate[:, None], t).value)
+    if lag is None:
         return None
-    half = 1.96 * found.std
+    half = 1.96 * lag.std
     note = "the vehicle turns too evenly to tell the clocks apart: taken as 0"
-    return Estimate.within("imu.time_offset", found.seconds, half, "s", half < UNSURE_CLOCK, note)
+    return Estimate.within("imu.time_offset", lag.seconds, half, "s", half < UNSURE_CLOCK, note)
 
 
-def _curves(found: MountFit) -> tuple[Curve, ...]:
+def _curves(fit: MountFit) -> tuple[Curve, ...]:
     """For the report: first corners, tilt and depth as measured and as the fit has them, over time."""
-    rig, state, moments = found.rig, found.state, found.moments
+    rig, state, moments = fit.rig, fit.state, fit.moments
     t = np.array([moment.time for moment in moments])
     pixels, owner, _ = residuals(rig, state, moments)
     tags = np.array([tag for moment in moments for tag in moment.corners])
-    seen = np.array([corner for moment in moments for corner in moment.corners.values()])
+    corners = np.array([corner for moment in moments for corner in moment.corners.values()])
     curves = []
 
     def add(title: str, label: str, t: Array, measured: Array, fitted: Array) -> None:
@@ -950,7 +950,7 @@ def _curves(found: MountFit) -> tuple[Curve, ...]:
     for tag in np.unique(tags):
         of = tags == tag
         for i, axis in enumerate("uv"):
-            measured = seen[of, 0, i]
+            measured = corners[of, 0, i]
             fitted = measured - pixels[of, 0, i]
             add(f"tag {tag}, top-left corner", f"{axis} [px]", t[owner[of]], measured, fitted)
     felt = np.array([np.full(3, math.nan) if m.up is None else m.up for m in moments])
@@ -958,7 +958,7 @@ def _curves(found: MountFit) -> tuple[Curve, ...]:
     for i, axis in enumerate("xy"):
         add("tilt by the IMU", f"up along body {axis} [-]", t, felt[:, i], up[:, i])
     depth = np.array([math.nan if m.depth is None else m.depth for m in moments])
-    add("pressure port", "depth [m]", t, depth, found.port_depths)
+    add("pressure port", "depth [m]", t, depth, fit.port_depths)
     return tuple(curves)
 
 
@@ -993,6 +993,6 @@ def run(
     """
     options = dict(locals())
     refuse_places(out, report, "vehicle")
-    where, body = load_pool(pool), load_vehicle(vehicle)
-    recording = read_mount_log(log, where, body)
-    return finish("mounts", calibrate_mounts(recording, where, body, name=Path(log).name, seed=seed), options)
+    site, body = load_pool(pool), load_vehicle(vehicle)
+    recording = read_mount_log(log, site, body)
+    return finish("mounts", calibrate_mounts(recording, site, body, name=Path(log).name, seed=seed), options)

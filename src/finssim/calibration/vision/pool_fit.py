@@ -98,8 +98,8 @@ SAME = 1.15
 class RobustPixels:
     """Whitening of rows one by one with Huber's weights, from residuals at one model."""
 
-    def __init__(self, model: PoolModel, seen: Observations, least: float = 0.3) -> None:
-        size = _sizes(model, seen)
+    def __init__(self, model: PoolModel, observed: Observations, least: float = 0.3) -> None:
+        size = _sizes(model, observed)
         self.scale = max(least, 1.2 * float(np.median(size)) / 1.1774)
         self._root = np.sqrt(huber_weight(size, 2.0 * self.scale)) / self.scale
 
@@ -108,7 +108,7 @@ class RobustPixels:
         return np.asarray(scaled.reshape(-1, *values.shape[2:]))
 
 
-def pinhole_poses(seen: Observations, lens: Lens, seed: int = 0) -> list[Solution]:
+def pinhole_poses(observed: Observations, lens: Lens, seed: int = 0) -> list[Solution]:
     """Poses of a camera that saw the points in straight lines, the best first; costs are comparable.
 
     Water between changes such a pose much, but not where the search from it ends.
@@ -116,9 +116,9 @@ def pinhole_poses(seen: Observations, lens: Lens, seed: int = 0) -> list[Solutio
     Raises:
         CalibrationError: Fewer than four points, all on one line, or no pixel within the lens's reach.
     """
-    rays, ok = lens.rays(seen.pixels)
+    rays, ok = lens.rays(observed.pixels)
     front = ok & (rays[:, 2] > 0.05)
-    X, rays = seen.points[front], rays[front]
+    X, rays = observed.points[front], rays[front]
     count = len(np.unique(X.round(6), axis=0))
     values = np.linalg.svd(X - X.mean(axis=0), compute_uv=False) if count >= 3 else np.zeros(3)
     if count < 4 or values[1] < 1e-3 * values[0]:
@@ -126,19 +126,19 @@ def pinhole_poses(seen: Observations, lens: Lens, seed: int = 0) -> list[Solutio
             f"{count} usable points{' on one line' if len(X) >= 4 else ''}: expected at least 4 that do not lie on one "
             "line; whether the camera file belongs to these pixels decides which are usable"
         )
-    plane, reference = Interface(UP, 0.0), seen.points[~seen.dry].mean(axis=0)
+    plane, reference = Interface(UP, 0.0), observed.points[~observed.dry].mean(axis=0)
     near = []
     for R_cp, C in _candidates(X, rays[:, :2] / rays[:, 2:], np.random.default_rng(seed)):
         camera = Camera(lens, C, matrix_to_quat(R_cp.T))
-        near.append(_straightened(PoolModel(camera, plane, reference, refractive=False), seen, 10))
+        near.append(_straightened(PoolModel(camera, plane, reference, refractive=False), observed, 10))
     # Most starts have met by now, and what has met ends at one pose.
-    found = _distinct([_straightened(s.model, seen, 30) for s in _distinct(near)])
-    found = [s for s in found if np.median(_sizes(s.model, seen)) <= 0.2 * lens.width]
-    if not found:
+    poses = _distinct([_straightened(s.model, observed, 30) for s in _distinct(near)])
+    poses = [s for s in poses if np.median(_sizes(s.model, observed)) <= 0.2 * lens.width]
+    if not poses:
         raise CalibrationError(
             "no pose of the camera explains the pixels: check ids, units and the camera file"
         )
-    return found
+    return poses
 
 
 def _candidates(X: Array, xy: Array, rng: np.random.Generator) -> list[tuple[Array, Array]]:
@@ -182,42 +182,42 @@ def _candidates(X: Array, xy: Array, rng: np.random.Generator) -> list[tuple[Arr
     return [(R, C) for _, R, C in runs[:STARTS]]
 
 
-def _straightened(model: PoolModel, seen: Observations, iterations: int) -> Solution:
+def _straightened(model: PoolModel, observed: Observations, iterations: int) -> Solution:
     """The straight-line pose nearby that suits the pixels better, judged by a scale common to all."""
     active = np.array([name in NAMES[:6] for name in NAMES])
-    whiten, prior = RobustPixels(model, seen), Prior(start=model)
-    model = solve(model, seen, whiten, active, prior, iterations=iterations, tolerance=1e-6).model
-    return Solution(model, _score(model, seen))
+    whiten, prior = RobustPixels(model, observed), Prior(start=model)
+    model = solve(model, observed, whiten, active, prior, iterations=iterations, tolerance=1e-6).model
+    return Solution(model, _score(model, observed))
 
 
-def _sizes(model: PoolModel, seen: Observations) -> Array:
+def _sizes(model: PoolModel, observed: Observations) -> Array:
     """Lengths of the residuals (N,) [px]."""
-    return np.asarray(np.linalg.norm(residuals(model, seen)[0], axis=1))
+    return np.asarray(np.linalg.norm(residuals(model, observed)[0], axis=1))
 
 
-def _score(model: PoolModel, seen: Observations) -> float:
+def _score(model: PoolModel, observed: Observations) -> float:
     """Mean length of the residuals [px], long ones counted as three medians."""
-    size = _sizes(model, seen)
+    size = _sizes(model, observed)
     return float(np.minimum(size, 3.0 * np.median(size)).mean())
 
 
 def _distinct(solutions: list[Solution]) -> list[Solution]:
     """The best first, without those that are another's pose to a degree and a hundredth of the distance."""
-    kept: list[Solution] = []
+    selected: list[Solution] = []
     for s in sorted(solutions, key=lambda s: s.cost):
         here, reach = s.model.camera, 0.01 * np.linalg.norm(s.model.camera.position - s.model.reference)
-        others = (k.model.camera for k in kept)
+        others = (k.model.camera for k in selected)
         if all(
             np.trace(here.R_pc.T @ other.R_pc) < 3.0 - 3e-4
             or np.linalg.norm(here.position - other.position) > reach
             for other in others
         ):
-            kept.append(s)
-    return kept
+            selected.append(s)
+    return selected
 
 
 def plane_starts(
-    pinhole: PoolModel, normals: Sequence[Array], plane: Interface, seen: Observations, depth: float
+    pinhole: PoolModel, normals: Sequence[Array], plane: Interface, observed: Observations, depth: float
 ) -> Iterator[PoolModel]:
     """The straight-line pose with a plane put before the points and the camera moved back to match.
 
@@ -227,11 +227,11 @@ def plane_starts(
         pinhole: Straight-line pose.
         normals: Directions to try, each turned to the camera's side.
         plane: Holds indices and window.
-        seen: Of which the points under water count.
+        observed: Of which the points under water count.
         depth: Distance of the plane from the reference point where it is known [m], or NaN.
     """
     camera, reference = pinhole.camera, pinhole.reference
-    wet = seen.points[~seen.dry]
+    wet = observed.points[~observed.dry]
     for direction in normals:
         apparent = float(direction @ (camera.position - reference))
         normal, apparent = (direction, apparent) if apparent > 0.0 else (-direction, -apparent)
@@ -261,28 +261,28 @@ class Found:
     """The plane's normal is along the survey's z."""
 
 
-def search(seen: Observations, lens: Lens, settings: Settings) -> Found:
+def search(observed: Observations, lens: Lens, settings: Settings) -> Found:
     """The best of many starts, with robust weights.
 
     Raises:
         CalibrationError: No pose explains the pixels, the survey is left-handed, or contradicts what was measured.
     """
-    if len(seen) > ENOUGH:
-        kept = np.random.default_rng(settings.seed).choice(len(seen), ENOUGH, replace=False)
-        seen = seen.subset(np.sort(kept))
-    poses = pinhole_poses(seen, lens, settings.seed)
+    if len(observed) > ENOUGH:
+        sample = np.random.default_rng(settings.seed).choice(len(observed), ENOUGH, replace=False)
+        observed = observed.subset(np.sort(sample))
+    poses = pinhole_poses(observed, lens, settings.seed)
     near = [p.model for p in poses[:3] if p.cost < 3.0 * poses[0].cost + 0.5]
     runs: list[tuple[float, PoolModel, bool]] = []
-    for surface, normals in _families(near[0], seen, settings):
-        runs += _family(near, normals, seen, settings, surface)
+    for surface, normals in _families(near[0], observed, settings):
+        runs += _family(near, normals, observed, settings, surface)
     # Bent rays come first: straight ones may fit the mirror image of a good survey better than the survey.
-    _refuse_left_handed(seen, lens, min([_score(near[0], seen), *(run[0] for run in runs)]))
+    _refuse_left_handed(observed, lens, min([_score(near[0], observed), *(run[0] for run in runs)]))
     if not runs:
         raise CalibrationError(
             "no place of the plane between camera and points explains the pixels: check the water height, its sign and "
             "the interface"
         )
-    chosen = _choose(runs, len(seen))
+    chosen = _choose(runs, len(observed))
     return Found(chosen[1], near[0], chosen[2])
 
 
@@ -330,7 +330,9 @@ def known_plane(model: PoolModel, settings: Settings, surface: bool) -> tuple[Ar
     return normal if surface else None, np.nan if depth is None else depth
 
 
-def _families(pinhole: PoolModel, seen: Observations, settings: Settings) -> list[tuple[bool, list[Array]]]:
+def _families(
+    pinhole: PoolModel, observed: Observations, settings: Settings
+) -> list[tuple[bool, list[Array]]]:
     """(surface?, normals to try)."""
     if settings.plane is not None:
         normal, _ = settings.unit_plane
@@ -340,7 +342,7 @@ def _families(pinhole: PoolModel, seen: Observations, settings: Settings) -> lis
         return surface
     towards = pinhole.camera.position - pinhole.reference
     towards = towards / np.linalg.norm(towards)
-    axes = np.linalg.svd(seen.points - seen.points.mean(axis=0), full_matrices=True)[2]
+    axes = np.linalg.svd(observed.points - observed.points.mean(axis=0), full_matrices=True)[2]
     facing: list[Array] = []
     for n in (towards, -np.asarray(pinhole.camera.R_pc)[:, 2], *np.eye(3), *axes):
         n = n if n @ towards > 0.0 else -n
@@ -352,7 +354,7 @@ def _families(pinhole: PoolModel, seen: Observations, settings: Settings) -> lis
 def _family(
     poses: Sequence[PoolModel],
     normals: Sequence[Array],
-    seen: Observations,
+    observed: Observations,
     settings: Settings,
     surface: bool,
 ) -> list[tuple[float, PoolModel, bool]]:
@@ -362,40 +364,40 @@ def _family(
     for pinhole in poses:
         _refuse_wrong_side(pinhole, settings, surface)
         _, depth = known_plane(pinhole, settings, surface)
-        starts += plane_starts(pinhole, normals, plane, seen, depth)
+        starts += plane_starts(pinhole, normals, plane, observed, depth)
     ends: list[tuple[float, PoolModel]] = []
-    for counts, most in (((6, 4), len(starts)), ((30, 40), 4)):
-        models = [_descend(model, seen, settings, surface, counts) for model in starts[:most]]
-        ends = [(_score(model, seen), model) for model in models if model is not None]
+    for counts, count in (((6, 4), len(starts)), ((30, 40), 4)):
+        models = [_descend(model, observed, settings, surface, counts) for model in starts[:count]]
+        ends = [(_score(model, observed), model) for model in models if model is not None]
         ends.sort(key=lambda pair: pair[0])
         starts = [model for _, model in ends]
     return [(value, model, surface) for value, model in ends]
 
 
 def _descend(
-    model: PoolModel, seen: Observations, settings: Settings, surface: bool, counts: tuple[int, int]
+    model: PoolModel, observed: Observations, settings: Settings, surface: bool, counts: tuple[int, int]
 ) -> PoolModel | None:
     """Pose alone, then pose and plane."""
     start = model
     for count, names in zip(counts, (NAMES[:6], NAMES[:9]), strict=True):
         prior = prior_of(model, start, settings, surface, (np.inf,) * 8)
         active = np.array([name in names for name in NAMES])
-        whiten = RobustPixels(model, seen)
-        model, cost = solve(model, seen, whiten, active, prior, iterations=count, tolerance=1e-7)
+        whiten = RobustPixels(model, observed)
+        model, cost = solve(model, observed, whiten, active, prior, iterations=count, tolerance=1e-7)
         if not np.isfinite(cost):
             return None
     return model
 
 
-def _refuse_left_handed(seen: Observations, lens: Lens, best: float) -> None:
+def _refuse_left_handed(observed: Observations, lens: Lens, best: float) -> None:
     """Refuse a survey whose mirror image, in straight lines, fits clearly better than the best model of it.
 
     A plane of points can always be mirrored, and says nothing.
     """
-    values = np.linalg.svd(seen.points - seen.points.mean(axis=0), compute_uv=False)
+    values = np.linalg.svd(observed.points - observed.points.mean(axis=0), compute_uv=False)
     if values[2] < 0.02 * values[1]:
         return
-    mirrored = replace(seen, points=seen.points * np.array([1.0, 1.0, -1.0]))
+    mirrored = replace(observed, points=observed.points * np.array([1.0, 1.0, -1.0]))
     if _score(pinhole_poses(mirrored, lens)[0].model, mirrored) < MIRRORED * best:
         raise CalibrationError(
             "the survey's frame is left-handed: its mirror image fits clearly better; negate one axis (usually y or z) "
@@ -408,9 +410,10 @@ def _refuse_wrong_side(pinhole: PoolModel, settings: Settings, surface: bool) ->
     _, depth = known_plane(pinhole, settings, surface)
     if np.isfinite(depth) and depth <= 0.0:
         sense = "below" if pinhole.camera.position[2] < pinhole.reference[2] else "above"
-        where = "the plane given" if settings.water_height is None else "the water's height given"
+        plane_name = "the plane given" if settings.water_height is None else "the water's height given"
         raise CalibrationError(
-            f"the pixels put the camera at z {sense} the points, and {where} is {-depth:.3g} m on the other side of "
+            f"the pixels put the camera at z {sense} the points, and {plane_name} is {-depth:.3g} m on the other side "
+            "of "
             f"them: the survey's z points {'down' if sense == 'below' else 'up'}, or its x and y make it left-handed "
             "(seen from the camera, y must lie to the left of x where z is up); give the water's height with the other "
             "sign, or negate y in the survey"
@@ -459,15 +462,15 @@ class Noise:
     scale: float = 1.0
     """Of all survey errors, as the residuals tell it."""
 
-    def survey_modes(self, J_point: Array, seen: Observations) -> Array:
+    def survey_modes(self, J_point: Array, observed: Observations) -> Array:
         """What one standard error of a location's x, y, z and of a tag's direction does to each pixel [px], (N, 2, 4).
 
         Args:
             J_point: Derivative of the pixel by the point, (N, 2, 3).
-            seen: The rows.
+            observed: The rows.
         """
-        sigma = np.where(np.isfinite(seen.sigma), seen.sigma, self.survey)[:, None, None]
-        turn = self.survey_yaw * np.einsum("nij,nj->ni", J_point, seen.arm)[..., None]
+        sigma = np.where(np.isfinite(observed.sigma), observed.sigma, self.survey)[:, None, None]
+        turn = self.survey_yaw * np.einsum("nij,nj->ni", J_point, observed.arm)[..., None]
         return np.asarray(self.scale * np.concatenate([J_point * sigma, turn], axis=-1))
 
 
@@ -477,18 +480,18 @@ class Whitener:
     V_l = sigma² 1 + J_l B_l S B_lᵀ J_lᵀ: a location is displaced as a whole, and a tag turned, by the survey's error.
     """
 
-    def __init__(self, J_point: Array, seen: Observations, noise: Noise) -> None:
+    def __init__(self, J_point: Array, observed: Observations, noise: Noise) -> None:
         """
         Args:
             J_point: Derivative of the pixel by the point, (N, 2, 3).
-            seen: The rows.
+            observed: The rows.
             noise: Standard errors.
         """
-        modes = noise.survey_modes(J_point, seen)
+        modes = noise.survey_modes(J_point, observed)
         self.logdet = 0.0
         self._groups: list[tuple[NDArray[np.intp], Array]] = []
-        order = np.argsort(seen.location, kind="stable")
-        _, starts, counts = np.unique(seen.location[order], return_index=True, return_counts=True)
+        order = np.argsort(observed.location, kind="stable")
+        _, starts, counts = np.unique(observed.location[order], return_index=True, return_counts=True)
         for count in np.unique(counts):
             rows = np.stack([order[s : s + count] for s in starts[counts == count]])
             B = modes[rows].reshape(len(rows), 2 * count, 4)
@@ -513,11 +516,11 @@ def estimate_noise(
     residual: Array,
     J: Array,
     J_point: Array,
-    seen: Observations,
+    observed: Observations,
     noise: Noise,
     prior: Array,
     *,
-    pixel_known: bool,
+    fixed_pixel: bool,
 ) -> Noise:
     """Most likely standard errors of pixels and survey (restricted likelihood: what the fit swallowed is given back).
 
@@ -525,25 +528,25 @@ def estimate_noise(
         residual: Measured minus predicted [px], (N, 2).
         J: Derivative of the prediction by the fitted parameters, (N, 2, P).
         J_point: By the point, (N, 2, 3).
-        seen: The rows.
+        observed: The rows.
         noise: What is believed before.
         prior: Information of the priors on the parameters, (P, P).
-        pixel_known: The pixel's error is given and stays.
+        fixed_pixel: The pixel's error is given and stays.
     """
-    if len(seen) > NOISE_ROWS:  # two numbers need no more; whole locations, evenly
-        every = int(np.ceil(len(seen) / NOISE_ROWS))
-        rows = np.flatnonzero(seen.location % every == 0)
+    if len(observed) > NOISE_ROWS:  # two numbers need no more; whole locations, evenly
+        every = int(np.ceil(len(observed) / NOISE_ROWS))
+        rows = np.flatnonzero(observed.location % every == 0)
         if len(rows) > NOISE_ROWS // 4:
-            residual, J, J_point, seen = residual[rows], J[rows], J_point[rows], seen.subset(rows)
+            residual, J, J_point, observed = residual[rows], J[rows], J_point[rows], observed.subset(rows)
 
     def at(x: Array) -> Noise:
-        pixel = noise.pixel if pixel_known else max(LEAST_PIXEL, math.exp(x[1]))
+        pixel = noise.pixel if fixed_pixel else max(LEAST_PIXEL, math.exp(x[1]))
         return replace(noise, pixel=pixel, scale=math.exp(x[0]))
 
     def cost(x: Array) -> float:
         if np.abs(x).max() > 12.0:
             return 1e12
-        whiten = Whitener(J_point, seen, at(x))
+        whiten = Whitener(J_point, observed, at(x))
         r, A = whiten(residual), whiten(J)
         N = A.T @ A + prior
         scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
@@ -551,15 +554,15 @@ def estimate_noise(
         g = A.T @ r
         chi2 = float(r @ r) - float(g @ np.linalg.lstsq(N, g, rcond=None)[0])
         usual = (x[0] / KNOWN_SURVEY) ** 2
-        if not pixel_known:
+        if not fixed_pixel:
             usual += ((x[1] - math.log(USUAL_PIXEL)) / KNOWN_PIXEL) ** 2
         return chi2 + whiten.logdet + logdet + usual
 
-    start = [0.0, math.log(max(noise.pixel, LEAST_PIXEL))][: 1 if pixel_known else 2]
-    found = minimize(
+    start = [0.0, math.log(max(noise.pixel, LEAST_PIXEL))][: 1 if fixed_pixel else 2]
+    solution = minimize(
         cost, np.array(start), method="Nelder-Mead", options={"xatol": 0.01, "fatol": 0.01, "maxiter": 120}
     )
-    return at(found.x)
+    return at(solution.x)
 
 
 CHANCE = 0.02
@@ -602,45 +605,45 @@ class Refined:
 
 def refine(
     model: PoolModel,
-    seen: Observations,
+    observed: Observations,
     active: NDArray[np.bool_],
     prior: Prior,
     noise: Noise,
     *,
-    pixel_known: bool = False,
+    fixed_pixel: bool = False,
 ) -> Refined:
     """Fit with the errors of pixels and survey estimated on the way, and wrong rows named.
 
     Args:
         model: From the search.
-        seen: All rows.
+        observed: All rows.
         active: Parameters to fit, (18,).
         prior: What is known beforehand.
         noise: What is believed of the errors.
-        pixel_known: The pixel's error is given.
+        fixed_pixel: The pixel's error is given.
 
     Raises:
         CalibrationError: Too many rows do not fit.
     """
-    robust = RobustPixels(model, seen)
-    model = solve(model, seen, robust, active, prior, iterations=40).model
-    robust = RobustPixels(model, seen, least=0.05)
-    model = solve(model, seen, robust, active, prior, iterations=40).model
-    if not pixel_known:
-        size = np.linalg.norm(residuals(model, seen)[0], axis=1)
+    robust = RobustPixels(model, observed)
+    model = solve(model, observed, robust, active, prior, iterations=40).model
+    robust = RobustPixels(model, observed, least=0.05)
+    model = solve(model, observed, robust, active, prior, iterations=40).model
+    if not fixed_pixel:
+        size = np.linalg.norm(residuals(model, observed)[0], axis=1)
         noise = replace(noise, pixel=max(0.05, float(np.median(size)) / 1.1774))
-    used = _plausible(model, seen, noise)
+    used = _plausible(model, observed, noise)
     free = np.flatnonzero(active)
     for _ in range(ROUNDS):
-        _refuse_few(used, seen, int(active.sum()))
-        rows = seen.subset(used)
+        _refuse_few(used, observed, int(active.sum()))
+        rows = observed.subset(used)
         J, J_point = model.jacobians(rows.points, rows.dry)
         J_prior = prior.rows(model)[1][:, free]
         off, information = residuals(model, rows)[0], J_prior.T @ J_prior
-        noise = estimate_noise(off, J[..., free], J_point, rows, noise, information, pixel_known=pixel_known)
+        noise = estimate_noise(off, J[..., free], J_point, rows, noise, information, fixed_pixel=fixed_pixel)
         whiten = Whitener(J_point, rows, noise)
         (model, cost), before = solve(model, rows, whiten, active, prior), used
-        used = _plausible(model, seen, noise)
+        used = _plausible(model, observed, noise)
         if np.array_equal(used, before):
             break
     covariance = _covariance(model, rows, whiten, free, prior)
@@ -648,60 +651,64 @@ def refine(
     return Refined(model, noise, before, whiten, active, prior, covariance, cost, dof)
 
 
-def touched(fit: Refined, seen: Observations) -> tuple[str, ...]:
+def touched(fit: Refined, observed: Observations) -> tuple[str, ...]:
     """Points used, and the camera, that the plane and its window have come to rest against although the pixels want it
     further on; the nearest first.
 
     Args:
         fit: Of these rows.
-        seen: All rows.
+        observed: All rows.
     """
-    wet = fit.used & ~seen.dry
-    distance = np.where(wet, clearances(fit.model, seen.points), np.inf)
+    wet = fit.used & ~observed.dry
+    distance = np.where(wet, clearances(fit.model, observed.points), np.inf)
     near = [i for i in np.argsort(distance) if distance[i] < TOUCHING]
     if not near and fit.model.clearance >= TOUCHING:
         return ()
     N, g = normal_equations(
-        fit.model, seen.subset(fit.used), fit.whiten, np.flatnonzero(fit.active), fit.prior
+        fit.model, observed.subset(fit.used), fit.whiten, np.flatnonzero(fit.active), fit.prior
     )
     scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
     if float((g / scale) @ np.linalg.lstsq(N / np.outer(scale, scale), g / scale, rcond=1e-9)[0]) < PRESSED:
         return ()
-    names = dict.fromkeys(seen.locations[seen.location[i]] for i in near)
+    names = dict.fromkeys(observed.locations[observed.location[i]] for i in near)
     return (*((CAMERA,) if fit.model.clearance < TOUCHING else ()), *names)
 
 
-def _plausible(model: PoolModel, seen: Observations, noise: Noise) -> NDArray[np.bool_]:
+def _plausible(model: PoolModel, observed: Observations, noise: Noise) -> NDArray[np.bool_]:
     """Rows whose residual is of the size that the errors of pixel and survey make, whatever it shares with others."""
-    d2 = surprise(model, seen, noise)
+    d2 = surprise(model, observed, noise)
     inner = max(1.0, float(np.median(d2)) / float(chi2.ppf(0.5, 2)))
-    return np.asarray(d2 < inner * chi2.ppf(1.0 - CHANCE / len(seen), 2))
+    return np.asarray(d2 < inner * chi2.ppf(1.0 - CHANCE / len(observed), 2))
 
 
-def surprise(model: PoolModel, seen: Observations, noise: Noise, covariance: Array | None = None) -> Array:
+def surprise(
+    model: PoolModel, observed: Observations, noise: Noise, covariance: Array | None = None
+) -> Array:
     """Squared residuals over what the errors of pixel and survey make of them, (N,); infinite where there is none.
 
     Args:
         model: Predicts.
-        seen: The rows.
+        observed: The rows.
         noise: Standard errors.
         covariance: Of the model's parameters, if their errors count too, (18, 18).
     """
-    r, ok = residuals(model, seen)
-    J, J_point = (np.where(ok[:, None, None], part, 0.0) for part in model.jacobians(seen.points, seen.dry))
-    modes = noise.survey_modes(J_point, seen)
+    r, ok = residuals(model, observed)
+    J, J_point = (
+        np.where(ok[:, None, None], part, 0.0) for part in model.jacobians(observed.points, observed.dry)
+    )
+    modes = noise.survey_modes(J_point, observed)
     V = modes @ modes.transpose(0, 2, 1) + noise.pixel**2 * np.eye(2)
     if covariance is not None:
         V = V + J @ covariance @ J.transpose(0, 2, 1)
     return np.where(ok, np.einsum("ni,nij,nj->n", r, np.linalg.inv(V), r), np.inf)
 
 
-def _refuse_few(used: NDArray[np.bool_], seen: Observations, parameters: int) -> None:
-    wrong = len(seen) - int(used.sum())
-    if wrong > MOST_WRONG * len(seen):
+def _refuse_few(used: NDArray[np.bool_], observed: Observations, parameters: int) -> None:
+    wrong = len(observed) - int(used.sum())
+    if wrong > MOST_WRONG * len(observed):
         raise CalibrationError(
-            f"{wrong} of {len(seen)} points do not fit any one camera and plane: check that ids, units and the camera "
-            "file belong together, and that the camera did not move"
+            f"{wrong} of {len(observed)} points do not fit any one camera and plane: check that ids, units and the "
+            "camera file belong together, and that the camera did not move"
         )
     if 2 * int(used.sum()) < 6:
         raise CalibrationError(
@@ -751,35 +758,35 @@ class HeldOut:
         }
 
 
-def held_out(fit: Refined, seen: Observations, folds: int, seed: int, normal: Array) -> HeldOut | None:
+def held_out(fit: Refined, observed: Observations, folds: int, seed: int, normal: Array) -> HeldOut | None:
     """Refit without each part of the locations in turn; None where too few would be left.
 
     Args:
         fit: To all rows; its outliers stay out.
-        seen: All rows.
+        observed: All rows.
         folds: Parts, at most one for each location.
         seed: Of the parts.
         normal: Of the planes, one through each point, on which pixels are back-projected: unit, pool frame [-], (3,).
     """
     used = np.flatnonzero(fit.used)
-    place = seen.location if len(np.unique(seen.location[used])) >= FEW else np.arange(len(seen))
-    names = np.unique(place[used])
+    group = observed.location if len(np.unique(observed.location[used])) >= FEW else np.arange(len(observed))
+    names = np.unique(group[used])
     folds = min(folds, len(names))
     if folds < 2:
         return None
-    fold = np.empty(int(place.max()) + 1, int)
+    fold = np.empty(int(group.max()) + 1, int)
     fold[np.random.default_rng(seed).permutation(names)] = np.arange(len(names)) % folds
     pixels, points, rows = [], [], []
     for k in range(folds):
-        inside = np.zeros(len(seen), bool)
-        inside[used] = fold[place[used]] != k
-        outside = used[fold[place[used]] == k]
-        if 2 * inside.sum() < 8 or len(np.unique(seen.points[inside].round(6), axis=0)) < 4:
+        inside = np.zeros(len(observed), bool)
+        inside[used] = fold[group[used]] != k
+        outside = used[fold[group[used]] == k]
+        if 2 * inside.sum() < 8 or len(np.unique(observed.points[inside].round(6), axis=0)) < 4:
             return None
-        part = seen.subset(inside)  # the errors stay as they were
+        part = observed.subset(inside)  # the errors stay as they were
         whiten = Whitener(fit.model.jacobians(part.points, part.dry)[1], part, fit.noise)
         model = solve(fit.model, part, whiten, fit.active, fit.prior).model
-        here = seen.subset(outside)
+        here = observed.subset(outside)
         r, ok = residuals(model, here)
         rows.append(outside[ok])
         pixels.append(r[ok])
@@ -787,23 +794,23 @@ def held_out(fit: Refined, seen: Observations, folds: int, seed: int, normal: Ar
     return HeldOut(np.concatenate(pixels), np.concatenate(points), np.concatenate(rows), folds)
 
 
-def error_vectors(model: PoolModel, seen: Observations, normal: Array) -> Array:
+def error_vectors(model: PoolModel, observed: Observations, normal: Array) -> Array:
     """Where each pixel's ray meets the plane through its point, minus the point [m], (N, 3); NaN where it does not.
 
     Args:
         model: Camera and water.
-        seen: Pixels and points.
+        observed: Pixels and points.
         normal: Unit normal of the planes, pool frame [-], (3,).
     """
-    rays, ok = model.camera.lens.rays(seen.pixels)
-    origin = np.broadcast_to(np.asarray(model.camera.position), seen.points.shape).copy()
+    rays, ok = model.camera.lens.rays(observed.pixels)
+    origin = np.broadcast_to(np.asarray(model.camera.position), observed.points.shape).copy()
     direction = np.where(ok[:, None], rays, np.nan) @ np.asarray(model.camera.R_pc).T
-    if model.refractive and not seen.dry.all():  # what is dry is seen straight from the camera
-        water = back_project(model.camera, model.interface, seen.pixels[~seen.dry])
-        origin[~seen.dry], direction[~seen.dry] = water.origin, water.direction
+    if model.refractive and not observed.dry.all():  # what is dry is seen straight from the camera
+        water = back_project(model.camera, model.interface, observed.pixels[~observed.dry])
+        origin[~observed.dry], direction[~observed.dry] = water.origin, water.direction
     with np.errstate(all="ignore"):
-        length = ((seen.points - origin) @ normal) / (direction @ normal)
-    return np.asarray(origin + length[:, None] * direction - seen.points)
+        length = ((observed.points - origin) @ normal) / (direction @ normal)
+    return np.asarray(origin + length[:, None] * direction - observed.points)
 
 
 # What was estimated, with intervals and whether the pictures tell it, and what to measure so that they do.
@@ -903,7 +910,7 @@ WHOLE_LENS = "--fit pose,height,tilt,index,focal,center,distortion"
 
 def advice(
     fit: Refined,
-    seen: Observations,
+    observed: Observations,
     surface: bool,
     settings: Settings,
     table: Mapping[str, Estimate],
@@ -914,7 +921,7 @@ def advice(
 
     Args:
         fit: The fit.
-        seen: All rows.
+        observed: All rows.
         surface: The plane is a water surface.
         settings: Options.
         table: Estimates.
@@ -924,26 +931,26 @@ def advice(
     if touching:
         yield finding("plane_touches", places=tuple(touching))
     yield from contradicted
-    yield from _place(fit, seen, surface, settings, table)
+    yield from _place(fit, observed, surface, settings, table)
     yield from _conflicts(fit, surface, settings)
-    yield from _numbers(fit, seen)
-    yield from _left_out(fit, seen, surface)
+    yield from _numbers(fit, observed)
+    yield from _left_out(fit, observed, surface)
 
 
 def _place(
-    fit: Refined, seen: Observations, surface: bool, settings: Settings, table: Mapping[str, Estimate]
+    fit: Refined, observed: Observations, surface: bool, settings: Settings, table: Mapping[str, Estimate]
 ) -> Iterator[Finding]:
     """On camera height, water height and index, which few points cannot separate."""
-    model, wet = fit.model, seen.subset(fit.used & ~seen.dry)
+    model, wet = fit.model, observed.subset(fit.used & ~observed.dry)
     height = table["camera_height" if surface else "camera_distance"]
     half = 0.5 * (height.ci95[1] - height.ci95[0])
     n = model.interface.normal
     across = (wet.points - model.camera.position) - ((wet.points - model.camera.position) @ n)[:, None] * n
     radius = float(np.linalg.norm(across, axis=1).max())
-    whole = model.clearance + model.depth
-    steepest = float(np.arctan2(radius, whole))
+    distance = model.clearance + model.depth
+    steepest = float(np.arctan2(radius, distance))
     levels = float(np.ptp(wet.points @ n))
-    what = "camera height, water height" if surface else "distances of camera and points from the wall"
+    quantities = "camera height, water height" if surface else "distances of camera and points from the wall"
     tape = "measure the water's height with a tape and give --water-height"
     tape = (
         ""
@@ -952,15 +959,15 @@ def _place(
     )
     if steepest < NARROW:
         angle = float(np.degrees(steepest))
-        yield finding("points_narrow", radius=radius, angle=angle, quantities=what, remedy=tape)
-    if levels < ONE_DEPTH * whole and half > 0.01 * whole:
-        yield finding("one_depth", spread=levels, quantities=what, half=1000.0 * half, remedy=tape)
+        yield finding("points_narrow", radius=radius, angle=angle, quantities=quantities, remedy=tape)
+    if levels < ONE_DEPTH * distance and half > 0.01 * distance:
+        yield finding("one_depth", spread=levels, quantities=quantities, half=1000.0 * half, remedy=tape)
     if not height.identifiable:
         low, high = height.ci95
         yield finding("height_unknown", height.name, estimate=height.estimate, low=low, high=high)
     focal = table["focal"]
     loose = focal.ci95[1] - focal.ci95[0] > 0.02 * focal.estimate
-    if fit.active[NAMES.index("focal")] and loose and levels < 0.05 * whole:
+    if fit.active[NAMES.index("focal")] and loose and levels < 0.05 * distance:
         yield finding("focal_of_one_depth")
 
 
@@ -968,7 +975,7 @@ def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[Find
     """Where the pixels pull an estimate far from what was known."""
     prior, model = fit.prior, fit.model
     focal = NAMES.index("focal")
-    place = "water's height" if surface else "plane's place"
+    plane_name = "water's height" if surface else "plane's place"
     lens = "" if fit.active[focal] else f"; or let the lens be fitted ({WHOLE_LENS})"
     if np.isfinite(prior.index_std):
         pull = (model.interface.index_far - settings.index) / prior.index_std
@@ -978,7 +985,7 @@ def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[Find
                 index=model.interface.index_far,
                 given=settings.index,
                 times=abs(pull),
-                place=place,
+                place=plane_name,
                 remedy=lens,
             )
     pull = np.log(model.camera.lens.fx / prior.start.camera.lens.fx) / prior.lens_std[0]
@@ -991,8 +998,8 @@ def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[Find
             yield finding("tilt_pulled", lean=float(np.degrees(lean)), remedy=lens)
 
 
-def _numbers(fit: Refined, seen: Observations) -> Iterator[Finding]:
-    locations = len(np.unique(seen.location[fit.used]))
+def _numbers(fit: Refined, observed: Observations) -> Iterator[Finding]:
+    locations = len(np.unique(observed.location[fit.used]))
     if locations < 12:
         yield finding("few_places", places=locations)
     if fit.noise.pixel > 1.5:
@@ -1002,24 +1009,26 @@ def _numbers(fit: Refined, seen: Observations) -> Iterator[Finding]:
         yield finding("survey_rough", times=fit.noise.scale, error=error)
 
 
-def _left_out(fit: Refined, seen: Observations, surface: bool) -> Iterator[Finding]:
+def _left_out(fit: Refined, observed: Observations, surface: bool) -> Iterator[Finding]:
     """Rows that were left out: marks above the water that nobody called dry, and others."""
-    above = _above(fit, seen)
+    above = _above(fit, observed)
     wrong = int((~fit.used & ~above).sum())
     if above.any():
-        names = tuple(seen.names[i] for i in np.flatnonzero(above))
-        place = "above the water found" if surface else "on the camera's side of the plane found"
-        yield finding("marks_dry", marks=names, place=place)
+        names = tuple(observed.names[i] for i in np.flatnonzero(above))
+        side_name = "above the water found" if surface else "on the camera's side of the plane found"
+        yield finding("marks_dry", marks=names, place=side_name)
     if wrong:
         yield finding("rows_wrong", rows=wrong)
 
 
-def _above(fit: Refined, seen: Observations) -> NDArray[np.bool_]:
+def _above(fit: Refined, observed: Observations) -> NDArray[np.bool_]:
     """Rows left out that lie on the camera's side of the plane and are met by straight lines, as far as the pose is
     told, (N,)."""
-    side = seen.points @ fit.model.interface.normal + fit.model.interface.offset > 0.0
-    side &= ~fit.used & ~seen.dry
-    straight = surprise(fit.model, replace(seen, dry=np.ones(len(seen), bool)), fit.noise, fit.covariance)
+    side = observed.points @ fit.model.interface.normal + fit.model.interface.offset > 0.0
+    side &= ~fit.used & ~observed.dry
+    straight = surprise(
+        fit.model, replace(observed, dry=np.ones(len(observed), bool)), fit.noise, fit.covariance
+    )
     met = side & (straight < float(chi2.ppf(CERTAIN, 2)))
     return met & (2 * met.sum() > side.sum())  # some are met by chance
 
@@ -1087,11 +1096,11 @@ class PoolFit(Refined):
         }
 
 
-def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = None) -> PoolFit:
+def calibrate_pool(observed: Observations, lens: Lens, settings: Settings | None = None) -> PoolFit:
     """Find the camera and the plane from no guess of either.
 
     Args:
-        seen: Pixels and surveyed points.
+        observed: Pixels and surveyed points.
         lens: Of the camera.
         settings: Options; those of `Settings` if None.
 
@@ -1099,40 +1108,40 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
         CalibrationError: The points cannot tell a pose, or contradict each other or what is given; says which.
     """
     settings = settings or Settings()
-    if seen.dry.all():
+    if observed.dry.all():
         raise CalibrationError("every point is marked dry: at least 4 must be under water")
-    found = search(seen, extended_lens(lens), settings)
-    notes = list(seen.findings)
-    fit = _best_lens(seen, found, settings, notes)
+    best_start = search(observed, extended_lens(lens), settings)
+    notes = list(observed.findings)
+    fit = _best_lens(observed, best_start, settings, notes)
     level = abs(float(fit.model.interface.normal[2])) > np.cos(LEVEL)
-    if level and not found.surface and settings.interface == "auto" and settings.plane is None:
-        found, notes = replace(found, surface=True), list(seen.findings)
-        fit = _best_lens(seen, found, settings, notes)
-    fit = _released(seen, settings, fit, notes)
-    if found.surface and fit.model.interface.normal[2] < 0.0:
+    if level and not best_start.surface and settings.interface == "auto" and settings.plane is None:
+        best_start, notes = replace(best_start, surface=True), list(observed.findings)
+        fit = _best_lens(observed, best_start, settings, notes)
+    fit = _released(observed, settings, fit, notes)
+    if best_start.surface and fit.model.interface.normal[2] < 0.0:
         notes.append(finding("camera_below"))
-    pinhole = _pinhole(seen, found, settings, fit)
-    normal = UP if found.surface else fit.model.interface.normal
-    parts = [held_out(f, seen, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
-    table, errors = estimates(fit, found.surface, settings)
-    touching = touched(fit, seen)
-    contradicted = _contradicted(seen, settings, fit)
+    pinhole = _pinhole(observed, best_start, settings, fit)
+    normal = UP if best_start.surface else fit.model.interface.normal
+    parts = [held_out(f, observed, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
+    table, errors = estimates(fit, best_start.surface, settings)
+    touching = touched(fit, observed)
+    contradicted = _contradicted(observed, settings, fit)
     return PoolFit(
         **vars(fit),
-        surface=found.surface,
+        surface=best_start.surface,
         settings=settings,
         estimates=table,
         correlation=errors,
-        seen=seen,
-        residual=residuals(fit.model, seen)[0],
-        error=error_vectors(fit.model, seen, normal),
+        seen=observed,
+        residual=residuals(fit.model, observed)[0],
+        error=error_vectors(fit.model, observed, normal),
         held_out=parts[0],
         pinhole=pinhole,
-        pinhole_residual=residuals(pinhole.model, seen)[0],
+        pinhole_residual=residuals(pinhole.model, observed)[0],
         pinhole_held_out=parts[1],
         lens_fitted=_lens_groups(fit.active),
         findings=(
-            *advice(fit, seen, found.surface, settings, table, touching, contradicted),
+            *advice(fit, observed, best_start.surface, settings, table, touching, contradicted),
             *notes,
         ),
         touching=touching,
@@ -1140,35 +1149,39 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
 
 
 def _refined(
-    seen: Observations, model: PoolModel, settings: Settings, active: NDArray[np.bool_], prior: Prior
+    observed: Observations, model: PoolModel, settings: Settings, active: NDArray[np.bool_], prior: Prior
 ) -> Refined:
     pixel, survey = settings.pixel_sigma or 0.4, max(settings.survey_sigma, 1e-7)
     noise = Noise(pixel=pixel, survey=survey, survey_yaw=settings.survey_yaw_sigma)
-    return refine(model, seen, active, prior, noise, pixel_known=settings.pixel_sigma is not None)
+    return refine(model, observed, active, prior, noise, fixed_pixel=settings.pixel_sigma is not None)
 
 
-def _best_lens(seen: Observations, found: Found, settings: Settings, notes: list[Finding]) -> Refined:
+def _best_lens(
+    observed: Observations, best_start: Found, settings: Settings, notes: list[Finding]
+) -> Refined:
     """The fit as asked; where nobody asked, the lens is fitted as far as held-out points get better by it."""
-    start = replace(found.model, interface=replace(found.model.interface, index_far=settings.index))
+    start = replace(best_start.model, interface=replace(best_start.model.interface, index_far=settings.index))
 
     def fitted(model: PoolModel, active: NDArray[np.bool_]) -> Refined:
         stds = lens_std(settings, model.camera.lens.width)
-        return _refined(seen, model, settings, active, prior_of(model, start, settings, found.surface, stds))
+        return _refined(
+            observed, model, settings, active, prior_of(model, start, settings, best_start.surface, stds)
+        )
 
-    best = fitted(found.model, active_names(settings))
+    best = fitted(best_start.model, active_names(settings))
     if settings.fit is not None:
         return best
-    normal = UP if found.surface else best.model.interface.normal
-    error = _generalisation(best, seen, settings, normal)
+    normal = UP if best_start.surface else best.model.interface.normal
+    error = _generalisation(best, observed, settings, normal)
     for extra in LENS_STEPS:
         active = active_names(settings, extra)
-        if 2 * len(seen) < 3 * active.sum() or not np.isfinite(error):
+        if 2 * len(observed) < 3 * active.sum() or not np.isfinite(error):
             break
         try:
             other = fitted(best.model, active)
         except (CalibrationError, np.linalg.LinAlgError):
             continue
-        further = _generalisation(other, seen, settings, normal)
+        further = _generalisation(other, observed, settings, normal)
         if further < BETTER * error:
             best, error = other, further
     if groups := _lens_groups(best.active & ~active_names(settings)):
@@ -1176,13 +1189,13 @@ def _best_lens(seen: Observations, found: Found, settings: Settings, notes: list
     return best
 
 
-def _generalisation(fit: Refined, seen: Observations, settings: Settings, normal: Array) -> float:
+def _generalisation(fit: Refined, observed: Observations, settings: Settings, normal: Array) -> float:
     """Held-out error in the picture [px], rows that the fit left out counted as far as they lie."""
-    out = held_out(fit, seen, settings.folds, settings.seed, normal)
+    out = held_out(fit, observed, settings.folds, settings.seed, normal)
     if out is None:
         return float("nan")
-    left = residuals(fit.model, seen.subset(~fit.used))[0]
-    return rms(np.concatenate([out.pixels, np.clip(left, -20.0, 20.0)]))
+    excluded = residuals(fit.model, observed.subset(~fit.used))[0]
+    return rms(np.concatenate([out.pixels, np.clip(excluded, -20.0, 20.0)]))
 
 
 def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
@@ -1190,11 +1203,11 @@ def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
     return tuple(group for group, name in named.items() if active[NAMES.index(name)])
 
 
-def _released(seen: Observations, settings: Settings, fit: Refined, notes: list[Finding]) -> Refined:
+def _released(observed: Observations, settings: Settings, fit: Refined, notes: list[Finding]) -> Refined:
     """Let the surface tilt freely where the pixels contradict a level one and nobody set how level it is."""
     if not np.isfinite(fit.prior.tilt_std) or settings.tilt_sigma is not None or not fit.active[6]:
         return fit
-    free = _without(seen, settings, fit, replace(fit.prior, tilt_std=np.inf))
+    free = _without(observed, settings, fit, replace(fit.prior, tilt_std=np.inf))
     assert fit.prior.normal is not None
     if free is None:
         return fit
@@ -1212,11 +1225,11 @@ def _lean(model: PoolModel, normal: Array) -> float:
     return float(np.arccos(np.clip(model.interface.normal @ normal, -1.0, 1.0)))
 
 
-def _contradicted(seen: Observations, settings: Settings, fit: Refined) -> list[Finding]:
+def _contradicted(observed: Observations, settings: Settings, fit: Refined) -> list[Finding]:
     """A finding where the pixels by themselves put the plane elsewhere than it was measured."""
     if not settings.known_depth or not fit.active[NAMES.index("depth")]:
         return []
-    free = _without(seen, settings, fit, replace(fit.prior, depth_std=np.inf))
+    free = _without(observed, settings, fit, replace(fit.prior, depth_std=np.inf))
     if free is None:
         return []
     by = 1000.0 * (free.model.depth - fit.prior.depth)
@@ -1224,22 +1237,22 @@ def _contradicted(seen: Observations, settings: Settings, fit: Refined) -> list[
     return [finding("plane_contradicted", distance=abs(by), sense=sense)]
 
 
-def _without(seen: Observations, settings: Settings, fit: Refined, loose: Prior) -> Refined | None:
+def _without(observed: Observations, settings: Settings, fit: Refined, loose: Prior) -> Refined | None:
     """The fit with a prior loosened, where the pixels contradict that prior; else None."""
     try:
-        free = _refined(seen, fit.model, settings, fit.active, loose)
+        free = _refined(observed, fit.model, settings, fit.active, loose)
     except (CalibrationError, np.linalg.LinAlgError):
         return None
-    held = solve(free.model, seen.subset(free.used), free.whiten, fit.active, fit.prior)
+    held = solve(free.model, observed.subset(free.used), free.whiten, fit.active, fit.prior)
     return free if 2.0 * (held.cost - free.cost) > DOUBT else None
 
 
-def _pinhole(seen: Observations, found: Found, settings: Settings, fit: Refined) -> Refined:
+def _pinhole(observed: Observations, best_start: Found, settings: Settings, fit: Refined) -> Refined:
     """Straight lines fitted to the same rows, as plain calibrations do."""
-    model = replace(found.pinhole, camera=replace(found.pinhole.camera, lens=fit.model.camera.lens))
+    model = replace(best_start.pinhole, camera=replace(best_start.pinhole.camera, lens=fit.model.camera.lens))
     active = fit.active & np.array([name in NAMES[:6] or name in NAMES[10:] for name in NAMES])
     prior = replace(fit.prior, normal=None, depth=np.nan, depth_std=np.inf, index_std=np.inf)
-    part = seen.subset(fit.used)
+    part = observed.subset(fit.used)
     alike = Noise(pixel=1.0, survey=1e-7, survey_yaw=1e-7)
     end = solve(model, part, Whitener(np.zeros((len(part), 2, 3)), part, alike), active, prior).model
     alike = replace(alike, pixel=max(0.05, rms(residuals(end, part)[0]) / np.sqrt(2.0)))
@@ -1270,20 +1283,20 @@ LEAST_THICKNESS = 0.02
 """Thickness of the points, over their lesser width, below which their mirror image cannot be told from them."""
 
 
-def doubted(fit: PoolFit, *, lens_told: bool = True) -> PoolFit:
+def doubted(fit: PoolFit, *, lens_stated: bool = True) -> PoolFit:
     """The calibration with what speaks against it put first.
 
     Args:
         fit: The calibration.
-        lens_told: Somebody said how sure the lens is.
+        lens_stated: Somebody said how sure the lens is.
 
     Raises:
         CalibrationError: It cannot be a camera before water; says which number to check.
     """
     _refuse_depth(fit)
-    found = [*_touching(fit), *_handed(fit)]
-    exact = [] if lens_told or "focal" in fit.lens_fitted else [finding("lens_exact")]
-    return replace(fit, findings=(*_straight(fit), *found, *fit.findings, *exact))
+    findings = [*_touching(fit), *_handed(fit)]
+    exact = [] if lens_stated or "focal" in fit.lens_fitted else [finding("lens_exact")]
+    return replace(fit, findings=(*_straight(fit), *findings, *fit.findings, *exact))
 
 
 def _refuse_depth(fit: PoolFit) -> None:
@@ -1393,7 +1406,7 @@ def pool_json(
         "lens_fitted": list(fit.lens_fitted),
         "outliers": fit.outliers,
         "correlation": plain(fit.correlation.as_json(), 4),
-        "findings": [one.as_json() for one in fit.findings],
+        "findings": [item.as_json() for item in fit.findings],
         "settings": plain(asdict(fit.settings)),
         "inputs": dict(inputs or {}),
         "out": None if out is None else str(out),
@@ -1461,9 +1474,9 @@ def _survey_share(fit: PoolFit) -> float:
     """
     if fit.held_out is None or not len(fit.held_out.rows):
         return math.nan
-    seen, noise = fit.seen.subset(fit.held_out.rows), fit.noise
-    sigma = np.where(np.isfinite(seen.sigma), seen.sigma, noise.survey)
-    turn = noise.survey_yaw**2 * np.sum(seen.arm**2, axis=1)
+    held_out_rows, noise = fit.seen.subset(fit.held_out.rows), fit.noise
+    sigma = np.where(np.isfinite(held_out_rows.sigma), held_out_rows.sigma, noise.survey)
+    turn = noise.survey_yaw**2 * np.sum(held_out_rows.arm**2, axis=1)
     return 100.0 * noise.scale * float(np.sqrt(np.mean(2.0 * sigma**2 + turn)))
 
 
@@ -1575,47 +1588,51 @@ def run(
     Raises:
         CalibrationError, LocalizationError, OutputError: As they say; nothing is written then.
     """
-    given = {k: v for k, v in locals().items() if k not in ("inputs", "out", "as_json", "report", "camera")}
-    for name, value in given.items():
+    arguments = {
+        k: v for k, v in locals().items() if k not in ("inputs", "out", "as_json", "report", "camera")
+    }
+    for name, value in arguments.items():
         if isinstance(value, float) and not math.isfinite(value):
             raise CalibrationError(f"--{name.replace('_', '-')} is {value}, expected a finite number")
     refuse_places(out, report, "pool")
     file = load_camera(camera)
-    settings = _settings(given, file)
-    seen = _observations(list(map(Path, inputs)), surveyed, unit, z, edge, family)
-    _refuse_pixels(seen, file)
-    lens_told = focal_sigma is not None or center_sigma is not None or any(_lens_sigma(file))
-    found = doubted(calibrate_pool(seen, file.lens, settings), lens_told=lens_told)
+    settings = _settings(arguments, file)
+    observed = _observations(list(map(Path, inputs)), surveyed, unit, z, edge, family)
+    _refuse_pixels(observed, file)
+    lens_stated = focal_sigma is not None or center_sigma is not None or any(_lens_sigma(file))
+    pool_fit = doubted(calibrate_pool(observed, file.lens, settings), lens_stated=lens_stated)
     hashes = {
         str(path): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in map(Path, [*inputs, *filter(None, [surveyed]), camera])
         if path.is_file()
     }
-    record = pool_record(found, hashes)
-    write_pool(Pool(found.model.camera, found.model.interface, latency, record=record), out)
-    words = pool_report(found)
+    record = pool_record(pool_fit, hashes)
+    write_pool(Pool(pool_fit.model.camera, pool_fit.model.interface, latency, record=record), out)
+    summary = pool_report(pool_fit)
     if report is not None:
         defaults = run.__kwdefaults__ or {}
-        options = {k: v for k, v in given.items() if v != defaults.get(k)}
+        options = {k: v for k, v in arguments.items() if v != defaults.get(k)}
         repeat = [command_line("pool", inputs, {"camera": camera, "out": out, **options})]
         repeat += [f"{path}  sha256 {digest}" for path, digest in hashes.items()]
-        words.write(report, pool_json(found, out=Path(out), inputs=hashes), pool_pictures(found), repeat)
-    as_object = pool_json(found, out=Path(out), inputs=hashes) if as_json else None
-    publish(as_object, words.show, (out, report))
-    return found
+        summary.write(
+            report, pool_json(pool_fit, out=Path(out), inputs=hashes), pool_pictures(pool_fit), repeat
+        )
+    as_object = pool_json(pool_fit, out=Path(out), inputs=hashes) if as_json else None
+    publish(as_object, summary.show, (out, report))
+    return pool_fit
 
 
-def _settings(given: Mapping[str, Any], file: CameraFile) -> Settings:
+def _settings(arguments: Mapping[str, Any], file: CameraFile) -> Settings:
     """The options as `Settings`: texts read, degrees as radians, what is not given from the camera file."""
-    options = {f.name: given[f.name] for f in fields(Settings) if given.get(f.name) is not None}
-    options["plane"] = _plane(given["plane"])
-    options["window"] = tuple(_layer(text) for text in given["window"])
-    fit = given["fit"]
+    options = {f.name: arguments[f.name] for f in fields(Settings) if arguments.get(f.name) is not None}
+    options["plane"] = _plane(arguments["plane"])
+    options["window"] = tuple(_layer(text) for text in arguments["window"])
+    fit = arguments["fit"]
     options["fit"] = None if fit in (None, "auto") else tuple(filter(None, map(str.strip, fit.split(","))))
     for name in {"tilt_sigma", "survey_yaw_sigma"} & options.keys():
         options[name] = math.radians(options[name])
     focal, center = _lens_sigma(file)
-    held = given["index"] != Settings.index and "index" not in (options["fit"] or ())
+    held = arguments["index"] != Settings.index and "index" not in (options["fit"] or ())
     defaults = {"focal_sigma": focal, "center_sigma": center}
     return Settings(**{**defaults, **({"index_sigma": 0.0} if held else {}), **options})
 
@@ -1638,20 +1655,20 @@ def _observations(
     return observe(paths, read_survey(surveyed, unit=unit, edge=edge, z=z), family=family)
 
 
-def _refuse_pixels(seen: Observations, file: CameraFile) -> None:
+def _refuse_pixels(observed: Observations, file: CameraFile) -> None:
     """Refuse pixels that another size of picture must have had, and what are none."""
-    spread = float(np.ptp(seen.pixels, axis=0).max())
-    if len(seen) > 1 and 0.0 < spread < LEAST_SPREAD:
+    spread = float(np.ptp(observed.pixels, axis=0).max())
+    if len(observed) > 1 and 0.0 < spread < LEAST_SPREAD:
         raise CalibrationError(
             f"the pixels spread over {spread:.3g} px in all: expected pixels, u from 0 to {file.lens.width - 1} and v "
             f"from 0 to {file.lens.height - 1}, not parts of the picture's size or coordinates on a plane before the "
             "lens: multiply them by the size"
         )
-    outside = ~file.lens.inside(seen.pixels)
+    outside = ~file.lens.inside(observed.pixels)
     if outside.mean() > 0.2:
         raise CalibrationError(
-            f"{int(outside.sum())} of {len(seen)} pixels lie outside the camera file's picture of {file.lens.width} x "
-            f"{file.lens.height}: the pixels come from another camera or another resolution"
+            f"{int(outside.sum())} of {len(observed)} pixels lie outside the camera file's picture of "
+            f"{file.lens.width} x {file.lens.height}: the pixels come from another camera or another resolution"
         )
 
 
@@ -1663,9 +1680,9 @@ def _lens_sigma(file: CameraFile) -> tuple[float, float]:
 
 def _remembered(file: CameraFile, name: str) -> float:
     estimates = file.record.get("estimates")
-    found = estimates.get(name) if isinstance(estimates, Mapping) else None
+    entry = estimates.get(name) if isinstance(estimates, Mapping) else None
     try:
-        low, high = (float(x) for x in found["ci95"])  # type: ignore[index]
+        low, high = (float(x) for x in entry["ci95"])  # type: ignore[index]
     except (KeyError, TypeError, ValueError):
         return 0.0
     return max(0.0, (high - low) / 3.92)

@@ -78,9 +78,9 @@ class PoolModel:
         pixels = np.full((len(points), 2), np.nan)
         wet = ~dry if self.refractive else np.zeros(len(points), bool)
         if wet.any():
-            seen = project(self.camera, self.interface, points[wet])
-            good = (seen.status == Status.OK) | (seen.status == Status.OUTSIDE_IMAGE)
-            pixels[wet] = np.where(good[:, None], seen.pixels, np.nan)
+            projection = project(self.camera, self.interface, points[wet])
+            good = (projection.status == Status.OK) | (projection.status == Status.OUTSIDE_IMAGE)
+            pixels[wet] = np.where(good[:, None], projection.pixels, np.nan)
         if not wet.all():
             direct, ok = self.camera.lens.project(self._optical(points[~wet]))
             pixels[~wet] = np.where(ok[:, None], direct, np.nan)
@@ -122,9 +122,9 @@ class PoolModel:
         """Derivatives by fx fy cx cy and distortion as those by log focal, centre and distortion, (N, 2, 8)."""
         lens = self.camera.lens
         focal = of_lens[..., 0] * lens.fx + of_lens[..., 1] * lens.fy
-        known = of_lens[..., 4:9]
-        zeros = np.zeros((*known.shape[:-1], 5 - known.shape[-1]))
-        return np.concatenate([focal[..., None], of_lens[..., 2:4], known, zeros], axis=-1)
+        centre_and_distortion = of_lens[..., 4:9]
+        zeros = np.zeros((*centre_and_distortion.shape[:-1], 5 - centre_and_distortion.shape[-1]))
+        return np.concatenate([focal[..., None], of_lens[..., 2:4], centre_and_distortion, zeros], axis=-1)
 
     def _direct_jacobians(self, points: Array) -> tuple[Array, Array]:
         optical, R_pc = self._optical(points), np.asarray(self.camera.R_pc)
@@ -237,12 +237,12 @@ class Settings:
                 raise CalibrationError(f"unknown '{name}' to fit; available: {', '.join(FITTED)}")
         if self.fit is not None and "pose" not in self.fit:
             raise CalibrationError("fit leaves the pose out: the camera's pose is always fitted, add pose")
-        known = [self.water_height is not None, self.water_depth is not None, self.plane is not None]
-        if sum(known) > 1:
+        stated = [self.water_height is not None, self.water_depth is not None, self.plane is not None]
+        if sum(stated) > 1:
             raise CalibrationError(
                 "the place of the water is given twice: give one of its height, depth and plane"
             )
-        if self.fit is not None and "height" not in self.fit and not any(known):
+        if self.fit is not None and "height" not in self.fit and not any(stated):
             raise CalibrationError(
                 "fit leaves the height out and none is given: add height, or give --water-height"
             )
@@ -252,11 +252,11 @@ class Settings:
                     f"window is {layer.thickness:g} m thick, expected at most {THICKEST:g}: thickness is in metres, "
                     "10 mm of glass are 0.010:1.52"
                 )
-        for field, (name, per, least, most) in RANGES.items():
+        for field, (name, per, least, greatest) in RANGES.items():
             value = getattr(self, field)
-            if value is not None and not least <= per * value <= most:
+            if value is not None and not least <= per * value <= greatest:
                 raise CalibrationError(
-                    f"{name} is {per * value:g}, expected a number from {least:g} to {most:g}"
+                    f"{name} is {per * value:g}, expected a number from {least:g} to {greatest:g}"
                 )
         if self.folds < 2:
             raise CalibrationError(f"folds is {self.folds}, expected at least 2")
@@ -339,8 +339,8 @@ class Prior:
             )
         r[2:4] = model.depth - self.depth, model.interface.index_far - self.start.interface.index_far
         r[4:] = model.lens_values - self.start.lens_values
-        given = np.isfinite(r) & np.isfinite(std) & (std > 0.0)
-        return r[given] / std[given], J[given] / std[given, None]
+        informative = np.isfinite(r) & np.isfinite(std) & (std > 0.0)
+        return r[informative] / std[informative], J[informative] / std[informative, None]
 
 
 class Solution(NamedTuple):
@@ -351,16 +351,16 @@ class Solution(NamedTuple):
     """Half the sum of squares of whitened residuals and priors."""
 
 
-def residuals(model: PoolModel, seen: Observations) -> tuple[Array, NDArray[np.bool_]]:
+def residuals(model: PoolModel, observed: Observations) -> tuple[Array, NDArray[np.bool_]]:
     """Measured minus predicted pixel (N, 2), and where there is one (N,); `LOST` elsewhere."""
-    r = seen.pixels - model.predict(seen.points, seen.dry)
+    r = observed.pixels - model.predict(observed.points, observed.dry)
     ok = np.isfinite(r).all(axis=1)
     return np.where(ok[:, None], r, LOST), ok
 
 
 def solve(
     start: PoolModel,
-    seen: Observations,
+    observed: Observations,
     whiten: Whitening,
     active: NDArray[np.bool_],
     prior: Prior,
@@ -372,7 +372,7 @@ def solve(
 
     Args:
         start: Where to begin.
-        seen: The rows.
+        observed: The rows.
         whiten: Turns residuals (N, 2) and derivatives (N, 2, P) into independent rows of unit variance.
         active: Which of `NAMES` move, (18,).
         prior: Of those and of the others.
@@ -382,21 +382,21 @@ def solve(
     free = np.flatnonzero(active)
 
     def steps_from(model: PoolModel) -> Callable[[float], PoolModel | None]:
-        N, g = normal_equations(model, seen, whiten, free, prior)
-        bounds, scale = _bounds(model, seen, free), np.sqrt(np.maximum(np.diagonal(N), 1e-300))
+        N, g = normal_equations(model, observed, whiten, free, prior)
+        bounds, scale = _bounds(model, observed, free), np.sqrt(np.maximum(np.diagonal(N), 1e-300))
         H, b = N / np.outer(scale, scale), g / scale
 
         def stepped(damping: float) -> PoolModel | None:
             step = np.zeros(len(NAMES))
             step[free] = _sliding(H + damping * np.eye(len(free)), b, scale, bounds) / scale
-            return _tried(model, step, seen, 8 in free)
+            return _tried(model, step, observed, 8 in free)
 
         return stepped
 
     def cost(model: PoolModel) -> float:
         if model.refractive and (model.clearance <= 0.0 or not 1.0 < model.interface.index_far < 3.0):
             return np.inf
-        e, r = whiten(residuals(model, seen)[0]), prior.rows(model)[0]
+        e, r = whiten(residuals(model, observed)[0]), prior.rows(model)[0]
         return 0.5 * float(e @ e + r @ r)
 
     *_, end = descent(start, cost, steps_from, rounds=iterations, tolerance=tolerance)
@@ -404,11 +404,11 @@ def solve(
 
 
 def normal_equations(
-    model: PoolModel, seen: Observations, whiten: Whitening, free: NDArray[np.intp], prior: Prior
+    model: PoolModel, observed: Observations, whiten: Whitening, free: NDArray[np.intp], prior: Prior
 ) -> tuple[Array, Array]:
     """Information (P, P) and gradient (P,) at a model, by the parameters `free`, priors included."""
-    r, ok = residuals(model, seen)
-    J = model.jacobians(seen.points, seen.dry)[0][..., free]
+    r, ok = residuals(model, observed)
+    J = model.jacobians(observed.points, observed.dry)[0][..., free]
     J = np.where((ok & np.isfinite(J).all(axis=(1, 2)))[:, None, None], J, 0.0)
     A, e = whiten(J), whiten(r)
     r_prior, J_prior = prior.rows(model)
@@ -421,11 +421,11 @@ def clearances(model: PoolModel, points: Array) -> Array:
     return model.depth - (points - model.reference) @ model.interface.normal - model.interface.thickness
 
 
-def _bounds(model: PoolModel, seen: Observations, free: NDArray[np.intp]) -> tuple[Array, Array]:
+def _bounds(model: PoolModel, observed: Observations, free: NDArray[np.intp]) -> tuple[Array, Array]:
     """Clearances of the points in the water and of the camera (M,), and their derivatives by the parameters (M, P)."""
     if not model.refractive:
         return np.zeros(0), np.zeros((0, len(free)))
-    wet, n = seen.points[~seen.dry], model.interface.normal
+    wet, n = observed.points[~observed.dry], model.interface.normal
     distance = clearances(model, wet)
     wet, distance = wet[distance > 0.0], distance[distance > 0.0]
     rows = np.zeros((len(wet) + 1, len(NAMES)))
@@ -445,15 +445,15 @@ def _sliding(H: Array, b: Array, scale: Array, bounds: tuple[Array, Array]) -> A
     """
     x = np.linalg.solve(H, b)
     distance, rows = bounds
-    left = distance + (rows / scale) @ x
-    if np.all(left >= NEARER * distance):
+    clearance = distance + (rows / scale) @ x
+    if np.all(clearance >= NEARER * distance):
         return x
-    near = np.argsort(left / np.maximum(distance, 1e-300))[:MOST_BOUNDS]
+    near = np.argsort(clearance / np.maximum(distance, 1e-300))[:MOST_BOUNDS]
     values, vectors = np.linalg.eigh(H)
     root = vectors / np.sqrt(np.maximum(values, 1e-14))
     G = (rows[near] / scale) @ root
     length = np.maximum(np.linalg.norm(G, axis=1), 1e-300)
-    h = (NEARER * distance[near] - left[near]) / length
+    h = (NEARER * distance[near] - clearance[near]) / length
     size = float(np.abs(h).max())
     E = np.concatenate([(G / length[:, None]).T, h[None] / size])
     try:
@@ -464,7 +464,7 @@ def _sliding(H: Array, b: Array, scale: Array, bounds: tuple[Array, Array]) -> A
     return x if off < 1e-9 else np.asarray(x - root @ r[:-1] / r[-1] * size)
 
 
-def _tried(model: PoolModel, step: Array, seen: Observations, movable: bool) -> PoolModel | None:
+def _tried(model: PoolModel, step: Array, observed: Observations, movable: bool) -> PoolModel | None:
     """The model a step away, or None where the step leads out of all sense.
 
     What a turn of the plane takes from a clearance beyond first order is given back by its depth where that may move.
@@ -474,9 +474,9 @@ def _tried(model: PoolModel, step: Array, seen: Observations, movable: bool) -> 
     try:
         trial = model.moved(step)
         if model.refractive and movable:
-            before = clearances(model, seen.points)
-            held = (before > 0.0) & ~seen.dry
-            short = 0.5 * NEARER * before - clearances(trial, seen.points)
+            before = clearances(model, observed.points)
+            held = (before > 0.0) & ~observed.dry
+            short = 0.5 * NEARER * before - clearances(trial, observed.points)
             if held.any() and (back := float(short[held].max())) > 0.0:
                 trial = model.moved(step + back * (np.arange(len(NAMES)) == 8))
         return trial

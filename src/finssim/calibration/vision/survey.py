@@ -147,16 +147,16 @@ def read_table(path: str | Path, *, unit: str | None = None) -> Table:
         if _known(head) >= 2:
             table = text_table(text, names=head, spaces=None, comment=COMMENT)
     if not table.names:
-        what = "holds nothing but comments" if table.comments else "is empty"
+        lack = "holds nothing but comments" if table.comments else "is empty"
         raise CalibrationError(
-            f"{path}: the file {what}: expected a line of names, such as id,x,y,z, and rows"
+            f"{path}: the file {lack}: expected a line of names, such as id,x,y,z, and rows"
         )
     if all(_number(cell) is not None for cell in table.names):
         raise CalibrationError(
             f"{path}: the first line is no header: name the columns, such as id,x,y,z or u,v,x,y,z"
         )
-    said = next((m[1].lower() for line in table.comments if (m := _UNIT_COMMENT.match(line))), None)
-    return _table(str(path), table, "m" if said and said.startswith("met") else said or unit)
+    stated = next((m[1].lower() for line in table.comments if (m := _UNIT_COMMENT.match(line))), None)
+    return _table(str(path), table, "m" if stated and stated.startswith("met") else stated or unit)
 
 
 def _table(path: str, text: TextTable, default: str | None) -> Table:
@@ -174,8 +174,8 @@ def _table(path: str, text: TextTable, default: str | None) -> Table:
         for k, (name, unit) in enumerate(heads)
     ]
     rows = []
-    for i, words in zip(text.lines, cells, strict=True):
-        columns = [(n, w, f) for n, w, f in zip(names, words, factors, strict=False) if n and w]
+    for i, column_cells in zip(text.lines, cells, strict=True):
+        columns = [(n, w, f) for n, w, f in zip(names, column_cells, factors, strict=False) if n and w]
         numbers = {n: x * f for n, w, f in columns if (x := _number(w)) is not None and math.isfinite(x)}
         row = Row(i, {n: w for n, w, _ in columns}, numbers)
         _check(path, row)
@@ -198,9 +198,9 @@ def _check(path: str, row: Row) -> None:
 def _column(word: str) -> tuple[str, str]:
     """Standard name (empty: of no use here) and unit of a column."""
     word = word.strip().strip("\"'")
-    found = _UNIT_AT_END.search(word)
-    unit = (found[1] or found[2] or "").lower() if found else ""
-    bare = word[: found.start()] if found else word
+    match = _UNIT_AT_END.search(word)
+    unit = (match[1] or match[2] or "").lower() if match else ""
+    bare = word[: match.start()] if match else word
     plain = re.sub(r"[\s_\-.]", "", bare.lower())
     name = _BY_WORD.get(plain, "")
     if unit == "px" and name in ("x", "y"):
@@ -208,7 +208,7 @@ def _column(word: str) -> tuple[str, str]:
     return name or (plain if re.fullmatch(r"[uv][0-3]", plain) else ""), unit
 
 
-def _factor(name: str, unit: str, default: str | None, words: list[str]) -> float:
+def _factor(name: str, unit: str, default: str | None, cells: list[str]) -> float:
     if name in LENGTHS:
         unit = unit or default or "m"
         if unit not in METRES:
@@ -217,7 +217,7 @@ def _factor(name: str, unit: str, default: str | None, words: list[str]) -> floa
     if name in ANGLES:
         if unit == "deg":
             return math.pi / 180.0
-        values = [x for word in words if (x := _number(word)) is not None]
+        values = [x for word in cells if (x := _number(word)) is not None]
         degrees = unit != "rad" and any(abs(x) > 2.0 * math.pi for x in values)
         return math.pi / 180.0 if degrees else 1.0
     return 1.0
@@ -271,12 +271,12 @@ def grid_points(path: str | Path) -> tuple[dict[int, np.ndarray], float]:
             "an edge above 0 and a spacing above the edge"
         )
     turn = quat_from_euler(*np.radians(angles))
-    found = {}
+    points = {}
     for row in range(rows):
         for column in range(columns):
             flat = corners(edge) + np.array([column * dx, row * dy, 0.0])
-            found[first + row * columns + column] = np.asarray(position) + quat_rotate(turn, flat)
-    return found, sigma
+            points[first + row * columns + column] = np.asarray(position) + quat_rotate(turn, flat)
+    return points, sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -518,11 +518,11 @@ class _Rows:
             self.findings.append(finding("not_surveyed", names=tuple(self.unknown)))
         matches = list(self._matches.values())
         if not matches:
-            known = [] if survey is None else [*survey.points, *map(str, survey.tags), *survey.locations]
-            seen = f"; observed: {', '.join(list(self.unknown)[:5])}" if self.unknown else ""
+            surveyed = [] if survey is None else [*survey.points, *map(str, survey.tags), *survey.locations]
+            observed = f"; observed: {', '.join(list(self.unknown)[:5])}" if self.unknown else ""
             raise CalibrationError(
                 f"{source}: no observation belongs to a surveyed point "
-                f"(surveyed: {', '.join(known[:5]) or 'none'}{seen})"
+                f"(surveyed: {', '.join(surveyed[:5]) or 'none'}{observed})"
             )
         labels = {m.placed.group or id(m.placed): m.placed.group or m.placed.name for m in reversed(matches)}
         order = {
@@ -558,11 +558,11 @@ def _match_frames(rows: _Rows, frames: Sequence[Frame], survey: Survey) -> None:
         if survey.locations and not lay and not survey.tags:
             rows.unknown[frame.image or "a picture without a name"] = None
             continue
-        found = most_certain(frame.detections)
-        for detection in found:
+        detections = most_certain(frame.detections)
+        for detection in detections:
             placed = survey.tags.get(detection.tag)
             for tag, here in lay:
-                if tag == detection.tag or (tag is None and len(found) == 1):
+                if tag == detection.tag or (tag is None and len(detections) == 1):
                     placed = here
             if placed is None:
                 rows.unknown[f"tag {detection.tag}"] = None

@@ -158,6 +158,6 @@ class Interface:
         return e1, np.cross(n, e1)
 
 
-def _check_index(what: str, index: float) -> None:
+def _check_index(label: str, index: float) -> None:
     if not (math.isfinite(index) and index > 0.0):
-        raise OpticsError(f"{what} {index}, expected a positive number (air 1.0003, fresh water 1.333)")
+        raise OpticsError(f"{label} {index}, expected a positive number (air 1.0003, fresh water 1.333)")

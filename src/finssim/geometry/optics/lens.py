@@ -76,11 +76,11 @@ class RadialTangential:
         z = _plane(points_c)
         s = (z * z.conj()).real
         R, _, denominator = self._radial(s)
-        one = z / denominator
+        scale = z / denominator
         power = [s, s * s, s * s * s]
         tangential = [2j * s - 1j * z * z, 2.0 * s + z * z]  # OpenCV's order: p1, then p2
-        columns = [one * power[0], one * power[1], *tangential, one * power[2]]
-        columns += [-one * R * each for each in power]
+        columns = [scale * power[0], scale * power[1], *tangential, scale * power[2]]
+        columns += [-scale * R * each for each in power]
         out = np.empty((*z.shape, 2, self._count))
         for i, column in enumerate(columns[: self._count]):
             out[..., i] = _pairs(column)

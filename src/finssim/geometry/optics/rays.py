@@ -220,19 +220,19 @@ def project(camera: Camera, interface: Interface, points_p: npt.ArrayLike) -> Pr
         return seen_at(camera, refract(camera, interface, np.asarray(points_p, float)))
 
 
-def seen_at(camera: Camera, found: Refraction) -> Projection:
+def seen_at(camera: Camera, refraction: Refraction) -> Projection:
     """Pixels of rays that are already found."""
     with np.errstate(all="ignore"):
-        surface = camera.position + found.height * found.direction
-        direction_c = found.direction @ camera.R_pc
-        pixels, seen = camera.lens.project(direction_c)
+        surface = camera.position + refraction.height * refraction.direction
+        direction_c = refraction.direction @ camera.R_pc
+        pixels, visible = camera.lens.project(direction_c)
         inside = camera.lens.inside(pixels)
-        if inside.all() and found.right_side.all():
+        if inside.all() and refraction.right_side.all():
             return Projection(pixels, np.zeros(inside.shape, np.int8), surface)
         status = np.where(inside, np.int8(Status.OK), np.int8(Status.OUTSIDE_IMAGE))
         behind = np.where(direction_c[..., 2] <= 0.0, np.int8(Status.BEHIND_CAMERA), np.int8(Status.NO_RAY))
-        status = np.where(seen, status, behind)
-        status = np.asarray(np.where(found.right_side, status, np.int8(Status.WRONG_SIDE)), np.int8)
+        status = np.where(visible, status, behind)
+        status = np.asarray(np.where(refraction.right_side, status, np.int8(Status.WRONG_SIDE)), np.int8)
     wrong = status == Status.WRONG_SIDE
     surface[wrong] = pixels[wrong] = np.nan
     return Projection(pixels, status, surface)
@@ -301,8 +301,8 @@ class WaterRays:
         shape = good.shape
         if good.all():
             return points, np.broadcast_to(self.status, shape).copy()
-        why = np.where(np.abs(towards) > PARALLEL_COSINE, np.int8(Status.AWAY), np.int8(Status.PARALLEL))
-        status = np.where((self.status == 0) & ~good, why, self.status).astype(np.int8)
+        reason = np.where(np.abs(towards) > PARALLEL_COSINE, np.int8(Status.AWAY), np.int8(Status.PARALLEL))
+        status = np.where((self.status == 0) & ~good, reason, self.status).astype(np.int8)
         points[status != 0] = np.nan
         return points, status
 
@@ -318,7 +318,7 @@ def back_project(camera: Camera, interface: Interface, pixels: npt.ArrayLike) ->
     Returns:
         Rays with a status each: NO_RAY, PARALLEL, TOTAL_REFLECTION and AWAY have none.
     """
-    rays_c, seen = camera.lens.rays(pixels)
+    rays_c, valid = camera.lens.rays(pixels)
     n = interface.normal
     height = float(n @ camera.position) + interface.offset
     with np.errstate(all="ignore"):
@@ -343,17 +343,17 @@ def back_project(camera: Camera, interface: Interface, pixels: npt.ArrayLike) ->
         good = (cosine > PARALLEL_COSINE) & (worst > 0.0)
         if height >= 0.0 and good.all():
             return WaterRays(origin, direction, np.zeros(cosine.shape, np.int8))
-        status = _rejected(seen, cosine, worst, height)
+        status = _rejected(valid, cosine, worst, height)
     bad = status != 0
     origin[bad] = direction[bad] = np.nan
     return WaterRays(origin, direction, status)
 
 
-def _rejected(seen: npt.NDArray[np.bool_], cosine: Array, kappa: Array, height: float) -> StatusArray:
+def _rejected(valid: npt.NDArray[np.bool_], cosine: Array, kappa: Array, height: float) -> StatusArray:
     status = np.where(kappa > 0.0, np.int8(Status.OK), np.int8(Status.TOTAL_REFLECTION))
     status = np.where((cosine < 0.0) | (height < 0.0), np.int8(Status.AWAY), status)
     status = np.where(np.abs(cosine) <= PARALLEL_COSINE, np.int8(Status.PARALLEL), status)
-    return np.asarray(np.where(seen, status, np.int8(Status.NO_RAY)), np.int8)
+    return np.asarray(np.where(valid, status, np.int8(Status.NO_RAY)), np.int8)
 
 
 # Derivatives of `project` and `back_project`, by the implicit function theorem.
@@ -374,12 +374,12 @@ class Jacobians:
     def __init__(self, camera: Camera, interface: Interface, points_p: Array) -> None:
         self._camera, self._interface, self._points = camera, interface, points_p
         with np.errstate(all="ignore"):
-            self._found = found = refract(camera, interface, points_p)
-            self._direction, self._rho = found.direction, found.across
-            self._direction_c = found.direction @ camera.R_pc
-            self._change = found.stack.derivatives()
+            self._found = refraction = refract(camera, interface, points_p)
+            self._direction, self._rho = refraction.direction, refraction.across
+            self._direction_c = refraction.direction @ camera.R_pc
+            self._change = refraction.stack.derivatives()
             self._by_v = camera.lens.project_jacobian(self._direction_c) @ camera.R_pc.T
-            self._by_k = (self._by_v @ found.across[..., None])[..., 0]
+            self._by_k = (self._by_v @ refraction.across[..., None])[..., 0]
 
     @cached_property
     def projection(self) -> Projection:
@@ -461,8 +461,8 @@ def back_project_jacobian(
         d(x, y)/d(u, v) [m/px], (..., 2, 2), and d(x, y)/dz [-], (..., 2); NaN where the pixel sees no such point.
     """
     points, _ = back_project(camera, interface, pixels).at_z(z)
-    whole = plane_jacobian(camera, interface, points, (0.0, 0.0, 1.0))
-    return whole[..., :2, :2], whole[..., :2, 2]
+    jacobian = plane_jacobian(camera, interface, points, (0.0, 0.0, 1.0))
+    return jacobian[..., :2, :2], jacobian[..., :2, 2]
 
 
 def plane_jacobian(

@@ -100,13 +100,13 @@ RANDOMIZED: Table = {
 
 def own_settings(task: str, learner: str, randomized: bool) -> dict[str, Any]:
     """Changes of a learner's defaults for a task; none for a task that no table names."""
-    found: dict[str, Any] = {}
+    changes: dict[str, Any] = {}
     for name in ("*", task):
         for table in (SETTINGS, RANDOMIZED) if randomized else (SETTINGS,):
             rows = table.get(name, {})
-            found |= rows.get("on-policy", {}) if learner in ON_POLICY else {}
-            found |= rows.get(learner, {})
-    return found
+            changes |= rows.get("on-policy", {}) if learner in ON_POLICY else {}
+            changes |= rows.get(learner, {})
+    return changes
 
 
 # Settings that all PPO learners share, whichever library they are of.
@@ -172,10 +172,13 @@ class ActingLearner:
     """Fewest samples between two updates: with few worlds, rollouts are longer. 0: as the settings say."""
 
     @classmethod
-    def settings_for(cls, task: Task, own: Mapping[str, Any], worlds: int | None, steps: int | None) -> Any:
-        """The settings of a training: defaults with the task's `own` changes; then worlds and steps, unless None."""
-        given = {name: value for name, value in (("worlds", worlds), ("steps", steps)) if value is not None}
-        settings = replace(cls.Settings(), **{**own, **given})
+    def settings_for(
+        cls, task: Task, changes: Mapping[str, Any], worlds: int | None, steps: int | None
+    ) -> Any:
+        """The settings of a training: defaults with the task's `changes` changes; then worlds and steps, unless "
+        "None."""
+        stated = {name: value for name, value in (("worlds", worlds), ("steps", steps)) if value is not None}
+        settings = replace(cls.Settings(), **{**changes, **stated})
         if not cls.rollout_samples:
             return settings
         least = math.ceil(cls.rollout_samples / (settings.worlds * len(task.agents)))

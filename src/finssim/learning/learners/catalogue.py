@@ -81,12 +81,12 @@ class LearnerKind:
         Raises:
             LearningError: A change names no setting, has another type than the setting's own, or counts too few.
         """
-        own = {}
+        task_changes = {}
         if self.own is None:
-            own = own_settings(
+            task_changes = own_settings(
                 task.name, next(name for name, kind in LEARNERS.items() if kind == self), randomized
             )
-        chosen = self._class().settings_for(task, own, worlds, steps)
+        chosen = self._class().settings_for(task, task_changes, worlds, steps)
         return replace(
             chosen, **{name: _fitting(chosen, name, value) for name, value in (changes or {}).items()}
         )
@@ -191,14 +191,16 @@ def learner_named(name: str) -> LearnerKind:
         EnvironmentSetupError: There is no such file or class, or its code fails.
     """
     if ":" in name:
-        found = own_class(name, ActingLearner, "learner")
-        if not (isinstance(found, type) and issubclass(found, ActingLearner) and hasattr(found, "Settings")):
+        learner = own_class(name, ActingLearner, "learner")
+        if not (
+            isinstance(learner, type) and issubclass(learner, ActingLearner) and hasattr(learner, "Settings")
+        ):
             raise LearningError(
                 f"'{name}' is no learner: derive it from finssim.learning.learners.base.ActingLearner, with a frozen "
                 "dataclass Settings"
             )
-        what = (found.__doc__ or found.__name__).strip().splitlines()[0]
-        return LearnerKind(found.__module__, found.__name__, what, own=found)
+        title = (learner.__doc__ or learner.__name__).strip().splitlines()[0]
+        return LearnerKind(learner.__module__, learner.__name__, title, own=learner)
     if name not in LEARNERS:
         raise LearningError(f"unknown learner '{name}'; available: {', '.join(LEARNERS)}, or FILE.py:CLASS")
     return LEARNERS[name]
@@ -206,15 +208,15 @@ def learner_named(name: str) -> LearnerKind:
 
 def _fitting(settings: Any, name: str, value: Any) -> Any:
     """The value, as the type of the setting of that name."""
-    known = {field.name: getattr(settings, field.name) for field in fields(settings)}
-    if name not in known:
-        raise LearningError(f"unknown setting '{name}'; available: {', '.join(known)}")
-    kind = type(known[name])
+    values = {field.name: getattr(settings, field.name) for field in fields(settings)}
+    if name not in values:
+        raise LearningError(f"unknown setting '{name}'; available: {', '.join(values)}")
+    kind = type(values[name])
     try:
         fitting = _as_kind(kind, value)
     except (KeyError, TypeError, ValueError) as error:
         raise LearningError(
-            f"setting {name} is {value!r}, expected {kind.__name__} such as {known[name]!r}"
+            f"setting {name} is {value!r}, expected {kind.__name__} such as {values[name]!r}"
         ) from error
     least = 0 if name in MAY_BE_ZERO else 1
     counts = fitting if kind is tuple else (fitting,) if kind is int else ()

@@ -84,8 +84,8 @@ class Gail(TorchRlPpo):
     ) -> None:
         """Load the demonstrations; set up generator and discriminator."""
         super().__init__(environment, settings, seed=seed, device=device)
-        found = demonstrations_for(environment, settings.demonstrations)
-        observation, action = (torch.from_numpy(x).to(device) for x in (found.observation, found.action))
+        data = demonstrations_for(environment, settings.demonstrations)
+        observation, action = (torch.from_numpy(x).to(device) for x in (data.observation, data.action))
         self._shown = torch.cat([observation, action], dim=-1)
         self.judge = Discriminator(self._shown, settings.discriminator_hidden).to(device)
         self._worlds = JudgedTensors(environment, self.judge)
@@ -115,17 +115,17 @@ class Gail(TorchRlPpo):
     def _discriminate(self, done: torch.Tensor) -> float:
         """One gradient step: the demonstrations as ones, the learner's own steps as zeros."""
         size = self.settings.discriminator_batch
-        shown = self._shown[torch.randint(len(self._shown), (size,))].requires_grad_()
-        own = done[torch.randint(len(done), (size,))]
-        yes, no = self.judge(shown), self.judge(own)
+        expert_rows = self._shown[torch.randint(len(self._shown), (size,))].requires_grad_()
+        learner_rows = done[torch.randint(len(done), (size,))]
+        yes, no = self.judge(expert_rows), self.judge(learner_rows)
         entropy = nn.functional.binary_cross_entropy_with_logits
         loss = entropy(yes, torch.ones_like(yes)) + entropy(no, torch.zeros_like(no))
-        (slope,) = torch.autograd.grad(yes.sum(), shown, create_graph=True)
-        whole = (
+        (slope,) = torch.autograd.grad(yes.sum(), expert_rows, create_graph=True)
+        objective = (
             loss + 0.5 * self.settings.gradient_penalty * ((slope * self.judge.scale) ** 2).sum(dim=-1).mean()
         )
         self.judge_optimizer.zero_grad()
-        whole.backward()
+        objective.backward()
         self.judge_optimizer.step()
         return float(loss.detach())
 

@@ -72,30 +72,32 @@ class DaggerSettings:
     hidden: tuple[int, ...] = (64, 64)
 
 
-def demonstrations_for(environment: Environment, place: str) -> Demonstrations:
+def demonstrations_for(environment: Environment, folder: str) -> Demonstrations:
     """A data set that fits an environment.
 
     Raises:
         LearningError: None is named, or it is of another task, vehicle or action mode.
         DatasetError: It cannot be read.
     """
-    if not place:
+    if not folder:
         raise LearningError(
             "no demonstrations are named: collect some with finssim collect, and give --set demonstrations=DIR"
         )
-    found = load(place)
+    data = load(folder)
     vehicle, sight = environment.simulator.vehicles[0], environment.sight
     shapes = {name: list(x.shape[1:]) for name, x in sight.pictures.items()} if sight else {}
-    for what, has, wanted in (
-        ("task", found.about["task"], environment.task.name),
-        ("action mode", found.about["action"]["mode"], environment.action_mode),
-        ("vehicle", found.about["vehicle"]["sha256"], vehicle.sha256),
-        ("observation", found.observation.shape[1], environment.observation_size),
-        ("pictures", {k: list(x.shape[1:]) for k, x in found.pictures.items()}, shapes),
+    for quantity, has, required in (
+        ("task", data.about["task"], environment.task.name),
+        ("action mode", data.about["action"]["mode"], environment.action_mode),
+        ("vehicle", data.about["vehicle"]["sha256"], vehicle.sha256),
+        ("observation", data.observation.shape[1], environment.observation_size),
+        ("pictures", {k: list(x.shape[1:]) for k, x in data.pictures.items()}, shapes),
     ):
-        if has != wanted:
-            raise LearningError(f"{place} is of {what} {has}, expected {wanted}: collect for what is trained")
-    return found
+        if has != required:
+            raise LearningError(
+                f"{folder} is of {quantity} {has}, expected {required}: collect for what is trained"
+            )
+    return data
 
 
 class _Cloner(ActingLearner):
@@ -145,9 +147,9 @@ class _Cloner(ActingLearner):
     def _drive(self, steps: int) -> None:
         with torch.no_grad():
             for _ in range(steps):
-                seen = self._worlds.observation.to(self.device, copy=True)
-                seen = seen[:, 0] if self._pictures else seen  # only one vehicle can see
-                self._worlds.step(self.policy(seen, **self._pictures).clamp(-1.0, 1.0))
+                observation = self._worlds.observation.to(self.device, copy=True)
+                observation = observation[:, 0] if self._pictures else observation  # only one vehicle can see
+                self._worlds.step(self.policy(observation, **self._pictures).clamp(-1.0, 1.0))
                 self.tally.look()
 
     def network(self) -> nn.Module:
@@ -175,10 +177,10 @@ class Bc(_Cloner):
     ) -> None:
         """Load the demonstrations and set up the network."""
         super().__init__(environment, settings, seed=seed, device=device)
-        found = demonstrations_for(environment, settings.demonstrations)
-        self._observation = torch.from_numpy(found.observation).to(device)
-        self._action = torch.from_numpy(found.action).to(device)
-        self._shown = {name: torch.from_numpy(x).to(device) for name, x in found.pictures.items()}
+        data = demonstrations_for(environment, settings.demonstrations)
+        self._observation = torch.from_numpy(data.observation).to(device)
+        self._action = torch.from_numpy(data.action).to(device)
+        self._shown = {name: torch.from_numpy(x).to(device) for name, x in data.pictures.items()}
 
     def update(self) -> dict[str, float]:
         """One round of regression, then a while of driving, which only measures."""
@@ -208,13 +210,13 @@ class Dagger(_Cloner):
         n, m = environment.observation_size, environment.action_size
         self._observation, self._action = torch.empty(0, n), torch.empty(0, m)
         if settings.demonstrations:
-            found = demonstrations_for(environment, settings.demonstrations)
-            self._keep(torch.from_numpy(found.observation), torch.from_numpy(found.action))
+            data = demonstrations_for(environment, settings.demonstrations)
+            self._keep(torch.from_numpy(data.observation), torch.from_numpy(data.action))
 
     def _keep(self, observation: torch.Tensor, action: torch.Tensor) -> None:
-        kept = self.settings.kept
-        self._observation = torch.cat([self._observation, observation])[-kept:]
-        self._action = torch.cat([self._action, action])[-kept:]
+        limit = self.settings.kept
+        self._observation = torch.cat([self._observation, observation])[-limit:]
+        self._action = torch.cat([self._action, action])[-limit:]
 
     def update(self) -> dict[str, float]:
         """One rollout, labelled by the expert, and regression on all that is kept."""
@@ -228,14 +230,14 @@ class Dagger(_Cloner):
         return {**self.tally.row(), **row}
 
     def _rollout(self) -> tuple[torch.Tensor, torch.Tensor]:
-        seen, told = [], []
+        observations, labels = [], []
         agents, expert_drives = self.environment.agents, self._rounds < self.settings.expert_rounds
         for _ in range(self.settings.rollout):
             rows = self._worlds.observation.flatten(0, 1).cpu().clone()
-            wanted, self._memory = self._expert.act(self._memory, Known(rows.numpy()), NOWHERE)
-            label = torch.from_numpy(np.clip(wanted, -1.0, 1.0).astype(np.float32))
-            seen.append(rows)
-            told.append(label)
+            action, self._memory = self._expert.act(self._memory, Known(rows.numpy()), NOWHERE)
+            label = torch.from_numpy(np.clip(action, -1.0, 1.0).astype(np.float32))
+            observations.append(rows)
+            labels.append(label)
             done = label if expert_drives else self.policy(rows.to(self.device)).clamp(-1.0, 1.0)
             terminated, truncated = self._worlds.step(done.to(self._worlds.device))
             self.tally.look()
@@ -243,7 +245,7 @@ class Dagger(_Cloner):
             if ended.any():
                 mask = np.repeat(ended, agents)
                 self._memory = restarted(self._memory, self._fresh, mask)
-        return torch.cat(seen), torch.cat(told)
+        return torch.cat(observations), torch.cat(labels)
 
     def learned(self) -> dict[str, Any]:
         """Network, optimiser, what is kept, and the expert's memory."""

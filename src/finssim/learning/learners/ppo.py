@@ -120,10 +120,10 @@ class InformedTeacher:
         """Integrals of the errors at the start of episodes."""
         return np.zeros((rows, len(self._ppo._errors)), np.float32)
 
-    def act(self, memory: Any, known: Known, goal: Any) -> tuple[Any, Any]:
+    def act(self, memory: Any, reading: Known, goal: Any) -> tuple[Any, Any]:
         """What it would do where the student's worlds are now, and its integrals after; a goal is in what is seen."""
         ppo, A = self._ppo, self._ppo.arrays
-        observation, ppo._integral = A.array(known.observation), A.array(memory)
+        observation, ppo._integral = A.array(reading.observation), A.array(memory)
         observation, integral = ppo._integrated(observation)
         action = ppo.actor(ppo._look(observation, ppo._drawn)[1])
         return A.numpy(A.xp.clip(action, -1.0, 1.0)), A.numpy(integral)
@@ -178,11 +178,11 @@ class Ppo(ActingLearner):
         self._observation, self._final = self._views("observation"), self._views("final_observation")
         self._action, self._reward = self._views("action"), self._views("agent_reward").reshape(-1)
         self._terminated, self._truncated = A.view(e.arrays.terminated), A.view(e.arrays.truncated)
-        known = s.asymmetric and e.arrays.privileged.size > 0
+        has_privileged = s.asymmetric and e.arrays.privileged.size > 0
         self._drawn, self._final_drawn = (
-            self._views(name) if known else None for name in ("privileged", "final_privileged")
+            self._views(name) if has_privileged else None for name in ("privileged", "final_privileged")
         )
-        if s.teacher == INFORMED and not known:
+        if s.teacher == INFORMED and not has_privileged:
             raise LearningError(
                 "an informed teacher sees what randomisation has drawn: give randomize, and leave asymmetric as it is"
             )
@@ -277,8 +277,8 @@ class Ppo(ActingLearner):
 
     def _ask(self, t: int) -> None:
         """Note what the teacher would do at step t, and at first do it."""
-        known = Known(self.arrays.numpy(self._observation))
-        answer, self._remembered = self._teacher.act(self._remembered, known, NOWHERE)  # type: ignore[union-attr]
+        reading = Known(self.arrays.numpy(self._observation))
+        answer, self._remembered = self._teacher.act(self._remembered, reading, NOWHERE)  # type: ignore[union-attr]
         label = self._label[t] = self.arrays.array(answer)  # type: ignore[index]
         if 1.0 - self.left < self.settings.taught / 3.0:
             self._u[t] = label
@@ -293,12 +293,12 @@ class Ppo(ActingLearner):
         """The scaled observation, what the policy sees, what its GRU makes of that, and what the critic sees."""
         xp, k = self.arrays.xp, self._window
         x = (observation - self._mean) * self._scale if self.settings.normalize else observation
-        seen = xp.concatenate([x, self._memory[:, :k]], 1) if k else x
+        policy_input = xp.concatenate([x, self._memory[:, :k]], 1) if k else x
         if self._informed:
-            seen, drawn = xp.concatenate([seen, drawn], 1), None
-        h = self._cell.step(seen, self._memory[:, k:])[0] if self.gru else None
-        parts = [part for part in (seen, h, drawn) if part is not None]
-        return x, seen, h, xp.concatenate(parts, 1) if len(parts) > 1 else seen
+            policy_input, drawn = xp.concatenate([policy_input, drawn], 1), None
+        h = self._cell.step(policy_input, self._memory[:, k:])[0] if self.gru else None
+        parts = [part for part in (policy_input, h, drawn) if part is not None]
+        return x, policy_input, h, xp.concatenate(parts, 1) if len(parts) > 1 else policy_input
 
     def _remember(self, x: Array, action: Array, h: Array | None) -> None:
         s, xp, k = self.settings, self.arrays.xp, self._window
@@ -346,8 +346,8 @@ class Ppo(ActingLearner):
     def _learn(self, advantage: Array, target: Array, before: Array, rate: float) -> dict[str, float]:
         """Gradient steps on samples in random order; of a policy with a GRU, on whole rows in random order."""
         A, s, T = self.arrays, self.settings, self.settings.rollout
-        shown = self._label if self._taught else self._u
-        samples = [x[:T] for x in (self._x, self._c, shown, advantage, target, self._density)]
+        actions = self._label if self._taught else self._u
+        samples = [x[:T] for x in (self._x, self._c, actions, advantage, target, self._density)]
         if self.gru is None:
             samples = [x.reshape(T * self._rows, *x.shape[2:]) for x in samples]
         n, size = (self._rows, max(1, s.batch // T)) if self.gru else (T * self._rows, s.batch)

@@ -48,19 +48,23 @@ class RslRlPpo(ActingLearner):
         age_episodes(environment)
         self._worlds = Tensors(environment)
         self._rows = environment.worlds * environment.agents
-        seen = self._seen()
-        groups = {"actor": ["policy"], "critic": list(seen.keys())}
+        groups_now = self._seen()
+        groups = {"actor": ["policy"], "critic": list(groups_now.keys())}
         noise = {
             "class_name": "GaussianDistribution",
             "std_type": "log",  # a step of the optimiser cannot take it to zero
             "init_std": float(torch.tensor(settings.log_std).exp()),
         }
         sizes = {"hidden_dims": list(settings.hidden), "activation": "elu"}
-        actor = MLPModel(seen, groups, "actor", environment.action_size, distribution_cfg=noise, **sizes)
-        critic = MLPModel(seen, groups, "critic", 1, **sizes)
+        actor = MLPModel(
+            groups_now, groups, "actor", environment.action_size, distribution_cfg=noise, **sizes
+        )
+        critic = MLPModel(groups_now, groups, "critic", 1, **sizes)
         _begin(actor.mlp, 0.01)
         _begin(critic.mlp, 1.0)
-        storage = RolloutStorage("rl", self._rows, settings.rollout, seen, [environment.action_size], device)
+        storage = RolloutStorage(
+            "rl", self._rows, settings.rollout, groups_now, [environment.action_size], device
+        )
         self.ppo = PPO(
             actor,
             critic,
@@ -83,17 +87,17 @@ class RslRlPpo(ActingLearner):
     def update(self) -> dict[str, float]:
         """One rollout, and `epochs` passes over it."""
         self.ppo.train_mode()
-        seen = self._seen()
+        groups = self._seen()
         with torch.inference_mode():
             for _ in range(self.settings.rollout):
-                action = self.ppo.act(seen)
+                action = self.ppo.act(groups)
                 terminated, truncated = self._worlds.step(action)
                 self.tally.look()
-                seen = self._seen()
+                groups = self._seen()
                 reward = self._worlds.reward.flatten().clone()
                 self._add_last_values(reward, truncated & ~terminated)
-                self.ppo.process_env_step(seen, reward, self._by_row(terminated | truncated), {})
-            self.ppo.compute_returns(seen)
+                self.ppo.process_env_step(groups, reward, self._by_row(terminated | truncated), {})
+            self.ppo.compute_returns(groups)
         self.steps += self.environment.worlds * self.settings.rollout
         self._set_rate(self.settings.learning_rate * self.left)
         losses = self.ppo.update()
@@ -117,9 +121,9 @@ class RslRlPpo(ActingLearner):
         """Copies of what actor and critic see now, or saw at the end of the episodes that ended in this step."""
         e, w = self.environment, self._worlds
         groups = {"policy": (w.final_observation if final else w.observation).reshape(self._rows, -1).clone()}
-        told = privileged_rows(e, "final_privileged" if final else "privileged")
-        if told is not None and self.settings.asymmetric:
-            groups["privileged"] = told.clone()
+        privileged = privileged_rows(e, "final_privileged" if final else "privileged")
+        if privileged is not None and self.settings.asymmetric:
+            groups["privileged"] = privileged.clone()
         return TensorDict(groups, batch_size=[self._rows])
 
     def _add_last_values(self, reward: torch.Tensor, timed_out: torch.Tensor) -> None:

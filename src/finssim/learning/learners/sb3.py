@@ -54,7 +54,7 @@ class Sb3Ppo(ActingLearner):
         self.model: Any = PPO(
             "MlpPolicy",
             TalliedWorlds(self.tally),
-            learning_rate=lambda left: s.learning_rate * max(left, 0.0),
+            learning_rate=lambda remaining: s.learning_rate * max(remaining, 0.0),
             n_steps=s.rollout,
             batch_size=s.batch,
             n_epochs=s.epochs,

@@ -127,11 +127,11 @@ class TorchRlPpo(ActingLearner):
 
     def _rollout(self) -> TensorDict:
         """Act for `rollout` control steps: samples (rollout * worlds, agents, ...)."""
-        w, s, seen = self._worlds, self.settings, []
+        w, s, observations = self._worlds, self.settings, []
         actions, rewards, ends, kills, lasts = [], [], [], [], []
         for _ in range(s.rollout):
-            seen.append(w.observation.clone())
-            mean, std = self.actor(seen[-1])
+            observations.append(w.observation.clone())
+            mean, std = self.actor(observations[-1])
             actions.append(mean + std * torch.randn_like(mean))
             terminated, truncated = w.step(actions[-1])
             self.tally.look()
@@ -139,7 +139,7 @@ class TorchRlPpo(ActingLearner):
             ends.append(terminated | truncated)
             kills.append(terminated)
             lasts.append(w.final_observation[ends[-1]])  # by the mask: a copy
-        observation, action = torch.stack(seen), torch.stack(actions)
+        observation, action = torch.stack(observations), torch.stack(actions)
         value = self.critic(observation)
         after = torch.cat([value[1:], self.critic(w.observation)[None]])
         done = torch.stack(ends)
@@ -172,10 +172,10 @@ class TorchRlPpo(ActingLearner):
             full = x.reshape(*x.shape[:2], -1, 1).expand_as(value)
             return full.movedim(0, -2).contiguous()
 
-        found = vec_generalized_advantage_estimate(
+        estimates = vec_generalized_advantage_estimate(
             s.discount, s.gae_lambda, *(time_last(x) for x in (value, after, reward, done, killed))
         )
-        advantage, target = (x.movedim(-2, 0) for x in found)
+        advantage, target = (x.movedim(-2, 0) for x in estimates)
         return advantage, target
 
     def _batches(self, samples: TensorDict) -> Any:

@@ -73,10 +73,10 @@ class Frame:
 def most_certain(detections: Iterable[Detection]) -> list[Detection]:
     """One detection of each family and id: that with the fewest corrected bits, then the greatest margin."""
     best: dict[tuple[str, int], Detection] = {}
-    for found in detections:
-        rival = best.setdefault((found.family, found.tag), found)
-        if (found.hamming, -_known(found.margin)) < (rival.hamming, -_known(rival.margin)):
-            best[found.family, found.tag] = found
+    for detection in detections:
+        rival = best.setdefault((detection.family, detection.tag), detection)
+        if (detection.hamming, -_known(detection.margin)) < (rival.hamming, -_known(rival.margin)):
+            best[detection.family, detection.tag] = detection
     return list(best.values())
 
 
@@ -93,9 +93,11 @@ def write_detections(frames: Iterable[Frame], path: str | Path) -> None:
     rows: list[list[object]] = []
     for frame in frames:
         head: list[object] = [_cell(frame.time), frame.image]
-        for found in frame.detections:
-            pixels = [_cell(x) for x in np.asarray(found.corners, float).ravel().tolist()]
-            rows.append([*head, found.tag, *pixels, _cell(found.margin), found.hamming, found.family])
+        for detection in frame.detections:
+            pixels = [_cell(x) for x in np.asarray(detection.corners, float).ravel().tolist()]
+            rows.append(
+                [*head, detection.tag, *pixels, _cell(detection.margin), detection.hamming, detection.family]
+            )
         if not frame.detections:
             rows.append(head + [""] * (len(COLUMNS) - 2))
     write_csv(path, COLUMNS, rows)
@@ -127,75 +129,75 @@ def read_detections(path: str | Path, notes: list[str] | None = None) -> list[Fr
     columns = _columns(header, str(path))
     if table.unfinished and rows:
         line, last = rows[-1]
-        whole = len(last) >= len(header) and tuple(header) != COLUMNS
-        what = "may be cut" if whole else "is cut short and was left out"
-        _note(notes, f"{path}: line {line}, the last, has no end: it {what}")
-        rows = rows if whole else rows[:-1]
+        complete = len(last) >= len(header) and tuple(header) != COLUMNS
+        outcome = "may be cut" if complete else "is cut short and was left out"
+        _note(notes, f"{path}: line {line}, the last, has no end: it {outcome}")
+        rows = rows if complete else rows[:-1]
     pictures: dict[tuple[str, str], tuple[float, str, list[Detection]]] = {}
     for line, cells in rows:
-        where = f"{path}: line {line}"
+        label = f"{path}: line {line}"
         if len(cells) < len(header) or any(cells[len(header) :]):
             raise LocalizationError(
-                f"{where}: {len(cells)} cells, expected the {len(header)} of the column names: correct or "
+                f"{label}: {len(cells)} cells, expected the {len(header)} of the column names: correct or "
                 "remove the line"
             )
         row = {name: cells[i] for name, i in columns.items()}
         key = row.get("image", ""), row.get("time", "")
         if key not in pictures:
-            time = _number(table, row, "time", where) if key[1] else math.nan
+            time = _number(table, row, "time", label) if key[1] else math.nan
             pictures[key] = (time, key[0], [])
         if any(cell for name, cell in row.items() if name not in ("time", "image")):
-            pictures[key][2].append(_detection(table, row, where))
-    return [Frame(time, image, tuple(found)) for time, image, found in pictures.values()]
+            pictures[key][2].append(_detection(table, row, label))
+    return [Frame(time, image, tuple(frames)) for time, image, frames in pictures.values()]
 
 
-def _detection(table: TextTable, row: Mapping[str, str], where: str) -> Detection:
-    pixels = [_number(table, row, f"{axis}{i}", where) for i in range(4) for axis in "uv"]
+def _detection(table: TextTable, row: Mapping[str, str], label: str) -> Detection:
+    pixels = [_number(table, row, f"{axis}{i}", label) for i in range(4) for axis in "uv"]
     return Detection(
-        tag=_whole(table, row, "tag", where),
+        tag=_whole(table, row, "tag", label),
         corners=np.array(pixels).reshape(4, 2),
-        margin=_number(table, row, "margin", where) if row.get("margin") else math.nan,
-        hamming=_whole(table, row, "hamming", where) if row.get("hamming") else 0,
+        margin=_number(table, row, "margin", label) if row.get("margin") else math.nan,
+        hamming=_whole(table, row, "hamming", label) if row.get("hamming") else 0,
         family=row.get("family", ""),
     )
 
 
-def _number(table: TextTable, row: Mapping[str, str], name: str, where: str) -> float:
+def _number(table: TextTable, row: Mapping[str, str], name: str, label: str) -> float:
     value = table.number(row[name])
     if value is None or not math.isfinite(value):
         raise LocalizationError(
-            f"{where}: {name} is '{row[name][:40]}', expected a finite number: correct or remove the line"
+            f"{label}: {name} is '{row[name][:40]}', expected a finite number: correct or remove the line"
         )
     return value
 
 
-def _whole(table: TextTable, row: Mapping[str, str], name: str, where: str) -> int:
-    value = _number(table, row, name, where)
+def _whole(table: TextTable, row: Mapping[str, str], name: str, label: str) -> int:
+    value = _number(table, row, name, label)
     if value != int(value) or value < 0:
-        raise LocalizationError(f"{where}: {name} is {row[name]}, expected a whole number from 0")
+        raise LocalizationError(f"{label}: {name} is {row[name]}, expected a whole number from 0")
     return int(value)
 
 
-def _columns(header: list[str], where: str) -> dict[str, int]:
+def _columns(header: list[str], label: str) -> dict[str, int]:
     """Our column name -> its place in the file."""
     spoken = [re.sub(r"[\s\-.\[\]()]+", "_", name.lower()).strip("_") for name in header]
-    known = {other: name for name, others in _OTHER_NAMES.items() for other in (name, *others)}
-    found = [(known.get(name) or "", _CORNER.fullmatch(name)) for name in spoken]
-    numbers = [int(match[1] or match[4]) for _, match in found if match]
+    standard_names = {other: name for name, others in _OTHER_NAMES.items() for other in (name, *others)}
+    matches = [(standard_names.get(name) or "", _CORNER.fullmatch(name)) for name in spoken]
+    numbers = [int(match[1] or match[4]) for _, match in matches if match]
     first = min(numbers, default=0)  # corners may count from 1
     columns: dict[str, int] = {}
-    for place, (name, match) in enumerate(found):
+    for position, (name, match) in enumerate(matches):
         if match:
             axis = (match[2] or match[3]).translate(str.maketrans("xy", "uv"))
             name = f"{axis}{int(match[1] or match[4]) - first}"
         if name in columns:
-            raise LocalizationError(f"{where}: '{header[place]}' is a second column of {name}: remove one")
+            raise LocalizationError(f"{label}: '{header[position]}' is a second column of {name}: remove one")
         if name:
-            columns[name] = place
+            columns[name] = position
     missing = [name for name in COLUMNS[2:11] if name not in columns]
     if missing:
         raise LocalizationError(
-            f"{where}: no column '{missing[0]}' among {', '.join(header)[:200]}: expected {','.join(COLUMNS)}"
+            f"{label}: no column '{missing[0]}' among {', '.join(header)[:200]}: expected {','.join(COLUMNS)}"
         )
     return columns
 

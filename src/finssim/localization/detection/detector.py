@@ -54,25 +54,25 @@ class Pattern:
     plain: Array
     """Pseudo-inverse of derivatives by 8 parameters, offset and two slopes of the light, blur and gain, (13, n)."""
 
-    def even(self, seen: Array) -> Array:
+    def even(self, gray: Array) -> Array:
         """Gray at the points as under even light: less its local mean, over its local contrast, (n,)."""
-        level = self.less_mean(seen)
+        level = self.less_mean(gray)
         return level / self._spread(level)
 
-    def less_mean(self, seen: Array) -> Array:
+    def less_mean(self, gray: Array) -> Array:
         """Gray less its local mean, (n,)."""
-        return seen - self._smooth(seen)
+        return gray - self._smooth(gray)
 
-    def contrast(self, seen: Array) -> Array:
+    def contrast(self, gray: Array) -> Array:
         """Local standard deviation of the gray, with a share of that of all of it, (n,)."""
-        return self._spread(self.less_mean(seen))
+        return self._spread(self.less_mean(gray))
 
     def _spread(self, level: Array) -> Array:
         square = level * level
         return np.asarray(np.sqrt(self._smooth(square) + FLAT**2 * square.mean() + 1e-12))
 
-    def _smooth(self, seen: Array) -> Array:
-        grid = seen.reshape(self.surround.shape)
+    def _smooth(self, gray: Array) -> Array:
+        grid = gray.reshape(self.surround.shape)
         return np.asarray((self.surround @ grid @ self.surround.T).ravel())
 
 
@@ -176,22 +176,24 @@ def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> Fit | None:
     patch, shift = _patch(image, corners, cell, smooth=(BLURS[0] * cell) ** 2 - LENS_BLUR**2)
     blur = nearest_blur(LENS_BLUR / cell)
     pattern = pattern_of(family, tag, blur)
-    given = _sample(patch, _through(_from_square(corners - shift), pattern.points))
-    if given is None:
+    sampled = _sample(patch, _through(_from_square(corners - shift), pattern.points))
+    if sampled is None:
         return None
     limit = 1.0 + 0.5 * cell
     coarse = _settle(pattern, patch, corners - shift, limit, plain=True)
-    found = coarse
+    settled = coarse
     if coarse is not None:
-        seen_blur = nearest_blur(blur + coarse.wider)  # sharper or softer than was assumed
-        pattern = pattern_of(family, tag, seen_blur)
-        found = _settle(pattern, patch, coarse.corners, limit) or coarse
-        weights = _weights_of(found.left, found.gain) if found is not coarse else None
+        fitted_blur = nearest_blur(blur + coarse.wider)  # sharper or softer than was assumed
+        pattern = pattern_of(family, tag, fitted_blur)
+        settled = _settle(pattern, patch, coarse.corners, limit) or coarse
+        weights = _weights_of(settled.left, settled.gain) if settled is not coarse else None
         if weights is not None:
-            found = _settle(pattern, patch, found.corners, limit, solver=_solver(pattern, weights)) or found
-    if coarse is None or found is None:
-        return Fit(corners, _correlation(pattern.values, given), float(np.ptp(given)))
-    return Fit(found.corners + shift, found.correlation, coarse.gain)
+            settled = (
+                _settle(pattern, patch, settled.corners, limit, solver=_solver(pattern, weights)) or settled
+            )
+    if coarse is None or settled is None:
+        return Fit(corners, _correlation(pattern.values, sampled), float(np.ptp(sampled)))
+    return Fit(settled.corners + shift, settled.correlation, coarse.gain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,11 +228,11 @@ def _settle(
     H = _from_square(start)
     here = start
     for _ in range(STEPS):
-        seen = _sample(patch, _through(H, pattern.points))
-        if seen is None:
+        sampled = _sample(patch, _through(H, pattern.points))
+        if sampled is None:
             return None
-        seen = seen if plain else pattern.even(seen)
-        solution = solver @ seen
+        sampled = sampled if plain else pattern.even(sampled)
+        solution = solver @ sampled
         gain = float(solution[-1])
         if not gain > 0.0 or np.abs(solution[:8]).max() > 0.3 * gain:
             return None
@@ -239,15 +241,17 @@ def _settle(
         if not np.abs(here - start).max() < limit:
             return None
         if np.abs(here - before).max() < (COARSE if plain else SETTLED):
-            told = pattern.values if plain else pattern.columns @ solution
-            return _Settled(here, gain, float(solution[-2]) / gain, seen - told, _correlation(told, seen))
+            predicted = pattern.values if plain else pattern.columns @ solution
+            return _Settled(
+                here, gain, float(solution[-2]) / gain, sampled - predicted, _correlation(predicted, sampled)
+            )
     return None
 
 
-def _weights_of(left: Array, gain: float) -> Array | None:
+def _weights_of(residual: Array, gain: float) -> Array | None:
     """Weights of the points, small where glare, a shadow's edge or a finger hides the tag; None if nothing does."""
-    scale = max(1.48 * float(np.median(np.abs(left))), SMALLEST_RESIDUAL * gain)
-    far = (left / (3.0 * scale)) ** 2
+    scale = max(1.48 * float(np.median(np.abs(residual))), SMALLEST_RESIDUAL * gain)
+    far = (residual / (3.0 * scale)) ** 2
     if np.mean(far > 1.0) < 0.01:
         return None
     return np.asarray(1.0 / (1.0 + far) ** 2)
@@ -297,10 +301,10 @@ def _sample(patch: Array, points: Array) -> Array | None:
     x, y = points
     if not (points.min() >= 0.0 and x.max() < width - 1 and y.max() < height - 1):
         return None
-    whole = points.astype(np.intp)
-    a, b = points - whole
+    cells = points.astype(np.intp)
+    a, b = points - cells
     flat = patch.ravel()
-    at = whole[1] * width + whole[0]
+    at = cells[1] * width + cells[0]
     upper, lower = flat.take(at), flat.take(at + width)
     upper += a * (flat.take(at + 1) - upper)
     lower += a * (flat.take(at + width + 1) - lower)
@@ -383,20 +387,20 @@ class Detector:
             return []
         part = gray[top:bottom, left:right]
         if self.refine == "fit":
-            found = find_tags(part, self.family, "edges", self.max_hamming)
+            detections = find_tags(part, self.family, "edges", self.max_hamming)
         else:
             light = _linear(part, self.gamma)
             bytes_ = part if light is part else np.rint(light).astype(np.uint8)
-            found = find_tags(bytes_, self.family, self.refine, self.max_hamming)
+            detections = find_tags(bytes_, self.family, self.refine, self.max_hamming)
         corner = np.array([left, top], float)
-        moved = [replace(d, corners=d.corners + corner) for d in found]
+        moved = [replace(d, corners=d.corners + corner) for d in detections]
         return self._fitted(gray, moved) if self.refine == "fit" else moved
 
-    def _fitted(self, gray: Image, found: list[Detection]) -> list[Detection]:
+    def _fitted(self, gray: Image, detections: list[Detection]) -> list[Detection]:
         """The detections with corners from the fit; a tag that the fit denies is left out."""
-        light = _linear(gray, self.gamma) if self.gamma != 1.0 and found else gray
+        light = _linear(gray, self.gamma) if self.gamma != 1.0 and detections else gray
         fitted = []
-        for tag in found:
+        for tag in detections:
             fit = fit_tag(light, tag.family, tag.tag, tag.corners)
             if fit is None:
                 fitted.append(tag)
@@ -541,15 +545,15 @@ class RegionTracker:
         self.counts.pictures += 1
         self.counts.pixels_given += image.size
         regions = merged(self._regions(now, predicted or {}, predicted_std))
-        found = [d for region in regions for d in self._search(image, region)]
-        here = {d.tag for d in found}
+        detections = [d for region in regions for d in self._search(image, region)]
+        here = {d.tag for d in detections}
         self._since_whole += 1
         due = self._since_whole >= self._search_every and self._incomplete(here)
         if not here or due:
-            found += self._search(image, None)
+            detections += self._search(image, None)
             self._since_whole = 0
-            self.counts.recovered += len({d.tag for d in found} - here)
-        best = most_certain(found)
+            self.counts.recovered += len({d.tag for d in detections} - here)
+        best = most_certain(detections)
         self._remember(best, now)
         self.counts.found += len(best)
         return best
@@ -564,29 +568,29 @@ class RegionTracker:
         self.counts.pixels += inside
         self.counts.whole += region is None
         self.counts.regions += region is not None
-        found = self._detector.detect(image, region)
-        return [d for d in found if self._tags is None or d.tag in self._tags]
+        detections = self._detector.detect(image, region)
+        return [d for d in detections if self._tags is None or d.tag in self._tags]
 
     def _regions(
         self, now: float, predicted: Mapping[int, npt.ArrayLike], predicted_std: float
     ) -> list[Region]:
         regions = []
         for tag in sorted(self._seen.keys() | predicted.keys()):
-            seen = self._seen.get(tag)
-            lost = seen.lost if seen else 0
+            remembered = self._seen.get(tag)
+            lost = remembered.lost if remembered else 0
             if tag in predicted:
                 corners = np.asarray(predicted[tag], float)
                 if np.isfinite(corners).all():
                     regions.append(region_around(corners, SIGMAS * predicted_std, lost))
-            elif seen and lost <= MOST_LOST:
-                ahead = seen.corners + AHEAD * seen.velocity * (now - seen.time)
-                regions.append(region_around(np.vstack([seen.corners, ahead]), 0.0, lost))
+            elif remembered and lost <= MOST_LOST:
+                ahead = remembered.corners + AHEAD * remembered.velocity * (now - remembered.time)
+                regions.append(region_around(np.vstack([remembered.corners, ahead]), 0.0, lost))
         return regions
 
-    def _remember(self, found: list[Detection], now: float) -> None:
-        for seen in self._seen.values():
-            seen.lost += 1
-        for tag in found:
+    def _remember(self, detections: list[Detection], now: float) -> None:
+        for remembered in self._seen.values():
+            remembered.lost += 1
+        for tag in detections:
             before = self._seen.get(tag.tag)
             velocity = np.zeros(2)
             if before is not None and before.lost <= 3 and now > before.time:
@@ -613,22 +617,22 @@ def region_around(corners: Array, uncertainty: float = 0.0, lost: int = 0) -> Re
 
 def merged(regions: list[Region]) -> list[Region]:
     """The same places in regions of which no two overlap: those that do become one around both."""
-    apart: list[Region] = []
+    separate: list[Region] = []
     for region in regions:
         joined = region
         while True:
-            touching = next((other for other in apart if _overlap(joined, other)), None)
+            touching = next((other for other in separate if _overlap(joined, other)), None)
             if touching is None:
                 break
-            apart.remove(touching)
+            separate.remove(touching)
             joined = (
                 min(joined[0], touching[0]),
                 min(joined[1], touching[1]),
                 max(joined[2], touching[2]),
                 max(joined[3], touching[3]),
             )
-        apart.append(joined)
-    return apart
+        separate.append(joined)
+    return separate
 
 
 def _overlap(a: Region, b: Region) -> bool:

@@ -39,7 +39,7 @@ def find_tags(image: Image, family: str, refine: str, max_hamming: int) -> list[
     if min(image.shape) < 16:
         return []
     with _ONE_AT_A_TIME:
-        found = _library(family, refine).detect(np.ascontiguousarray(image))
+        detections = _library(family, refine).detect(np.ascontiguousarray(image))
     return [
         Detection(
             tag=int(tag.tag_id),
@@ -49,7 +49,7 @@ def find_tags(image: Image, family: str, refine: str, max_hamming: int) -> list[
             hamming=int(tag.hamming),
             family=family,
         )
-        for tag in found
+        for tag in detections
         if tag.hamming <= max_hamming
     ]
 

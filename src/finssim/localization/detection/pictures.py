@@ -48,8 +48,8 @@ def pictures(
     Raises:
         LocalizationError: A source is not there or of unknown kind, no picture can be read, or `times` misses one.
     """
-    given = [sources] if isinstance(sources, (str, Path)) else list(sources)
-    files = [file for source in given for file in _files(Path(source))]
+    locations = [sources] if isinstance(sources, (str, Path)) else list(sources)
+    files = [file for source in locations for file in _files(Path(source))]
     clock = None if times is None else _read_times(Path(times))
     names = _names(files)
     if clock is not None:
@@ -144,36 +144,36 @@ def _stream(
     files: Sequence[Path],
     names: Mapping[Path, str],
     clock: Mapping[str, float],
-    tell: Callable[[str], None],
+    notify: Callable[[str], None],
 ) -> Iterator[Timed]:
-    left_out, given = 0, 0
+    excluded, yielded = 0, 0
     first = ""
     for file in files:
         try:
-            for picture in _of_file(file, names[file], clock, tell):
-                given += 1
+            for picture in _of_file(file, names[file], clock, notify):
+                yielded += 1
                 yield picture
         except LocalizationError as error:
-            left_out += 1
+            excluded += 1
             first = first or str(error)
-            tell(f"{error}: left out")
-    if not given:
+            notify(f"{error}: left out")
+    if not yielded:
         raise LocalizationError(f"none of {len(files)} files can be read; the first: {first}")
-    if left_out:
-        tell(f"{left_out} of {len(files)} files were left out")
+    if excluded:
+        notify(f"{excluded} of {len(files)} files were left out")
 
 
 def _of_file(
-    file: Path, name: str, clock: Mapping[str, float], tell: Callable[[str], None]
+    file: Path, name: str, clock: Mapping[str, float], notify: Callable[[str], None]
 ) -> Iterator[Timed]:
     if file.suffix.lower() in VIDEO_FILES:
-        yield from _of_video(file, name, tell)
+        yield from _of_video(file, name, notify)
         return
     time = clock.get(name, clock.get(file.name, math.nan))
     yield (_time_in(file.stem) if math.isnan(time) else time), name, read_picture(file)
 
 
-def _of_video(file: Path, name: str, tell: Callable[[str], None]) -> Iterator[Timed]:
+def _of_video(file: Path, name: str, notify: Callable[[str], None]) -> Iterator[Timed]:
     import cv2
 
     video = cv2.VideoCapture(str(file))
@@ -197,7 +197,7 @@ def _of_video(file: Path, name: str, tell: Callable[[str], None]) -> Iterator[Ti
     if count == 0:
         raise LocalizationError(f"{file}: is no video that can be read")
     if 0 < count < announced:
-        tell(f"{file}: the video is cut short: {count} of {announced} pictures were read")
+        notify(f"{file}: the video is cut short: {count} of {announced} pictures were read")
 
 
 def _time_in(stem: str) -> float:

@@ -98,9 +98,9 @@ def follow(tilt: Tilt, omega: npt.ArrayLike, accel: npt.ArrayLike, dt: float, ga
     """
     accel = np.asarray(accel, float)
     force = np.sqrt(np.sum(accel * accel, axis=-1, keepdims=True))
-    known = np.isfinite(force) & (force > 1e-6)
-    weight = np.where(known, np.exp(-0.5 * ((force - gains.gravity) / gains.tolerance) ** 2), 0.0)
-    up_measured = np.where(known, accel / np.where(known, force, 1.0), tilt.up)
+    usable = np.isfinite(force) & (force > 1e-6)
+    weight = np.where(usable, np.exp(-0.5 * ((force - gains.gravity) / gains.tolerance) ** 2), 0.0)
+    up_measured = np.where(usable, accel / np.where(usable, force, 1.0), tilt.up)
     error = weight * (skew(up_measured) @ tilt.up[..., None])[..., 0]
     turn = np.asarray(omega, float) - tilt.bias + gains.proportional * error
     up = (quat_to_matrix(quat_from_rotvec(-dt * turn)) @ tilt.up[..., None])[..., 0]
@@ -207,20 +207,20 @@ def innovation(state: YawState, yaw: Number, variance: Number) -> YawInnovation:
     return YawInnovation(residual, S, residual**2 / S)
 
 
-def correct(state: YawState, found: YawInnovation, variance: Number) -> YawState:
+def correct(state: YawState, correction: YawInnovation, variance: Number) -> YawState:
     """The state after a measured yaw, in Joseph's form.
 
     ψ <- ψ + K (ψ_vis - ψ),  K = P / (P + R), and likewise the bias                     (paper, eq. 15)
     """
-    K, L = state.variance / found.S, state.cross / found.S
+    K, L = state.variance / correction.S, state.cross / correction.S
     # P <- [1-K 0; -L 1] P [1-K 0; -L 1]' + R [K L]' [K L]
-    kept = 1.0 - K
+    retained = 1.0 - K
     cross = state.cross - L * state.variance
     return YawState(
-        _wrapped(state.yaw + K * found.residual),
-        state.bias + L * found.residual,
-        kept * kept * state.variance + variance * K * K,
-        kept * cross + variance * K * L,
+        _wrapped(state.yaw + K * correction.residual),
+        state.bias + L * correction.residual,
+        retained * retained * state.variance + variance * K * K,
+        retained * cross + variance * K * L,
         state.bias_variance - L * (state.cross + cross) + variance * L * L,
     )
 

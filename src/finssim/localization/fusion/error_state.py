@@ -351,12 +351,12 @@ class ConstantVelocity:
             self._turned_to(self._positioned(track, sample.time), sample.time),
             np.array(sample.position),
         )
-        track, seen = self._placed(track, "vision", sample.time, z, _H_VISION, R[:2, :2], [0, 1], lambda: z)
+        track, placed = self._placed(track, "vision", sample.time, z, _H_VISION, R[:2, :2], [0, 1], lambda: z)
         if sample.yaw is None:
-            return track, (seen,)
+            return track, (placed,)
         track, turned = self._turned(track, sample.time, sample.yaw, float(R[2, 2]))
         track = changed(track, compass=track.compass and not turned.used)
-        return track, (seen, turned)
+        return track, (placed, turned)
 
     def velocity(self, track: Track, sample: VelocitySample) -> tuple[Track, tuple[Outcome, ...]]:
         """Take in a velocity over the floor, turned into the pool frame by the heading so far."""
@@ -367,10 +367,10 @@ class ConstantVelocity:
         z = R_pb @ np.array(sample.velocity)
         turned = track.yaw.variance * float(z @ z) + self.settings.aids.velocity_bias**2
         R = (self.settings.aids.velocity_std**2 + turned) * np.eye(3)
-        found = position_filter.innovation(track.position, _H_VELOCITY, z, R)
-        position = position_filter.correct(track.position, found, _H_VELOCITY, R)
+        innovation = position_filter.innovation(track.position, _H_VELOCITY, z, R)
+        position = position_filter.correct(track.position, innovation, _H_VELOCITY, R)
         track = changed(track, position=position, velocity_time=sample.time)
-        return track, (Outcome("velocity", "accepted", float(found.mahalanobis), 3),)
+        return track, (Outcome("velocity", "accepted", float(innovation.mahalanobis), 3),)
 
     def heading(self, track: Track, sample: HeadingSample) -> tuple[Track, tuple[Outcome, ...]]:
         """Take in a heading: as a yaw of the camera, with the compass's offset in its variance."""
@@ -396,14 +396,14 @@ class ConstantVelocity:
             x[unknown] = math.nan
             P[unknown, :] = math.nan
             P[:, unknown] = math.nan
-        seen = track.yaw_seen is not None
+        has_yaw = track.yaw_seen is not None
         silent = track.rate is None or track.imu_time is None or time - track.imu_time > GYRO_HOLD
         return Estimate(
             time=time,
             x=x,
             P=P,
-            yaw=yaw.yaw if seen else math.nan,
-            yaw_variance=yaw.variance + track.gates[1].doubt if seen else math.nan,
+            yaw=yaw.yaw if has_yaw else math.nan,
+            yaw_variance=yaw.variance + track.gates[1].doubt if has_yaw else math.nan,
             yaw_rate=math.nan if silent else (track.rate or 0.0) - yaw.bias,
             roll=track.roll if track.imu_time is not None else math.nan,
             pitch=track.pitch if track.imu_time is not None else math.nan,
@@ -426,12 +426,12 @@ class ConstantVelocity:
     ) -> tuple[Track, Outcome]:
         """The track after a fix or a depth that its gate has judged; `restart` is where the axes begin anew."""
         s, k = self.settings, KINEMATIC_GATES.index(stream)
-        found = position_filter.innovation(track.position, H, z, R)
-        distance = float(found.mahalanobis)
+        innovation = position_filter.innovation(track.position, H, z, R)
+        distance = float(innovation.mahalanobis)
         verdict, memory = judge(s.gate, track.gates[k], time, z, R, distance, s.speed_std)
         position = track.position
         if verdict == "accepted":
-            position = position_filter.correct(position, found, H, R)
+            position = position_filter.correct(position, innovation, H, R)
         elif verdict != "gate":
             position = position_filter.restarted(position, axes, restart(), R, s.speed_std)
         gates = (*track.gates[:k], memory, *track.gates[k + 1 :])
@@ -439,25 +439,25 @@ class ConstantVelocity:
         track = changed(track, position=position, gates=gates, **believed)
         return track, Outcome(stream, verdict, distance, len(z))
 
-    def _turned(self, track: Track, time: float, seen: float, variance: float) -> tuple[Track, Outcome]:
+    def _turned(self, track: Track, time: float, measured: float, variance: float) -> tuple[Track, Outcome]:
         s = self.settings
-        found = attitude.innovation(track.yaw, seen, variance)
+        innovation = attitude.innovation(track.yaw, measured, variance)
         # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
         carried = track.imu_time is not None and time - track.imu_time <= GYRO_HOLD
-        distance = float(found.mahalanobis)
+        distance = float(innovation.mahalanobis)
         verdict, memory = judge_carried(
-            s.gate, track.gates[1], time, float(found.residual), variance, distance, 0.05, carried
+            s.gate, track.gates[1], time, float(innovation.residual), variance, distance, 0.05, carried
         )
         if verdict == "accepted":
-            yaw = attitude.correct(track.yaw, found, variance)
+            yaw = attitude.correct(track.yaw, innovation, variance)
         elif verdict == "gate":
             yaw = track.yaw
         else:
-            yaw = attitude.restarted(track.yaw, seen, variance, s.bias_std)
+            yaw = attitude.restarted(track.yaw, measured, variance, s.bias_std)
         then = track.yaw_seen if verdict == "gate" else time
         gates = (track.gates[0], memory, track.gates[2])
         track = changed(track, yaw=yaw, yaw_seen=then, gates=gates)
-        return track, Outcome("yaw", verdict, found.mahalanobis, 1)
+        return track, Outcome("yaw", verdict, innovation.mahalanobis, 1)
 
     def tilt(self, track: Track) -> tuple[float, float]:
         """Roll and pitch of a state [rad]."""
@@ -484,11 +484,11 @@ class ConstantVelocity:
         if math.isnan(then) or time <= then:
             return changed(track, position_time=_later(then, time))
         position = track.position
-        seen = max(-math.inf if t is None else t for t in (track.vision_time, track.velocity_time))
+        aided = max(-math.inf if t is None else t for t in (track.vision_time, track.velocity_time))
         dived = -math.inf if track.depth_time is None else track.depth_time
-        for until in _steps(then, time, (seen + s.coast, seen + s.hold, dived + s.coast, dived + s.hold)):
+        for until in _steps(then, time, (aided + s.coast, aided + s.hold, dived + s.coast, dived + s.hold)):
             middle = 0.5 * (then + until)
-            blind, deaf = middle - seen, middle - dived
+            blind, deaf = middle - aided, middle - dived
             still = ([0, 1] if blind > s.hold else []) + ([2] if deaf > s.hold else [])
             if still:
                 position = position_filter.frozen(position, still)
@@ -539,12 +539,13 @@ def _diagonal(std: tuple[float, float]) -> Array:
 def motion_of(settings: Settings, xy_slows: bool, z_slows: bool) -> Motion:
     """The motion model where the axes without news slow down to rest, give or take `speed_std`."""
     slows = (xy_slows, xy_slows, z_slows)
-    rate, own = settings.decay, settings.motion
+    rate, motion = settings.decay, settings.motion
     density = [
-        2.0 * rate * settings.speed_std**2 if slow else q for slow, q in zip(slows, own.density, strict=True)
+        2.0 * rate * settings.speed_std**2 if slow else q
+        for slow, q in zip(slows, motion.density, strict=True)
     ]
-    decay = [rate if slow else given for slow, given in zip(slows, own.decay, strict=True)]
-    return replace(own, density=(density[0], density[1], density[2]), decay=(decay[0], decay[1], decay[2]))
+    decay = [rate if slow else nominal for slow, nominal in zip(slows, motion.decay, strict=True)]
+    return replace(motion, density=(density[0], density[1], density[2]), decay=(decay[0], decay[1], decay[2]))
 
 
 def _steps(start: float, end: float, cuts: Iterable[float]) -> list[float]:
@@ -755,15 +756,15 @@ def velocity_model(state: InertialState, omega: Array, lever: Array) -> tuple[Ar
         Velocity, body frame [m/s], (..., 3), and its Jacobian, (..., 3, 20).
     """
     back = np.swapaxes(quat_to_matrix(state.q), -1, -2)
-    own = (back @ state.v[..., None])[..., 0] + cross(omega - state.gyro_bias, lever)
+    predicted = (back @ state.v[..., None])[..., 0] + cross(omega - state.gyro_bias, lever)
     gain = 1.0 + state.extra[..., 1]
-    H = np.zeros((*own.shape[:-1], 3, state.covariance.shape[-1]))
+    H = np.zeros((*predicted.shape[:-1], 3, state.covariance.shape[-1]))
     H[..., V] = gain * back
     H[..., A] = gain * (back @ skew(state.v))
     H[..., G] = gain * skew(lever)
-    H[..., S] = own
+    H[..., S] = predicted
     H[..., D] = _I[15][:3, :3]
-    return gain * own + state.extra[..., 2:], H
+    return gain * predicted + state.extra[..., 2:], H
 
 
 def error_innovation(state: InertialState, residual: Array, H: Array, R: Array) -> tuple[Array, Array]:
@@ -796,8 +797,8 @@ def correct(state: InertialState, residual: Array, H: Array, R: Array, gain: Arr
         gain: As `error_innovation` gives it.
     """
     d = (gain @ residual[..., None])[..., 0]
-    kept = _I[gain.shape[-2]] - gain @ H
-    covariance = kept @ state.covariance @ np.swapaxes(kept, -1, -2)
+    retained = _I[gain.shape[-2]] - gain @ H
+    covariance = retained @ state.covariance @ np.swapaxes(retained, -1, -2)
     covariance = covariance + gain @ R @ np.swapaxes(gain, -1, -2)
     q = quat_multiply(quat_from_rotvec(d[..., A]), state.q)
     return InertialState(
@@ -848,10 +849,10 @@ def stopped(state: InertialState, axes: list[int]) -> InertialState:
 def parted(state: InertialState, axes: list[int], walk: float) -> InertialState:
     """Some positions told apart from all other errors, and their variances grown by `walk` [m²]."""
     covariance = state.covariance.copy()
-    own = covariance[np.ix_(axes, axes)] + walk * np.eye(len(axes))
+    of_axes = covariance[np.ix_(axes, axes)] + walk * np.eye(len(axes))
     covariance[axes, :] = 0.0
     covariance[:, axes] = 0.0
-    covariance[np.ix_(axes, axes)] = own
+    covariance[np.ix_(axes, axes)] = of_axes
     return changed(state, covariance=covariance)
 
 
@@ -1001,9 +1002,11 @@ class ErrorState:
         def restart(state: InertialState) -> InertialState:
             return restarted(state, [0, 1], state.p[:2] + off, R_xy, speed)
 
-        track, seen = self._measured(track, "vision", sample.time, off, H[:2], R_xy, fix, speed, restart)
+        track, fix_outcome = self._measured(
+            track, "vision", sample.time, off, H[:2], R_xy, fix, speed, restart
+        )
         if sample.yaw is None or track.inertial is None:
-            return track, (seen,)
+            return track, (fix_outcome,)
         yaw, H = yaw_model(track.inertial)
         residual, R_yaw = wrap_angle(np.array([sample.yaw]) - yaw), R[2:, 2:]
         # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
@@ -1015,7 +1018,7 @@ class ErrorState:
         track, turn_outcome = self._measured(
             track, "yaw", sample.time, residual, H, R_yaw, residual, 0.05, turn, carried=carried
         )
-        return track, (seen, turn_outcome)
+        return track, (fix_outcome, turn_outcome)
 
     def velocity(
         self, track: InertialTrack, sample: VelocitySample
@@ -1027,8 +1030,10 @@ class ErrorState:
             return changed(track, before=before), outcomes
         track, state = self._at(track, sample.time)
         expected, H = velocity_model(state, np.array(track.omega), self._log)
-        seen, R = np.array(sample.velocity), aids.velocity_std**2 * np.eye(3)
-        track, outcome = self._measured(track, "velocity", sample.time, seen - expected, H, R, seen, 1.0)
+        measured, R = np.array(sample.velocity), aids.velocity_std**2 * np.eye(3)
+        track, outcome = self._measured(
+            track, "velocity", sample.time, measured - expected, H, R, measured, 1.0
+        )
         return track, (outcome,)
 
     def heading(
@@ -1067,8 +1072,10 @@ class ErrorState:
         if carried is None:
             verdict, memory = judge(gate, memory, time, value, R, distance, drift)
         else:
-            apart, variance = float(residual[0]), float(R[0, 0])
-            verdict, memory = judge_carried(gate, memory, time, apart, variance, distance, drift, carried)
+            difference, variance = float(residual[0]), float(R[0, 0])
+            verdict, memory = judge_carried(
+                gate, memory, time, difference, variance, distance, drift, carried
+            )
         if verdict == "accepted" or (verdict == "reacquired" and restart is None):
             state = correct(state, residual, H, R, gain)
         elif verdict == "reacquired" and restart is not None:
@@ -1134,15 +1141,15 @@ class ErrorState:
         before, s = track.before, self.settings
         if track.force is None or None in (before.vision_time, before.yaw_seen, before.depth_time):
             return track
-        known = self._before.estimate(before, time)
-        level = quat_from_euler(known.roll, known.pitch, known.yaw)
+        prior = self._before.estimate(before, time)
+        level = quat_from_euler(prior.roll, prior.pitch, prior.yaw)
         from_level = axes_of_up(self.site.up)
         R = from_level @ quat_to_matrix(level)
         q = quat_multiply(matrix_to_quat(from_level), level)
         extra = 0 if s.aids is None else AIDED
         covariance = np.zeros((15 + extra, 15 + extra))
-        covariance[:6, :6] = known.P
-        covariance[6:9, 6:9] = np.diag([s.tilt_std**2, s.tilt_std**2, known.yaw_variance])
+        covariance[:6, :6] = prior.P
+        covariance[6:9, 6:9] = np.diag([s.tilt_std**2, s.tilt_std**2, prior.yaw_variance])
         covariance[9:15, 9:15] = np.diag([s.bias_std**2] * 3 + [s.accel_bias_std**2] * 3)
         if s.aids is not None:
             a = s.aids
@@ -1153,8 +1160,8 @@ class ErrorState:
                 covariance[8, 8] += a.heading_bias**2
                 covariance[8, 15] = covariance[15, 8] = -(a.heading_bias**2)
         state = InertialState(
-            known.x[:3] - R @ self._body,
-            known.x[3:],
+            prior.x[:3] - R @ self._body,
+            prior.x[3:],
             q,
             np.zeros(3),
             np.zeros(3),
@@ -1209,8 +1216,8 @@ class ErrorState:
 
 def _aided(track: InertialTrack) -> float | None:
     """Time of the latest fix or Doppler velocity [s]; None before the first."""
-    told = [t for t in (track.vision_time, track.velocity_time) if t is not None]
-    return max(told) if told else None
+    times = [t for t in (track.vision_time, track.velocity_time) if t is not None]
+    return max(times) if times else None
 
 
 def _mean(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -114,7 +114,7 @@ class Timeline(Generic[S]):
         k = bisect.bisect_right(self._keys, key)
         self._keys.insert(k, key)
         self._samples.insert(k, sample)
-        gone = self._outcomes[k:]
+        replaced = self._outcomes[k:]
         state = self._states[k - 1] if k else self._before
         states, outcomes = [], []
         for item in self._samples[k:]:
@@ -123,7 +123,7 @@ class Timeline(Generic[S]):
             outcomes.append(outcome)
         self._states[k:], self._outcomes[k:] = states, outcomes
         self._forget()
-        return gone, outcomes
+        return replaced, outcomes
 
     def _forget(self) -> None:
         """Drop what is older than the horizon; the state after it stays."""
@@ -241,22 +241,22 @@ def health_of(
         math.nan if then is None else estimate.time - then
         for then in (estimate.vision_time, estimate.imu_time, estimate.depth_time)
     )
-    told = [t for t in (estimate.vision_time, estimate.velocity_time) if t is not None]
+    times = [t for t in (estimate.vision_time, estimate.velocity_time) if t is not None]
     mode = mode_of(
-        estimate.time - max(told) if told and estimate.vision_time is not None else vision, settings
+        estimate.time - max(times) if times and estimate.vision_time is not None else vision, settings
     )
     variances = estimate.P.diagonal().tolist()
     vx, vy, vz = estimate.x[3:].tolist()
     imu_fresh, depth_fresh = imu <= settings.imu_fresh + 1e-9, depth <= settings.depth_fresh + 1e-9
-    known = all(map(math.isfinite, (*variances[:3], estimate.yaw_variance)))
-    sure = known and max(variances[:3]) <= settings.ready_position
+    finite = all(map(math.isfinite, (*variances[:3], estimate.yaw_variance)))
+    sure = finite and max(variances[:3]) <= settings.ready_position
     return Health(
         ready=sure
         and estimate.yaw_variance <= settings.ready_yaw
         and imu_fresh
         and depth_fresh
         and mode in ("fresh", "coast"),
-        initialized=known,
+        initialized=finite,
         vision_mode=mode,
         vision_fresh=mode == "fresh",
         imu_fresh=imu_fresh,
@@ -339,9 +339,9 @@ class Estimator:
         reason = refusal(sample) or self._clock(sample) or self._timeline.refusal(sample)
         if reason is not None:
             return self.refuse(sample.stream, reason)
-        gone, now = self._timeline.insert(sample, self._apply)
+        replaced, now = self._timeline.insert(sample, self._apply)
         # An outcome that is the same object as before stands: those of the IMU's samples, which are most.
-        other = [pair for pair in zip(gone, now[1:], strict=True) if pair[0] is not pair[1]]
+        other = [pair for pair in zip(replaced, now[1:], strict=True) if pair[0] is not pair[1]]
         self._tally([old for old, _ in other], -1)
         self._tally([now[0], *(new for _, new in other)], +1)
         self._arrived = max(self._arrived, sample.time if sample.arrival is None else sample.arrival)
@@ -366,8 +366,8 @@ class Estimator:
         if time is None:
             time = self._timeline.head if math.isfinite(self._timeline.head) else 0.0
         track = self._timeline.state_at(time) if time < self._timeline.head else self._timeline.state
-        found: Estimate = self._model.estimate(track, time)
-        return found
+        predicted: Estimate = self._model.estimate(track, time)
+        return predicted
 
     def health(self, estimate: Estimate) -> Health:
         """The condition that goes with an estimate."""
@@ -466,11 +466,13 @@ class Fixes:
         constraints = self._constraints(time, estimator)
         if constraints is None and self._locate.needs_height:
             return "no depth or tilt"
-        found = self._locate(frame.detections, constraints)
-        if not found.ok:
-            return counted(found.reason)
-        R = np.asarray(found.covariance, float)
-        return VisionSample(time, (found.x, found.y), found.yaw, rows_of(0.5 * (R + R.T)), frame.time)
+        measurement = self._locate(frame.detections, constraints)
+        if not measurement.ok:
+            return counted(measurement.reason)
+        R = np.asarray(measurement.covariance, float)
+        return VisionSample(
+            time, (measurement.x, measurement.y), measurement.yaw, rows_of(0.5 * (R + R.T)), frame.time
+        )
 
     def _constraints(self, time: float, estimator: Estimator) -> Constraints | None:
         near, site = estimator.at(time), estimator.site

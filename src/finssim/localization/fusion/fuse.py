@@ -121,12 +121,12 @@ def error_figures(rows: Sequence[Sequence[Any]], truth: StreamTable) -> dict[str
     names = [name for name in ("x", "y", "z", "yaw") if truth.has(name)]
     if not names:
         return {}
-    surveyed = series("truth", truth.t, truth.columns(*names), GAP, where=truth.name)
+    surveyed = series("truth", truth.t, truth.columns(*names), GAP, label=truth.name)
     if "yaw" in names:
         surveyed.values[:, -1] = np.unwrap(surveyed.values[:, -1])
-    known, covered = surveyed.between(ours[:, 0])
+    reference, covered = surveyed.between(ours[:, 0])
     errors = {}
-    for name, true in zip(names, known.T, strict=True):
+    for name, true in zip(names, reference.T, strict=True):
         e = ours[:, 1 + ("x", "y", "z", "yaw").index(name)] - true
         errors[name] = np.where(covered, wrap_angle(e) if name == "yaw" else e, np.nan)
     figures = {}
@@ -138,29 +138,29 @@ def error_figures(rows: Sequence[Sequence[Any]], truth: StreamTable) -> dict[str
 
 
 def _figures(errors: dict[str, Array], chosen: npt.NDArray[np.bool_]) -> dict[str, float]:
-    found = {}
+    figures = {}
     for name, e in errors.items():
-        known = e[chosen & np.isfinite(e)]
-        if len(known):
-            found[f"rms_{name}"] = float(np.sqrt(np.mean(known**2)))
+        finite = e[chosen & np.isfinite(e)]
+        if len(finite):
+            figures[f"rms_{name}"] = float(np.sqrt(np.mean(finite**2)))
     if "x" in errors and "y" in errors:
         far = np.hypot(errors["x"], errors["y"])[chosen]
         far = far[np.isfinite(far)]
         if len(far):
-            found["p95_horizontal"] = float(np.percentile(far, 95))
-    return found
+            figures["p95_horizontal"] = float(np.percentile(far, 95))
+    return figures
 
 
 def summary_lines(summary: dict[str, Any]) -> list[str]:
     """The summary for a person."""
     shares = ", ".join(f"{mode} {share:.1%}" for mode, share in summary["states"].items() if share)
     lines = [f"{summary['rows']} rows: {shares}; ready {summary['ready']:.1%}"]
-    for stream, taken in summary["accepted"].items():
+    for stream, accepted in summary["accepted"].items():
         refused = summary["refused"].get(stream, {})
-        words = ", ".join(f"{word} {n}" for word, n in sorted(refused.items())) or "none"
+        text = ", ".join(f"{word} {n}" for word, n in sorted(refused.items())) or "none"
         nis = summary["nis_per_dimension"].get(stream)
         lines.append(
-            f"{stream:7s} taken in {taken}, refused: {words}"
+            f"{stream:7s} taken in {accepted}, refused: {text}"
             + ("" if nis is None else f"; NIS per dimension {nis:.2f} (1 expected)")
         )
     if summary["refused"].get("clock"):
@@ -169,12 +169,12 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     ages = ", ".join(f"{s} {_age(health[f'age_{s}'])}" for s in ("vision", "depth", "imu"))
     lines.append(f"ages at the end: {ages}")
     for state, figures in summary.get("errors", {}).items():
-        words = ", ".join(
+        text = ", ".join(
             f"{name} {math.degrees(v):.2f}°" if "yaw" in name else f"{name} {100 * v:.2f} cm"
             for name, v in figures.items()
             if name != "samples"
         )
-        lines.append(f"against the truth, {state} ({figures['samples']} rows): {words}")
+        lines.append(f"against the truth, {state} ({figures['samples']} rows): {text}")
     return lines
 
 
@@ -242,19 +242,19 @@ def run(
     site, body = load_pool(pool), load_vehicle(str(vehicle))
     read = load_log(log, body, latency=site.latency, imu_axes=imu_axes)
     pixel_std = site.pixel_std if pixel_std is None else pixel_std
-    found = fuse(read, site, body, rate=rate, mode=mode, profile=profile, method=method, pixel_std=pixel_std)
-    write_rows(found.rows, out)
+    fused = fuse(read, site, body, rate=rate, mode=mode, profile=profile, method=method, pixel_std=pixel_std)
+    write_rows(fused.rows, out)
     if as_json:
-        print(json.dumps({"out": str(out), "notes": read.notes, **found.summary}, allow_nan=False))
+        print(json.dumps({"out": str(out), "notes": read.notes, **fused.summary}, allow_nan=False))
     else:
         print(
             "\n".join(
-                [*(f"note: {note}" for note in read.notes), *summary_lines(found.summary), f"wrote {out}"]
+                [*(f"note: {note}" for note in read.notes), *summary_lines(fused.summary), f"wrote {out}"]
             )
         )
-    if found.interrupted:
+    if fused.interrupted:
         raise KeyboardInterrupt
-    return found
+    return fused
 
 
 def fuse(
@@ -285,18 +285,18 @@ def fuse(
     if log.frames:  # default tags are for the virtual world
         fixes = Fixes(TagLocator(pool, vehicle.file_tags, method=method, pixel_std=pixel_std))
     deliveries = _deliveries(log)
-    found = Run()
+    result = Run()
     try:
         for t, arrived in _by_row(deliveries, rate):
             for item in arrived:
                 _take(item, estimator, fixes)
             estimate = estimator.estimate(t)
-            found.rows.append(row_of(estimate, estimator.health(estimate)))
+            result.rows.append(row_of(estimate, estimator.health(estimate)))
     except KeyboardInterrupt:
-        found.interrupted = True
-    final = estimator.health(estimator.estimate(found.rows[-1][0] if found.rows else None))
-    found.summary = summary_of(found.rows, final, estimator.nis, log.truth)
-    return found
+        result.interrupted = True
+    final = estimator.health(estimator.estimate(result.rows[-1][0] if result.rows else None))
+    result.summary = summary_of(result.rows, final, estimator.nis, log.truth)
+    return result
 
 
 def _take(item: Delivery, estimator: Estimator, fixes: Fixes | None) -> None:
@@ -319,15 +319,17 @@ def _deliveries(log: Log) -> list[tuple[float, Delivery]]:
     Raises:
         LocalizationError: There is none with a time, or they span too long.
     """
-    found: list[tuple[float, Delivery]] = [
+    deliveries: list[tuple[float, Delivery]] = [
         (s.arrival if s.arrival is not None else s.time, s) for s in log.samples
     ]
-    found += [(frame.time, frame) for frame in log.frames]
-    found += [(item.time, item) for item in log.missed]
-    times = [t for t, _ in found if math.isfinite(t)]
+    deliveries += [(frame.time, frame) for frame in log.frames]
+    deliveries += [(item.time, item) for item in log.missed]
+    times = [t for t, _ in deliveries if math.isfinite(t)]
     if not times:
         raise LocalizationError("the log holds no sample with a time: nothing to fuse")
-    return sorted(((t if math.isfinite(t) else min(times), s) for t, s in found), key=lambda pair: pair[0])
+    return sorted(
+        ((t if math.isfinite(t) else min(times), s) for t, s in deliveries), key=lambda pair: pair[0]
+    )
 
 
 def _by_row(

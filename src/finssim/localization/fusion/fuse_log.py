@@ -129,7 +129,7 @@ class Series:
         return np.asarray((1.0 - share) * self.values[k - 1] + share * self.values[k])
 
 
-def series(what: str, t: Array, values: Array, longest_gap: float, *, where: str) -> Series:
+def series(quantity: str, t: Array, values: Array, longest_gap: float, *, label: str) -> Series:
     """Sort samples by time and leave out those without any number; of equal times the last is taken.
 
     Raises:
@@ -140,9 +140,9 @@ def series(what: str, t: Array, values: Array, longest_gap: float, *, where: str
     good = np.isfinite(t) & np.isfinite(values).any(axis=1)
     t, values = t[good], values[good]
     if not len(t):
-        raise LocalizationError(f"{where}: no row holds a time and a {what}: expected numbers")
+        raise LocalizationError(f"{label}: no row holds a time and a {quantity}: expected numbers")
     last = np.append(t[1:] > t[:-1], True)
-    return Series(what, t[last], values[last], longest_gap)
+    return Series(quantity, t[last], values[last], longest_gap)
 
 
 def read_stream_table(path: str | Path, *, timed: bool = True) -> StreamTable:
@@ -166,15 +166,15 @@ def read_stream_table(path: str | Path, *, timed: bool = True) -> StreamTable:
             f"'{','.join(names)[:60]}'"
         )
     rows = text.rows
-    whole = [row for row in rows if len(row) == len(names)]
-    table = StreamTable(str(path), np.full(len(whole), np.nan), {}, {})
-    if len(whole) < len(rows):
+    complete = [row for row in rows if len(row) == len(names)]
+    table = StreamTable(str(path), np.full(len(complete), np.nan), {}, {})
+    if len(complete) < len(rows):
         table.notes.append(
-            f"{Path(path).name}: {len(rows) - len(whole)} rows do not have {len(names)} cells and were left out"
+            f"{Path(path).name}: {len(rows) - len(complete)} rows do not have {len(names)} cells and were left out"
         )
-    if not whole:
+    if not complete:
         raise LocalizationError(f"{path}: holds no rows: give a table with samples")
-    for name, cells in zip(names, zip(*whole, strict=True), strict=True):
+    for name, cells in zip(names, zip(*complete, strict=True), strict=True):
         values = [_number(cell, text) for cell in cells]
         no_numbers = all(math.isnan(v) for v in values) and any(c.lower() not in EMPTY for c in cells)
         if no_numbers or name in WORDS:
@@ -251,8 +251,8 @@ def load_log(path: str | Path, vehicle: Vehicle, *, latency: float = 0.0, imu_ax
             raise LocalizationError(f"{path}: holds no imu.csv, depth.csv, vision.csv or detections.csv")
         log.truth = tables.pop("truth", None)
     else:
-        whole = read_stream_table(path)
-        tables = {name: whole for name in ("imu", "depth", "vision") if _present(name, whole)}
+        full_table = read_stream_table(path)
+        tables = {name: full_table for name in ("imu", "depth", "vision") if _present(name, full_table)}
         if not tables:
             raise LocalizationError(
                 f"{path}: no column p, q, r, depth, or x and y: see docs/trials.md for the names"
@@ -314,20 +314,20 @@ def imu_columns(table: StreamTable, sensor: Imu | None, axes: str | None = None)
     Raises:
         LocalizationError: Columns are in the sensor's axes, whose mount is not known; or no attitude can be so.
     """
-    own = table.has(*SENSOR_RATES) and not table.has(*RATES)
-    turned = axes == "sensor" or (own and axes is None)
+    in_sensor_axes = table.has(*SENSOR_RATES) and not table.has(*RATES)
+    turned = axes == "sensor" or (in_sensor_axes and axes is None)
     if turned and sensor is None:
         raise LocalizationError(
             f"{table.name}: rates in the IMU's axes, but the vehicle file has no sensors.imu.orientation: add it"
         )
     mount = np.array(sensor.orientation if turned and sensor is not None else (0.0, 0.0, 0.0, 1.0), float)
-    found = [np.full((len(table.t), 3), np.nan)] * 2
+    vectors = [np.full((len(table.t), 3), np.nan)] * 2
     forces = SENSOR_FORCE if table.has(*SENSOR_FORCE) else FORCE
-    for i, names in enumerate((SENSOR_RATES if own else RATES, forces)):
+    for i, names in enumerate((SENSOR_RATES if in_sensor_axes else RATES, forces)):
         if table.has(*names):
-            found[i] = in_body_axes(table.columns(*names), mount)
+            vectors[i] = in_body_axes(table.columns(*names), mount)
     up = table.up()
-    return ImuColumns(found[0], found[1], None if up is None else in_body_axes(up, mount), mount)
+    return ImuColumns(vectors[0], vectors[1], None if up is None else in_body_axes(up, mount), mount)
 
 
 def _imu(
@@ -341,11 +341,11 @@ def _imu(
         force = np.full(omega.shape, np.nan)
     tilt = np.full((len(omega), 2), np.nan) if up is None else np.stack(roll_pitch(up), axis=-1)
     rows = np.flatnonzero(~np.isnan(omega).any(axis=1))
-    apart = float(np.median(np.diff(table.t[rows]))) if len(rows) > 2 else 0.0
-    if apart > LONGEST_GAP:
+    interval = float(np.median(np.diff(table.t[rows]))) if len(rows) > 2 else 0.0
+    if interval > LONGEST_GAP:
         raise LocalizationError(
-            f"{table.name}: rates of turn come every {apart:.3g} s, expected at most {LONGEST_GAP:g} s: are its times "
-            "in seconds?"
+            f"{table.name}: rates of turn come every {interval:.3g} s, expected at most {LONGEST_GAP:g} s: are its "
+            "times in seconds?"
         )
     if len(rows) > 1:  # an attitude that was logged in rows of its own is carried on to the next rate
         tilt = _carried(table.t, tilt)
@@ -364,8 +364,8 @@ def _imu(
 
 def _carried(t: Array, values: Array) -> Array:
     """Each row's values or, for at most 0.1 s, those of the row before."""
-    known = np.where(np.isfinite(values).all(axis=1), np.arange(len(t)), -1)
-    last = np.maximum.accumulate(known)
+    rows = np.where(np.isfinite(values).all(axis=1), np.arange(len(t)), -1)
+    last = np.maximum.accumulate(rows)
     fresh = (last >= 0) & (t - t[np.maximum(last, 0)] <= 0.1)
     return np.where(fresh[:, None], values[np.maximum(last, 0)], np.nan)
 

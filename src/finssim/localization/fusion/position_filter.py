@@ -69,10 +69,10 @@ def transition(dt: float, motion: Motion) -> Array:
         return _I6 + dt * _SHIFT
     rate = np.array(motion.decay)
     A = np.eye(6)
-    kept = np.exp(-rate * dt)
+    decay = np.exp(-rate * dt)
     reach = np.where(rate > 0.0, -np.expm1(-rate * dt) / np.where(rate > 0.0, rate, 1.0), dt)
     A[[0, 1, 2], [3, 4, 5]] = reach
-    A[[3, 4, 5], [3, 4, 5]] = kept
+    A[[3, 4, 5], [3, 4, 5]] = decay
     return A
 
 
@@ -84,10 +84,10 @@ def process_noise(dt: float, motion: Motion) -> Array:
     q, rate = np.array(motion.density), np.array(motion.decay)
     slow = rate * dt < 1e-4  # below it the closed form loses digits that the series keeps
     l = np.where(slow, 1.0, rate)
-    gone = -np.expm1(-l * dt)
+    decayed = -np.expm1(-l * dt)
     vv = np.where(slow, dt, (1.0 - np.exp(-2.0 * l * dt)) / (2.0 * l))
-    pv = np.where(slow, 0.5 * dt**2, gone**2 / (2.0 * l**2))
-    pp = np.where(slow, dt**3 / 3.0, (dt - gone / l - 0.5 * gone**2 / l) / l**2)
+    pv = np.where(slow, 0.5 * dt**2, decayed**2 / (2.0 * l**2))
+    pp = np.where(slow, dt**3 / 3.0, (dt - decayed / l - 0.5 * decayed**2 / l) / l**2)
     if not motion.integrated:
         pv, pp = np.zeros(3), np.zeros(3)
     Q = np.zeros((6, 6))
@@ -151,15 +151,15 @@ def _inverse(S: Array) -> Array:
     return np.asarray(np.array([[c, -b], [-b, a]]) / determinant)
 
 
-def correct(state: PositionState, found: Innovation, H: Array, R: Array) -> PositionState:
+def correct(state: PositionState, correction: Innovation, H: Array, R: Array) -> PositionState:
     """The state after a measurement, in Joseph's form, which keeps P symmetric and positive whatever is rounded.
 
     x <- x + K ρ,  P <- (I - K H) P (I - K H)' + K R K'
     """
-    K = found.gain
-    kept = _I6 - K @ H
-    P = kept @ state.P @ kept.swapaxes(-1, -2) + K @ R @ K.swapaxes(-1, -2)
-    x = state.x + (K @ found.residual[..., None])[..., 0]
+    K = correction.gain
+    retained = _I6 - K @ H
+    P = retained @ state.P @ retained.swapaxes(-1, -2) + K @ R @ K.swapaxes(-1, -2)
+    x = state.x + (K @ correction.residual[..., None])[..., 0]
     return PositionState(x, 0.5 * (P + P.swapaxes(-1, -2)))
 
 

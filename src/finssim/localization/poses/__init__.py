@@ -188,25 +188,25 @@ def correspondences(detections: Iterable[Detection], tags_b: Mapping[int, Array]
         detections: Tags of one picture.
         tags_b: Tag id -> corners in the body frame [m], (4, 3), as `tag_corners_b`.
     """
-    found = list(detections)
-    known = [detection for detection in found if detection.tag in tags_b]
+    all_detections = list(detections)
+    recognised = [detection for detection in all_detections if detection.tag in tags_b]
     rejected: dict[str, int] = {}
-    if len(known) < len(found):
-        rejected[UNKNOWN_TAG] = 4 * (len(found) - len(known))
-    square = [detection for detection in known if _clockwise(detection.corners)]
-    if len(square) < len(known):
-        rejected[NO_SQUARE] = 4 * (len(known) - len(square))
-        known = square
-    if len({detection.tag for detection in known}) < len(known):
-        best = {detection.tag: detection for detection in reversed(most_certain(known))}
-        rejected[TWICE] = 4 * (len(known) - len(best))
-        known = list(best.values())
-    if not known:
+    if len(recognised) < len(all_detections):
+        rejected[UNKNOWN_TAG] = 4 * (len(all_detections) - len(recognised))
+    square = [detection for detection in recognised if _clockwise(detection.corners)]
+    if len(square) < len(recognised):
+        rejected[NO_SQUARE] = 4 * (len(recognised) - len(square))
+        recognised = square
+    if len({detection.tag for detection in recognised}) < len(recognised):
+        best = {detection.tag: detection for detection in reversed(most_certain(recognised))}
+        rejected[TWICE] = 4 * (len(recognised) - len(best))
+        recognised = list(best.values())
+    if not recognised:
         return Correspondences(np.empty((0, 2)), np.empty((0, 3)), (), rejected)
     return Correspondences(
-        np.concatenate([detection.corners for detection in known]),
-        np.concatenate([tags_b[detection.tag] for detection in known]),
-        tuple(detection.tag for detection in known),
+        np.concatenate([detection.corners for detection in recognised]),
+        np.concatenate([tags_b[detection.tag] for detection in recognised]),
+        tuple(detection.tag for detection in recognised),
         rejected,
     )
 

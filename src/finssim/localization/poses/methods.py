@@ -122,8 +122,8 @@ def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | Non
     inverse = _damped_inverse(now.H, 0.0)
     if inverse is None:
         return None
-    where = (float(xi[0]), float(xi[1]), math.remainder(float(xi[2]), math.tau))
-    return RigidFit(where, inverse, now.weighted_J, A, now.missed, step_number, converged)
+    pose = (float(xi[0]), float(xi[1]), math.remainder(float(xi[2]), math.tau))
+    return RigidFit(pose, inverse, now.weighted_J, A, now.missed, step_number, converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,8 +278,8 @@ def corner_points(pool: Pool, R_pg: Array, pixels: Array, heights: Array, *, str
     beside = pixels + _STEPS
     with np.errstate(all="ignore"):
         if straight:
-            found = _points(*_air(pool, R_pg, beside), heights)
-            return _corner_points(*found, np.ones(len(pixels), bool))
+            air_points = _points(*_air(pool, R_pg, beside), heights)
+            return _corner_points(*air_points, np.ones(len(pixels), bool))
         rays = back_project(pool.camera, pool.interface, beside)
         origin, direction = rays.origin @ R_pg, rays.direction @ R_pg
         centre = float(pool.camera.position @ R_pg[:, 2])
@@ -295,8 +295,8 @@ def corner_points(pool: Pool, R_pg: Array, pixels: Array, heights: Array, *, str
 
 def _air(pool: Pool, R_pg: Array, pixels: Array) -> tuple[Array, Array, npt.NDArray[np.int8]]:
     """Straight rays: origin, direction in g, status."""
-    rays, seen = pool.camera.lens.rays(pixels)
-    status = np.where(seen, np.int8(Status.OK), np.int8(Status.NO_RAY)).astype(np.int8)
+    rays, valid = pool.camera.lens.rays(pixels)
+    status = np.where(valid, np.int8(Status.OK), np.int8(Status.NO_RAY)).astype(np.int8)
     return pool.camera.position @ R_pg, rays @ (pool.camera.R_pc.T @ R_pg), status
 
 
@@ -312,8 +312,8 @@ def _points(
     worst = status.max(axis=0)
     if met.all() and not worst.any():
         return points, slope, worst
-    why = np.where(np.abs(steep[0]) > _GRAZING, np.int8(Status.AWAY), np.int8(Status.PARALLEL))
-    return points, slope, np.where((worst == 0) & ~met, why, worst).astype(np.int8)
+    reason = np.where(np.abs(steep[0]) > _GRAZING, np.int8(Status.AWAY), np.int8(Status.PARALLEL))
+    return points, slope, np.where((worst == 0) & ~met, reason, worst).astype(np.int8)
 
 
 def _corner_points(
@@ -377,9 +377,9 @@ def planar_fit(
         return refused(method, "height and tilt are not known: give a depth", pairs.rejected, tags=pairs.tags)
     R_pg = _frame_of(constraints.up)
     level = pairs.points_b @ tilt_matrix(constraints.roll, constraints.pitch).T
-    seen = corner_points(pool, R_pg, pairs.pixels, constraints.z_b + level[:, 2], straight=straight)
+    corners = corner_points(pool, R_pg, pairs.pixels, constraints.z_b + level[:, 2], straight=straight)
     limit = max(WORST_WITHOUT_WATER if straight else WORST, 8.0 * pixel_std)
-    solved = _solve(seen, level, pixel_std, limit, len(pairs.tags))
+    solved = _solve(corners, level, pixel_std, limit, len(pairs.tags))
     rejected = {**pairs.rejected, **solved.rejected}
     fit = solved.fit
     if fit is None:
@@ -390,13 +390,13 @@ def planar_fit(
         "",
         R_pg @ np.array([fit.xi[0], fit.xi[1], constraints.z_b]),
         R_pg @ _about_up(fit.xi[2]) @ tilt_matrix(constraints.roll, constraints.pitch),
-        _covariance(fit, seen, level, solved.used, constraints, R_pg, pixel_std),
+        _covariance(fit, corners, level, solved.used, constraints, R_pg, pixel_std),
         fit.rms,
         _tags(pairs, solved.used),
         int(solved.used.sum()),
         rejected,
         fit.iterations,
-        _medium(seen.in_air[solved.used]) if not straight else "",
+        _medium(corners.in_air[solved.used]) if not straight else "",
     )
 
 
@@ -414,26 +414,28 @@ class _Solved:
     reason: str = ""
 
 
-def _solve(seen: CornerPoints, level: Array, pixel_std: float, limit: float, tags: int) -> _Solved:
+def _solve(corners: CornerPoints, level: Array, pixel_std: float, limit: float, tags: int) -> _Solved:
     """Fit the corners that have a point, once more without those that miss by far."""
-    used = seen.status == 0
-    rejected = {} if used.all() else _reasons(seen)
+    used = corners.status == 0
+    rejected = {} if used.all() else _reasons(corners)
     if used.sum() < FEWEST:
-        words = ", ".join(f"{n} {name}" for name, n in rejected.items())
+        text = ", ".join(f"{n} {name}" for name, n in rejected.items())
         return _Solved(
-            None, used, rejected, f"fewer than {FEWEST} corners have a ray to their height ({words})"
+            None, used, rejected, f"fewer than {FEWEST} corners have a ray to their height ({text})"
         )
-    fit = _fit(seen, level, used, pixel_std)
+    fit = _fit(corners, level, used, pixel_std)
     if fit is not None and fit.missed.max() > limit:
         far = fit.missed > limit
         few = 2 * int(far.sum()) < len(far) and len(far) - int(far.sum()) >= FEWEST
-        kept = _without(used, far) if few else _without_a_tag(seen, level, used, pixel_std, limit, tags)
-        if kept is None:
-            words = f"{int(far.sum())} of {len(far)} corners miss by more than {limit:.1f} px"
-            return _Solved(None, used, rejected, f"residual too large: {words}: {_SUSPECTS[tags > 1]}")
-        rejected["outlier" if few else "contradicting tag"] = int(used.sum() - kept.sum())
-        used = kept
-        fit = _fit(seen, level, used, pixel_std)
+        retained = (
+            _without(used, far) if few else _without_a_tag(corners, level, used, pixel_std, limit, tags)
+        )
+        if retained is None:
+            text = f"{int(far.sum())} of {len(far)} corners miss by more than {limit:.1f} px"
+            return _Solved(None, used, rejected, f"residual too large: {text}: {_SUSPECTS[tags > 1]}")
+        rejected["outlier" if few else "contradicting tag"] = int(used.sum() - retained.sum())
+        used = retained
+        fit = _fit(corners, level, used, pixel_std)
     if fit is None:
         return _Solved(None, used, rejected, "the corners lie too close together to tell the heading")
     if not fit.converged:
@@ -443,35 +445,35 @@ def _solve(seen: CornerPoints, level: Array, pixel_std: float, limit: float, tag
     return _Solved(fit, used, rejected)
 
 
-def _reasons(seen: CornerPoints) -> dict[str, int]:
-    return {name.lower().replace("_", " "): n for name, n in count_rejections(seen.status).items()}
+def _reasons(corners: CornerPoints) -> dict[str, int]:
+    return {name.lower().replace("_", " "): n for name, n in count_rejections(corners.status).items()}
 
 
 def _without(used: Flags, far: Flags) -> Flags:
-    kept = used.copy()
-    kept[np.flatnonzero(used)[far]] = False
-    return kept
+    retained = used.copy()
+    retained[np.flatnonzero(used)[far]] = False
+    return retained
 
 
 def _without_a_tag(
-    seen: CornerPoints, level: Array, used: Flags, pixel_std: float, limit: float, tags: int
+    corners: CornerPoints, level: Array, used: Flags, pixel_std: float, limit: float, tags: int
 ) -> Flags | None:
     """The corners without one tag, if they agree then, and do so for that tag only."""
     agreeing = []
     for i in range(tags if tags > 1 else 0):
-        kept = used.copy()
-        kept[4 * i : 4 * i + 4] = False
-        fit = _fit(seen, level, kept, pixel_std) if FEWEST <= kept.sum() < used.sum() else None
+        retained = used.copy()
+        retained[4 * i : 4 * i + 4] = False
+        fit = _fit(corners, level, retained, pixel_std) if FEWEST <= retained.sum() < used.sum() else None
         if fit is not None and fit.converged and fit.missed.max() <= limit:
-            agreeing.append(kept)
+            agreeing.append(retained)
     return agreeing[0] if len(agreeing) == 1 else None
 
 
-def _fit(seen: CornerPoints, level: Array, used: Flags, pixel_std: float) -> RigidFit | None:
-    A = _inverse(seen.per_pixel)
+def _fit(corners: CornerPoints, level: Array, used: Flags, pixel_std: float) -> RigidFit | None:
+    A = _inverse(corners.per_pixel)
     if not used.all():
-        return rigid_fit(seen.Q[used], level[used, :2], A[used], 2.5 * pixel_std)
-    return rigid_fit(seen.Q, level[:, :2], A, 2.5 * pixel_std)
+        return rigid_fit(corners.Q[used], level[used, :2], A[used], 2.5 * pixel_std)
+    return rigid_fit(corners.Q, level[:, :2], A, 2.5 * pixel_std)
 
 
 def _inverse(D: Array) -> Array:
@@ -484,7 +486,7 @@ def _inverse(D: Array) -> Array:
 
 def _covariance(
     fit: RigidFit,
-    seen: CornerPoints,
+    corners: CornerPoints,
     level: Array,
     used: Flags,
     constraints: Constraints,
@@ -495,7 +497,7 @@ def _covariance(
 
     With the miss e_i = Q_i - P_i, an error δ that all share moves the solution by -H^-1 sum_i J_i' w_i A_i de_i/dδ.
     """
-    slope, level = seen.per_height[used], level[used]
+    slope, level = corners.per_height[used], level[used]
     cp, sp = math.cos(constraints.pitch), math.sin(constraints.pitch)
     # Crossed with the axes of roll, R_y e1 = (cp, 0, -sp), and of pitch, e2: R_g p -> axis x R_g p, side by side.
     turned = (
@@ -512,7 +514,7 @@ def _covariance(
     shared[1:3] = (
         slope[:, None] * (turned[:, :, 2] + raised[1:3])[:, :, None] - turned[:, :, :2] @ turn.T
     ).transpose(1, 0, 2)
-    shared[3:] = seen.per_pixel[used].transpose(2, 0, 1)
+    shared[3:] = corners.per_pixel[used].transpose(2, 0, 1)
     moved = np.empty((4, 5))  # x, y, psi, z_b by height, roll, pitch, u, v
     moved[:3] = fit.response(shared)
     moved[3] = raised
@@ -678,8 +680,8 @@ def refine_pose(
     rotation: Array,
     huber: float,
     *,
-    known: Known | None = None,
-    most_steps: int = 50,
+    extra_rows: Known | None = None,
+    max_steps: int = 50,
 ) -> RefinedPose | None:
     """Levenberg and Marquardt's method on the reprojection error, with analytic Jacobians and Huber's rho.
 
@@ -692,29 +694,29 @@ def refine_pose(
         position: t_pb to start from, pool frame [m], (3,).
         rotation: R_pb to start from, (3, 3).
         huber: Distance [px] from which on Huber's rho grows linearly.
-        known: What else counts; then a shift of the whole picture is sought too.
-        most_steps: Give up after so many.
+        extra_rows: What else counts; then a shift of the whole picture is sought too.
+        max_steps: Give up after so many.
 
     Returns:
         The minimum, or None where the start cannot be seen.
     """
 
     def at(position: Array, rotation: Array, shift: Array) -> RefinedPose | None:
-        return _linearised(see, points_b, pixels, huber, known, position, rotation, shift)
+        return _linearised(see, points_b, pixels, huber, extra_rows, position, rotation, shift)
 
     now = at(position, rotation, np.zeros(2))
     if now is None:
         return None
-    share = _STILL_SHARE if known is None else 0.0
-    damping, growth, converged, steps = 1e-3 if known is None else 1e-6, 2.0, False, 0
-    while steps < most_steps and not converged and damping < 1e12:
+    share = _STILL_SHARE if extra_rows is None else 0.0
+    damping, growth, converged, steps = 1e-3 if extra_rows is None else 1e-6, 2.0, False, 0
+    while steps < max_steps and not converged and damping < 1e12:
         steps += 1
         D = damping * np.maximum(np.diagonal(now.H), 1e-12)
         step = np.linalg.solve(now.curvature + np.diag(D), -now.g)
         promised = float(-(step @ now.g) + step @ (D * step))
         converged = promised < max(_STILL, share * now.cost)
         turn = quat_to_matrix(quat_from_rotvec(step[3:6]))
-        shift = now.shift + step[6:] if known else now.shift
+        shift = now.shift + step[6:] if extra_rows else now.shift
         then = at(now.position + step[:3], turn @ now.rotation, shift)
         gain = -1.0 if then is None else (now.cost - then.cost) / max(promised, 1e-300)
         if then is not None and gain >= 0.0:
@@ -731,19 +733,19 @@ def _linearised(
     points_b: Array,
     pixels: Array,
     huber: float,
-    known: Known | None,
+    extra_rows: Known | None,
     position: Array,
     rotation: Array,
     shift: Array,
 ) -> RefinedPose | None:
     arms = points_b @ rotation.T
-    found, by_point, seen = see(arms + position)
-    if not seen.all():
+    projected, by_point, visible = see(arms + position)
+    if not visible.all():
         return None
-    miss = found + shift - pixels
+    miss = projected + shift - pixels
     missed = np.sqrt(np.sum(miss * miss, axis=1))
     parts = [by_point, -by_point @ skew(arms)]
-    if known is not None:
+    if extra_rows is not None:
         parts.append(np.broadcast_to(np.eye(2), (len(miss), 2, 2)))
     J = np.concatenate(parts, axis=-1)
     far = missed > huber
@@ -752,11 +754,11 @@ def _linearised(
     weighted = (weight[:, None, None] * J).reshape(-1, J.shape[-1])
     H, g = weighted.T @ J.reshape(-1, J.shape[-1]), weighted.T @ miss.ravel()
     curvature = H
-    if known is not None:
+    if extra_rows is not None:
         # From nearby Newton's curvature is quicker; from afar, where most of the points are, weights alone are safer.
         along = np.where(far, np.sqrt(weight) / np.maximum(missed, huber), 0.0)[:, None] * miss
         flat = np.einsum("ij,ijk->ik", along, J)
-        r, K = known(position, rotation, shift)
+        r, K = extra_rows(position, rotation, shift)
         cost, g, H = cost + float(r @ r), g + K.T @ r, H + K.T @ K
         curvature = H - flat.T @ flat
     return RefinedPose(position, rotation, shift, cost, missed, H, curvature, g)
@@ -774,8 +776,8 @@ def through_lens(lens: Lens, R: Array | None = None, position: Array | None = No
 
     def see(points: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
         points_c = (points - position) @ R
-        pixels, seen = lens.project(points_c)
-        return pixels, lens.project_jacobian(points_c) @ R.T, seen
+        pixels, visible = lens.project(points_c)
+        return pixels, lens.project_jacobian(points_c) @ R.T, visible
 
     return see
 
@@ -799,10 +801,10 @@ def through_water(pool: Pool) -> See:
 # Which of several poses that explain a picture is the vehicle's.
 
 
-def _distinct(found: Iterable[RefinedPose | None]) -> list[RefinedPose]:
+def _distinct(poses: Iterable[RefinedPose | None]) -> list[RefinedPose]:
     """The minima among what was found, each once, the best first."""
     minima: list[RefinedPose] = []
-    for pose in sorted((pose for pose in found if pose is not None), key=lambda pose: pose.cost):
+    for pose in sorted((pose for pose in poses if pose is not None), key=lambda pose: pose.cost):
         if all(_apart(pose, other) for other in minima):
             minima.append(pose)
     return minima
@@ -820,7 +822,7 @@ def minima_from(
         huber: Distance [px] from which on Huber's rho grows linearly.
     """
     points, pixels = pairs.points_b, pairs.pixels
-    begun = _distinct(refine_pose(see, points, pixels, t, R, huber, most_steps=5) for t, R in starts)
+    begun = _distinct(refine_pose(see, points, pixels, t, R, huber, max_steps=5) for t, R in starts)
     return _distinct(refine_pose(see, points, pixels, a.position, a.rotation, huber) for a in begun[:4])
 
 
@@ -904,8 +906,8 @@ def _lean(pose: RefinedPose, constraints: Constraints) -> float:
     """Angle between up as the pose has it in the body, and as roll and pitch have it [rad]."""
     R_pg = axes_of_up(constraints.up)
     up_b = pose.rotation.T @ R_pg[:, 2]
-    known = tilt_matrix(constraints.roll, constraints.pitch)[2]
-    return float(np.arctan2(np.linalg.norm(np.cross(up_b, known)), up_b @ known))
+    up = tilt_matrix(constraints.roll, constraints.pitch)[2]
+    return float(np.arctan2(np.linalg.norm(np.cross(up_b, up)), up_b @ up))
 
 
 def _apart(a: RefinedPose, b: RefinedPose) -> bool:
@@ -967,12 +969,12 @@ def pinhole_depth(
 
 def pinhole_poses(pairs: Correspondences, camera: Camera, pixel_std: float) -> list[RefinedPose]:
     """All distinct minima of the reprojection error without water, the best first."""
-    rays, seen = camera.lens.rays(pairs.pixels)
+    rays, valid = camera.lens.rays(pairs.pixels)
     rays_p = rays @ camera.R_pc.T
     starts = []
     for i in range(len(pairs.tags)):
         four = slice(4 * i, 4 * i + 4)
-        if seen[four].all():
+        if valid[four].all():
             starts += tag_poses(rays_p[four], camera.position, pairs.points_b[four])
     return minima_from(
         through_lens(camera.lens, camera.R_pc, camera.position), pairs, starts, 2.5 * pixel_std
@@ -1031,9 +1033,9 @@ def _doubt(choice: Choice, pixel_std: float) -> str:
     if 4 * far > count:
         return f"residual too large: {far} of {count} corners miss by more than {limit:.1f} px"
     if second is not None and choice.gap < SURE and choice.turned > NEAR:
-        one, other = (math.degrees(math.acos(min(1.0, abs(a.rotation[2, 2])))) for a in (best, second))
+        first, other = (math.degrees(math.acos(min(1.0, abs(a.rotation[2, 2])))) for a in (best, second))
         return (
-            f"ambiguous: attitudes tilted by {one:.0f} and {other:.0f} degrees explain the corners equally well: "
+            f"ambiguous: attitudes tilted by {first:.0f} and {other:.0f} degrees explain the corners equally well: "
             "give roll and pitch, or a depth for the refractive method"
         )
     return ""
@@ -1045,8 +1047,8 @@ def _starts(pairs: Correspondences, pool: Pool, pixel_std: float) -> Iterator[tu
     normal_b = normal_b / np.linalg.norm(normal_b)
     up = pool.interface.normal if pool.is_surface else np.array([0.0, 0.0, 1.0])
     middle = pairs.points_b.mean(axis=0)
-    for seen in pinhole_poses(pairs, pool.camera, pixel_std)[:2]:
-        lowered = _deepened(seen, pairs, pool)
+    for apparent_pose in pinhole_poses(pairs, pool.camera, pixel_std)[:2]:
+        lowered = _deepened(apparent_pose, pairs, pool)
         if lowered is None:
             continue
         position, rotation = lowered
@@ -1065,11 +1067,11 @@ def _upright(rotation: Array, up: Array) -> Array:
     return np.asarray(R_pg @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
-def _deepened(seen: RefinedPose, pairs: Correspondences, pool: Pool) -> tuple[Array, Array] | None:
+def _deepened(apparent_pose: RefinedPose, pairs: Correspondences, pool: Pool) -> tuple[Array, Array] | None:
     """Where a body is that appears at a pose: its corners, at their apparent depth times the ratio of the indices on
     the refracted rays, and the rigid motion that fits these."""
     interface = pool.interface
-    apparent = pairs.points_b @ seen.rotation.T + seen.position
+    apparent = pairs.points_b @ apparent_pose.rotation.T + apparent_pose.position
     rays = back_project(pool.camera, interface, pairs.pixels)
     depth = -interface.distance(apparent)
     ratio = interface.index_far / interface.index_near
@@ -1119,11 +1121,11 @@ def weighted_fit(
     Returns:
         The measurement, or why there is none.
     """
-    found = list(detections)
-    start = planar_fit(found, pool, tags_b, constraints, pixel_std)
+    all_detections = list(detections)
+    start = planar_fit(all_detections, pool, tags_b, constraints, pixel_std)
     if constraints is None or not start.ok:
         return refused(METHOD, start.reason, start.rejected, tags=start.tags)
-    pairs = correspondences([d for d in found if d.tag in start.tags], tags_b)
+    pairs = correspondences([d for d in all_detections if d.tag in start.tags], tags_b)
     pose = refine_pose(
         through_water(pool),
         pairs.points_b,
@@ -1131,8 +1133,8 @@ def weighted_fit(
         start.position,
         start.rotation,
         HUBER * pixel_std,
-        known=_known(constraints, pixel_std),
-        most_steps=MOST_STEPS,
+        extra_rows=_known(constraints, pixel_std),
+        max_steps=MOST_STEPS,
     )
     if pose is None or not pose.converged:
         steps = 0 if pose is None else pose.iterations

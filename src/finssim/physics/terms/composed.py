@@ -60,12 +60,12 @@ def add_term(term: Term) -> Term:
             f"{', '.join(term.parameters)}"
         )
     used = set()
-    for what, function in _functions(term).items():
+    for role, function in _functions(term).items():
         for name, kind in _arguments(function).items():
             expected = [STATE[name]] if name in STATE else list(KINDS.values())
             if (name not in STATE and name not in term.parameters) or kind not in expected:
                 raise TermError(
-                    f"term '{term.name}': {what} takes '{name}: {getattr(kind, '__name__', kind)}', expected of: "
+                    f"term '{term.name}': {role} takes '{name}: {getattr(kind, '__name__', kind)}', expected of: "
                     f"{', '.join([*STATE, *term.parameters])}; parameters are {', '.join(KINDS)}"
                 )
             used.add(name)
@@ -87,7 +87,7 @@ def _require_zero(term: Term) -> None:
 
 
 def _functions(term: Term) -> dict[str, Any]:
-    return {what: f for what in ("wrench", "slope") if (f := getattr(term, what)) is not None}
+    return {role: f for role in ("wrench", "slope") if (f := getattr(term, role)) is not None}
 
 
 @cache
@@ -147,12 +147,12 @@ def parameter_row(terms: tuple[Term, ...], numbers: Mapping[str, Any]) -> NDArra
 
 
 @cache
-def composed(terms: tuple[Term, ...], what: str) -> Any:
+def composed(terms: tuple[Term, ...], role: str) -> Any:
     """Sum of what the terms give, as a `wp.func` of (x, w, v, nu_r, up, depth, density) -> vec6.
 
     Args:
         terms: The terms, in the order of their rows.
-        what: `wrench` or `slope`.
+        role: `wrench` or `slope`.
 
     Returns:
         None where no term gives it. x holds the parameters, (worlds, vehicles, `row_length`).
@@ -161,23 +161,28 @@ def composed(terms: tuple[Term, ...], what: str) -> Any:
     calls = []
     for term in terms:
         _require_zero(term)
-        function = _functions(term).get(what)
+        function = _functions(term).get(role)
         if function is None:
             continue
         slots = {slot.name: slot for slot in layout(terms) if slot.term is term}
-        taken = [name if name in STATE else _read(slots[name]) for name in _arguments(function)]
+        arguments = [name if name in STATE else _read(slots[name]) for name in _arguments(function)]
         space[f"t_{term.name}"] = function
-        calls.append(f"t_{term.name}({', '.join(taken)})")
+        calls.append(f"t_{term.name}({', '.join(arguments)})")
     if not calls:
         return None
     head = "x: wp.array3d(dtype=float), w: int, v: int, nu_r: vec6, up: wp.vec3, depth: float, density: float"
-    text = f"def added_{what}({head}):\n    return {' + '.join(calls)}\n"
+    text = f"def added_{role}({head}):\n    return {' + '.join(calls)}\n"
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    place = f"<{what} of {', '.join(term.name for term in terms)}, {digest}>"
-    linecache.cache[place] = (len(text), None, text.splitlines(keepends=True), place)  # Warp reads the source
+    position = f"<{role} of {', '.join(term.name for term in terms)}, {digest}>"
+    linecache.cache[position] = (
+        len(text),
+        None,
+        text.splitlines(keepends=True),
+        position,
+    )  # Warp reads the source
     space["__name__"] = f"{__name__}_{digest}"
-    exec(compile(text, place, "exec"), space)
-    return wp.func(space[f"added_{what}"], module=wp.get_module(space["__name__"]))
+    exec(compile(text, position, "exec"), space)
+    return wp.func(space[f"added_{role}"], module=wp.get_module(space["__name__"]))
 
 
 def _read(slot: Slot) -> str:

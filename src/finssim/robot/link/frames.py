@@ -122,15 +122,15 @@ class Form:
             if constant is not None:
                 numbers.append(constant)
                 continue
-            given = getattr(message, name)
+            value = getattr(message, name)
             if count == 1:
-                numbers.append(given)
+                numbers.append(value)
                 continue
-            if len(given) != (count or self.outputs):
+            if len(value) != (count or self.outputs):
                 raise LinkError(
-                    f"{self.layout.title}: {name} has {len(given)} values, expected {count or self.outputs}"
+                    f"{self.layout.title}: {name} has {len(value)} values, expected {count or self.outputs}"
                 )
-            numbers.extend([given[i] for i in order] if order else given)
+            numbers.extend([value[i] for i in order] if order else value)
         return numbers
 
     def _refuse_not_finite(self, message: Any) -> None:
@@ -138,10 +138,10 @@ class Form:
         for field in self.fields:
             if field.code != "f":
                 continue
-            given = getattr(message, field.name)
-            if not all(map(math.isfinite, (given,) if field.values == 1 else given)):
+            value = getattr(message, field.name)
+            if not all(map(math.isfinite, (value,) if field.values == 1 else value)):
                 raise LinkError(
-                    f"{self.layout.title}: {field.name} is {given}, expected finite numbers: "
+                    f"{self.layout.title}: {field.name} is {value}, expected finite numbers: "
                     "stop the motors instead of sending it"
                 )
 
@@ -151,11 +151,11 @@ class Form:
         # Single precision cannot overflow the sum, so it is finite where all of them are.
         if not math.isfinite(sum(values)):
             return None
-        found: dict[str, Any] = dict(self.absent)
+        decoded: dict[str, Any] = dict(self.absent)
         for name, first, end, order in self._places:
             part = values[first:end] if end else values[first]
-            found[name] = tuple([part[i] for i in order]) if order else part
-        return self.layout.message(**found)
+            decoded[name] = tuple([part[i] for i in order]) if order else part
+        return self.layout.message(**decoded)
 
 
 @lru_cache(maxsize=64)
@@ -173,21 +173,25 @@ def _codes(fields: tuple[Field, ...], outputs: int) -> str:
 def _crc_terms(length: int) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.int64], int]:
     """What each byte of a message of that length adds to its CRC: 256 numbers per place in a row, where each place
     begins in them, and the CRC of zeros alone. The CRC is linear: all that is added is added by exclusive or."""
-    one = np.arange(256, dtype=np.uint16)
+    single = np.arange(256, dtype=np.uint16)
     for _ in range(8):
-        one = np.where(one & 1, (one >> 1) ^ 0xA001, one >> 1).astype(np.uint16)
+        single = np.where(single & 1, (single >> 1) ^ 0xA001, single >> 1).astype(np.uint16)
     terms, crc = np.empty((length, 256), np.uint16), 0xFFFF
-    for place in range(length - 1, -1, -1):
-        behind = one if place == length - 1 else (terms[place + 1] >> 8) ^ one[terms[place + 1] & 0xFF]
-        terms[place] = behind
-        crc = (crc >> 8) ^ int(one[crc & 0xFF])
+    for position in range(length - 1, -1, -1):
+        behind = (
+            single
+            if position == length - 1
+            else (terms[position + 1] >> 8) ^ single[terms[position + 1] & 0xFF]
+        )
+        terms[position] = behind
+        crc = (crc >> 8) ^ int(single[crc & 0xFF])
     return terms.ravel(), 256 * np.arange(length), crc
 
 
 def crc16_modbus(data: bytes) -> int:
     """CRC16-MODBUS: polynomial x¹⁶ + x¹⁵ + x² + 1 reflected (0xA001), initial value 0xFFFF; 0x4B37 of "123456789"."""
-    terms, place, of_zeros = _crc_terms(len(data))
-    return of_zeros ^ int(np.bitwise_xor.reduce(terms[place + np.frombuffer(data, np.uint8)]))
+    terms, position, of_zeros = _crc_terms(len(data))
+    return of_zeros ^ int(np.bitwise_xor.reduce(terms[position + np.frombuffer(data, np.uint8)]))
 
 
 @dataclass(frozen=True)
@@ -408,12 +412,12 @@ class Decoder:
         self.refused: Counter[str] = Counter(bad_crc=0, bad_length=0, unknown_type=0, not_finite=0)
         self.skipped_bytes = 0
         self._rest = b""
-        known = [form for layout in kinds for form in forms(layout, outputs)]
-        self.longest = max(form.size for form in known)
-        self._plain = {f.layout.magic[0]: f for f in known if len(f.prefix) < _HEADER}
-        self._headed = {f.prefix: f for f in known if len(f.prefix) >= _HEADER}
+        all_forms = [form for layout in kinds for form in forms(layout, outputs)]
+        self.longest = max(form.size for form in all_forms)
+        self._plain = {f.layout.magic[0]: f for f in all_forms if len(f.prefix) < _HEADER}
+        self._headed = {f.prefix: f for f in all_forms if len(f.prefix) >= _HEADER}
         self._types = {prefix[:4] for prefix in self._headed}
-        self._magic = _search(form.layout.magic for form in known)
+        self._magic = _search(form.layout.magic for form in all_forms)
 
     @property
     def counts(self) -> dict[str, int | dict[str, int]]:
@@ -423,14 +427,14 @@ class Decoder:
     def feed(self, data: bytes) -> list[Message]:
         """Messages that `data` completes, in the order of their bytes; never raises, whatever the bytes are."""
         data, at = self._rest + data, 0
-        found: list[Message] = []
+        messages: list[Message] = []
         while begin := self._magic.search(data, at):
             self.skipped_bytes += begin.start() - at
             at = begin.start()
             form = self._frame(data, at)
             if form is None:
                 self._rest = data[at:]
-                return found
+                return messages
             if isinstance(form, str):
                 self.refused[form] += 1
                 self.skipped_bytes += 1
@@ -442,10 +446,10 @@ class Decoder:
                 self.refused["not_finite"] += 1
             else:
                 self.accepted[type(message).__name__] += 1
-                found.append(message)
+                messages.append(message)
         self.skipped_bytes += len(data) - at
         self._rest = b""
-        return found
+        return messages
 
     def _frame(self, data: bytes, at: int) -> Form | str | None:
         """The frame that begins at a magic, why none does, or None while too few bytes have come to tell."""

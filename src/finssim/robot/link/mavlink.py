@@ -172,12 +172,12 @@ class MavlinkLink:
                 return []
             self._dvl_at = now
             return [self._numbered(report.kind, report.age, report.values)]
-        made: list[Message] = []
+        completed: list[Message] = []
         try:
             messages = self._wire.parse_buffer(data) or []
         except Exception:  # pymavlink raises whatever it stumbles over
             self.counts["bad"] += 1
-            return made
+            return completed
         for message in messages:
             kind = message.get_type()
             if kind == "BAD_DATA" or kind.startswith("UNKNOWN"):
@@ -190,8 +190,8 @@ class MavlinkLink:
                 before = self._gap.get(number, gap)
                 self._gap[number] = gap if not math.isfinite(before) else before + SMOOTH * (gap - before)
                 self._seen[number] = now
-                made += self._handlers[kind](now, message)
-        return made
+                completed += self._handlers[kind](now, message)
+        return completed
 
     def _numbered(self, kind: int, age: float, values: Any) -> NavigationAid:
         self._aids += 1
@@ -220,7 +220,7 @@ class MavlinkLink:
         self._sequence = self._sequence + 1 & 0xFFFF
         depth = (self._pressure - self._surface) / (self.vehicle.water.density * self.vehicle.water.gravity)
         p, r, s = gyro.tolist()
-        made: list[Message] = [
+        messages: list[Message] = [
             Telemetry(
                 sequence=self._sequence,
                 mcu_ms=int(m.time_boot_ms),
@@ -235,8 +235,8 @@ class MavlinkLink:
         ]
         if self.vehicle.sensors.compass is not None and now - self._heading_at >= HEADING_PERIOD:
             self._heading_at = now
-            made.append(self._numbered(HEADING, 0.0, (-float(m.yaw), 0.0, 0.0)))
-        return made
+            messages.append(self._numbered(HEADING, 0.0, (-float(m.yaw), 0.0, 0.0)))
+        return messages
 
     def _raw_imu(self, now: float, m: Any) -> list[Message]:
         if max(abs(m.xacc), abs(m.yacc), abs(m.zacc)) > ACCELEROMETER_RANGE:
@@ -366,8 +366,8 @@ class MavlinkLink:
         if self._alive == -math.inf:
             return frames
         frames += self._questions(now)
-        running, wanted = state in ("armed", "hold"), now - self._wanted < REQUEST_LASTS
-        if self._others or not (running or wanted or self._ours):
+        running, requested = state in ("armed", "hold"), now - self._wanted < REQUEST_LASTS
+        if self._others or not (running or requested or self._ours):
             return frames  # somebody else has the vehicle, or nobody asked for it
         if now - self._manual_at >= MANUAL_PERIOD - 1e-6 or not running:
             self._manual_at = now
@@ -375,7 +375,7 @@ class MavlinkLink:
         arming = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
         if running:
             self._ours = True
-        elif wanted and state == "disarmed":
+        elif requested and state == "disarmed":
             if self.mode != MANUAL:
                 custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
                 mode = self._command(mavlink.MAV_CMD_DO_SET_MODE, custom, float(MANUAL))
@@ -399,15 +399,17 @@ class MavlinkLink:
         gain = self._mixer.autopilot.gain
         roll, pitch, yaw, throttle, forward, lateral = np.clip(demand, -gain, gain).tolist()
         # As the autopilot's inputs: pitch, roll, throttle, yaw, forward, lateral.
-        own = self._gain if math.isfinite(self._gain) else self._parameters.get("JS_GAIN_DEFAULT", 0.0)
-        if self._version is not None and self._version >= (4, 5) and own >= gain:
-            lift = own * self._parameters.get("JS_THR_GAIN", 1.0)
-            x, y, r = (round(1000.0 * part / own) for part in (forward, lateral, yaw))
+        current_gain = (
+            self._gain if math.isfinite(self._gain) else self._parameters.get("JS_GAIN_DEFAULT", 0.0)
+        )
+        if self._version is not None and self._version >= (4, 5) and current_gain >= gain:
+            lift = current_gain * self._parameters.get("JS_THR_GAIN", 1.0)
+            x, y, r = (round(1000.0 * part / current_gain) for part in (forward, lateral, yaw))
             z, s, t = round(500.0 + 500.0 * throttle / lift), round(FULL * pitch), round(FULL * roll)
             z = min(max(z, 0), 1000)
             pulses = (
-                NEUTRAL + s, NEUTRAL + t, NEUTRAL + 0.8 * lift * (z - 500), NEUTRAL + 0.4 * own * r,
-                NEUTRAL + 0.4 * own * x, NEUTRAL + 0.4 * own * y,
+                NEUTRAL + s, NEUTRAL + t, NEUTRAL + 0.8 * lift * (z - 500), NEUTRAL + 0.4 * current_gain * r,
+                NEUTRAL + 0.4 * current_gain * x, NEUTRAL + 0.4 * current_gain * y,
             )  # fmt: skip
             message = mavlink.MAVLink_manual_control_message(VEHICLE[0], x, y, z, r, 0, 0, 3, s, t)
         else:
@@ -434,14 +436,14 @@ class MavlinkLink:
                 frames += self._ask(now, ("read", name), 1.0, read)
         return frames
 
-    def _first(self, now: float, what: str) -> float:
+    def _first(self, now: float, key: str) -> float:
         """When this was looked at first [s]."""
-        return self._asked.setdefault(("first", what), now)
+        return self._asked.setdefault(("first", key), now)
 
-    def _ask(self, now: float, what: Any, period: float, message: Any) -> list[bytes]:
-        if now - self._asked.get(what, -math.inf) < period - 1e-6:
+    def _ask(self, now: float, key: Any, period: float, message: Any) -> list[bytes]:
+        if now - self._asked.get(key, -math.inf) < period - 1e-6:
             return []
-        self._asked[what] = now
+        self._asked[key] = now
         return [self._pack(message)]
 
     def _command(self, command: int, *parameters: float) -> Any:

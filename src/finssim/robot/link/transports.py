@@ -106,7 +106,7 @@ class UdpTransport:
         Args:
             wait: Longest time to wait for one [s].
         """
-        found: list[bytes] = []
+        datagrams: list[bytes] = []
         if wait:
             select.select([self._socket], [], [], wait)
         for _ in range(_DATAGRAMS_AT_ONCE):
@@ -129,10 +129,10 @@ class UdpTransport:
                 self.peer = sender
             if sender == self.peer:
                 self._heard = now
-                found.append(data)
+                datagrams.append(data)
             else:
                 self._refuse(sender)
-        return found
+        return datagrams
 
     def _refuse(self, sender: Address) -> None:
         key = sender if sender in self.refused or len(self.refused) < _NAMED else None
@@ -158,12 +158,12 @@ class UdpTransport:
 def resolved(address: Address) -> Address:
     """IPv4 address of a host name."""
     try:
-        (*_, found), *_ = socket.getaddrinfo(*address, family=socket.AF_INET, type=socket.SOCK_DGRAM)
+        (*_, endpoint), *_ = socket.getaddrinfo(*address, family=socket.AF_INET, type=socket.SOCK_DGRAM)
     except OSError as problem:
         raise LinkError(
             f"{address[0]}: no such host ({problem.strerror}): give a name or an IPv4 address"
         ) from None
-    return str(found[0]), int(found[1])
+    return str(endpoint[0]), int(endpoint[1])
 
 
 def _name(address: Address) -> str:
@@ -204,21 +204,21 @@ class TcpServer(Generic[State]):
         address: Where they connect.
     """
 
-    def __init__(self, address: Address, state: Callable[[], State], *, most: int = 8) -> None:
+    def __init__(self, address: Address, state: Callable[[], State], *, backlog: int = 8) -> None:
         """Listen.
 
         Args:
             address: Host and port; port 0 takes a free one.
             state: Makes what is remembered of a client.
-            most: Clients at a time; others are turned away.
+            backlog: Clients at a time; others are turned away.
 
         Raises:
             LinkError: It cannot be bound.
         """
         self.clients: dict[socket.socket, State] = {}
-        self._state, self._most = state, most
+        self._state, self._most = state, backlog
         self._listener = bound_socket(socket.SOCK_STREAM, address)
-        self._listener.listen(most)
+        self._listener.listen(backlog)
         self._listener.setblocking(False)
         self.address: Address = self._listener.getsockname()
 
@@ -449,21 +449,21 @@ class TcpTransport:
         if not self._ready():
             return []
         assert self._socket is not None  # it is ready
-        found: list[bytes] = []
-        taken = 0
+        pieces: list[bytes] = []
+        total = 0
         try:
-            while taken < _MOST_AT_ONCE:
+            while total < _MOST_AT_ONCE:
                 data = self._socket.recv(_BYTES_AT_ONCE)
                 if not data:
                     raise ConnectionResetError("closed by the other end")
-                taken, self._since = taken + len(data), self._clock()
-                found += self.pieces(data)
+                total, self._since = total + len(data), self._clock()
+                pieces += self.pieces(data)
         except BlockingIOError:
             if self._clock() - self._since > _SILENCE:
                 self._lose(f"silent for {_SILENCE:g} s")
         except OSError as problem:
             self._lose(str(problem))
-        return found
+        return pieces
 
     def send(self, data: bytes) -> None:
         """Send bytes; what cannot leave whole is counted."""
@@ -506,15 +506,17 @@ class TcpTransport:
                 self._drop()
         return self.connected
 
-    def _lose(self, why: str) -> None:
-        _LOG.warning("%s %s: lost (%s); trying again every %g s", self.title, _name(self.peer), why, _RETRY)
+    def _lose(self, reason: str) -> None:
+        _LOG.warning(
+            "%s %s: lost (%s); trying again every %g s", self.title, _name(self.peer), reason, _RETRY
+        )
         self._next_try = self._clock() + _RETRY
         self._drop()
 
     def _drop(self) -> None:
-        gone, self._socket, self.connected = self._socket, None, False
-        if gone is not None:
-            gone.close()
+        previous, self._socket, self.connected = self._socket, None, False
+        if previous is not None:
+            previous.close()
 
 
 class _Beside:
@@ -560,9 +562,9 @@ class MavlinkAddress:
             LinkError: It is none, or the key cannot be read.
         """
         rest, _, query = address.removeprefix("mavlink").removeprefix("://").partition("?")
-        kind, _, where = (rest or cls.DEFAULT).partition(":")
+        kind, _, target = (rest or cls.DEFAULT).partition(":")
         options = {name: values[-1] for name, values in parse_qs(query).items()}
-        if kind not in ("udpin", "udpout", "tcp", "serial") or not where or options.keys() - {"dvl", "key"}:
+        if kind not in ("udpin", "udpout", "tcp", "serial") or not target or options.keys() - {"dvl", "key"}:
             raise LinkError(
                 f"{address}: give mavlink://udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE,BAUD, "
                 "with ?dvl=HOST for a Water Linked log and &key=FILE for a signing key"
@@ -575,7 +577,7 @@ class MavlinkAddress:
                 raise LinkError(
                     f"{options['key']}: the signing key cannot be read: {problem.strerror}"
                 ) from None
-        return cls(kind, where, options.get("dvl", "" if rest else "127.0.0.1"), key)
+        return cls(kind, target, options.get("dvl", "" if rest else "127.0.0.1"), key)
 
     def open(self) -> Transport:
         """The wire, with the log's beside it.
@@ -664,9 +666,9 @@ class MemoryTransport:
 
     def receive(self) -> list[bytes]:
         """What the other end has sent, oldest first."""
-        found = list(self._inbox) if self._open else []
+        received = list(self._inbox) if self._open else []
         self._inbox.clear()
-        return found
+        return received
 
     def close(self) -> None:
         """Stop taking and giving."""
@@ -679,9 +681,9 @@ class MemoryTransport:
 
 def memory_pair() -> tuple[MemoryTransport, MemoryTransport]:
     """Two ends: what goes in at one comes out at the other."""
-    one: deque[bytes] = deque(maxlen=4096)
+    first: deque[bytes] = deque(maxlen=4096)
     other: deque[bytes] = deque(maxlen=4096)
-    return MemoryTransport(one, other), MemoryTransport(other, one)
+    return MemoryTransport(first, other), MemoryTransport(other, first)
 
 
 def open_transport(address: str, bind: str = DEFAULT_BIND) -> Transport:
@@ -713,9 +715,9 @@ def open_transport(address: str, bind: str = DEFAULT_BIND) -> Transport:
     )
 
 
-def host_port(text: str, where: str) -> tuple[str, int]:
-    """Host and port of "HOST:PORT"; raises LinkError that begins with `where`."""
+def host_port(text: str, label: str) -> tuple[str, int]:
+    """Host and port of "HOST:PORT"; raises LinkError that begins with `label`."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 65535:
-        raise LinkError(f"{where}: {text!r} is no HOST:PORT: give for example 127.0.0.1:58766")
+        raise LinkError(f"{label}: {text!r} is no HOST:PORT: give for example 127.0.0.1:58766")
     return host, int(port)

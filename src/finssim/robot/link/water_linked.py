@@ -61,8 +61,8 @@ def decode_line(line: bytes, counts: Counter[str] | None = None) -> DvlVelocity 
     report = _object(line)
     kind = report.get("type")
     if kind != "velocity" or report.get("tracking_mode", "bottom") != "bottom":
-        known = kind in ("velocity", "velocity_water", "position_local", "response")
-        counts["velocity_water" if kind == "velocity" else kind if known else "not a report"] += 1
+        recognised = kind in ("velocity", "velocity_water", "position_local", "response")
+        counts["velocity_water" if kind == "velocity" else kind if recognised else "not a report"] += 1
         return None
     if report.get("velocity_valid") is not True:
         counts["no bottom lock"] += 1

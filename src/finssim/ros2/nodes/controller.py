@@ -168,8 +168,8 @@ class Controller(RobotNode):
         if math.isnan(self.runtime.started):
             self.runtime.guide = self.guide or _here(self.state.reading(now))
         before, began = self.runtime.counters.decisions, self.runtime.started
-        seen, self._seen = self._seen, []
-        self.runtime.step(now, (), seen)
+        pictures, self._seen = self._seen, []
+        self.runtime.step(now, (), pictures)
         if self.runtime.started != began and not math.isnan(self.runtime.started):
             self._show(self.runtime.guide, self.runtime.started)
         if self.runtime.counters.decisions > before:

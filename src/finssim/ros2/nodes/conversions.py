@@ -98,12 +98,12 @@ def aid_of(key: str, message: Any, age: float, frame: str) -> NavigationAid | st
 
 def force_of(message: Any, names: Sequence[str]) -> Array | str:
     """The thrusts of a ThrusterCommand in canonical order [N], or why it cannot be used."""
-    told, force = list(message.names), [float(f) for f in message.force]
-    if sorted(told) != sorted(names):
-        return f"it names the thrusters {', '.join(told) or 'none'}, expected {', '.join(names)}, each once"
-    if len(force) != len(told):
-        return f"it has {len(force)} thrusts for {len(told)} thrusters"
-    by_name = dict(zip(told, force, strict=True))
+    named, force = list(message.names), [float(f) for f in message.force]
+    if sorted(named) != sorted(names):
+        return f"it names the thrusters {', '.join(named) or 'none'}, expected {', '.join(names)}, each once"
+    if len(force) != len(named):
+        return f"it has {len(force)} thrusts for {len(named)} thrusters"
+    by_name = dict(zip(named, force, strict=True))
     ordered = np.array([by_name[name] for name in names])
     return ordered if np.isfinite(ordered).all() else "it holds a thrust that is not finite"
 
@@ -120,8 +120,8 @@ def station_of_pose(message: Any) -> Station | str:
     frame = message.header.frame_id
     if frame not in ("", "map"):
         return f"a goal in frame '{frame}', expected map"
-    place, q = np.array(xyz(message.pose.position)), np.array(xyzw(message.pose.orientation))
-    if not (np.isfinite(place).all() and np.isfinite(q).all()):
+    position, q = np.array(xyz(message.pose.position)), np.array(xyzw(message.pose.orientation))
+    if not (np.isfinite(position).all() and np.isfinite(q).all()):
         return "a goal that is not finite"
     length = float(np.linalg.norm(q))
     if not 0.9 < length < 1.1:
@@ -130,7 +130,7 @@ def station_of_pose(message: Any) -> Station | str:
     # The z axis' lean: its cosine is 1 - 2 (x² + y²), whatever the yaw.
     if 1.0 - 2.0 * (x * x + y * y) < math.cos(LEVEL):
         return "a goal that is not level: give a turn about z alone"
-    return Station((float(place[0]), float(place[1]), float(place[2])), float(quat_yaw(q / length)))
+    return Station((float(position[0]), float(position[1]), float(position[2])), float(quat_yaw(q / length)))
 
 
 def trajectory_of(message: Any) -> Trajectory | str:
@@ -162,14 +162,16 @@ def reading_of(status: Any, odometry: Any | None, time: float) -> Reading:
     """
     std = np.array([*status.position_std, *status.velocity_std, status.yaw_std], float)
     if odometry is None:
-        place, q, nu = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0]), np.full(6, math.nan)
+        position, q, nu = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0]), np.full(6, math.nan)
     else:
         pose, twist = odometry.pose.pose, odometry.twist.twist
-        place, q = np.array(xyz(pose.position)), np.array(xyzw(pose.orientation))
+        position, q = np.array(xyz(pose.position)), np.array(xyzw(pose.orientation))
         nu = np.array([*xyz(twist.linear), *xyz(twist.angular)])
-    whole = bool(np.isfinite(place).all() and np.isfinite(nu).all() and abs(np.linalg.norm(q) - 1.0) < 0.01)
-    reason = str(status.reason) or ("" if whole else "no odometry")
-    return Reading(time, place, q, nu, bool(status.ready) and whole, str(status.mode), reason, std)
+    valid = bool(
+        np.isfinite(position).all() and np.isfinite(nu).all() and abs(np.linalg.norm(q) - 1.0) < 0.01
+    )
+    reason = str(status.reason) or ("" if valid else "no odometry")
+    return Reading(time, position, q, nu, bool(status.ready) and valid, str(status.mode), reason, std)
 
 
 def image_of(message: Any, *, colour: bool = False) -> npt.NDArray[np.uint8] | None:
@@ -216,9 +218,9 @@ def compressed_of(message: Any) -> npt.NDArray[np.uint8] | None:
 def tags_of(message: Any) -> tuple[int, str, Picture] | None:
     """Time of exposure [ns], finder, and tags of a String with JSON; None where it is malformed."""
     try:
-        told = json.loads(message.data)
-        tags = tuple(_tag(tag) for tag in told["tags"][:MOST_TAGS])
-        stamp, sequence, finder = int(told["stamp_ns"]), int(told["sequence"]), str(told["finder"])
+        decoded = json.loads(message.data)
+        tags = tuple(_tag(tag) for tag in decoded["tags"][:MOST_TAGS])
+        stamp, sequence, finder = int(decoded["stamp_ns"]), int(decoded["sequence"]), str(decoded["finder"])
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         return None
     if not FIRST_TIME <= stamp <= LAST_TIME:  # a number of any size in JSON
@@ -226,11 +228,11 @@ def tags_of(message: Any) -> tuple[int, str, Picture] | None:
     return stamp, finder, Picture(0.0, sequence, None, tags)
 
 
-def _tag(told: Any) -> TagCorners:
-    corners = np.array(told["corners"], float)
+def _tag(values: Any) -> TagCorners:
+    corners = np.array(values["corners"], float)
     if corners.shape != (4, 2) or not np.isfinite(corners).all():
         raise ValueError("no corners")
-    return TagCorners(int(told["id"]), corners)
+    return TagCorners(int(values["id"]), corners)
 
 
 # The messages of a record as messages of rclpy: one description of what each field holds, for both.

@@ -137,7 +137,7 @@ class FixFrame:
         """
         near = estimator.at(fix.time)
         height = float(estimator.estimate(fix.time).x[2])
-        place = np.array([*fix.position, height if math.isfinite(height) else 0.0])
+        position = np.array([*fix.position, height if math.isfinite(height) else 0.0])
         roll, pitch = (a if math.isfinite(a) else 0.0 for a in (near.roll, near.pitch))
         level = quat_from_euler(roll, pitch, fix.yaw or 0.0)
         P = np.diag([0.0, 0.0, self._height_variance, UNKNOWN if fix.yaw is None else 0.0])
@@ -146,7 +146,7 @@ class FixFrame:
         full = np.diag([0.0, 0.0, 0.0, TILT_VARIANCE, TILT_VARIANCE, 0.0])
         full[np.ix_(KNOWN, KNOWN)] = self._turn @ P @ self._turn.T
         q = np.asarray(quat_multiply(self._q_wg, level))
-        return self._T_wp[:3, :3] @ place + self._T_wp[:3, 3], q, full
+        return self._T_wp[:3, :3] @ position + self._T_wp[:3, 3], q, full
 
     def from_map(self, message: Any, time: float, now: float) -> VisionSample:
         """The fix in a PoseWithCovarianceStamped; whether its numbers are fit to be used is the estimator's to say.
@@ -157,13 +157,13 @@ class FixFrame:
             now: [s]
         """
         pose = message.pose.pose
-        place = self._T_wp[:3, :3].T @ (np.array(xyz(pose.position)) - self._T_wp[:3, 3])
+        position = self._T_wp[:3, :3].T @ (np.array(xyz(pose.position)) - self._T_wp[:3, 3])
         level = quat_multiply(quat_conjugate(self._q_wg), np.array(xyzw(pose.orientation)))
         P = np.array(message.pose.covariance, float).reshape(6, 6)[np.ix_(KNOWN, KNOWN)]
         R = (self._turn.T @ P @ self._turn)[np.ix_([0, 1, 3], [0, 1, 3])]
         rows = tuple((float(row[0]), float(row[1]), float(row[2])) for row in 0.5 * (R + R.T))
         yaw = float(quat_to_euler(level)[2])
-        return VisionSample(time, (float(place[0]), float(place[1])), yaw, rows, now)
+        return VisionSample(time, (float(position[0]), float(position[1])), yaw, rows, now)
 
 
 # Coordinate frames as topics: map, odom and base_link of REP-105, what is mounted where, and the vehicle's URDF.
@@ -183,8 +183,8 @@ class Pose(NamedTuple):
 
     def times(self, other: Pose) -> Pose:
         """Of a frame of the second pose in that of the first."""
-        place = self.position + np.asarray(quat_rotate(self.orientation, other.position))
-        return Pose(place, np.asarray(quat_multiply(self.orientation, other.orientation)))
+        position = self.position + np.asarray(quat_rotate(self.orientation, other.position))
+        return Pose(position, np.asarray(quat_multiply(self.orientation, other.orientation)))
 
     def inverse(self) -> Pose:
         """The other way round."""

@@ -53,28 +53,28 @@ class BridgeTopics:
     def tell(self, now: float, **values: Any) -> None:
         """Publish state and events; `values` are further fields of ThrusterState."""
         bridge, node = self._bridge, self._node
-        known = {
+        state_values = {
             "reason": bridge.reason,
             "source": self._label if bridge.source else "",
             "requested": bridge.requested,
             "force": bridge.force,
             "achieved": bridge.force,
         }
-        node.send("thrusters", node.make.thrusters(node.ns(now), bridge.state, {**known, **values}))
+        node.send("thrusters", node.make.thrusters(node.ns(now), bridge.state, {**state_values, **values}))
         for event in bridge.drain():
             node.event(event.kind, event.text, event.time)
 
-    def _arm(self, wanted: bool) -> str:
+    def _arm(self, requested: bool) -> str:
         """Arm or disarm; "" or why it is refused."""
         now = self._node.now()
-        if not wanted:
+        if not requested:
             self._bridge.disarm(now)
             return ""
         self._count()
         if self._publishers > 1:
-            why = f"{self._publishers} publishers on {self._node.topic('command')}: leave one"
-            self._bridge.log.repeat(now, "refused", f"topic may not arm: {why}")
-            return why
+            reason = f"{self._publishers} publishers on {self._node.topic('command')}: leave one"
+            self._bridge.log.repeat(now, "refused", f"topic may not arm: {reason}")
+            return reason
         return self._bridge.arm(now, "topic")
 
     def _on_command(self, message: Any) -> None:
@@ -95,9 +95,9 @@ class BridgeTopics:
 
     def _on_match(self, info: Any) -> None:
         """Publishers came or went: two are a fault at once, even if one has left again before this is told."""
-        most = self._matched + info.total_count_change
+        highest = self._matched + info.total_count_change
         self._matched = info.current_count
-        self._judge(most)
+        self._judge(highest)
 
     def _count(self) -> None:
         """The same, seen twice a second; all that Humble has, whose rclpy looks through the whole graph for it."""
@@ -109,12 +109,12 @@ class BridgeTopics:
     def _judge(self, publishers: int) -> None:
         """Two that publish commands are a fault, even under one name."""
         if publishers > 1 and self._bridge.state in ("armed", "hold"):
-            why = f"two publishers command the thrusters: {publishers} on {self._node.topic('command')}"
-            self._bridge.stop(self._node.now(), why)
+            reason = f"two publishers command the thrusters: {publishers} on {self._node.topic('command')}"
+            self._bridge.stop(self._node.now(), reason)
 
     def _on_service(self, request: Any, response: Any) -> Any:
-        why = self._arm(bool(request.data))
-        response.success, response.message = not why, why
+        reason = self._arm(bool(request.data))
+        response.success, response.message = not reason, reason
         return response
 
 
@@ -166,9 +166,9 @@ class HardwareBridge(RobotNode):
 
     def aid(self, now: float, aid: NavigationAid) -> None:
         """Publish what a navigation instrument measured, stamped with its measurement."""
-        made = self.make.aid(self.ns(now - aid.age), aid)
-        if made is not None:
-            self.send(*made)
+        message = self.make.aid(self.ns(now - aid.age), aid)
+        if message is not None:
+            self.send(*message)
 
     def _speeds(self, stamp: int, rpm: Sequence[float] | None) -> Any:
         message = None if rpm is None else self.make.shafts(stamp, rpm)

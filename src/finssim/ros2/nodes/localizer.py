@@ -52,11 +52,11 @@ class Localizer(RobotNode):
         self.perception.telemetry(times[0], telemetry_of(message), times[1])
 
     def _on_tags(self, message: Any) -> None:
-        found = tags_of(message)
-        if found is None:
+        decoded = tags_of(message)
+        if decoded is None:
             self.verdicts["malformed tags"] += 1
-        elif found[1] != self.get_name():
-            self._locate(found[0], found[2])
+        elif decoded[1] != self.get_name():
+            self._locate(decoded[0], decoded[2])
 
     def _on_image(self, message: Any) -> None:
         image, lens = self._unpack(message), self.pool.camera.lens
@@ -64,9 +64,9 @@ class Localizer(RobotNode):
             self.verdicts["not a picture of this camera"] += 1
             return
         stamp = nanoseconds(message.header.stamp)
-        seen = self._tracker.detect(image, (stamp - self.base) * 1e-9)
+        detections = self._tracker.detect(image, (stamp - self.base) * 1e-9)
         self.sequence += 1
-        picture = Picture(0.0, self.sequence, None, tuple(TagCorners(d.tag, d.corners) for d in seen))
+        picture = Picture(0.0, self.sequence, None, tuple(TagCorners(d.tag, d.corners) for d in detections))
         self.send("tags", self.make.found_tags(stamp, picture, self.get_name()))
         self._locate(stamp, picture)
 
@@ -96,7 +96,7 @@ class _Kept:
 
     def fix(self, frame: Frame, estimator: Estimator) -> VisionSample | str:
         """As `Fixes.fix`."""
-        found = self._fixes.fix(frame, estimator)
-        whole = isinstance(found, VisionSample) and bool(np.isfinite(found.position).all())
-        self.newest = found if isinstance(found, VisionSample) and whole else None
-        return found
+        result = self._fixes.fix(frame, estimator)
+        valid = isinstance(result, VisionSample) and bool(np.isfinite(result.position).all())
+        self.newest = result if isinstance(result, VisionSample) and valid else None
+        return result

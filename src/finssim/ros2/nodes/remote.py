@@ -131,10 +131,10 @@ class RemoteBridge:
         """Thrusters off."""
         self._node.send("arm", ros_type("std_msgs/msg/Bool")(data=False))
 
-    def stop(self, now: float, why: str) -> None:
+    def stop(self, now: float, reason: str) -> None:
         """Emergency stop."""
         self._node.send("stop", ros_type("std_msgs/msg/Empty")())
-        self._node.event("stop", why, now)
+        self._node.event("stop", reason, now)
 
     def acknowledge(self, now: float) -> None:
         """End a fault."""
@@ -142,9 +142,9 @@ class RemoteBridge:
 
     def command(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None = None) -> Array:
         """Ask for thrusts along the thrusters' axes, canonical order [N], (n,)."""
-        wanted, source = np.asarray(force, float), source if self._source is None else self._source()
-        self._node.send("command", self._node.make.command(self._node.ns(now), wanted, source))
-        return wanted
+        requested, source = np.asarray(force, float), source if self._source is None else self._source()
+        self._node.send("command", self._node.make.command(self._node.ns(now), requested, source))
+        return requested
 
     def reading(self, now: float, reading: Reading) -> None:
         """The bridge hears the estimator itself."""
@@ -202,8 +202,8 @@ class Watcher(RobotNode):
     def turn(self, timeout: float) -> None:
         """Hear what has come, waiting for it no longer than that [s]."""
         end = time.monotonic() + timeout
-        while (left := end - time.monotonic()) > 0.0:
-            rclpy.spin_once(self, timeout_sec=left)
+        while (remaining := end - time.monotonic()) > 0.0:
+            rclpy.spin_once(self, timeout_sec=remaining)
         self.state = self.bridge.state
         if self._arm and self.state != "disarmed":
             self._arm = False

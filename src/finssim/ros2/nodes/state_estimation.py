@@ -27,8 +27,8 @@ class StateEstimation(RobotNode):
         file = self.parameter("pool_file", "pool.yaml")
         pool = None if file == "none" else load_pool(file)
         mode = self.parameter("mode", "error-state" if self.vehicle.sensors.imu else "constant-velocity")
-        place = self.parameter("let_in", "")
-        self.perception = Perception(self.vehicle, pool, mode=mode, let_in=place_of(place) if place else None)
+        start = self.parameter("let_in", "")
+        self.perception = Perception(self.vehicle, pool, mode=mode, let_in=place_of(start) if start else None)
         self.sends("odometry", "estimator", "diagnostics", "event")
         self.frames = Frames(self, pool)
         self.hears("telemetry", self._on_telemetry)
@@ -67,7 +67,11 @@ class StateEstimation(RobotNode):
 
     def _tell(self) -> None:
         reading, health = self.perception.reading(self.now()), self.perception.health()
-        counts = {f"{s}: {word}": n for s, words in health.counts.items() for word, n in words.items()}
+        counts = {
+            f"{s}: {word}": n
+            for s, counts_by_word in health.counts.items()
+            for word, n in counts_by_word.items()
+        }
         self.diagnose("ok" if reading.ready else "warn", reading.reason or reading.mode, counts)
 
 

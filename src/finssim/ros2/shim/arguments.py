@@ -167,11 +167,11 @@ def override(overrides: Overrides, pattern: str, name: str, value: Any) -> None:
 def overrides_for(node: str, overrides: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Values for one node by its full name, such as `/finsrov/controller`."""
     values: dict[str, Any] = {}
-    for pattern, given in overrides.items():
+    for pattern, pattern_values in overrides.items():
         pattern = pattern if pattern.startswith("/") else f"/{pattern}"
         # As rclpy has it: "/*" is one name, and "/**", which becomes that with a star, any number.
         if re.fullmatch(pattern.replace("/*", r"(/\w+)"), node):
-            values.update(given)
+            values.update(pattern_values)
     return values
 
 
@@ -272,8 +272,8 @@ def _scalar(event: Any) -> bool | int | float | str:
         if -(2**63) <= number < 2**63:
             return number
         return float(number)
-    found = _FLOAT.fullmatch(text)
-    return float(found["number"] or re.sub(r"\.", "", text)) if found else text
+    match = _FLOAT.fullmatch(text)
+    return float(match["number"] or re.sub(r"\.", "", text)) if match else text
 
 
 # What stands after `--ros-args` on a command line: remapping, parameters, log levels.
@@ -304,23 +304,23 @@ def parse_arguments(arguments: Sequence[str]) -> RosArguments:
     Raises:
         RosArgumentsError: An argument for ROS that is malformed or not known.
     """
-    found, words, ros = RosArguments(), list(arguments), False
-    while words:
-        word = words.pop(0)
+    parsed, tokens, ros = RosArguments(), list(arguments), False
+    while tokens:
+        word = tokens.pop(0)
         if word == "--ros-args":
             ros = True
         elif not ros:
-            found.rest.append(word)
+            parsed.rest.append(word)
         elif word == "--":
             ros = False
         elif word not in _SWITCHES:
-            if not words:
+            if not tokens:
                 raise RosArgumentsError(f"--ros-args: {word} stands at the end: give its value after it")
-            _take(found, word, words.pop(0))
-    return found
+            _take(parsed, word, tokens.pop(0))
+    return parsed
 
 
-def _take(found: RosArguments, flag: str, value: str) -> None:
+def _take(parsed: RosArguments, flag: str, value: str) -> None:
     """Add one flag with its value."""
     if flag in ("-r", "--remap"):
         source, target = _pair(flag, value)
@@ -329,25 +329,25 @@ def _take(found: RosArguments, flag: str, value: str) -> None:
             raise RosArgumentsError(
                 f"--ros-args {flag} {value}: '{target}' is no name, or a namespace without its slash"
             )
-        found.remaps.append(Remap(node, source, target))
+        parsed.remaps.append(Remap(node, source, target))
     elif flag in ("-p", "--param"):
         name, text = _pair(flag, value)
         node, _, name = name.rpartition(":")
         try:
-            override(found.parameters, node or "/**", name, parsed_value(text))
+            override(parsed.parameters, node or "/**", name, parsed_value(text))
         except ValueError as error:
             raise RosArgumentsError(f"--ros-args {flag} {value}: {error}") from None
     elif flag == "--params-file":
-        read_parameters(Path(value), found.parameters)
+        read_parameters(Path(value), parsed.parameters)
     elif flag == "--log-level":
         logger, mark, level = value.rpartition(":=")
         if level.upper() not in LoggingSeverity.__members__ or (mark and not logger):
             raise RosArgumentsError(
                 f"--log-level {value}: expected [LOGGER:=] and debug, info, warn, error or fatal"
             )
-        found.levels.append((logger, LoggingSeverity[level.upper()]))
+        parsed.levels.append((logger, LoggingSeverity[level.upper()]))
     elif flag in ("-e", "--enclave"):
-        found.enclave = value
+        parsed.enclave = value
     elif flag not in ("--log-config-file", "--log-file-name"):
         raise RosArgumentsError(
             f"--ros-args: unknown argument '{flag}': known are -r, -p, --params-file, --log-level and -e"
@@ -355,7 +355,7 @@ def _take(found: RosArguments, flag: str, value: str) -> None:
 
 
 def _pair(flag: str, value: str) -> tuple[str, str]:
-    left, mark, right = value.partition(":=")
-    if not (left and mark and right):
+    name, mark, right = value.partition(":=")
+    if not (name and mark and right):
         raise RosArgumentsError(f"--ros-args {flag} {value}: expected NAME:=VALUE")
-    return left, right
+    return name, right

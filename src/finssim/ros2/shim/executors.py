@@ -174,10 +174,10 @@ class SingleThreadedExecutor:
         future.add_done_callback(lambda _: self.wake())
         with self._spinning():
             while self.context.ok() and not self._stopped and not future.done():
-                left = end - time.monotonic()
-                if left <= 0:
+                remaining = end - time.monotonic()
+                if remaining <= 0:
                     return
-                self._spin_once(min(left, LONGEST_WAIT))
+                self._spin_once(min(remaining, LONGEST_WAIT))
 
     @contextmanager
     def _spinning(self) -> Iterator[None]:
@@ -194,10 +194,10 @@ class SingleThreadedExecutor:
         end = float("inf") if endless else time.monotonic() + (timeout_sec or 0.0)
         work = next(self._round, None) or self._search()
         while work is None and not self._stopped:
-            left = end - time.monotonic()
-            if left <= 0:
+            remaining = end - time.monotonic()
+            if remaining <= 0:
                 return
-            happened = self._wait(left)
+            happened = self._wait(remaining)
             work = self._search()
             self._tell_mismatches(now=happened and work is None)
         if work is not None:

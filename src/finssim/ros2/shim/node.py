@@ -62,16 +62,16 @@ class NodeGraph:
 
     def get_topic_names_and_types(self) -> list[tuple[str, list[str]]]:
         """Every topic on the wire with its types."""
-        found: dict[str, set[str]] = {}
+        types_by_topic: dict[str, set[str]] = {}
         for kind in ("publications", "subscriptions"):
             for topic, name in self.context.participant.endpoints(kind):
                 if topic.startswith("rt/"):
-                    found.setdefault(topic[2:], set()).add(name)
-        return sorted((topic, sorted(names)) for topic, names in found.items())
+                    types_by_topic.setdefault(topic[2:], set()).add(name)
+        return sorted((topic, sorted(names)) for topic, names in types_by_topic.items())
 
     def _count(self, topic: str, kind: str) -> int:
         full = f"rt{expanded(topic, self._name, self._namespace)}"
-        return sum(found == full for found, _ in self.context.participant.endpoints(kind))
+        return sum(endpoint_name == full for endpoint_name, _ in self.context.participant.endpoints(kind))
 
 
 # Simulated time: the topic /clock drives a node's clock where its parameter `use_sim_time` is true.
@@ -145,8 +145,8 @@ class Node(NodeParameters, NodeGraph):
         if unknown:
             raise TypeError(f"Node takes no argument '{min(unknown)}'")
         self._context = context or get_default_context()
-        own = parse_arguments(cli_args or ())
-        sources = [self.context.arguments, own] if use_global_arguments else [own]
+        local_arguments = parse_arguments(cli_args or ())
+        sources = [self.context.arguments, local_arguments] if use_global_arguments else [local_arguments]
         self._rules = [rule for source in reversed(sources) for rule in source.remaps]
         self._name, self._namespace = self._named(node_name, namespace or "")
         self._logger = get_logger(self.get_fully_qualified_name().strip("/").replace("/", "."))
@@ -284,10 +284,10 @@ class Node(NodeParameters, NodeGraph):
 
     def destroy_timer(self, timer: Timer) -> bool:
         """Remove a timer; whether it was the node's."""
-        known = timer in self._timers
+        present = timer in self._timers
         timer.cancel()
         self._timers = [t for t in self._timers if t is not timer]
-        return known
+        return present
 
     def destroy_publisher(self, publisher: Publisher) -> bool:
         """Remove a publisher; whether it was the node's."""
@@ -359,7 +359,7 @@ class Node(NodeParameters, NodeGraph):
         return True
 
     def _parameters_changed(
-        self, new: list[Parameter], changed: list[Parameter], gone: list[Parameter]
+        self, new: list[Parameter], changed: list[Parameter], removed: list[Parameter]
     ) -> None:
         """Tell everybody on /parameter_events, and follow `use_sim_time`."""
         for parameter in (*new, *changed):
@@ -371,7 +371,7 @@ class Node(NodeParameters, NodeGraph):
                 node=self.get_fully_qualified_name(),
                 new_parameters=[p.to_parameter_msg() for p in new],
                 changed_parameters=[p.to_parameter_msg() for p in changed],
-                deleted_parameters=[p.to_parameter_msg() for p in gone],
+                deleted_parameters=[p.to_parameter_msg() for p in removed],
             )
         )
 

@@ -292,14 +292,14 @@ class NodeParameters:
         if name in self._values:
             raise ParameterAlreadyDeclaredException(f"parameter '{name}' is declared twice")
         parameter = Parameter(name, value=value)
-        why = self._set([parameter], {name: descriptor})
-        if why:
+        reason = self._set([parameter], {name: descriptor})
+        if reason:
             wrong = (
                 not descriptor.dynamic_typing
                 and value is not None
                 and parameter.type_.value != descriptor.type
             )
-            raise (InvalidParameterTypeException if wrong else InvalidParameterValueException)(why)
+            raise (InvalidParameterTypeException if wrong else InvalidParameterValueException)(reason)
         return self._values[name]
 
     def declare_parameters(
@@ -307,7 +307,7 @@ class NodeParameters:
     ) -> list[Parameter]:
         """Declare several as (name, value, descriptor), their names below `namespace` if it is not empty."""
         prefix = f"{namespace}{DOT}" if namespace else ""
-        if not all(1 <= len(given) <= 3 for given in parameters):
+        if not all(1 <= len(entry) <= 3 for entry in parameters):
             raise TypeError("each parameter is (name,), (name, value) or (name, value, descriptor)")
         return [
             self.declare_parameter(prefix + name, *rest, ignore_override=ignore_override)
@@ -416,8 +416,10 @@ class NodeParameters:
         if not self._undeclared:
             for parameter in parameters:
                 self._declared(parameter.name)
-        why = self._set(list(parameters))
-        return codec_of().message("rcl_interfaces/msg/SetParametersResult")(successful=not why, reason=why)
+        reason = self._set(list(parameters))
+        return codec_of().message("rcl_interfaces/msg/SetParametersResult")(
+            successful=not reason, reason=reason
+        )
 
     def describe_parameter(self, name: str) -> Any:
         """Its rcl_interfaces/ParameterDescriptor."""
@@ -442,7 +444,7 @@ class NodeParameters:
         self._afterwards.insert(0, callback)
 
     def _parameters_changed(
-        self, new: list[Parameter], changed: list[Parameter], gone: list[Parameter]
+        self, new: list[Parameter], changed: list[Parameter], removed: list[Parameter]
     ) -> None:
         """Parameters have been declared, set and undeclared."""
 
@@ -459,34 +461,34 @@ class NodeParameters:
         for parameter in parameters:
             name = parameter.name
             descriptor = (self._descriptors if descriptors is None else descriptors).get(name)
-            why = (
+            reason = (
                 ""
                 if descriptor is None
                 else self._refusal(parameter, descriptor, declaring=descriptors is not None)
             )
-            if why:
-                return f"parameter '{name}' {why}"
+            if reason:
+                return f"parameter '{name}' {reason}"
         for callback in self._callbacks:
             result = callback(parameters)
             if not result.successful:
                 return f"parameter '{', '.join(p.name for p in parameters)}' was refused: {result.reason}"
         new: list[Parameter] = []
         changed: list[Parameter] = []
-        gone: list[Parameter] = []
+        removed: list[Parameter] = []
         for parameter in parameters:
             name = parameter.name
             if descriptors is None and parameter.type_ is Kind.NOT_SET:
                 self._values.pop(name, None), self._descriptors.pop(name, None)
-                gone.append(parameter)
+                removed.append(parameter)
                 continue
             (changed if self.get_parameter_or(name).type_ is not Kind.NOT_SET else new).append(parameter)
             if descriptors is not None:
                 self._descriptors[name] = descriptors[name]
             elif name not in self._descriptors:
-                made = codec_of().message("rcl_interfaces/msg/ParameterDescriptor")
-                self._descriptors[name] = made(name=name, dynamic_typing=True)
+                added = codec_of().message("rcl_interfaces/msg/ParameterDescriptor")
+                self._descriptors[name] = added(name=name, dynamic_typing=True)
             self._values[name] = parameter
-        self._parameters_changed(new, changed, gone)
+        self._parameters_changed(new, changed, removed)
         for afterwards in self._afterwards:
             afterwards(parameters)
         return ""
@@ -501,11 +503,9 @@ class NodeParameters:
         elif kind is Kind.NOT_SET:
             return "" if declaring else "has a fixed type and cannot be undeclared"
         elif kind.value != descriptor.type:
-            wanted = Kind(descriptor.type)
-            such = ", such as 1.0" if wanted is Kind.DOUBLE else ""
-            return (
-                f"is {wanted.name}, found {parameter.value!r} ({kind.name}): give a value of that type{such}"
-            )
+            expected = Kind(descriptor.type)
+            such = ", such as 1.0" if expected is Kind.DOUBLE else ""
+            return f"is {expected.name}, found {parameter.value!r} ({kind.name}): give a value of that type{such}"
         if kind is Kind.INTEGER and descriptor.integer_range:
             return _outside(parameter.value, descriptor.integer_range[0], close=0.0)
         if kind is Kind.DOUBLE and descriptor.floating_point_range:

@@ -136,8 +136,8 @@ class Clock:
     """
 
     def __new__(cls, *, clock_type: ClockType = ClockType.SYSTEM_TIME) -> Any:
-        wanted = ROSClock if clock_type == ClockType.ROS_TIME else cls
-        return super().__new__(wanted)
+        clock_class = ROSClock if clock_type == ClockType.ROS_TIME else cls
+        return super().__new__(clock_class)
 
     def __init__(self, *, clock_type: ClockType = ClockType.SYSTEM_TIME) -> None:
         self.clock_type = clock_type

@@ -51,8 +51,8 @@ def through_water(radiance: wp.vec3, attenuation: wp.vec3, veil: wp.vec3, path: 
     """
     out = wp.vec3()
     for i in range(3):
-        kept = wp.exp(-attenuation[i] * path)
-        out[i] = radiance[i] * kept + veil[i] * (1.0 - kept)
+        transmitted = wp.exp(-attenuation[i] * path)
+        out[i] = radiance[i] * transmitted + veil[i] * (1.0 - transmitted)
     return out
 
 

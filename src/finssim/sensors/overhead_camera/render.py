@@ -42,8 +42,8 @@ class Rectangle(NamedTuple):
 
     def clipped(self, width: int, height: int) -> Rectangle:
         """The part of it within an image."""
-        left, top = min(max(self.left, 0), width), min(max(self.top, 0), height)
-        return Rectangle(left, top, max(min(self.right, width), left), max(min(self.bottom, height), top))
+        x0, top = min(max(self.left, 0), width), min(max(self.top, 0), height)
+        return Rectangle(x0, top, max(min(self.right, width), x0), max(min(self.bottom, height), top))
 
     @property
     def area(self) -> int:
@@ -71,19 +71,19 @@ def rectangles(scene: Scene, tags: Sequence[TagInScene], steepest: float) -> lis
     pixels, visible = _seen(scene, corners)
     depth = np.max(np.abs(scene.interface.distance(corners)), axis=1)
     margin = BORDER + math.ceil(scene.sensor.spot) + _ripple_shift(scene, corners, depth, steepest)
-    found = []
+    boxes = []
     for i in range(len(tags)):
         box = Rectangle(0, 0, lens.width, lens.height)
         if visible[i].all():
             low, high = np.floor(pixels[i].min(0) - margin[i]), np.ceil(pixels[i].max(0) + margin[i]) + 1
             box = Rectangle(*(int(x) for x in np.clip([*low, *high], -(2**30), 2**30)))
-        found.append(box.clipped(lens.width, lens.height))
-    return found
+        boxes.append(box.clipped(lens.width, lens.height))
+    return boxes
 
 
-def merged(found: Iterable[Rectangle]) -> list[Rectangle]:
+def merged(boxes: Iterable[Rectangle]) -> list[Rectangle]:
     """Rectangles that cover the same pixels, with those that overlap joined while that costs few pixels more."""
-    rest = [r for r in found if r.area > 0]
+    rest = [r for r in boxes if r.area > 0]
     done: list[Rectangle] = []
     while rest:
         a = rest.pop()
@@ -163,8 +163,11 @@ def _tags(tags: Sequence[TagInScene], frame: SurfaceFrame) -> NDArray[Any]:
     table = np.zeros(len(tags), dtype=layout_of(TagData))
     offset = 0
     for row, tag in zip(table, tags, strict=True):
-        for pose, place, axes in ((tag.pose, "start", "q_start"), (tag.end or tag.pose, "end", "q_end")):
-            row[place] = frame.point(pose.position)
+        for pose, position_field, axes in (
+            (tag.pose, "start", "q_start"),
+            (tag.end or tag.pose, "end", "q_end"),
+        ):
+            row[position_field] = frame.point(pose.position)
             row[axes] = frame.quaternion(quat_to_matrix(pose.orientation))
         if np.dot(row["q_start"], row["q_end"]) < 0.0:
             row["q_end"] *= -1.0  # the same axes, on the short way from the start
