@@ -273,7 +273,7 @@ def test_localize_reads_the_tilt(files, tmp_path, capsys):
     """Without --imu the vehicle is taken as level, which is said, and its tags' places lie centimetres off."""
     with_it = localized(files, tmp_path, name="a.csv")
     without = localized(files, tmp_path, known=["--depth", "depth.csv"], name="b.csv")
-    assert "taken as level, give or take 2.0 degrees" in capsys.readouterr().out
+    assert "assumed level, within 2.0 degrees" in capsys.readouterr().out
     np.testing.assert_allclose(column(with_it, "roll"), quat_to_euler(attitude(TIMES))[0], atol=1e-3)
     assert (column(without, "roll") == 0.0).all()
     assert np.abs(column(without, "x") - position(TIMES)[:, 0]).max() > 2e-3

@@ -161,7 +161,7 @@ def test_camera_reads_a_charuco_board(place, charuco, capsys):
     ("words", "sentence"),
     [
         ([*CAMERA, "--board", "nine"], "--board is 'nine', expected columns x rows such as 9x6"),
-        ([*CAMERA, "--board", "5x4"], "count the board's corners again"),
+        ([*CAMERA, "--board", "5x4"], "check the count of the board's corners"),
         ([*CAMERA, "--board", "2x2"], "the board has 2x2 corners, expected at least 3"),
         ([*CAMERA, "--board", "9x6", "--charuco", "7x5"], "--board and --charuco are both given"),
         ([*CAMERA, "--charuco", "seven"], "--charuco is 'seven'"),

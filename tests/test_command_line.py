@@ -120,14 +120,14 @@ def test_what_the_source_says_is_what_python_has(words):
     """Each command's options, as read from its source, are parameters of its function with the same defaults."""
     what = COMMANDS[words]
     definition = read(what.work if isinstance(what, Experiment) else what)
-    module, _, name = definition.place.partition(":")
+    module, _, name = definition.path.partition(":")
     found = inspect.signature(getattr(import_module(module), name)).parameters
     extra = any(p.kind is p.VAR_KEYWORD for p in found.values())
     for option in definition.options:
         assert option.name in found or extra
         if option.name in found:
             assert found[option.name].default == option.default
-    assert set(definition.made) <= found.keys() or extra
+    assert set(definition.makers) <= found.keys() or extra
 
 
 def test_every_option_has_help():

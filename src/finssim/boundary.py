@@ -58,7 +58,7 @@ def refusal(error: Exception) -> str | None:
     if isinstance(error, OSError):
         return _system_error(error)
     if isinstance(error, MemoryError):
-        return f"not enough memory: {error or 'something asked for is too large'}: ask for less"
+        return f"not enough memory: {error or 'a requested size is too large'}: ask for less"
     if isinstance(error, ValueError) and (
         _is_ours(type(error).__module__) or _raised_by_us(error.__traceback__)
     ):

@@ -70,14 +70,13 @@ COMMANDS: dict[str, str | Experiment] = {
 """Words -> what they do."""
 
 GROUPS = {
-    "trials": "Look at logs of trials, and make trials of foreign logs.\n\nExample: finssim trials check trials",
+    "trials": "Check trials, and import foreign logs as trials.\n\nExample: finssim trials check trials",
     "calibrate": "Fit a vehicle's numbers to measurements and write a vehicle file with their 95 % intervals.\n\n"
     "Example: finssim calibrate hydrodynamics --help",
     "experiment": "Reproduce a table of the paper in simulation, beside the paper's own numbers.\n\n"
     "Example: finssim experiment replay --help",
-    "record": "Look at records of runs, and mend those that were cut off.\n\nExample: finssim record info run.mcap",
-    "ros2": "Be ROS 2 nodes on this machine's ROS domain; those of a sourced ROS 2 see them and are seen.\n\n"
-    "Example: finssim ros2 up pool",
+    "record": "Inspect records of runs, and repair truncated ones.\n\nExample: finssim record info run.mcap",
+    "ros2": "Run ROS 2 nodes, with or without a ROS 2 installation.\n\nExample: finssim ros2 up pool",
 }
 """Help of what only has commands below it."""
 
@@ -87,7 +86,7 @@ app = command_app(
     COMMANDS,
     GROUPS,
     name="finssim",
-    help="Identify and locate underwater vehicles, simulate them, train controllers, and check all of it.",
+    help="Identify, locate and simulate underwater vehicles, train controllers, and deploy them.",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )
@@ -114,7 +113,7 @@ def _finssim(
 
 
 def vehicles() -> None:
-    """List the vehicles of the catalogue; `show NAME` prints one in full.
+    """List the vehicles in the catalogue; `show NAME` prints one in full.
 
     Example: finssim vehicles
     """
@@ -135,7 +134,7 @@ def show_vehicle(
     Example: finssim vehicles show finsrov --picture finsrov.png
 
     Args:
-        name (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        name (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         picture: Also draw the thruster layout into this file (.png, .svg).
     """
     from rich.console import Console

@@ -11,7 +11,7 @@ once:
         Args:
             duration: Simulated time [s].
             out (FILE): Table to write.
-            device (DEVICE): Where to compute: cpu or cuda.
+            device (DEVICE): Compute device: cpu or cuda.
         \"\"\"
 
 What comes before `*` is typed by its place, the rest as `--name`; a bool is a flag, a `Sequence` may be given several
@@ -74,7 +74,7 @@ class Option:
     name: str
     kind: Any
     many: bool
-    """May be given several times."""
+    """May be repeated."""
     positional: bool
     default: Any
     """`inspect.Parameter.empty` where it must be given."""
@@ -123,10 +123,10 @@ class Option:
 class Definition:
     """A function as its source tells it."""
 
-    place: str
+    path: str
     help: str
     options: tuple[Option, ...]
-    made: Mapping[str, Definition]
+    makers: Mapping[str, Definition]
     """Parameter -> the function that makes its value of options."""
     extra: bool
     """Takes whatever words follow, as `*words`."""
@@ -134,19 +134,19 @@ class Definition:
     def all_options(self) -> Iterator[Option]:
         """Those of the makers too, in the order of the help."""
         yield from self.options
-        for maker in self.made.values():
+        for maker in self.makers.values():
             yield from maker.options
 
     def values(self, typed: Mapping[str, Any]) -> dict[str, Any]:
         """Parameter -> what it is called with, of what was typed."""
         values = {option.name: option.value(typed[option.name]) for option in self.options}
-        return values | {name: maker.call(typed) for name, maker in self.made.items()}
+        return values | {name: maker.call(typed) for name, maker in self.makers.items()}
 
     def call(self, typed: Mapping[str, Any], *extra: str) -> Any:
         """Call it with what was typed."""
         values = self.values(typed)
         positional = [values.pop(option.name) for option in self.options if option.positional]
-        return loaded(self.place)(*positional, *extra, **values)
+        return loaded(self.path)(*positional, *extra, **values)
 
 
 def loaded(path: str) -> Callable[..., Any]:
@@ -189,7 +189,7 @@ def read(path: str) -> Definition:
         names = {argument.arg for argument in node.args.args + node.args.kwonlyargs}
         names |= set((reference[3] or "").split(", "))
         options += [option for option in further.options if option.name not in names]
-        makers |= {name: maker for name, maker in further.made.items() if name not in names}
+        makers |= {name: maker for name, maker in further.makers.items() if name not in names}
     lines_of_help = re.split(r"\n(?:Args|Returns|Raises|Note):\n", about)[0].replace("`", "")
     extra = isinstance(node, ast.FunctionDef) and node.args.vararg is not None
     return Definition(path, lines_of_help, tuple(options), makers, extra)
@@ -197,11 +197,11 @@ def read(path: str) -> Definition:
 
 Help = tuple[str | None, str]
 """METAVAR, and words."""
-Taken = Iterator[tuple[str, ast.expr | None, ast.expr | None, bool, Help]]
+Arguments = Iterator[tuple[str, ast.expr | None, ast.expr | None, bool, Help]]
 """Name, annotation, default, whether it is known by its place, and help."""
 
 
-def _arguments(function: ast.FunctionDef, helps: Mapping[str, Help]) -> Taken:
+def _arguments(function: ast.FunctionDef, helps: Mapping[str, Help]) -> Arguments:
     arguments = function.args
     defaults = [
         *[None] * (len(arguments.args) - len(arguments.defaults)),
@@ -212,7 +212,7 @@ def _arguments(function: ast.FunctionDef, helps: Mapping[str, Help]) -> Taken:
         yield a.arg, a.annotation, default, k < len(arguments.args), helps.get(a.arg, (None, ""))
 
 
-def _fields(settings: ast.ClassDef) -> Taken:
+def _fields(settings: ast.ClassDef) -> Arguments:
     """Fields, each with the text below it as help."""
     for field, below in pairwise([*settings.body, ast.Pass()]):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
@@ -329,7 +329,7 @@ def _handler(name: str, work: Work, *, group: bool = False) -> Callable[..., Any
 def _experiment(name: str, definition: Definition, typed: Mapping[str, Any]) -> int:
     from finssim.experiments.campaign import run_experiment
 
-    path = definition.place
+    path = definition.path
     work, tables = loaded(path), loaded(f"{path.partition(':')[0]}:tables_of")
     options = {"bar": typed.get("robot") is None, "as_json": typed["as_json"]}
     return _status(run_experiment(name, work, tables, **options, **definition.values(typed)))

@@ -67,13 +67,12 @@ EXTRAS = {
     ),
     "view": Extra(
         {"matplotlib": "matplotlib", "viser": "viser"},
-        "draw pictures of vehicles and figures of evaluations, see runs live in the browser",
+        "draw pictures of vehicles and figures of evaluations, show runs live in the browser",
     ),
     "mujoco": Extra({"mujoco": "mujoco"}, "measure speed as a ratio to MuJoCo's"),
+    "usd": Extra({"usd-core": "pxr"}, "place USD models in described worlds"),
     "mpc": Extra({"casadi": "casadi"}, "control by nonlinear model prediction (nmpc)"),
-    "perception": Extra(
-        {"newton": "newton"}, "let cameras, sonars and altimeters see the worlds of finssim.worlds"
-    ),
+    "perception": Extra({"newton": "newton"}, "simulate cameras, sonars and altimeters in finssim.worlds"),
     "vision": Extra(
         {"opencv-python-headless": "cv2", "pupil-apriltags": "pupil_apriltags", "matplotlib": "matplotlib"},
         "detect tags, calibrate cameras and pools from pictures, locate a vehicle from pictures or video",
@@ -103,9 +102,9 @@ EXTRA_OF_MODULE = {
 
 
 def doctor(*, as_json: bool = False) -> int:
-    """Say what is installed, which devices compute, and what each missing extra would enable.
+    """List installed packages and compute devices, and what each missing extra would enable.
 
-    Exit status 1: of what everything needs, the core packages and a processor that computes, something is not there.
+    Exit status 1: a core package or a working compute device is missing.
 
     Example: finssim doctor
     """

@@ -17,7 +17,7 @@ from pathlib import Path
 LONGEST_NAME = 200
 """Of a file or folder that data names [bytes]: 255 are possible, and suffixes, seeds and digests are added."""
 
-_WHAT_TO_DO = {
+_REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space or write elsewhere",
     errno.EDQUOT: "the disk quota is used up: free some space or write elsewhere",
     errno.EFBIG: "the file grew past the limit on file sizes: raise the limit or write elsewhere",
@@ -54,7 +54,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         OutputError: The target is a directory or a device, or the system refused to write.
     """
     target = Path(os.path.realpath(path))
-    with _one_sentence(target, label=path):
+    with _as_output_error(target, label=path):
         if target.is_dir():
             raise OutputError(f"cannot write {path}: it is a directory: give a file name")
         if target.exists() and not target.is_file():
@@ -91,7 +91,7 @@ def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = Non
         OutputError: The target is a file or holds other files, or the system refused to write.
     """
     target = Path(os.path.realpath(path))
-    with _one_sentence(target, label=path):
+    with _as_output_error(target, label=path):
         _refuse_foreign(target, path, replaces)
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = _beside(target)
@@ -101,7 +101,7 @@ def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = Non
             for file in temporary.rglob("*"):
                 _flush(file)
             _refuse_foreign(target, path, replaces)
-            _take_the_place(target, temporary)
+            _swap_in(target, temporary)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
@@ -185,7 +185,7 @@ def _refuse_foreign(target: Path, label: str | os.PathLike[str], replaces: str |
         raise OutputError(f"cannot write {label}: the directory already holds files: give a new or empty one")
 
 
-def _take_the_place(target: Path, temporary: Path) -> None:
+def _swap_in(target: Path, temporary: Path) -> None:
     """Rename `temporary` to `target`; an earlier output steps aside first and returns if the rename fails."""
     if not target.exists():
         os.rename(temporary, target)
@@ -223,16 +223,16 @@ def _flush(path: Path) -> None:
 
 
 @contextmanager
-def _one_sentence(target: Path, *, label: str | os.PathLike[str]) -> Iterator[None]:
+def _as_output_error(target: Path, *, label: str | os.PathLike[str]) -> Iterator[None]:
     """Turn the system's refusals to write under the target's directory into one `OutputError`."""
     try:
         yield
     except OutputError:
         raise
     except OSError as error:
-        if error.errno not in _WHAT_TO_DO or not _about_output(error, target):
+        if error.errno not in _REMEDIES or not _about_output(error, target):
             raise
-        raise OutputError(f"cannot write {label}: {_WHAT_TO_DO[error.errno]}") from error
+        raise OutputError(f"cannot write {label}: {_REMEDIES[error.errno]}") from error
 
 
 def _about_output(error: OSError, target: Path) -> bool:

@@ -30,7 +30,7 @@ CHUNK_BEGINS = re.compile(rb"\x06.{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)
 
 
 @contextmanager
-def whole_mcap(path: Path, notes: list[str]) -> Iterator[Path]:
+def intact_mcap(path: Path, notes: list[str]) -> Iterator[Path]:
     """The file itself; or, of an MCAP that is cut or damaged, a temporary copy of its whole records.
 
     Args:
@@ -51,7 +51,7 @@ def whole_mcap(path: Path, notes: list[str]) -> Iterator[Path]:
 
 def _copied(data: mmap.mmap, copy: Path) -> str | None:
     """Copy the whole records of a file of which others are broken, and say which; nothing of a file that is well."""
-    spans, lost = _whole_records(data)
+    spans, lost = _intact_records(data)
     summary, ends = _summary(data), data[-len(MAGIC) :] == MAGIC
     if not lost and ends and summary is not None:
         return None
@@ -70,11 +70,11 @@ def _copied(data: mmap.mmap, copy: Path) -> str | None:
     return "damaged: its index cannot be read" if ends else "cut off and was read up to the cut"
 
 
-def _whole_records(data: mmap.mmap) -> tuple[list[tuple[int, int]], list[int]]:
+def _intact_records(data: mmap.mmap) -> tuple[list[tuple[int, int]], list[int]]:
     """Begin and end of each whole record up to the end of the data, and the lengths of what is broken between them."""
     spans, lost, at = [], [], len(MAGIC)
     while at < len(data) and data[at] not in (DATA_END, FOOTER):
-        if (end := _whole(data, at)) is None:
+        if (end := _record_end(data, at)) is None:
             if (end := _resumed(data, at)) is None:
                 break
             lost.append(end - at)
@@ -87,13 +87,13 @@ def _whole_records(data: mmap.mmap) -> tuple[list[tuple[int, int]], list[int]]:
 def _resumed(data: mmap.mmap, at: int) -> int | None:
     """Where the next whole record begins after a broken one: where that says that it ends, or else the next chunk."""
     end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
-    if end < len(data) and _whole(data, end) is not None:
+    if end < len(data) and _record_end(data, end) is not None:
         return end
     begins = (match.start() for match in CHUNK_BEGINS.finditer(data, at + 1))
-    return next((begin for begin in begins if _whole(data, begin) is not None), None)
+    return next((begin for begin in begins if _record_end(data, begin) is not None), None)
 
 
-def _whole(data: bytes | mmap.mmap, at: int) -> int | None:
+def _record_end(data: bytes | mmap.mmap, at: int) -> int | None:
     """The end of the record that begins there; None if it is broken or cut."""
     if at + 9 > len(data):
         return None
@@ -147,7 +147,7 @@ def _sound_chunk(body: bytes) -> bool:
         records = _unpacked(compression.decode("ascii"), body[begin:])
     except Exception:  # each compression has errors of its own
         return False
-    return len(records) == size and (zlib.crc32(records) == crc if crc else _last_whole(records) == size)
+    return len(records) == size and (zlib.crc32(records) == crc if crc else _last_record_end(records) == size)
 
 
 def _summary(data: mmap.mmap) -> bytes | None:
@@ -164,16 +164,16 @@ def _summary(data: mmap.mmap) -> bytes | None:
 def _announced(summary: bytes) -> Iterator[bytes]:
     """The schemas and channels of a summary."""
     at = 0
-    while (end := _whole(summary, at)) is not None:
+    while (end := _record_end(summary, at)) is not None:
         if summary[at] in (SCHEMA, CHANNEL):
             yield summary[at:end]
         at = end
 
 
-def _last_whole(records: bytes) -> int:
+def _last_record_end(records: bytes) -> int:
     """Where the last whole record ends."""
     at = 0
-    while (end := _whole(records, at)) is not None:
+    while (end := _record_end(records, at)) is not None:
         at = end
     return at
 
@@ -189,7 +189,7 @@ def _of_cut_chunk(data: bytes) -> bytes:
         records = _unpacked(compression, data[41 + length + 8 :])
     except Exception:  # as above
         return b""
-    return records[: _last_whole(records)]
+    return records[: _last_record_end(records)]
 
 
 def _unpacked(compression: str, packed: bytes) -> bytes:
@@ -228,13 +228,13 @@ def mcap_metadata(path: Path, name: str) -> dict[str, str]:
             if kind != METADATA:
                 file.seek(length, 1)
                 continue
-            strings = _words(file.read(length))
+            strings = _strings(file.read(length))
             if len(strings) % 2 and strings[0] == name:
                 return dict(zip(strings[1::2], strings[2::2], strict=True))
     return {}
 
 
-def _words(data: bytes) -> list[str]:
+def _strings(data: bytes) -> list[str]:
     """The name, and keys and values by turns; as many as the data hold."""
     strings, at = [], 0
     while at + 4 <= len(data):

@@ -15,9 +15,9 @@ from finssim.calibration.report import fit_json, fit_report, state_text
 from finssim.calibration.vehicle_file import (
     all_findings,
     calibrated,
-    kept,
     number_in,
     number_origins,
+    retained_values,
     write_vehicle,
 )
 from finssim.vehicles import load_vehicle
@@ -29,7 +29,7 @@ def test_only_what_the_data_determine_is_written():
     before, after = fit.vehicle, calibrated(fit)
     assert after.hydrodynamic_set("calibrated").linear_damping[0, 0] == 39.1
     assert after.hydrodynamic_set("calibrated").quadratic_damping[5, 5] == 0.47763214
-    assert kept(fit, after) == {"yaw.d2": 0.47763214, "heave.d1": 80.09677}
+    assert retained_values(fit, after) == {"yaw.d2": 0.47763214, "heave.d1": 80.09677}
     old, new = number_origins(before), number_origins(after)
     moved = {".".join(path) for path in new if new[path] != old[path]}
     assert moved == {
@@ -192,4 +192,4 @@ def test_a_part_of_the_drag_is_written_as_unsure():
     assert after.hydrodynamic_set("calibrated").quadratic_damping[5, 5] == 0.1
     assert state_text(fit.estimates["yaw.d2"], fit, after) == "unsure"
     assert after.origin_of(f"{SET}.quadratic_damping.5").note == "95 % interval 0 to 9; rests on its bound"
-    assert "yaw.d2" not in kept(fit, after)
+    assert "yaw.d2" not in retained_values(fit, after)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.calibration.check import check, check_trials, print_reports, together
+from finssim.calibration.check import check, check_trials, print_reports, set_findings
 from finssim.calibration.programmes import programmes
 from finssim.calibration.synthetic import simulate_programme
 from finssim.calibration.trials.trial_files import write_trial
@@ -301,12 +301,12 @@ def test_between_trials(simulated):
     assert [r.verdict for r in twice] == ["usable", "refused"]
     assert said(twice[1].findings, "duplicate") == [{"other": surge.name}]
     out = [changed(trial, header={"role": "held-out"}) for trial in (surge, yaw)]
-    assert said(together(check_trials(out, VEHICLE)), "all_held_out")
+    assert said(set_findings(check_trials(out, VEHICLE)), "all_held_out")
     mixed = check_trials(
         [changed(surge, header={"vehicle": "bluerov2"}), changed(yaw, header={"vehicle": "finsrov"})]
     )
-    assert said(together(mixed), "several_vehicles") == [{"vehicles": ("bluerov2", "finsrov")}]
-    good = together(check_trials([surge, changed(yaw, header={"role": "held-out"})], VEHICLE))
+    assert said(set_findings(mixed), "several_vehicles") == [{"vehicles": ("bluerov2", "finsrov")}]
+    good = set_findings(check_trials([surge, changed(yaw, header={"role": "held-out"})], VEHICLE))
     assert {"sway", "yaw"} <= set(said(good, "axes_untold")[0]["axes"])
 
 
@@ -318,10 +318,10 @@ def test_an_offset_that_several_trials_share_is_told_once(simulated):
         trial = simulated[name]
         moved = {c: np.interp(trial.t - 0.12, trial.t, trial.channels[c]) for c in ("roll", "pitch", "yaw")}
         late.append(replace(trial, channels={**trial.channels, **moved}))
-    (found,) = said(together(check_trials(late, VEHICLE)), "stream_offset_common", "care")
+    (found,) = said(set_findings(check_trials(late, VEHICLE)), "stream_offset_common", "care")
     assert (found["group"], found["sense"], found["reference"]) == ("attitude", "late", "rates")
     assert found["trials"] == 3 and found["seconds"] == pytest.approx(-0.12, abs=0.03)
-    assert not said(together(check_trials(list(simulated.values()), VEHICLE)), "stream_offset_common")
+    assert not said(set_findings(check_trials(list(simulated.values()), VEHICLE)), "stream_offset_common")
 
 
 @pytest.mark.slow
@@ -331,7 +331,7 @@ def test_the_report_is_json_and_fits_a_hundred_columns(simulated):
     text = json.dumps({"trials": [one.as_json() for one in reports]}, allow_nan=False)
     assert json.loads(text)["trials"][0]["axes"]["surge"]["tells"]["m_eff"]["can"] is True
     page = StringIO()
-    print_reports(reports, Console(file=page, width=100), together(reports))
+    print_reports(reports, Console(file=page, width=100), set_findings(reports))
     lines = page.getvalue().split("\n")
     assert max(map(len, lines)) <= 100 and any(line.startswith("surge") for line in lines)
 

@@ -227,9 +227,9 @@ def test_a_dead_zone_shows_only_where_the_table_goes_there():
     """A gap between standstill and the slowest speed is a dead zone if speeds above it are much closer together."""
     above = np.linspace(32.0, 280.0, 80)
     seen = dead_zone(np.r_[0.0, 0.0, above])
-    assert seen.known and seen.speed == 32.0 and seen.interval[0] < 32.0
-    assert not dead_zone(above).known, "no standstill in the table"
-    assert not dead_zone(np.linspace(0.0, 280.0, 10)).known, "the next speed is as far again"
+    assert seen.measured and seen.speed == 32.0 and seen.interval[0] < 32.0
+    assert not dead_zone(above).measured, "no standstill in the table"
+    assert not dead_zone(np.linspace(0.0, 280.0, 10)).measured, "the next speed is as far again"
 
 
 # -- the fit ------------------------------------------------------------------------------------------------------

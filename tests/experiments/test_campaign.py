@@ -11,7 +11,7 @@ from signal import SIGINT, SIGKILL, SIGTERM
 
 import pytest
 
-from finssim.experiments.campaign import ResultError, keep_result, kept_result, run_jobs, write_json
+from finssim.experiments.campaign import ResultError, keep_result, load_result, run_jobs, write_json
 from finssim.experiments.robot_trials import Job
 from reference import played
 
@@ -53,7 +53,7 @@ def test_a_result_that_was_changed_is_not_gone_on_with(tmp_path):
     """It reads as it was written, numbers of 70 bits too; a digit, a key or a half of it missing is refused."""
     path, result = tmp_path / "P01.json", {"e_p": 0.1 + 0.2, "seed": 2**70, "target": ["P01", None]}
     keep_result(path, result)
-    assert kept_result(path) == result
+    assert load_result(path) == result
     text = path.read_text()
     for changed, reason in (
         (text.replace("P01", "P02"), "is not as it was written: remove it"),
@@ -63,7 +63,7 @@ def test_a_result_that_was_changed_is_not_gone_on_with(tmp_path):
     ):
         path.write_text(changed)
         with pytest.raises(ResultError, match=reason):
-            kept_result(path)
+            load_result(path)
 
 
 @pytest.mark.slow

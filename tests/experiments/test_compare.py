@@ -67,7 +67,7 @@ def test_runs_of_a_name_are_a_group(tmp_path):
 def test_what_cannot_be_compared_is_refused(tmp_path):
     """Another setting, a seed twice, another task, nothing."""
     a, b = policy(tmp_path / "run1", 1), policy(tmp_path / "run2", 2, gain=3.0)
-    with pytest.raises(CompareError, match="differ in gain: name them apart"):
+    with pytest.raises(CompareError, match="differ in gain: give different names"):
         groups_of([str(a), str(b)])
     with pytest.raises(CompareError, match="two runs with seed 1"):
         groups_of([f"a={a}", f"a={policy(tmp_path / 'again', 1)}"])

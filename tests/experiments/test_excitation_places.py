@@ -5,7 +5,7 @@ import pytest
 
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.programmes import programmes
-from finssim.experiments.excitation import STOPPING, box_of, place_of
+from finssim.experiments.excitation import STOPPING, box_of, start_of
 from finssim.geometry.rotations import quat_from_yaw, quat_rotate
 from finssim.pool.plant_spec import Basin
 from finssim.vehicles import AXES, load_vehicle
@@ -18,7 +18,7 @@ PLAN = programmes("all", VEHICLE)
 def test_way_and_stop_stay_in_the_water_and_the_workspace(programme):
     """From the start over the room and the stopping way, the envelope keeps off walls, floor and surface, and the
     body origin inside the bridge's inner box."""
-    place = place_of(programme, VEHICLE, box_of(BASIN))
+    place = start_of(programme, VEHICLE, box_of(BASIN))
     axis = programme.axes[0]
     column = programme.tau_desired[:, AXES.index(axis)]
     way = np.zeros(3)
@@ -36,7 +36,7 @@ def test_way_and_stop_stay_in_the_water_and_the_workspace(programme):
 
 def test_surge_and_sway_go_along_the_length_of_the_pool():
     """Left in the body is -x in a world in which the vehicle heads for +y."""
-    by_name = {p.name: place_of(p, VEHICLE, box_of(BASIN)) for p in PLAN}
+    by_name = {p.name: start_of(p, VEHICLE, box_of(BASIN)) for p in PLAN}
     assert by_name["surge_plus_6"].position[0] < -1.0 and by_name["surge_plus_6"].yaw == 0.0
     assert by_name["sway_plus_9"].position[0] > 1.0
     assert by_name["sway_plus_9"].yaw == pytest.approx(np.pi / 2)
@@ -45,4 +45,4 @@ def test_surge_and_sway_go_along_the_length_of_the_pool():
 
 def test_a_pool_without_room_is_refused():
     with pytest.raises(CalibrationError, match="leaves -?0.* m to go along heave"):
-        place_of(next(p for p in PLAN if p.axes == ("heave",)), VEHICLE, box_of(Basin(depth=0.6)))
+        start_of(next(p for p in PLAN if p.axes == ("heave",)), VEHICLE, box_of(Basin(depth=0.6)))

@@ -128,7 +128,7 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     where = OnRobot(wiring=Wiring(robot="127.0.0.1:1", lockstep=True), pool_file=tmp_path / "pool.yaml")
     with pytest.raises(RobotError, match="give --arm"):
         excite(tmp_path / "a", where)
-    with pytest.raises(RobotError, match="by hand somebody has to press enter"):
+    with pytest.raises(RobotError, match="--by-hand waits for enter"):
         excite(tmp_path / "b", robot(where.wiring, by_hand=True, unattended=True))
     with pytest.raises(RobotError, match="holds other files"):
         excite(tmp_path / "a", where, levels=[0.5])
@@ -141,9 +141,9 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     with pytest.raises(CalibrationError, match="to go along surge"):
         box = box_of(small)
         from finssim.calibration.programmes import programmes
-        from finssim.experiments.excitation import place_of
+        from finssim.experiments.excitation import start_of
 
-        place_of(programmes("surge", small)[0], small, box)
+        start_of(programmes("surge", small)[0], small, box)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     [
         (["--robot", "pool", "--pool-file", "pool.yaml", "--pool", "1"], "leave --simulate, --pool"),
         (["--robot", "pool"], "give --pool-file"),
-        (["--arm"], "name one with --robot"),
+        (["--arm"], "need a robot: give --robot"),
     ],
 )
 def test_options_that_do_not_go_together(tmp_path, words, sentence, capsys):

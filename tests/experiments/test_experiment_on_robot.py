@@ -146,8 +146,8 @@ def test_a_trial_that_the_bridge_stops_counts_and_ends_an_unattended_session(tmp
             "--let-in is for dead reckoning",
         ),
         (["--robot", "pool", "--arm", "--pool-file", "none", "--let-in", "here"], "expected two numbers x,y"),
-        (["--let-in", "0,0"], "name one with --robot"),
-        (["--unattended"], "name one with --robot"),
+        (["--let-in", "0,0"], "need a robot: give --robot"),
+        (["--unattended"], "need a robot: give --robot"),
     ],
 )
 def test_options_that_do_not_go_together(tmp_path, words, sentence, capsys):

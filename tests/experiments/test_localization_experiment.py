@@ -13,7 +13,7 @@ from finssim.experiments import localization_experiment as module
 from finssim.experiments import statistics
 from finssim.experiments.localization_experiment import (
     CONDITIONS,
-    METHODS_SHOWN,
+    METHOD_TITLES,
     PAPER_TABLE_2,
     Picture,
     localization_experiment,
@@ -67,7 +67,7 @@ def test_the_result_has_its_documented_parts(done):
     assert (result["places"], result["pictures_per_seed"]) == (20, 40)
     assert set(result["results"]) == {*CONDITIONS, "lifted"}
     for methods in result["results"].values():
-        assert set(methods) == set(METHODS_SHOWN)
+        assert set(methods) == set(METHOD_TITLES)
         for figures in methods.values():
             assert figures["located"] + sum(figures["reasons"].values()) == figures["pictures"]
             low, high = figures["rmse_ci95_cm"]
@@ -288,6 +288,6 @@ def test_methods_are_told_the_noise_that_the_calibration_found(monkeypatch):
         "locate",
         lambda *words, **named: told.append(named["pixel_std"]) or locate(*words, **named),
     )
-    one = experiment._one("published", 1, "geometry", {"locations": (5, 4), "images": 40})
-    assert len(told) == len(experiment.METHODS_SHOWN)
-    assert set(told) == {one.found.refractive.pixel_std} and one.found.refractive.pixel_std > 0.1
+    one = experiment._play_seed("published", 1, "geometry", {"locations": (5, 4), "images": 40})
+    assert len(told) == len(experiment.METHOD_TITLES)
+    assert set(told) == {one.calibration.refractive.pixel_std} and one.calibration.refractive.pixel_std > 0.1

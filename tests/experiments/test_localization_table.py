@@ -7,7 +7,7 @@ from rich.console import Console
 
 from finssim.experiments.localization_experiment import (
     CONDITIONS,
-    METHODS_SHOWN,
+    METHOD_TITLES,
     PAPER_TABLE_2,
     tables_of,
 )
@@ -39,7 +39,7 @@ NOTHING = {
 @pytest.fixture
 def result():
     """Made-up figures, each method's other than the next one's."""
-    methods = {method: figures(1.0 + k) for k, method in enumerate(METHODS_SHOWN)}
+    methods = {method: figures(1.0 + k) for k, method in enumerate(METHOD_TITLES)}
     return {
         "seeds": [1, 2],
         "seeds_asked_for": 2,
@@ -72,7 +72,7 @@ def printed(result, width=100):
 def test_every_figure_of_every_method_is_shown(result):
     """Under its conditions, with its interval and how many pictures were located; and on the page as well."""
     text, page = printed(result), markdown_of(tables_of(result))
-    for k in range(len(METHODS_SHOWN)):
+    for k in range(len(METHOD_TITLES)):
         for cell in (f"{1 + k:.2f}", f"[{0.875 + k:.2f}, {1.125 + k:.2f}]", f"{2 + 2 * k:.2f}"):
             assert text.count(cell) >= 4 and page.count(cell) >= 4
     assert "10/12" in text and "10/12" in page

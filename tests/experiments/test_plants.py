@@ -41,14 +41,14 @@ def test_the_plants_of_the_protocol_ship():
 def test_a_plant_is_seen_with_what_is_asked_for():
     """In place of its noise; the environment has the sensors, and the result says so."""
     assert load_plant("sensors").environment_arguments()["noise"] == Sensing()
-    seen = load_plant("noise").seen("sensors")
+    seen = load_plant("noise").with_view("sensors")
     assert seen.observe == "sensors" and not seen.noise and seen.title.endswith("; seen: sensors")
-    assert load_plant("nominal").seen("truth").environment_arguments()["noise"] == MeasurementNoise()
-    told = seen.told_of_sight(FINSROV)["observe"]
+    assert load_plant("nominal").with_view("truth").environment_arguments()["noise"] == MeasurementNoise()
+    told = seen.observe_record(FINSROV)["observe"]
     assert told["name"] == "sensors" and told["fixes"]["rate"] == 30.0 and told["imu"]["rate"] == 100.0
-    assert load_plant("noise").told_of_sight(FINSROV) == {}
+    assert load_plant("noise").observe_record(FINSROV) == {}
     with pytest.raises(PlantError, match="observe is 'eyes', expected truth, estimator, sensors"):
-        load_plant("nominal").seen("eyes")
+        load_plant("nominal").with_view("eyes")
     with pytest.raises(ValueError, match="noise and observe: sensors are both given"):
         Plant(name="both", noise={"yaw_std": 0.1}, observe="sensors")
 

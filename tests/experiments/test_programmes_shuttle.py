@@ -5,7 +5,7 @@ import pytest
 
 from finssim.calibration.programmes import travel
 from finssim.experiments.demo import PERIODS, shuttles
-from finssim.experiments.excitation import box_of, place_of
+from finssim.experiments.excitation import box_of, start_of
 from finssim.pool.plant_spec import Basin
 from finssim.vehicles import AXES, load_vehicle
 
@@ -28,7 +28,7 @@ def test_as_much_forward_as_back_and_named_by_axis_and_level(axis):
 def test_the_way_fits_the_room_on_either_side_of_the_start(axis, level):
     """By the damping of the vehicle's file; the start is the middle of the pool."""
     (programme,) = shuttles({axis: [level]}, VEHICLE)
-    place = place_of(programme, VEHICLE, box_of(Basin()))
+    place = start_of(programme, VEHICLE, box_of(Basin()))
     assert place.position[:2] == pytest.approx((0.0, 0.0), abs=1e-12)
     assert (
         travel(programme.tau_desired[:, AXES.index(axis)], programme.rate, axis, VEHICLE) < 2.0 * place.room

@@ -151,7 +151,7 @@ def test_records_that_do_not_fit_are_refused(tmp_path):
     for path, task, sentence in (
         (other, "t1", "is of the vehicle .*, expected finsrov .* --vehicle"),
         (slow, "t1", "decided every 0.2 s, expected at most 0.1 s, the period of t1"),
-        (never, "t1", "nowhere was the robot armed"),
+        (never, "t1", "the robot was never armed"),
         (tmp_path / "blind.mcap", "t1", "holds no estimate of where it was"),
         (slow, "t9", "unknown task 't9'; available: t1, t2"),
     ):

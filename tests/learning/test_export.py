@@ -232,7 +232,7 @@ def test_what_cannot_be_written_is_refused(tmp_path):
     worlds = finssim.make("t1", worlds=2, seed=3)
     scaled = PPO("MlpPolicy", VecNormalize(Sb3VecEnv(worlds)), n_steps=8, batch_size=16, device="cpu")
     for model, message in (
-        (scaled, "VecNormalize scales what it sees: train without it"),
+        (scaled, "VecNormalize scales the observations: train without it"),
         (nn.Linear(15, 6), "does not take observations of 16 elements"),
         (nn.Linear(16, 4), r"maps \(2, 16\) to \(2, 4\)"),
         (print, "expected a torch module"),

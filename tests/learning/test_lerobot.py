@@ -155,7 +155,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path, capsys):
     """A set of an earlier version, a rate that is no whole number, two sets at once: nothing is written."""
     out = tmp_path / "out"
     old = save(tmp_path / "sets/old", EPISODES, {k: x for k, x in DESCRIBED.items() if k != "period"})
-    with pytest.raises(DatasetError, match="does not tell its period: collect it again"):
+    with pytest.raises(DatasetError, match="has no period: collect it again"):
         export_lerobot(old, out)
     odd = save(tmp_path / "sets/odd", EPISODES, {**DESCRIBED, "period": 0.15})
     with pytest.raises(

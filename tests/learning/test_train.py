@@ -238,7 +238,7 @@ def test_only_the_same_training_is_resumed(tmp_path, capsys):
     with pytest.raises(ResumeError, match="nothing to resume: there is no folder .*leave out --resume"):
         train("t1", out=tmp_path / "p", resume=True, **SMALL)
     first = network(train("t1", out=tmp_path / "p", **SMALL))
-    with pytest.raises(ResumeError, match="seed was 5 and is 6 now: give what the training began with"):
+    with pytest.raises(ResumeError, match="seed was 5 and is 6 now: give the original settings"):
         train("t1", out=tmp_path / "p", resume=True, **{**SMALL, "seed": 6})
     side = tmp_path / "p-training"
     for path in side.glob("checkpoint-*/resume.npz"):
@@ -291,7 +291,7 @@ def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path, learner):
         (
             {"init": "pid", "learner": "rsl-rl"},
             TrainingError,
-            "learner 'rsl-rl' imitates nobody before it learns",
+            "learner 'rsl-rl' has no initial imitation",
         ),
         (
             {"init": "pdi"},

@@ -11,7 +11,7 @@ from finssim.geometry.rotations import quat_from_euler
 from finssim.localization import LocalizationError, localize
 from finssim.localization.detection.detections import Frame, write_detections
 from finssim.localization.detection.families import printable
-from finssim.localization.localize import known_of
+from finssim.localization.localize import prior_sources
 from finssim.localization.pool import write_pool
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.vehicles import load_vehicle
@@ -130,7 +130,7 @@ def test_a_constant_depth_needs_no_time(files, capsys):
     depth = -float(POOL.interface.distance(position + rotation(angles, up) @ PORT))
     _, rows = located(files, depth=str(depth))
     printed = capsys.readouterr().out
-    assert "taken as level, give or take 2.0 degrees" in printed
+    assert "assumed level, within 2.0 degrees" in printed
     assert [float(rows[0][k]) for k in "xyz"] == pytest.approx(position, abs=1e-6)
     assert rows[1]["reason"] == "no tag seen"
     assert float(rows[0]["std_x"]) > 3e-3  # 2 degrees of tilt, and a depth sensor's centimetre
@@ -215,7 +215,7 @@ def test_an_interrupt_keeps_the_rows_so_far(files, monkeypatch):
 def test_height_follows_from_pressure_behind_a_wall(tmp_path):
     """Where the plane is a wall, the surface is the world frame's origin."""
     pool = replace(POOLS["window wall"], world_position=(0.0, 0.0, 1.2))
-    known = known_of(pool, load_vehicle("finsrov"), depth=0.5, imu=None)
+    known = prior_sources(pool, load_vehicle("finsrov"), depth=0.5, imu=None)
     found = known.at(0.0, needs_height=True)
     assert found.z_b == pytest.approx(1.2 - 0.5 + 0.115)
     assert found.up == (0.0, 0.0, 1.0)

@@ -173,7 +173,7 @@ def test_wrong_tables_are_refused_by_line(tmp_path, pool, text, words):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({}, "nothing says on which plane the points lie"),
+        ({}, "the plane of the points is missing"),
         ({"z": 0.1, "plane": "0,0,1,0"}, "give one of them"),
         ({"plane": "0,0,1"}, "expected four numbers a,b,c,d"),
         ({"plane": "0,0,0,1"}, "not all zero"),

@@ -70,7 +70,7 @@ def test_a_bridge_that_heard_nothing_cannot_be_armed():
     bridge = Bridge(FINSROV)
     assert "telemetry" in bridge.arm(5.0, "operator")
     bridge.telemetry(5.0, telemetry(1))
-    assert "estimator has said nothing" in bridge.arm(5.0, "operator")
+    assert "no output of the estimator yet" in bridge.arm(5.0, "operator")
 
 
 def test_teleoperation_may_arm_without_localization():

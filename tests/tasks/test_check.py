@@ -134,11 +134,11 @@ def test_the_example_passes_and_runs():
 @pytest.mark.parametrize(
     ("task", "sentence"),
     [
-        (Leaking, "a reward depends on the episode before"),
+        (Leaking, "a reward depends on the previous episode"),
         (Moving, "an observation depends on the episode before"),
         (Unbounded, "'way to the depth, upwards' reaches .*: give it a scale or a clip"),
         (Dicing, "equal seeds give other numbers"),
-        (Endless, "goes on after its time limit of 10 control steps"),
+        (Endless, "continues after its time limit of 10 control steps"),
         (Miscounting, "return and length are not those of the last episode"),
         (Misshapen, r"metric 'success' has shape \(3,\), expected \(8,\)"),
     ],

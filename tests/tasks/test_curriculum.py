@@ -151,6 +151,6 @@ def test_a_schedule_without_anything_to_widen_is_refused(ranges, sentence):
 def test_a_task_without_hold_needs_to_be_told_what_success_is():
     """Unless nothing is judged."""
     task = StationKeeping(hold=0.0)
-    with pytest.raises(EnvironmentSetupError, match="has no hold time: say when an episode succeeds"):
+    with pytest.raises(EnvironmentSetupError, match="has no hold time: define success"):
         environment(task=task, curriculum={"by": "success"})
     environment(task=task, curriculum={}).set_progress(0.5)

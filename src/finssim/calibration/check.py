@@ -42,7 +42,7 @@ AGREE = 0.7
 """Correlation of two streams below which their offset is not counted."""
 
 
-def told_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> list[str]:
+def identified_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> list[str]:
     """Names of the trials that tell a parameter of an axis; held-out and refused ones do not count."""
     return [
         report.name
@@ -53,7 +53,7 @@ def told_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> list[s
     ]
 
 
-def together(reports: Sequence[TrialReport]) -> list[Finding]:
+def set_findings(reports: Sequence[TrialReport]) -> list[Finding]:
     """Findings about the set."""
     findings = []
     vehicles = {report.vehicle for report in reports if report.vehicle}
@@ -76,7 +76,7 @@ def together(reports: Sequence[TrialReport]) -> list[Finding]:
     if 0 < fitting < 5:
         findings.append(finding("few_trials", trials=fitting))
     findings += _late(good)
-    nothing = [a for a in AXES if not any(told_by(reports, a, parameter) for parameter in PARAMETERS)]
+    nothing = [a for a in AXES if not any(identified_by(reports, a, parameter) for parameter in PARAMETERS)]
     if nothing and len(nothing) < len(AXES):
         findings.append(finding("axes_untold", axes=tuple(map(str, nothing))))
     return findings
@@ -140,7 +140,7 @@ class StreamReport:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Told:
+class Identifiability:
     """Whether a trial tells a parameter."""
 
     can: bool
@@ -172,7 +172,7 @@ class AxisReport:
     rests: float = 0.0
     """Time without input and motion [s]."""
     excited: bool = False
-    tells: dict[str, Told] = field(default_factory=dict)
+    tells: dict[str, Identifiability] = field(default_factory=dict)
     """By parameter."""
 
 
@@ -253,7 +253,7 @@ def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
         console.print(_streams(report.streams))
     if report.axes:
         console.print(_axes(report.axes))
-        console.print(_tells(report.axes, report.inputs == "passive"), highlight=False)
+        console.print(_identifiability_table(report.axes, report.inputs == "passive"), highlight=False)
     console.print()
 
 
@@ -303,7 +303,7 @@ def _axes(axes: Sequence[AxisReport]) -> Table:
     return table
 
 
-def _tells(axes: Sequence[AxisReport], passive: bool) -> Table:
+def _identifiability_table(axes: Sequence[AxisReport], passive: bool) -> Table:
     """What each axis tells, and why not the rest; reasons that several share are said once."""
     grid = Table.grid(padding=(0, 1))
     for a in axes:
@@ -329,7 +329,7 @@ def _print_overview(reports: Sequence[TrialReport], console: Console) -> None:
     """Trials that tell each parameter of each axis, together."""
     table = _table(("axis", *PARAMETERS), ("axis",), "trials that tell")
     for axis in AXES:
-        counts = [len(told_by(reports, axis, parameter)) for parameter in PARAMETERS]
+        counts = [len(identified_by(reports, axis, parameter)) for parameter in PARAMETERS]
         table.add_row(axis, *(str(count) if count else "[dim]-[/dim]" for count in counts))
     console.print(table)
 
@@ -574,18 +574,20 @@ SLOW = 8.0
 """Rate below which a motor's lag lies between two samples [Hz]."""
 
 
-def with_tells(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> AxisReport:
+def with_identifiability(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> AxisReport:
     """The report with what the axis tells."""
     specific = {"k": ("roll", "pitch"), "buoyancy": ("heave",)}
     names = [name for name in PARAMETERS if report.axis in specific.get(name, AXES)]
     if blocked := _blocked(report, inputs):
-        return replace(report, tells={name: Told(can=False, why=blocked) for name in names})
+        return replace(report, tells={name: Identifiability(can=False, why=blocked) for name in names})
     verdicts = (
-        _passive_tells(report)
+        _passive_identifiability(report)
         if inputs.source == "passive"
-        else _driven_tells(report, motion, inputs, vehicle)
+        else _driven_identifiability(report, motion, inputs, vehicle)
     )
-    return replace(report, tells={name: Told(can=verdicts[name][0], why=verdicts[name][1]) for name in names})
+    return replace(
+        report, tells={name: Identifiability(can=verdicts[name][0], why=verdicts[name][1]) for name in names}
+    )
 
 
 def _blocked(report: AxisReport, inputs: Drive) -> str:
@@ -624,7 +626,7 @@ def _damping(report: AxisReport) -> dict[str, tuple[bool, str]]:
     return dict.fromkeys(("d1", "d2"), (report.decades >= SEPARATE, reason))
 
 
-def _passive_tells(report: AxisReport) -> dict[str, tuple[bool, str]]:
+def _passive_identifiability(report: AxisReport) -> dict[str, tuple[bool, str]]:
     """Parameter -> whether a trial without thrust tells it, and why."""
     scale, nothing = "passive: sets the scale of the others", "passive: no thrust"
     m_eff = {
@@ -643,7 +645,7 @@ def _passive_tells(report: AxisReport) -> dict[str, tuple[bool, str]]:
     }
 
 
-def _driven_tells(
+def _driven_identifiability(
     report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle
 ) -> dict[str, tuple[bool, str]]:
     """Parameter -> whether a trial with inputs tells it, and why."""
@@ -1014,13 +1016,13 @@ def check(
     vehicle: str | None = None,
     as_json: bool = False,
 ) -> None:
-    """Say what trials can and cannot identify: rates [Hz], gaps [s], clock jumps, saturation, excitation.
+    """Report what trials can and cannot identify: rates [Hz], gaps [s], clock jumps, saturation, excitation.
 
     Example: finssim trials check trials --vehicle bluerov2
 
     Args:
         paths (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
-        vehicle (NAME|FILE): Vehicle that made them, where their headers name none.
+        vehicle (NAME|FILE): Vehicle of the trials, if their headers name none.
         as_json: Print one JSON object instead of tables.
 
     Raises:
@@ -1037,7 +1039,7 @@ def check(
                 raise
             trials.append(TrialReport(name=location.name, findings=(finding("unusable", reason=str(error)),)))
     reports = check_trials(trials, loaded)
-    common = together(reports)
+    common = set_findings(reports)
     if as_json:
         records = [entry.as_json() for entry in reports], [entry.as_json() for entry in common]
         print(
@@ -1059,7 +1061,7 @@ def check_trials(trials: Sequence[Trial | TrialReport], vehicle: Vehicle | None 
     first_names: dict[str, str] = {}
     reports = []
     for trial in trials:
-        report = trial if isinstance(trial, TrialReport) else _one(trial, vehicle)
+        report = trial if isinstance(trial, TrialReport) else _report_of(trial, vehicle)
         if report.sha256 and report.sha256 in first_names:
             twice = finding("duplicate", other=first_names[report.sha256])
             report = replace(report, findings=(*report.findings, twice))
@@ -1068,7 +1070,7 @@ def check_trials(trials: Sequence[Trial | TrialReport], vehicle: Vehicle | None 
     return reports
 
 
-def _one(trial: Trial, user_vehicle: Vehicle | None) -> TrialReport:
+def _report_of(trial: Trial, user_vehicle: Vehicle | None) -> TrialReport:
     streams, findings = stream_reports(trial)
     findings += unit_findings(trial)
     report = TrialReport(
@@ -1081,7 +1083,7 @@ def _one(trial: Trial, user_vehicle: Vehicle | None) -> TrialReport:
         findings=tuple(findings),
         sha256=trial.sha256,
     )
-    vehicle = user_vehicle or _own_vehicle(trial, findings)
+    vehicle = user_vehicle or _header_vehicle(trial, findings)
     findings += implausible(trial, vehicle)
     if vehicle is None:
         return replace(report, findings=tuple(findings))
@@ -1099,7 +1101,7 @@ def _one(trial: Trial, user_vehicle: Vehicle | None) -> TrialReport:
     )
 
 
-def _own_vehicle(trial: Trial, findings: list[Finding]) -> Vehicle | None:
+def _header_vehicle(trial: Trial, findings: list[Finding]) -> Vehicle | None:
     """The vehicle that the header names; findings say why there is none."""
     if trial.header.vehicle is None:
         findings.append(finding("no_vehicle"))
@@ -1131,7 +1133,7 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
     trial_motion = motion(trial, vehicle)
     findings += [entry for entry in trial_motion.findings if entry not in findings]
     axes = [
-        with_tells(axis, trial_motion, inputs, vehicle)
+        with_identifiability(axis, trial_motion, inputs, vehicle)
         for axis in axis_reports(trial_motion, inputs, vehicle)
     ]
     findings += work_findings(axes, trial_motion, trial.header.axis)

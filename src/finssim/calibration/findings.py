@@ -18,10 +18,10 @@ Severity = Literal["refused", "care", "note"]
 SEVERITIES: tuple[Severity, ...] = ("refused", "care", "note")
 """The worst first."""
 
-MOST_NAMES = 8
+MAX_NAMES = 8
 """Items of a list that a sentence names."""
 
-MOST_SUBJECTS = 3
+MAX_SUBJECTS = 3
 """Subjects that a sentence names where it holds for several."""
 
 
@@ -31,7 +31,7 @@ class _Template(string.Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         if not isinstance(value, (tuple, list)):
             return str(super().format_field(value, format_spec))
-        return listed([format(item, format_spec) for item in value], MOST_NAMES)
+        return listed([format(item, format_spec) for item in value], MAX_NAMES)
 
 
 def listed(texts: Sequence[str], limit: int) -> str:
@@ -94,7 +94,7 @@ def sentences(findings: Iterable[Finding]) -> list[str]:
         if item.subject not in named:
             named.append(item.subject)
     return [
-        f"{listed(named, MOST_SUBJECTS)}: {text}" if any(named) else text
+        f"{listed(named, MAX_SUBJECTS)}: {text}" if any(named) else text
         for (_, text), named in subjects.items()
     ]
 

@@ -98,7 +98,7 @@ def fit_hydrodynamics(
         raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
     if asked and (method == "regression" or known):
         raise CalibrationError(
-            f"{asked[0]} needs --method simulation: a regression looks at one axis at a time"
+            f"{asked[0]} needs --method simulation: the regression fits one axis at a time"
         )
     if known and method == "simulation":
         raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")
@@ -304,18 +304,18 @@ def calibrate_hydrodynamics(
 
     Args:
         trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
-        axes (AXES): Axes to fit, of surge,sway,heave,roll,pitch,yaw; those that the trials excite if not given.
-        method (METHOD): regression: each axis by its equation of motion; simulation: what simulates the trials best;
-            auto: the regression where it replays the trials very well, else the simulation unless that replays them
-            worse.
-        estimate (NAMES): Also fit, of thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k or the parameters
+        axes (AXES): Axes to fit, of surge,sway,heave,roll,pitch,yaw; the excited ones if not given.
+        method (METHOD): regression: each axis by its equation of motion; simulation: least simulation error; auto:
+            regression if it replays the trials very well, otherwise simulation unless that replays them worse.
+        estimate (NAMES): Further parameters to fit, of
+            thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k or the parameters
             of the vehicle's terms, such as lift.coefficient (simulation method).
         damping (KIND): Drag: linear, quadratic, both, or auto to choose.
-        fix (AXIS.m=N): Inertias that are known, added mass included [kg, kg m²]: yaw.m=0.6,surge.m=24 (regression).
-        horizon: Longest stretch simulated without a restart [s] (simulation method).
-        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        fix (AXIS.m=N): Known inertias, including added mass [kg, kg m²]: yaw.m=0.6,surge.m=24 (regression).
+        horizon: Longest segment simulated without a restart [s] (simulation method).
+        report (DIR): Directory for report.html, report.md, figures and fit.json.
         ranges (FILE): Ranges file to write from the 95 % intervals, for `finssim train --randomize`.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.

@@ -454,8 +454,8 @@ def estimates_of(result: Study, thruster: Thruster) -> list[Estimate]:
     if not result.sure:
         rests += ": no step follows first order plus dead time within 10 %"
     if response.hidden:
-        rests += "; below half a sample, the log cannot tell it from 0"
-    late = "the command's change is known to one sample of its log, which is in the interval"
+        rests += "; below half a sample it is indistinguishable from 0"
+    late = "the command's change is known to one sample of its log; the interval includes this"
     if response.delay < response.sample:
         late = f"delay {response.delay:.3g} s is below one sample of {response.sample:.3g} s"
     gain, half = result.gain
@@ -492,9 +492,9 @@ def _dead_zones(result: Study, thruster: Thruster) -> list[Estimate]:
         if result.domain == "force":
             low, high = (abs(float(thruster.speed(sign * force))) for force in (low, high))
         bracketed = low > 0.0 and high <= NARROW_DEAD_ZONE * low
-        note = "no commands were tried between the last that stands and the first that turns"
+        note = "no commands were logged between the last without and the first with rotation"
         if bracketed:
-            note = "between the last command that leaves the shaft standing and the first that turns it"
+            note = "between the last command without and the first with rotation"
         elif low == 0.0:
             note = f"the smallest command tried, {high / RPM:.0f} rpm, already turns the shaft"
         ends = sorted((sign * low / RPM + 0.0, sign * high / RPM + 0.0))
@@ -672,9 +672,9 @@ def calibrate_motor(
 
     Args:
         trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
-        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        report (DIR): Directory for report.html, report.md, figures and fit.json.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
     """

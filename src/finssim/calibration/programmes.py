@@ -178,7 +178,7 @@ KINDS = ("published", "validation", "multisine")
 RATE = 50.0
 """Of the commands [Hz]."""
 LONGEST = 3600.0
-"""Of a multi-sine [s]."""
+"""Duration of a multi-sine [s]."""
 
 STEP_SEQUENCE = (("rest", 1.0), ("baseline", 1.0), ("excitation", 9.0), ("coast", 2.0), ("rest", 1.0))
 """Pre-zero, baseline, hold, rest, post-zero of the published procedure, by our phase words [s]."""
@@ -301,7 +301,7 @@ def programmes(
         vehicle: Whose limits count.
         levels: Magnitudes for every axis, or by axis [N, N m]; for a multi-sine the peak. Both directions are driven.
         kind: One of `KINDS`.
-        repeats: How often every programme comes.
+        repeats: Repeats of every programme.
         seed: Of a multi-sine's phases.
         coast: Longest coast after a dive [s].
         duration: Of one multi-sine [s].

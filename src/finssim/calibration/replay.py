@@ -834,15 +834,15 @@ def run_replay(
     as_json: bool = False,
     console: Console | None = None,
 ) -> Replay:
-    """Drive models with recorded inputs and score them: NRMSE per axis and trial, in-sample ones labelled.
+    """Simulate models with recorded inputs and score them: NRMSE per axis and trial, in-sample trials labelled.
 
     Example: finssim replay trials/held-out --vehicle fitted.yaml --hydrodynamics calibrated --out replay
 
     Args:
         paths (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        hydrodynamics (MODEL): Model to replay: calibrated, simplified or mesh. May be given several times.
-        horizon: Also predict this far ahead [s] from measured states all along the trials.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        hydrodynamics (MODEL): Model to replay: calibrated, simplified or mesh. May be repeated.
+        horizon: Also score predictions this far ahead [s] from measured states throughout the trials.
         out (DIR): Directory for replay.json, replay.md and figures.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.

@@ -28,8 +28,8 @@ from finssim.calibration.trials.trial_files import load_trials
 from finssim.calibration.vehicle_file import (
     all_findings,
     calibrated,
-    kept,
     number_in,
+    retained_values,
     write_ranges,
     write_vehicle,
     yaml_path,
@@ -96,7 +96,7 @@ def progress_bar() -> Iterator[Callable[..., None]]:
 
 BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
 PER_FIGURE = 6
-MOST_CURVES = 48
+MAX_CURVES = 48
 """More are not drawn; the report says so."""
 WIDE = 1.0
 """Half width of the axis of relative intervals."""
@@ -174,7 +174,7 @@ def draw_correlation(correlation: Correlation) -> Figure:
 
 def draw_curves(curves: Sequence[Curve]) -> Iterator[Figure]:
     """Figures of up to six curves each: measured and fitted, and below them what is left over."""
-    drawn = list(curves)[:MOST_CURVES]
+    drawn = list(curves)[:MAX_CURVES]
     for start in range(0, len(drawn), PER_FIGURE):
         part = drawn[start : start + PER_FIGURE]
         columns = min(2, len(part))
@@ -321,7 +321,7 @@ def fit_json(
         "method": fit.method,
         "vehicle": {"name": fit.vehicle.name, "sha256": fit.vehicle.sha256},
         "parameters": {name: estimate.as_json() for name, estimate in fit.estimates.items()},
-        "kept": kept(fit, vehicle),
+        "kept": retained_values(fit, vehicle),
         "quality": plain(fit.quality),
         "correlation": None if fit.correlation is None else fit.correlation.as_json(),
         "findings": [item.as_json() for item in findings],
@@ -392,7 +392,7 @@ def quality_text(figures: Mapping[str, float], *, every: bool = True) -> str:
     return ", ".join(f"{QUALITY.get(key, key.replace('_', ' '))} {number_text(figures[key])}" for key in keys)
 
 
-AS_GIVEN = "as given"
+AS_STATED = "as given"
 """Note of a number that was not estimated: the table on the terminal leaves it out."""
 
 ExtraTable = tuple[Sequence[str], Sequence[Sequence[str]], Sequence[str]]
@@ -438,7 +438,7 @@ class Report:
             right = heading in ("estimate", "file had")
             table.add_column(heading, justify="right" if right else "left", overflow="fold")
         for estimate in self.estimates:
-            if estimate.note != AS_GIVEN:
+            if estimate.note != AS_STATED:
                 style = "" if estimate.identifiable else "yellow"
                 table.add_row(*map(Text, self.cells(estimate)), style=style)
         console.print(self.headline, highlight=False, markup=False)
@@ -473,7 +473,7 @@ class Report:
             page.lead(sentence)
         page.items(self.advice_title, self.advice)
         page.heading("Estimates")
-        kinds = ["" if e.identifiable or e.note == AS_GIVEN else "doubt" for e in self.estimates]
+        kinds = ["" if e.identifiable or e.note == AS_STATED else "doubt" for e in self.estimates]
         page.table(self.heads, [self.cells(e) for e in self.estimates], kinds, last="words")
         for note in (*self.notes, self.reading):
             page.note(note)
@@ -486,10 +486,10 @@ class Report:
 
 
 READING = (
-    "The interval holds the true value in 19 of 20 such calibrations, if the model's form is right: it knows of noise "
-    "and of how much trials differ, not of a wrong model. `unsure`: written, though told together with another number "
-    "and not alone. `file kept`: the trials do not determine it, and the vehicle file keeps its own. Score the result "
-    "on trials that the fit has not seen with `finssim replay` before relying on it."
+    "The interval holds the true value in 19 of 20 such calibrations, if the model's form is right: it "
+    "covers noise and the differences between trials, but not a wrong model. `unsure`: written, "
+    "although determined only jointly with another number. `file kept`: the trials do not determine it, and "
+    "the vehicle file's value is kept. Score the result on held-out trials with `finssim replay` before relying on it."
 )
 
 
@@ -507,9 +507,11 @@ def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> 
     for name, estimate in fit.estimates.items():
         if estimate.note:
             notes.setdefault(estimate.note, []).append(name)
-    unchanged = ", ".join(f"{name} {number_text(value)}" for name, value in kept(fit, vehicle).items())
+    unchanged = ", ".join(
+        f"{name} {number_text(value)}" for name, value in retained_values(fit, vehicle).items()
+    )
     sentence = vehicle.calibrations[-1].sentence()
-    undrawn = len(fit.curves) - MOST_CURVES
+    undrawn = len(fit.curves) - MAX_CURVES
     return Report(
         title=f"Calibration of {fit.vehicle.name}: {sentence}",
         headline=f"{fit.vehicle.name}: {sentence}",

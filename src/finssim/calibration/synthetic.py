@@ -312,7 +312,7 @@ def measure(
     out |= dict(zip(("roll", "pitch", "yaw"), quat_to_euler(q_measured), strict=True))
     for i, name in enumerate("xyz"):
         out[name] = x_measured[..., i]
-    rates, force, depth = _own_sensors(recording, vehicle, noise, every, seed)
+    rates, force, depth = _sensor_channels(recording, vehicle, noise, every, seed)
     if depth is None:
         at = vehicle.sensors.depth.position if vehicle.sensors.depth else np.zeros(3)
         depth = -(x + quat_rotate(q, np.broadcast_to(at, x.shape)))[..., 2] + error(noise.depth_std)
@@ -329,7 +329,7 @@ def measure(
     return out | {name: velocity[..., i] for i, name in enumerate("uvw")}
 
 
-def _own_sensors(
+def _sensor_channels(
     recording: Recording, vehicle: Vehicle, noise: NoiseProfile, every: int, seed: int
 ) -> tuple[Array | None, Array | None, Array | None]:
     """Rates, specific force and depth by the vehicle's own sensors, the newest sample since the last row; None where

@@ -172,14 +172,14 @@ _UNITS: dict[str, dict[str, float]] = {
     "time": {u: TIME_UNITS[u] for u in ("s", "ms", "us", "min")}
     | dict.fromkeys(("sec", "second", "seconds"), 1.0),
 }
-_SHOWN = {
+_UNIT_CHOICES = {
     "speed": "rpm, rad/s, rev/s",
     "force": "N, kgf, gf, lbf",
     "pulse": "us, ms",
     "voltage": "V, mV",
     "time": "s, ms, us",
 }
-_WORDS = {
+_KEYWORDS = {
     "speed": {"speed", "rpm", "omega", "rotation", "rotational", "shaft", "rev", "revs", "velocity"},
     "force": {"force", "thrust", "load", "loadcell"},
     "pulse": {"pwm", "pulse", "pulsewidth", "esc", "throttle", "signal"},
@@ -233,8 +233,8 @@ def find_columns(headers: list[str], used: list[bool], label: str) -> dict[str, 
     for quantity, source in columns.items():
         if math.isnan(source.factor):
             raise CalibrationError(
-                f"{label}: column '{source.header}' has no unit: write it into the header, one of {_SHOWN[quantity]}, "
-                f"such as '{source.header} ({_SHOWN[quantity].split(',')[0]})'"
+                f"{label}: column '{source.header}' has no unit: write it into the header, one of "
+                f"{_UNIT_CHOICES[quantity]}, such as '{source.header} ({_UNIT_CHOICES[quantity].split(',')[0]})'"
             )
     return columns
 
@@ -246,7 +246,7 @@ def _recognised(header: str) -> tuple[str, float] | None:
     for word, (quantity, factor) in _IMPLIED.items():
         if word in tokens and _plain(unit) in ("", word):
             return quantity, factor
-    matches = [quantity for quantity, keywords in _WORDS.items() if tokens & keywords]
+    matches = [quantity for quantity, keywords in _KEYWORDS.items() if tokens & keywords]
     if unit:
         matches = [quantity for quantity in matches if _plain(unit) in _UNITS[quantity]]
         if not label and not matches:

@@ -154,7 +154,7 @@ class DeadZone:
 
     speed: float
     interval: tuple[float, float]
-    known: bool
+    measured: bool
     """Whether the table shows a gap; otherwise `speed` is 0 and the interval ends at the slowest speed seen."""
     note: str = ""
 
@@ -179,12 +179,12 @@ def dead_zone(speed: Array) -> DeadZone | None:
     standing = speed[np.abs(speed) <= STANDING * fastest]
     if standing.size == 0:
         note = "the table holds no standstill: its slowest speed is an upper limit"
-        return DeadZone(speed=0.0, interval=(0.0, slowest), known=False, note=note)
+        return DeadZone(speed=0.0, interval=(0.0, slowest), measured=False, note=note)
     gap, spacing = slowest - float(np.max(standing)), float(np.median(np.diff(turning[:8])))
     if gap <= 3.0 * spacing:
         note = "speeds between standstill and the slowest were not tried"
-        return DeadZone(speed=0.0, interval=(0.0, slowest), known=False, note=note)
-    return DeadZone(speed=slowest, interval=(max(slowest - 2.0 * spacing, 0.0), slowest), known=True)
+        return DeadZone(speed=0.0, interval=(0.0, slowest), measured=False, note=note)
+    return DeadZone(speed=slowest, interval=(max(slowest - 2.0 * spacing, 0.0), slowest), measured=True)
 
 
 # The law between pulse width, battery voltage and shaft speed, fitted to tables.
@@ -414,7 +414,7 @@ def bench(
             sides[name] = side
         zones = [zone for zone in (dead_zone(sign * table.speed) for table in at) if zone is not None]
         if zones and measured:
-            dead[name] = _together(zones)
+            dead[name] = _joint_dead_zone(zones)
         speeds = [_fastest(table, sign, _pulse_range(thruster, tables)) for table in at]
         fastest[name] = max(speeds, default=(0.0, False, 0.0))
     esc = None
@@ -471,13 +471,15 @@ def _reference(volts: Sequence[float], thruster: Thruster, label: str, requested
     return min(near, key=lambda v: abs(v - requested))
 
 
-def _together(zones: Sequence[DeadZone]) -> DeadZone:
+def _joint_dead_zone(zones: Sequence[DeadZone]) -> DeadZone:
     """One dead zone from those of several tables: their median, over all of their intervals."""
-    measured = [zone for zone in zones if zone.known]
+    measured = [zone for zone in zones if zone.measured]
     chosen = measured or list(zones)
     ends = [end for zone in chosen for end in zone.interval]
     middle = float(np.median([zone.speed for zone in chosen]))
-    return DeadZone(speed=middle, interval=(min(ends), max(ends)), known=bool(measured), note=chosen[0].note)
+    return DeadZone(
+        speed=middle, interval=(min(ends), max(ends)), measured=bool(measured), note=chosen[0].note
+    )
 
 
 def _pulse_range(thruster: Thruster, tables: Sequence[ThrustTable]) -> tuple[float, float, float]:
@@ -763,12 +765,12 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
             continue
         sure = math.isfinite(side.half_width) and side.c > side.half_width
         note = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N{volts and ', '}{volts}"
-        note += "" if sure else ": too few or too scattered to tell"
+        note += "" if sure else ": too few or too scattered"
         add(f"c_{name}", side.c, _around(side.c, side.half_width), "N s²/rad²", sure, note)
         if zone is not None:
             low, high = sorted(sign * TO_RPM * end for end in zone.interval)
             note = zone.note or f"slowest speed that turns; {side.c * zone.speed**2:.2g} N there"
-            add(f"dead_rpm_{name}", sign * TO_RPM * zone.speed + 0.0, (low, high), "rpm", zone.known, note)
+            add(f"dead_rpm_{name}", sign * TO_RPM * zone.speed + 0.0, (low, high), "rpm", zone.measured, note)
     if len(result.sides) == 2:
         plus, minus = result.sides["plus"], result.sides["minus"]
         ratio = minus.c / plus.c
@@ -826,7 +828,7 @@ def fit_thruster(
     Args:
         tables: CSV files (see `read_table`), folders of bench trials, or what was read from them.
         vehicle: Whose thrusters they are.
-        group: Propeller group that all tables speak about.
+        group: Propeller group of all tables.
         voltage: At which the numbers shall hold [V], and for tables without a voltage column the voltage they were
             taken at; where not given, the tables' only one, else that of the vehicle file's ESC, else the middle one.
         pool_voltages: Fit all voltages together; otherwise the others only check the prediction.
@@ -838,7 +840,7 @@ def fit_thruster(
     Raises:
         CalibrationError: A table that cannot be read, names that the vehicle does not have, too few rows.
     """
-    read = _named_apart([(item, table) for item in tables for table in _read(item, vehicle)])
+    read = _distinct_names([(item, table) for item in tables for table in _read(item, vehicle)])
     if not read:
         raise CalibrationError("no table given: name at least one CSV file of speeds and thrusts")
     _refuse_duplicates(read)
@@ -911,7 +913,7 @@ def _is_trial(path: Path) -> bool:
     return any({f"rpm_{name}", f"pwm_{name}"} & header for name in names)
 
 
-def _named_apart(read: Sequence[tuple[Any, ThrustTable]]) -> list[ThrustTable]:
+def _distinct_names(read: Sequence[tuple[Any, ThrustTable]]) -> list[ThrustTable]:
     """Tables of files with the same name are called by their folder too: `H_LF/sweep`."""
     names = [table.name for _, table in read]
     return [
@@ -949,12 +951,12 @@ def calibrate_thruster(
 
     Args:
         tables (TABLE): Tables of force against rpm or pulse width (.csv), or trials.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
-        group (NAME): Propeller group that all tables speak about.
-        voltage: Battery voltage at which the numbers shall hold [V], where tables have several.
-        pool_voltages: Fit all voltages together instead of checking one on the others.
-        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        group (NAME): Propeller group of all tables.
+        voltage: Battery voltage of the fit [V], if the tables have several.
+        pool_voltages: Fit all voltages jointly instead of validating one fit on the others.
+        report (DIR): Directory for report.html, report.md, figures and fit.json.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
     """

@@ -34,7 +34,7 @@ from finssim.vehicles import (
 from finssim.vehicles.terms import TERMS
 
 __all__ = [
-    "all_findings", "calibrated", "estimate_at", "file_tree", "folded", "kept", "leaves",
+    "all_findings", "calibrated", "estimate_at", "file_tree", "folded", "retained_values", "leaves",
     "number_in", "number_origins", "scaled_thrust", "write_vehicle",
 ]  # fmt: skip
 
@@ -162,7 +162,7 @@ UNITS = {
 }
 """Key -> unit of its value, written behind it."""
 
-ONE_LINE = (("water",), ("hull",), ("thrusters", "*"), ("tags", "mounts", "*"), ("perception", "*"))
+SINGLE_LINE = (("water",), ("hull",), ("thrusters", "*"), ("tags", "mounts", "*"), ("perception", "*"))
 """Sections that are written on one line where they fit."""
 
 
@@ -209,7 +209,7 @@ def _lines(key: Any, node: Any, path: Key, pad: str) -> Iterator[str]:
     head = f"{pad}{_word(key)}:"
     flow = f"{head} {_word(node)}"
     unit = f"  # [{_unit(path)}]" if _unit(path) else ""
-    short = not node or (_on_one_line(path) and len(flow) <= LONG)
+    short = not node or (_on_single_line(path) and len(flow) <= LONG)
     if isinstance(node, Mapping) and not short and not ("value" in node and not _rows(node["value"])):
         yield head + unit
         for inner, value in node.items():
@@ -293,10 +293,10 @@ def _marks(origin: Provenance | None, inherited: Provenance | None) -> dict[str,
     return {mark: text for mark, text in marks.items() if text}
 
 
-def _on_one_line(path: Key) -> bool:
+def _on_single_line(path: Key) -> bool:
     return any(
         len(path) == len(pattern) and all(p in ("*", q) for p, q in zip(pattern, path, strict=True))
-        for pattern in ONE_LINE
+        for pattern in SINGLE_LINE
     )
 
 
@@ -330,7 +330,7 @@ def _prose(text: str) -> list[str]:
     return [f"description: {'>' if text.endswith(chr(10)) else '>-'}", *(f"  {line}" for line in lines)]
 
 
-OWN = ("position", "axis", "group", "motor_index", "motor_sign")
+PER_THRUSTER = ("position", "axis", "group", "motor_index", "motor_sign")
 """What a thruster keeps for itself; the rest goes to its group where all its members agree."""
 
 
@@ -408,7 +408,8 @@ def _grouped(
         shared = [
             key
             for key in thrusters[first]
-            if key not in OWN and all(_same(key, first, member, thrusters, origins) for member in members[1:])
+            if key not in PER_THRUSTER
+            and all(_same(key, first, member, thrusters, origins) for member in members[1:])
         ]
         groups[group] = {key: thrusters[first][key] for key in shared}
         for key in shared:
@@ -503,7 +504,7 @@ def calibrated(fit: Fit) -> Vehicle:
     )
 
 
-def kept(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
+def retained_values(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
     """Parameters with a place in the vehicle file that the fit left as they were, with the number they keep.
 
     Args:
@@ -546,7 +547,7 @@ def number_in(vehicle: Vehicle, path: str) -> float | None:
     """The number at a dotted path of the vehicle file, `*` and groups by their first thruster; None where none is."""
     keys = tuple(path.split("."))
     for leaf, full_path, value in numbers(vehicle):
-        if _same_place(keys, leaf, vehicle) or keys == full_path:
+        if _same_number(keys, leaf, vehicle) or keys == full_path:
             return value
     return dict(leaves(vehicle.values())).get(keys)  # a coupling of a matrix whose file gives the diagonal
 
@@ -584,12 +585,12 @@ def _plain_value(value: Any) -> Any:
 def _covers(changes: Sequence[Key], leaf: Key, vehicle: Vehicle) -> bool:
     """Whether one of the changes set this number, or a list or section that holds it."""
     return any(
-        _same_place(change, leaf[: len(change)], vehicle) or _same_place(change, leaf, vehicle)
+        _same_number(change, leaf[: len(change)], vehicle) or _same_number(change, leaf, vehicle)
         for change in changes
     )
 
 
-def _same_place(pattern: Key, leaf: Key, vehicle: Vehicle) -> bool:
+def _same_number(pattern: Key, leaf: Key, vehicle: Vehicle) -> bool:
     """Whether a path of an estimate or change means a number of the file's tree.
 
     `*` is any name; `thruster_groups.G.x` is x of every thruster of G; an entry of a diagonal matrix may be given by
@@ -611,7 +612,7 @@ def _same_place(pattern: Key, leaf: Key, vehicle: Vehicle) -> bool:
 
 def _estimate_of(leaf: Key, estimates: Mapping[str, Estimate], vehicle: Vehicle) -> Estimate | None:
     for estimate in estimates.values():
-        if estimate.path is not None and _same_place(tuple(estimate.path.split(".")), leaf, vehicle):
+        if estimate.path is not None and _same_number(tuple(estimate.path.split(".")), leaf, vehicle):
             return estimate
     return None
 
@@ -718,7 +719,7 @@ def range_factors(fit: Fit, vehicle: Vehicle) -> dict[str, Factor]:
     )
     for key in ("time_constant", "delay"):
         paths = [f"thrusters.{name}.{key}" for name in names if getattr(vehicle.thrusters[name], key) > 0.0]
-        if paths and all(_given(vehicle, path) for path in paths):
+        if paths and all(_stated(vehicle, path) for path in paths):
             factors[key] = _around(_factor(path, fit, vehicle) for path in paths)
     return factors
 
@@ -751,14 +752,14 @@ def _around(factors: Iterable[Factor]) -> Factor:
     return Factor(min(f.low for f in every), max(f.high for f in every), reason)
 
 
-def _given(vehicle: Vehicle, path: str) -> bool:
+def _stated(vehicle: Vehicle, path: str) -> bool:
     return any(path == stated or stated.startswith(f"{path}.") for stated in vehicle.provenance)
 
 
 def _ranges_text(fit: Fit, vehicle: Vehicle) -> str:
     record, tree = vehicle.calibrations[-1], dict[str, Any]()
     for entry, factor in range_factors(fit, vehicle).items():
-        _place(tree, entry, factor)
+        _insert(tree, entry, factor)
     lines = [
         "# Factors on the numbers of the calibrated vehicle. told: 95 % interval over the estimate, at least",
         "# 2 % to either side; not told by the trials, or guessed: half to double; not asked for: 0.9 to 1.1.",
@@ -778,7 +779,7 @@ def _factor_lines(tree: Mapping[str, Any], pad: str = "") -> Iterator[str]:
             yield from _factor_lines(node, pad + "  ")
 
 
-def _place(tree: dict[str, Any], entry: str, drawn: Any) -> None:
+def _insert(tree: dict[str, Any], entry: str, drawn: Any) -> None:
     """Put what is drawn where a ranges file has it: `linear_damping.surge` under `axes` of its family."""
     *above, key = entry.split(".")
     for name in [*above, "axes"] if key in AXES else above:

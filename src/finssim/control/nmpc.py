@@ -132,14 +132,14 @@ class Nmpc:
             raise ControlError("a state or a goal that is not finite cannot be planned with")
         memories = [x.reshape(len(rows[0]), *x.shape[len(shape) :]) for x in memory]
         results = [
-            self._one(NmpcMemory(*(x[i] for x in memories)), *(x[i] for x in rows))
+            self._single(NmpcMemory(*(x[i] for x in memories)), *(x[i] for x in rows))
             for i in range(len(rows[0]))
         ]
         tau = np.reshape([wrench for wrench, _ in results], (*shape, 6))
         after = map(np.stack, zip(*(after_one for _, after_one in results), strict=True))
         return tau, NmpcMemory(*(x.reshape(*shape, *x.shape[1:]) for x in after))
 
-    def _one(
+    def _single(
         self, memory: NmpcMemory, p: Array, q: Array, nu: Array, p_goal: Array, q_goal: Array, v_goal: Array,
         a_goal: Array,
     ) -> tuple[Array, NmpcMemory]:  # fmt: skip

@@ -19,7 +19,7 @@ from pydantic import (
 
 KINDS = ("uniform", "log_uniform", "normal", "choice")
 
-MOST_CHOICES = 32
+MAX_CHOICES = 32
 
 CUT = 4.0
 """A normal distribution is cut at so many standard deviations, unless `within` says where."""
@@ -87,7 +87,7 @@ class Distribution(Part):
     """[mean, standard deviation], of the normal distribution before it is cut."""
     within: Pair | None = None
     """[low, high] where a normal distribution is cut; 4 standard deviations from the mean if None."""
-    choice: tuple[float, ...] | None = Field(default=None, min_length=1, max_length=MOST_CHOICES)
+    choice: tuple[float, ...] | None = Field(default=None, min_length=1, max_length=MAX_CHOICES)
     """One of these."""
     weights: tuple[float, ...] | None = None
     """Of the choices, in any unit; equal if None."""
@@ -104,7 +104,7 @@ class Distribution(Part):
         if not all(math.isfinite(x) for x in numbers):
             raise ValueError("expected finite numbers")
         if (self.within is not None) > (self.normal is not None):
-            raise ValueError("within belongs to a normal distribution: leave it out")
+            raise ValueError("within belongs to a normal distribution: omit it")
         if self.weights is not None and (self.choice is None or len(self.weights) != len(self.choice)):
             raise ValueError("weights belong to choices: give one for each")
         if self.weights is not None and (min(self.weights) < 0.0 or sum(self.weights) <= 0.0):

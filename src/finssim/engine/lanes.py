@@ -560,17 +560,17 @@ class Loop:
     def __init__(self, trace: Trace, name: str, start: SimpleNamespace) -> None:
         """Begin with what section 0 has computed."""
         self._trace, self._name, self._start = trace, name, start
-        for word, number in zip(self._words(), _numbers(start), strict=True):
+        for word, number in zip(self._operands(), _numbers(start), strict=True):
             trace.sections[0].append(f"F {word} = {_word(number)};")
 
-    def _words(self) -> list[str]:
+    def _operands(self) -> list[str]:
         return [f"{self._name}_{i}" for i in range(len(_numbers(self._start)))]
 
     def value(self) -> SimpleNamespace:
         """The struct, in the section that is being written."""
         examples = [n.example if isinstance(n, Lane) else n for n in _numbers(self._start)]
         lanes = iter(
-            [self._trace.symbol("F", word, x) for word, x in zip(self._words(), examples, strict=True)]
+            [self._trace.symbol("F", word, x) for word, x in zip(self._operands(), examples, strict=True)]
         )
         return SimpleNamespace(
             **{
@@ -583,10 +583,10 @@ class Loop:
 
     def carry(self, value: SimpleNamespace) -> None:
         """End the loop's pass with other numbers."""
-        for word, number in zip(self._words(), _numbers(value), strict=True):
+        for word, number in zip(self._operands(), _numbers(value), strict=True):
             if _word(number) != word:
                 self._trace.sections[1].append(f"const F {word}_next = {_word(number)};")
-        for word, number in zip(self._words(), _numbers(value), strict=True):
+        for word, number in zip(self._operands(), _numbers(value), strict=True):
             if _word(number) != word:
                 self._trace.sections[1].append(f"{word} = {word}_next;")
 

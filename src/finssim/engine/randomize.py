@@ -25,7 +25,7 @@ from finssim.engine.launch import Pipeline
 from finssim.engine.measured import SENSORS, Measurement
 from finssim.engine.packed import Packed
 from finssim.engine.plant_arrays import build_plant, twist_shift, vehicle_parameters
-from finssim.engine.ranges_file import MOST_WAVES, Ranges, load_ranges
+from finssim.engine.ranges_file import MAX_WAVES, Ranges, load_ranges
 from finssim.engine.ranges_table import ENTRIES, INDEX, TETHER, WORLD, WORLD_END, added_entry, drawn_entries
 from finssim.engine.state import State
 from finssim.engine.surroundings import TetherLine
@@ -94,13 +94,13 @@ def finish_values(d: DrawnArrays, w: int, v: int):
     if d.water != 0:
         count = wp.floor(x[w, v, wp.static(COLUMN["waves.count"])])
         x[w, v, wp.static(COLUMN["waves.count"])] = count
-        for i in range(MOST_WAVES):
+        for i in range(MAX_WAVES):
             if float(i) >= count:
                 x[w, v, wp.static(COLUMN["waves.0.amplitude"]) + 4 * i] = 0.0
 
 
 @wp.func
-def tell(d: DrawnArrays, w: int, v: int):
+def write_privileged(d: DrawnArrays, w: int, v: int):
     """The privileged numbers of an agent; those of the episode that ended move aside."""
     size = d.told.shape[0]
     for i in range(size):
@@ -152,7 +152,7 @@ def draw_episode(
     if d.water != 0 and v == 0:
         write_water(water, nominal, d.values, w, d.drift)
     if v < d.agents:
-        tell(d, w, v)
+        write_privileged(d, w, v)
 
 
 @wp.kernel(enable_backward=False)

@@ -34,7 +34,7 @@ from finssim.yaml_file import read_mapping
 
 SHIPPED = Path(__file__).parent / "ranges"
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
-MOST_WAVES = 8
+MAX_WAVES = 8
 """Most waves that may be drawn for a world: every one costs time in every step."""
 LONGEST = 2.0
 """Longest delay that may be drawn, of a command or of what is seen [s]."""
@@ -63,9 +63,9 @@ def _factor_or_with_mass(value: Any) -> Any:
 
 
 def _count(pair: tuple[int, int]) -> tuple[int, int]:
-    if not 0 <= pair[0] <= pair[1] <= MOST_WAVES:
+    if not 0 <= pair[0] <= pair[1] <= MAX_WAVES:
         raise ValueError(
-            f"is {list(pair)}, expected two whole numbers [low, high] with 0 <= low <= high <= {MOST_WAVES}"
+            f"is {list(pair)}, expected two whole numbers [low, high] with 0 <= low <= high <= {MAX_WAVES}"
         )
     return pair
 
@@ -222,7 +222,7 @@ class Success(Part):
     """The return was at least this."""
 
     @model_validator(mode="after")
-    def _one(self) -> "Success":
+    def _single(self) -> "Success":
         if (self.held is None) == (self.episode_return is None):
             raise ValueError("expected either held [s] or episode_return")
         return self
@@ -329,7 +329,7 @@ class Ranges(Part):
         return {**out, "terms": terms} if terms else out
 
     @model_validator(mode="after")
-    def _together(self) -> "Ranges":
+    def _consistent(self) -> "Ranges":
         from finssim.engine.ranges_table import check_correlated  # the table is made of this file's parts
 
         check_correlated(self)

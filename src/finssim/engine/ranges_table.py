@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from finssim.engine.distributions import Distribution, Drawn, distribution_of, unknown
 from finssim.engine.measured import SENSORS
-from finssim.engine.ranges_file import AXES, MOST_WAVES, EachScales, Offsets, Ranges
+from finssim.engine.ranges_file import AXES, MAX_WAVES, EachScales, Offsets, Ranges
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.vehicles.terms import Term
 
@@ -65,7 +65,7 @@ def _table() -> Iterator[Entry]:
     yield Entry("current_drift.deviation", "m/s", 0.0, world=True)
     yield Entry("current_drift.time", "s", 0.0, world=True)
     yield Entry("waves.count", "1", 0.0, world=True, told=False)
-    for i in range(MOST_WAVES):
+    for i in range(MAX_WAVES):
         yield Entry(f"waves.{i}.amplitude", "m", 0.0, world=True)
         yield Entry(f"waves.{i}.wavelength", "m", 1.0, world=True)
         for name in ("heading", "phase"):
@@ -123,7 +123,9 @@ def drawn_entries(ranges: Ranges, thrusters: int = MAX_THRUSTERS) -> dict[str, D
         thrusters: Of the vehicle that has most; entries of further ones are left out.
     """
     distributions = {
-        name: distribution_of(drawn) for name, drawn in _given(ranges, thrusters) if drawn is not None
+        name: distribution_of(drawn)
+        for name, drawn in _stated_entries(ranges, thrusters)
+        if drawn is not None
     }
     return {
         e.name: distributions[e.name]
@@ -133,7 +135,7 @@ def drawn_entries(ranges: Ranges, thrusters: int = MAX_THRUSTERS) -> dict[str, D
     }
 
 
-def _given(ranges: Ranges, thrusters: int) -> Iterator[tuple[str, Drawn | None]]:
+def _stated_entries(ranges: Ranges, thrusters: int) -> Iterator[tuple[str, Drawn | None]]:
     yield from ranges.terms.items()
     for name in ("mass", "buoyancy", "inertia", "mesh_drag", "added_time_constant", "delay", "added_delay",
                  "command_jitter", "slew", "dead_zone", "added_dead_zone", "current", "vertical_current"):  # fmt: skip

@@ -132,6 +132,7 @@ class Scene:
         bodies = [self.model.body(i) for i in range(self.model.nbody)]
         drawn = [b for b in bodies if b.name in shapes and b.mocapid[0] >= 0]
         self._drawn_solids = [b.mocapid[0] for b in drawn], [shapes[b.name] for b in drawn]
+        self._scales = None if self.world is None else self.world.scales.numpy().copy()
         self._find_vehicles()
         self._painter: Painter | None = None
         names = ("position", "quaternion", "velocity", "acceleration", "pressed")
@@ -202,6 +203,10 @@ class Scene:
         """Put the solids that the world's draws move where they are now."""
         bodies, shapes = self._drawn_solids
         if self.world is not None and bodies:
+            if not np.array_equal(self.world.scales.numpy(), self._scales):
+                raise SimulatorError(
+                    "a draw has changed the size of solids, which MuJoCo keeps: draw first, then make the scene"
+                )
             pose = self.world.transforms.numpy()[0, shapes].astype(float)
             self.data.mocap_pos[bodies], self.data.mocap_quat[bodies] = (
                 pose[:, :3],
@@ -243,8 +248,8 @@ class Scene:
     def _refuse(self) -> None:
         self._broken = True
         raise SimulatorError(
-            f"a number stopped being finite {self.data.time:.3f} s into the scene: look at commands and parameters, "
-            "or take more substeps, and place the vehicles anew"
+            f"a number stopped being finite {self.data.time:.3f} s into the scene: check commands "
+            "and parameters, or use more substeps, and place the vehicles again"
         )
 
     @property

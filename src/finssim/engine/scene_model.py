@@ -189,6 +189,7 @@ def _add_solids(mj: ModuleType, spec: Any, layout: WorldLayout) -> None:
     """
     for k in solid_shapes(layout):
         shape, pose = layout.shapes[k], layout.transforms.numpy()[0, k].astype(float)
+        scale = float(layout.scales.numpy()[0, k])
         position, attitude = pose[:3], wxyz_from_xyzw(pose[3:])
         name, body = f"solid{k}", spec.worldbody
         common = {"rgba": [*map(float, shape.finish.colour), 1.0], "priority": 1}
@@ -199,12 +200,12 @@ def _add_solids(mj: ModuleType, spec: Any, layout: WorldLayout) -> None:
         if shape.kind == "mesh":
             flex = spec.add_flex(name=name, dim=2, radius=SHELL, **common)
             flex.vert, flex.elem = (
-                np.asarray(shape.vertices).ravel().tolist(),
+                (scale * np.asarray(shape.vertices)).ravel().tolist(),
                 np.asarray(shape.faces).ravel().tolist(),
             )
             flex.vertbody, flex.selfcollide = [name] * len(shape.vertices), mj.mjtFlexSelf.mjFLEXSELF_NONE
             continue
-        size = [*shape.size]
+        size = [scale * length for length in shape.size]
         if shape.heights is not None:
             low, high = float(shape.heights.min()), float(shape.heights.max())
             rows, columns = shape.heights.shape

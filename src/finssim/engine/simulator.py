@@ -14,7 +14,7 @@ from finssim.engine.lanes import LANES
 from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
 from finssim.engine.plant_arrays import SimulatorError, build_plant
-from finssim.engine.solids import WorldSolids, layout_of, look_around, pool_of
+from finssim.engine.solids import WorldSolids, layout_of, pool_of, refresh_clearing
 from finssim.engine.state import HISTORY, VehicleState, clear_actuators, new_state
 from finssim.engine.step import physics_kernel, tick
 from finssim.engine.surroundings import Dock, Pool, TetherLine, Water
@@ -100,8 +100,8 @@ class Simulator:
         """
         crew = [vehicles] if isinstance(vehicles, Vehicle | str) else list(vehicles)
         self.vehicles = [v if isinstance(v, Vehicle) else load_vehicle(v) for v in crew]
-        self.hydrodynamics = one_of(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
-        self.integrator = one_of(integrator, INTEGRATORS, "integrator")
+        self.hydrodynamics = checked_choice(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
+        self.integrator = checked_choice(integrator, INTEGRATORS, "integrator")
         if worlds < 1 or substeps < 1 or not self.vehicles:
             raise SimulatorError(
                 f"worlds={worlds}, substeps={substeps}: expected at least one, and one vehicle"
@@ -183,7 +183,7 @@ class Simulator:
             pipeline.add(advance_drift, [self.water, s.steps, self.control_step, self.seed, s.episode])
         if self._solids is not None:
             inputs = [self.state, self.solids, self.plant.array, self.control_step]
-            pipeline.add(look_around, inputs, len(self.vehicles))
+            pipeline.add(refresh_clearing, inputs, len(self.vehicles))
         # One world at a time on a processor, what is not there costs less than another kernel takes to compile.
         general = self.device.is_cpu and not self.in_lanes
         kernel = physics_kernel(
@@ -366,7 +366,7 @@ class Simulator:
 # What a simulator is given, checked: names, devices, vehicles that share a world.
 
 
-def one_of(value: str, available: Sequence[str], kind: str) -> str:
+def checked_choice(value: str, available: Sequence[str], kind: str) -> str:
     """The value, if it is among the available ones; else a sentence that lists them."""
     if value not in available:
         close = difflib.get_close_matches(value, available, n=1)

@@ -78,8 +78,8 @@ class WorldSolids:
         shapes = [layout.shapes[k] for k in chosen]
         self.count = len(shapes)
         contact, solids = layout.world.contact, Solids()
-        self.meshes: dict[str, wp.Mesh] = {}
-        """By object; kept alive for the kernels."""
+        self.meshes: dict[int, wp.Mesh] = {}
+        """By the id of their vertices; kept alive for the kernels."""
         size, bound = np.array([shape.size for shape in shapes], np.float32).reshape(-1, 3), []
         for row, shape in zip(size, shapes, strict=True):
             a, b, c = map(float, shape.size)
@@ -88,8 +88,8 @@ class WorldSolids:
                 points, faces = np.asarray(shape.vertices), np.asarray(shape.faces)
                 row[0] = _is_closed(points, faces)
                 bound.append(np.linalg.norm(points, axis=1).max())
-                if shape.owner not in self.meshes:
-                    self.meshes[shape.owner] = wp.Mesh(
+                if id(shape.vertices) not in self.meshes:
+                    self.meshes[id(shape.vertices)] = wp.Mesh(
                         wp.array(np.float32(points), dtype=wp.vec3, device=device),
                         wp.array(np.int32(faces).ravel(), dtype=int, device=device),
                     )
@@ -106,7 +106,7 @@ class WorldSolids:
                 wp.array(size, dtype=wp.vec3),
                 wp.array(np.float32(bound), dtype=float),
             )
-            ids = [self.meshes[s.owner].id if s.kind == "mesh" else 0 for s in shapes]
+            ids = [self.meshes[id(s.vertices)].id if s.kind == "mesh" else 0 for s in shapes]
             solids.shape = wp.array(np.array(chosen, np.int32), dtype=int)
             solids.mesh = wp.array(np.array(ids, np.uint64), dtype=wp.uint64)
             solids.heights = wp.array(np.float32(heights), dtype=float)
@@ -114,7 +114,7 @@ class WorldSolids:
             solids.drawn, solids.count = wp.full(by_vehicle, -1, dtype=int), wp.zeros(by_vehicle, dtype=int)
             solids.near = wp.zeros((*by_vehicle, NEIGHBOURS), dtype=int)
             solids.force, solids.reach = wp.zeros(by_vehicle, dtype=float), wp.zeros(by_vehicle, dtype=float)
-        solids.pose, solids.draws = layout.transforms, layout.draws
+        solids.pose, solids.scale, solids.draws = layout.transforms, layout.scales, layout.draws
         solids.stiffness, solids.damping, solids.friction = (
             contact.stiffness,
             contact.damping,
@@ -137,7 +137,7 @@ def _is_closed(points: Any, faces: Any) -> bool:
 
 
 @wp.kernel(enable_backward=False)
-def look_around(
+def refresh_clearing(
     state: State,
     solids: Solids,
     plant: wp.array2d(dtype=VehicleParameters),

@@ -104,21 +104,22 @@ def anatomy(
     address: str | None = None,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """How wrong may one thing be? Controllers of T1 in plants where it is wrong by growing amounts, and all at once.
+    """Test controllers of T1 in plants with one parameter wrong by increasing amounts, and with all wrong at once.
 
     Example: finssim experiment anatomy --causes lag,current --rows calibrated,pid --seeds 1 --out anatomy
 
     Args:
-        out (DIR): Directory for JSON, Markdown, figure, policies and trials; one that was interrupted goes on.
-        causes (NAMES): What is wrong, separated by commas; everything if not given.
-        rows (NAMES): Rows of experiment t1 that differ in who steers, separated by commas; all of them if not given.
+        out (DIR): Directory for JSON, Markdown, figure, policies and trials; an interrupted one is continued.
+        causes (NAMES): Wrong parameters, separated by commas; all if not given.
+        rows (NAMES): Rows of experiment t1 with different controllers, separated by commas; all if not given.
         seeds: Trainings of each policy.
         seed: Seed of every random number; equal seeds give equal results.
-        trials: Of each policy in each plant, the published setpoints in turn; ten times as many in all at once.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        steps: Control steps to learn from, all worlds together; what the task needs if not given.
-        processes: Plants at once; as many as processors if not given.
-        address (ADDRESS): Of a Ray cluster that does the work in their place, HOST:PORT or auto.
+        trials: Trials of each policy in each plant, over the published setpoints; ten times as many in the last
+            plant.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        steps: Control steps of the training, summed over all worlds; the task's default if not given.
+        processes: Parallel plants; one per processor if not given.
+        address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto.
         progress: Told the share that is done and what comes next.
 
     Returns:

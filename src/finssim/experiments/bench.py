@@ -146,7 +146,7 @@ def bench(*, device: str = "cpu", progress: Progress = lambda part, text: None) 
     Example: finssim bench --json > bench.json
 
     Args:
-        device (DEVICE): Where to compute: cpu or cuda.
+        device (DEVICE): Compute device: cpu or cuda.
         progress: Told the share that is done and what is measured next.
     """
     plan: dict[tuple[str, str], Callable[[], float | None]] = {

@@ -30,16 +30,16 @@ VEHICLE = "finsrov"
 def bench_cameras(
     *, site: str = "pool", device: str = "cpu", progress: Progress = lambda part, text: None
 ) -> dict[str, Any]:
-    """Measure pictures per second: a vehicle's step, rays, water and noise, beside the bare rays; in processor-seconds.
+    """Measure images per processor-second: a vehicle's step, rays, water and noise, beside the bare rays.
 
-    Each of 256 worlds has a vehicle with a square camera of 90°, and objects and water of its own. The bare rate is
-    that of Newton's SensorCamera alone with depth, shape and normal, measured in turn with the other.
+    Each of 256 worlds has a vehicle with a square camera of 90°, and different objects and water. The bare rate is
+    that of Newton's SensorCamera alone with depth, shape and normal, measured alternately.
 
     Example: finssim bench cameras --json
 
     Args:
-        site (SITE|FILE): World whose shapes are seen.
-        device (DEVICE): Where to compute: cpu or cuda.
+        site (SITE|FILE): Site of the measurement.
+        device (DEVICE): Compute device: cpu or cuda.
         progress: Told the share that is done and what is measured next.
     """
     batch = WorldBatch(load_world(site), worlds=WORLDS, device=device)

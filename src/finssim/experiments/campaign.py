@@ -135,7 +135,7 @@ def keep_result(path: Path, result: Mapping[str, Any]) -> None:
     write_json(path, {**result, "sha256": _digest(result)})
 
 
-def kept_result(path: Path) -> dict[str, Any]:
+def load_result(path: Path) -> dict[str, Any]:
     """A result that `keep_result` wrote.
 
     Raises:
@@ -230,7 +230,7 @@ def run_jobs(
     files = {job.key(): folder / f"{job.key()}.json" for job in jobs}
     missing = {job.key(): job for job in jobs if not files[job.key()].is_file()}
     if address is None:
-        work, items = partial(_play_one, folder=folder, play=play), list(missing.items())
+        work, items = partial(_play_job, folder=folder, play=play), list(missing.items())
     else:
         work, items = partial(_play_away, play=play), [(k, j, _policy_files(j)) for k, j in missing.items()]
     with closing(spread(work, items, processes, address)) as played:
@@ -241,7 +241,7 @@ def run_jobs(
             if result is not None:
                 show(job, result)
             progress(1.0 - remaining / len(files), f"{remaining} trials left")
-    return [kept_result(files[job.key()]) for job in jobs if files[job.key()].is_file()]
+    return [load_result(files[job.key()]) for job in jobs if files[job.key()].is_file()]
 
 
 def spread(
@@ -365,13 +365,13 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _play_one(keyed: tuple[str, Job], folder: Path, play: Play) -> dict[str, Any] | None:
+def _play_job(keyed: tuple[str, Job], folder: Path, play: Play) -> dict[str, Any] | None:
     """Play a job and write KEY.json of its result, with its job."""
     key, job = keyed
-    return _kept(job, folder / key, play(job, folder / key))
+    return _stored(job, folder / key, play(job, folder / key))
 
 
-def _kept(job: Job, path: Path, played: dict[str, Any] | None) -> dict[str, Any] | None:
+def _stored(job: Job, path: Path, played: dict[str, Any] | None) -> dict[str, Any] | None:
     """The result with its job, written to PATH.json; None where there is none."""
     if played is None:
         return None
@@ -413,4 +413,4 @@ def _come_back(
     for name, content in files.items():
         with atomic_write(path.with_name(plain_name(name, "file of a trial", ClusterError))) as temporary:
             temporary.write_bytes(content)
-    return _kept(job, path, played)
+    return _stored(job, path, played)

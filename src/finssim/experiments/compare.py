@@ -41,7 +41,7 @@ class CompareError(ValueError):
 class Run:
     """One training."""
 
-    place: Path
+    path: Path
     description: PolicyDescription
     curves: dict[str, NDArray[np.float64]]
     """Columns of `curves.csv`; empty if it has none."""
@@ -124,8 +124,8 @@ def _check(name: str, runs: Sequence[Run]) -> None:
         different = next((key for key in {**ours, **theirs} if ours.get(key) != theirs.get(key)), "")
         if different:
             raise CompareError(
-                f"{first.place} and {run.place} are both '{name}', but differ in {different}: "
-                "name them apart with NAME=DIR"
+                f"{first.path} and {run.path} are both '{name}', but differ in {different}: "
+                "give different names with NAME=DIR"
             )
     seeds = [run.seed for run in runs]
     for seed in seeds:
@@ -191,12 +191,12 @@ def scores_of(runs: Sequence[Sequence[Mapping[str, Any]]], measure: str) -> NDAr
 
 NOTE = (
     "interquartile mean over seeds and targets; in brackets 95 % of a bootstrap over the seeds, stratified by target. "
-    "With fewer than five seeds an interval is too narrow; with fewer than three nobody is called better."
+    "With fewer than five seeds an interval is too narrow; with fewer than three no group is called better."
 )
 VERDICTS = {
     "better": "{a} is better than {b} in {measure}",
     "worse": "{b} is better than {a} in {measure}",
-    "open": "{a} and {b} are not told apart in {measure}",
+    "open": "{a} and {b} are not distinguishable in {measure}",
 }
 
 
@@ -304,17 +304,17 @@ def compare(
     seed: int = 42,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Compare trainings over seeds: interquartile means with intervals, who is likely better, learning curves.
+    """Compare trainings over seeds: interquartile means, probability of improvement, learning curves.
 
     Example: finssim compare runs/hold-seed1 runs/hold-seed2 runs/hold-seed3 cloned=runs/bc-1 --out compared
 
     Args:
-        runs (RUN...): Policy directories, each DIR or NAME=DIR; those of one name differ in the seed alone.
+        runs (RUN...): Policy directories, each DIR or NAME=DIR; those of one name differ only in the seed.
         out (DIR): Directory for table, figure and evaluations.
-        measures: What to compare; the task's own measures if not given. May be given several times.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        plant (FILE|NAME): What differs from the vehicle file, as for evaluate.
-        trials: Trials of each run; as many as evaluate makes if not given.
+        measures: Metric to compare; the task's metrics if not given. May be repeated.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        plant (FILE|NAME): What differs from the vehicle file, as in finssim evaluate.
+        trials: Trials per run; the default of evaluate if not given.
         seed: Seed of every random number; equal seeds give equal results.
         progress: Told the share that is done and what comes next.
 
@@ -326,7 +326,7 @@ def compare(
     jobs = [
         Job(
             row=group.name, target=run.description.task, task=run.description.task, seed=run.seed, noise=seed,
-            controller=str(run.place), vehicle=vehicle, water=water, trials=trials,
+            controller=str(run.path), vehicle=vehicle, water=water, trials=trials,
         )
         for group in groups for run in group.runs
     ]  # fmt: skip
@@ -371,7 +371,7 @@ def comparison(
     for group in groups:
         seconds = [run.seconds for run in group.runs if run.seconds is not None]
         rows[group.name] = {
-            "runs": [str(run.place) for run in group.runs],
+            "runs": [str(run.path) for run in group.runs],
             "seeds": [run.seed for run in group.runs],
             "steps": group.runs[0].description.training.get("steps"),
             "seconds": sum(seconds) / len(seconds) if seconds else None,

@@ -235,7 +235,9 @@ def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identific
     identified = calibrated(fit)
     findings = tuple(all_findings(fit, identified))
     identified = _named(
-        identified, f"{name} as identified", "Hydrodynamics from trials where they tell it, else guesses."
+        identified,
+        f"{name} as identified",
+        "Hydrodynamics from trials where these determine them, otherwise guesses.",
     )
     write_vehicle(identified, folder / vehicle_file)
     vehicle = load_vehicle(folder / vehicle_file)
@@ -271,13 +273,13 @@ ARROW = 0.18
 
 HEADS = ("parameter", "estimate", "95 % interval", "catalogue", "unit", "state")
 UNSURE = (
-    "unsure: told together with another number and not alone, as a part of the drag. file kept: the trials do not "
+    "unsure: determined only jointly with another number, such as a part of the drag. file kept: the trials do not "
     "determine the number, and the vehicle keeps its guess."
 )
 POOL_VEHICLE = (
     " The catalogue's vehicle is the one around which the pool drew its own: the plant's coefficients are known to the "
-    "pool alone. Its propellers push up to 15 % more or less than the bench said, so what is found are effective "
-    "masses and dampings: those of the thrust that the vehicle file promises."
+    "pool alone. Its propellers push up to 15 % more or less than the bench said, so the estimates "
+    "are effective masses and dampings: those for the nominal thrust of the vehicle file."
 )
 
 
@@ -314,7 +316,7 @@ def _identification(result: Identification, hardware: bool) -> list[Table]:
     lead = (
         f"Identified in {result.seconds:.0f} s from {len(result.fit.trials)} trials of {source}, beginning with "
         "guessed hydrodynamics: the robot's own software played each programme, and its record became a trial. "
-        f"{len(result.replay.pairs)} other trials, at levels that the fit has not seen, are replayed with an NRMSE of "
+        f"{len(result.replay.pairs)} other trials, at levels that were not fitted, are replayed with an NRMSE of "
         f"{'unknown' if score is None else f'{score:.3f}'}. What follows was trained and tuned in the identified "
         f"vehicle, and tried {same}."
     )
@@ -426,11 +428,12 @@ def demo(
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
 ) -> Path:
-    """Identify a vehicle in the virtual pool or on a robot, train in it, deploy there beside two PIDs, write a report.
+    """Identify a vehicle in the virtual pool or on a robot, train and deploy a policy, write a report.
 
-    Trials are recorded and controllers deployed through the robot's whole software: camera, localization, fusion,
-    controller, allocation, bridge and the motor controller's protocol. Beside the policy, `pid` and `pid-paper` try the
-    same setpoints in the same pool, `pid` tuned from the identified vehicle.
+    Trials are recorded and controllers deployed through the robot's complete software: camera, localization,
+    fusion,
+    controller, allocation, bridge and the motor controller's protocol. For comparison, `pid` (tuned from the
+    identified vehicle) and `pid-paper` run the same setpoints in the same pool.
 
     Example: finssim demo --vehicle bluerov2_heavy --out demo
 
@@ -440,15 +443,15 @@ def demo(
 
     Args:
         out: Directory of trials, vehicle, policy, results and report.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         seed: Seed of every random number; equal seeds give equal results.
-        steps: Control steps to learn from, all worlds together; what the task needs if not given.
+        steps: Control steps of the training, summed over all worlds; the task's default if not given.
         console: Where progress is shown; standard error if None.
         scope: How much of it; `FULL` if None.
         processes: As many as there are processors if None.
-        firmware (NAME): What steers the motors: mcu, FinsROV's motor controller, or ardusub, an autopilot: commands
-            then go by MAVLink, the policy acts by its axes (`pilot6`), and in place of the pool and its camera there is
-            a tank, a Doppler log, a compass, and setpoints three times as far.
+        firmware (NAME): Firmware of the vehicle: mcu (FinsROV's motor controller) or ardusub (an autopilot over
+            MAVLink: the policy uses its axes, `pilot6`, in a tank with a DVL and a compass instead of the pool and
+            its camera, with setpoints three times as far).
         robot: Where trials are made and setpoints held, in place of the virtual pool.
         attendant: The person beside that robot, instead of the terminal's keyboard.
 
@@ -555,7 +558,7 @@ class _Demonstration:
         """Where trials are made."""
         return FIRMWARES[self.firmware].site if self.robot is None else self.robot.site
 
-    def tell(self, text: str) -> None:
+    def report(self, text: str) -> None:
         """Show a line of progress."""
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
@@ -563,7 +566,7 @@ class _Demonstration:
     def _working(self, doing: str) -> Iterator[Progress]:
         """Show what is done, and how far it is; a robot's session has a line of its own."""
         text = f"{doing} {'in the virtual pool' if self.robot is None else 'on the robot'}"
-        self.tell(text)
+        self.report(text)
         with nullcontext() if self.robot is not None else self.console.status(text) as status:
             yield lambda part, detail: status.update(f"{text}: {detail}") if status else None
 
@@ -588,13 +591,13 @@ class _Demonstration:
                 record_programmes, plans, robot=self.robot, **person, pool_vehicle=self.name, plant=self.seed,
                 severity=SEVERITY, seed=self.seed, site=self.site, firmware=self.firmware, leave_out=True,
                 processes=self.processes, progress=progress,
-                show=lambda run, result: self.tell(
+                show=lambda run, result: self.report(
                     f"  {run.target}: {'left out: ' if result['fault'] else ''}{result['fault'] or result['text']}"
                 ),
             )  # fmt: skip
             result = identify(self.out, self.name, seed=self.seed, record=record)
         identifiable = sum(e.identifiable for e in result.fit.estimates.values())
-        self.tell(
+        self.report(
             f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
             f"{len(result.fit.estimates)} parameters told, NRMSE on {len(result.replay.pairs)} other trials "
             f"{result.replay.aggregate('calibrated').value:.3f}"
@@ -605,7 +608,7 @@ class _Demonstration:
         held = "held" if result["success"] else result["fault"] or "not held"
         if result["e_p_m"] is not None:
             held += f", {result['e_p_m']:.3f} m and {result['e_psi_deg']:.1f}° off"
-        self.tell(f"  {job.row} at {job.target}: {held}")
+        self.report(f"  {job.row} at {job.target}: {held}")
 
     def _commands(self) -> list[str]:
         """Command lines that repeat the demonstration's steps by hand."""

@@ -244,7 +244,7 @@ def evaluate(
     seed: int = 42,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Try a controller: success, errors [m, deg], time to settle [s]; or errors along trajectories [m].
+    """Evaluate a controller: success, errors [m, deg], settling time [s]; or errors along trajectories [m].
 
     Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
 
@@ -257,21 +257,20 @@ def evaluate(
     Args:
         controller (DIR|pid|pid-paper|RECORD): A policy's directory, or pid, or pid-paper; or records of one controller
             on a robot (.mcap).
-        task (TASK): Task to be tried on; finssim tasks lists them. One's own: FILE.py:CLASS. Of records a task of one
-            vehicle.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        task (TASK): Task; finssim tasks lists them. Your own: FILE.py:CLASS. For records, a task of one vehicle.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), current, foreign, held_out, lag, mesh,
-            noise, randomised, sensors, simplified, waves, or a file. May be given several times.
+            noise, randomised, sensors, simplified, waves, or a file. May be repeated.
         observe (FILE|NAME): What is seen in every plant: truth, estimator, sensors or a file of fixes; what the plant
             says if not given.
         trajectories (FILE|NAME): What t2 follows: straight, broken, ellipse, lemniscate (all four if not given),
-            circle, figure_eight, helix, or a YAML or CSV file. May be given several times.
+            circle, figure_eight, helix, or a YAML or CSV file. May be repeated.
         trials: Trials in each plant; if not given, t1's eight setpoints for 60 s, or each trajectory, once.
-        truth (TABLE): By which records are measured, in place of the robot's own estimate: a table (.csv, .parquet) of
+        truth (TABLE): Truth for scoring records, instead of the robot's own estimate: a table (.csv, .parquet) of
             motion capture, t [s], x, y, z [m] and qx, qy, qz, qw or yaw [rad], or the truth file of finssim pool.
         seed: Seed of every random number; equal seeds give equal results.
-        out: Directory for evaluation.json, trajectories and, of t1 and t2, a figure.
+        out: Directory for evaluation.json, trajectories and, for t1 and t2, a figure.
 
     Returns:
         The result of the evaluation; of several plants `plants`, one for each, in their order.
@@ -293,9 +292,9 @@ def evaluate(
     if records and unheeded:
         raise EvaluationError(f"a record was made once and for all: leave {', '.join(unheeded)} out")
     if truth is not None and not records:
-        raise EvaluationError("--truth tells of records: a simulation knows its own")
+        raise EvaluationError("--truth is for records: a simulation has its own truth")
     plants = [] if records else _plants([plant] if isinstance(plant, str | Path) else plant)
-    plants = plants if observe is None else [plant_file.seen(observe) for plant_file in plants]
+    plants = plants if observe is None else [plant_file.with_view(observe) for plant_file in plants]
     with atomic_directory(out, replaces=EVALUATION_FILE) if out is not None else nullcontext() as folder:
         evaluations = [_recorded(records, task, vehicle, trajectories, truth)] if records else []
         for plant_file in plants:
@@ -384,7 +383,7 @@ def evaluate_controller(
         record: New folder for every state, command and thrust; none if None.
     """
     if trajectories and task != "t2":
-        raise EvaluationError(f"task '{task}' follows no trajectory: leave it out, or evaluate t2")
+        raise EvaluationError(f"task '{task}' follows no trajectory: omit it, or evaluate t2")
     the_task = task_named(task)
     count = len(trajectories) or (len(FORMS[task].targets) if task in FORMS else EPISODES)
     trials = count if trials is None else trials
@@ -406,7 +405,11 @@ def evaluate_controller(
         else:
             measures = run_episodes(agent, the_task, body, plant, **options)
     plant_values = plant.model_dump(mode="json", exclude_defaults=True)
-    about = {"hydrodynamics": plant.hydrodynamics or hydrodynamics, "seed": seed, **plant.told_of_sight(body)}
+    about = {
+        "hydrodynamics": plant.hydrodynamics or hydrodynamics,
+        "seed": seed,
+        **plant.observe_record(body),
+    }
     return evaluation(agent.describe(), task, body, plant_values, measures, played, **about)
 
 

@@ -201,7 +201,7 @@ LEAST_ROOM = 0.15
 
 
 @dataclass(frozen=True)
-class Place:
+class Start:
     """Where a programme begins."""
 
     position: tuple[float, float, float]
@@ -221,7 +221,7 @@ def box_of(surroundings: Basin | Vehicle) -> Box:
     return tuple(map(float, lower)), tuple(map(float, upper))  # type: ignore[return-value]
 
 
-def place_of(programme: Programme, vehicle: Vehicle, box: Box) -> Place:
+def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> Start:
     """The start of a programme: its way then lies in the middle of the water, surge and sway along x.
 
     One that goes both ways begins in the middle itself, and has half of the way to either side.
@@ -241,7 +241,7 @@ def place_of(programme: Programme, vehicle: Vehicle, box: Box) -> Place:
     x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (top + bottom)
     axis = programme.axes[0]
     if len(programme.axes) != 1 or axis in ("roll", "pitch", "yaw"):
-        return Place((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
+        return Start((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
     column = programme.tau_desired[:, AXES.index(axis)]
     sign = float(column.max() > 0.0) - float(column.min() < 0.0)  # 0 where it goes both ways
     # Heading along x for surge; across it for sway, so that its left is where x falls.
@@ -258,7 +258,7 @@ def place_of(programme: Programme, vehicle: Vehicle, box: Box) -> Place:
             f"{programme.name}: the pool leaves {way:.2f} m to go along {axis}, expected {LEAST_ROOM} m or more: use a "
             "larger pool"
         )
-    return Place((x, y, z), yaw, way)
+    return Start((x, y, z), yaw, way)
 
 
 ESTIMATOR = "error-state"
@@ -266,7 +266,7 @@ ESTIMATOR = "error-state"
 
 
 def programme_trial(
-    programme: Programme, vehicle: Vehicle, start: Place, *, hold: str | None = "pid"
+    programme: Programme, vehicle: Vehicle, start: Start, *, hold: str | None = "pid"
 ) -> RobotTrial:
     """The trial that plays a programme, and ends with it; its record has the phases.
 
@@ -343,7 +343,7 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     record.parent.mkdir(parents=True, exist_ok=True)
     record.unlink(missing_ok=True)
     vehicle, seed = load_vehicle(run.vehicle), noise_seed(run.seed, run.row, run.target)
-    start = place_of(run.programme, vehicle, run.water)
+    start = start_of(run.programme, vehicle, run.water)
     trial = programme_trial(run.programme, vehicle, start, hold=run.hold)
     about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
     with Recorder(record, vehicle, about, pictures="none") as recorder:
@@ -372,7 +372,7 @@ def record_programmes(
     console: Console | None = None,
     **pool: Any,
 ) -> dict[str, list[Path]]:
-    """Make trials of programmes, played by the robot's whole software at the start that `place_of` gives each.
+    """Make trials of programmes, played by the robot's whole software at the start that `start_of` gives each.
 
     Args:
         plans: What is played.
@@ -415,7 +415,7 @@ def _on_robot(
         for programme in plan
         if not (folders[role] / programme.name).is_dir()
     ]
-    places = {path: place_of(programme, vehicle, box_of(vehicle)) for _, programme, path in remaining}
+    places = {path: start_of(programme, vehicle, box_of(vehicle)) for _, programme, path in remaining}
     starts = {path: Station(start.position, start.yaw) for path, start in places.items()}
     check_starts({path.name: start for path, start in starts.items()}, vehicle)
     if not remaining:
@@ -476,7 +476,7 @@ def _in_pool(
     ]
     body = load_vehicle(vehicle)
     for run in runs:  # what cannot be is refused before anything is played
-        place_of(run.programme, body, runs[0].water)
+        start_of(run.programme, body, runs[0].water)
     with tempfile.TemporaryDirectory() as scratch:
         results = run_jobs(
             runs, Path(scratch), play_programme, processes=processes, progress=progress, show=show
@@ -522,7 +522,7 @@ def excite(
     seed: int = 0,
     as_json: bool = False,
 ) -> list[Path]:
-    """Write excitation programmes (wrench [N, N m] and thrust [N] at 50 Hz) for a robot, or run them in a simulation.
+    """Play excitation programmes on a robot or in simulation, or write them as tables (wrench [N, N m], 50 Hz).
 
     Example: finssim excite surge,yaw --vehicle finsrov --pool 1 --out trials
 
@@ -530,22 +530,22 @@ def excite(
 
     Args:
         axes (AXES): all, or of surge,sway,heave,roll,pitch,yaw separated by commas.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (DIR): Directory of the programmes or trials.
         kind (KIND): published (steps, dive-and-coast, pulses), validation, or multisine.
         levels (LEVELS): Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times.
-        repeats: How often every programme comes.
-        simulate: Run them in the simulator and write the trials they make.
-        pool (SEED): Seed of a virtual pool: the robot's whole software plays them there, records, and makes trials.
-        severity (NAME): Of that pool: nominal, realistic or hard; realistic if not given.
-        pool_vehicle (NAME|FILE): Vehicle around which that pool's own is drawn; the robot's if not given.
+        repeats: Repeats of every programme.
+        simulate: Run them in the simulator and write the trials.
+        pool (SEED): Seed of a virtual pool, in which the robot's software plays them, records, and writes trials.
+        severity (NAME): Severity of that pool: nominal, realistic or hard; realistic if not given.
+        pool_vehicle (NAME|FILE): Vehicle around which that pool's plant is drawn; the robot's if not given.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         noise (NAME): Noise of simulated trials: sensors, published or none.
-        inputs (NAMES): Inputs that simulated trials log, of wrench,rpm,force,pwm,command.
+        inputs (NAMES): Inputs logged in simulated trials, of wrench,rpm,force,pwm,command.
         rate: Rows of a simulated trial per second [Hz].
         coast: Longest coast after a dive [s].
-        duration: Of a multi-sine [s].
-        room: Longest way along a linear axis [m]: lowers the levels to fit a pool.
+        duration: Duration of a multi-sine [s].
+        room: Longest distance along a linear axis [m]: lowers the levels to fit a pool.
         robot: The robot that plays them, in place of a simulation.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
@@ -561,15 +561,11 @@ def excite(
     }  # fmt: skip
     of_pool = severity is not None or pool_vehicle is not None
     if robot is not None and (simulate or pool is not None or of_pool):
-        raise CalibrationError(
-            "--robot is where it is done: leave --simulate, --pool and what tells of it out"
-        )
+        raise CalibrationError("--robot excludes --simulate, --pool and their options")
     if pool is not None and (simulate or room is not None):
         raise CalibrationError("--pool goes with neither --simulate nor --room: a pool has its own room")
     if pool is None and of_pool:
-        raise CalibrationError(
-            "--severity and --pool-vehicle tell of a virtual pool: name one with --pool SEED"
-        )
+        raise CalibrationError("--severity and --pool-vehicle need a virtual pool: give --pool SEED")
     if robot is not None:
         folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, room=room, **plan)
     elif pool is not None:

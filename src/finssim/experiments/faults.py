@@ -374,7 +374,7 @@ AUTOPILOT: Mapping[str, Scenario] = {
     ),
     "ap-mode": _autopilot("the mode is changed", "mode to ALT_HOLD", 0.5, _command(176, 1, 2), handed_over=True),
     "ap-disarm": _autopilot("somebody disarms", "was disarmed", 0.5, _command(400, 0)),
-    "ap-station": _autopilot("a second ground station, which looks", "", math.inf, {
+    "ap-station": _autopilot("a second ground station, which listens", "", math.inf, {
         "1": another_station("heartbeat", 6, 8, 0, 0, 0, 3, every=1.0, system=254),
         "2": another_station("request_data_stream", 1, 1, 0, 2, 1, every=2.0),
     }),
@@ -585,10 +585,10 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         **lost,
         "provenance": provenance(),
     }
-    return {**result, "ok": passed(result) and (not aided or ended_as_told(scenario, result))}
+    return {**result, "ok": passed(result) and (not aided or ended_as_named(scenario, result))}
 
 
-def ended_as_told(scenario: Scenario, result: Mapping[str, Any]) -> bool:
+def ended_as_named(scenario: Scenario, result: Mapping[str, Any]) -> bool:
     """Whether an autopilot's trial ended for the reason and in the time that its scenario names, or drove on."""
     if not scenario.ends:
         return bool(result["state"] == "armed")
@@ -708,7 +708,7 @@ class Process:
             )
 
     @property
-    def said(self) -> str:
+    def output(self) -> str:
         """Standard output so far."""
         return self._out.read_text(encoding="utf-8", errors="replace")
 
@@ -800,23 +800,23 @@ def pair(job: FaultJob, folder: Path) -> Iterator[Pair]:
     truth, record = folder / "truth", folder / "run.mcap"
     end = f"127.0.0.1:{port + 4}"
     both = {"vehicle": job.vehicle, "pool-file": folder / "pool.yaml"}
-    world = _words(
+    world = _arguments(
         "pool", **both, port=port, robot=end, plant=job.plant, start=start, severity=job.severity, seed=job.seed,
         camera="corners", truth=truth,
     )  # fmt: skip
-    ours = _words(
+    ours = _arguments(
         "run", "--arm", "--json", **both, goal=goal, bind=end, policy="pid", record=record,
         robot=f"udp://127.0.0.1:{port}", pictures=f"udp://127.0.0.1:{port + 1}",
     )  # fmt: skip
     with Process(world, folder, "pool") as pool:
-        _await(lambda: "pictures: " in pool.said, "the pool never said 'pictures: '", pool)
+        _await(lambda: "pictures: " in pool.output, "the pool never said 'pictures: '", pool)
         with Process(ours, folder, "robot") as robot:
             both_at_work = Pair(pool, robot, port, truth, record)
             _await(both_at_work.turning, "no thruster ever turned", robot, 20.0 * POLL)
             yield both_at_work
 
 
-def _words(*arguments: str, **options: Any) -> list[str]:
+def _arguments(*arguments: str, **options: Any) -> list[str]:
     """A command line: words, then options with their values."""
     return [*arguments, *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
 
@@ -830,7 +830,7 @@ def _await(ready: Callable[[], bool], failure: str, process: Process, poll: floa
     deadline = time.monotonic() + STARTING
     while not ready():
         if not process.running or time.monotonic() > deadline:
-            last = (process.complained + process.said).strip()[-300:] or "it said nothing"
+            last = (process.complained + process.output).strip()[-300:] or "it said nothing"
             raise ReliabilityError(f"{failure}: {process.name}: {last}")
         time.sleep(poll)
 
@@ -890,7 +890,7 @@ def _kill_pool(job: FaultJob, both: Pair) -> dict[str, Any]:
     ended, truth = time.monotonic(), read_truth(both.truth)
     stopped = _first_stop(both.record, killed)
     off = None if heard is None or stopped is None else max(heard, stopped - killed)
-    summary = json.loads(both.robot.said or "{}")
+    summary = json.loads(both.robot.output or "{}")
     course = Course(truth.time, truth.position, truth.thrust, np.ones(len(truth.time)))
     return {
         **measured(course, began, began, None),
@@ -1019,24 +1019,24 @@ def faults_experiment(
     address: str | None = None,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Break one thing after another while a vehicle drives: time until thrust is gone [s], place in the workspace [m].
+    """Inject faults while a vehicle drives: time until the thrust is zero [s], distance to the workspace [m].
 
-    Exit status 3: a fault did what it must not.
+    Exit status 3: a trial failed.
 
     Example: finssim experiment faults --scenarios link-cut,blind-3 --out faults
 
     Args:
-        out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
-        seeds: Virtual pools, each with its own vehicle, water and noise.
+        out (DIR): Directory for JSON, Markdown, figures, policies and trials; an interrupted one is continued.
+        seeds: Number of virtual pools, each with different vehicle, water and noise.
         seed: Seed of every random number; equal seeds give equal results.
         scenarios (NAMES): Faults, separated by commas; all if not given.
-        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file; finsrov, with ardusub
+        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file; finsrov, with ardusub
             bluerov2_heavy, if not given.
-        firmware (NAME): What steers the motors: mcu, the motor controller of finssim run, or ardusub, an autopilot, in
-            the tank, with a Doppler log in place of the camera.
-        processes: Trials at once; as many as processors if not given.
-        address (ADDRESS): Of a Ray cluster that does the work in their place, HOST:PORT or auto; kills stay here.
+        firmware (NAME): Firmware of the vehicle: mcu (the motor controller of finssim run) or ardusub (an
+            autopilot, in the tank, with a DVL instead of the camera).
+        processes: Parallel trials; one per processor if not given.
+        address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto; kills stay here.
         progress: Told the share that is done and what comes next.
 
     Returns:

@@ -370,7 +370,7 @@ RESULT_FILE = "localization.json"
 PAPER_TABLE_2: Mapping[str, Sequence[float]] = PAPER["localization"]
 """Method -> RMSE and 95th percentile in the paper [cm]: its camera over its pool, calibrated on the same places."""
 
-METHODS_SHOWN = {
+METHOD_TITLES = {
     **{name: (name, "refractive") for name in ("refractive", "refractive-weighted", "refractive-6dof")},
     **{name: (name, "pinhole") for name in ("pinhole-depth", "pinhole")},
     "pinhole, refractive pose": ("pinhole", "refractive"),
@@ -389,7 +389,7 @@ NOTE = (
     "its camera over its pool, calibrated and measured on the same places, with the depth known. These are different "
     "experiments and stand side by side for orientation."
 )
-WORDS = {
+TITLES = {
     "published": "every error",
     "flat": "no ripples",
     "quiet": "noise of the pictures alone",
@@ -544,7 +544,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     for name, methods in result["results"].items():
         rows = [
             [
-                WORDS[method],
+                TITLES[method],
                 *(
                     figure_text({"value": m[f"{x}_cm"], "ci95": m[f"{x}_ci95_cm"]}, ".2f")
                     for x in ("rmse", "p95")
@@ -554,10 +554,10 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
             for method, m in methods.items()
         ]
         tables.append(
-            Table(title=f"ours, {name} conditions: {WORDS[name]}", heads=HEADS, rows=rows, intervals=True)
+            Table(title=f"ours, {name} conditions: {TITLES[name]}", heads=HEADS, rows=rows, intervals=True)
         )
     rows = [
-        [f"paper, {WORDS[m]}", f"{p['rmse_cm']:.2f}", f"{p['p95_cm']:.2f}", ""]
+        [f"paper, {TITLES[m]}", f"{p['rmse_cm']:.2f}", f"{p['p95_cm']:.2f}", ""]
         for m, p in result["paper"].items()
     ]
     paper = "the paper: its camera over its pool"
@@ -594,7 +594,7 @@ class SeedResult:
     """One drawing of the test under one set of conditions."""
 
     campaign: Campaign
-    found: Calibrated
+    calibration: Calibrated
     scores: Mapping[str, Scores]
     """By method."""
 
@@ -608,15 +608,15 @@ def localization_experiment(
     progress: Progress = lambda part, text: None,
     **size: Any,
 ) -> dict[str, Any]:
-    """Locate a tag at places that the calibration has not seen, by refractive and pinhole methods: RMSE, P95 [cm].
+    """Locate a tag at places held out from the calibration, by refractive and pinhole methods: RMSE, P95 [cm].
 
-    Every seed draws the places' survey errors, readings, camera file, plumb line, ripples and noise anew.
+    Every seed draws the places' survey errors, readings, camera file, plumb line, ripples and noise again.
 
     Example: finssim experiment localization --seeds 3 --out localization
 
     Args:
         out (DIR): Directory for JSON, Markdown and figures.
-        renderer (NAME): own, or geometry (no pictures: exact corners with noise).
+        renderer (NAME): own, or geometry (exact corners with noise instead of images).
         seeds: Repetitions with other errors.
         seed: Seed of every random number; equal seeds give equal results.
         progress: Told the share that is done and what comes next.
@@ -638,10 +638,10 @@ def localization_experiment(
     for k in range(seeds):
         for j, name in enumerate(CONDITIONS):
             progress((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
-            drawn[name].append(_one(name, seed + k, renderer, size))
+            drawn[name].append(_play_seed(name, seed + k, renderer, size))
         progress((k + 0.8) / seeds, f"seed {seed + k}, another depth")
         campaign = lifted(runs[k].campaign, LIFT)  # the same calibration, the tag at another depth
-        higher.append(_scored(campaign, list(pictures(campaign, renderer)), runs[k].found))
+        higher.append(_scored(campaign, list(pictures(campaign, renderer)), runs[k].calibration))
     scores = {
         **{name: [seed_result.scores for seed_result in each] for name, each in drawn.items()},
         "lifted": higher,
@@ -655,11 +655,11 @@ def localization_experiment(
         "pictures_per_seed": sum(visit.images for visit in visits),
         "conditions": {name: vars(CONDITIONS[name]) for name in CONDITIONS},
         "results": {
-            name: {method: pooled([seed_result[method] for seed_result in each]) for method in METHODS_SHOWN}
+            name: {method: pooled([seed_result[method] for seed_result in each]) for method in METHOD_TITLES}
             for name, each in scores.items()
         },
         "lift_m": LIFT,
-        "pixel_std_px": [seed_result.found.refractive.pixel_std for seed_result in runs],
+        "pixel_std_px": [seed_result.calibration.refractive.pixel_std for seed_result in runs],
         "calibration": [_errors(seed_result) for seed_result in runs],
         "paper": {m: {"rmse_cm": r, "p95_cm": p} for m, (r, p) in PAPER_TABLE_2.items()},
         "provenance": provenance(),
@@ -671,7 +671,7 @@ def localization_experiment(
 def _write(result: Mapping[str, Any], out: Path, first: SeedResult) -> None:
     """Write the directory: result, page, figures, and what a user needs to do the first seed by hand."""
     with atomic_directory(out, replaces=RESULT_FILE) as folder:
-        scores, calibration = first.scores, first.found
+        scores, calibration = first.scores, first.calibration
         _draw_error_map(first.campaign, scores["pinhole"], scores["refractive"], folder / "error_map.png")
         write_camera(folder / "camera.yaml", first.campaign.lens, {})
         write_pool(calibration.refractive, folder / "pool.yaml")
@@ -681,7 +681,7 @@ def _write(result: Mapping[str, Any], out: Path, first: SeedResult) -> None:
         write_json(folder / RESULT_FILE, result, tables_of(result))
 
 
-def _one(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedResult:
+def _play_seed(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedResult:
     campaign = draw_campaign(CONDITIONS[name], seed, **size)
     observed = list(pictures(campaign, renderer))
     calibration = calibrate(campaign, observed)
@@ -692,13 +692,13 @@ def _scored(campaign: Campaign, observed: Sequence[Picture], calibration: Calibr
     pools = {"refractive": calibration.refractive, "pinhole": calibration.pinhole}
     return {
         row: locate(campaign, observed, pools[kind], method, pixel_std=calibration.refractive.pixel_std)
-        for row, (method, kind) in METHODS_SHOWN.items()
+        for row, (method, kind) in METHOD_TITLES.items()
     }
 
 
 def _errors(seed_result: SeedResult) -> dict[str, Any]:
     """What the calibration of one seed got wrong, the truth being known here."""
-    true, fit = seed_result.campaign.truth, seed_result.found.refractive
+    true, fit = seed_result.campaign.truth, seed_result.calibration.refractive
     (x, y, height), (x_fit, y_fit, height_fit) = true.camera.position, fit.camera.position
     over = height - true.interface.height(x, y)
     over_fit = height_fit - fit.interface.height(x_fit, y_fit)

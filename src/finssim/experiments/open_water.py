@@ -175,20 +175,20 @@ def open_water(
     severity: Severity = "realistic",
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Drift of Doppler log, depth, IMU and compass in open water [m], and whether the estimator's ellipse holds it.
+    """Measure the drift of dead reckoning (DVL, depth, IMU, compass) in open water [m].
 
     Example: finssim experiment open-water --seeds 1 --out drift
 
     Args:
         out (DIR): Directory for the result.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        minutes: Of each way [min].
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        minutes: Duration of each run [min].
         speed: [m/s]
         shape (WORD): line or square (of 10 m).
         positioning (NAME): Fixes: none, motion-capture or usbl.
-        seeds: Ways, each with its own water and noise.
+        seeds: Runs, each with different water and noise.
         seed: Seed of every random number; equal seeds give equal results.
-        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
+        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
         progress: Told the share that is done and what comes next.
     """
     ours, way = load_vehicle(vehicle), way_of(shape, 60.0 * minutes, speed)

@@ -62,14 +62,14 @@ class Plant(BaseModel):
         return load_ranges(value) if isinstance(value, str) else value
 
     @model_validator(mode="after")
-    def _sees_one_way(self) -> Plant:
+    def _single_view(self) -> Plant:
         if self.observe is not None:
             observed(self.observe)  # which refuses what there is not
         if self.observe and self.noise:
             raise ValueError(f"noise and observe: {self.observe} are both given, expected one of them")
         return self
 
-    def seen(self, observe: str) -> Plant:
+    def with_view(self, observe: str) -> Plant:
         """The same plant, seen otherwise.
 
         Raises:
@@ -81,7 +81,7 @@ class Plant(BaseModel):
         except ValidationError as error:
             raise PlantError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
 
-    def told_of_sight(self, vehicle: Vehicle) -> dict[str, Any]:
+    def observe_record(self, vehicle: Vehicle) -> dict[str, Any]:
         """What a result says of `observe`, with its numbers, as a policy's description does; empty if there is none."""
         if self.observe is None:
             return {}
@@ -123,7 +123,7 @@ class Plant(BaseModel):
         """
         if self.held_out and not task.world:
             raise PlantError(
-                f"plant '{self.name}' changes how a site looks, and task '{task.name}' sees none: take another plant"
+                f"plant '{self.name}' changes what a site looks like, and task '{task.name}' sees none: use another"
             )
         return Environment(
             replace(task, held_out=True) if self.held_out else task,

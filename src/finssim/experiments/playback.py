@@ -39,7 +39,7 @@ def play(
     plant: str = "nominal",
     seed: int = 42,
 ) -> None:
-    """Print the messages of a record as they came, a JSON object a line [s, SI units]; or film an episode of a policy.
+    """Print the messages of a record in real time, as JSON lines [SI units]; or film an episode of a policy.
 
     Example: finssim play run.mcap --topics odom,events --speed 4
 
@@ -47,14 +47,14 @@ def play(
 
     Args:
         path (FILE|DIR): Record of a run (.mcap), or directory of a policy.
-        speed (FACTOR): Times as fast as it was recorded, or as the episode is [-].
-        fast: Without waiting.
-        topics (NAMES): Of a record only these, with commas between: odom,thruster_cmd.
-        start: Begin so long after the start of the record [s].
-        video (FILE): Film of an episode of the policy to write (.mp4).
-        task (TASK): Of the episode; the one that the policy was trained for if not given. One's own: FILE.py:CLASS.
-        vehicle (NAME|FILE): In the episode; the one that the policy was trained for if not given.
-        plant (FILE|NAME): What differs in the episode from the vehicle file, as of finssim evaluate.
+        speed (FACTOR): Speed factor relative to the record, or to the episode [-].
+        fast: Print without waiting.
+        topics (NAMES): Topics of a record to print, separated by commas: odom,thruster_cmd.
+        start: Offset from the start of the record [s].
+        video (FILE): Film of an episode to write (.mp4).
+        task (TASK): Task of the episode; that of the policy's training if not given. Your own: FILE.py:CLASS.
+        vehicle (NAME|FILE): Vehicle in the episode; that of the policy's training if not given.
+        plant (FILE|NAME): Plant of the episode, as in finssim evaluate.
         seed: Of the episode.
 
     Raises:

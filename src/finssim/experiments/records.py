@@ -23,7 +23,7 @@ from finssim.experiments.metrics import MAX_GAP, T1_SETPOINTS, in_room
 from finssim.experiments.tables import Table
 from finssim.experiments.trials import DURATION, Motion, Trial, follows, interpolated, localization_errors
 from finssim.geometry.rotations import quat_from_yaw
-from finssim.learning.demonstrations import DatasetError, Episode, about, found_in, save
+from finssim.learning.demonstrations import DatasetError, Episode, about, data_sets_in, save
 from finssim.learning.demonstrations import collect as collect_episodes
 from finssim.learning.lerobot import export_lerobot
 from finssim.pool.task_site import Referee
@@ -149,7 +149,7 @@ def read_drive(path: Path, vehicle: Vehicle) -> Drive:
 def _check(record: Record, vehicle: Vehicle) -> None:
     about = record.metadata
     if "vehicle_sha256" not in about:
-        raise DriveError(f"{record.path}: does not say of which vehicle it is: not a record of FinsSim")
+        raise DriveError(f"{record.path}: does not name its vehicle: not a record of FinsSim")
     if about["vehicle_sha256"] != vehicle.sha256:
         raise DriveError(
             f"{record.path}: is of the vehicle {about['vehicle']} {about['vehicle_sha256'][:12]}, expected "
@@ -281,7 +281,7 @@ def episodes_of(
     if drive.period > period * (1.0 + 1e-6):
         raise DriveError(
             f"{drive.path}: {drive.driver} decided every {drive.period:g} s, expected at most {period:g} s, the period "
-            f"of {task.name}: it cannot be taken for a controller of that task"
+            f"of {task.name}, so it is not a controller of that task"
         )
     guide_of = _guides(drive, vehicle, task.moving, goal)
     stretches = indices_of(drive, period, split_goals=not task.moving and goal is None)
@@ -392,7 +392,7 @@ def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Gu
             f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: {GIVE}"
         )
     if np.isnan(drive.motion.t).any():
-        raise DriveError(f"{drive.path}: does not say when its trajectory began: not a record of finssim run")
+        raise DriveError(f"{drive.path}: has no start time of its trajectory: not a record of finssim run")
     guide = load_trajectory(name, vehicle=vehicle)
     off = float(np.linalg.norm(guide.at(drive.motion.t).position - drive.goal[:, :3], axis=1).max())
     if off > SAME_GOAL:
@@ -416,33 +416,32 @@ def collect(
     seed: int = 42,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Keep episodes of a task as a Minari data set: let an expert do it, or take what was done with a vehicle.
+    """Store episodes of a task as a Minari data set, from an expert or from records of a driven vehicle.
 
     Example: finssim collect pid --task t1 --episodes 200 --out demonstrations/hold
 
     Args:
         experts (DIR|NAME|RECORD...): A policy's directory or a baseline of the task; or records of driven vehicles
             (.mcap).
-        task (TASK): Task to be shown; finssim tasks lists them.
+        task (TASK): Task of the demonstrations; finssim tasks lists them.
         out (DATASET): Folder of the data set.
-        episodes: How many; each agent's is one of its own. Not of records.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        episodes: Number of episodes, counted per agent. Not for records.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        action: What is commanded: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
-        randomize (FILE): Ranges that vehicle and water are drawn from, by name or file.
+        action: Action mode: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
+        randomize (FILE): Ranges of vehicle and water parameters, by name or file.
         observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
             through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
-        disturb: Noise on what is done, not on what is written, in parts of full action: shows recoveries.
-        goal (GOAL): Of records: where to, in place of what they say: x,y,z,yaw_deg [m, deg], or end: where each stretch
-            ended; of t2 the trajectory.
+        disturb: Noise on the executed but not on the stored action, as a fraction of full action: shows recoveries.
+        goal (GOAL): Goal for records, instead of the recorded one: x,y,z,yaw_deg [m, deg], or end for the final
+            pose of each interval; for t2 the trajectory.
         seed: Seed of every random number; equal seeds give equal results.
         progress: Told the share that is done.
     """
     records = [Path(word) for word in experts if word.endswith(".mcap")]
     if records and (len(records) < len(experts) or episodes or randomize or disturb):
         raise DriveError(
-            "records are taken as they are, and by themselves: leave out other experts, --episodes, --randomize and "
-            "--disturb"
+            "records cannot be combined with other experts, --episodes, --randomize and --disturb"
         )
     if records:
         return collect_records(records, task, out=out, vehicle=vehicle, action=action, goal=goal)
@@ -455,15 +454,15 @@ def collect(
 
 
 def datasets(places: Sequence[Path], *, lerobot: Path | None = None) -> dict[str, Any]:
-    """List demonstrations: task, vehicle, expert, episodes, steps. With --lerobot, write one as LeRobot reads it too.
+    """List demonstrations: task, vehicle, expert, episodes, steps. With --lerobot, export one for LeRobot.
 
     Example: finssim datasets demonstrations
 
     Args:
-        places (PATH...): Data sets, or folders that hold some.
-        lerobot (DIR): Folder for a LeRobot data set (format 3.0) of the one data set that is named.
+        places (PATH...): Data sets, or folders of them.
+        lerobot (DIR): Folder for the LeRobot data set (format 3.0), from a single data set.
     """
-    paths = [path for location in places for path in found_in(location)]
+    paths = [path for location in places for path in data_sets_in(location)]
     if lerobot is None:
         return {str(path): about(path) for path in paths}
     if len(paths) != 1:
@@ -551,7 +550,7 @@ def collect_records(
     if not demonstrations:
         names = ", ".join(str(path) for path in records)
         raise DriveError(
-            f"{names}: nowhere was the robot armed, its estimate ready and its driver at the helm for two decisions "
+            f"{names}: the robot was never armed, its estimate ready and its driver in control for two decisions "
             f"{the_task.control_step:g} s apart towards one goal: nothing to learn from"
         )
     described = {

@@ -117,11 +117,11 @@ RESULT_FILE = "replay_experiment.json"
 
 NOTE = (
     "ours: held-out trials of a virtual plant outside all three model classes. paper: Unity replaying trials of the "
-    "real FinsROV in its pool. These are different experiments and stand side by side for orientation."
+    "real FinsROV in its pool. These are different experiments, listed together for orientation."
 )
 LEVELS = {
     "same_levels": "held-out repeats of the fitted levels",
-    "other_levels": "the validation sweeps, levels that no fit has seen",
+    "other_levels": "the validation sweeps, at levels that were not fitted",
 }
 
 
@@ -203,13 +203,13 @@ def replay_experiment(
 ) -> dict[str, Any]:
     """Identify on half of the trials of a plant outside the model class, replay three models on the other half.
 
-    The calibrated model is what the fit found; mesh and simplified have the vehicle file's published numbers.
+    The calibrated model is the fit; mesh and simplified have the vehicle file's published numbers.
 
     Example: finssim experiment replay --seeds 3 --out experiment
 
     Args:
         out (DIR): Directory for JSON, Markdown and figures.
-        seeds: Repetitions with other noise and starts.
+        seeds: Repetitions with different noise and initial states.
         seed: Seed of every random number; equal seeds give equal results.
         vehicle: Name or file of the vehicle whose file the operator starts from.
         repeats: Of every level and direction, an even number.

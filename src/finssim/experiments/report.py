@@ -29,18 +29,18 @@ class ReportError(ValueError):
 
 
 def report(results: Sequence[Path], *, into: Annotated[Sequence[Path], "--into"], check: bool = False) -> int:
-    """Fill the tables of Markdown pages with what experiments have measured.
+    """Fill the tables of Markdown pages from results of experiments.
 
-    A page has a table where it says <!-- finssim report: t1 --> and <!-- end -->, for the result in t1.json; after the
-    name may stand table=2 (the second of the result), columns=0,1,3, rows=calibrated;paper: calibrated (names as the
-    table has them), and headline=yes. A result in sentences, as of soak, is a list of them.
+    A page marks a table with <!-- finssim report: t1 --> and <!-- end -->, for the result in t1.json; options after
+    the name are table=2 (the second table of the result), columns=0,1,3, rows=calibrated;paper: calibrated (names
+    as in the table), and headline=yes. A result in sentences, such as soak, becomes a list.
 
     Example: finssim report results/t1.json results/anatomy.json --into docs/experiments.md --into README.md
 
     Args:
         results (FILE.json...): Results of experiments t1, t2, anatomy, faults and soak.
-        into (PAGE.md): Page whose tables are filled. May be given several times.
-        check: Change nothing; exit status 1 where a page does not say what the results do.
+        into (PAGE.md): Page whose tables are filled. May be repeated.
+        check: Change nothing; exit status 1 if a page differs from the results.
 
     Raises:
         ReportError: A file is no result of such an experiment, or a page asks for what there is not.

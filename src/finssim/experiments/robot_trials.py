@@ -347,22 +347,22 @@ def robot_or_none(
     """The robot that options name; none where they name none, and nothing tells of one.
 
     Args:
-        robot (ADDRESS): Robot on which it is done: its motor controller's udp://HOST:PORT or serial:DEVICE, its
-            autopilot's mavlink://KIND:WHERE, or pool or mavlink for the virtual pool on this machine. With --lockstep:
+        robot (ADDRESS): Run on this robot: its motor controller's udp://HOST:PORT or serial:DEVICE, its autopilot's
+            mavlink://KIND:ADDRESS, or pool or mavlink for the virtual pool on this machine. With --lockstep:
             pool, mavlink, or HOST:PORT.
-        pool_file (FILE|none): Of that robot: camera, water plane and frames (.yaml); none where no camera looks and
-            position fixes come by wire.
-        site (NAME): Where that robot is: pool, tank or open-water, by which it is equipped. If not given: pool.
-        bind (ADDRESS:PORT): Address and port of this end, for udp; pictures come to the port after it. Loopback unless
-            given.
+        pool_file (FILE|none): Pool file of that robot: camera, water plane and frames (.yaml); none if position
+            fixes arrive over the link.
+        site (NAME): Site of that robot, which sets its sensors: pool (default), tank or open-water.
+        bind (ADDRESS:PORT): Local address and port for udp; images arrive at the next port. Loopback if not given.
         pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
             otherwise none, if not given.
-        lockstep: Take turns with finssim pool --lockstep, as fast as both compute.
-        arm: Let thrusters turn, as soon as the state is known. Without it they never do.
-        by_hand: Somebody carries the vehicle to where each trial starts; the tuned PID steers it there if not given.
-        unattended: Nobody presses enter before each trial; a fault ends the session, and nothing is armed after it.
-        let_in (X,Y): Where the vehicle is when the command begins, world frame [m], known to 5 cm: its position is
-            reckoned on from there by Doppler log and compass through all trials. With --pool-file none.
+        lockstep: Run in lock-step with finssim pool --lockstep, as fast as possible.
+        arm: Arm, as soon as the state is known. Without it the thrusters never turn.
+        by_hand: The vehicle is carried to the start of each trial by hand; by default the tuned PID steers it
+            there.
+        unattended: Start each trial without waiting for enter; a fault ends the session.
+        let_in (X,Y): Position of the vehicle at the start of the command, world frame [m], known to 5 cm: start of
+            dead reckoning by DVL and compass through all trials. With --pool-file none.
 
     Raises:
         GoalError: --let-in is no place.
@@ -372,13 +372,13 @@ def robot_or_none(
         stated = (arm, by_hand, unattended, lockstep, pool_file, pictures, site, let_in)
         if any(x is not None and x is not False for x in stated):
             raise RobotError(
-                "--arm, --by-hand, --unattended, --lockstep, --pool-file, --site, --let-in and --pictures tell of a "
-                "robot: name one with --robot"
+                "--arm, --by-hand, --unattended, --lockstep, --pool-file, --site, --let-in and "
+                "--pictures need a robot: give --robot"
             )
         return None
     if pool_file is None:
         raise RobotError(
-            "a robot knows where it is by its pool file: give --pool-file, or none where position fixes come by wire"
+            "a robot needs its pool file: give --pool-file, or none if position fixes arrive over the link"
         )
     wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep)
     file = None if pool_file == "none" else Path(pool_file)
@@ -429,7 +429,7 @@ class Session:
         """Of a robot that was let in: one for all trials, so that what it reckons is carried from each to the next."""
         return Perception(self.equipped, None, mode="error-state", let_in=self.robot.let_in)
 
-    def say(self, text: str) -> None:
+    def notify(self, text: str) -> None:
         """Tell whoever watches."""
         self.console.print(text, highlight=False, markup=False)
 
@@ -467,7 +467,7 @@ class Session:
         while True:
             trial = make()
             x, y, z = start.position
-            self.say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {round(math.degrees(start.yaw))}°")
+            self.notify(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {round(math.degrees(start.yaw))}°")
             partial = record.with_name(f".{record.stem}.partial.mcap")
             partial.parent.mkdir(parents=True, exist_ok=True)
             partial.unlink(missing_ok=True)
@@ -496,15 +496,15 @@ class Session:
                 return outcome
             self._put_away(partial, record, outcome)
             if outcome.ended == "skipped":
-                self.say(f"{trial.name}: skipped")
+                self.notify(f"{trial.name}: skipped")
                 return None
             if outcome.ended == "interrupted":
                 raise KeyboardInterrupt
             if self.attendant is None:
                 raise RobotError(
-                    f"{trial.name}: {outcome.fault}: look at the vehicle, then give the command again: it goes on here"
+                    f"{trial.name}: {outcome.fault}: check the vehicle, then repeat the command, which continues here"
                 )
-            self.say(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
+            self.notify(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
 
     def _put_away(self, partial: Path, record: Path, outcome: Outcome) -> None:
         """Keep what there is of a trial that was begun; nothing was recorded of one that was not."""
@@ -537,9 +537,7 @@ def session(
     if not robot.arm:
         raise RobotError("trials turn thrusters: give --arm when the water is clear of people and cables")
     if robot.unattended and robot.by_hand:
-        raise RobotError(
-            "by hand somebody has to press enter at every start: leave --unattended or --by-hand out"
-        )
+        raise RobotError("--by-hand waits for enter at every start: omit --unattended or --by-hand")
     console = console or Console(stderr=True)
     site = None if robot.pool_file is None else load_pool(robot.pool_file)
     with ExitStack() as stack:
@@ -547,7 +545,7 @@ def session(
         if attendant is None and not robot.unattended:
             if not sys.stdin.isatty():
                 raise RobotError(
-                    "nobody can press enter, as standard input is no terminal: run it in one, or give --unattended"
+                    "standard input is not a terminal, so enter cannot be pressed: use one, or give --unattended"
                 )
             keyboard = Keyboard()
             stack.enter_context(keyboard)
@@ -571,8 +569,8 @@ def take_folder(file: Path, about: Mapping[str, Any]) -> None:
             temporary.write_text(text, encoding="utf-8")
     elif not file.is_file() or file.read_text(encoding="utf-8") != text:
         raise RobotError(
-            f"{out}: holds other files, or what was made with other settings: give a new --out, or the same settings, "
-            "such as vehicle and seed, to go on"
+            f"{out}: holds other files, or results of other settings: give a new --out, or the same "
+            "settings, such as vehicle and seed, to continue"
         )
 
 
@@ -880,8 +878,8 @@ def play_jobs(
         console.print(f"  {held}", highlight=False, markup=False)
         if result["fault"] and robot.unattended:
             raise RobotError(
-                f"{job.row}, {job.target}: stopped, which counts: {result['fault']}: look at the vehicle, then give "
-                "the command again, which goes on with the next trial"
+                f"{job.row}, {job.target}: stopped, which counts: {result['fault']}: check the "
+                "vehicle, then repeat the command, which continues with the next trial"
             )
 
     with ExitStack() as stack:

@@ -80,19 +80,19 @@ def simulate(
     """Simulate a vehicle from rest under a constant wrench and record its motion.
 
     Columns: t [s], the state as `finssim.engine.recorder` names it, and the delivered thrust of every thruster [N].
-    Beside the table goes `OUT.json` with the vehicle's hash, the command and where the run came from.
+    `OUT.json` beside the table holds the vehicle's hash, the command and the provenance.
 
     Example: finssim simulate --vehicle finsrov --command "surge=10 yaw=1" --duration 10 --out run.csv
 
     Args:
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        command (WRENCH): Constant wrench: "surge=10 yaw=1". surge sway heave in N, roll pitch yaw in N m; the rest is
-            0.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        command (WRENCH): Constant wrench: "surge=10 yaw=1". surge sway heave in N, roll pitch yaw in N m; omitted
+            axes are 0.
         duration: Simulated time [s].
-        out: Table to write, one row per control step of 0.1 s: a .csv file. OUT.json tells its origin.
+        out: Table to write, one row per control step of 0.1 s: a .csv file. OUT.json records its origin.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         depth: Depth of the body origin at the start [m].
-        device (DEVICE): Where to compute: cpu or cuda.
+        device (DEVICE): Compute device: cpu or cuda.
 
     Raises:
         CommandError: The command, a time or the file's name cannot be used, or the motion did not stay finite.
@@ -126,7 +126,7 @@ def simulate(
     last, achieved = rows[-1], allocator.achieved(thrust)
     angles_deg = np.degrees(quat_to_euler(last[4:8]))
     cells = [
-        ["wrench asked [N, N m]", *(f"{x:.4g}" for x in tau)],
+        ["requested wrench [N, N m]", *(f"{x:.4g}" for x in tau)],
         ["wrench given [N, N m]", *(f"{x:.4g}" for x in achieved.round(4) + 0.0)],
         ["velocity [m/s, rad/s]", *(f"{x:.3f}" for x in last[8:14])],
         ["place [m, deg]", *(f"{x:.2f}" for x in last[1:4]), *(f"{x:.1f}" for x in angles_deg)],

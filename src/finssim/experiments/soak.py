@@ -43,7 +43,7 @@ def soak(
     vehicle: str = "finsrov",
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Keep a station for hours in lock-step and watch the memory [MiB]. Ctrl-C ends it with what is known until then.
+    """Keep a station for hours in lock-step and watch the memory [MiB]. Ctrl-C ends it with the results so far.
 
     Exit status 3: the memory grew, or the bridge stopped the vehicle.
 
@@ -53,8 +53,8 @@ def soak(
         out (DIR): Directory for the result and the samples.
         hours: Vehicle time to keep a station [h].
         seed: Seed of every random number; equal seeds give equal results.
-        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         progress: Told the share that is done and how it goes.
 
     Returns:

@@ -12,7 +12,7 @@ import numpy as np
 
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.campaign import keep_result, kept_result
+from finssim.experiments.campaign import keep_result, load_result
 from finssim.experiments.plants import load_plant
 from finssim.experiments.tables import Table, figure_text
 from finssim.experiments.trials import EpisodeError, follows, run_episodes, summarize_episodes
@@ -100,10 +100,10 @@ def play(
     records: bool = False,
     show: Callable[[str], None] = lambda line: print(line, file=sys.stderr),
 ) -> dict[str, Any]:
-    """Play any task through the deployed software, all its vehicles in lock-step; print it beside the batch.
+    """Run any task through the deployed software, with all vehicles in lock-step; compare with the batch.
 
-    Every vehicle has its plant, motor controller, bridge and pilot; robots tell each other where they are, and the task
-    itself scores what is true. In the pool the overhead camera locates vehicles, in open water motion capture does.
+    Every vehicle has its plant, motor controller, bridge and pilot; robots exchange their positions, and the task
+    scores the truth. Vehicles are located by the overhead camera in the pool, by motion capture in open water.
 
     Example: finssim experiment stack team-pursuit --policy runs/team --episodes 20 --out runs/team-stack
 
@@ -111,12 +111,12 @@ def play(
         task (TASK): Task, or FILE.py:CLASS of one's own.
         policy (DIR|NAME): A policy's directory, or a baseline of the task.
         episodes: How many.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         plant: Seed of every vehicle's plant.
-        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
+        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
         seed: Seed of every random number; equal seeds give equal results.
-        out (DIR): Directory that keeps every episode; one that was interrupted goes on.
-        records: Keep in --out what every agent recorded (.mcap), and its truth (.truth).
+        out (DIR): Directory that keeps every episode; an interrupted one is continued.
+        records: Store in --out the record (.mcap) and the truth (.truth) of every agent.
         show: Called with a line after each episode.
 
     Returns:
@@ -126,7 +126,7 @@ def play(
         PolicyError, ControlError, BaselineError, VehicleError, OutputError: As they say.
     """
     if records and out is None:
-        raise EpisodeError("--records are kept in a directory: give --out")
+        raise EpisodeError("--records needs a directory: give --out")
     body = load_vehicle(vehicle)
     fitted = fitted_task(task, body)
     vehicles = [body] * len(fitted.vehicles)
@@ -135,7 +135,7 @@ def play(
         "plant": plant, "severity": severity, "seed": seed,
     }  # fmt: skip
     file = None if out is None else out / ROWS
-    earlier = kept_result(file) if file is not None and file.is_file() else {}
+    earlier = load_result(file) if file is not None and file.is_file() else {}
     rows = (
         list(earlier["episodes"]) if earlier and earlier == {**about, "episodes": earlier["episodes"]} else []
     )

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from rich.console import Console
 
-from finssim.experiments.campaign import Progress, keep_result, kept_result, spread, write_json
+from finssim.experiments.campaign import Progress, keep_result, load_result, spread, write_json
 from finssim.experiments.compare import MEASURES
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
@@ -131,7 +131,7 @@ class Search(BaseModel):
     """Option of a training, or settings.NAME of its learner -> what it may be."""
 
     @model_validator(mode="after")
-    def _one(self) -> Search:
+    def _single_measure(self) -> Search:
         for name in self.options:
             if "." in name and not name.startswith("settings."):
                 raise ValueError(f"'{name}' is no option: one with a dot is settings.NAME, of the learner")
@@ -165,7 +165,7 @@ class Sweep(BaseModel):
         return tuple(range(1, value + 1)) if isinstance(value, int) and not isinstance(value, bool) else value
 
     @model_validator(mode="after")
-    def _known(self) -> Sweep:
+    def _check_options(self) -> Sweep:
         if self.task not in TASKS:
             raise ValueError(f"task is '{self.task}', expected one of {', '.join(TASKS)}")
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
@@ -276,17 +276,17 @@ def sweep(
     processes: Annotated[int | None, (1, None)] = None,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Train every setting with every seed on one machine or many, and evaluate each policy; goes on where it was.
+    """Train every setting with every seed on one machine or several, and evaluate each policy; resumes.
 
-    Exit status 3: a training failed, which the table tells.
+    Exit status 3: a training failed, as the table shows.
 
     Example: finssim sweep sweep.yaml --out swept
 
     Args:
-        file (FILE): What to train: task, seeds, settings (.yaml).
-        out (DIR): Directory of the runs; those that it has are kept.
-        address (ADDRESS): Of a Ray cluster to join, HOST:PORT or auto; this machine alone if not given.
-        processes: Trainings at once on this machine; one a processor if not given.
+        file (FILE): Sweep file: task, seeds, settings (.yaml).
+        out (DIR): Directory of the runs; existing ones are kept.
+        address (ADDRESS): Ray cluster to use, HOST:PORT or auto; only this machine if not given.
+        processes: Parallel trainings on this machine; one per processor if not given.
         progress: Told the share that is done.
 
     Returns:
@@ -306,7 +306,7 @@ def sweep(
         """The rows of jobs, those that are missing after playing them."""
         for job in jobs:
             if (path := runs / job.key / ROW_FILE).is_file():
-                rows[job.key] = kept_result(path)
+                rows[job.key] = load_result(path)
         missing = [job for job in jobs if job.key not in rows]
         if missing:
             with closing(spread(play, missing, processes, address)) as outcomes:

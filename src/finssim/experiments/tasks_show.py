@@ -154,7 +154,7 @@ def _limited(value: Any) -> Any:
 
 
 def tasks_list() -> dict[str, Any]:
-    """List the tasks: agents, sizes of observation and action, period and length [s]; `show NAME` tells one in full.
+    """List the tasks: agents, sizes of observation and action, period and length [s]; `show NAME` describes one.
 
     Example: finssim tasks
     """
@@ -162,13 +162,13 @@ def tasks_list() -> dict[str, Any]:
 
 
 def tasks_show(task: str, *, vehicle: str = "finsrov", action: str | None = None) -> dict[str, Any]:
-    """Tell all of a task as a vehicle does it: observation, action [N, N m], reward, success, settings.
+    """Describe a task for a vehicle: observation, action [N, N m], reward, success, settings.
 
     Example: finssim tasks show docking --vehicle bluerov2_heavy
 
     Args:
-        task (NAME|FILE.py:CLASS): Task, or one's own as FILE.py:CLASS.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        task (NAME|FILE.py:CLASS): Task, or your own as FILE.py:CLASS.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         action (MODE): wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
 
     Raises:
@@ -191,7 +191,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         return [Table(title="", heads=heads, rows=rows, left=(0, 6, 7), whole=(0, 6))]
     parts = {
         "Observation, of one agent: each over its scale, within ± clip": (result["observation"]["parts"], ""),
-        "Action: what -1 and 1 stand for": (result["action"]["components"], ""),
+        "Action: limits at -1 and 1": (result["action"]["components"], ""),
         "Reward, in every step": (result["reward"]["terms"], result["reward"]["told"]),
         "Ends": (result["ends"], ""),
         "Counted": (result["totals"], ""),

@@ -94,7 +94,7 @@ class Spec:
     """In the order of the table."""
     targets: Sequence[str]
     """Setpoints or trajectories that are played."""
-    known_targets: Sequence[str]
+    allowed_targets: Sequence[str]
     """All that may be requested."""
     kind: str
     """What targets are, in the plural."""
@@ -164,7 +164,10 @@ class Spec:
         source, units = (
             ("hardware, by the robot's own estimate, whose error is not in it", "seeds")
             if hardware
-            else ("a virtual pool whose vehicle, water and camera no training has seen", "plants and seeds")
+            else (
+                "a virtual pool whose vehicle, water and camera were not used in training",
+                "plants and seeds",
+            )
         )
         first = ["trajectory"] if self.by_target else []
         return Table(
@@ -208,24 +211,24 @@ def transfer_experiment(
 
     Args:
         spec: Which experiment.
-        out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
-        plants: Virtual pools, each with its own vehicle, water and camera.
-        seeds: Trainings of each policy, each tried with its own noise.
+        out (DIR): Directory for JSON, Markdown, figures, policies and trials; an interrupted one is continued.
+        plants: Number of virtual pools, each with different vehicle, water and camera.
+        seeds: Trainings of each policy, each tested with different noise.
         seed: Seed of every random number; equal seeds give equal results.
-        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
-        camera (MODE): corners (projected through the rippling water, with noise), or pictures (drawn, and searched for
-            tags: several times slower).
-        firmware (NAME): What steers the motors: mcu, or ardusub, an autopilot: commands then go by MAVLink, policies
-            act by its axes, and a tank, a Doppler log, a compass and setpoints three times as far take the place of
-            the pool and its camera.
-        estimator (MODE): Filter that locates: error-state, with the IMU's accelerations, or constant-velocity, the
-            paper's.
-        rows (NAMES): Rows of the table, separated by commas; all but nmpc, which takes an extra, if not given.
+        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
+        camera (MODE): corners (projected through the rippling water, with noise), or pictures (rendered, with tag
+            detection: several times slower).
+        firmware (NAME): Firmware of the vehicle: mcu or ardusub (an autopilot over MAVLink: policies use its axes,
+            in a tank with a DVL and a compass instead of the pool and its camera, with setpoints three times as
+            far).
+        estimator (MODE): State estimator: error-state, with the IMU's accelerations, or constant-velocity, as in
+            the paper.
+        rows (NAMES): Rows of the table, separated by commas; all except nmpc, which needs an extra, if not given.
         targets: What is played; the published ones if None.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        steps: Control steps to learn from, all worlds together; what the task needs if not given.
-        processes: Trainings or trials at once; as many as processors if not given.
-        address (ADDRESS): Of a Ray cluster that does the work in their place, HOST:PORT or auto.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        steps: Control steps of the training, summed over all worlds; the task's default if not given.
+        processes: Parallel trainings or trials; one per processor if not given.
+        address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto.
         robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
         attendant: The person beside that robot, instead of the terminal's keyboard.
         pool_vehicle: Name or file of the vehicle around which the pools' own are drawn; `vehicle` if None.
@@ -244,7 +247,7 @@ def transfer_experiment(
     usual = [name for name, row in spec.rows.items() if row.controller not in COSTLY]
     rows, targets = list(rows or usual), list(targets or spec.targets)
     check_choices(rows, spec.rows, "row", ValueError)
-    check_choices(targets, spec.known_targets, "target", ValueError)
+    check_choices(targets, spec.allowed_targets, "target", ValueError)
     check_choices([severity], ("nominal", "realistic", "hard"), "severity", ValueError)
     check_choices([camera], ("corners", "pictures"), "camera", ValueError)
     check_choices([estimator], MODELS, "estimator", ValueError)
@@ -487,7 +490,7 @@ T1 = Spec(
     title="Station keeping",
     rows=ROWS["t1"],
     targets=tuple(T1_SETPOINTS),
-    known_targets=tuple(T1_SETPOINTS),
+    allowed_targets=tuple(T1_SETPOINTS),
     kind="setpoints",
     by_target=False,
     columns=T1_COLUMNS,
@@ -511,7 +514,7 @@ T2 = Spec(
     title="Trajectory tracking",
     rows=ROWS["t2"],
     targets=T2_TRAJECTORIES,
-    known_targets=tuple(TRAJECTORIES),
+    allowed_targets=tuple(TRAJECTORIES),
     kind="trajectories",
     by_target=True,
     columns={
@@ -537,7 +540,7 @@ SPECS: Mapping[str, Spec] = {"t1": T1, "t2": T2}
 def t1(*, setpoints: Annotated[Sequence[str] | None, ","] = None, **options: Any) -> dict[str, Any]:
     """Station keeping in the virtual pool (the paper's Table IV): success, errors [m, deg], time to settle [s], jitter.
 
-    With --robot the published protocol on a vehicle, guided on the screen, marked as hardware.
+    With --robot, run the published protocol on a vehicle, with instructions on the screen, marked as hardware.
 
     Example: finssim experiment t1 --rows calibrated,pid --seeds 1 --out t1
 
@@ -553,7 +556,7 @@ def t1(*, setpoints: Annotated[Sequence[str] | None, ","] = None, **options: Any
 def t2(*, trajectories: Annotated[Sequence[str] | None, ","] = None, **options: Any) -> dict[str, Any]:
     """Trajectory tracking in the virtual pool (the paper's Table V): horizontal and vertical RMSE, 3-D P95 [m].
 
-    With --robot the published protocol on a vehicle, guided on the screen, marked as hardware.
+    With --robot, run the published protocol on a vehicle, with instructions on the screen, marked as hardware.
 
     Example: finssim experiment t2 --rows calibrated-dr,pid --trajectories lemniscate --seeds 1 --out t2
 

@@ -83,7 +83,7 @@ def simulate_responses(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> d
 
 
 def validate(name: str, *, hydrodynamics: str = "calibrated") -> dict[str, Any]:
-    """Print simulated beside published pool responses, and say where they disagree.
+    """Compare simulated with published pool responses, and report where they disagree.
 
     Example: finssim validate finsrov
 

@@ -33,7 +33,7 @@ LAMPS = ((0.15, 0.30, -0.05), (0.15, -0.30, -0.05))
 
 
 def worlds_list() -> dict[str, Any]:
-    """List the sites and the sensors of the catalogue; `show SITE` says what one holds, and draws it.
+    """List the sites and sensors in the catalogue; `show SITE` describes and renders one.
 
     Example: finssim worlds
     """
@@ -53,18 +53,18 @@ def worlds_show(
     seed: int | None = None,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Say what a site holds, and draw what a camera and a sonar see from its viewpoint.
+    """Describe a site, and render the view of a camera and a sonar from its viewpoint.
 
     Example: finssim worlds show dock --lamps --out dock.png
 
     Args:
-        site (SITE|FILE): Site of the catalogue, or the path of a world file.
-        camera (NAME|FILE): Camera of the catalogue, or the path of its file.
-        sonar (NAME|FILE): Imaging sonar of the catalogue, or the path of its file.
-        sonar_range: Longest range of its picture, in place of the one in its file [m].
+        site (SITE|FILE): Site in the catalogue, or path of a world file.
+        camera (NAME|FILE): Camera in the catalogue, or path of its file.
+        sonar (NAME|FILE): Imaging sonar in the catalogue, or path of its file.
+        sonar_range: Longest range of its image, instead of that in its file [m].
         lamps: Two lights on the vehicle, beside the camera.
-        seed: Draw objects and water as a world of this seed has them; without it they stand as in the file.
-        out (FILE): Picture to write: what the camera sees, and the sonar's fan (.png).
+        seed: Seed for drawing objects and water; as in the file if not given.
+        out (FILE): Image to write: the camera's view and the sonar's fan (.png).
     """
     world = load_world(site)
     eye, ear = load_device(camera), load_device(sonar)

@@ -182,14 +182,12 @@ def about(folder: str | Path) -> dict[str, Any]:
     except (ValueError, OSError) as error:
         raise DatasetError(f"{folder}: no data set there: make one with finssim collect") from error
     if OURS not in metadata:
-        raise DatasetError(
-            f"{folder}: not a data set of FinsSim: it does not say of which task and vehicle it is"
-        )
+        raise DatasetError(f"{folder}: not a data set of FinsSim: task and vehicle are missing")
     described: dict[str, Any] = json_value(metadata[OURS], DatasetError, str(folder))
     return {**described, "episodes": metadata["total_episodes"], "steps": metadata["total_steps"]}
 
 
-def found_in(folder: str | Path) -> list[Path]:
+def data_sets_in(folder: str | Path) -> list[Path]:
     """The data sets at a place: itself, or those right under it.
 
     Raises:
@@ -323,7 +321,7 @@ def record_episodes(
     quota = np.full(worlds, count // rows)
     quota[: -(-(count - int(quota.sum()) * agents) // agents)] += 1
     fresh = expert.reset(rows)
-    memory, (observed, pictures) = fresh, _apart(environment.reset(seed=environment.seed), rows)
+    memory, (observed, pictures) = fresh, _separated(environment.reset(seed=environment.seed), rows)
     running: list[list[Any]] = [[] for _ in range(rows)]
     episodes: list[Episode] = []
     broken = 0
@@ -340,7 +338,7 @@ def record_episodes(
                 running[i].append((observed[i], views, action[i], float(reward[i])))
         ended = step.terminated | step.truncated
         if ended.any():
-            last, final_pictures = _apart(step.final_observation, rows)
+            last, final_pictures = _separated(step.final_observation, rows)
             measured = environment.task.metrics(environment.arrays)
             broke = ended & (
                 environment.arrays.done.numpy() == 0
@@ -362,12 +360,12 @@ def record_episodes(
                         )
                     running[i] = []
             memory = restarted(memory, fresh, np.repeat(ended, agents))
-        observed, pictures = _apart(step.observation, rows)
+        observed, pictures = _separated(step.observation, rows)
         show(min(len(episodes) / count, 1.0))
     return episodes[:count]
 
 
-def _apart(observation: Any, rows: int) -> tuple[NDArray[np.float32], dict[str, NDArray[np.uint8]]]:
+def _separated(observation: Any, rows: int) -> tuple[NDArray[np.float32], dict[str, NDArray[np.uint8]]]:
     """Numbers (rows, n) and pictures by name of an observation, as copies."""
     if not isinstance(observation, dict):
         return observation.reshape(rows, -1).copy(), {}

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.learning.layers import Arrays
-from finssim.learning.network import Network, asked, first_memory
+from finssim.learning.network import Network, answer_of, first_memory
 from finssim.tasks import Environment
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.environment import GREATEST_SEED
@@ -192,7 +192,7 @@ class HeldEvaluation:
         ends = EpisodeEnds(e, arrays)
         for _ in range(self._limit):
             with arrays.plain():
-                answer, memory = asked(network, observation, memory, pictures)
+                answer, memory = answer_of(network, observation, memory, pictures)
             action[:] = answer
             e.advance()
             ends.look(ends.done() & ~ends.ended)

@@ -28,7 +28,7 @@ from finssim.learning.network import (
     Cell,
     Linear,
     Network,
-    asked,
+    answer_of,
     first_memory,
 )
 from finssim.provenance import provenance
@@ -365,7 +365,7 @@ def _mean_of(model: Any, kind: str) -> nn.Module | Network:
     if hasattr(model, "get_vec_normalize_env"):  # Stable-Baselines3
         if model.get_vec_normalize_env() is not None:
             raise ExportError(
-                f"{kind}: VecNormalize scales what it sees: train without it; the observations are of order one"
+                f"{kind}: VecNormalize scales the observations: train without it; the observations are of order one"
             )
         policy = model.policy
         if hasattr(policy, "lstm_actor"):
@@ -377,7 +377,7 @@ def _mean_of(model: Any, kind: str) -> nn.Module | Network:
     actor = getattr(getattr(model, "alg", None), "actor", None)  # RSL-RL
     if isinstance(getattr(actor, "mlp", None), nn.Module):
         if getattr(actor, "obs_normalization", False):
-            raise ExportError(f"{kind}: obs_normalization scales what it sees: train without it")
+            raise ExportError(f"{kind}: obs_normalization scales the observations: train without it")
         return nn.Sequential(*actor.mlp)
     raise ExportError(
         f"{kind}: expected a torch module, a Network, an algorithm of Stable-Baselines3 or a runner of RSL-RL: give "
@@ -475,7 +475,7 @@ def _check_agreement(network: nn.Module | Network, policy: Policy, tolerance: fl
         sentence = (
             f"onnxruntime and the network differ by {error:.2g} in an action, expected at most {allowed:.2g}"
         )
-        raise ExportError(f"{sentence}: look for weights that are not finite or huge")
+        raise ExportError(f"{sentence}: check for weights that are not finite or very large")
 
 
 def _memory(network: nn.Module | Network, rows: int) -> NDArray[Any] | None:
@@ -501,7 +501,7 @@ def _answer(
         copy = deepcopy(network).cpu().eval().to(torch.float64 if kind is np.float64 else torch.float32)
         with torch.no_grad():
             tensors = {name: torch.from_numpy(x) for name, x in pictures.items()}
-            parts = asked(copy, *(None if x is None else torch.from_numpy(x) for x in inputs), tensors)
+            parts = answer_of(copy, *(None if x is None else torch.from_numpy(x) for x in inputs), tensors)
         action, after = (None if x is None else x.numpy() for x in parts)
     action = np.clip(action, -1.0, 1.0) if limited else action
     return action if after is None else np.concatenate([action, after], axis=1)

@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from finssim.learning.served import copied, one_agent, served
+from finssim.learning.served import copied, served, single_agent
 from finssim.tasks import SEEING, TASKS, Environment, EnvironmentSetupError, Task
 from finssim.tasks.onlooker import Onlooker
 
@@ -68,7 +68,7 @@ class Env(gymnasium.Env[Any, Any]):
             EnvironmentSetupError: As `finssim.make`; or the task has several agents, or there are several worlds.
         """
         self.render_mode = options.pop("render_mode", None)
-        self.environment = one_agent(served(task, options, auto_reset=False, pictures=True), "Gymnasium")
+        self.environment = single_agent(served(task, options, auto_reset=False, pictures=True), "Gymnasium")
         if self.environment.worlds != 1:
             raise EnvironmentSetupError(
                 f"worlds is {self.environment.worlds}, expected 1: several are a VectorEnv"
@@ -153,7 +153,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         if num_envs is not None:
             options["worlds"] = num_envs
         environment = served(task, options, auto_reset=self._same_step, pictures=True)
-        self.environment = one_agent(environment, "Gymnasium")
+        self.environment = single_agent(environment, "Gymnasium")
         self.num_envs = self.environment.worlds
         self._ended = np.zeros(self.num_envs, bool)
         self.single_observation_space = observation_space(self.environment)

@@ -21,7 +21,7 @@ Array = Any
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def single_thread() -> Iterator[None]:
     """Matrix products on one thread: a second gains little on so small networks, and loses much on a busy machine."""
     from threadpoolctl import threadpool_limits
 
@@ -216,13 +216,13 @@ class Stack:
             if i > 0:
                 slope = self._memory("s", i, len(x))
                 xp.multiply(x, x, out=slope)
-                xp.subtract(self._one, slope, out=slope)
+                xp.subtract(self._layer, slope, out=slope)
                 dx *= slope
             dy = dx
         return dy
 
     @property
-    def _one(self) -> Array:
+    def _layer(self) -> Array:
         if "one" not in self.__dict__:
             self.__dict__["one"] = self.arrays.array(1.0)
         return self.__dict__["one"]

@@ -26,7 +26,7 @@ FILE_MIB = 100
 """A file of frames ends with the episode that takes it to this size [MiB]."""
 FILES = 1000
 """In a folder, at most."""
-PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+FILE_PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 
 
@@ -60,7 +60,7 @@ def export_lerobot(source: str | Path, out: str | Path) -> dict[str, Any]:
     with atomic_directory(out, replaces=INFO_FILE) as folder:
         rows, parts = _frames(folder, source, fps, title)
         features = _features({key: x[0] for key, x in parts.items()}, described)
-        episodes = folder / "meta/episodes" / f"{_place(0)}.parquet"
+        episodes = folder / "meta/episodes" / f"{_file_path(0)}.parquet"
         episodes.parent.mkdir(parents=True)
         pd.DataFrame(rows).to_parquet(episodes, index=False)
         pd.DataFrame({"task_index": [0]}, index=[title]).to_parquet(folder / "meta/tasks.parquet")
@@ -75,7 +75,7 @@ def export_lerobot(source: str | Path, out: str | Path) -> dict[str, Any]:
             "video_files_size_in_mb": 2 * FILE_MIB,
             "fps": fps,
             "splits": {"train": f"0:{len(rows)}"},
-            "data_path": f"data/{PLACE}.parquet",
+            "data_path": f"data/{FILE_PATH}.parquet",
             "video_path": None,
             "features": features,
         }
@@ -101,7 +101,7 @@ def _frames(
             writer.close()
             file, size, writer = file + 1, 0, None
         if writer is None:
-            path = folder / "data" / f"{_place(file)}.parquet"
+            path = folder / "data" / f"{_file_path(file)}.parquet"
             path.parent.mkdir(parents=True, exist_ok=True)
             writer = pq.ParquetWriter(path, table.schema)
         writer.write_table(table)
@@ -142,7 +142,7 @@ def _rate(described: Mapping[str, Any], source: str | Path) -> int:
     """Frames in a second [Hz]."""
     period = described.get("period")
     if not period:
-        raise DatasetError(f"{source}: does not tell its period: collect it again with this version")
+        raise DatasetError(f"{source}: has no period: collect it again with this version")
     fps = round(1.0 / period)
     if abs(fps * period - 1.0) > 1e-6:
         raise DatasetError(
@@ -151,8 +151,8 @@ def _rate(described: Mapping[str, Any], source: str | Path) -> int:
     return fps
 
 
-def _place(file: int) -> str:
-    return PLACE.format(chunk_index=file // FILES, file_index=file % FILES)
+def _file_path(file: int) -> str:
+    return FILE_PATH.format(chunk_index=file // FILES, file_index=file % FILES)
 
 
 def _columns(episode: Episode, index: int, began: int, fps: int) -> dict[str, NDArray[Any]]:

@@ -213,7 +213,7 @@ def first_memory(network: Any, rows: int, device: str | None = None) -> Array | 
     return torch.zeros(rows, size, device=device)
 
 
-def asked(
+def answer_of(
     network: Any, observation: Array, memory: Array | None, pictures: Mapping[str, Array] | None = None
 ) -> tuple[Array, Array | None]:
     """Action (N, m) and the memory after, of a `Network` or a torch module; one that sees takes pictures by name."""

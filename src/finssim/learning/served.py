@@ -58,7 +58,7 @@ def copied(observation: Any, rows: Any = ...) -> Any:
     return observation[rows].copy()
 
 
-def one_agent(environment: Environment, library: str) -> Environment:
+def single_agent(environment: Environment, library: str) -> Environment:
     """The environment, if it has one agent, which is all that the library's interface takes."""
     if environment.agents > 1:
         raise EnvironmentSetupError(

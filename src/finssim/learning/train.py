@@ -51,8 +51,8 @@ def train(
 ) -> Path:
     """Train a policy and write it to a directory that runs without the learner.
 
-    The folder `OUT-training` beside it takes the TensorBoard log and the last two checkpoints: policy directories from
-    which a killed training goes on to the same result.
+    The folder `OUT-training` beside it holds the TensorBoard log and the last two checkpoints: policy directories
+    from which a killed training resumes, with the same result.
 
     Example: finssim train t1 --vehicle finsrov --seed 1 --out runs/hold
 
@@ -62,34 +62,34 @@ def train(
 
     Args:
         task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking,
-            pursuit, team-pursuit, formation; with a camera camera-docking, pipeline or gate, with a sonar net; or one's
-            own, FILE.py:CLASS.
-        out: Directory of the policy; an earlier policy there is replaced when done.
-        learner (NAME): Who learns: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; one agent also torchrl-ppo,
-            several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; tasks with pictures distill,
-            their default; or one's own, FILE.py:CLASS.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+            pursuit, team-pursuit, formation; with a camera camera-docking, pipeline or gate, with a sonar net; or
+            your own, FILE.py:CLASS.
+        out: Directory of the policy; an earlier policy there is replaced at the end.
+        learner (NAME): Learner: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; one agent also torchrl-ppo,
+            several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; tasks with images
+            distill, their default; or your own, FILE.py:CLASS.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        action (MODE): What the policy commands: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
-        randomize (FILE): Ranges that vehicle and water are drawn from: hold_for_position, fossen_learn_to_swim,
+        action (MODE): Action mode: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
+        randomize (FILE): Ranges of vehicle and water parameters: hold_for_position, fossen_learn_to_swim,
             equivalent_box, pool, open_water, no_thruster_dynamics, or a file.
         observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
             through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
         seed: Seed of every random number; equal seeds give equal results.
         worlds: Worlds simulated at once.
-        steps: Control steps to learn from, all worlds together; what the task needs if not given.
-        until (SHARE): Share of successes, such as 0.95, at which the training is done before its steps are: of the held
-            episodes, in two evaluations one after the other.
-        init (NAME|DIR): Whom the policy imitates before it learns by itself: a baseline of the task, such as pid, a
-            policy directory, informed (a policy trained first that sees what --randomize has drawn), or none; pursuit,
-            team-pursuit and formation have their baselines if not given. Of ppo; --set taught=SHARE says for how much
+        steps: Control steps of the training, summed over all worlds; the task's default if not given.
+        until (SHARE): Success rate, such as 0.95, that ends the training early if reached in two consecutive
+            evaluations.
+        init (NAME|DIR): Controller to imitate first (ppo only): a baseline of the task, such as pid, a policy
+            directory, informed (a policy trained first that observes the parameters drawn by --randomize), or none;
+            pursuit, team-pursuit and formation default to their baselines. --set taught=FRACTION sets the fraction
             of the training.
-        settings (NAME=VALUE): Change of a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be
-            given several times.
-        resume: Go on from the last checkpoint of a training that was killed.
-        wandb (PROJECT): Project of Weights & Biases that the curves are sent to, besides TensorBoard; with
-            WANDB_MODE=offline they are written beside the policy for a later 'wandb sync'.
-        device (DEVICE): Where to compute: cpu or cuda.
+        settings (NAME=VALUE): Change a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be
+            repeated.
+        resume: Resume a killed training from its last checkpoint.
+        wandb (PROJECT): Project of Weights & Biases to send the curves to, besides TensorBoard; with
+            WANDB_MODE=offline they are stored beside the policy for 'wandb sync'.
+        device (DEVICE): Compute device: cpu or cuda.
         console: Where progress is shown; standard error if None.
         shown: Name of the directory in messages, where `out` is a temporary one.
         interrupted: Where the policy so far goes after Ctrl-C; if None, `out`, or `OUT-training/interrupted` where
@@ -127,12 +127,12 @@ def train(
 
     from finssim.learning.episodes import HELD_WORLDS, HeldEvaluation, held_seed
     from finssim.learning.export import description_of
-    from finssim.learning.layers import one_thread
+    from finssim.learning.layers import single_thread
     from finssim.learning.training_loop import Loop, TrainingView, last_checkpoint
 
     checkpoint = last_checkpoint(side) if resume else None
     randomized = randomization is not None
-    changes = dict(settings) if isinstance(settings, Mapping) else settings_of_words(settings)
+    changes = dict(settings) if isinstance(settings, Mapping) else parse_settings(settings)
     values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=changes)
     values = _taught(values, init, learner, mode_name == the_task.action)
 
@@ -160,7 +160,7 @@ def train(
     )
     began = time.perf_counter()
     full = randomization and randomization.at_full_width()  # as it is measured, whatever it grew from
-    with one_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
+    with single_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a last small batch does no harm
         warnings.filterwarnings("ignore", message=".*on the GPU.*")
         loop = Loop(
@@ -177,7 +177,7 @@ def train(
                 f"no checkpoint in {side} yet: starting from the beginning", soft_wrap=True, markup=False
             )
         stopped = loop.run()
-    folder = (interrupted or _place_beside(Path(out), side)) if stopped else Path(out)
+    folder = (interrupted or _path_beside(Path(out), side)) if stopped else Path(out)
     _finish(
         loop, folder, stopped, console, folder if stopped else shown or folder, time.perf_counter() - began
     )
@@ -189,15 +189,13 @@ def _taught(values: Any, init: str | Path | None, learner: str, default_action: 
     if not hasattr(values, "teacher"):
         if init is None:
             return values
-        raise TrainingError(
-            f"learner '{learner}' imitates nobody before it learns: leave init out, or take ppo"
-        )
+        raise TrainingError(f"learner '{learner}' has no initial imitation: omit init, or use ppo")
     if init is not None:
         return replace(values, teacher="" if str(init) == "none" else str(init))
     return values if default_action else replace(values, teacher="")
 
 
-def settings_of_words(texts: Sequence[str]) -> dict[str, Any]:
+def parse_settings(texts: Sequence[str]) -> dict[str, Any]:
     """Changes of settings from NAME=VALUE; a value with commas is a list.
 
     Raises:
@@ -233,7 +231,7 @@ def _finish(loop: Any, folder: Path, stopped: bool, console: Console, label: Pat
         raise KeyboardInterrupt
 
 
-def _place_beside(out: Path, side: Path) -> Path:
+def _path_beside(out: Path, side: Path) -> Path:
     """Where an unfinished policy goes: a finished one that is there already must not be lost to it."""
     return side / "interrupted" if (out / DESCRIPTION_FILE).is_file() else out
 

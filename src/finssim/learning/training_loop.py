@@ -107,7 +107,7 @@ CHECKPOINTS = 4
 """In a training, at least: after each such part, or `CHECKPOINT_STEPS`, whichever comes first."""
 CHECKPOINT_STEPS = 500_000
 """Control steps of all worlds together between two checkpoints, at most."""
-KEPT = 2
+RETAINED = 2
 """Checkpoints that stay: should the newest be damaged, there is one before it."""
 EVALUATIONS = 10
 """Held evaluations in a training; each takes about as long as an update."""
@@ -253,7 +253,7 @@ class Loop:
         )
         checkpoints = _checkpoints(self.side)
         after_this = checkpoints.index(checkpoint) + 1
-        for other in (*checkpoints[: max(after_this - KEPT, 0)], *checkpoints[after_this:]):
+        for other in (*checkpoints[: max(after_this - RETAINED, 0)], *checkpoints[after_this:]):
             shutil.rmtree(other)
 
     def resume(self, state: Mapping[str, Any]) -> None:
@@ -267,7 +267,7 @@ class Loop:
             if saved != value:
                 raise ResumeError(
                     f"cannot go on in {self.side}: {name} was {saved!r} and is {value!r} now: "
-                    "give what the training began with, or leave out --resume"
+                    "give the original settings, or omit --resume"
                 )
         if "best" not in state:
             raise ResumeError(f"{self.side}: the checkpoint is of an earlier version: leave out --resume")

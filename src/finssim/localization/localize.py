@@ -46,7 +46,7 @@ DEPTH_STD = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class PriorSources:
     """Sources of height and tilt."""
 
     base: Constraints
@@ -92,7 +92,7 @@ class Known:
         return replace(self.base, z_b=self.surface - below - lever, roll=roll, pitch=pitch)
 
 
-def known_of(
+def prior_sources(
     pool: Pool,
     vehicle: Vehicle,
     *,
@@ -102,7 +102,7 @@ def known_of(
     tilt_std: float | None = None,
     shared_pixel_std: float = 0.0,
     longest_gap: float = 1.0,
-) -> Known:
+) -> PriorSources:
     """Read the sources.
 
     Args:
@@ -134,10 +134,12 @@ def known_of(
     assumed = []
     if imu is None:
         spread = math.degrees(base.tilt_std)
-        assumed.append(f"no --imu: the vehicle is taken as level, give or take {spread:.1f} degrees")
+        assumed.append(f"no --imu: the vehicle is assumed level, within {spread:.1f} degrees")
     if sensor is None and depth is not None:
-        assumed.append(f"{vehicle.name} has no depth sensor: the depth is taken as that of the body origin")
-    return Known(base, surface, _depth(depth, longest_gap), _tilt(imu, longest_gap), tuple(assumed))
+        assumed.append(
+            f"{vehicle.name} has no depth sensor: the depth is assumed to be that of the body origin"
+        )
+    return PriorSources(base, surface, _depth(depth, longest_gap), _tilt(imu, longest_gap), tuple(assumed))
 
 
 def _vertical(pool: Pool) -> tuple[tuple[float, float, float], float]:
@@ -205,7 +207,7 @@ class Locator:
         self,
         pool: Pool,
         vehicle: Vehicle,
-        prior: Known,
+        prior: PriorSources,
         *,
         method: str = "refractive",
         pixel_std: float = 0.5,
@@ -529,27 +531,28 @@ def run(
     truth: str | Path | None = None,
     as_json: bool = False,
 ) -> Run:
-    """Measure position and yaw in every picture: x, y, z [m], yaw [rad], pool frame, with standard deviations.
+    """Measure position and yaw in every image: x, y, z [m], yaw [rad], pool frame, with standard deviations.
 
     Example: finssim localize video.mp4 --pool pool.yaml --vehicle finsrov --depth depth.csv --out poses.csv
 
     Args:
-        inputs (INPUT): Pictures, folders of them, videos, or detection files (.csv).
+        inputs (INPUT): Images, folders of them, videos, or detection files (.csv).
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        out (FILE): Table to write (.csv), one row a picture.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        out (FILE): Table to write (.csv), one row per image.
         depth (FILE|Z): Table with columns t, depth, or one depth of the pressure port below the surface [m].
         imu (FILE): Table with columns t and roll, pitch [rad] or qx, qy, qz, qw; level if not given.
         method (METHOD): refractive, refractive-weighted, refractive-6dof, pinhole-depth or pinhole.
         family (NAME): Family of the tags; that of the vehicle file if not given.
-        refine (WAY): How corners are placed: fit, or AprilTag's own edges or none.
-        gamma: Encoding of the pictures: 1 linear, 2.2 video.
-        times (FILE): Table with columns image, time [s], where names of pictures hold none.
-        pixel_std: Error of a detected corner, per axis [px]; what the pool's calibration found, else 0.5, if not given.
-        shared_pixel_std: Error that all corners of a picture share, per axis [px]: waves.
+        refine (WAY): Corner refinement: fit, or AprilTag's own edges or none.
+        gamma: Gamma of the images: 1 linear, 2.2 video.
+        times (FILE): Table with columns image, time [s], if the image names contain none.
+        pixel_std: Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
+            given.
+        shared_pixel_std: Error common to all corners of an image, per axis [px]: waves.
         depth_std: Error of the depth [m]; that of the vehicle file if not given.
         tilt_std_deg: Error of roll and pitch [deg]; 0.5 with --imu, 2 without, if not given.
-        longest_gap: Depth and tilt are not interpolated over longer gaps [s].
+        longest_gap: Longest gap over which depth and tilt are interpolated [s].
         truth (FILE): Table with columns image or t, x, y, to compare with.
         as_json: Print one JSON object instead of tables.
 
@@ -565,7 +568,7 @@ def run(
             f"longest_gap is {longest_gap}, expected a time in seconds that is not negative"
         )
     site, body = load_pool(pool), load_vehicle(str(vehicle))
-    prior = known_of(
+    prior = prior_sources(
         site,
         body,
         depth=depth,

@@ -30,7 +30,7 @@ _BAD_ROWS_NAMED = 5
 class PointTable:
     """A table as it was read."""
 
-    where: str
+    label: str
     """The file, as messages call it."""
     names: list[str]
     """All columns, as the file calls them."""
@@ -130,7 +130,7 @@ def run_project(
     out: Path | None = None,
     as_json: bool = False,
 ) -> None:
-    """Pixels [px] at which points in the water appear.
+    """Project points in the water to pixels [px].
 
     Example: finssim project points.csv --pool pool.yaml
 
@@ -152,7 +152,7 @@ def run_project(
     columns = {
         "u": _cells(projection.pixels[:, 0], 6),
         "v": _cells(projection.pixels[:, 1], 6),
-        "status": _words(projection.status),
+        "status": _status_names(projection.status),
     }
     _give(table, columns, projection.status, "project", "points have a pixel in the image", out, as_json)
 
@@ -167,15 +167,15 @@ def run_backproject(
     out: Path | None = None,
     as_json: bool = False,
 ) -> None:
-    """Points [m] in the water that pixels see, on a plane.
+    """Back-project pixels to points [m] on a plane in the water.
 
     Example: finssim backproject pixels.csv --pool pool.yaml --z 0
 
     Args:
         pixels (PIXELS): Table with columns u, v [px]; - for standard input.
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
-        z: Height of the points, pool frame [m]; a column z goes before it.
-        plane: Plane of the points in place of --z: a,b,c,d with a x + b y + c z + d = 0 [m].
+        z: Height of the points, pool frame [m]; a column z has priority.
+        plane: Plane of the points, instead of --z: a,b,c,d with a x + b y + c z + d = 0 [m].
         pixel_std: Error of a pixel [px]; adds columns with the error of the points [m].
         out (FILE): Table to write; standard output if not given.
         as_json: Print one JSON object instead of tables.
@@ -198,7 +198,7 @@ def run_backproject(
     else:
         points, status = rays.at_plane(normal, offset)
     columns = {axis: _cells(points[:, i], 9) for i, axis in enumerate("xyz")}
-    columns["status"] = _words(status)
+    columns["status"] = _status_names(status)
     if pixel_std is not None:
         by_pixel = plane_jacobian(scene.camera, scene.interface, points, normal)[..., :2]
         sigma = pixel_std * np.sqrt(np.sum(by_pixel**2, axis=-1))
@@ -223,7 +223,7 @@ def _plane(table: PointTable, z: float | None, plane: str | None) -> tuple[Array
         return up, -table.numbers["z"]
     if z is None:
         raise LocalizationError(
-            f"{table.where}: nothing says on which plane the points lie: give a height z, a plane, or a column z"
+            f"{table.label}: the plane of the points is missing: give a height z, a plane, or a column z"
         )
     if not np.isfinite(z):
         raise LocalizationError(f"z is {z}, expected a finite height in metres")
@@ -235,7 +235,7 @@ def _cells(values: Array, digits: int) -> list[str]:
     return [f"{x:.{digits}f}" if np.isfinite(x) else "" for x in values.tolist()]
 
 
-def _words(status: npt.NDArray[np.int8]) -> list[str]:
+def _status_names(status: npt.NDArray[np.int8]) -> list[str]:
     return [Status(i).name.lower() for i in status.tolist()]
 
 

@@ -21,7 +21,7 @@ NEIGHBOURS = 32
 
 @wp.struct
 class Solids:
-    """Solids of one kind and size each in every world, whose poses differ."""
+    """Solids of one kind each in every world, whose poses and sizes differ."""
 
     kind: wp.array(dtype=int)  # BOX ... HEIGHTFIELD
     size: wp.array(dtype=wp.vec3)  # half extents; radius and half length; of a mesh: 1 if closed
@@ -31,6 +31,7 @@ class Solids:
     gentle: float  # cosine of the heightfield's steepest slope
     shape: wp.array(dtype=int)  # index of each among the poses
     pose: wp.array2d(dtype=wp.transform)  # to world, by (world, shape)
+    scale: wp.array2d(dtype=float)  # factor on its size, by (world, shape)
     draws: wp.array(dtype=int)  # changes with the poses of a world
     drawn: wp.array2d(dtype=int)  # at the last look around, by (world, vehicle)
     near: wp.array3d(dtype=int)  # which solids were near at that look, by (world, vehicle, NEIGHBOURS)
@@ -189,6 +190,22 @@ def solid_depth(solids: Solids, k: int, x: wp.vec3, radius: float, reach: float)
 
 
 @wp.func
+def scaled_depth(solids: Solids, k: int, scale: float, x: wp.vec3, radius: float, reach: float) -> wp.vec4:
+    """`solid_depth` of a solid drawn `scale` times as large: lengths are divided by it, and the depth multiplied.
+
+    Args:
+        solids: Their sizes.
+        k: Which.
+        scale: Factor on its size [-].
+        x: Centre of the sphere, axes of the solid [m].
+        radius: Of the sphere [m].
+        reach: How far from its surface a mesh is looked for [m].
+    """
+    face = solid_depth(solids, k, x / scale, radius / scale, reach / scale)
+    return wp.vec4(face[0], face[1], face[2], scale * face[3])
+
+
+@wp.func
 def spheres_along(half: float, least: float) -> int:
     """Spheres of a row within the hull, at most 1.4 radii apart.
 
@@ -253,10 +270,11 @@ def free_water(solids: Solids, w: int, v: int, position: wp.vec3, around: float)
     count = int(0)
     for k in range(solids.kind.shape[0]):
         pose = solids.pose[w, solids.shape[k]]
+        scale = solids.scale[w, solids.shape[k]]
         horizon = wp.max(free, around)
-        if wp.length(position - wp.transform_get_translation(pose)) - solids.bound[k] < horizon:
+        if wp.length(position - wp.transform_get_translation(pose)) - scale * solids.bound[k] < horizon:
             x = wp.transform_point(wp.transform_inverse(pose), position)
-            distance = -solid_depth(solids, k, x, 0.0, horizon)[3]
+            distance = -scaled_depth(solids, k, scale, x, 0.0, horizon)[3]
             free = wp.min(free, distance)
             if distance < around:
                 if count < wp.static(NEIGHBOURS):
@@ -313,15 +331,16 @@ def solids_wrench(
         if listed:
             k = solids.near[w, v, j]
         pose = solids.pose[w, solids.shape[k]]
-        if wp.length(position - wp.transform_get_translation(pose)) < solids.bound[k] + around:
+        scale = solids.scale[w, solids.shape[k]]
+        if wp.length(position - wp.transform_get_translation(pose)) < scale * solids.bound[k] + around:
             to_solid = wp.transform_inverse(pose)
             origin = wp.transform_point(to_solid, position)
             R = wp.quat_to_matrix(wp.transform_get_rotation(to_solid) * q)
-            if solid_depth(solids, k, origin, 0.0, 2.0 * around)[3] > -around:
+            if scaled_depth(solids, k, scale, origin, 0.0, 2.0 * around)[3] > -around:
                 for i in range(parts):
                     part = hull_sphere(i, half_size)
                     r = wp.vec3(part[0], part[1], part[2])
-                    face = solid_depth(solids, k, origin + R * r, part[3], 2.0 * around)
+                    face = scaled_depth(solids, k, scale, origin + R * r, part[3], 2.0 * around)
                     if face[3] > 0.0:
                         n = wp.vec3(face[0], face[1], face[2])
                         r = r - part[3] * (wp.transpose(R) * n)  # where the sphere touches

@@ -398,23 +398,24 @@ def run(
     duration: Annotated[float | None, (0.0, None)] = None,
     seed: int = 0,
 ) -> None:
-    """Be the physics behind ArduPilot's own ArduSub in SITL, started with `--model JSON:127.0.0.1`, until Ctrl-C.
+    """Simulate the physics for ArduPilot's ArduSub SITL, started with `--model JSON:127.0.0.1`, until Ctrl-C.
 
     Example: finssim ardusub-sitl --vehicle bluerov2_heavy --site tank --dvl 127.0.0.1:16171
 
     Args:
-        vehicle (NAME|FILE): Vehicle whose thrusters have an `esc`, of the catalogue or a file; of a calibrated one, its
+        vehicle (NAME|FILE): Vehicle whose thrusters have an `esc`: in the catalogue, or a (calibrated) vehicle
             file.
-        bind (HOST:PORT): Where SITL sends its packets: this machine alone unless given.
+        bind (HOST:PORT): Address to which SITL sends its packets; only this machine if not given.
         site (NAME): Walls and floor: pool, tank or open-water (no walls near, floor at 20 m).
-        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x (north), y, z [m], yaw left positive [deg]; half way
-            down if not given.
-        current (X,Y,Z): Of the water, world frame [m/s].
+        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x (north), y, z [m], yaw left positive [deg]; half
+            of the depth if not given.
+        current (X,Y,Z): Current, world frame [m/s].
         wave (A,LENGTH,HEADING): One wave: amplitude [m], length [m], direction of travel [deg]; none if not given.
-        voltage: Of the battery without load [V].
-        resistance: Of battery and wiring [ohm].
-        dvl (HOST:PORT): Also serve a Water Linked DVL there, for BlueOS' driver or a robot; its own port is 16171.
-        duration: When to end, simulated [s]; never if not given.
+        voltage: Battery voltage without load [V].
+        resistance: Resistance of battery and wiring [ohm].
+        dvl (HOST:PORT): Address to serve a Water Linked DVL, for BlueOS' driver or a robot; its usual port is
+            16171.
+        duration: Simulated duration [s]; until Ctrl-C if not given.
         seed: Seed of every random number; equal seeds give equal results.
 
     Raises:

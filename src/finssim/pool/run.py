@@ -505,42 +505,43 @@ def run(
     duration: Annotated[float | None, (0.0, None)] = None,
     seed: int = 0,
 ) -> None:
-    """Be the vehicle and its pool for a robot on this machine, until Ctrl-C.
+    """Simulate a vehicle and its pool for a robot on this machine, until Ctrl-C.
 
     Example: finssim pool --plant 1 --severity realistic --pool-file pool.yaml --truth truth.fst
 
     Args:
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        plant (SEED|FILE): Plant in the water: a seed to draw it from, or a plant file.
-        severity (NAME): How far a drawn plant and its camera are from what is known: nominal, realistic or hard.
-        lockstep: Time goes as fast as one robot asks, instead of in real time.
-        camera (KIND): What the camera sends: pictures, corners (of the tags) or none. If not given: pictures, over a
-            team or a tank corners, in open water, the water of a world, of a task and with ardusub none.
-        port: UDP port of the motor controller; pictures leave from the next, lock-step (TCP) is the one after. With
-            ardusub 0 takes a free one.
-        bind (ADDRESS): Address of this end: this machine alone unless given.
-        robot (HOST:PORT): The only robot that may command in real time; its pictures go to the port after this.
-        pool_file (FILE): Pool file to write: the camera as its calibration has it (.yaml).
-        truth (FILE): File to write what truly happened into, for scoring; of a team a folder.
-        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; in the middle, or at the
-            viewpoint of a world, if not given.
-        task (TASK): The site of a task in open water, in real time, with ports as of --team; messages between the
-            robots go to the port five after --port. What the task commands is commanded here; the task scores what is
-            true.
-        team (NAME,NAME): Several vehicles in one water, in real time: names or files with commas between, the agents of
-            --task, or side by side without. Each has a motor controller, at --port, ten ports on, and so on, for a
-            robot at --robot, ten ports on, and so on. A camera sees them all; each has tags of its own ids.
-        site (NAME): Where: pool, tank or open-water (current, waves, 20 m of water). If not given: pool; of a world its
-            basin, or open water as deep as its seabed.
-        world (SITE|FILE): What the vehicle's own cameras, sonars and altimeters see, drawn from --seed: a site of
-            finssim worlds, or a world file. Their readings go the way of the pictures.
-        positioning (NAME): Fixes on the robot's wire: none, motion-capture or usbl.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        plant (SEED|FILE): Plant: a seed to draw it from, or a plant file.
+        severity (NAME): How much a drawn plant and its camera differ from the files: nominal, realistic or hard.
+        lockstep: Advance time as fast as one robot requests, instead of in real time.
+        camera (KIND): Output of the camera: pictures, corners (of the tags) or none. Default: pictures; corners for
+            a team or a tank; none in open water, with a world or a task, and with ardusub.
+        port: UDP port of the motor controller; images use the next port, lock-step (TCP) the one after. With
+            ardusub, 0 selects a free one.
+        bind (ADDRESS): Local address; only this machine if not given.
+        robot (HOST:PORT): The only robot that may send commands in real time; images are sent to the next port.
+        pool_file (FILE): Pool file to write, with the calibrated camera (.yaml).
+        truth (FILE): File for the true states, for scoring; for a team a folder.
+        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; the centre, or the viewpoint
+            of a world, if not given.
+        task (TASK): Run the site of a task in open water, in real time, with ports as for --team; messages between
+            robots use the port of --port plus five. Other agents of the task are simulated, and the task scores the
+            truth.
+        team (NAME,NAME): Several vehicles at one site, in real time: names or files separated by commas, as agents
+            of --task or without a task. The ports of each further motor controller and robot are higher by ten than
+            --port and --robot. A camera sees all of them, with different tag ids.
+        site (NAME): Site: pool (default), tank or open-water (current, waves, 20 m deep); for a world the default
+            is its basin, or open water down to its seabed.
+        world (SITE|FILE): World for the vehicle's own cameras, sonars and altimeters, drawn from --seed: a site of
+            finssim worlds, or a world file. Readings are sent like images.
+        positioning (NAME): Position fixes on the robot's link: none, motion-capture or usbl.
         firmware (NAME): What steers the motors: mcu, the motor controller of `finssim run`, or ardusub, an autopilot
             that answers as ArduSub 4.5 does, over MAVLink, with a compass and a Doppler log.
-        ground (HOST:PORT,...): UDP, with ardusub: ground stations that are sent to; it answers whoever sends to --port.
-        tcp (HOST:PORT): With ardusub: where ground stations connect; port 0 takes a free one.
-        dvl (HOST:PORT): With ardusub: TCP server of the Water Linked Doppler log; port 0 takes a free one.
-        duration: When to end, pool's clock [s]; never if not given.
+        ground (HOST:PORT,...): With ardusub: UDP ground stations to send to; every sender to --port is answered,
+            too.
+        tcp (HOST:PORT): With ardusub: TCP address for ground stations; port 0 selects a free one.
+        dvl (HOST:PORT): With ardusub: TCP address of the Water Linked DVL; port 0 selects a free one.
+        duration: Duration, pool's clock [s]; until Ctrl-C if not given.
         seed: Seed of every random number; equal seeds give equal results.
 
     Raises:
@@ -587,7 +588,7 @@ def run(
     if not (0 < port or (ardusub and not lockstep and camera == "none")) or port > 65533:
         raise LinkError(f"port {port}: expected 1 to 65533, as the two after it are taken too")
     if pool_file is not None and plan.calibrated is None:
-        raise PlantSpecError("--pool-file tells of the camera, and --camera none has none: leave one out")
+        raise PlantSpecError("--pool-file describes the camera, and --camera none has none: omit one")
 
     def make_world(eye: Any) -> VirtualPool:
         """Begins to write files: only when every wire is open, lest those of a pool that is running are replaced."""

@@ -443,7 +443,7 @@ class StateWatch:
     def forget(self) -> None:
         """As before the first reading."""
         self._oldest = -math.inf
-        self._why = "the estimator has said nothing yet"
+        self._why = "no output of the estimator yet"
         self._pose: tuple[Array, Array] | None = None
 
     def accept(self, now: float, reading: Reading) -> None:

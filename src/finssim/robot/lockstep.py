@@ -225,10 +225,10 @@ class LockstepClient:
         except OSError as error:
             reason = "silent for too long" if isinstance(error, TimeoutError) else error.strerror or error
             raise LockstepError(
-                f"the world at {self.address} does not answer ({reason}): look at what its process says"
+                f"the world at {self.address} does not answer ({reason}): check the output of its process"
             ) from None
         if message is None:
-            raise LockstepError(f"the world at {self.address} has gone: look at what its process says")
+            raise LockstepError(f"the world at {self.address} is gone: check the output of its process")
         return decode_delivery(*message)
 
     def close(self) -> None:

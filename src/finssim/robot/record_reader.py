@@ -19,7 +19,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from finssim.files import atomic_write
-from finssim.mcap_files import MAGIC, whole_mcap
+from finssim.mcap_files import MAGIC, intact_mcap
 from finssim.robot.record_messages import METADATA, RecordError, types
 from finssim.yaml_file import json_value
 
@@ -27,7 +27,7 @@ __all__ = ["Entry", "Record", "describe_record", "events_of", "open_record", "pl
 
 
 def repair(file: Path, *, out: Path | None = None) -> None:
-    """Write a whole record of all that can be read of a cut or damaged one; FILE itself stays as it is.
+    """Write a complete record from the readable part of a truncated or damaged one; FILE is not changed.
 
     Example: finssim record repair run.mcap --out whole.mcap
 
@@ -59,7 +59,7 @@ def repair_record(path: Path, out: Path) -> list[str]:
     if out.resolve() == path.resolve():
         raise RecordError(f"{path}: cannot be repaired into itself: give another file with --out")
     notes: list[str] = []
-    with whole_mcap(path, notes) as complete, atomic_write(out) as temporary:
+    with intact_mcap(path, notes) as complete, atomic_write(out) as temporary:
         write_whole(complete, temporary, notes)
     return notes
 
@@ -187,7 +187,7 @@ class Record:
                 continue
             if schema.name not in types().types:
                 raise RecordError(
-                    f"{self.path}: {channel.topic} is of the unknown type {schema.name}: leave it out"
+                    f"{self.path}: {channel.topic} is of the unknown type {schema.name}: omit it"
                 )
             try:
                 decoded = types().deserialize_cdr(message.data, schema.name)
@@ -219,7 +219,7 @@ def open_record(path: Path | str) -> Iterator[Record]:
     refuse_foreign(path)
     notes: list[str] = []
     with ExitStack() as stack:
-        complete = stack.enter_context(whole_mcap(path, notes))
+        complete = stack.enter_context(intact_mcap(path, notes))
         file = stack.enter_context(complete.open("rb"))
         if not _indexed(file):
             copy = Path(stack.enter_context(TemporaryDirectory())) / path.name
@@ -371,7 +371,7 @@ EVENTS_SHOWN = 20
 
 
 def info(path: Path, *, as_json: bool = False) -> None:
-    """Tell what a record holds: vehicle, duration [s], topics with rates [Hz] and gaps [s], events, damage.
+    """Describe a record: vehicle, duration [s], topics with rates [Hz] and gaps [s], events, damage.
 
     Example: finssim record info run.mcap
 
@@ -406,9 +406,9 @@ def play_record(
     Args:
         path (FILE): Record of a run (.mcap).
         speed (FACTOR): Times as fast as it was recorded [-].
-        fast: Without waiting.
+        fast: Print without waiting.
         topics (NAMES): Only these, with commas between: odom,thruster_cmd.
-        start: Begin so long after the start of the record [s].
+        start: Offset from the start of the record [s].
 
     Raises:
         RecordError: Not a record, no such topic, or a speed that is not above zero.

@@ -195,8 +195,8 @@ class RecordSink:
         """Give up: the file ends after its last whole record, if the system lets it."""
         reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
         self.problem = (
-            f"{self.path}: recording stopped: {reason}: what was recorded until then is kept; "
-            "free some space or record elsewhere"
+            f"{self.path}: recording stopped: {reason}: the record up to then is kept; free some "
+            "space or record elsewhere"
         )
         self.dropped += len(self._queue)
         self._queue.clear()

@@ -323,50 +323,51 @@ def run(
     arm: bool = False,
     as_json: bool = False,
 ) -> int:
-    """Run a controller on a vehicle: estimate, decide, command; print how it went. Ctrl-C stops the thrusters.
+    """Run a controller on a vehicle: estimate, decide, command; print a summary. Ctrl-C stops the thrusters.
 
-    Exit status 3: the run ended in a fault of the vehicle; 4: the vehicle said nothing.
+    Exit status 3: the run ended in a fault of the vehicle; 4: the vehicle sent nothing.
 
     Example: finssim run --policy runs/hold --goal 0.5,0,-0.5,90 --pool-file pool.yaml --duration 60 --arm
 
     Example: finssim run --team runs/team --duration 60 --arm
 
     Args:
-        policy (DIR|NAME): A policy's directory, or pid, or pid-paper, or with --task one of the task's baselines.
-        task (TASK): Task that the policy must have been trained for, by name (see finssim tasks) or as FILE.py:CLASS of
-            one's own; the policy's if not given.
-        agent (NAME): This vehicle's place in a task of several; its first if not given.
-        goal (X,Y,Z,YAW|FILE): Station to keep: x,y,z [m] in the world frame (z = 0 on the water, negative below) and
+        policy (DIR|NAME): A policy's directory, pid or pid-paper, or with --task one of the task's baselines.
+        task (TASK): Task that the policy must have been trained for, by name (see finssim tasks) or FILE.py:CLASS;
+            the policy's if not given.
+        agent (NAME): This vehicle's agent in a task with several; the first if not given.
+        goal (X,Y,Z,YAW|FILE): Station to keep: x,y,z [m] in the world frame (z = 0 at the surface, negative below)
+            and
             heading [deg], or a file with goal: [x, y, z, yaw_deg].
-        trajectory (NAME|FILE): Trajectory to follow in place of a goal: straight, broken, ellipse, lemniscate, circle,
+        trajectory (NAME|FILE): Trajectory to follow instead of a goal: straight, broken, ellipse, lemniscate,
+            circle,
             figure_eight, helix, or a file.
         robot (ADDRESS): Motor controller: udp://HOST:PORT, serial:DEVICE, or pool for the virtual pool on this machine;
-            or autopilot: mavlink://udpin:HOST:PORT, udpout:, tcp: or serial:, with ?dvl=HOST for a Water Linked log, or
-            mavlink for that of the virtual pool.
+            or autopilot: mavlink://udpin:HOST:PORT, udpout:, tcp: or serial:, with ?dvl=HOST for a Water Linked
+            DVL, or mavlink for the virtual pool.
             With --lockstep: pool, or HOST:PORT.
-        bind (ADDRESS:PORT): Address and port of this end, for udp; pictures come to the port after it. Loopback unless
-            given.
+        bind (ADDRESS:PORT): Local address and port for udp; images arrive at the next port. Loopback if not given.
         pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
             otherwise none, if not given.
-        pool_file (FILE|none): Pool file: camera, water plane and frames (.yaml); none where no camera looks. If not
-            given: pool.yaml, of --team none.
-        site (NAME): Where: pool, tank or open-water. The workspace, and in open water Doppler log and compass, are then
-            those of finssim pool --site. If not given: pool, of --team open-water.
-        team (DIR|NAME): In place of --policy: who steers all agents of a task, each with a stack in a process of its
-            own. Their motor controllers and own ends are those of --robot and --bind, ten ports on, and so on. An
-            address is taken for that of --messages.
-        messages (ADDRESS): What carries messages between vehicles, such as finssim pool --task: HOST:PORT. Of --team
-            the port five after --robot if not given.
-        number: This vehicle's number among several under one camera: its tags' ids go on after those of the one before.
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        let_in (X,Y): Where the vehicle begins, world frame [m], known to 5 cm: for dead reckoning by Doppler log and
-            compass, where no camera and no position fix tells.
-        mode (MODE): Estimator: error-state, which takes the IMU's accelerations, or constant-velocity. If not given:
-            error-state on a vehicle with an IMU.
-        record (FILE): Record everything into this file (.mcap); of --team a folder with a file for each.
-        duration: End after this time [s]; at the end of the trajectory, or with Ctrl-C, if not given.
-        lockstep: Take turns with finssim pool --lockstep, as fast as both compute.
-        arm: Let thrusters turn, as soon as the state is known. Without it they never do.
+        pool_file (FILE|none): Pool file: camera, water plane and frames (.yaml); none without a camera. Default:
+            pool.yaml, with --team none.
+        site (NAME): Site: pool, tank or open-water. It sets the workspace, and in open water DVL and compass, as in
+            finssim pool --site. Default: pool, with --team open-water.
+        team (DIR|NAME): Policy or baseline for all agents of a task, instead of --policy, each in its own process.
+            Their ports are those of --robot and --bind, plus ten for each further agent. An address is used as
+            --messages.
+        messages (ADDRESS): Relay of messages between vehicles, such as finssim pool --task: HOST:PORT. With --team
+            the default is the port of --robot plus five.
+        number: This vehicle's index among several under one camera, which offsets its tag ids.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        let_in (X,Y): Position at the start, world frame [m], known to 5 cm: for dead reckoning by DVL and compass,
+            without camera and position fixes.
+        mode (MODE): Estimator: error-state, which uses the IMU's accelerations (default on a vehicle with an IMU),
+            or constant-velocity.
+        record (FILE): Record everything to this file (.mcap); with --team a folder with a file for each.
+        duration: Duration [s]; until the end of the trajectory or Ctrl-C if not given.
+        lockstep: Run in lock-step with finssim pool --lockstep, as fast as possible.
+        arm: Arm, as soon as the state is known. Without it the thrusters never turn.
         as_json: Print one JSON object instead of tables.
 
     Raises:
@@ -376,7 +377,9 @@ def run(
     if team is not None and _is_address(team):
         team, messages = None, team
     if (policy is None) == (team is None):
-        raise ControlError("who steers? give --policy for this vehicle, or --team for all of a task")
+        raise ControlError(
+            "no controller: give --policy for this vehicle, or --team for all agents of a task"
+        )
     if team is not None:
         if agent is not None or trajectory is not None or lockstep or number or let_in is not None:
             raise ControlError(
@@ -402,7 +405,7 @@ def run(
     if pool_file is None and not Path("pool.yaml").exists():
         raise ControlError(
             "there is no pool.yaml in this folder: name the pool file that finssim pool or calibrate pool has written "
-            "with --pool-file, or give --pool-file none where no camera looks"
+            "with --pool-file, or give --pool-file none without a camera"
         )
     filed = load_vehicle(vehicle)
     ours = numbered(vehicle_at(site, filed, navigation=robot.startswith("mavlink")), number)

@@ -454,7 +454,7 @@ def drive(
         recorder: Takes down everything.
         other: Whom the mode button hands over to; None: nobody.
         guide: Where `other` steers to.
-        rate: Turns of the loop a second [Hz].
+        rate: Rate of the loop [Hz].
         duration: [s]
         show: Called at every turn.
     """
@@ -503,25 +503,26 @@ def run(
     rate: Annotated[float, (20.0, 200.0)] = 60.0,
     duration: Annotated[float | None, (0.0, None)] = None,
 ) -> None:
-    """Drive by hand. Starts disarmed; START or enter arms; without a hand on LB or the keys there is no thrust.
+    """Drive by hand. Starts disarmed; START or enter arms; thrust needs LB or a key held.
 
     Example: finssim teleop --device keyboard --robot pool --record drive.mcap
 
     Args:
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        device (NAME): What is in the hands: gamepad or keyboard.
-        robot (WIRE): Wire to the motor controller: udp://HOST:PORT, serial:DEVICE, dry-run, or pool (the virtual pool
-            on this machine); or to an autopilot: mavlink or mavlink://KIND:WHERE, as of finssim run.
-        bind (ADDRESS:PORT): This end of the wire, for UDP.
-        pool_file (FILE): Pool file: camera, water plane and frames (.yaml); without it nobody knows the position.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        device (NAME): Input device: gamepad or keyboard.
+        robot (WIRE): Link to the motor controller: udp://HOST:PORT, serial:DEVICE, dry-run, or pool (the virtual
+            pool on this machine); or to an autopilot: mavlink or mavlink://KIND:ADDRESS, as in finssim run.
+        bind (ADDRESS:PORT): Local address and port, for UDP.
+        pool_file (FILE): Pool file: camera, water plane and frames (.yaml); without it the position is unknown.
         pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
             otherwise none, if not given. Needs --pool-file.
-        policy (DIR|pid): Whom SELECT or m hands over to: pid, or a policy's directory. Needs --pool-file and --goal.
-        goal (X,Y,Z,YAW): Where the policy steers to, in m and deg.
+        policy (DIR|pid): Controller to which SELECT or m hands over: pid, or a policy's directory. Needs
+            --pool-file and --goal.
+        goal (X,Y,Z,YAW): Goal of the policy, x,y,z,yaw [m, deg].
         record (FILE): Record of the run to write (.mcap).
-        key_hold (S): A key counts as held so long after its last press [s].
-        rate: Turns of the loop a second [Hz].
-        duration: End after so long [s]; with Ctrl-C if not given.
+        key_hold (S): Time for which a key counts as held after its last press [s].
+        rate: Rate of the loop [Hz].
+        duration: Duration [s]; until Ctrl-C if not given.
 
     Raises:
         TeleopError, LinkError, VehicleError, LocalizationError, PolicyError, OutputError: What cannot be used.
@@ -530,7 +531,7 @@ def run(
     pool = load_pool(pool_file) if pool_file is not None else None
     other, guide = _controller(policy, goal, body, pool)
     if pictures is not None and pool is None:
-        raise TeleopError("--pictures says nothing without the camera's pose: give --pool-file, too")
+        raise TeleopError("--pictures needs the camera's pose: give --pool-file, too")
     with ExitStack() as stack:
         if device == "keyboard":
             hands, keys = stack.enter_context(Keyboard(hold=key_hold)), KEYBOARD_HELP
@@ -557,7 +558,7 @@ def _controller(
     """Whom the person hands over to, and where it steers to."""
     if policy is None:
         if goal is not None:
-            raise TeleopError("--goal is where a controller steers to: give --policy, too, or leave it out")
+            raise TeleopError("--goal is where a controller steers to: give --policy, too, or omit it")
         return None, None
     if pool is None or goal is None:
         raise TeleopError(

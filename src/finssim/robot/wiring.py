@@ -196,7 +196,7 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[D
     with ExitStack() as stack:
         if wiring.lockstep and wiring.team:
             raise LinkError(
-                "a team takes turns within one process: finssim experiment stack; or leave --lockstep out"
+                "a team runs in lock-step within one process: use finssim experiment stack, or omit --lockstep"
             )
         link = link_of(wiring.robot, vehicle)
         if wiring.lockstep:

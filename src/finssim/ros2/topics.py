@@ -48,7 +48,7 @@ class ServiceName:
 
 FRAMES = {
     "map": "the pool: origin as the pool file has it, z up, z = 0 on the still water; positions jump with a fix",
-    "odom": "begins as the map and goes on by velocities alone: drifts, never jumps (REP-105)",
+    "odom": "begins as the map and is integrated from velocities: drifts, never jumps (REP-105)",
     "base_link": "the vehicle's body origin: x forward, y left, z up (REP-103)",
     "imu_link": "the inertial sensor as it is mounted; likewise pressure_link, each tag and each thruster",
     "dvl_link": "the Doppler log as it is mounted",

@@ -128,57 +128,58 @@ class Options:
     task: str | None = None
     """Task that the policy must have been trained for; its own if not given."""
     vehicle: str = "finsrov"
-    """(NAME|FILE) Vehicle of the catalogue, or the path of a vehicle file."""
+    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
     namespace: str | None = None
-    """(NAME) What the vehicle's topics stand below and its own frames begin with, such as robot_1: one for each of
-    several vehicles in a graph. The vehicle's name, and no prefix, if not given."""
+    """(NAME) Namespace of the vehicle's topics and prefix of its frames, such as robot_1, if there are several
+    vehicles. The vehicle's name, without prefix, if not given."""
     site: str = "pool"
-    """(NAME) Where: pool, tank or open-water, where no camera looks and Doppler log and compass are aboard."""
+    """(NAME) Site: pool, tank or open-water (DVL and compass instead of a camera)."""
     world: str | None = None
-    """(SITE|FILE) What the own cameras, sonars and altimeters of a vehicle in a virtual pool measure; in open water the
-    water is that of the world. The node camera makes topics of them."""
+    """(SITE|FILE) World for the own cameras, sonars and altimeters of a vehicle in a virtual pool; in open water
+    also its water. The node camera publishes them."""
     positioning: str = "none"
-    """(NAME) Fixes on the wire of a virtual pool: none, motion-capture or usbl."""
+    """(NAME) Position fixes of a virtual pool: none, motion-capture or usbl."""
     let_in: str | None = None
-    """(X,Y) Where the vehicle begins, in the map [m], for dead reckoning by Doppler log and compass, where no camera
-    and no position fix tells."""
+    """(X,Y) Position at the start, in the map [m], for dead reckoning by DVL and compass, without camera and
+    position fixes."""
     goal: str | None = None
-    """(X,Y,Z,YAW|FILE) Station to keep: x,y,z [m] in the map (z = 0 on the water) and heading [deg], or a file; the
-    place where it is armed if not given. The topic goal changes it."""
+    """(X,Y,Z,YAW|FILE) Station to keep: x,y,z [m] in the map (z = 0 at the surface) and heading [deg], or a file;
+    the
+    position at arming if not given. The topic goal changes it."""
     trajectory: str | None = None
-    """(NAME|FILE) Trajectory to follow in place of a goal: a name or a file."""
+    """(NAME|FILE) Trajectory to follow instead of a goal: a name or a file."""
     arm: bool = False
     """Arm once, as soon as the state is known; otherwise the topic arm does."""
     robot: str = "pool"
     """(ADDRESS) Motor controller of a robot: udp://HOST:PORT, serial:DEVICE, dry-run, or pool for a finssim pool on
-    this machine; or its autopilot: mavlink or mavlink://KIND:WHERE, as of finssim run."""
+    this machine; or its autopilot: mavlink or mavlink://KIND:ADDRESS, as in finssim run."""
     bind: str = "127.0.0.1:54321"
-    """(ADDRESS:PORT) Own end for udp; pictures are taken at the port after it."""
+    """(ADDRESS:PORT) Local address and port for udp; images arrive at the next port."""
     pictures: str | None = None
     """(ADDRESS) Overhead camera of a robot: udp://HOST:PORT or none; the pool's with --robot pool."""
     pool_file: Path | None = None
-    """(FILE|none) Pool file: read by a robot, written by a virtual pool (.yaml); none where no camera looks."""
+    """(FILE|none) Pool file: read by a robot, written by a virtual pool (.yaml); none without a camera."""
     plant: str = "1"
     """(SEED|FILE) Plant of a virtual pool: a seed, or a file."""
     severity: str = "realistic"
     """(NAME) Of a drawn plant: nominal, realistic or hard."""
     camera: str | None = None
-    """(KIND) What a virtual pool's camera sends: pictures, corners (of the tags) or none. If not given: pictures, over
-    a tank corners."""
+    """(KIND) Output of a virtual pool's camera: pictures, corners (of the tags) or none. Default: pictures, in a
+    tank corners."""
     port: int = 58766
-    """UDP port of a virtual pool; its pictures leave from the next."""
+    """UDP port of a virtual pool; images use the next port."""
     truth: Path | None = None
-    """(FILE) File for what truly happened in a virtual pool."""
+    """(FILE) Truth file of a virtual pool."""
     start: str | None = None
     """(X,Y,Z,YAW) Where the vehicle starts in sim and pool: x,y,z [m], yaw [deg]."""
     hydrodynamics: str | None = None
     """(MODEL) Model of sim: calibrated, mesh or simplified."""
     record: Path | None = None
-    """(FILE) Record all topics into this file (.mcap)."""
+    """(FILE) Record all topics to this file (.mcap)."""
     teleop: str | None = None
     """(DEVICE) Also drive by hand: joy (topic), gamepad or keyboard. The bridge then arms without localization."""
     duration: Annotated[float | None, (0.0, None)] = None
-    """End so long after the start [s]; with Ctrl-C if not given."""
+    """Duration [s]; until Ctrl-C if not given."""
     seed: int = 0
     """Seed of every random number; equal seeds give equal results."""
 
@@ -204,7 +205,7 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
     sees = o.world is not None or o.pictures is not None
     plan = Plan(graph, o.vehicle, namespace, extra=extra, blind=blind, sees=sees)
     if graph == "robot" and o.pool_file is None and not blind:
-        raise Ros2Error("a robot needs its pool file: give --pool-file, or none where no camera looks")
+        raise Ros2Error("a robot needs its pool file: give --pool-file, or none without a camera")
     plan.set("/**", site=o.site, frame_prefix=f"{o.namespace}/" if o.namespace else None)
     plan.set("controller", policy=o.policy, task=o.task, goal=o.goal, trajectory=o.trajectory)
     plan.set("sim", start=o.start, hydrodynamics=o.hydrodynamics, seed=o.seed)
@@ -248,14 +249,14 @@ def _wire(plan: Plan, o: Options) -> None:
 
 
 def up(graph: str, *, options: Options, notify: Callable[[str], None] = print) -> int:
-    """Start a graph of nodes as processes, print its topics and what happens, and end it with Ctrl-C.
+    """Start a graph of nodes as processes, print its topics and events, and stop it with Ctrl-C.
 
     Exit status 1: a node died. 3: the bridge ended in a fault.
 
     Example: finssim ros2 up pool --policy pid --goal 0.5,0,-0.5,90 --arm --duration 60
 
     Args:
-        graph (sim|pool|robot): sim (a vehicle of the engine), pool (the virtual pool and a robot in it) or robot.
+        graph (sim|pool|robot): sim (a simulated vehicle), pool (the virtual pool and a robot in it) or robot.
         options: As the person chose.
         notify: Takes a sentence.
 
@@ -305,7 +306,7 @@ def _await(pool_file: Path, nodes: Supervisor, interrupted: Callable[[], bool]) 
         if interrupted():
             raise KeyboardInterrupt
         if nodes.look() or time.monotonic() > end:
-            raise Ros2Error("the virtual pool did not start: see what it said above")
+            raise Ros2Error("the virtual pool did not start: see its output above")
         time.sleep(0.05)
 
 
@@ -318,9 +319,7 @@ def _watch(
 ) -> int:
     died = False
     if not options.arm:
-        notify(
-            "disarmed: thrusters will not turn until somebody publishes true on the topic arm, or with --arm"
-        )
+        notify("disarmed: thrusters turn only after true on the topic arm, or with --arm")
     end = time.monotonic() + (float("inf") if options.duration is None else options.duration)
     while not interrupted() and time.monotonic() < end:
         watcher.turn(0.2)

@@ -129,7 +129,7 @@ def _ends(played: Played) -> Iterator[str]:
     for world in range(played.ended.shape[1]):
         ends = np.flatnonzero(played.ended[:, world])
         if len(ends) == 0 or np.diff([-1, *ends]).max() > EPISODE:
-            yield f"an episode goes on after its time limit of {EPISODE} control steps"
+            yield f"an episode continues after its time limit of {EPISODE} control steps"
             return
 
 
@@ -160,7 +160,7 @@ def _leaks(first: Played, past: Played) -> Iterator[str]:
     if not np.array_equal(first.observation[start][:, worlds], past.observation[start][:, worlds]):
         yield "an observation depends on the episode before: set everything at the start"
     elif not np.array_equal(first.reward[second][:, worlds], past.reward[second][:, worlds]):
-        yield "a reward depends on the episode before: start over at the start whatever it is made of"
+        yield "a reward depends on the previous episode: reset its memory at the start"
 
 
 def _starts(played: Played) -> Iterator[str]:

@@ -171,7 +171,7 @@ def task_named(task: str | Task, **settings: Any) -> Task:
         return own_task(task, **settings)
     if task not in tasks:
         raise EnvironmentSetupError(
-            f"unknown task '{task}'; available: {', '.join((*TASKS, *SEEING))}; or one's own: FILE.py:CLASS"
+            f"unknown task '{task}'; available: {', '.join((*TASKS, *SEEING))}; or your own: FILE.py:CLASS"
         )
     named: Task = tasks[task](**settings)
     return named

@@ -126,5 +126,5 @@ def _success(plan: Curriculum, task: Task) -> Success:
     if plan.by != "success":
         return Success(episode_return=0.0)  # nothing is counted
     raise EnvironmentSetupError(
-        f"task '{task.name}' has no hold time: say when an episode succeeds, such as success: {{episode_return: 10}}"
+        f"task '{task.name}' has no hold time: define success, such as success: {{episode_return: 10}}"
     )

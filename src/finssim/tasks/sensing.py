@@ -94,7 +94,7 @@ class Sensing:
         if others:
             raise ValueError(
                 f"{others[0]} of the fixes is given, expected of: {', '.join(PER_FIX)}; "
-                "what velocities and rates are off by is said under sensors in the vehicle file"
+                "errors of velocities and rates are under sensors in the vehicle file"
             )
 
 
@@ -471,8 +471,8 @@ class SensingBatch:
         for vehicle in simulator.vehicles:
             if vehicle.sensors.imu is None:
                 raise EnvironmentSetupError(
-                    f"vehicle {vehicle.name} has no IMU, and nothing else tells its attitude: give sensors.imu in its "
-                    "file, or observe otherwise"
+                    f"vehicle {vehicle.name} has no IMU for its attitude: give sensors.imu in its "
+                    "file, or use another observation"
                 )
         self._simulator, self._arrays, self._seen = simulator, arrays, measurement
         dt = simulator.control_step

@@ -125,7 +125,9 @@ class Sight:
             WorldError: The site or the vehicle's sensor is refused.
         """
         if len(simulator.vehicles) > 1:
-            raise EnvironmentSetupError(f"task '{task.name}' has several vehicles: only one can see")
+            raise EnvironmentSetupError(
+                f"task '{task.name}' has several vehicles: only tasks with one can have sensors of a world"
+            )
         from finssim.worlds import CameraBatch, RangeBatch, SonarBatch, WorldBatch, poses_of
 
         self._task, self._state, self._arrays, self.seed = task, simulator.state, arrays, seed

@@ -87,7 +87,7 @@ class Task:
 
     def terms(self) -> Terms:
         """Of what the task is made."""
-        raise TypeError(f"task '{self.name}' does not say of what it is made: define terms()")
+        raise TypeError(f"task '{self.name}' has no terms: define terms()")
 
     def settings_class(self) -> type:
         """The class whose settings its kernels take: tasks of one such class and equal terms share kernels."""

@@ -183,8 +183,8 @@ class _Unknown(dict[str, Tensor]):
 
 def _unknown(name: str) -> EnvironmentSetupError:
     return EnvironmentSetupError(
-        f"it looks at {name}, which reset, reward and inside make, and on a robot none of them runs: look at what is "
-        "measured, the goal, the actions and the time alone"
+        f"it looks at {name}, which reset, reward and inside make, which do not run on a robot: use "
+        "only the measured state, the goal, the actions and the time"
     )
 
 

@@ -1,4 +1,4 @@
-"""T2, trajectory tracking: follow a moving reference, whatever the heading (paper, section IV)."""
+"""T2, trajectory tracking: follow a moving reference, heading free (paper, section IV)."""
 
 import math
 from collections.abc import Sequence
@@ -394,7 +394,7 @@ class TrajectoryTracking(FittedTask):
 
     succeeds: ClassVar[str] = "held"
     moving: ClassVar[bool] = True
-    title: ClassVar[str] = "follow a moving reference, whatever the heading"
+    title: ClassVar[str] = "follow a moving reference, heading free"
     name: str = "t2"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0

@@ -63,7 +63,7 @@ DEFAULTS: Mapping[str, str] = {
     "sensors": "IMU and pressure gauge of a small MEMS unit, at the body origin",
     "perception": "altimeter under the hull and imaging sonar at the nose (128 beams, 5 Hz), and a camera (48 px wide, "
     "10 Hz) on a vehicle that hovers: devices of small ROVs, delays and losses guessed",
-    "tags": "two tag25h9 (15 ahead, 16 astern) on the middle of the top, as large as it takes, as on FinsROV",
+    "tags": "two tag25h9 (15 ahead, 16 astern) on the top, as large as fits, as on FinsROV",
     "mcu": "an output for each thruster in the order of the file, positive forward; full scale is the fastest shaft",
     "safety": "silences of 0.5 s; 45 degrees of tilt, 60 for a vehicle that does not control its heave; the published "
     "pool, scaled to the vehicle's length",

@@ -32,38 +32,38 @@ class Choice:
     """What a person wants to look at."""
 
     source: Annotated[str, "argument"] = "pool"
-    """(pool|sim|FILE|FOLDER) What to look at: pool (the virtual pool with a robot in it), sim (the simulator), a record
-    (.mcap), or a folder that the engine's recorder wrote."""
+    """(pool|sim|FILE|FOLDER) Source: pool (the virtual pool with a robot in it), sim (the simulator), a record
+    (.mcap), or a folder written by the engine's recorder."""
     vehicle: str | None = None
-    """(NAME|FILE) Vehicle of the catalogue, or the path of a vehicle file; finsrov, or that of the record, if not
+    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file; finsrov, or that of the record, if not
     given."""
     policy: str = "pid"
-    """(DIR|pid|pid-paper) Who steers in pool and sim: a policy's directory, or pid, or pid-paper."""
+    """(DIR|pid|pid-paper) Controller in pool and sim: a policy's directory, pid or pid-paper."""
     task: str | None = None
-    """(TASK) Task that the policy must have been trained for: t1 or t2; t2 also follows a trajectory if none is
-    named."""
+    """(TASK) Task that the policy must have been trained for: t1 or t2; t2 follows a default trajectory if none is
+    given."""
     goal: str | None = None
     """(X,Y,Z,YAW|FILE) Station to keep in pool and sim: x,y,z [m] in the world frame and heading [deg], or a file."""
     trajectory: str | None = None
-    """(NAME|FILE) Trajectory to follow in place of a goal: a name or a file."""
+    """(NAME|FILE) Trajectory to follow instead of a goal: a name or a file."""
     plant: str = "1"
     """(SEED|FILE) Plant in the pool: a seed to draw it from, or a plant file."""
     severity: str = "realistic"
-    """(NAME) How hard a drawn plant is: nominal, realistic or hard."""
+    """(NAME) Severity of a drawn plant: nominal, realistic or hard."""
     camera: str = "corners"
-    """(KIND) What the pool's camera sends: pictures, or corners (of the tags)."""
+    """(KIND) Output of the pool's camera: pictures, or corners (of the tags)."""
     hydrodynamics: str = "calibrated"
     """(MODEL) Hydrodynamic model: calibrated, simplified or mesh."""
     truth: Path | None = None
-    """(FILE) Truth file of the pool that a record was made in, to show beside it."""
+    """(FILE) Truth file of the pool, to show beside a record."""
     truth_offset: float | None = None
-    """Robot's clock when the pool's showed 0 [s]; found by comparing both motions if not given."""
+    """Robot's clock at time 0 of the pool's clock [s]; estimated from both motions if not given."""
     basin: str | None = None
-    """(L,W,D) Pool to draw around a record: length,width,depth [m]; the vehicle's workspace if not given."""
+    """(L,W,D) Pool to show around a record: length,width,depth [m]; the vehicle's workspace if not given."""
     world: str | None = None
-    """(SITE|FILE|NUMBER) Of the pool what the vehicle's own cameras and sonars see, a site of finssim worlds or a
-    file, where motion capture locates it; of a record the world to draw around it, as --seed drew it; of a folder the
-    number of the run's world, the first that it has if not given."""
+    """(SITE|FILE|NUMBER) For pool, the world of the vehicle's own cameras and sonars (a site of finssim worlds or a
+    file), located by motion capture; for a record, the world to show, drawn from --seed; for a folder, the index of
+    the run's world, the first if not given."""
     seed: int = 0
     """Seed of every random number; equal seeds give equal results."""
 
@@ -114,7 +114,7 @@ def run(
     no_browser: bool = False,
     duration: Annotated[float | None, (0.0, None)] = None,
 ) -> None:
-    """Look at a vehicle in the browser, live or recorded: poses, goal, forces, camera, health, errors [m, deg].
+    """Show a vehicle in the browser, live or recorded: poses, goal, forces, camera, health, errors [m, deg].
 
     Example: finssim view run.mcap --truth truth.fst --basin 4,2,1
 
@@ -122,11 +122,11 @@ def run(
 
     Args:
         choice: What to look at.
-        speed: Times as fast as real [-].
-        port: Port of the page; the next free one if it is taken.
-        bind (ADDRESS): Address to serve at: this machine alone unless given.
-        no_browser: Print the page's address, and do not open it.
-        duration: When to end [s] after the page is up; with Ctrl-C if not given.
+        speed: Speed factor relative to real time [-].
+        port: Port of the page; the next free one if it is in use.
+        bind (ADDRESS): Address to serve at; only this machine if not given.
+        no_browser: Print the page's address without opening it.
+        duration: Duration [s]; until Ctrl-C if not given.
     """
     from finssim.viewer.app import View
 
@@ -151,7 +151,7 @@ def _refuse_strangers(choice: Choice) -> None:
     for name in sorted(set().union(*HEEDED.values()) - HEEDED[kind]):
         if getattr(choice, name) != getattr(usual, name):
             takers = " and ".join(other for other in HEEDED if name in HEEDED[other])
-            raise ViewError(f"--{name.replace('_', '-')} is for {takers}, not for a {kind}: leave it out")
+            raise ViewError(f"--{name.replace('_', '-')} is for {takers}, not for a {kind}: omit it")
 
 
 def _pool(choice: Choice) -> Source:

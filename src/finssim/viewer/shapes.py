@@ -141,10 +141,11 @@ def world_bodies(layout: WorldLayout) -> list[Body]:
     """
     parts: dict[str, list[Mesh]] = {}
     colours = {}
-    for shape, pose in zip(layout.shapes, layout.transforms.numpy()[0].astype(float), strict=True):
+    places = zip(layout.transforms.numpy()[0].astype(float), layout.scales.numpy()[0], strict=True)
+    for shape, (pose, scale) in zip(layout.shapes, places, strict=True):
         if shape.owner != "basin":
             mesh = _mesh_of(shape)
-            turned = Mesh(mesh.vertices @ quat_to_matrix(pose[3:]).T + pose[:3], mesh.faces)
+            turned = Mesh(scale * mesh.vertices @ quat_to_matrix(pose[3:]).T + pose[:3], mesh.faces)
             parts.setdefault(shape.owner, []).append(turned)
             colours[shape.owner] = tuple((255.0 * shape.finish.colour ** (1.0 / GAMMA)).astype(int).tolist())
     bodies = []

@@ -580,7 +580,7 @@ def _vehicle_of(record: Record) -> Vehicle:
     """The vehicle that the record names, from the file that it keeps where the catalogue has another one now."""
     name = record.metadata.get("vehicle")
     if name is None:
-        raise ViewError(f"{record.path}: does not say whose it is: give --vehicle")
+        raise ViewError(f"{record.path}: does not name its vehicle: give --vehicle")
     file_name = f"{plain_name(name, f'{record.path}: vehicle', ViewError)}.yaml"
     try:
         vehicle = catalogue_vehicle(name, str(record.path))

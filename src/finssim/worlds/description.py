@@ -39,6 +39,7 @@ from finssim.yaml_file import read_mapping
 
 if TYPE_CHECKING:
     from finssim.sensors.overhead_camera import Sensor, Water
+    from finssim.worlds.parts import ModelPart
 
 Array = NDArray[np.float64]
 
@@ -131,12 +132,14 @@ class Finish(Part):
 
 
 class Variation(Part):
-    """How far an object's pose is drawn from that of the file, uniformly, by world."""
+    """How far an object's pose and size are drawn from those of the file, by world; poses uniformly."""
 
     position: NonNegative3 = Field(default_factory=lambda: zeros(3))
     """Largest shift along x, y, z of its frame [m]."""
     yaw: NonNegative = 0.0
     """Largest turn about z of its frame [rad]."""
+    size: Annotated[float, Field(strict=True, ge=1.0, le=4.0)] = 1.0
+    """Largest factor by which it, and all that is in its frame, is drawn greater or smaller, log-uniformly."""
 
 
 class Repeat(Part):
@@ -154,6 +157,7 @@ SIZES = {
     "cylinder": {"radius", "length"},
     "plane": set(),
     "mesh": {"file"},
+    "model": {"file"},
     "group": set(),
 }
 """Kind of shape -> keys that it needs."""
@@ -162,7 +166,7 @@ SIZES = {
 class Object(Finish):
     """A shape with its place, or a group that others stand in."""
 
-    shape: Literal["box", "sphere", "capsule", "cylinder", "plane", "mesh", "group"]
+    shape: Literal["box", "sphere", "capsule", "cylinder", "plane", "mesh", "model", "group"]
     position: Vector3
     """Of the shape's middle, in the world or in `frame` [m]."""
     orientation: Quaternion | None = None
@@ -180,7 +184,7 @@ class Object(Finish):
     length: Positive | None = None
     """Of the cylinder, or of the straight part of a capsule [m]."""
     file: str | None = None
-    """STL beside the world file, in metres."""
+    """Beside the world file: STL of a mesh [m]; of a model MJCF (.xml), URDF (.urdf) or USD (.usd, .usda, .usdc)."""
     scale: Positive | None = None
     """Factor on the file's coordinates."""
     vary: Variation | None = None
@@ -195,7 +199,7 @@ class Object(Finish):
         required = SIZES[self.shape]
         if required - present:
             raise refuse_section(f"a {self.shape} needs {', '.join(sorted(required - present))}: add it")
-        if surplus := present - required - ({"scale"} if self.shape == "mesh" else set()):
+        if surplus := present - required - ({"scale"} if self.shape in ("mesh", "model") else set()):
             raise refuse_section(f"a {self.shape} has no {', '.join(sorted(surplus))}: remove it")
         if sum(x is not None for x in (self.orientation, self.axis, self.yaw)) > 1:
             raise refuse_section("more than one of orientation, axis and yaw: give one")
@@ -373,6 +377,15 @@ class WorldWater(Part):
         return per_km / 1e3
 
 
+class LightVariation(Part):
+    """How daylight is drawn by world."""
+
+    brightness: Annotated[float, Field(strict=True, ge=1.0, le=10.0)] = 1.0
+    """Largest factor by which daylight, veil and sky are drawn brighter or darker, log-uniformly."""
+    sun: Annotated[float, Field(strict=True, ge=0.0, le=math.pi)] = 0.0
+    """Largest turn of the sun about the vertical, and in height, uniformly [rad]; it stays 5° above the horizon."""
+
+
 class Light(Part):
     """Daylight just below the surface."""
 
@@ -384,6 +397,7 @@ class Light(Part):
     """Share of the irradiance that comes evenly from above rather than from the sun."""
     sky: NonNegative3 = Field(default_factory=lambda: zeros(3) + 1.0)
     """Radiance of the sky, or the ceiling, as seen through the surface from below, (3,)."""
+    vary: LightVariation = Field(default_factory=lambda: LightVariation())
 
     @model_validator(mode="after")
     def _from_above(self) -> Light:
@@ -455,8 +469,8 @@ class World(Part):
         for name, item in self.objects.items():
             if item.frame is not None and item.frame not in earlier:
                 raise refuse_section(
-                    f"objects.{name}: frame is '{item.frame}'{did_you_mean(item.frame, earlier)} expected an object "
-                    f"that stands before it: {', '.join(earlier) or 'there is none'}"
+                    f"objects.{name}: frame is '{item.frame}'{did_you_mean(item.frame, earlier)} expected an "
+                    f"object defined before it: {', '.join(earlier) or 'there is none'}"
                 )
             earlier.append(name)
         if (count := sum(len(item.positions) for item in self.objects.values())) > LARGEST:
@@ -490,6 +504,18 @@ class World(Part):
         except (OSError, MeshError) as error:
             raise WorldError(f"{self.path}: objects.{name}: cannot read {path.name}: {error}") from None
         return vertices * (item.scale or 1.0), faces
+
+    def model(self, name: str) -> list[ModelPart]:
+        """The shapes of an object from a model file, unscaled, in the object's axes."""
+        from finssim.worlds.parts import PartsError, parts_of
+
+        path = self.beside(self.objects[name].file or "", f"objects.{name}: file")
+        if not path.is_file():
+            raise WorldError(f"{self.path}: objects.{name}: no file {path.name} beside it")
+        try:
+            return parts_of(path)
+        except PartsError as error:
+            raise WorldError(f"{self.path}: objects.{name}: {path.name} {error}") from None
 
     def seabed_heights(self) -> Array | None:
         """z of the seabed on a grid over its size [m], (ny, nx), row 0 at the least y; None for a plane."""
@@ -755,7 +781,7 @@ def load_world(name_or_path: str | os.PathLike[str]) -> World:
     world = _checked(World, {**tree, "name": path.stem, "path": path}, label)
     for name, item in world.objects.items():
         if item.file is not None:
-            world.mesh(name)
+            world.model(name) if item.shape == "model" else world.mesh(name)
     world.seabed_heights()
     return world
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -51,6 +51,8 @@ class WorldLayout:
 
     transforms: wp.array
     """Shape to world of every shape; transform (worlds, shapes)."""
+    scales: wp.array
+    """Factor on the size of every shape [-]; float (worlds, shapes)."""
     draws: wp.array
     """How often each world was drawn; int (worlds,)."""
 
@@ -68,9 +70,14 @@ class WorldLayout:
         self._owners = list(dict.fromkeys(shape.owner for shape in self.shapes))
         self._frames = np.zeros((len(self._varied) + 1, worlds, 7))
         self._pose = np.zeros((worlds, len(self.shapes), 7))
-        self._drawn = np.zeros((worlds, 1 + 4 * len(self._varied) + len(self._owners)))
+        self._scale = np.ones((len(self._varied) + 1, worlds))
+        sizes = sum(item.vary.size > 1.0 for item, _, _ in self._varied)
+        self._first = np.cumsum([1, 4 * len(self._varied), len(self._owners), sizes, 3])
+        """Columns of what is drawn: the water; from these on poses, colours, sizes, light; last their number."""
+        self._drawn = np.zeros((worlds, self._first[-1]))
         self._look = np.zeros(worlds, int)
         self.transforms = wp.zeros((worlds, len(self.shapes)), dtype=wp.transform, device=self.device)
+        self.scales = wp.ones((worlds, len(self.shapes)), dtype=float, device=self.device)
         self.draws = wp.zeros(worlds, dtype=int, device=self.device)
         WorldLayout._place(self, np.arange(worlds))
 
@@ -88,11 +95,12 @@ class WorldLayout:
             return
         seeds = np.broadcast_to(np.asarray(seed), self.worlds)[rows]
         numbers = _uniform(seeds, rows, self._drawn.shape[1] + 1)
-        self._drawn[rows] = 2.0 * numbers[:, :-1] - 1.0
+        look = self._first[2]
+        self._drawn[rows] = 2.0 * np.delete(numbers, look, axis=1) - 1.0
         candidates = np.flatnonzero([look is not None and look.held_out == held_out for look in self.looks])
         choice = candidates if held_out else np.concatenate([[0], candidates])
         choice = choice if len(choice) else np.zeros(1, int)
-        self._look[rows] = choice[(numbers[:, -1] * len(choice)).astype(int)]
+        self._look[rows] = choice[(numbers[:, look] * len(choice)).astype(int)]
         self._place(rows)
 
     @property
@@ -112,12 +120,10 @@ class WorldLayout:
 
     def copy_draw(self, other: WorldLayout, world: int) -> None:
         """Draw all worlds as one of another layout is drawn, whose world has the first of this one's objects."""
-        varied, owners = len(other._varied), len(other._owners)
-        row = other._drawn[world]
         self._drawn[:], self._look[:] = 0.0, other._look[world]
-        self._drawn[:, : 1 + 4 * varied] = row[: 1 + 4 * varied]
-        colours = 1 + 4 * len(self._varied)
-        self._drawn[:, colours : colours + owners] = row[1 + 4 * varied :]
+        own, theirs = (np.concatenate([[0], layout._first]) for layout in (self, other))
+        for here, there, count in zip(own, theirs, np.diff(theirs), strict=False):
+            self._drawn[:, here : here + count] = other._drawn[world, there : there + count]
         self._place(np.arange(self.worlds))
 
     def move(self, name: str, poses: ArrayLike) -> None:
@@ -133,22 +139,30 @@ class WorldLayout:
     def _place(self, rows: np.ndarray) -> None:
         """Set the poses of some worlds, (k,), from what is drawn of them.
 
-        Drawn are numbers in [-1, 1]: of the water, four of each varied object, and of each object's colour.
+        Drawn are numbers in [-1, 1]: of the water, four of each varied object, of each object's colour, of each size
+        that varies, and three of the light.
         """
         drawn, n = self._drawn[rows], len(rows)
         frames = np.zeros((len(self._varied) + 1, n, 7))
         frames[:, :, 6] = 1.0  # the last is the world's
+        scale, size = np.ones((len(self._varied) + 1, n)), self._first[2]
         for i, (item, anchor, rest) in enumerate(self._varied):
             drawn_pose = drawn[:, 1 + 4 * i : 5 + 4 * i]
             shift = np.concatenate(
                 [drawn_pose[:, :3] * item.vary.position, quat_from_yaw(drawn_pose[:, 3] * item.vary.yaw)], 1
             )
-            frames[i] = _compose(_compose(frames[anchor], rest), shift)
+            frames[i] = _compose(_compose(frames[anchor], rest, scale[anchor]), shift)
+            scale[i] = scale[anchor]
+            if item.vary.size > 1.0:
+                scale[i] *= item.vary.size ** drawn[:, size]
+                size += 1
             if i in self._moved:
                 frames[i] = self._moved[i][rows]
-        self._frames[:, rows] = frames
-        self._pose[rows] = _compose(frames[self._anchor], self._rest[:, None]).swapaxes(0, 1)
+        self._frames[:, rows], self._scale[:, rows] = frames, scale
+        scale = scale[self._anchor]
+        self._pose[rows] = _compose(frames[self._anchor], self._rest[:, None], scale).swapaxes(0, 1)
         self.transforms.assign(np.float32(self._pose))
+        self.scales.assign(np.float32(self._scale[self._anchor].T))
         draws = self.draws.numpy().copy()
         draws[rows] += 1
         self.draws.assign(draws)
@@ -156,7 +170,7 @@ class WorldLayout:
     def poses(self, name: str) -> np.ndarray:
         """Position [m] and attitude xyzw of an object, of a row its first shape, world frame, (worlds, 7)."""
         anchor, rest = self._objects[name]
-        return _compose(self._frames[anchor], rest)
+        return _compose(self._frames[anchor], rest, self._scale[anchor])
 
     # ---- set-up
 
@@ -204,17 +218,36 @@ class WorldLayout:
         for name, item in self.world.objects.items():
             if item.shape == "group":
                 continue
-            vertices, faces = self.world.mesh(name) if item.shape == "mesh" else (None, None)
-            size = (item.radius or 0.0, 0.5 * (item.length or 0.0), 0.0)
-            if item.size is not None:
-                size = tuple(0.5 * float(s) for s in item.size)
+            parts = self._parts(name, item)
             anchor, rest = self._objects[name]
             for position in item.positions:
                 turned = _pose(quat_inverse_rotate(item.quaternion, position - item.position))
-                yield Shape(
-                    kind=item.shape, owner=name, finish=item, rest=_compose(rest, turned), anchor=anchor, size=size,
-                    vertices=vertices, faces=faces,
-                )  # fmt: skip
+                for part in parts:
+                    yield replace(part, rest=_compose(_compose(rest, turned), part.rest), anchor=anchor)
+
+    def _parts(self, name: str, item: Object) -> list[Shape]:
+        """The shapes of one object, in its axes."""
+        if item.shape == "model":
+            factor, shapes = item.scale or 1.0, []
+            for part in self.world.model(name):
+                given = "colour" in item.model_fields_set or part.colour is None
+                finish = item if given else item.model_copy(update={"colour": part.colour})
+                vertices = None if part.vertices is None else factor * part.vertices
+                shapes.append(Shape(
+                    kind=part.kind, owner=name, finish=finish, rest=_pose(factor * part.position, part.quaternion),
+                    size=tuple(factor * s for s in part.size), vertices=vertices, faces=part.faces,
+                ))  # fmt: skip
+            return shapes
+        vertices, faces = self.world.mesh(name) if item.shape == "mesh" else (None, None)
+        size = (item.radius or 0.0, 0.5 * (item.length or 0.0), 0.0)
+        if item.size is not None:
+            size = tuple(0.5 * float(s) for s in item.size)
+        rest = _pose([0, 0, 0])
+        return [
+            Shape(
+                kind=item.shape, owner=name, finish=item, rest=rest, size=size, vertices=vertices, faces=faces
+            )
+        ]
 
 
 def _pose(position: ArrayLike, quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0)) -> np.ndarray:
@@ -222,10 +255,16 @@ def _pose(position: ArrayLike, quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0)) -> 
     return np.concatenate([np.asarray(position, float), np.asarray(quaternion, float)])
 
 
-def _compose(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """Pose of `inner`, which is given in the axes of `outer`, in the axes that `outer` is given in, (..., 7)."""
-    q = outer[..., 3:]
-    moved, turned = outer[..., :3] + quat_rotate(q, inner[..., :3]), quat_multiply(q, inner[..., 3:])
+def _compose(outer: np.ndarray, inner: np.ndarray, scale: ArrayLike = 1.0) -> np.ndarray:
+    """Pose of `inner`, which is given in the axes of `outer`, in the axes that `outer` is given in, (..., 7).
+
+    Args:
+        outer: (..., 7).
+        inner: Its position is multiplied by `scale`, (..., 7).
+        scale: Factor [-], (...).
+    """
+    q, way = outer[..., 3:], np.asarray(scale)[..., None] * inner[..., :3]
+    moved, turned = outer[..., :3] + quat_rotate(q, way), quat_multiply(q, inner[..., 3:])
     return np.concatenate([moved, turned], -1)
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from finssim.geometry.rotations import quat_rotate
-from finssim.worlds.description import Look, World
+from finssim.worlds.description import Light, Look, World
 from finssim.worlds.layout import WorldLayout
 from finssim.worlds.pictures import picture_of
 
@@ -39,10 +40,10 @@ class Optics:
     attenuation: wp.array(dtype=wp.vec3)  # c [1/m]
     daylight_attenuation: wp.array(dtype=wp.vec3)  # K_d [1/m]
     veil: wp.array(dtype=wp.vec3)  # B just below the surface
-    daylight: wp.vec3  # irradiance there
-    sun: wp.vec3  # unit vector towards it
+    daylight: wp.array(dtype=wp.vec3)  # irradiance there
+    sun: wp.array(dtype=wp.vec3)  # unit vector towards it
     diffuse: float  # share of the irradiance from everywhere above
-    sky: wp.vec3  # radiance through the surface
+    sky: wp.array(dtype=wp.vec3)  # radiance through the surface
     snow: float  # particles per volume [1/m³]
     snow_size: float  # their diameter [m]
 
@@ -56,7 +57,7 @@ class WorldBatch(WorldLayout):
     Args:
         world: A site of the catalogue, a path, or a world.
         worlds: How many copies.
-        device: Where to compute: cpu or cuda.
+        device: Compute device: cpu or cuda.
     """
 
     def __init__(self, world: World | str, worlds: int = 1, device: str = "cpu") -> None:
@@ -71,6 +72,7 @@ class WorldBatch(WorldLayout):
             warnings.simplefilter("ignore")  # of collisions between seabeds, which are not asked for
             self.model = builder.finalize(device=self.device)
             self.state = self.model.state()
+        self._sizes = self.model.shape_scale.numpy().copy()
         self.caster = SensorCamera(
             self.model,
             load_textures=False,
@@ -101,18 +103,30 @@ class WorldBatch(WorldLayout):
             for look_or_none in self.looks
         ]
         factor = np.exp(drawn[:, :1] * np.log([[water.vary] for water in waters])[look])
-        for array, name, scale in (
-            (self.optics.attenuation, "attenuation", factor),
-            (self.optics.daylight_attenuation, "daylight_attenuation", factor),
-            (self.optics.veil, "veil", 1.0),
+        light, own = self.world.light, drawn[:, self._first[3] :]
+        bright = light.vary.brightness ** own[:, :1]
+        c, K, veil = (
+            np.array([getattr(water, name) for water in waters])[look]
+            for name in ("attenuation", "daylight_attenuation", "veil")
+        )
+        for name, value in (
+            ("attenuation", factor * c),
+            ("daylight_attenuation", factor * K),
+            ("veil", bright * veil),
+            ("daylight", bright * light.daylight),
+            ("sky", bright * light.sky),
+            ("sun", _suns(light, own[:, 1:])),
         ):
+            array = getattr(self.optics, name)
             values = array.numpy().copy()
-            values[rows] = scale * np.array([getattr(water, name) for water in waters])[look]
+            values[rows] = value
             array.assign(values)
         self.model.shape_transform.assign(self.transforms.flatten())
+        if self._first[3] > self._first[2]:
+            self.model.shape_scale.assign(self._sizes * self.scales.numpy().reshape(-1, 1))
         self.model.bvh_refit_shapes(self.state)
         table = self._tables[look]
-        level = np.exp(drawn[:, 1 + 4 * len(self._varied) :] * np.log(self.world.colour_vary))
+        level = np.exp(drawn[:, self._first[1] : self._first[2]] * np.log(self.world.colour_vary))
         level = level[:, [self._owners.index(shape.owner) for shape in self.shapes], None]
         for name in ("colour", "second", "glow"):
             table[name] *= level
@@ -130,7 +144,7 @@ class WorldBatch(WorldLayout):
         config = newton.ModelBuilder.ShapeConfig(
             density=0.0, has_shape_collision=False, has_particle_collision=False
         )
-        meshes: dict[str, Any] = {}
+        meshes: dict[int, Any] = {}
         for shape, pose in zip(self.shapes, self._pose[0], strict=True):
             options = {"xform": wp.transform(*map(float, pose)), "cfg": config}
             a, b, c = shape.size
@@ -148,22 +162,19 @@ class WorldBatch(WorldLayout):
                 field = newton.Heightfield(shape.heights, *shape.heights.shape, hx=a, hy=b)
                 builder.add_shape_heightfield(heightfield=field, cfg=config)
             else:
-                if shape.owner not in meshes:
-                    meshes[shape.owner] = newton.Mesh(
+                if id(shape.vertices) not in meshes:
+                    meshes[id(shape.vertices)] = newton.Mesh(
                         np.float32(shape.vertices), np.int32(shape.faces).ravel(), compute_inertia=False
                     )
-                builder.add_shape_mesh(-1, mesh=meshes[shape.owner], **options)
+                builder.add_shape_mesh(-1, mesh=meshes[id(shape.vertices)], **options)
 
     def _optics(self) -> Optics:
-        water, light, optics = self.world.water, self.world.light, Optics()
-        optics.attenuation = wp.full(self.worlds, wp.vec3(*water.attenuation), wp.vec3, self.device)
-        optics.daylight_attenuation = wp.full(
-            self.worlds, wp.vec3(*water.daylight_attenuation), wp.vec3, self.device
-        )
-        optics.veil = wp.full(self.worlds, wp.vec3(*water.veil), wp.vec3, self.device)
-        optics.daylight = wp.vec3(*light.daylight)
-        optics.sun = wp.normalize(wp.vec3(*light.sun))
-        optics.diffuse, optics.sky = light.diffuse, wp.vec3(*light.sky)
+        water, optics = self.world.water, Optics()
+        for name in ("attenuation", "daylight_attenuation", "veil", "daylight", "sun", "sky"):
+            setattr(
+                optics, name, wp.zeros(self.worlds, dtype=wp.vec3, device=self.device)
+            )  # `_place` fills them
+        optics.diffuse = self.world.light.diffuse
         if water.snow is not None:
             optics.snow, optics.snow_size = water.snow.density, water.snow.size
         return optics
@@ -185,6 +196,15 @@ class WorldBatch(WorldLayout):
                     picture, row["size"], row["contrast"] = picture_of(self.world, texture)
                     self._pictures.append(picture)
         return table
+
+
+def _suns(light: Light, drawn: np.ndarray) -> np.ndarray:
+    """Unit vectors towards the sun by numbers in [-1, 1], of its turn and its height, (k, 2); (k, 3)."""
+    x, y, z = light.sun / np.linalg.norm(light.sun)
+    turn = math.atan2(y, x) + light.vary.sun * drawn[:, 0]
+    lowest = min(math.radians(5.0), math.asin(z))
+    height = np.clip(math.asin(z) + light.vary.sun * drawn[:, 1], lowest, 0.5 * math.pi)
+    return np.stack([np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)], axis=1)
 
 
 def _grain(side: int = 256, patches: int = 16) -> np.ndarray:

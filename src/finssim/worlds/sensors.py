@@ -494,9 +494,9 @@ def _take_picture(
     c = optics.attenuation[w]
     K = optics.daylight_attenuation[w]
     veil = optics.veil[w]
-    daylight = optics.daylight
+    daylight = optics.daylight[w]
     diffuse = optics.diffuse
-    sun = (1.0 - diffuse) / optics.sun[2] * optics.sun
+    sun = (1.0 - diffuse) / optics.sun[w][2] * optics.sun[w]
     dim = dimming[v]
     gains = full_well * gain[v]
     noise_floor = read_noise * read_noise
@@ -537,7 +537,7 @@ def _take_picture(
             start = wp.cw_mul(reflectance, level * daylight + (1.0 - above) * veil)
             glow = surfaces[shape].glow
         elif ray[2] > 1.0e-6:
-            start = below_surface(ray, veil, optics.sky)
+            start = below_surface(ray, veil, optics.sky[w])
         # Light that falls off with depth takes K u from the exponent; a beacon's own light does not.
         net = c - ray[2] * K
         net = wp.vec3(wp.max(net[0], 1.0e-6), wp.max(net[1], 1.0e-6), wp.max(net[2], 1.0e-6))

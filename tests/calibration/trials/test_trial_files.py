@@ -316,7 +316,7 @@ def test_places_without_a_trial_are_refused(tmp_path):
     with pytest.raises(CalibrationError, match="finssim trials import"):
         load_trial(tmp_path / "log.bin")
     (tmp_path / "cut.parquet").write_bytes(b"PAR1 and then nothing")
-    with pytest.raises(CalibrationError, match="not a whole Parquet file"):
+    with pytest.raises(CalibrationError, match="not a complete Parquet file"):
         load_trial(tmp_path / "cut.parquet")
 
 

@@ -41,7 +41,7 @@ def test_json_is_one_object(tmp_path, capsys):
         ({"board": "9x6", "charuco": "7x5"}, "both given"),
         ({"model": "pinhole"}, "unknown lens model"),
         ({"board": "nine"}, "such as 9x6"),
-        ({"board": "5x4"}, "count the board's corners again"),
+        ({"board": "5x4"}, "check the count of the board's corners"),
         ({"charuco": "7x5"}, "none of 6 pictures shows"),
         ({"out": Path("camera.txt")}, "expected .yaml"),
     ],

@@ -10,7 +10,7 @@ import torch
 import finssim
 from finssim.learning.episodes import HeldEvaluation
 from finssim.learning.learners import LEARNERS, LearningError, learner_named
-from finssim.learning.network import Network, asked, first_memory
+from finssim.learning.network import Network, answer_of, first_memory
 from finssim.learning.resume import read_state, write_state
 from finssim.tasks import TASKS, task_named
 from reference.guess import BEST, Guess, GuessTogether
@@ -85,7 +85,7 @@ def test_it_finds_the_best_action(name, task):
         seen = torch.from_numpy(seen)
     with torch.no_grad():
         device = None if isinstance(network, Network) else "cpu"
-        action = np.asarray(asked(network, seen, first_memory(network, 2, device))[0])
+        action = np.asarray(answer_of(network, seen, first_memory(network, 2, device))[0])
     assert np.abs(action - BEST * np.array([[1.0], [-1.0]])).max() < 0.1
     assert row.keys() == before.keys() and row["held"] > before["held"] and row["mean_return"] > 0.9
     held = HeldEvaluation(finssim.make(task(), worlds=8, seed=77))(network)

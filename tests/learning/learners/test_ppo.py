@@ -17,7 +17,7 @@ from finssim.learning.layers import Arrays
 from finssim.learning.learners import learner_named
 from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.learners.ppo import Ppo
-from finssim.learning.network import Network, asked, first_memory
+from finssim.learning.network import Network, answer_of, first_memory
 from finssim.tasks import ObservationPart, StationKeeping
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.terms import End, RewardTerm, Terms
@@ -138,15 +138,15 @@ def test_an_informed_teacher_sees_what_was_drawn_and_the_student_does_not():
     learner.update()
     known, teacher = Known(learner.arrays.numpy(learner._observation)), learner._teacher
     network, memory = learner.network(), first_memory(learner.network(), 8, None)
-    before = teacher.act(teacher.reset(8), known, None)[0], asked(network, known.observation, memory)[0]
+    before = teacher.act(teacher.reset(8), known, None)[0], answer_of(network, known.observation, memory)[0]
     learner._drawn += 1.0
-    after = teacher.act(teacher.reset(8), known, None)[0], asked(network, known.observation, memory)[0]
+    after = teacher.act(teacher.reset(8), known, None)[0], answer_of(network, known.observation, memory)[0]
     assert np.abs(after[0] - before[0]).max() > 1e-3
     np.testing.assert_array_equal(after[1], before[1])
 
 
 def test_without_ranges_there_is_nothing_to_be_informed_of():
-    with pytest.raises(LearningError, match="sees what randomisation has drawn: give randomize"):
+    with pytest.raises(LearningError, match="observes the drawn parameters: give randomize"):
         made(StationKeeping(), ranges=None, **INFORMED)
 
 

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from finssim.learning.learners import LEARNERS, base, learner_named
-from finssim.learning.learners.base import ON_POLICY, RANDOMIZED, SETTINGS, own_settings
+from finssim.learning.learners.base import ON_POLICY, RANDOMIZED, SETTINGS, task_settings
 from finssim.tasks import SEEING, TASKS, task_named
 from reference.guess import Guess
 
@@ -16,11 +16,11 @@ def test_the_tasks_own_lines_outrank_the_others(monkeypatch):
     drawn = {"*": {"on-policy": {"a": 4, "b": 4}}, "t1": {"on-policy": {"d": 5}}}
     monkeypatch.setattr(base, "SETTINGS", plain)
     monkeypatch.setattr(base, "RANDOMIZED", drawn)
-    assert own_settings("other", "bc", True) == {}
-    assert own_settings("other", "sb3-ppo", False) == {"a": 1, "b": 1}
-    assert own_settings("other", "sb3-ppo", True) == {"a": 4, "b": 4}
-    assert own_settings("t1", "sb3-ppo", False) == {"a": 1, "b": 2, "c": 2}
-    assert own_settings("t1", "rsl-rl", True) == {"a": 4, "b": 2, "c": 3, "d": 5}
+    assert task_settings("other", "bc", True) == {}
+    assert task_settings("other", "sb3-ppo", False) == {"a": 1, "b": 1}
+    assert task_settings("other", "sb3-ppo", True) == {"a": 4, "b": 4}
+    assert task_settings("t1", "sb3-ppo", False) == {"a": 1, "b": 2, "c": 2}
+    assert task_settings("t1", "rsl-rl", True) == {"a": 4, "b": 2, "c": 3, "d": 5}
 
 
 @pytest.mark.parametrize("randomized", [False, True])
@@ -36,7 +36,7 @@ def test_a_training_begins_with_its_tasks_settings(name, randomized):
     kind = learner_named(name)
     for task in TASKS:
         settings = kind.settings(task_named(task), randomized=randomized)
-        for setting, value in own_settings(task, name, randomized).items():
+        for setting, value in task_settings(task, name, randomized).items():
             assert setting == "rollout" or getattr(settings, setting) == value
         given = kind.settings(task_named(task), randomized=randomized, steps=7, worlds=3)
         assert (given.steps, given.worlds) == (7, 3)

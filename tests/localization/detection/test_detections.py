@@ -10,7 +10,7 @@ from finssim.localization.detection.detections import (
     COLUMNS,
     Detection,
     Frame,
-    most_certain,
+    best_detections,
     read_detections,
     write_detections,
 )
@@ -137,5 +137,5 @@ def test_the_most_certain_of_two_of_one_id_stays():
     corrected, unknown = Detection(4, RING, 90.0, 1), Detection(4, RING)
     other = Detection(5, RING, 10.0)
     for order in ([weak, strong, corrected, unknown, other], [other, unknown, corrected, strong, weak]):
-        kept = {d.tag: d for d in most_certain(order)}
+        kept = {d.tag: d for d in best_detections(order)}
         assert kept == {4: strong, 5: other}

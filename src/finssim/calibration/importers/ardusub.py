@@ -22,7 +22,7 @@ from finssim.calibration.trials.conversion import GRAVITY
 from finssim.calibration.trials.trial import Array
 from finssim.control.ardusub import FULL, NEUTRAL
 from finssim.geometry.rotations import wrap_angle
-from finssim.mcap_files import whole_mcap
+from finssim.mcap_files import intact_mcap
 from finssim.vehicles import Vehicle
 from finssim.vehicles.autopilot import DEMANDS, FRAMES
 
@@ -212,7 +212,7 @@ def _recorded(path: Path, kinds: frozenset[str]) -> Iterator[tuple[str, dict[str
     from mcap.reader import NonSeekingReader
 
     systems: set[int] = set()
-    with whole_mcap(path, []) as complete, complete.open("rb") as file:
+    with intact_mcap(path, []) as complete, complete.open("rb") as file:
         messages = NonSeekingReader(file).iter_messages(log_time_order=False)
         while True:
             try:
@@ -498,7 +498,7 @@ def _voltage(log: Log) -> Stream | None:
         volts = unit * instance.numbers(kind, name)
         measured = (volts > 1.0) & (volts < 65.0)  # 0 and 65.535 V stand for "not measured"
         if measured.sum() >= 2:
-            return instance.stream(kind, {"voltage": volts}).taken(measured)
+            return instance.stream(kind, {"voltage": volts}).selected(measured)
     return None
 
 
@@ -506,7 +506,7 @@ def _arming(log: Log) -> Stream | None:
     """Words `armed` and `disarmed`; what was before the first event is its opposite."""
     if log.has("HEARTBEAT"):
         armed = [bool(int(mode) & ARMED_FLAG) for mode in log.numbers("HEARTBEAT", "base_mode")]
-        return _words(log, "HEARTBEAT", list(log.times["HEARTBEAT"]), armed)
+        return _arming_stream(log, "HEARTBEAT", list(log.times["HEARTBEAT"]), armed)
     times, armed = [], []
     if "ARM" in log.messages:
         times, armed = list(log.times["ARM"]), [bool(x) for x in log.numbers("ARM", "ArmState")]
@@ -518,10 +518,10 @@ def _arming(log: Log) -> Stream | None:
     if not times:
         return None
     begin = min(float(t[0]) for t in log.times.values() if len(t))
-    return _words(log, "ARM", [min(begin, times[0] - 1e-3), *times], [not armed[0], *armed])
+    return _arming_stream(log, "ARM", [min(begin, times[0] - 1e-3), *times], [not armed[0], *armed])
 
 
-def _words(log: Log, kind: str, times: list[float], armed: list[bool]) -> Stream:
+def _arming_stream(log: Log, kind: str, times: list[float], armed: list[bool]) -> Stream:
     labels = np.array(["armed" if on else "disarmed" for on in armed], dtype=np.str_)
     return Stream(source=f"{log.shown} {kind}", t=np.array(times), words={"arming": labels})
 
@@ -585,7 +585,7 @@ def _driven_by_sticks(
     for stream in (*streams, pulses):
         manual = (_mode(log, stream.t) == MANUAL) | ~_armed(log, stream.t)
         other += int((~manual).sum())
-        manual_streams.append(stream.taken(manual))
+        manual_streams.append(stream.selected(manual))
     if other:
         share = other / sum(len(stream.t) for stream in (*streams, pulses))
         manual_streams[-1] = manual_streams[-1].noting(finding("other_modes_left_out", share=share))

@@ -41,7 +41,7 @@ def outputs_of(
         CalibrationError: Outputs or thrusters that do not exist, or nothing to go by.
     """
     if requested:
-        outputs = _given(vehicle, requested)
+        outputs = _stated_outputs(vehicle, requested)
         basis = "as the map says"
     elif all(thruster.motor_index is not None for thruster in vehicle.thrusters.values()):
         outputs = {
@@ -94,7 +94,7 @@ def mixed_pulses(
     return pulses, mapped
 
 
-def _given(vehicle: Vehicle, requested: Mapping[str, str]) -> dict[int, tuple[str, int]]:
+def _stated_outputs(vehicle: Vehicle, requested: Mapping[str, str]) -> dict[int, tuple[str, int]]:
     outputs = {}
     for output, target in requested.items():
         number = output.upper().removeprefix("SERVO").removeprefix("C")
@@ -135,7 +135,7 @@ def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[i
             else f"has FRAME_CONFIG {int(config)}, which is not known here"
         )
         raise CalibrationError(
-            f"the log {lack}, so nothing tells which output drives which thruster: {way_out}"
+            f"the log {lack}, so it is unknown which output drives which thruster: {way_out}"
         )
     frame, factors = FRAMES[int(config)]
     names = list(vehicle.thrusters)

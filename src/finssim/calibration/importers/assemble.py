@@ -73,7 +73,7 @@ class ColumnSource(Part):
         return data
 
     @model_validator(mode="after")
-    def _one_source(self) -> ColumnSource:
+    def _single_source(self) -> ColumnSource:
         if (self.column is None) == (self.value is None):
             raise refuse_section("expected either 'column: NAME' or 'value: NUMBER'")
         return self
@@ -92,7 +92,7 @@ class TimeColumn(Part):
 
     @field_validator("unit")
     @classmethod
-    def _known(cls, unit: str) -> str:
+    def _check_names(cls, unit: str) -> str:
         if unit not in TIME_UNITS and unit != "date":
             raise refuse_value(
                 f"is '{unit}', expected one of {', '.join(TIME_UNITS)}, or date for written dates"
@@ -114,7 +114,7 @@ class PhaseColumn(Part):
 
     @field_validator("words")
     @classmethod
-    def _known(cls, labels: dict[str, str]) -> dict[str, str]:
+    def _check_names(cls, labels: dict[str, str]) -> dict[str, str]:
         for word in labels.values():
             if word not in PHASES:
                 raise refuse_value(
@@ -189,7 +189,7 @@ class SourceMap(Part):
 
     @field_validator("columns")
     @classmethod
-    def _known(cls, columns: dict[str, ColumnSource]) -> dict[str, ColumnSource]:
+    def _check_names(cls, columns: dict[str, ColumnSource]) -> dict[str, ColumnSource]:
         allowed = [*COLUMNS, *EXTRA_COLUMNS]
         for name, source in columns.items():
             if name not in EXTRA_COLUMNS and column_of(name) is None:
@@ -357,7 +357,7 @@ def split_rule(text: str) -> SplitRule:
         )
     except ValueError:
         raise CalibrationError(
-            f"split is '{text}', expected phase, gaps, gaps=SECONDS, arming or column; time windows stand in a map file"
+            f"split is '{text}', expected phase, gaps, gaps=SECONDS, arming or column; give time windows in a map file"
         ) from None
 
 
@@ -403,7 +403,7 @@ def _part(table: Table, rows: Rows) -> Table:
 
 WORDED = {
     "phase": ("phase", "no source of the map names a phase column"),
-    "arming": ("arming", "the log says nothing about arming"),
+    "arming": ("arming", "the log has no arming messages"),
     "column": ("split", "no source of the map names a split column"),
 }
 """Rule -> the words that it goes by, and what is said where there are none."""
@@ -443,7 +443,7 @@ def _windows(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
     return pieces
 
 
-Words = NDArray[np.str_]
+Texts = NDArray[np.str_]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -456,12 +456,12 @@ class Stream:
     """On the clock of the log [s], (n,)."""
     channels: dict[str, Array] = field(default_factory=dict)
     """Canonical or extra column -> values, (n,) each."""
-    words: dict[str, Words] = field(default_factory=dict)
+    words: dict[str, Texts] = field(default_factory=dict)
     """`phase`, `split` or `arming` -> a word for every sample, (n,) each; a word holds until the next."""
     findings: tuple[Finding, ...] = ()
     """What was repaired or left out."""
 
-    def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_], t: Array | None = None) -> Stream:
+    def selected(self, rows: NDArray[np.intp] | NDArray[np.bool_], t: Array | None = None) -> Stream:
         """Some of the samples, in that order; at times `t` where given."""
         return replace(
             self,
@@ -485,7 +485,7 @@ class Table:
     """Strictly increasing from 0 [s], (n,)."""
     channels: dict[str, Array]
     """NaN where a stream has no sample, (n,) each."""
-    words: dict[str, Words]
+    words: dict[str, Texts]
     """(n,) each."""
     findings: tuple[Finding, ...]
 
@@ -502,7 +502,7 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
     """
     timed = np.isfinite(stream.t)
     untimed = [] if timed.all() else [finding("samples_untimed", samples=(~timed).sum())]
-    stream = stream.taken(timed)
+    stream = stream.selected(timed)
     if len(stream.t) < 2:
         raise CalibrationError(f"{stream.source}: {len(stream.t)} samples, expected at least two")
     t, rows, repaired = ordered(stream.t, stream.channels)
@@ -514,11 +514,11 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
             "their own, or cut the log there",
             stream.source,
         )
-    stream = stream.taken(rows, t)
+    stream = stream.selected(rows, t)
     first = np.concatenate([[True], np.diff(t) > SAME_ROW])
     if not first.all():
         repaired = [*repaired, finding("samples_repeat", samples=(~first).sum())]
-        stream = stream.taken(first)
+        stream = stream.selected(first)
     if len(stream.t) < 2:
         raise CalibrationError(
             f"{stream.source}: the time never increases: name the column that holds the time"
@@ -564,7 +564,7 @@ def merge(streams: Sequence[Stream]) -> Table:
     """
     each = [in_order(stream, alone=len(streams) == 1) for stream in streams]
     _refuse_doubles(each)
-    _refuse_apart(each)
+    _refuse_disjoint(each)
     start = min(float(stream.t[0]) for stream in each)
     # On whole microseconds, so that a written and read trial has the same times.
     each = [replace(stream, t=np.round(stream.t - start, 6)) for stream in each]
@@ -592,7 +592,7 @@ def _refuse_doubles(streams: Sequence[Stream]) -> None:
             sources[name] = stream.source
 
 
-def _refuse_apart(streams: Sequence[Stream]) -> None:
+def _refuse_disjoint(streams: Sequence[Stream]) -> None:
     longest = max(streams, key=lambda stream: stream.t[-1] - stream.t[0])
     for stream in streams:
         if stream.t[0] > longest.t[-1] or stream.t[-1] < longest.t[0]:

@@ -33,7 +33,7 @@ from finssim.calibration.trials.conversion import TIME_UNITS, factor
 from finssim.calibration.trials.trial import Array, Trial, column_of
 from finssim.calibration.trials.trial_files import Table, read_table, write_trial
 from finssim.files import plain_name
-from finssim.mcap_files import MAGIC, mcap_metadata, whole_mcap
+from finssim.mcap_files import MAGIC, intact_mcap, mcap_metadata
 from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import json_value
@@ -124,7 +124,7 @@ def _by_names(table: Table, label: str) -> SourceMap:
     )
 
 
-def _known(table: Table, name: str, label: str) -> None:
+def _require_column(table: Table, name: str, label: str) -> None:
     if name not in table.columns:
         raise CalibrationError(
             f"{label}: no column '{name}'{did_you_mean(name, table.columns)} its columns are {_column_list(table)}"
@@ -132,7 +132,7 @@ def _known(table: Table, name: str, label: str) -> None:
 
 
 def _numbers(table: Table, name: str, label: str) -> Array:
-    _known(table, name, label)
+    _require_column(table, name, label)
     if name not in table.numbers:
         example = next((word for word in table.words[name] if word), "")
         raise CalibrationError(f"{label}: column '{name}' holds no numbers, for instance '{example}'")
@@ -140,13 +140,13 @@ def _numbers(table: Table, name: str, label: str) -> Array:
 
 
 def _text(table: Table, name: str, label: str) -> list[str]:
-    _known(table, name, label)
+    _require_column(table, name, label)
     return table.words[name] if name in table.words else [f"{x:g}" for x in table.numbers[name]]
 
 
 def _time(table: Table, time: TimeColumn, label: str) -> Array:
     """Seconds on the clock of the log."""
-    _known(table, time.column, label)
+    _require_column(table, time.column, label)
     if time.unit != "date" and time.column in table.numbers:
         return table.numbers[time.column] * TIME_UNITS[time.unit]
     try:
@@ -175,10 +175,10 @@ def _column_list(table: Table) -> str:
 
 # What our own records add to a bag: thrusters by name, phases and arming from events, the vehicle they are of.
 
-OWN = "finssim_msgs/msg/"
+NATIVE = "finssim_msgs/msg/"
 """Types by which a bag of ours is known, whoever wrote the file."""
 
-TAKEN = ("odom", "imu", "joint_states", "thruster_state", "thruster_cmd", "telemetry", "pressure")
+TRIAL_TOPICS = ("odom", "imu", "joint_states", "thruster_state", "thruster_cmd", "telemetry", "pressure")
 """Last parts of the topics that a trial is made of; the wanted wrench and the goal say nothing about what happened."""
 
 COMPASS = "/compass/imu"
@@ -195,18 +195,18 @@ THRUSTERS: dict[str, dict[str, tuple[str, str]]] = {
 """Type -> prefix of a trial's columns -> list of the message and its unit, one number a thruster."""
 
 
-def own_topics(types: Mapping[str, str]) -> dict[str, SourceMap]:
+def native_topics(types: Mapping[str, str]) -> dict[str, SourceMap]:
     """Topics of ours that make a trial; none of a bag without a type of ours.
 
     Args:
         types: Topic -> type, all that the bag has.
     """
-    if not any(kind.startswith(OWN) for kind in types.values()):
+    if not any(kind.startswith(NATIVE) for kind in types.values()):
         return {}
     return {
         topic: SourceMap()
         for topic in sorted(types)
-        if topic.rsplit("/", 1)[-1] in TAKEN and not topic.endswith(COMPASS)
+        if topic.rsplit("/", 1)[-1] in TRIAL_TOPICS and not topic.endswith(COMPASS)
     }
 
 
@@ -389,7 +389,7 @@ def _inside(value: Any) -> str:
 
 BAGS = (".mcap", ".db3", ".bag")
 
-WORDS = "std_msgs/msg/String"
+TEXT = "std_msgs/msg/String"
 
 
 def read_bag(path: Path, topics: Mapping[str, SourceMap]) -> list[Stream]:
@@ -405,7 +405,7 @@ def read_bag(path: Path, topics: Mapping[str, SourceMap]) -> list[Stream]:
     """
     with _opened(path) as (reader, findings):
         types = {c.topic: c.msgtype for c in reader.connections}
-        native = {} if topics else own_topics(types)
+        native = {} if topics else native_topics(types)
         topics = topics or native
         if not topics:
             topics = {topic: SourceMap() for topic, kind in sorted(types.items()) if kind in USUAL}
@@ -448,7 +448,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[Finding]]]:
 
     repairs: list[str] = []
     with ExitStack() as stack:
-        parts = [stack.enter_context(whole_mcap(part, repairs)) for part in bag_files(path) or [path]]
+        parts = [stack.enter_context(intact_mcap(part, repairs)) for part in bag_files(path) or [path]]
         findings = [finding("as_read", remark=repair) for repair in repairs]
         if parts != [path] and path.is_dir():
             findings.append(finding("no_metadata", bag=path.name, files=len(parts)))
@@ -502,7 +502,7 @@ def _messages(reader: Any, connections: Sequence[Any]) -> Iterator[tuple[int, An
 
 def _events(reader: Any) -> list[Stream]:
     """What the events of our own records say."""
-    connections = [c for c in reader.connections if c.topic.endswith("/events") and c.msgtype == WORDS]
+    connections = [c for c in reader.connections if c.topic.endswith("/events") and c.msgtype == TEXT]
     texts = ((time * 1e-9, message.data) for time, message in _messages(reader, connections))
     stream = spoken_events("events", texts, reader.start_time * 1e-9) if connections else None
     return [] if stream is None else [stream]
@@ -600,19 +600,19 @@ def import_trials(
     split: str | None = None,
     as_json: bool = False,
 ) -> list[Path]:
-    """Make trial folders of logs, in SI units and the body frame x forward, y left, z up.
+    """Convert logs to trial folders, in SI units and the body frame x forward, y left, z up.
 
     Example: finssim trials import dive.BIN --vehicle bluerov2 --split arming --out trials
 
     Args:
         logs (LOG): Tables (.csv, .parquet), ArduSub logs (.BIN, .tlog, .mcap of BlueOS), ROS 2 bags (.mcap, .db3,
-            folder). Tables and bags that belong together make one trial.
-        out (DIR): Folder in which the trial folders are made.
+            folder). Tables and bags that belong together form one trial.
+        out (DIR): Folder for the trial folders.
         column_map (FILE): Map of the log's columns or topics, with units and frames (.yaml).
         format (FORMAT): auto (by suffix), csv, ardupilot or rosbag.
-        vehicle (NAME|FILE): Vehicle that made the logs; before the map's.
-        split (RULE): Several trials of one log: by phase, gaps, gaps=SECONDS, arming or column; before the map's.
-        as_json: Print one JSON object instead of a line for each trial.
+        vehicle (NAME|FILE): Vehicle of the logs; overrides the map's.
+        split (RULE): Split a log into trials: by phase, gaps, gaps=SECONDS, arming or column; overrides the map's.
+        as_json: Print one JSON object instead of one line per trial.
 
     Returns:
         The folders, in the order of their trials; what was repaired or left out is told on standard error.
@@ -723,7 +723,7 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
     """Tables by trial: those for which `{trial}` or the first `*` of their patterns stands for the same text."""
     if paths and has_map and not mapped.files:
         raise CalibrationError(
-            f"the map says nothing about files such as {paths[0].name}: give 'files:' or 'columns:'"
+            f"the map has no entry for files such as {paths[0].name}: give 'files:' or 'columns:'"
         )
     by_trial: dict[str, list[tuple[str, Path, SourceMap | None]]] = {}
     unread = []

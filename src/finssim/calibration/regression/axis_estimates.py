@@ -291,7 +291,7 @@ class AxisResult:
             note = "the trials do not determine it"
         elif 0.5 * (high - low) > CERTAIN * abs(value):
             size = f"±{min(50.0 * (high - low) / abs(value), 9999.0):.0f} %" if value else "its own size"
-            note = f"known to no better than {size}"
+            note = f"uncertain by {size}"
         else:
             sure = True
         return self.note(name, value, (low, high), sure, note, path)

@@ -124,7 +124,7 @@ def _release(trial: Trial, axis: str, vehicle: Vehicle) -> Release:
     moved = motion(trial, vehicle)
     rate, travel = (_clean(samples) for samples in _samples(trial, axis, moved))
     if max(len(rate[0]), len(travel[0])) < FEWEST_SAMPLES:
-        raise CalibrationError(f"the motion of {axis} is unknown: nothing to see of it", trial.name)
+        raise CalibrationError(f"the motion of {axis} was not measured", trial.name)
     period = 0.0
     if axis in SWINGING:
         seen = rate if len(rate[0]) >= FEWEST_SAMPLES else (travel[0], np.gradient(travel[1], travel[0]))
@@ -603,7 +603,7 @@ class _Result:
         sure = bool(value > 0.0 and 0.5 * (high - low) <= USEFUL * value)
         self.estimates[name] = Estimate(
             name=name, estimate=value, ci95=(low, high), unit=unit, identifiable=sure, path=path,
-            note=note or ("" if sure else "not known to half its size"),
+            note=note or ("" if sure else "uncertain by more than half its value"),
         )  # fmt: skip
         return self.estimates[name]
 

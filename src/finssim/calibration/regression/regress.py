@@ -73,7 +73,7 @@ def buoyancy_estimate(chosen: Selection, vehicle: Vehicle) -> Estimate:
         ci95=(-high, -low),
         unit="N",
         identifiable=known,
-        note=note if known else f"not known to half its size: dive and coast; {note}",
+        note=note if known else f"uncertain by more than half its value: dive and coast; {note}",
         path="body.displaced_volume",
     )
 

@@ -1206,7 +1206,7 @@ def other_estimates(
         elif not np.isfinite(half):
             note = "the trials do not determine it"
         elif half > limit:
-            note = f"known to no better than ±{half:.2g} {unit}"
+            note = f"uncertain by ±{half:.2g} {unit}"
         path = PATHS[name] if name in PATHS else f"{SET}.{name}"
         out[name] = Estimate(
             name=name,
@@ -1661,7 +1661,7 @@ class Stages:
         self.segments = [replace(s, index=g) for g, stretch in enumerate(filter(None, kept)) for s in stretch]
         if not self.segments:
             raise CalibrationError(
-                f"no stretch of these trials has both inputs and measurements that tell of {', '.join(self.axes)}"
+                f"no interval of these trials has both inputs and measurements of {', '.join(self.axes)}"
             )
         commanded = np.array([s.commanded for s in self.segments])
         # Where every input is said to have acted, whoever asks for a lag doubts that.

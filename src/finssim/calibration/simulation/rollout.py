@@ -340,7 +340,7 @@ class Rollouts:
         steps = {round(s.step, 9) for s in segments}
         if len(steps) != 1:
             raise CalibrationError(
-                "there is nothing to simulate: no trial holds a usable stretch"
+                "nothing to simulate: no trial has a usable interval"
                 if not steps
                 else f"segments have steps of {sorted(steps)} s, expected one step for all"
             )

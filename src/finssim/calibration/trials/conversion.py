@@ -289,11 +289,11 @@ def in_our_frames(channels: Channels, body: str, world: str) -> Channels:
             if name in result:
                 result[name] = s * result[name]
     if turned != sunk:
-        result.update(_attitude_of_one_side(channels, turned))
+        result.update(_half_turned_attitude(channels, turned))
     return result
 
 
-def _attitude_of_one_side(channels: Channels, body: bool) -> Channels:
+def _half_turned_attitude(channels: Channels, body: bool) -> Channels:
     """Attitude when only the body axes (or only the world axes) change: half a turn about x from one side."""
     half_turn = matrix_to_quat(FROM_FOSSEN.A)
 

@@ -55,7 +55,7 @@ def require_fittable(trials: Sequence[Trial], vehicle: Vehicle) -> None:
     for trial in trials:
         if trial.header.role == "held-out":
             raise CalibrationError(
-                f"{trial.name}: its header says that it is held out: fit on other trials and replay this one"
+                f"{trial.name}: it is marked as held out: fit on other trials and replay this one"
             )
         for item in implausible(trial, vehicle):
             raise CalibrationError(f"{trial.name}: {item}")
@@ -284,7 +284,7 @@ def first_complete(present: dict[str, list[str]], trial: Trial, vehicle: Vehicle
     for kind in ORDER:
         if present[kind] and (kind == "tau" or len(present[kind]) == len(vehicle.thrusters)):
             return kind
-    raise CalibrationError(_what_is_missing(present, vehicle), trial.name)
+    raise CalibrationError(_missing_inputs(present, vehicle), trial.name)
 
 
 def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
@@ -304,7 +304,7 @@ def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
     return [names[name] for name in vehicle.thrusters if name in names and trial.has(names[name])]
 
 
-def _what_is_missing(present: dict[str, list[str]], vehicle: Vehicle) -> str:
+def _missing_inputs(present: dict[str, list[str]], vehicle: Vehicle) -> str:
     for kind in ORDER:
         if present[kind]:
             missing = [f"{kind}{n}" for n in vehicle.thrusters if f"{kind}{n}" not in present[kind]]
@@ -376,7 +376,7 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
     kind = first_complete(present, trial, vehicle)
     columns = present[kind]
     commanded, held, stepped = _between(trial, kind, columns)
-    t, values = _together(trial, columns, held)
+    t, values = _common_times(trial, columns, held)
     force, B, names = _channels(trial, vehicle, kind, columns, t, values)
     end = _end(trial, t, force) if held else None
     zero_after = end is not None and trial.header.inputs_after == "zero"
@@ -524,7 +524,7 @@ def _keeps_levels(trial: Trial, columns: list[str]) -> bool:
     return jumps >= 2 and alone >= 0.9 * jumps
 
 
-def _together(trial: Trial, columns: list[str], held: bool) -> tuple[Array, Array]:
+def _common_times(trial: Trial, columns: list[str], held: bool) -> tuple[Array, Array]:
     """Columns at the times when all of them are known: the last value if held, else in a straight line.
 
     Raises:

@@ -99,7 +99,7 @@ class Header(_Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _one_axis(cls, data: Any) -> Any:
+    def _single_axis(cls, data: Any) -> Any:
         """A single axis may stand without brackets."""
         if isinstance(data, dict) and "convert" in data:
             raise refuse_section(
@@ -161,7 +161,7 @@ INPUT_PREFIXES: dict[str, Column] = {
     "force_": Column("command", "N", "thrust of one thruster"),
     "rpm_": Column("command", "rpm", "shaft speed of one thruster, positive for positive thrust"),
     "pwm_": Column("command", "µs", "pulse width sent to the speed controller of one thruster"),
-    "command_": Column("command", "N", "thrust asked of one thruster"),
+    "command_": Column("command", "N", "requested thrust of one thruster"),
 }
 """Columns named PREFIX + thruster name."""
 

@@ -33,7 +33,7 @@ __all__ = ["Table", "load_trial", "load_trials", "new_samples", "read_table", "t
 
 Array = NDArray[np.float64]
 
-MOST_RAGGED = 0.1
+MAX_RAGGED = 0.1
 """Part of the rows that may have a wrong number of cells; a file with more of them is no table."""
 
 CHUNK = 20_000
@@ -125,7 +125,7 @@ def _read_csv(path: Path, **options: Any) -> Table:
             _append(columns, rows, text)
             rows = []
     _append(columns, rows, text)
-    _tell_ragged(ragged, len(text.texts), len(names), text.unfinished, table, path)
+    _report_ragged(ragged, len(text.texts), len(names), text.unfinished, table, path)
     for name, column in zip(names, columns, strict=True):
         _keep(table, name, column)
     return table
@@ -154,10 +154,10 @@ def _append(columns: list[list[Any]], rows: list[list[str]], text: TextTable) ->
             column.extend([cell if x is None else x for cell, x in zip(cells, numbers, strict=True)])
 
 
-def _tell_ragged(ragged: list[int], count: int, width: int, cut: bool, table: Table, path: Path) -> None:
+def _report_ragged(ragged: list[int], count: int, width: int, cut: bool, table: Table, path: Path) -> None:
     if ragged == [count] and cut:
         table.findings.append(finding("last_line_cut"))
-    elif len(ragged) > max(1.0, MOST_RAGGED * count):
+    elif len(ragged) > max(1.0, MAX_RAGGED * count):
         raise CalibrationError(
             f"{path}: {len(ragged)} of {count} rows do not have {width} cells, one for each column name "
             f"(first: row {ragged[0]}): is one table in it, with one separator?"
@@ -198,7 +198,7 @@ def _read_parquet(path: Path) -> Table:
         content = pyarrow.parquet.read_table(path)
     except (OSError, pyarrow.ArrowException) as error:
         raise CalibrationError(
-            f"{path}: is not a whole Parquet file: {' '.join(str(error).split())[:120]}"
+            f"{path}: is not a complete Parquet file: {' '.join(str(error).split())[:120]}"
         ) from None
     table = Table()
     _check_names(content.column_names, path)

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "Board", "BoardView", "MODELS", "adjust", "board_found", "calibrate_camera", "evidence",
+    "Board", "BoardView", "MODELS", "adjust", "common_board", "calibrate_camera", "evidence",
     "lens_names", "lens_vector", "parse_size", "run", "see_board",
 ]  # fmt: skip
 
@@ -157,7 +157,7 @@ def see_board(image: NDArray[np.uint8], board: Board) -> tuple[Array, Array] | N
     return pixels, board.corners[index]
 
 
-def board_found(images: Iterable[tuple[str, NDArray[np.uint8]]], square: float) -> Board:
+def common_board(images: Iterable[tuple[str, NDArray[np.uint8]]], square: float) -> Board:
     """The common chessboard that most of some pictures show.
 
     Args:
@@ -271,7 +271,7 @@ SPREAD = 4.0
 NONSENSE = 0.003
 """Residual of the usual picture, in widths of the image, with which nothing can be right."""
 
-MOST_LEFT_OUT = 0.25
+MAX_EXCLUDED = 0.25
 FOLDS = 8
 
 UNSURE_FOCAL = 0.02
@@ -538,15 +538,16 @@ def _refuse_nonsense(bundle: Bundle, views: Sequence[BoardView]) -> None:
     usual, limit = float(np.median(bundle.rms)), max(1.0, NONSENSE * views[0].width)
     if not usual <= limit:
         raise CalibrationError(
-            f"corners miss their places by {usual:.1f} px in the usual picture, expected below {limit:.1f} px: no lens "
-            "explains them: count the board's corners again, and see that it is flat and that the model suits the lens"
+            f"corner residuals are {usual:.1f} px in the median image, expected below {limit:.1f} px: no "
+            "lens fits them: check the count of the board's corners, that it is flat, and that the "
+            "model suits the lens"
         )
 
 
 def _without_outliers(views: Sequence[BoardView], bundle: Bundle) -> tuple[list[BoardView], Bundle]:
     """Leave out the worst view as long as it is far from the others, and fit again; the others, and their fit."""
     used = list(views)
-    for _ in range(min(int(MOST_LEFT_OUT * len(views)), len(views) - FEWEST_VIEWS)):
+    for _ in range(min(int(MAX_EXCLUDED * len(views)), len(views) - FEWEST_VIEWS)):
         if not _outliers(bundle.rms).any():
             break
         del used[int(np.argmax(bundle.rms))]
@@ -597,12 +598,20 @@ def _estimates(lens: Lens, half: Array) -> dict[str, Estimate]:
     for name, value, width in zip(lens_names(lens.model), lens_vector(lens), half, strict=True):
         unit, limit, note = "-", math.inf, "not told"
         if name.startswith("f"):
-            unit, limit, note = "px", UNSURE_FOCAL * value, "not told apart from the distance of the board"
+            unit, limit, note = (
+                "px",
+                UNSURE_FOCAL * value,
+                "not distinguishable from the distance of the board",
+            )
         elif name.startswith("c"):
-            unit, limit, note = "px", UNSURE_CENTRE * lens.width, "not told apart from a turn of the board"
+            unit, limit, note = (
+                "px",
+                UNSURE_CENTRE * lens.width,
+                "not distinguishable from a rotation of the board",
+            )
         estimate = Estimate.within(name, value, width, unit, width < limit, note)
         if unit == "-" and abs(value) < width < limit:
-            estimate = replace(estimate, note="not told apart from 0")
+            estimate = replace(estimate, note="not distinguishable from 0")
         estimates[name] = estimate
     return estimates
 
@@ -791,7 +800,7 @@ def _views_table(fit: CameraFit) -> ExtraTable:
 def camera_pictures(fit: CameraFit) -> dict[str, tuple[str, bytes]]:
     """File name -> what the picture shows, and the PNG."""
     drawn = {
-        "coverage.png": ("Where corners were seen, and how well pixels are known there", _coverage(fit)),
+        "coverage.png": ("Detected corners, and uncertainty of pixels", _coverage(fit)),
         "residuals.png": ("Corners less what the lens predicts, enlarged", _residuals(fit)),
     }
     return {name: (text, png(figure)) for name, (text, figure) in drawn.items()}
@@ -852,20 +861,20 @@ def run(
     seed: int = 0,
     as_json: bool = False,
 ) -> CameraFit:
-    """Fit a lens to pictures of a board: focal length and centre [px], distortion, with 95 % intervals.
+    """Fit a lens to images of a board: focal length and centre [px], distortion, with 95 % intervals.
 
     Example: finssim calibrate camera board/*.jpg --board 9x6 --square 0.025 --out camera.yaml
 
     Args:
-        images (IMAGE): Pictures of a board, folders of them, or videos.
+        images (IMAGE): Images of a board, folders of them, or videos.
         out (FILE): Camera file to write (.yaml).
-        board (NxM): Inner corners of a chessboard, such as 9x6; common ones are tried if not given.
+        board (NxM): Inner corners of a chessboard, such as 9x6; common sizes are tried if not given.
         square: Edge of a square [m].
-        charuco (NxM): Squares of a ChArUco board in place of a chessboard, such as 7x5.
+        charuco (NxM): Squares of a ChArUco board instead of a chessboard, such as 7x5.
         marker: Edge of its markers [m]; three quarters of a square if not given.
-        dictionary (NAME): Dictionary of its markers, as OpenCV calls it.
+        dictionary (NAME): OpenCV's name of the marker dictionary.
         model (MODEL): Lens: plumb_bob, rational or fisheye.
-        report (DIR): Directory for the report and its pictures.
+        report (DIR): Directory for the report and its figures.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 
@@ -881,7 +890,7 @@ def run(
     screen = Console(stderr=True)
     chosen = _board(board, square, charuco, marker, dictionary)
     if chosen is None:
-        chosen = board_found(((name, image) for _, name, image in pictures(images)), square)
+        chosen = common_board(((name, image) for _, name, image in pictures(images)), square)
         screen.print(f"found a {chosen.words}; --board says otherwise", highlight=False, markup=False)
     views, without = _board_views(images, chosen, screen)
     for name in without:

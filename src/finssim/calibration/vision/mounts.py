@@ -43,7 +43,7 @@ from finssim.geometry.rotations import (
     quat_to_rotvec,
     skew,
 )
-from finssim.localization.detection.detections import most_certain, read_detections
+from finssim.localization.detection.detections import best_detections, read_detections
 from finssim.localization.detection.families import corners
 from finssim.localization.fusion.attitude import TiltGains, follow, tilt_from
 from finssim.localization.fusion.fuse_log import Series, imu_columns, read_stream_table, series
@@ -244,7 +244,7 @@ def start_state(
     A tag without a mount gets that of the first moment that shows it beside one with a mount, as if all were level.
     """
     mounts = dict(mounts)
-    _place_unknown(rig, mounts, moments)
+    _locate_unknown(rig, mounts, moments)
     reference = mounts[rig.reference]
     poses, selected = [], []
     for i, moment in enumerate(moments):
@@ -295,7 +295,7 @@ def level_tag(rig: Rig, pixels: Array) -> Pose | None:
     return Pose(np.column_stack([x, np.cross(n, x), n]), points.mean(axis=0))
 
 
-def _place_unknown(rig: Rig, mounts: dict[int, Pose], moments: Sequence[Moment]) -> None:
+def _locate_unknown(rig: Rig, mounts: dict[int, Pose], moments: Sequence[Moment]) -> None:
     visible = {tag for moment in moments for tag in moment.corners}
     for tag in sorted(visible - mounts.keys()):
         for moment in moments:
@@ -366,7 +366,7 @@ def change(before: MountState, after: MountState, free: Sequence[str]) -> Array:
     return every[[before.names.index(name) for name in free]]
 
 
-MOST_MOMENTS = 150
+MAX_MOMENTS = 150
 """Moments that are used, spread over the recording; more tell the same."""
 
 FEWEST_MOMENTS = 8
@@ -405,7 +405,7 @@ class MountFit:
     """Root of the mean squared distance of corners [px]."""
     held_out_rms: float
     """The same for moments whose pose alone was fitted, to mounts from other moments [px]."""
-    left_out: int
+    excluded: int
     """Moments left out as far off."""
 
     def half_width(self, name: str) -> float:
@@ -432,7 +432,7 @@ def reference_tag(moments: Sequence[Moment], mounts: Mapping[int, Pose]) -> int:
     if best is None or not counts[best]:
         visible = sorted({tag for moment in moments for tag in moment.corners})
         raise CalibrationError(
-            f"none of the vehicle file's tags {sorted(mounts)} is seen, only {visible}: give the file the right ids"
+            f"none of the vehicle file's tags {sorted(mounts)} is seen, only {visible}: correct the ids in the file"
         )
     return best
 
@@ -472,14 +472,14 @@ def fit_mounts(
     origin = state
     state = _by_vision(rig, state, used)
     state, used, excluded = _without_far(rig, state, used)
-    candidates = _wanted(state, used)
+    candidates = _candidates(state, used)
     free = _hopeful(rig, state, used, candidates)
     state = as_before(state, origin, [name for name in candidates if name not in free])
     while True:
         state = minimise(rig, state, used, free)
         blocks = [restricted(block, state, free) for block in moment_blocks(rig, state, used)]
         covariance = trial_covariance(arrow_evidence(blocks, free, "blocks", BLOCKS))
-        worst = _least_told(free, intervals(np.zeros(len(free)), covariance)[:, 1])
+        worst = _least_observable(free, intervals(np.zeros(len(free)), covariance)[:, 1])
         if worst is None:
             break
         free = tuple(name for name in free if name != worst)
@@ -494,7 +494,7 @@ def fit_mounts(
         covariance=covariance,
         rms=float(np.sqrt(np.nanmean(np.sum(corner**2, axis=-1)))),
         held_out_rms=_held_out(rig, state, used, free) if held_out else math.nan,
-        left_out=excluded,
+        excluded=excluded,
     )
 
 
@@ -515,13 +515,13 @@ def _held_out(rig: Rig, state: MountState, moments: Sequence[Moment], free: tupl
 
 
 def _spread(moments: Sequence[Moment]) -> list[Moment]:
-    """At most `MOST_MOMENTS`, evenly over the recording."""
-    if len(moments) <= MOST_MOMENTS:
+    """At most `MAX_MOMENTS`, evenly over the recording."""
+    if len(moments) <= MAX_MOMENTS:
         return list(moments)
-    return [moments[i] for i in np.unique(np.linspace(0, len(moments) - 1, MOST_MOMENTS).astype(int))]
+    return [moments[i] for i in np.unique(np.linspace(0, len(moments) - 1, MAX_MOMENTS).astype(int))]
 
 
-def _wanted(state: MountState, moments: Sequence[Moment]) -> tuple[str, ...]:
+def _candidates(state: MountState, moments: Sequence[Moment]) -> tuple[str, ...]:
     """Shared unknowns that the sensors at hand could tell."""
     up, depth = any(m.up is not None for m in moments), any(m.depth is not None for m in moments)
     observable = {"turn_x": up, "turn_y": up, "turn_z": up, "z": depth, "x": depth and up, "y": depth and up}
@@ -547,7 +547,7 @@ def _without_far(
     return state, [m for m, ok in zip(moments, keep, strict=True) if ok], int(np.sum(~keep))
 
 
-def _least_told(free: Sequence[str], half: Array) -> str | None:
+def _least_observable(free: Sequence[str], half: Array) -> str | None:
     """The unknown that is least told, by its half width in its own unit, if it is not told well enough."""
     limits = np.array([UNSURE_ANGLE if "turn" in name else UNSURE_LENGTH for name in free])
     ratio = np.where(np.isfinite(half), half, np.inf) / limits
@@ -563,7 +563,7 @@ def _hopeful(
     while True:
         some = [restricted(block, state, free) for block in blocks]
         local = trial_covariance(arrow_evidence(some, free, "blocks", 1)).local
-        worst = _least_told(free, 1.96 * np.sqrt(np.diagonal(local)))
+        worst = _least_observable(free, 1.96 * np.sqrt(np.diagonal(local)))
         if worst is None:
             return free
         free = tuple(name for name in free if name != worst)
@@ -669,7 +669,7 @@ def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog
         raise CalibrationError(f"{folder / DETECTIONS}: pictures without a time: add a column 'time' [s]")
     up, turning = _read_imu(folder / IMU, vehicle, findings)
     pictures = tuple(
-        (float(time[i]), {d.tag: np.asarray(d.corners, float) for d in most_certain(frames[i].detections)})
+        (float(time[i]), {d.tag: np.asarray(d.corners, float) for d in best_detections(frames[i].detections)})
         for i in np.argsort(time, kind="stable")
     )
     depth = _read_depth(folder / DEPTH, findings)
@@ -752,7 +752,7 @@ def _read_depth(path: Path, findings: list[Finding]) -> Series | None:
 EDGE_STD = 0.25e-3
 """Standard deviation of a tag's edge measured with a ruler [m]: it makes every distance wrong by the same share."""
 
-KEPT = "the motion does not tell it: kept from the file"
+RETAINED = "the motion does not determine it: kept from the file"
 
 
 def distance_std(fit: MountFit) -> float:
@@ -777,7 +777,7 @@ def tag_estimates(
         any_identified = True
         written[tag] = {"position": pose.t.tolist(), "orientation": matrix_to_quat(pose.R).tolist()}
         turn = quat_to_rotvec(matrix_to_quat(pose.R @ mounts.get(tag, pose).R.T))
-        note = f"{KEPT}, and it defines the body's axes and origin"
+        note = f"{RETAINED}, and it defines the body's axes and origin"
         if tag != fit.rig.reference:
             note = "too few pictures show this tag together with others"
         for axis, value, width in zip(AXES, np.append(np.degrees(turn), pose.t), half, strict=True):
@@ -867,7 +867,7 @@ def calibrate_mounts(log: MountLog, pool: Pool, vehicle: Vehicle, *, name: str, 
         "rmse": mount_fit.rms,
         "rmse_held_out": mount_fit.held_out_rms,
         "samples": float(len(mount_fit.moments)),
-        "rejected": float(mount_fit.left_out),
+        "rejected": float(mount_fit.excluded),
     }
     return Fit(
         kind="mounts",
@@ -929,7 +929,7 @@ def imu_clock(
     if lag is None:
         return None
     half = 1.96 * lag.std
-    note = "the vehicle turns too evenly to tell the clocks apart: taken as 0"
+    note = "the vehicle turns too evenly to estimate the clock offset: assumed 0"
     return Estimate.within("imu.time_offset", lag.seconds, half, "s", half < UNSURE_CLOCK, note)
 
 
@@ -972,16 +972,16 @@ def run(
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Find where tags sit on the vehicle, from its motion, its IMU and its pressure port: poses [m, deg].
+    """Estimate the mounts of tags on the vehicle from its motion, IMU and pressure port: poses [m, deg].
 
     Example: finssim calibrate mounts log --pool pool.yaml --vehicle mine.yaml --out mine.yaml
 
     Args:
         log (LOG): Folder with detections.csv, imu.csv and depth.csv.
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
-        report (DIR): Directory for the report and its pictures.
+        report (DIR): Directory for the report and its figures.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 

@@ -18,7 +18,7 @@ from scipy.stats import t as student
 from finssim.calibration.findings import CalibrationError, Finding, finding, plain
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.report import (
-    AS_GIVEN,
+    AS_STATED,
     HEADS,
     Report,
     command_line,
@@ -252,7 +252,7 @@ def plane_starts(
 
 
 @dataclass(frozen=True)
-class Found:
+class BestStart:
     """Where the search ended."""
 
     model: PoolModel
@@ -261,7 +261,7 @@ class Found:
     """The plane's normal is along the survey's z."""
 
 
-def search(observed: Observations, lens: Lens, settings: Settings) -> Found:
+def search(observed: Observations, lens: Lens, settings: Settings) -> BestStart:
     """The best of many starts, with robust weights.
 
     Raises:
@@ -276,14 +276,14 @@ def search(observed: Observations, lens: Lens, settings: Settings) -> Found:
     for surface, normals in _families(near[0], observed, settings):
         runs += _family(near, normals, observed, settings, surface)
     # Bent rays come first: straight ones may fit the mirror image of a good survey better than the survey.
-    _refuse_left_handed(observed, lens, min([_score(near[0], observed), *(run[0] for run in runs)]))
+    _refuse_mirrored(observed, lens, min([_score(near[0], observed), *(run[0] for run in runs)]))
     if not runs:
         raise CalibrationError(
             "no place of the plane between camera and points explains the pixels: check the water height, its sign and "
             "the interface"
         )
     chosen = _choose(runs, len(observed))
-    return Found(chosen[1], near[0], chosen[2])
+    return BestStart(chosen[1], near[0], chosen[2])
 
 
 def prior_of(
@@ -298,7 +298,7 @@ def prior_of(
         surface: The normal is along the survey's z.
         stds: Of the lens's parameters.
     """
-    normal, depth = known_plane(model, settings, surface)
+    normal, depth = stated_plane(model, settings, surface)
     tilt = settings.tilt_sigma
     if tilt is None:
         tilt = float(PLANE_TILT if settings.plane is not None else SURFACE_TILT if surface else np.inf)
@@ -317,7 +317,7 @@ def prior_of(
     )
 
 
-def known_plane(model: PoolModel, settings: Settings, surface: bool) -> tuple[Array | None, float]:
+def stated_plane(model: PoolModel, settings: Settings, surface: bool) -> tuple[Array | None, float]:
     """Normal towards the camera, and distance of the plane from the reference point; None and NaN where unknown."""
     towards, depth = model.camera.position - model.reference, settings.water_depth
     if settings.plane is not None:
@@ -363,7 +363,7 @@ def _family(
     starts: list[PoolModel] = []
     for pinhole in poses:
         _refuse_wrong_side(pinhole, settings, surface)
-        _, depth = known_plane(pinhole, settings, surface)
+        _, depth = stated_plane(pinhole, settings, surface)
         starts += plane_starts(pinhole, normals, plane, observed, depth)
     ends: list[tuple[float, PoolModel]] = []
     for counts, count in (((6, 4), len(starts)), ((30, 40), 4)):
@@ -389,7 +389,7 @@ def _descend(
     return model
 
 
-def _refuse_left_handed(observed: Observations, lens: Lens, best: float) -> None:
+def _refuse_mirrored(observed: Observations, lens: Lens, best: float) -> None:
     """Refuse a survey whose mirror image, in straight lines, fits clearly better than the best model of it.
 
     A plane of points can always be mirrored, and says nothing.
@@ -407,7 +407,7 @@ def _refuse_left_handed(observed: Observations, lens: Lens, best: float) -> None
 
 
 def _refuse_wrong_side(pinhole: PoolModel, settings: Settings, surface: bool) -> None:
-    _, depth = known_plane(pinhole, settings, surface)
+    _, depth = stated_plane(pinhole, settings, surface)
     if np.isfinite(depth) and depth <= 0.0:
         sense = "below" if pinhole.camera.position[2] < pinhole.reference[2] else "above"
         plane_name = "the plane given" if settings.water_height is None else "the water's height given"
@@ -442,10 +442,10 @@ LEAST_PIXEL = 0.02
 NOISE_ROWS = 2000
 """Rows from which the size of the errors is estimated."""
 
-KNOWN_SURVEY = 0.35
+STATED_SURVEY = 0.35
 """Standard deviation of the logarithm of the survey's error: what is said of it is right within about a third."""
 
-KNOWN_PIXEL, USUAL_PIXEL = 1.2, 0.4
+STATED_PIXEL, USUAL_PIXEL = 1.2, 0.4
 """The same of the pixel's error, and its usual size [px]."""
 
 
@@ -553,9 +553,9 @@ def estimate_noise(
         logdet = float(np.linalg.slogdet(N / np.outer(scale, scale))[1]) + 2.0 * float(np.log(scale).sum())
         g = A.T @ r
         chi2 = float(r @ r) - float(g @ np.linalg.lstsq(N, g, rcond=None)[0])
-        usual = (x[0] / KNOWN_SURVEY) ** 2
+        usual = (x[0] / STATED_SURVEY) ** 2
         if not fixed_pixel:
-            usual += ((x[1] - math.log(USUAL_PIXEL)) / KNOWN_PIXEL) ** 2
+            usual += ((x[1] - math.log(USUAL_PIXEL)) / STATED_PIXEL) ** 2
         return chi2 + whiten.logdet + logdet + usual
 
     start = [0.0, math.log(max(noise.pixel, LEAST_PIXEL))][: 1 if fixed_pixel else 2]
@@ -568,7 +568,7 @@ def estimate_noise(
 CHANCE = 0.02
 """Chance that a right row is taken for a wrong one anywhere in a survey."""
 
-MOST_WRONG = 0.4
+MAX_WRONG = 0.4
 """Share of wrong rows beyond which nothing is believed."""
 
 ROUNDS = 6
@@ -705,7 +705,7 @@ def surprise(
 
 def _refuse_few(used: NDArray[np.bool_], observed: Observations, parameters: int) -> None:
     wrong = len(observed) - int(used.sum())
-    if wrong > MOST_WRONG * len(observed):
+    if wrong > MAX_WRONG * len(observed):
         raise CalibrationError(
             f"{wrong} of {len(observed)} points do not fit any one camera and plane: check that ids, units and the "
             "camera file belong together, and that the camera did not move"
@@ -815,7 +815,7 @@ def error_vectors(model: PoolModel, observed: Observations, normal: Array) -> Ar
 
 # What was estimated, with intervals and whether the pictures tell it, and what to measure so that they do.
 
-TOLD = 0.7
+IDENTIFIED = 0.7
 """A standard error above this part of what was known before means that the pictures tell next to nothing."""
 
 FAR = 0.05
@@ -847,7 +847,7 @@ def estimates(fit: Refined, surface: bool, settings: Settings) -> tuple[dict[str
     rows, moved = {}, (np.abs(G) > 1e-12).any(axis=1)
     for (name, (unit, value)), variance, moves in zip(table.items(), np.diagonal(V), moved, strict=True):
         std = float(np.sqrt(max(0.0, variance)))
-        note = _doubt(name, std, fit, settings) if moves else AS_GIVEN
+        note = _doubt(name, std, fit, settings) if moves else AS_STATED
         rows[name] = Estimate.within(name, value, quantile * std, unit, not note, note)
     names = [name for name, moves in zip(table, moved, strict=True) if moves]
     return rows, correlation(names, V[np.ix_(moved, moved)])
@@ -879,19 +879,19 @@ def _doubt(name: str, std: float, fit: Refined, settings: Settings) -> str:
     reach = model.clearance + max(model.depth, 0.0)
     before, sentence = np.inf, ""
     if name == "index":
-        before, sentence = prior.index_std, f"the pixels do not tell it: held at {settings.index:g}"
+        before, sentence = prior.index_std, f"not determined by the pixels: fixed at {settings.index:g}"
     elif name in ("tilt_x", "tilt_y"):
-        before, sentence = np.degrees(prior.tilt_std), "the pixels do not tell it: held level"
+        before, sentence = np.degrees(prior.tilt_std), "not determined by the pixels: assumed level"
     elif name in LENS_NAMES:
         before = prior.lens_std[LENS_NAMES.index(name)] * (model.camera.lens.fx if name == "focal" else 1.0)
-        sentence = "the pixels do not tell it: held at the camera file's"
-    elif name in ("water_height", "point_distance") and settings.known_depth:
+        sentence = "not determined by the pixels: fixed at the camera file's"
+    elif name in ("water_height", "point_distance") and settings.stated_depth:
         before, sentence = prior.depth_std, "rests on the measured height"
     elif name in ("camera_height", "camera_distance", "water_height", "point_distance"):
         if min(model.clearance, model.depth - model.interface.thickness) < AT_BOUND * reach:
             return "at its bound: the plane touches the camera or a point"
-        before, sentence = FAR * reach / TOLD, "the pixels do not tell it"
-    return sentence if np.isfinite(before) and std > TOLD * before else ""
+        before, sentence = FAR * reach / IDENTIFIED, "not determined by the pixels"
+    return sentence if np.isfinite(before) and std > IDENTIFIED * before else ""
 
 
 # What a survey cannot tell, and what to measure so that the next one can.
@@ -899,13 +899,13 @@ def _doubt(name: str, std: float, fit: Refined, settings: Settings) -> str:
 NARROW = np.radians(20.0)
 """Angle of incidence below which refraction looks like a nearer floor."""
 
-ONE_DEPTH = 0.02
+COMMON_DEPTH = 0.02
 """Spread of depths, over the distance to the camera, below which they count as one."""
 
 CERTAIN = 0.999
 """Share of the marks above the water that are taken for such."""
 
-WHOLE_LENS = "--fit pose,height,tilt,index,focal,center,distortion"
+FULL_LENS = "--fit pose,height,tilt,index,focal,center,distortion"
 
 
 def advice(
@@ -931,13 +931,13 @@ def advice(
     if touching:
         yield finding("plane_touches", places=tuple(touching))
     yield from contradicted
-    yield from _place(fit, observed, surface, settings, table)
+    yield from _separability(fit, observed, surface, settings, table)
     yield from _conflicts(fit, surface, settings)
     yield from _numbers(fit, observed)
-    yield from _left_out(fit, observed, surface)
+    yield from _excluded_rows(fit, observed, surface)
 
 
-def _place(
+def _separability(
     fit: Refined, observed: Observations, surface: bool, settings: Settings, table: Mapping[str, Estimate]
 ) -> Iterator[Finding]:
     """On camera height, water height and index, which few points cannot separate."""
@@ -954,13 +954,13 @@ def _place(
     tape = "measure the water's height with a tape and give --water-height"
     tape = (
         ""
-        if settings.known_depth
+        if settings.stated_depth
         else f": {tape if surface else 'measure where the wall is and give --plane'}"
     )
     if steepest < NARROW:
         angle = float(np.degrees(steepest))
         yield finding("points_narrow", radius=radius, angle=angle, quantities=quantities, remedy=tape)
-    if levels < ONE_DEPTH * distance and half > 0.01 * distance:
+    if levels < COMMON_DEPTH * distance and half > 0.01 * distance:
         yield finding("one_depth", spread=levels, quantities=quantities, half=1000.0 * half, remedy=tape)
     if not height.identifiable:
         low, high = height.ci95
@@ -976,7 +976,7 @@ def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[Find
     prior, model = fit.prior, fit.model
     focal = NAMES.index("focal")
     plane_name = "water's height" if surface else "plane's place"
-    lens = "" if fit.active[focal] else f"; or let the lens be fitted ({WHOLE_LENS})"
+    lens = "" if fit.active[focal] else f"; or let the lens be fitted ({FULL_LENS})"
     if np.isfinite(prior.index_std):
         pull = (model.interface.index_far - settings.index) / prior.index_std
         if abs(pull) > 3.0:
@@ -1003,13 +1003,13 @@ def _numbers(fit: Refined, observed: Observations) -> Iterator[Finding]:
     if locations < 12:
         yield finding("few_places", places=locations)
     if fit.noise.pixel > 1.5:
-        yield finding("residuals_large", residual=fit.noise.pixel, options=WHOLE_LENS)
+        yield finding("residuals_large", residual=fit.noise.pixel, options=FULL_LENS)
     if fit.noise.scale > 2.0:
         error = 1000.0 * fit.noise.survey * fit.noise.scale
         yield finding("survey_rough", times=fit.noise.scale, error=error)
 
 
-def _left_out(fit: Refined, observed: Observations, surface: bool) -> Iterator[Finding]:
+def _excluded_rows(fit: Refined, observed: Observations, surface: bool) -> Iterator[Finding]:
     """Rows that were left out: marks above the water that nobody called dry, and others."""
     above = _above(fit, observed)
     wrong = int((~fit.used & ~above).sum())
@@ -1039,7 +1039,7 @@ DOUBT = 20.0
 LEVEL = np.radians(3.0)
 """A plane of any direction that is found this near to level is a water surface [rad]."""
 
-MOST_LEAN = np.radians(5.0)
+MAX_LEAN = np.radians(5.0)
 """A surface tilted further from the survey's z than this is none [rad]."""
 
 LENS_STEPS = (("focal", "center"), ("focal", "center", "distortion"))
@@ -1058,7 +1058,7 @@ class PoolFit(Refined):
     settings: Settings
     estimates: dict[str, Estimate]
     correlation: Correlation
-    seen: Observations
+    observed: Observations
     residual: Array
     """Measured minus predicted [px], (N, 2)."""
     error: Array
@@ -1079,7 +1079,7 @@ class PoolFit(Refined):
         """Names of the rows left out, the worst first."""
         size = np.linalg.norm(self.residual, axis=1)
         rows = np.flatnonzero(~self.used)
-        return [self.seen.names[i] for i in rows[np.argsort(-size[rows])]]
+        return [self.observed.names[i] for i in rows[np.argsort(-size[rows])]]
 
     def residual_json(self) -> dict[str, float | int]:
         """Figures of the rows used."""
@@ -1087,7 +1087,7 @@ class PoolFit(Refined):
         error = error[np.isfinite(error).all(axis=1)]
         return {
             "points": int(self.used.sum()),
-            "locations": len(np.unique(self.seen.location[self.used])),
+            "locations": len(np.unique(self.observed.location[self.used])),
             "rms_px": rms(self.residual[self.used]),
             "rms_mm": 1000.0 * rms(error),
             "pixel_sigma": self.noise.pixel,
@@ -1132,7 +1132,7 @@ def calibrate_pool(observed: Observations, lens: Lens, settings: Settings | None
         settings=settings,
         estimates=table,
         correlation=errors,
-        seen=observed,
+        observed=observed,
         residual=residuals(fit.model, observed)[0],
         error=error_vectors(fit.model, observed, normal),
         held_out=parts[0],
@@ -1157,7 +1157,7 @@ def _refined(
 
 
 def _best_lens(
-    observed: Observations, best_start: Found, settings: Settings, notes: list[Finding]
+    observed: Observations, best_start: BestStart, settings: Settings, notes: list[Finding]
 ) -> Refined:
     """The fit as asked; where nobody asked, the lens is fitted as far as held-out points get better by it."""
     start = replace(best_start.model, interface=replace(best_start.model.interface, index_far=settings.index))
@@ -1214,7 +1214,7 @@ def _released(observed: Observations, settings: Settings, fit: Refined, notes: l
     # Small enough to be a tilt, and told by the pixels rather than free to go anywhere.
     lean = _lean(free.model, fit.prior.normal)
     error = float(np.sqrt(max(free.covariance[k, k] for k in (6, 7))))
-    if not (lean < MOST_LEAN and error < lean / 3.0):
+    if not (lean < MAX_LEAN and error < lean / 3.0):
         return fit
     notes.append(finding("plane_tilted", lean=float(np.degrees(lean))))
     return free
@@ -1227,7 +1227,7 @@ def _lean(model: PoolModel, normal: Array) -> float:
 
 def _contradicted(observed: Observations, settings: Settings, fit: Refined) -> list[Finding]:
     """A finding where the pixels by themselves put the plane elsewhere than it was measured."""
-    if not settings.known_depth or not fit.active[NAMES.index("depth")]:
+    if not settings.stated_depth or not fit.active[NAMES.index("depth")]:
         return []
     free = _without(observed, settings, fit, replace(fit.prior, depth_std=np.inf))
     if free is None:
@@ -1247,7 +1247,7 @@ def _without(observed: Observations, settings: Settings, fit: Refined, loose: Pr
     return free if 2.0 * (held.cost - free.cost) > DOUBT else None
 
 
-def _pinhole(observed: Observations, best_start: Found, settings: Settings, fit: Refined) -> Refined:
+def _pinhole(observed: Observations, best_start: BestStart, settings: Settings, fit: Refined) -> Refined:
     """Straight lines fitted to the same rows, as plain calibrations do."""
     model = replace(best_start.pinhole, camera=replace(best_start.pinhole.camera, lens=fit.model.camera.lens))
     active = fit.active & np.array([name in NAMES[:6] or name in NAMES[10:] for name in NAMES])
@@ -1313,7 +1313,7 @@ def _refuse_depth(fit: PoolFit) -> None:
 
 def _measured_depth(fit: PoolFit) -> tuple[float, str]:
     """Distance of the plane from the middle of the points under water as it was measured [m], and by which option."""
-    settings, middle = fit.settings, fit.seen.points[~fit.seen.dry].mean(axis=0)
+    settings, middle = fit.settings, fit.observed.points[~fit.observed.dry].mean(axis=0)
     if settings.water_height is not None:
         return abs(settings.water_height - float(middle[2])), f"--water-height {settings.water_height:g}"
     if settings.water_depth is not None:
@@ -1331,8 +1331,9 @@ def _touching(fit: PoolFit) -> list[Finding]:
         return []
     if error > ABSURD:
         raise CalibrationError(
-            f"the camera ends on the plane itself, with residuals of {error:.0f} px: no camera before this plane sees "
-            "the points so; check the unit and sign of the water's height, the window's thickness [m], the index, and "
+            f"the fitted camera is on the plane itself, with residuals of {error:.0f} px: no camera "
+            "in front of this plane fits the points; check the unit and sign of the water's height, the "
+            "window's thickness [m], the index, and "
             "whether there is water between at all; nothing is written"
         )
     return [finding("camera_on_plane", residual=error)]
@@ -1356,7 +1357,7 @@ def _handed(fit: PoolFit) -> list[Finding]:
         return []
     if settings.water_height is not None or settings.plane is not None:
         return []
-    values = np.linalg.svd(fit.seen.points - fit.seen.points.mean(axis=0), compute_uv=False)
+    values = np.linalg.svd(fit.observed.points - fit.observed.points.mean(axis=0), compute_uv=False)
     if values[2] >= LEAST_THICKNESS * values[1]:
         return []
     return [finding("handedness_open")]
@@ -1368,16 +1369,17 @@ def _handed(fit: PoolFit) -> list[Finding]:
 DIGITS = {"m": 4, "deg": 3, "px": 2}
 """Digits after the point: tenths of a millimetre, thousandths of a degree, hundredths of a pixel; five without unit."""
 
-MOST_NAMES = 12
+MAX_NAMES = 12
 """Outliers that a sentence names."""
 
 LEAST_SPREAD = 5.0
 """Largest width of all pixels that are refused: numbers from 0 to 1 are no pixels [px]."""
 
 READING = (
-    "The interval holds the true value in 19 of 20 such calibrations, if what was given beforehand (index, tape, "
-    "level, camera file) is as exact as it was said to be. A note says where the pixels do not tell a number and what "
-    "it rests on instead. Judge the result by the error at points held out, in the depth where it will be used. "
+    "The interval holds the true value in 19 of 20 such calibrations, if the priors (index, tape, "
+    "level, camera file) are as accurate as stated. A note marks a number that the pixels do not "
+    "determine, and names its prior. Judge the result by the error at points held out, in the depth "
+    "where it will be used. "
     "Arrows that swirl or grow outwards tell of a wrong lens, window or water height; others are noise."
 )
 
@@ -1438,8 +1440,8 @@ def pool_report(fit: PoolFit) -> Report:
     if fit.pinhole_held_out is not None:
         summary.append(f"straight lines, held out: {_figures(fit.pinhole_held_out)}")
     if fit.outliers:
-        more = ", ..." if len(fit.outliers) > MOST_NAMES else ""
-        summary.append(f"left out as wrong: {', '.join(fit.outliers[:MOST_NAMES])}{more}")
+        more = ", ..." if len(fit.outliers) > MAX_NAMES else ""
+        summary.append(f"left out as wrong: {', '.join(fit.outliers[:MAX_NAMES])}{more}")
     kind = "water surface" if fit.surface else "wall"
     return Report(
         title=f"Camera and {kind} from {figures['locations']} surveyed places",
@@ -1455,7 +1457,7 @@ def pool_report(fit: PoolFit) -> Report:
 
 def _cells(estimate: Estimate) -> tuple[str, ...]:
     value, low, high = (f"{x:.{DIGITS.get(estimate.unit, 5)}f}" for x in (estimate.estimate, *estimate.ci95))
-    interval = "" if estimate.note == AS_GIVEN else f"{low} to {high}"
+    interval = "" if estimate.note == AS_STATED else f"{low} to {high}"
     return estimate.name, value, interval, estimate.unit, estimate.note
 
 
@@ -1474,7 +1476,7 @@ def _survey_share(fit: PoolFit) -> float:
     """
     if fit.held_out is None or not len(fit.held_out.rows):
         return math.nan
-    held_out_rows, noise = fit.seen.subset(fit.held_out.rows), fit.noise
+    held_out_rows, noise = fit.observed.subset(fit.held_out.rows), fit.noise
     sigma = np.where(np.isfinite(held_out_rows.sigma), held_out_rows.sigma, noise.survey)
     turn = noise.survey_yaw**2 * np.sum(held_out_rows.arm**2, axis=1)
     return 100.0 * noise.scale * float(np.sqrt(np.mean(2.0 * sigma**2 + turn)))
@@ -1502,7 +1504,7 @@ def _map(fit: PoolFit) -> Figure:
     if not fit.surface:
         across, names = fit.model.tangents, ("along the wall [m]", "along the wall, across [m]")
     axes.plot(*(across @ fit.model.camera.position), "^", color="black", markersize=8, label="camera")
-    draw_arrows(axes, fit.seen.points @ across.T, 1000.0 * fit.error @ across.T, fit.used, "mm", 1000.0)
+    draw_arrows(axes, fit.observed.points @ across.T, 1000.0 * fit.error @ across.T, fit.used, "mm", 1000.0)
     axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
     return figure
 
@@ -1511,7 +1513,7 @@ def _picture(fit: PoolFit) -> Figure:
     lens = fit.model.camera.lens
     figure = new_figure(7.4, 7.4 * lens.height / lens.width + 0.6)
     axes = figure.subplots()
-    draw_arrows(axes, fit.seen.pixels, fit.residual, fit.used, "px", 1.0)
+    draw_arrows(axes, fit.observed.pixels, fit.residual, fit.used, "px", 1.0)
     picture_axes(axes, lens)
     return figure
 
@@ -1547,38 +1549,41 @@ def run(
     seed: int = 0,
     as_json: bool = False,
 ) -> PoolFit:
-    """Find camera pose [m, deg] and water plane (height [m], tilt [deg], index) from surveyed points in the water.
+    """Estimate camera pose [m, deg] and water plane (height [m], tilt [deg], index) from surveyed points in the
+    water.
 
     Example: finssim calibrate pool points.csv --surveyed survey.csv --camera camera.yaml --out pool.yaml
 
     Args:
-        inputs (INPUT): Detections (.csv), pixels (id,u,v), pixels with points (u,v,x,y,z), or pictures of tags.
+        inputs (INPUT): Detections (.csv), pixels (id,u,v), pixels with points (u,v,x,y,z), or images of tags.
         camera (FILE): Camera file: ours, or one of OpenCV, ROS or Kalibr.
         out (FILE): Pool file to write (.yaml).
         surveyed (FILE): Survey (.csv): id,x,y,z of points, or tag,x,y,z,yaw_deg,edge of tags, or
-            image,x,y,z,yaw_deg,edge of one tag that was moved; not needed where the inputs hold the points.
-        report (DIR): Directory for the report and its pictures.
-        interface (KIND): What the camera looks through: surface, wall, or auto to try.
-        plane (PLANE): The surveyed plane itself, n_x,n_y,n_z,b with n . X + b = 0 [m].
-        window (LAYER): Solid layer THICKNESS:INDEX, such as 0.010:1.52 for 10 mm of glass; several from the camera on.
-        water_height: z of the surface in the survey's frame, by a tape [m].
-        water_depth: In place of it: from the surveyed points to the surface [m].
-        water_height_sigma: Error of either, or of the plane's place [m]; 0.005 if not given.
+            image,x,y,z,yaw_deg,edge of one moved tag; not needed if the inputs contain the points.
+        report (DIR): Directory for the report and its figures.
+        interface (KIND): Interface between camera and water: surface, wall, or auto.
+        plane (PLANE): Surveyed interface plane n_x,n_y,n_z,b with n . X + b = 0 [m].
+        window (LAYER): Solid layer THICKNESS:INDEX, such as 0.010:1.52 for 10 mm of glass; several in order from
+            the camera.
+        water_height: z of the surface in the survey's frame, from a tape measure [m].
+        water_depth: Depth of the surveyed points below the surface [m], instead of --water-height.
+        water_height_sigma: Standard deviation of either, or of the plane's position [m]; 0.005 if not given.
         index: Refractive index of the water.
-        index_sigma: Error of that; 0.003 if neither is given, 0 (held) if only --index is.
-        tilt_sigma: How far the plane may lean [deg]; 0.2 for a surface, 0.5 for --plane, free for a wall.
-        fit (NAMES): What is fitted, of pose,height,tilt,index,focal,center,distortion; chosen if not given.
-        focal_sigma: Relative error of the camera file's focal length; what the file says if not given.
-        center_sigma: Error of its optical centre [px]; what the file says if not given.
-        pixel_sigma: Error of a pixel [px]; from the residuals if not given.
-        survey_sigma: Error of a surveyed coordinate [m].
-        survey_yaw_sigma: Error of a tag's direction [deg].
-        unit (UNIT): Of lengths in tables that do not say: m, cm, mm, in, ft.
-        z: Height of points whose table has no such column [m].
-        edge: Of tags whose survey has no such column [m].
-        family (NAME): Of tags in pictures.
-        latency: Time stamps of pictures minus their exposure [s], kept in the file.
-        folds: Parts that are held out in turn.
+        index_sigma: Standard deviation of the index; 0.003 if neither is given, 0 (fixed) if only --index is.
+        tilt_sigma: Standard deviation of the plane's tilt [deg]; 0.2 for a surface, 0.5 for --plane, free for a
+            wall.
+        fit (NAMES): Parameters to fit, of pose,height,tilt,index,focal,center,distortion; automatic if not given.
+        focal_sigma: Relative standard deviation of the camera file's focal length; from the file if not given.
+        center_sigma: Standard deviation of its optical centre [px]; from the file if not given.
+        pixel_sigma: Standard deviation of a pixel [px]; from the residuals if not given.
+        survey_sigma: Standard deviation of a surveyed coordinate [m].
+        survey_yaw_sigma: Standard deviation of a tag's heading [deg].
+        unit (UNIT): Unit of lengths in tables without one: m, cm, mm, in, ft.
+        z: Height of points in tables without z [m].
+        edge: Edge of tags in surveys without that column [m].
+        family (NAME): Family of the tags in images.
+        latency: Time stamps of images minus their exposure [s], written to the file.
+        folds: Folds of the cross-validation.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 

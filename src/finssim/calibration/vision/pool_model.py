@@ -222,7 +222,7 @@ class Settings:
     survey_yaw_sigma: float = math.radians(0.5)
     """Of a tag's direction [rad]."""
     folds: int = 5
-    """Parts that are held out in turn."""
+    """Folds of the cross-validation."""
     seed: int = 0
     """Of the parts and of samples."""
 
@@ -264,7 +264,7 @@ class Settings:
             raise CalibrationError(f"plane has normal {self.plane[:3]}, expected a direction")
 
     @property
-    def known_depth(self) -> bool:
+    def stated_depth(self) -> bool:
         """Whether a measurement of the plane's place is given."""
         return any(x is not None for x in (self.water_height, self.water_depth, self.plane))
 
@@ -281,7 +281,7 @@ def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.
     held = {
         "index": settings.index_sigma <= 0.0,
         "tilt": settings.tilt_sigma is not None and settings.tilt_sigma <= 0.0,
-        "height": settings.known_depth and settings.water_height_sigma <= 0.0,
+        "height": settings.stated_depth and settings.water_height_sigma <= 0.0,
     }
     groups = {*(settings.fit or ("pose", "height", "tilt", "index")), *extra}
     groups |= {name for name in ("focal", "center") if getattr(settings, f"{name}_sigma") > 0.0}
@@ -303,7 +303,7 @@ LOST = 500.0
 NEARER = 0.1
 """Part of its distance from a point or the camera that one step must leave the plane."""
 
-MOST_BOUNDS = 60
+MAX_BOUNDS = 60
 """Points looked at in one step, those that the plane comes nearest to."""
 
 Whitening = Callable[[Array], Array]
@@ -389,7 +389,7 @@ def solve(
         def stepped(damping: float) -> PoolModel | None:
             step = np.zeros(len(NAMES))
             step[free] = _sliding(H + damping * np.eye(len(free)), b, scale, bounds) / scale
-            return _tried(model, step, observed, 8 in free)
+            return _stepped(model, step, observed, 8 in free)
 
         return stepped
 
@@ -448,7 +448,7 @@ def _sliding(H: Array, b: Array, scale: Array, bounds: tuple[Array, Array]) -> A
     clearance = distance + (rows / scale) @ x
     if np.all(clearance >= NEARER * distance):
         return x
-    near = np.argsort(clearance / np.maximum(distance, 1e-300))[:MOST_BOUNDS]
+    near = np.argsort(clearance / np.maximum(distance, 1e-300))[:MAX_BOUNDS]
     values, vectors = np.linalg.eigh(H)
     root = vectors / np.sqrt(np.maximum(values, 1e-14))
     G = (rows[near] / scale) @ root
@@ -464,7 +464,7 @@ def _sliding(H: Array, b: Array, scale: Array, bounds: tuple[Array, Array]) -> A
     return x if off < 1e-9 else np.asarray(x - root @ r[:-1] / r[-1] * size)
 
 
-def _tried(model: PoolModel, step: Array, observed: Observations, movable: bool) -> PoolModel | None:
+def _stepped(model: PoolModel, step: Array, observed: Observations, movable: bool) -> PoolModel | None:
     """The model a step away, or None where the step leads out of all sense.
 
     What a turn of the plane takes from a clearance beyond first order is given back by its depth where that may move.

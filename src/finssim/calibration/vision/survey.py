@@ -17,7 +17,7 @@ from finssim.calibration.trials.conversion import UNITS
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
 from finssim.localization import LocalizationError
 from finssim.localization.camera_file import Fields
-from finssim.localization.detection.detections import Frame, most_certain, read_detections
+from finssim.localization.detection.detections import Frame, best_detections, read_detections
 from finssim.localization.detection.families import corners
 from finssim.text_table import TextTable, read_text, read_text_table, text_table
 from finssim.text_table import number as _number
@@ -142,9 +142,11 @@ def read_table(path: str | Path, *, unit: str | None = None) -> Table:
     text, _ = read_text(path, CalibrationError)
     table = text_table(text, spaces=None, comment=COMMENT)
     heads = [text_table(line.lstrip("#%/ "), spaces=None).names for line in table.comments]
-    if heads and table.names and _known(table.names) < 2:  # the header itself may be behind a comment sign
-        head = max(heads, key=_known)
-        if _known(head) >= 2:
+    if (
+        heads and table.names and _recognised(table.names) < 2
+    ):  # the header itself may be behind a comment sign
+        head = max(heads, key=_recognised)
+        if _recognised(head) >= 2:
             table = text_table(text, names=head, spaces=None, comment=COMMENT)
     if not table.names:
         lack = "holds nothing but comments" if table.comments else "is empty"
@@ -223,7 +225,7 @@ def _factor(name: str, unit: str, default: str | None, cells: list[str]) -> floa
     return 1.0
 
 
-def _known(names: Sequence[str]) -> int:
+def _recognised(names: Sequence[str]) -> int:
     """How many column names mean something here."""
     return sum(bool(_column(word)[0]) for word in names)
 
@@ -558,7 +560,7 @@ def _match_frames(rows: _Rows, frames: Sequence[Frame], survey: Survey) -> None:
         if survey.locations and not lay and not survey.tags:
             rows.unknown[frame.image or "a picture without a name"] = None
             continue
-        detections = most_certain(frame.detections)
+        detections = best_detections(frame.detections)
         for detection in detections:
             placed = survey.tags.get(detection.tag)
             for tag, here in lay:

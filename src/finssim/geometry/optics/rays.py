@@ -217,10 +217,10 @@ def project(camera: Camera, interface: Interface, points_p: npt.ArrayLike) -> Pr
         Pixels with a status each: WRONG_SIDE, BEHIND_CAMERA and NO_RAY have none, OUTSIDE_IMAGE has.
     """
     with np.errstate(all="ignore"):
-        return seen_at(camera, refract(camera, interface, np.asarray(points_p, float)))
+        return refracted_pixels(camera, refract(camera, interface, np.asarray(points_p, float)))
 
 
-def seen_at(camera: Camera, refraction: Refraction) -> Projection:
+def refracted_pixels(camera: Camera, refraction: Refraction) -> Projection:
     """Pixels of rays that are already found."""
     with np.errstate(all="ignore"):
         surface = camera.position + refraction.height * refraction.direction
@@ -384,7 +384,7 @@ class Jacobians:
     @cached_property
     def projection(self) -> Projection:
         """What `project` returns, from the rays that are found already."""
-        return seen_at(self._camera, self._found)
+        return refracted_pixels(self._camera, self._found)
 
     @cached_property
     def point(self) -> Array:

@@ -33,7 +33,7 @@ CHASE: dict[str, dict[str, Any]] = {
     "ppo": {"discount": 0.99, "steps": 600_000},
 }
 
-SEEN: dict[str, dict[str, Any]] = {"bc": {"steps": 600_000, "hidden": (128, 64), "batch": 256}}
+SIGHT: dict[str, dict[str, Any]] = {"bc": {"steps": 600_000, "hidden": (128, 64), "batch": 256}}
 """Of tasks with pictures, each of which costs a network of its own."""
 
 SETTINGS: Table = {
@@ -48,11 +48,11 @@ SETTINGS: Table = {
     "t3": {"on-policy": {"discount": 0.95}, "ppo": {"steps": 600_000}},
     "docking": {"ppo": {"steps": 900_000}},
     # Its teacher succeeds in all episodes after a quarter of these steps, and its student after half of them.
-    "pipeline": {"distill": {"teacher_steps": 600_000, "steps": 60_000}, **SEEN},
-    "gate": {"distill": {"teacher_steps": 600_000}, **SEEN},
+    "pipeline": {"distill": {"teacher_steps": 600_000, "steps": 60_000}, **SIGHT},
+    "gate": {"distill": {"teacher_steps": 600_000}, **SIGHT},
     # Its student succeeds in all episodes after a quarter of these steps.
-    "net": {"distill": {"teacher_steps": 300_000, "steps": 12_800}, **SEEN},
-    "camera-docking": SEEN,
+    "net": {"distill": {"teacher_steps": 300_000, "steps": 12_800}, **SIGHT},
+    "camera-docking": SIGHT,
     "pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "teacher": "lead"}},
     # With 1.5 million, half of the seeds have only begun to capture.
     "team-pursuit": {
@@ -98,7 +98,7 @@ RANDOMIZED: Table = {
 """On top of those, where every episode has another vehicle (`--randomize`)."""
 
 
-def own_settings(task: str, learner: str, randomized: bool) -> dict[str, Any]:
+def task_settings(task: str, learner: str, randomized: bool) -> dict[str, Any]:
     """Changes of a learner's defaults for a task; none for a task that no table names."""
     changes: dict[str, Any] = {}
     for name in ("*", task):
@@ -191,7 +191,7 @@ class ActingLearner:
         self.steps = 0
 
     @property
-    def left(self) -> float:
+    def remaining(self) -> float:
         """Part of the training that is still to come, in [0, 1]."""
         return max(0.0, 1.0 - self.steps / self.settings.steps)
 

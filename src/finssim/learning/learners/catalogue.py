@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol
 
-from finssim.learning.learners.base import ActingLearner, own_settings
+from finssim.learning.learners.base import ActingLearner, task_settings
 from finssim.tasks import Environment, Task
 from finssim.tasks.make import own_class
 
@@ -83,7 +83,7 @@ class LearnerKind:
         """
         task_changes = {}
         if self.own is None:
-            task_changes = own_settings(
+            task_changes = task_settings(
                 task.name, next(name for name, kind in LEARNERS.items() if kind == self), randomized
             )
         chosen = self._class().settings_for(task, task_changes, worlds, steps)
@@ -145,25 +145,23 @@ LEARNERS: dict[str, LearnerKind] = {
     "torchrl-ippo": LearnerKind(
         "torchrl_ppo",
         "TorchRlIppo",
-        "independent PPO of TorchRL: each agent's value from what it sees",
+        "independent PPO of TorchRL: each agent's value from its own observation",
         extra="torchrl",
         agents="several",
     ),
     "torchrl-mappo": LearnerKind(
         "torchrl_ppo",
         "TorchRlMappo",
-        "multi-agent PPO of TorchRL: values from what all agents see",
+        "multi-agent PPO of TorchRL: values from the observations of all agents",
         extra="torchrl",
         agents="several",
     ),
     "bc": LearnerKind("imitation", "Bc", "behaviour cloning of demonstrations", extra="imitation", sees=None),
-    "dagger": LearnerKind(
-        "imitation", "Dagger", "DAgger: an expert says what it would have done", extra="imitation"
-    ),
+    "dagger": LearnerKind("imitation", "Dagger", "DAgger: an expert labels each step", extra="imitation"),
     "distill": LearnerKind(
         "distill",
         "Distill",
-        "a teacher by PPO, who shows a student with a camera what to do",
+        "a teacher by PPO, distilled into a student with images",
         extra="perception",
         agents="one",
         sees=True,
@@ -175,7 +173,7 @@ LEARNERS: dict[str, LearnerKind] = {
 
 MAY_BE_ZERO = ("warm_up", "clone_passes", "expert_rounds", "history", "memory")
 """Settings that count what may be left out; of all others there is at least one."""
-MOST = 10**9
+LARGEST = 10**9
 """Of anything that is counted."""
 SIGNED = ("log_std", "entropy")
 """Numbers that may be negative."""
@@ -220,8 +218,8 @@ def _fitting(settings: Any, name: str, value: Any) -> Any:
         ) from error
     least = 0 if name in MAY_BE_ZERO else 1
     counts = fitting if kind is tuple else (fitting,) if kind is int else ()
-    if any(not least <= count <= MOST for count in counts):
-        raise LearningError(f"setting {name} is {value!r}, expected {least} or more, at most {MOST}")
+    if any(not least <= count <= LARGEST for count in counts):
+        raise LearningError(f"setting {name} is {value!r}, expected {least} or more, at most {LARGEST}")
     if kind is float and not math.isfinite(fitting):
         raise LearningError(f"setting {name} is {value!r}, expected a finite number")
     if kind is float and name not in SIGNED and not 0.0 <= fitting <= (1.0 if name in SHARES else math.inf):

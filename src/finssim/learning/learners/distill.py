@@ -170,7 +170,7 @@ class Distill(ActingLearner):
         """Regression on batches drawn with replacement; mean squared errors of the action and of the teacher's row."""
         s, total = self.settings, torch.zeros(2, device=self.device)
         for group in self.optimizer.param_groups:
-            group["lr"] = s.learning_rate * max(self.left, 0.02)
+            group["lr"] = s.learning_rate * max(self.remaining, 0.02)
         for _ in range(batches):
             index = torch.randint(min(self._count, s.kept), (s.batch,), device=self.device)
             batch = {name: values[index] for name, values in self._kept.items()}

@@ -132,7 +132,7 @@ class _Cloner(ActingLearner):
     ) -> float:
         """Regression on batches drawn with replacement; the mean squared error over all of them."""
         for group in self.optimizer.param_groups:
-            group["lr"] = self.settings.learning_rate * self.left
+            group["lr"] = self.settings.learning_rate * self.remaining
         total, rounds = 0.0, max(1, count // self.settings.batch)
         for _ in range(rounds):
             index = torch.randint(len(observation), (self.settings.batch,))

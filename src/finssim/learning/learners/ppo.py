@@ -125,7 +125,7 @@ class InformedTeacher:
         ppo, A = self._ppo, self._ppo.arrays
         observation, ppo._integral = A.array(reading.observation), A.array(memory)
         observation, integral = ppo._integrated(observation)
-        action = ppo.actor(ppo._look(observation, ppo._drawn)[1])
+        action = ppo.actor(ppo._encode(observation, ppo._drawn)[1])
         return A.numpy(A.xp.clip(action, -1.0, 1.0)), A.numpy(integral)
 
     def learned(self) -> dict[str, Any] | None:
@@ -184,7 +184,7 @@ class Ppo(ActingLearner):
         )
         if s.teacher == INFORMED and not has_privileged:
             raise LearningError(
-                "an informed teacher sees what randomisation has drawn: give randomize, and leave asymmetric as it is"
+                "an informed teacher observes the drawn parameters: give randomize, and keep asymmetric"
             )
         self._window = s.history * n + (m if s.last_action else 0)
         drawn = 0 if self._drawn is None else self._drawn.shape[1]
@@ -235,7 +235,7 @@ class Ppo(ActingLearner):
         """One rollout, and `epochs` passes over it; a row of the training curve."""
         if isinstance(self._teacher, InformedTeacher) and not self._teacher.trained:
             self._teacher.train()
-        rate = self.settings.learning_rate * self.left
+        rate = self.settings.learning_rate * self.remaining
         with self.arrays.plain():
             before = self.arrays.copy(self._memory[:, self._window :])
             self._roll_out()
@@ -253,7 +253,7 @@ class Ppo(ActingLearner):
         sigma = A.xp.exp(self.noise.values)
         for t in range(s.rollout):
             observation, integral = self._integrated(self._observation)
-            x, self._x[t], h, judged = self._look(observation, self._drawn)
+            x, self._x[t], h, judged = self._encode(observation, self._drawn)
             if self._c is not self._x:
                 self._c[t] = judged
             action, noise = self._u[t], A.noise(self._noise)
@@ -268,19 +268,19 @@ class Ppo(ActingLearner):
             self.environment.advance()
             self.tally.look()
             self._close(t)
-        self._c[s.rollout] = self._look(self._integrated(self._observation)[0], self._drawn)[3]
+        self._c[s.rollout] = self._encode(self._integrated(self._observation)[0], self._drawn)[3]
 
     @property
     def _taught(self) -> bool:
         """Whether the teacher is imitated in this update."""
-        return self._teacher is not None and 1.0 - self.left < self.settings.taught
+        return self._teacher is not None and 1.0 - self.remaining < self.settings.taught
 
     def _ask(self, t: int) -> None:
         """Note what the teacher would do at step t, and at first do it."""
         reading = Known(self.arrays.numpy(self._observation))
         answer, self._remembered = self._teacher.act(self._remembered, reading, NOWHERE)  # type: ignore[union-attr]
         label = self._label[t] = self.arrays.array(answer)  # type: ignore[index]
-        if 1.0 - self.left < self.settings.taught / 3.0:
+        if 1.0 - self.remaining < self.settings.taught / 3.0:
             self._u[t] = label
 
     def _integrated(self, observation: Array) -> tuple[Array, Array]:
@@ -289,7 +289,7 @@ class Ppo(ActingLearner):
             return observation, self._integral
         return with_integrals(self.arrays.xp, observation, self._integral, self._errors)
 
-    def _look(self, observation: Array, drawn: Array | None) -> tuple[Array, Array, Array | None, Array]:
+    def _encode(self, observation: Array, drawn: Array | None) -> tuple[Array, Array, Array | None, Array]:
         """The scaled observation, what the policy sees, what its GRU makes of that, and what the critic sees."""
         xp, k = self.arrays.xp, self._window
         x = (observation - self._mean) * self._scale if self.settings.normalize else observation
@@ -320,7 +320,7 @@ class Ppo(ActingLearner):
             A.xp.broadcast_to(mask[:, None], (e.worlds, e.agents)).reshape(-1)
             for mask in (truncated & ~terminated, done)
         )
-        value = self.critic(self._look(self._integrated(self._final)[0], self._final_drawn)[3])[:, 0]
+        value = self.critic(self._encode(self._integrated(self._final)[0], self._final_drawn)[3])[:, 0]
         self._r[t] += self.settings.discount * A.xp.where(late, value, 0.0 * value)
         self._go[t] = A.xp.where(done, 0.0 * value, 0.0 * value + 1.0)
         if self._taught:

@@ -48,7 +48,7 @@ class RslRlPpo(ActingLearner):
         age_episodes(environment)
         self._worlds = Tensors(environment)
         self._rows = environment.worlds * environment.agents
-        groups_now = self._seen()
+        groups_now = self._observe()
         groups = {"actor": ["policy"], "critic": list(groups_now.keys())}
         noise = {
             "class_name": "GaussianDistribution",
@@ -87,19 +87,19 @@ class RslRlPpo(ActingLearner):
     def update(self) -> dict[str, float]:
         """One rollout, and `epochs` passes over it."""
         self.ppo.train_mode()
-        groups = self._seen()
+        groups = self._observe()
         with torch.inference_mode():
             for _ in range(self.settings.rollout):
                 action = self.ppo.act(groups)
                 terminated, truncated = self._worlds.step(action)
                 self.tally.look()
-                groups = self._seen()
+                groups = self._observe()
                 reward = self._worlds.reward.flatten().clone()
                 self._add_last_values(reward, truncated & ~terminated)
                 self.ppo.process_env_step(groups, reward, self._by_row(terminated | truncated), {})
             self.ppo.compute_returns(groups)
         self.steps += self.environment.worlds * self.settings.rollout
-        self._set_rate(self.settings.learning_rate * self.left)
+        self._set_rate(self.settings.learning_rate * self.remaining)
         losses = self.ppo.update()
         row = {"value_loss": losses["value"], "policy_gradient_loss": losses["surrogate"]}
         return {**self.tally.row(), "action_std": self.ppo.actor.output_std.mean().item(), **row}
@@ -117,7 +117,7 @@ class RslRlPpo(ActingLearner):
         """Take what `learned` gave."""
         self.ppo.load(state, None, True)
 
-    def _seen(self, final: bool = False) -> TensorDict:
+    def _observe(self, final: bool = False) -> TensorDict:
         """Copies of what actor and critic see now, or saw at the end of the episodes that ended in this step."""
         e, w = self.environment, self._worlds
         groups = {"policy": (w.final_observation if final else w.observation).reshape(self._rows, -1).clone()}
@@ -133,7 +133,9 @@ class RslRlPpo(ActingLearner):
         """
         rows = self._by_row(timed_out).nonzero().flatten()
         if len(rows):
-            reward[rows] += self.settings.discount * self.ppo.critic(self._seen(final=True)[rows]).flatten()
+            reward[rows] += (
+                self.settings.discount * self.ppo.critic(self._observe(final=True)[rows]).flatten()
+            )
 
     def _by_row(self, worlds: torch.Tensor) -> torch.Tensor:
         return worlds.repeat_interleave(self.environment.agents)

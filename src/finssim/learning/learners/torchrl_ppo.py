@@ -119,7 +119,7 @@ class TorchRlPpo(ActingLearner):
             samples = self._rollout()
         self.steps += self.environment.worlds * self.settings.rollout
         for group in self.optimizer.param_groups:
-            group["lr"] = self.settings.learning_rate * self.left
+            group["lr"] = self.settings.learning_rate * self.remaining
         losses = [self._learn(batch) for _ in range(self.settings.epochs) for batch in self._batches(samples)]
         policy, value = torch.stack(losses).mean(dim=0).tolist()
         row = {"action_std": self.actor.log_std.exp().mean().item(), "value_loss": value}

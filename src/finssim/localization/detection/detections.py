@@ -70,12 +70,12 @@ class Frame:
     """As found: an id may be there twice."""
 
 
-def most_certain(detections: Iterable[Detection]) -> list[Detection]:
+def best_detections(detections: Iterable[Detection]) -> list[Detection]:
     """One detection of each family and id: that with the fewest corrected bits, then the greatest margin."""
     best: dict[tuple[str, int], Detection] = {}
     for detection in detections:
         rival = best.setdefault((detection.family, detection.tag), detection)
-        if (detection.hamming, -_known(detection.margin)) < (rival.hamming, -_known(rival.margin)):
+        if (detection.hamming, -_comparable(detection.margin)) < (rival.hamming, -_comparable(rival.margin)):
             best[detection.family, detection.tag] = detection
     return list(best.values())
 
@@ -154,10 +154,10 @@ def read_detections(path: str | Path, notes: list[str] | None = None) -> list[Fr
 def _detection(table: TextTable, row: Mapping[str, str], label: str) -> Detection:
     pixels = [_number(table, row, f"{axis}{i}", label) for i in range(4) for axis in "uv"]
     return Detection(
-        tag=_whole(table, row, "tag", label),
+        tag=_integer(table, row, "tag", label),
         corners=np.array(pixels).reshape(4, 2),
         margin=_number(table, row, "margin", label) if row.get("margin") else math.nan,
-        hamming=_whole(table, row, "hamming", label) if row.get("hamming") else 0,
+        hamming=_integer(table, row, "hamming", label) if row.get("hamming") else 0,
         family=row.get("family", ""),
     )
 
@@ -171,7 +171,7 @@ def _number(table: TextTable, row: Mapping[str, str], name: str, label: str) -> 
     return value
 
 
-def _whole(table: TextTable, row: Mapping[str, str], name: str, label: str) -> int:
+def _integer(table: TextTable, row: Mapping[str, str], name: str, label: str) -> int:
     value = _number(table, row, name, label)
     if value != int(value) or value < 0:
         raise LocalizationError(f"{label}: {name} is {row[name]}, expected a whole number from 0")
@@ -202,7 +202,7 @@ def _columns(header: list[str], label: str) -> dict[str, int]:
     return columns
 
 
-def _known(margin: float) -> float:
+def _comparable(margin: float) -> float:
     return -math.inf if math.isnan(margin) else margin
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.localization import LocalizationError
-from finssim.localization.detection.detections import Detection, most_certain
+from finssim.localization.detection.detections import Detection, best_detections
 from finssim.localization.detection.families import EDGES, bitmap, family_named, find_tags
 
 __all__ = ["REFINEMENTS", "Detector", "RegionTracker", "SearchCounts", "detector"]
@@ -186,7 +186,7 @@ def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> Fit | None:
         fitted_blur = nearest_blur(blur + coarse.wider)  # sharper or softer than was assumed
         pattern = pattern_of(family, tag, fitted_blur)
         settled = _settle(pattern, patch, coarse.corners, limit) or coarse
-        weights = _weights_of(settled.left, settled.gain) if settled is not coarse else None
+        weights = _weights_of(settled.residual, settled.gain) if settled is not coarse else None
         if weights is not None:
             settled = (
                 _settle(pattern, patch, settled.corners, limit, solver=_solver(pattern, weights)) or settled
@@ -206,7 +206,7 @@ class _Settled:
     """White minus black, in gray levels or in shares of the local contrast."""
     wider: float
     """By how much the picture's blur is wider than the pattern's [cells]."""
-    left: Array
+    residual: Array
     """What the pattern does not explain, in the same unit, (n,)."""
     correlation: float
 
@@ -456,7 +456,7 @@ LEAST = 8.0
 """Smallest padding [px]."""
 PER_LOSS = 0.5
 """Growth of the padding with every picture in which the tag was not found [edges]."""
-MOST_LOST = 30
+MAX_LOST = 30
 """Pictures after which a lost tag is searched in the whole picture alone."""
 AHEAD = 1.5
 """Regions reach from the last place of a tag, should it have stopped, to this many times its motion since."""
@@ -489,7 +489,7 @@ class SearchCounts:
 
 
 @dataclass
-class _Seen:
+class _Remembered:
     """The last that is known of a tag."""
 
     corners: Array
@@ -517,7 +517,7 @@ class RegionTracker:
         self._detector = detector
         self._tags = None if tags is None else frozenset(tags)
         self._search_every = search_every
-        self._seen: dict[int, _Seen] = {}
+        self._seen: dict[int, _Remembered] = {}
         self._since_whole = search_every
         self._last_time = math.nan
 
@@ -553,7 +553,7 @@ class RegionTracker:
             detections += self._search(image, None)
             self._since_whole = 0
             self.counts.recovered += len({d.tag for d in detections} - here)
-        best = most_certain(detections)
+        best = best_detections(detections)
         self._remember(best, now)
         self.counts.found += len(best)
         return best
@@ -582,7 +582,7 @@ class RegionTracker:
                 corners = np.asarray(predicted[tag], float)
                 if np.isfinite(corners).all():
                     regions.append(region_around(corners, SIGMAS * predicted_std, lost))
-            elif remembered and lost <= MOST_LOST:
+            elif remembered and lost <= MAX_LOST:
                 ahead = remembered.corners + AHEAD * remembered.velocity * (now - remembered.time)
                 regions.append(region_around(np.vstack([remembered.corners, ahead]), 0.0, lost))
         return regions
@@ -595,7 +595,7 @@ class RegionTracker:
             velocity = np.zeros(2)
             if before is not None and before.lost <= 3 and now > before.time:
                 velocity = (tag.corners - before.corners).mean(axis=0) / (now - before.time)
-            self._seen[tag.tag] = _Seen(tag.corners, now, velocity)
+            self._seen[tag.tag] = _Remembered(tag.corners, now, velocity)
         self._last_time = now
 
 

@@ -22,7 +22,7 @@ Image = npt.NDArray[np.uint8]
 EDGES = {"edges": 1, "none": 0}
 """Name -> the library's `refine_edges`."""
 
-_ONE_AT_A_TIME = Lock()
+_LOCK = Lock()
 """The library keeps its memory in the detector, and ctypes lets other threads run meanwhile."""
 
 
@@ -38,7 +38,7 @@ def find_tags(image: Image, family: str, refine: str, max_hamming: int) -> list[
     # The library looks at squares whose sides are read two pixels around: a picture of a few pixels has none.
     if min(image.shape) < 16:
         return []
-    with _ONE_AT_A_TIME:
+    with _LOCK:
         detections = _library(family, refine).detect(np.ascontiguousarray(image))
     return [
         Detection(

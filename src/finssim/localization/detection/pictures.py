@@ -55,8 +55,8 @@ def pictures(
     if clock is not None:
         for file, name in names.items():
             if file.suffix.lower() in PICTURE_FILES and name not in clock and file.name not in clock:
-                raise LocalizationError(f"{times}: no time of {name}: add a line with it or leave it out")
-    return _stream(files, names, clock or {}, tell or _say)
+                raise LocalizationError(f"{times}: no time of {name}: add a line with it or omit it")
+    return _stream(files, names, clock or {}, tell or _print_note)
 
 
 def read_picture(path: Path) -> Image:
@@ -103,7 +103,7 @@ def write_picture(image: npt.NDArray[np.uint8], path: Path | str) -> None:
         temporary.write_bytes(encoded.tobytes())
 
 
-def _say(sentence: str) -> None:
+def _print_note(sentence: str) -> None:
     print(sentence, file=sys.stderr)
 
 

@@ -257,7 +257,7 @@ STEEPEST = math.radians(80.0)
 """Pitch beyond which the gyro tells no yaw rate."""
 KINEMATIC_GATES = ("vision", "yaw", "depth")
 """Streams in the order of their gates."""
-TAKEN, STEEP = (Outcome("imu", "accepted"),), (Outcome("imu", "steep"),)
+ACCEPTED, STEEP = (Outcome("imu", "accepted"),), (Outcome("imu", "steep"),)
 
 
 @dataclass(frozen=True)
@@ -327,7 +327,7 @@ class ConstantVelocity:
             rate=rate,
             imu_time=sample.time,
         )
-        return track, STEEP if steep else TAKEN
+        return track, STEEP if steep else ACCEPTED
 
     def depth(self, track: Track, sample: DepthSample) -> tuple[Track, tuple[Outcome, ...]]:
         """Take in a depth: up . p + offset + lever = -depth."""

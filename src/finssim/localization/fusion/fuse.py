@@ -221,15 +221,16 @@ def run(
     Args:
         log (LOG): Folder of imu.csv, depth.csv and vision.csv or detections.csv, or one table.
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
-        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Table to write (.csv).
-        rate: Rows a second [Hz].
+        rate: Rows per second [Hz].
         mode (MODE): constant-velocity (paper, eq. 14-15) or error-state (uses IMU acceleration).
         profile (NAME): Noise of the filter: default, or published as in the paper.
-        method (METHOD): How detections become fixes: refractive, refractive-weighted, refractive-6dof, pinhole-depth or
+        method (METHOD): Localization method: refractive, refractive-weighted, refractive-6dof, pinhole-depth or
             pinhole.
-        pixel_std: Error of a detected corner, per axis [px]; what the pool's calibration found, else 0.5, if not given.
-        imu_axes (AXES): Axes of the IMU's columns: body or sensor; told by their names if not given.
+        pixel_std: Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
+            given.
+        imu_axes (AXES): Axes of the IMU's columns: body or sensor; from their names if not given.
         as_json: Print one JSON object instead of tables.
 
     Raises:

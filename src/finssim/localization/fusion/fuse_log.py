@@ -25,7 +25,7 @@ from finssim.vehicles.equipment import Imu
 Array = npt.NDArray[np.float64]
 
 TIME = ("t", "time", "time_s", "timestamp", "stamp", "seconds")
-WORDS = ("image", "status", "reason")
+TEXT_COLUMNS = ("image", "status", "reason")
 """Columns that are words even where they look like numbers."""
 QUATERNION = ("qx", "qy", "qz", "qw")
 LONGEST_GAP = 2.0
@@ -177,7 +177,7 @@ def read_stream_table(path: str | Path, *, timed: bool = True) -> StreamTable:
     for name, cells in zip(names, zip(*complete, strict=True), strict=True):
         values = [_number(cell, text) for cell in cells]
         no_numbers = all(math.isnan(v) for v in values) and any(c.lower() not in EMPTY for c in cells)
-        if no_numbers or name in WORDS:
+        if no_numbers or name in TEXT_COLUMNS:
             table.words[name] = list(cells)
         else:
             table.numbers[name] = np.array(values, float)

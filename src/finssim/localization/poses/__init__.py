@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.rotations import matrix_to_quat
-from finssim.localization.detection.detections import Detection, most_certain
+from finssim.localization.detection.detections import Detection, best_detections
 
 __all__ = [
     "Constraints", "Correspondences", "Measurement", "axes_of_up", "correspondences", "refused", "tilt_matrix",
@@ -166,7 +166,7 @@ class Correspondences:
     """Corners left aside, by reason."""
 
     @property
-    def why_too_few(self) -> str:
+    def too_few_reason(self) -> str:
         """The sentence for a picture without any corner of the vehicle."""
         if NO_SQUARE in self.rejected:
             return (
@@ -198,7 +198,7 @@ def correspondences(detections: Iterable[Detection], tags_b: Mapping[int, Array]
         rejected[NO_SQUARE] = 4 * (len(recognised) - len(square))
         recognised = square
     if len({detection.tag for detection in recognised}) < len(recognised):
-        best = {detection.tag: detection for detection in reversed(most_certain(recognised))}
+        best = {detection.tag: detection for detection in reversed(best_detections(recognised))}
         rejected[TWICE] = 4 * (len(recognised) - len(best))
         recognised = list(best.values())
     if not recognised:

@@ -36,8 +36,8 @@ __all__ = [
 
 # A rigid motion in the plane that lays one set of points on another, measured in pixels.
 
-_MOST_STEPS = 30
-_MOST_TURNS = 8
+_MAX_STEPS = 30
+_MAX_TURNS = 8
 _STILL_PLANE = 1e-13
 """A step that changes the misses by less than the root of this [px²] is the last."""
 
@@ -106,7 +106,7 @@ def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | Non
     now = _evaluate(xi, Q, points, A, huber)
     damping, converged = 1e-6, False
     step_number = 0
-    while step_number < _MOST_STEPS and not converged:
+    while step_number < _MAX_STEPS and not converged:
         step_number += 1
         inverse = _damped_inverse(now.H, damping)
         if inverse is None:
@@ -189,7 +189,7 @@ def _least_squares(Q: Array, points: Array, A: Array) -> tuple[float, float, flo
         for i, j in ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))
     )
     _, _, psi = begin = _procrustes(centre, middle, q, p)
-    for _ in range(_MOST_TURNS):
+    for _ in range(_MAX_TURNS):
         c, s = math.cos(psi), math.sin(psi)
         slope = (ss - cc) * c * s + cs * (c * c - s * s) - c1 * s + s1 * c
         curvature = (ss - cc) * (c * c - s * s) - 4.0 * cs * c * s - c1 * c - s1 * s
@@ -335,8 +335,8 @@ WORST = 4.0
 WORST_WITHOUT_WATER = 40.0
 """The same where the water is left out, which alone may cost many pixels."""
 _SUSPECTS = (
-    "look at the tag's id, edge and mount, the depth, the tilt and the pool file",
-    "the tags contradict each other: look at their ids and mounts, the depth, the tilt and the pool file",
+    "check the tag's id, edge and mount, the depth, the tilt and the pool file",
+    "the tags contradict each other: check their ids and mounts, the depth, the tilt and the pool file",
 )
 
 
@@ -372,7 +372,7 @@ def planar_fit(
     method = "pinhole-depth" if straight else "refractive"
     pairs = correspondences(detections, tags_b)
     if not pairs.tags:
-        return refused(method, pairs.why_too_few, pairs.rejected)
+        return refused(method, pairs.too_few_reason, pairs.rejected)
     if constraints is None:
         return refused(method, "height and tilt are not known: give a depth", pairs.rejected, tags=pairs.tags)
     R_pg = _frame_of(constraints.up)
@@ -437,7 +437,7 @@ def _solve(corners: CornerPoints, level: Array, pixel_std: float, limit: float, 
         used = retained
         fit = _fit(corners, level, used, pixel_std)
     if fit is None:
-        return _Solved(None, used, rejected, "the corners lie too close together to tell the heading")
+        return _Solved(None, used, rejected, "the corners are too close together to determine the heading")
     if not fit.converged:
         return _Solved(None, used, rejected, f"did not converge in {fit.iterations} steps")
     if fit.missed.max() > limit:
@@ -620,7 +620,7 @@ def mirrored(R_pb: Array, sight_p: Array, normal_b: Array) -> Array:
 
 See = Callable[[Array], tuple[Array, Array, npt.NDArray[np.bool_]]]
 """Points, pool frame (n, 3) -> pixels (n, 2), derivatives by the point (n, 2, 3), and which are seen (n,)."""
-Known = Callable[[Array, Array, Array], tuple[Array, Array]]
+ExtraRows = Callable[[Array, Array, Array], tuple[Array, Array]]
 """t_pb, R_pb and a shift of the picture [px] -> misses of what is known (m,) and derivatives (m, 8), [px]."""
 
 _STILL = 1e-10
@@ -680,7 +680,7 @@ def refine_pose(
     rotation: Array,
     huber: float,
     *,
-    extra_rows: Known | None = None,
+    extra_rows: ExtraRows | None = None,
     max_steps: int = 50,
 ) -> RefinedPose | None:
     """Levenberg and Marquardt's method on the reprojection error, with analytic Jacobians and Huber's rho.
@@ -733,7 +733,7 @@ def _linearised(
     points_b: Array,
     pixels: Array,
     huber: float,
-    extra_rows: Known | None,
+    extra_rows: ExtraRows | None,
     position: Array,
     rotation: Array,
     shift: Array,
@@ -805,7 +805,7 @@ def _distinct(poses: Iterable[RefinedPose | None]) -> list[RefinedPose]:
     """The minima among what was found, each once, the best first."""
     minima: list[RefinedPose] = []
     for pose in sorted((pose for pose in poses if pose is not None), key=lambda pose: pose.cost):
-        if all(_apart(pose, other) for other in minima):
+        if all(_separation(pose, other) for other in minima):
             minima.append(pose)
     return minima
 
@@ -910,7 +910,7 @@ def _lean(pose: RefinedPose, constraints: Constraints) -> float:
     return float(np.arctan2(np.linalg.norm(np.cross(up_b, up)), up_b @ up))
 
 
-def _apart(a: RefinedPose, b: RefinedPose) -> bool:
+def _separation(a: RefinedPose, b: RefinedPose) -> bool:
     far = float(np.linalg.norm(a.position - b.position)) > 0.005
     return far or _angle(a.rotation, b.rotation) > 0.01
 
@@ -945,7 +945,7 @@ def pinhole(
     method = "pinhole"
     pairs = correspondences(detections, tags_b)
     if not pairs.tags:
-        return refused(method, pairs.why_too_few, pairs.rejected)
+        return refused(method, pairs.too_few_reason, pairs.rejected)
     minima = pinhole_poses(pairs, pool.camera, pixel_std)
     if not minima:
         return refused(method, "the corners show no pose", pairs.rejected, tags=pairs.tags)
@@ -1012,7 +1012,7 @@ def refractive_bundle(
     method = "refractive-6dof"
     pairs = correspondences(detections, tags_b)
     if not pairs.tags:
-        return refused(method, pairs.why_too_few, pairs.rejected)
+        return refused(method, pairs.too_few_reason, pairs.rejected)
     minima = minima_from(through_water(pool), pairs, _starts(pairs, pool, pixel_std), 2.5 * pixel_std)
     if not minima:
         return refused(method, "the corners show no pose in the water", pairs.rejected, tags=pairs.tags)
@@ -1094,7 +1094,7 @@ HUBER = 2.5
 """Miss in standard deviations from which on Huber's rho grows linearly."""
 SUREST = 1e-6
 """What is given as exact is held as tightly as this [m, rad, px]."""
-MOST_STEPS = 30
+MAX_STEPS = 30
 
 
 def weighted_fit(
@@ -1133,8 +1133,8 @@ def weighted_fit(
         start.position,
         start.rotation,
         HUBER * pixel_std,
-        extra_rows=_known(constraints, pixel_std),
-        max_steps=MOST_STEPS,
+        extra_rows=_constraint_rows(constraints, pixel_std),
+        max_steps=MAX_STEPS,
     )
     if pose is None or not pose.converged:
         steps = 0 if pose is None else pose.iterations
@@ -1143,7 +1143,7 @@ def weighted_fit(
     return measured(METHOD, pose, pose.covariance(pixel_std), pairs, start.medium)
 
 
-def _known(constraints: Constraints, pixel_std: float) -> Known:
+def _constraint_rows(constraints: Constraints, pixel_std: float) -> ExtraRows:
     """Misses of height, tilt and shift, (6,), and their derivatives, in pixels: over their deviations, times that of a
     pixel."""
     up, port_b = np.asarray(constraints.up, float), np.asarray(constraints.port, float)

@@ -264,7 +264,7 @@ COMMAND = Layout(
     magic=b"\xaa",
     header=(),
     payload=(
-        Field("enable", "?", "0: motors off, whatever follows"),
+        Field("enable", "?", "0: motors off, regardless of the rest"),
         Field("normalised", "f", "part of the full-scale shaft speed, -1 to 1, per motor output", values=0),
     ),
     tail=b"\xbb",

@@ -63,7 +63,9 @@ REMEMBERED = 1.0
 STRANGE, STRANGERS, OF = 12.0, 2, 4
 """Difference from every input that was sent at which one is somebody else's [µs], and how many of the last reports make
 it certain: two pilots take turns."""
-OTHERS = "somebody else steers, or what we send is lost: the autopilot receives other inputs than ours"
+OTHERS = (
+    "manual control from elsewhere, or our frames are lost: the autopilot receives other inputs than ours"
+)
 HEADING_PERIOD = 0.2
 """Between headings that are taken from the autopilot's attitude [s]."""
 DVL_FRESH = 1.0
@@ -106,7 +108,7 @@ class MavlinkLink:
         if imu is not None and abs(imu.orientation[3]) < 1.0 - 1e-6:
             raise LinkError(
                 f"{vehicle.name}: sensors.imu.orientation is {imu.orientation.tolist()}, expected 0, 0, 0, 1: an "
-                "autopilot tells its attitude and rates in the vehicle's own axes (set AHRS_ORIENTATION there)"
+                "autopilot reports attitude and rates in the vehicle's own axes (set AHRS_ORIENTATION there)"
             )
         self._wire: Any = mavlink.MAVLink(
             None, srcSystem=GROUND, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER
@@ -341,12 +343,12 @@ class MavlinkLink:
         if self._others:
             return OTHERS
         if self._failing:
-            return f"the autopilot is in failsafe: {self.says or 'it does not say why'}"
+            return f"the autopilot is in failsafe: {self.says or 'it gives no reason'}"
         if not self.armed:
-            return f"the autopilot was disarmed: {self.says or 'it does not say why'}"
+            return f"the autopilot was disarmed: {self.says or 'it gives no reason'}"
         if self.mode != MANUAL:
             self._others = True
-            return f"somebody changed the autopilot's mode to {_mode(self.mode)}"
+            return f"the autopilot's mode was changed to {_mode(self.mode)}"
         return ""
 
     # -- what goes out ----------------------------------------------------------------------------------------

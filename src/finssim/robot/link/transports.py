@@ -650,7 +650,7 @@ class DryRun:
 
     def describe(self) -> str:
         """How many frames went nowhere."""
-        return f"dry run, {self.sent} frames sent to nobody"
+        return f"dry run, {self.sent} frames, not sent"
 
 
 class MemoryTransport:

@@ -161,7 +161,7 @@ class HardwareBridge(RobotNode):
         self.send("shafts", self._speeds(stamp, telemetry.motor_rpm))
 
     def echo(self, now: float, echo: CommandEcho) -> None:
-        """Publish what the motor controller made of a command."""
+        """Publish a command as executed by the motor controller."""
         self.send("echo", self.make.echo(self.ns(now), echo))
 
     def aid(self, now: float, aid: NavigationAid) -> None:

@@ -36,7 +36,7 @@ class SubscriptionEventCallbacks:
             "use_default_callbacks"
         }
         if unknown:
-            raise TypeError(f"the event '{min(unknown)}' needs a sourced ROS 2: leave it out")
+            raise TypeError(f"the event '{min(unknown)}' needs a sourced ROS 2: omit it")
         self.matched = matched
 
 

@@ -380,4 +380,4 @@ def _check_options(options: dict[str, Any]) -> None:
     """Callback groups are met anyway; everything else would be ignored, so it is refused."""
     unknown = set(options) - {"callback_group"}
     if unknown:
-        raise TypeError(f"'{min(unknown)}' needs a sourced ROS 2: leave it out")
+        raise TypeError(f"'{min(unknown)}' needs a sourced ROS 2: omit it")

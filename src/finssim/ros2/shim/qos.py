@@ -73,9 +73,7 @@ class QoSProfile:
 
     def __init__(self, **policies: Any) -> None:
         unknown = set(policies) - set(POLICIES)
-        assert not unknown, (
-            f"QoSProfile: '{min(unknown)}' is no policy, or needs a sourced ROS 2: leave it out"
-        )
+        assert not unknown, f"QoSProfile: '{min(unknown)}' is no policy, or needs a sourced ROS 2: omit it"
         if (
             "depth" not in policies
             and policies.get("history", HistoryPolicy.KEEP_LAST) == HistoryPolicy.KEEP_LAST

@@ -239,7 +239,7 @@ def surface_frame(camera: Camera, interface: Interface) -> SurfaceFrame:
     height = float(n @ position + interface.offset)
     if height <= 0.0:
         raise SensorError(
-            f"camera stands {-height:.4g} m behind the interface: turn the normal towards the camera"
+            f"camera stands {-height:.4g} m behind the interface: reverse the normal so that it points to the camera"
         )
     return SurfaceFrame(position - height * n, np.stack([first, np.cross(n, first), n]), height)
 

@@ -1,0 +1,194 @@
+"""Rigid models of other programs as parts of a world: MJCF and URDF, read by MuJoCo, and USD, read by OpenUSD."""
+# mypy: ignore-errors
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from finssim.geometry.rotations import matrix_to_quat, quat_multiply, quat_rotate
+
+SUFFIXES = (".xml", ".mjcf", ".urdf", ".usd", ".usda", ".usdc", ".usdz")
+Y_UP = np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
+"""From axes with y up to axes with z up, xyzw."""
+
+
+class PartsError(ValueError):
+    """A model file that cannot be used, in one sentence without the file's name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelPart:
+    """One shape of a model, in the model's axes, z up."""
+
+    kind: str
+    """box, sphere, capsule, cylinder, plane or mesh."""
+    position: np.ndarray
+    """[m], (3,)"""
+    quaternion: np.ndarray
+    """Shape to model, xyzw, (4,)."""
+    size: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Half extents of a box; radius and half length of the round ones [m]."""
+    vertices: np.ndarray | None = None
+    """Of a mesh, shape axes [m], (n, 3)."""
+    faces: np.ndarray | None = None
+    """(m, 3)"""
+    colour: np.ndarray | None = None
+    """Diffuse reflectance of red, green and blue; None if the file gives none, (3,)."""
+
+
+def parts_of(path: Path) -> list[ModelPart]:
+    """The shapes of a model file at rest, all joints at zero.
+
+    Args:
+        path: MJCF (`.xml`, `.mjcf`) or URDF (`.urdf`), which need `finssim[mujoco]`, or USD (`.usd`, `.usda`, `.usdc`,
+            `.usdz`), which needs `usd-core`. Files that it names must be in its folder or below.
+
+    Raises:
+        PartsError: It cannot be read, or has a shape that worlds do not have.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise PartsError(f"ends in '{path.suffix}', expected one of {', '.join(SUFFIXES)}")
+    parts = list(_usd(path) if suffix.startswith(".usd") else _mujoco(path))
+    if not parts:
+        raise PartsError("has no shapes")
+    return parts
+
+
+def _mujoco(path: Path) -> Iterator[ModelPart]:
+    try:
+        import mujoco
+    except ImportError:
+        raise PartsError("needs mujoco: pip install 'finssim[mujoco]'") from None
+    _refuse_outside(path)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise PartsError(f"is not a model: {' '.join(str(error).split())[:160]}") from None
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    kinds = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind for kind in
+             ("box", "sphere", "capsule", "cylinder", "plane", "mesh")}  # fmt: skip
+    for g in range(model.ngeom):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or f"{g}"
+        kind = kinds.get(int(model.geom_type[g]))
+        if kind is None:
+            raise PartsError(f"geom '{name}' is neither {', '.join(kinds.values())}: replace it")
+        mesh = {}
+        if kind == "mesh":
+            m = model.geom_dataid[g]
+            v, f = model.mesh_vertadr[m], model.mesh_faceadr[m]
+            mesh["vertices"] = model.mesh_vert[v : v + model.mesh_vertnum[m]].astype(float)
+            mesh["faces"] = model.mesh_face[f : f + model.mesh_facenum[m]].astype(int)
+        size = (0.0, 0.0, 0.0) if kind in ("plane", "mesh") else tuple(map(float, model.geom_size[g]))
+        material = model.geom_matid[g]
+        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[g]
+        yield ModelPart(
+            kind=kind, position=data.geom_xpos[g].copy(), size=size, colour=rgba[:3].astype(float),
+            quaternion=matrix_to_quat(data.geom_xmat[g].reshape(3, 3)), **mesh,
+        )  # fmt: skip
+
+
+def _refuse_outside(path: Path) -> None:
+    """Refuse a model that names files outside its folder."""
+    try:
+        tree = ElementTree.parse(path)
+    except (OSError, ElementTree.ParseError) as error:
+        raise PartsError(f"cannot be read: {error}") from None
+    for element in tree.iter():
+        for key in ("file", "filename", "meshdir", "texturedir", "assetdir"):
+            name = element.get(key, "")
+            if name.startswith(("/", "~")) or re.search(r"^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)", name):
+                raise PartsError(f"names the file '{name}': put it into the model's folder or below")
+
+
+def _usd(path: Path) -> Iterator[ModelPart]:
+    try:
+        from pxr import Tf, Usd, UsdGeom
+    except ImportError:
+        raise PartsError("needs OpenUSD: pip install usd-core") from None
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise PartsError(f"is not a USD stage: {' '.join(str(error).split())[:160]}") from None
+    unit = UsdGeom.GetStageMetersPerUnit(stage)
+    upright = Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.array([0.0, 0.0, 0.0, 1.0])
+    poses = UsdGeom.XformCache()
+    turns = {
+        "X": [0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)],
+        "Y": [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)],
+    }
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        kind = {
+            "Cube": "box",
+            "Sphere": "sphere",
+            "Capsule": "capsule",
+            "Cylinder": "cylinder",
+            "Mesh": "mesh",
+        }.get(prim.GetTypeName())
+        if kind is None:
+            if prim.IsA(UsdGeom.Gprim):
+                raise PartsError(f"{prim.GetPath()} is a {prim.GetTypeName()}, expected Cube, Sphere, Capsule, "
+                                 "Cylinder or Mesh: replace it")  # fmt: skip
+            continue
+        if UsdGeom.Imageable(prim).ComputeVisibility() == UsdGeom.Tokens.invisible:
+            continue
+        matrix = np.array(poses.GetLocalToWorldTransform(prim)).T
+        scale = np.linalg.norm(matrix[:3, :3], axis=0)
+        rotation = matrix[:3, :3] / scale
+        if np.linalg.det(rotation) < 0.0 or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4:
+            if kind != "mesh":
+                raise PartsError(f"{prim.GetPath()} is mirrored or sheared: give it as a mesh")
+            scale, rotation = None, np.eye(3)
+        if kind not in ("box", "mesh") and np.ptp(scale) > 1e-4 * scale.max():
+            raise PartsError(
+                f"{prim.GetPath()} is scaled by {scale.tolist()}, expected equal factors: give it as a mesh"
+            )
+        q, mesh, size = matrix_to_quat(rotation), {}, (0.0, 0.0, 0.0)
+        if kind == "mesh":
+            points = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(), float).reshape(-1, 3)
+            counts, corners = (
+                np.array(attribute.Get(), int)
+                for attribute in (
+                    UsdGeom.Mesh(prim).GetFaceVertexCountsAttr(),
+                    UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr(),
+                )
+            )
+            mesh["vertices"] = unit * (points @ matrix[:3, :3].T if scale is None else points * scale)
+            mesh["faces"] = _triangles(counts, corners)
+        elif kind == "box":
+            size = tuple(float(0.5 * unit * s * UsdGeom.Cube(prim).GetSizeAttr().Get()) for s in scale)
+        else:
+            shape = getattr(UsdGeom, prim.GetTypeName())(prim)
+            length = shape.GetHeightAttr().Get() if kind != "sphere" else 0.0
+            size = (
+                float(unit * scale[0] * shape.GetRadiusAttr().Get()),
+                float(0.5 * unit * scale[0] * length),
+                0.0,
+            )
+            if kind != "sphere" and (axis := shape.GetAxisAttr().Get()) in turns:
+                q = quat_multiply(q, np.array(turns[axis]))
+        colours = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
+        yield ModelPart(
+            kind=kind, position=quat_rotate(upright, unit * matrix[:3, 3]), quaternion=quat_multiply(upright, q),
+            size=size, colour=np.array(colours[0], float) if colours else None, **mesh,
+        )  # fmt: skip
+
+
+def _triangles(counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Polygons as fans of triangles, (m, 3)."""
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    return np.array(
+        [
+            (corners[a], corners[a + k], corners[a + k + 1])
+            for a, n in zip(first, counts, strict=True)
+            for k in range(1, n - 1)
+        ]
+    ).reshape(-1, 3)
