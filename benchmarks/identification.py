@@ -8,6 +8,8 @@ Parts:
     slow        5 Hz, wrench and velocity alone, by simulation error
     replay      half of the trials fitted, the other half replayed
     published   trials simulated with FinsROV's published raw fits, and what its published noise lets anyone tell
+    shape       plants whose drag is linear or quadratic alone: is that what `auto` chooses where the other shape alone
+                fits worse by a factor of 1.5 (RMSE)? Decays of a heading, driven trials by either method
 
 The estimators start from a file whose hydrodynamics are wrong by a factor of two.
 """
@@ -28,11 +30,12 @@ from numpy.typing import NDArray
 
 from finssim.calibration.fit import Estimate, Fit
 from finssim.calibration.programmes import Programme, programmes
+from finssim.calibration.regression.passive import passive
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.replay import replay
 from finssim.calibration.simulation.fit import fit_by_simulation
 from finssim.calibration.synthetic import Recording, record, simulate_programme, trials_of
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.vehicle import moved_to_origin
 
@@ -187,6 +190,70 @@ def held_out(vehicle: Vehicle, axes: str, method: str) -> dict[str, Any]:
     return report.as_json()
 
 
+APART = 1.5
+"""RMSE with the wrong shape of drag over that with the right one from which a choice is expected to be right."""
+
+
+def spins(rng: np.random.Generator, d1: float, d2: float, noise: float = 0.02) -> list[Trial]:
+    """Headings at 10 Hz of four spins that die out, r_dot = -d1 r - d2 |r| r, d1 [1/s], d2 [1/rad], noise [rad]."""
+    out = []
+    for k in range(4):
+        t = np.arange(0.0, 15.0, 0.1)
+        side, r0 = rng.choice([-1.0, 1.0]), rng.uniform(0.8, 1.8)
+        turned = np.log1p(d2 * r0 * t) / d2 if d2 > 0.0 else r0 * -np.expm1(-d1 * t) / d1
+        yaw = rng.uniform(-3.0, 3.0) + side * turned + noise * rng.standard_normal(len(t))
+        out.append(Trial(name=f"spin_{k}", t=t, channels={"yaw": yaw}, header=Header(passive=True)))
+    return out
+
+
+def of_one_shape(vehicle: Vehicle, axis: str, shape: str, size: float) -> Vehicle:
+    """The vehicle whose drag on an axis is of one shape: `size` times the file's at the speed of half thrust."""
+    i, chosen = AXES.index(axis), vehicle.hydrodynamics["calibrated"]
+    d1, d2 = float(chosen.linear_damping[i, i]), float(chosen.quadratic_damping[i, i])
+    push = 0.5 * float(vehicle.wrench_limits[i])
+    # d1 v + d2 v² = push
+    speed = 2.0 * push / (d1 + math.sqrt(d1**2 + 4.0 * d2 * push))
+    drag = {"linear_damping": size * push / speed, "quadratic_damping": size * push / speed**2}
+    off = "quadratic_damping" if shape == "linear" else "linear_damping"
+    return vehicle.replace(
+        {f"hydrodynamics.calibrated.{name}.{i}.{i}": x for name, x in (drag | {off: 0.0}).items()}
+    )
+
+
+def shapes(vehicle: Vehicle, axes: str, count: int, method: str) -> dict[str, Any]:
+    """How often the shape of drag is right, over draws of plant and noise: `right` alone, `both`, or `wrong` alone."""
+    rng, guess = np.random.default_rng(5), blind(vehicle)
+    estimators = {
+        "decay": lambda trials, body, **_: passive(trials, body),
+        "regression": regress,
+        "simulation": fit_by_simulation,
+    }
+    estimate, counts = estimators[method], dict.fromkeys(("right", "both", "wrong"), 0)
+    cycle = (FOUR if axes == "all" else axes).split(",")
+    for k in range(count):
+        shape, other = ("linear", "quadratic")[:: 1 if k % 2 else -1]
+        size, axis = rng.uniform(0.5, 2.0), "yaw" if method == "decay" else cycle[k // 2 % len(cycle)]
+        if method == "decay":
+            trials = spins(rng, *((0.25 * size, 0.0) if shape == "linear" else (0.0, 0.7 * size)))
+        else:
+            plant = of_one_shape(vehicle, axis, shape, size)
+            trials = simulate_programme(programmes(axis, plant), plant, seed=k)
+        fit = estimate(trials, guess, damping="auto")
+        if method == "decay":
+            rmse = {name: fit.quality["yaw"][f"rmse_{name}"] for name in (shape, other)}
+        else:
+            separate = {name: estimate(trials, guess, damping=name) for name in (shape, other)}
+            rmse = {name: one.quality[axis]["rmse"] for name, one in separate.items()}
+        if rmse[other] < APART * rmse[shape]:
+            continue
+        selected = {
+            name: any(e.estimate > 0.0 for n, e in fit.estimates.items() if n.startswith(f"{axis}.{term}"))
+            for name, term in (("linear", "d1"), ("quadratic", "d2"))
+        }
+        counts["wrong" if not selected[shape] else "both" if selected[other] else "right"] += 1
+    return {"method": method, "draws": count, **counts}
+
+
 def raw_fits(vehicle: Vehicle) -> Vehicle:
     """FinsROV with the raw fits of its own identification."""
     changes: dict[str, float] = {}
@@ -217,7 +284,7 @@ def print_parameters(title: str, figures: dict[str, dict[str, Any]]) -> None:
 
 def main() -> None:
     """Run the parts asked for, print tables, write JSON."""
-    parts = ("coverage", "simulation", "slow", "replay", "published")
+    parts = ("coverage", "simulation", "slow", "replay", "published", "shape")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help="which parts; all if none")
     parser.add_argument("--vehicle", default="finsrov", help="name or file")
@@ -261,6 +328,16 @@ def run(part: str, vehicle: Vehicle, given: argparse.Namespace) -> Any:
             for axis, by_trial in report["nrmse"].items():
                 scores = [x for x in by_trial.values() if x is not None]
                 print(f"  {axis:<8} mean {np.mean(scores):.4f}, worst trial {max(scores):.4f}")
+        return out
+    if part == "shape":
+        counts = {"decay": given.repetitions, "regression": given.repetitions, "simulation": given.few}
+        out = {method: shapes(vehicle, given.axes, count, method) for method, count in counts.items()}
+        for method, one in out.items():
+            apart = sum(one[key] for key in ("right", "both", "wrong"))
+            print(
+                f"{method}: in {apart} of {one['draws']} draws the shapes differ by a factor of {APART}; the right one "
+                f"alone {one['right']}, both {one['both']}, the wrong one alone {one['wrong']}"
+            )
         return out
     raw = raw_fits(load_vehicle("finsrov"))
     out = {"raw": coverage(raw, FOUR, given.few, "regression")}

@@ -7,7 +7,8 @@ import pytest
 
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.programmes import programmes
-from finssim.calibration.simulation.fit import fit_by_simulation
+from finssim.calibration.simulation.fit import compared, excites, fit_by_simulation
+from finssim.calibration.simulation.rollout import segments, streams
 from finssim.calibration.synthetic import simulate_programme
 from finssim.engine.plant_arrays import twist_shift
 from finssim.vehicles import AXES, load_vehicle
@@ -114,6 +115,40 @@ def test_damping_at_zero_rests_on_its_bound():
     d2 = fit.estimates["surge.d2"]
     assert not d2.identifiable and d2.note
     assert d2.ci95[0] == 0.0 <= d2.estimate
+
+
+@pytest.mark.slow
+def test_damping_that_slow_motion_does_not_show_stays_the_files():
+    """Of 0.02 rad/s: FinsROV's d2 of yaw can be told from nothing, so it is neither written nor set to zero."""
+    vehicle = load_vehicle("finsrov")
+    trials = simulate_programme(programmes("yaw", vehicle, levels={"yaw": (0.005,)}), vehicle, seed=3)
+    fit = fit_by_simulation(trials, vehicle)
+    d1, d2 = (fit.estimates[f"yaw.{name}"] for name in ("d1", "d2"))
+    assert d2.estimate == truth(vehicle, "yaw")["d2"] and "nor from the file's" in d2.note
+    assert f"{SET}.quadratic_damping.5.5" not in fit.changes
+    assert fit.changes[f"{SET}.linear_damping.5.5"] == d1.estimate
+    assert d1.ci95[0] < truth(vehicle, "yaw")["d1"] < d1.ci95[1]
+
+
+@pytest.mark.slow
+def test_a_small_swing_is_fitted_and_integrals_are_not_compared():
+    """Roll of a stiff vehicle under sway is fitted though nothing drives it; places add nothing to velocities."""
+    file = load_vehicle("bluerov2_heavy")
+    stiff = file.replace({"body.center_of_buoyancy": [0.0, 0.0, 0.04]})
+    plan = programmes("sway", stiff, levels={"sway": (25.0,)})[:1]
+    (trial,) = simulate_programme(plan, stiff, seed=3)
+    one = streams(replace(trial, header=trial.header.model_copy(update={"axis": ()})), file)
+    assert np.ptp(one.motion.nu[:, 3]) < 0.25
+    assert excites(one, file) == {"sway", "roll"}
+    segment = segments(one, file, length=5.0, step=0.02)[0]
+    assert {"u", "v", "w", "x", "y", "z", "depth"} < set(segment.measured)
+    assert (
+        {"v", "w"}
+        <= set(compared(segment, one.motion, ("sway", "heave")).measured)
+        <= {"v", "w", "p", "q", "r"}
+    )
+    blind = replace(segment, measured={c: m for c, m in segment.measured.items() if c != "w"})
+    assert {"z", "depth"} <= set(compared(blind, one.motion, ("heave",)).measured)
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -212,6 +212,8 @@ class AxisResult:
     """Whether the damping is known well enough to be written; both of its terms are, or neither."""
     dropped: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Damping that was left out, because the data do not show it -> its 95 % interval."""
+    retained: Set[str] = frozenset()
+    """Of that, what stays the vehicle file's, for the data exclude it as little as zero."""
     given: float | None = None
     """Effective inertia where it is known [kg, kg m²]."""
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -231,11 +233,13 @@ class AxisResult:
             self.added_mass(float(self.file.M_RB[self.i, self.i]))
         for name, family in (("d1", "linear_damping"), ("d2", "quadratic_damping")):
             if name in self.dropped:
-                note = f"not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}"
-                self.note(name, 0.0, self.dropped[name], False, note, self.path(family))
+                value = self.value(name)
+                nor = ", nor from the file's," if value else ""
+                note = f"not distinguishable from zero{nor} at speeds of {low:.2g}-{high:.2g} {unit}"
+                self.note(name, value, self.dropped[name], False, note, self.path(family))
             elif name in self.numbers:
                 self.add(name, self.path(family))
-            if self.drag_known:
+            if self.drag_known and name not in self.retained:
                 self.changes[self.path(family)] = max(self.value(name), 0.0)
         if not self.drag_known:
             self.findings.append(finding("damping_unknown", self.axis, low=low, high=high, unit=unit))
@@ -252,7 +256,9 @@ class AxisResult:
         return f"{SET}.{family}.{self.i}.{self.i}"
 
     def value(self, name: str) -> float:
-        """Of a number; 0 where it was not fitted."""
+        """Of a number; where it was not fitted 0, or the vehicle file's."""
+        if name in self.retained:
+            return float({"d1": self.file.D1, "d2": self.file.D2}[name][self.i, self.i])
         return self.numbers[name].value if name in self.numbers else 0.0
 
     def note(

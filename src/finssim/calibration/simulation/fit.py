@@ -147,6 +147,7 @@ class Parameters:
         start: Mapping[str, float] | None = None,
         imposed: Sequence[str] = (),
         unseen: Sequence[str] = (),
+        retained: Sequence[str] = (),
     ) -> None:
         """Choose what is free.
 
@@ -161,6 +162,7 @@ class Parameters:
             imposed: Axes that are not fitted: their added mass alone is free, for its momentum turns and pushes the
                 others. Their coordinates come last.
             unseen: Those of `imposed` that no trial measured, and that therefore are simulated: their drag is free too.
+            retained: Damping that is not free and stays the vehicle file's, such as `pitch.d2`.
 
         Raises:
             CalibrationError: The calibrated set holds no coefficients.
@@ -172,16 +174,16 @@ class Parameters:
         self.imposed = tuple(a for a in AXES if a in imposed)
         self.unseen = tuple(a for a in self.imposed if a in unseen)
         self.index = np.array([AXES.index(a) for a in self.axes], int)
-        self.damping, self.extras = damping, tuple(extras)
+        self.damping, self.extras, self.retained = damping, tuple(extras), tuple(retained)
         self.terms = tuple(path for path in self.set.term_scalars if path in extras)
         self.biases = tuple(a for a in AXES if a in biases)
         self.r_h = np.asarray(self.set.reference_point, float)
         self.H, self.M_RB, self.M_A = plant.H, plant.M_RB, plant.M_A
         self.D1, self.D2 = plant.D1, plant.D2
         for a, i in zip(self.axes, self.index, strict=True):
-            if damping[a] == "linear":
+            if damping[a] == "linear" and f"{a}.d2" not in retained:
                 self.D2[i, :] = self.D2[:, i] = 0.0
-            elif damping[a] == "quadratic":
+            elif damping[a] == "quadratic" and f"{a}.d1" not in retained:
                 self.D1[i, :] = self.D1[:, i] = 0.0
         self.coordinates = tuple(self._coordinates())
         self.names = tuple(c.name for c in self.coordinates)
@@ -1180,7 +1182,10 @@ def axis_result(
         for n in ("d1", "d2")
         if n not in own and f"{axis}.{n}" in first
     }
-    return AxisResult(axis=axis, numbers=own, file=matrices(p.vehicle), dropped=dropped, **known)
+    retained = {n for n in dropped if f"{axis}.{n}" in p.retained}
+    return AxisResult(
+        axis=axis, numbers=own, file=matrices(p.vehicle), dropped=dropped, retained=retained, **known
+    )
 
 
 def other_estimates(
@@ -1227,7 +1232,7 @@ TELL = {
 }
 """Measured columns that tell of an axis, the most direct first."""
 
-DRIFTING = {"x": "u", "y": "v", "yaw": "r"}
+DRIFTING = {"x": "u", "y": "v", "z": "w", "depth": "w", "yaw": "r"}
 """Integrals without a restoring force: where the rate is measured they add drift, not knowledge."""
 
 SEEN = 0.9
@@ -1235,9 +1240,6 @@ SEEN = 0.9
 
 PUSH = 0.03
 """Range of a wrench, as part of the vehicle's limit, below which an axis is not driven."""
-
-SWING = 0.2
-"""Range of the rate of roll or pitch that tells of it though no thruster is meant for it [rad/s]."""
 
 ANSWER = (0.02, 0.02, 0.02, 0.04, 0.04, 0.04)
 """Range of a velocity below which an axis does not answer [m/s, rad/s]."""
@@ -1302,8 +1304,9 @@ def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
         noise = s.motion.noise_std[i]
         answers = _range(nu) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
         pushed = limits[i] > 0.0 and _range(tau[:, i]) > PUSH * limits[i]
-        # Weight rights roll and pitch again: a swing tells of them whatever began it.
-        swings = i in (3, 4) and _range(nu) > max(SWING, 10.0 * np.nan_to_num(noise))
+        # Weight rights roll and pitch again: a swing tells of them whatever began it, be it small. If they were not
+        # fitted, the file's stiffness, which nobody may have measured, would decide how surge and sway go on.
+        swings = i in (3, 4)
         if answers and (pushed or swings or s.drive.source == "passive"):
             out.add(axis)
     return out
@@ -1501,9 +1504,9 @@ def _drag_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: fl
     free = np.isin(names, p.names)
     C = found.covariance
     C = (C.local if C.alone[at].any() else C.trials)[np.ix_(at, at)]
-    d = np.zeros(2)
-    d[free] = x[at]
     before = float(p.set.linear_damping[i][i]), float(p.set.quadratic_damping[i][i])
+    d = np.where(np.isin(names, p.retained), before, 0.0)
+    d[free] = x[at]
     return drag_known(d, free, [C], 2.0, [speed], before)
 
 
@@ -1562,6 +1565,7 @@ class Stages:
         apart = [float(np.median(np.diff(s.drive.t))) for s in prepared if not s.drive.held]
         self.own_error = OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
         self.shorter: dict[str, float] = {}
+        self.retained: tuple[str, ...] = ()
         self.used: list[Streams] = []
         self.segments: list[Segment] = []
         self.extras = {word for word in estimate if word not in ("bias", "trial_bias")}
@@ -1677,6 +1681,7 @@ class Stages:
             start=start,
             imposed=self.imposed,
             unseen=self.unseen,
+            retained=self.retained,
         )
         return Shooting(
             self.segments,
@@ -1813,6 +1818,7 @@ def fit_by_simulation(
         chosen_kinds = _select(kinds, stage)
         if chosen_kinds != kinds:
             first = fit.numbers(stage)
+            fit.retained = _retained(chosen_kinds, first, stage.problem.parameters)
             stage = fit.next(chosen_kinds, stage)
     return fit.result(stage, first, remarks, damping=damping, seed=seed)
 
@@ -1878,3 +1884,22 @@ def _select(kinds: dict[str, str], stage: Stage) -> dict[str, str]:
         if p_value[weakest] > AKAIKE:
             new[axis] = "quadratic" if weakest == "d1" else "linear"
     return new
+
+
+def _retained(kinds: dict[str, str], first: Mapping[str, Number], p: Parameters) -> tuple[str, ...]:
+    """Damping that was left out and stays the vehicle file's, because the data exclude that no more than zero.
+
+    Slow swings show no quadratic drag, and a vehicle without any would tumble at speeds that no trial had. None where
+    the scale of thrust is free: the file's number would decide that.
+    """
+    if "thrust_scale" in p.names:
+        return ()
+    absent = {"linear": ("d2", p.set.quadratic_damping), "quadratic": ("d1", p.set.linear_damping)}
+    out = []
+    for axis, kind in kinds.items():
+        if kind in absent:
+            name, D = absent[kind]
+            i = AXES.index(axis)
+            if 0.0 < D[i][i] <= first[f"{axis}.{name}"].ends[1]:
+                out.append(f"{axis}.{name}")
+    return tuple(out)
