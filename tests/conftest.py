@@ -10,6 +10,7 @@ import multiprocessing.process
 import sys
 import time
 from collections import defaultdict
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -94,6 +95,8 @@ def pytest_collection_finish():
 def pytest_sessionstart(session):
     """With -m "not slow", a process that a test starts fails the test."""
     if session.config.option.markexpr == "not slow":
+        with suppress(ImportError):
+            import glfw  # noqa: F401  # which MuJoCo imports; it asks a Python process for its library's version
         sys.addaudithook(_audit)
         start = multiprocessing.process.BaseProcess.start
 

@@ -101,7 +101,13 @@ HOMES = {
     "newton": {"worlds/model.py"},
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
-    "mujoco": {"engine/scene_model.py", "engine/scene_picture.py", "experiments/bench.py"},
+    "mujoco": {
+        "engine/scene_model.py",
+        "engine/scene_picture.py",
+        "experiments/bench.py",
+        "worlds/parts.py",
+    },
+    "pxr": {"worlds/parts.py"},
     "pandas": {"engine/recorder.py", "learning/lerobot.py"},
     "pyarrow": {"calibration/trials/trial_files.py", "engine/recorder.py", "learning/lerobot.py"},
     "matplotlib": {

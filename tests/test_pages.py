@@ -91,7 +91,7 @@ def test_the_rov_on_the_page_is_sound_and_its_log_is_read(tmp_path, monkeypatch)
 
 def test_the_world_on_the_page_loads(tmp_path):
     """The example file is a world, with its mooring and what moves with it."""
-    (example,) = blocks(ROOT / "docs" / "worlds.md", "yaml")
+    example, *_ = blocks(ROOT / "docs" / "worlds.md", "yaml")
     (tmp_path / "buoy.yaml").write_text(example, encoding="utf-8")
     assert load_world(tmp_path / "buoy.yaml").objects["buoy"].frame == "mooring"
 

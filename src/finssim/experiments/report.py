@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from finssim.experiments import anatomy, faults, soak, transfer
+from finssim.experiments import anatomy, faults, seeing, soak, transfer
 from finssim.experiments.tables import Table, markdown_table
 from finssim.files import atomic_write
 
@@ -17,6 +17,7 @@ TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Table]]] = {
     **dict.fromkeys(transfer.SPECS, transfer.tables_of),
     "anatomy": anatomy.tables_of,
     "faults": faults.tables_of,
+    "seeing": seeing.tables_of,
     "soak": soak.tables_of,
 }
 """Experiment -> the tables of its result."""
@@ -38,7 +39,7 @@ def report(results: Sequence[Path], *, into: Annotated[Sequence[Path], "--into"]
     Example: finssim report results/t1.json results/anatomy.json --into docs/experiments.md --into README.md
 
     Args:
-        results (FILE.json...): Results of experiments t1, t2, anatomy, faults and soak.
+        results (FILE.json...): Results of experiments t1, t2, anatomy, faults and soak, and `seeing.json`.
         into (PAGE.md): Page whose tables are filled. May be repeated.
         check: Change nothing; exit status 1 if a page differs from the results.
 

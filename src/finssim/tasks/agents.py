@@ -826,6 +826,8 @@ class WallFollower(DriveBaseline):
     """Radius of the tube at the net's foot [m]."""
     gain: float = 0.5
     """Speed per distance [1/s]."""
+    integral: float = 0.3
+    """Of the error of the speed over ground, in the speed asked for [1/s]: what a stream takes away."""
     jump: float = 0.25
     """Distance and heading change by less from ping to ping [m, rad]."""
     memory_share: float = 0.5
@@ -844,8 +846,8 @@ class WallFollower(DriveBaseline):
         )  # fmt: skip
 
     def reset(self, n: int) -> Array:  # type: ignore[override]
-        """The net square ahead at its distance, (n, 2)."""
-        return np.tile([self.distance, 0.0], (n, 1))
+        """The net square ahead at its distance, and no integral of the speeds along x, y, z, (n, 5)."""
+        return np.tile([self.distance, 0.0, 0.0, 0.0, 0.0], (n, 1))
 
     def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
         """Actions for observations and pictures of inspecting a net."""
@@ -853,8 +855,8 @@ class WallFollower(DriveBaseline):
         point, enough = self.nearest(next(iter(pictures.values())), memory[:, 0])
         measured = np.column_stack([np.hypot(point[:, 0], point[:, 1]), np.arctan2(point[:, 1], point[:, 0])])
         share = np.where(enough, 1.0 - self.memory_share, 0.0)[:, None]
-        memory = memory + share * np.clip(measured - memory, -self.jump, self.jump)
-        away, turn = memory.T
+        line = memory[:, :2] + share * np.clip(measured - memory[:, :2], -self.jump, self.jump)
+        away, turn = line.T
         slant = self.height + RANGE_SCALE * o[:, 9] + self.tube
         above = np.sqrt(np.maximum(slant**2 - away**2, 0.0)) + self.under - self.height
         towards = np.clip(self.gain * (away - self.distance), -0.15, 0.15)
@@ -866,7 +868,10 @@ class WallFollower(DriveBaseline):
                 self.drive.turned(turn),
             ]
         )
-        return self.drive.action(o[:, [3, 4, 5, 8]], target), memory
+        lag = memory[:, 2:] + self.period * self.integral * (target[:, :3] - o[:, 3:6])
+        lag = np.clip(lag, -self.speed, self.speed)
+        target[:, :3] += lag
+        return self.drive.action(o[:, [3, 4, 5, 8]], target), np.column_stack([line, lag])
 
     def nearest(self, picture: NDArray[np.uint8], before: Array) -> tuple[Array, Mask]:
         """The net in pings.
