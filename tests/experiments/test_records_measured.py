@@ -206,6 +206,17 @@ def test_a_memory_that_was_drawn_is_not_in_a_record(held, tmp_path):
     assert Referee(task, [FINSROV], seed=1).metrics()["success"] == 0.0  # where it is played, it is scored
 
 
+def test_a_record_moves_the_pipeline_as_a_whole_and_a_drawn_net_is_refused(held):
+    """The pipe keeps its bends, at the goal's pose; corners that are drawn with a net's world are in no record."""
+    record = read_record(held[0], "pipeline", FINSROV)
+    referee = Referee("pipeline", [FINSROV], guide=record.guide, start=record.motion.at(0.0))
+    pipe = referee.arrays.reference.position.numpy()[0]
+    drawn = Referee("pipeline", [FINSROV], seed=1).arrays.reference.position.numpy()[0]
+    np.testing.assert_array_equal(pipe, drawn)
+    with pytest.raises(ControlError, match="needs the poses of rope_0, .* drawn with its world"):
+        read_record(held[0], "net", FINSROV).scores("net", FINSROV)
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

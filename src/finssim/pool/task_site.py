@@ -207,15 +207,22 @@ class Referee:
             action_size: Numbers in the action of a vehicle; those of the task's own action mode if None.
 
         Raises:
-            ControlError: A task in plain torch whose memory begins with what is drawn, for an episode played elsewhere.
+            ControlError: A task in plain torch whose memory begins with what is drawn, or one with marks that are drawn
+                with its world, for an episode played elsewhere.
         """
         self.task = task = fitted_task(task, vehicles)
+        if start is not None and task.marks:
+            raise ControlError(
+                f"task '{task.name}' needs the poses of {', '.join(task.marks)}, which are drawn with its world and are "
+                "in no record: finssim experiment stack scores it as it is played"
+            )
         if start is not None:
             task = _told(type(task))(**{field.name: getattr(task, field.name) for field in fields(task)})
         size = action_size or len(action_mode(task.action, vehicles[0]).labels)
         self._state, self.arrays = one_world(task, size)
         device = self._state.steps.device
-        if guide is not None and (start is None or self.arrays.reference.position is not None):
+        follows = not task.world and (start is None or self.arrays.reference.position is not None)
+        if guide is not None and follows:
             fill_table(self.arrays.reference, [guide])
         self._guide = guide if start is not None else None
         self.world: WorldBatch | None = None
