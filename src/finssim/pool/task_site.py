@@ -213,8 +213,8 @@ class Referee:
         self.task = task = fitted_task(task, vehicles)
         if start is not None and task.marks:
             raise ControlError(
-                f"task '{task.name}' needs the poses of {', '.join(task.marks)}, which are drawn with its world and are "
-                "in no record: finssim experiment stack scores it as it is played"
+                f"task '{task.name}' needs the poses of {', '.join(task.marks)}, which are drawn with its world and "
+                "are in no record: finssim experiment stack scores it as it is played"
             )
         if start is not None:
             task = _told(type(task))(**{field.name: getattr(task, field.name) for field in fields(task)})
