@@ -172,7 +172,7 @@ def test_an_interrupted_demonstration_goes_on(tmp_path, monkeypatch, made):
             demo(tmp_path / "demo", **options)
     assert demo(tmp_path / "demo", **options) == tmp_path / "demo" / "report.html"
     assert Policy.load(tmp_path / "demo" / "policy").description.training["complete"]
-    with pytest.raises(RobotError, match="made with other settings"):
+    with pytest.raises(RobotError, match="results of other settings"):
         demo(tmp_path / "demo", **{**options, "seed": 2})
 
 

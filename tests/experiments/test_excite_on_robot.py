@@ -149,7 +149,7 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--robot", "pool", "--pool-file", "pool.yaml", "--pool", "1"], "leave --simulate, --pool"),
+        (["--robot", "pool", "--pool-file", "pool.yaml", "--pool", "1"], "excludes --simulate, --pool"),
         (["--robot", "pool"], "give --pool-file"),
         (["--arm"], "need a robot: give --robot"),
     ],

@@ -222,7 +222,7 @@ def test_a_record_moves_the_pipeline_as_a_whole_and_a_drawn_net_is_refused(held)
     [
         (["a.mcap", "pid"], "one controller at a time"),
         (["a.mcap", "--trials", "3", "--hydrodynamics", "mesh"], "leave --trials, --hydrodynamics out"),
-        (["pid", "--truth", "m.csv"], "--truth tells of records"),
+        (["pid", "--truth", "m.csv"], "--truth is for records"),
     ],
 )
 def test_what_does_not_go_together_is_refused(words, sentence, capsys):

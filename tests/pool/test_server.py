@@ -299,7 +299,7 @@ def test_the_command_draws_pictures():
     [
         (["--camera", "film"], "unknown camera 'film'"),
         (["--severity", "easy"], "easy"),
-        (["--camera", "none", "--pool-file", "x.yaml"], "leave one out"),
+        (["--camera", "none", "--pool-file", "x.yaml"], "omit one"),
         (["--start", "0,0"], "0,0"),
         (["--plant", "nowhere.yaml"], "nowhere.yaml"),
         (["--port", "70000"], "70000"),

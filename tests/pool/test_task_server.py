@@ -83,8 +83,8 @@ def test_one_camera_tells_vehicles_apart_by_their_tags():
         (["run", "--team", "lead"], "--team lead is a baseline: give its task with --task"),
         (["run", "--team", "lead", "--task", "pursuit"], "has one agent: run it with --policy lead"),
         (["run", "--team", "consensus", "--task", "formation", "--agent", "corner_1"], "leave --agent"),
-        (["run", "--team", "consensus", "--policy", "pid"], "who steers?"),
-        (["run", "--arm"], "who steers?"),
+        (["run", "--team", "consensus", "--policy", "pid"], "no controller: give --policy"),
+        (["run", "--arm"], "no controller: give --policy"),
     ],
 )
 def test_what_a_team_cannot_do_is_refused(words, sentence, capsys):

@@ -435,7 +435,7 @@ def _on_robot(
                 )
                 if outcome is None:
                     continue
-                opened.say(f"  {fastest_text(programme, outcome)}")
+                opened.notify(f"  {fastest_text(programme, outcome)}")
             write_trial_of(record, path, role)
 
 

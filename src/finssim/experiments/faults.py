@@ -366,14 +366,14 @@ AUTOPILOT: Mapping[str, Scenario] = {
     "ap-our-heartbeat": _autopilot("ours is lost", "", math.inf, pool_fault(no_ground_heartbeat=True)),
     "ap-silence": _autopilot("telemetry is lost", SILENT, 1.0, pool_fault(drop=1.0)),
     "ap-deaf": _autopilot(
-        "what is sent is lost", "what we send is lost|was disarmed", 3.5, pool_fault(drop_commands=1.0)
+        "what is sent is lost", "our frames are lost|was disarmed", 3.5, pool_fault(drop_commands=1.0)
     ),
     "ap-joystick": _autopilot(
-        "a joystick steers", "somebody else steers", 0.5, another_station("manual_control", 1, 0, 0, 500, 400, 0),
+        "a joystick steers", "manual control", 0.5, another_station("manual_control", 1, 0, 0, 500, 400, 0),
         handed_over=True,
     ),
-    "ap-mode": _autopilot("the mode is changed", "mode to ALT_HOLD", 0.5, _command(176, 1, 2), handed_over=True),
-    "ap-disarm": _autopilot("somebody disarms", "was disarmed", 0.5, _command(400, 0)),
+    "ap-mode": _autopilot("the mode is changed", "changed to ALT_HOLD", 0.5, _command(176, 1, 2), handed_over=True),
+    "ap-disarm": _autopilot("disarmed from outside", "was disarmed", 0.5, _command(400, 0)),
     "ap-station": _autopilot("a second ground station, which listens", "", math.inf, {
         "1": another_station("heartbeat", 6, 8, 0, 0, 0, 3, every=1.0, system=254),
         "2": another_station("request_data_stream", 1, 1, 0, 2, 1, every=2.0),

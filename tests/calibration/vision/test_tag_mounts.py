@@ -133,7 +133,7 @@ def test_wrongly_read_tags_do_not_pull(rocked):
     fit = fit_mounts(RIG, FILE, broken)
     off = errors(fit, ("16.x", "16.y"))
     assert max(abs(off["16.x"]), abs(off["16.y"])) < 1e-3
-    assert fit.left_out > 0
+    assert fit.excluded > 0
 
 
 def test_what_shows_too_little_is_refused(rocked):

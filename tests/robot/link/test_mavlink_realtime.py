@@ -34,13 +34,13 @@ def test_a_pid_goes_to_its_goal_over_real_sockets(tmp_path):
     free = ["--port", "0", "--tcp", "127.0.0.1:0", "--dvl", "127.0.0.1:0", "--ground", ground]
     world = ["pool", "--firmware", "ardusub", "--truth", str(truth), *free, *VEHICLE]
     with Process(world, tmp_path, "pool") as pool:
-        assert until(lambda: "Doppler log: " in pool.said), pool.complained
-        log = re.search(r"Doppler log: (\S+)", pool.said)[1]
+        assert until(lambda: "Doppler log: " in pool.output), pool.complained
+        log = re.search(r"Doppler log: (\S+)", pool.output)[1]
         robot = ["run", "--robot", f"mavlink://udpin:{ground}?dvl={log}", "--policy", "pid", *VEHICLE]
         robot += ["--pool-file", "none", "--let-in", "0,0", "--goal", "0.3,0,-0.6,0", "--duration", "5"]
         with Process([*robot, "--arm", "--json"], tmp_path, "robot") as run:
             assert until(lambda: not run.running) and run.broke() == ""
-            summary = json.loads(run.said)
+            summary = json.loads(run.output)
         assert pool.end() == 0
     assert summary["state"] == "armed" and summary["faults"] == []
     assert summary["samples"]["velocity"]["accepted"] > 20
