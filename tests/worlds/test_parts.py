@@ -5,7 +5,7 @@ import pytest
 
 from finssim.geometry.rotations import quat_to_matrix
 from finssim.worlds import WorldError, WorldLayout
-from finssim.worlds.parts import parts_of
+from finssim.worlds.parts import PartsError, parts_of
 
 WATER = "about: A site.\nwater: {attenuation: [0, 0, 0], veil: [0, 0, 0], daylight_attenuation: [0, 0, 0]}\n"
 MJCF = """<mujoco><asset><mesh name="wedge" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/></asset><worldbody>
@@ -118,6 +118,20 @@ def test_a_model_stands_in_a_world_with_its_own_colours(tmp_path):
     np.testing.assert_allclose(
         [s.finish.colour for s in shapes], [[0.8, 0.1, 0.1], [0.5, 0.5, 0.5]], atol=1e-6
     )
+
+
+def test_files_outside_the_folder_are_refused_however_they_are_named(tmp_path):
+    """By a file that the model includes, or as a layer of a USD stage."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "own").mkdir()
+    write(tmp_path, "other.usda", USD)
+    write(tmp_path / "own", "more.xml", "<mujoco><asset><mesh file='../secret.stl'/></asset></mujoco>")
+    with pytest.raises(PartsError, match="names the file '../secret.stl'"):
+        parts_of(write(tmp_path / "own", "rack.xml", "<mujoco><include file='more.xml'/></mujoco>"))
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    layered = "#usda 1.0\n(\n    subLayers = [@../other.usda@]\n)\n"
+    with pytest.raises(PartsError, match="names the file .*other.usda"):
+        parts_of(write(tmp_path / "own", "rack.usda", layered))
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,9 @@ import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,15 @@ from finssim.geometry.rotations import matrix_to_quat, quat_multiply, quat_rotat
 SUFFIXES = (".xml", ".mjcf", ".urdf", ".usd", ".usda", ".usdc", ".usdz")
 Y_UP = np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
 """From axes with y up to axes with z up, xyzw."""
+
+
+USD_KINDS = {"Cube": "box", "Sphere": "sphere", "Capsule": "capsule", "Cylinder": "cylinder", "Mesh": "mesh"}
+FROM_Z = {
+    "X": [0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)],
+    "Y": [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)],
+    "Z": [0.0, 0.0, 0.0, 1.0],
+}
+"""Turns the z axis to another, xyzw."""
 
 
 class PartsError(ValueError):
@@ -96,8 +106,8 @@ def _mujoco(path: Path) -> Iterator[ModelPart]:
         )  # fmt: skip
 
 
-def _refuse_outside(path: Path) -> None:
-    """Refuse a model that names files outside its folder."""
+def _refuse_outside(path: Path, including: tuple[Path, ...] = ()) -> None:
+    """Refuse a model that names files outside its folder, itself or by a file that it includes."""
     try:
         tree = ElementTree.parse(path)
     except (OSError, ElementTree.ParseError) as error:
@@ -107,6 +117,8 @@ def _refuse_outside(path: Path) -> None:
             name = element.get(key, "")
             if name.startswith(("/", "~")) or re.search(r"^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)", name):
                 raise PartsError(f"names the file '{name}': put it into the model's folder or below")
+        if element.tag == "include" and (included := path.parent / element.get("file", "")) not in including:
+            _refuse_outside(included, (*including, path))
 
 
 def _usd(path: Path) -> Iterator[ModelPart]:
@@ -118,68 +130,73 @@ def _usd(path: Path) -> Iterator[ModelPart]:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
         raise PartsError(f"is not a USD stage: {' '.join(str(error).split())[:160]}") from None
+    folder = path.resolve().parent
+    for layer in stage.GetUsedLayers():
+        if layer.realPath and not Path(layer.realPath).resolve().is_relative_to(folder):
+            raise PartsError(f"names the file '{layer.realPath}': put it into the model's folder or below")
     unit = UsdGeom.GetStageMetersPerUnit(stage)
     upright = Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.array([0.0, 0.0, 0.0, 1.0])
     poses = UsdGeom.XformCache()
-    turns = {
-        "X": [0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)],
-        "Y": [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)],
-    }
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
-        kind = {
-            "Cube": "box",
-            "Sphere": "sphere",
-            "Capsule": "capsule",
-            "Cylinder": "cylinder",
-            "Mesh": "mesh",
-        }.get(prim.GetTypeName())
-        if kind is None:
-            if prim.IsA(UsdGeom.Gprim):
-                raise PartsError(f"{prim.GetPath()} is a {prim.GetTypeName()}, expected Cube, Sphere, Capsule, "
-                                 "Cylinder or Mesh: replace it")  # fmt: skip
+        if not prim.IsA(UsdGeom.Gprim) or (
+            UsdGeom.Imageable(prim).ComputeVisibility() == UsdGeom.Tokens.invisible
+        ):
             continue
-        if UsdGeom.Imageable(prim).ComputeVisibility() == UsdGeom.Tokens.invisible:
-            continue
-        matrix = np.array(poses.GetLocalToWorldTransform(prim)).T
-        scale = np.linalg.norm(matrix[:3, :3], axis=0)
-        rotation = matrix[:3, :3] / scale
-        if np.linalg.det(rotation) < 0.0 or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4:
-            if kind != "mesh":
-                raise PartsError(f"{prim.GetPath()} is mirrored or sheared: give it as a mesh")
-            scale, rotation = None, np.eye(3)
-        if kind not in ("box", "mesh") and np.ptp(scale) > 1e-4 * scale.max():
-            raise PartsError(
-                f"{prim.GetPath()} is scaled by {scale.tolist()}, expected equal factors: give it as a mesh"
+        part = _usd_part(prim, unit, np.array(poses.GetLocalToWorldTransform(prim)).T)
+        turned = quat_multiply(upright, part.quaternion)
+        yield replace(part, position=quat_rotate(upright, part.position), quaternion=turned)
+
+
+def _usd_part(prim: Any, unit: float, matrix: np.ndarray) -> ModelPart:
+    """One geometric prim in the stage's own axes; `matrix` is prim to stage, (4, 4), `unit` the stage's in metres."""
+    from pxr import UsdGeom
+
+    name, kind = prim.GetPath(), USD_KINDS.get(prim.GetTypeName())
+    if kind is None:
+        raise PartsError(
+            f"{name} is a {prim.GetTypeName()}, expected one of {', '.join(USD_KINDS)}: replace it"
+        )
+    shape = getattr(UsdGeom, prim.GetTypeName())(prim)
+    colours = shape.GetDisplayColorAttr().Get()
+    colour, position = np.array(colours[0], float) if colours else None, unit * matrix[:3, 3]
+    if kind == "mesh":
+        points, counts, corners = (
+            attribute.Get()
+            for attribute in (
+                shape.GetPointsAttr(),
+                shape.GetFaceVertexCountsAttr(),
+                shape.GetFaceVertexIndicesAttr(),
             )
-        q, mesh, size = matrix_to_quat(rotation), {}, (0.0, 0.0, 0.0)
-        if kind == "mesh":
-            points = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(), float).reshape(-1, 3)
-            counts, corners = (
-                np.array(attribute.Get(), int)
-                for attribute in (
-                    UsdGeom.Mesh(prim).GetFaceVertexCountsAttr(),
-                    UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr(),
-                )
-            )
-            mesh["vertices"] = unit * (points @ matrix[:3, :3].T if scale is None else points * scale)
-            mesh["faces"] = _triangles(counts, corners)
-        elif kind == "box":
-            size = tuple(float(0.5 * unit * s * UsdGeom.Cube(prim).GetSizeAttr().Get()) for s in scale)
-        else:
-            shape = getattr(UsdGeom, prim.GetTypeName())(prim)
-            length = shape.GetHeightAttr().Get() if kind != "sphere" else 0.0
-            size = (
-                float(unit * scale[0] * shape.GetRadiusAttr().Get()),
-                float(0.5 * unit * scale[0] * length),
-                0.0,
-            )
-            if kind != "sphere" and (axis := shape.GetAxisAttr().Get()) in turns:
-                q = quat_multiply(q, np.array(turns[axis]))
-        colours = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
-        yield ModelPart(
-            kind=kind, position=quat_rotate(upright, unit * matrix[:3, 3]), quaternion=quat_multiply(upright, q),
-            size=size, colour=np.array(colours[0], float) if colours else None, **mesh,
-        )  # fmt: skip
+        )
+        if not points or not counts or not corners:
+            raise PartsError(f"{name} has no faces: remove it")
+        vertices, faces = (
+            unit * np.array(points, float) @ matrix[:3, :3].T,
+            _triangles(np.array(counts), np.array(corners)),
+        )
+        upright = np.array([0.0, 0.0, 0.0, 1.0])
+        return ModelPart(
+            kind=kind, position=position, quaternion=upright, vertices=vertices, faces=faces, colour=colour
+        )
+    scale = np.linalg.norm(matrix[:3, :3], axis=0)
+    rotation = matrix[:3, :3] / np.maximum(scale, 1e-12)
+    if np.linalg.det(rotation) < 0.0 or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4:
+        raise PartsError(f"{name} is mirrored, sheared or flat: give it as a mesh")
+    if kind != "box" and np.ptp(scale) > 1e-4 * scale.max():
+        raise PartsError(f"{name} is scaled by {scale.tolist()}, expected equal factors: give it as a mesh")
+    q = matrix_to_quat(rotation)
+    if kind == "box":
+        size = tuple(float(0.5 * unit * s * shape.GetSizeAttr().Get()) for s in scale)
+    else:
+        length = 0.0 if kind == "sphere" else shape.GetHeightAttr().Get()
+        size = (
+            float(unit * scale[0] * shape.GetRadiusAttr().Get()),
+            float(0.5 * unit * scale[0] * length),
+            0.0,
+        )
+        if kind != "sphere":
+            q = quat_multiply(q, np.array(FROM_Z[shape.GetAxisAttr().Get()]))
+    return ModelPart(kind=kind, position=position, quaternion=q, size=size, colour=colour)
 
 
 def _triangles(counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
