@@ -199,44 +199,14 @@ def test_reports_reach_several_clients_as_whole_lines(server):
         assert client.receive() == [] and "closed" in client.describe()
 
 
-@pytest.mark.parametrize(
-    ("request_", "success"),
-    [
-        ({"command": "reset_dead_reckoning"}, True),
-        ({"command": "calibrate_gyro"}, True),
-        ({"command": "trigger_ping"}, True),
-        ({"command": "set_config", "parameters": {"speed_of_sound": 1480, "range_mode": "=1"}}, True),
-        ({"command": "set_config", "parameters": {"speed_of_sound": 900}}, False),
-        ({"command": "set_config", "parameters": {"acoustic_enabled": "no"}}, False),
-        ({"command": "set_config", "parameters": {"depth": 1}}, False),
-        ({"command": "set_config"}, False),
-        ({"command": ["set_config"]}, False),
-    ],
-)
-def test_commands_are_answered(server, request_, success):
-    """With a `response` as the log gives it, which the reader knows."""
+@pytest.mark.parametrize("command", ["reset_dead_reckoning", "set_config", ["set_config"]])
+def test_commands_are_refused(server, command):
+    """With a `response` as a log gives it, which the reader knows."""
     client, counts = connected(server), Counter()
-    client.send(json.dumps(request_).encode() + b"\n")
+    client.send(json.dumps({"command": command}).encode() + b"\n")
     (answer,) = received(client, server)
-    assert json.loads(answer)["success"] is success
-    assert bool(json.loads(answer)["error_message"]) is not success
+    assert json.loads(answer)["success"] is False and json.loads(answer)["error_message"]
     assert decode_line(answer, counts) is None and counts == {"response": 1}
-    client.send(b'{"command":"get_config"}\n')
-    (answer,) = received(client, server)
-    expected = 1480 if success and "parameters" in request_ else 1475.0
-    assert json.loads(answer)["result"]["speed_of_sound"] == expected
-    client.close()
-
-
-def test_a_log_that_is_told_not_to_ping_reports_once_per_trigger(server):
-    """Up to 15 wait in its queue."""
-    client = connected(server)
-    client.send(b'{"command":"set_config","parameters":{"acoustic_enabled":false}}\n')
-    client.send(b'{"command":"trigger_ping"}\n' * 16)
-    assert json.loads(received(client, server, 17)[-1])["success"] is False
-    for _ in range(20):
-        server.send(b'{"type":"velocity"}\n')
-    assert len(received(client, server, 20, within=0.2)) == 15
     client.close()
 
 

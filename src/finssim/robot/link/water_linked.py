@@ -196,25 +196,8 @@ class DvlClient(TcpTransport):
         return [] if data is None else self._lines.feed(data)
 
 
-_MOST_PINGS = 15
-_CONFIG: dict[str, Any] = {
-    "speed_of_sound": 1475.0,
-    "acoustic_enabled": True,
-    "dark_mode_enabled": False,
-    "mounting_rotation_offset": 0.0,
-    "range_mode": "auto",
-    "periodic_cycling_enabled": True,
-}
-_RANGES = {"speed_of_sound": (1000.0, 2000.0), "mounting_rotation_offset": (0.0, 360.0)}
-
-
 class DvlServer:
-    """A log's TCP server: reports to everyone who is connected, and answers to commands. No call waits.
-
-    Attributes:
-        config: What `get_config` tells; nothing but `acoustic_enabled` changes what is sent.
-        resets: How often dead reckoning was reset.
-    """
+    """A log's TCP server: reports to everyone who is connected; commands are refused. No call waits."""
 
     def __init__(self, address: Address = ("127.0.0.1", PORT)) -> None:
         """Listen.
@@ -226,28 +209,22 @@ class DvlServer:
         Raises:
             LinkError: It cannot be bound.
         """
-        self.config, self.resets = dict(_CONFIG), 0
-        self._pings = 0
         self._server = TcpServer(address, _Lines)
         self.address: Address = self._server.address
 
     def poll(self) -> None:
-        """Let new clients in and answer their commands; call it often."""
+        """Let new clients in and refuse their commands; call it often."""
         for client, lines, data in self._server.receive():
             for line in lines.feed(data):
-                self._server.send(_line(self._answer(_object(line))), client)
+                self._server.send(_line(_refusal(_object(line))), client)
 
     def send(self, line: bytes) -> None:
-        """Send a report to every client, if the log pings: always, or once per `trigger_ping` where it is told not to.
+        """Send a report to every client.
 
         Args:
             line: With its newline. A client that does not read is let go.
         """
         self.poll()
-        if not self.config["acoustic_enabled"]:
-            if not self._pings:
-                return
-            self._pings -= 1
         for client in list(self._server.clients):
             self._server.send(line, client)
 
@@ -255,37 +232,15 @@ class DvlServer:
         """Let everyone go and stop listening."""
         self._server.close()
 
-    def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        command, error, result = request.get("command"), "", None
-        if command == "reset_dead_reckoning":
-            self.resets += 1
-        elif command == "get_config":
-            result = self.config
-        elif command == "set_config":
-            error = self._configure(request.get("parameters"))
-        elif command == "trigger_ping":
-            error = "the queue of pings is full" if self._pings == _MOST_PINGS else ""
-            self._pings += not error
-        elif command != "calibrate_gyro":
-            error = "unknown command"
-        return {
-            "response_to": command if isinstance(command, str) else "",
-            "success": not error,
-            "error_message": error,
-            "result": result,
-            "format": _FORMAT,
-            "type": "response",
-        }
 
-    def _configure(self, parameters: Any) -> str:
-        """Take all settings or none; what is wrong with them, or nothing."""
-        if not isinstance(parameters, dict) or not parameters:
-            return "no parameters"
-        for name, value in parameters.items():
-            fits = type(value) is type(_CONFIG.get(name))
-            if name in _RANGES:
-                fits = math.isfinite(_number(value, *_RANGES[name]))
-            if not fits:
-                return f"{name}: unknown or out of range"
-        self.config.update(parameters)
-        return ""
+def _refusal(request: dict[str, Any]) -> dict[str, Any]:
+    """The response to a command: a simulated log has no settings."""
+    command = request.get("command")
+    return {
+        "response_to": command if isinstance(command, str) else "",
+        "success": False,
+        "error_message": "a simulated log takes no commands",
+        "result": None,
+        "format": _FORMAT,
+        "type": "response",
+    }
