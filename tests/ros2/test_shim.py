@@ -227,7 +227,8 @@ def test_parameters_are_declared_once_and_before_use(context):
     with pytest.raises(ParameterNotDeclaredException):
         node.get_parameter("other")
     assert node.get_parameter_or("other", Parameter("other", value=3)).value == 3
-    assert Node("b", allow_undeclared_parameters=True).get_parameter("other").value is None
+    with pytest.raises(TypeError, match="needs a sourced ROS 2"):
+        Node("b", allow_undeclared_parameters=True)
 
 
 def test_values_from_outside_keep_the_type(context):

@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from finssim.ros2.shim.arguments import RosArguments, parse_arguments
@@ -29,7 +29,6 @@ class Context:
         """Whether SIGTERM came."""
         self._participant: Participant | None = None
         self._waiters: weakref.WeakSet[Any] = weakref.WeakSet()
-        self._on_shutdown: list[Callable[[], None]] = []
         self._lock = threading.RLock()
 
     def init(self, args: Sequence[str] | None = None, *, domain_id: int | None = None) -> None:
@@ -76,10 +75,6 @@ class Context:
             self.participant.announce([node.record() for node in self.nodes])
             self.wake()
 
-    def on_shutdown(self, callback: Callable[[], None]) -> None:
-        """Call it when the wire is left."""
-        self._on_shutdown.append(callback)
-
     def add_waiter(self, waiter: Any) -> None:
         """Wake this too when something changes."""
         self._waiters.add(waiter)
@@ -109,8 +104,6 @@ class Context:
                 waiter.close()
             self.nodes.clear()
             participant.close()
-        for callback in self._on_shutdown:
-            callback()
 
     def leave_on_sigterm(self) -> None:
         """Let SIGTERM end `spin` as rclpy does, unless the program handles that signal or this is no main thread."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -75,7 +74,7 @@ class Future:
     """An answer that comes while some executor spins. Not to be awaited: coroutines need a sourced ROS 2."""
 
     def __init__(self, *, executor: Any = None) -> None:
-        self._finished = threading.Event()
+        self._finished = False
         self._result: Any = None
         self._exception: BaseException | None = None
         self._cancelled = False
@@ -83,7 +82,7 @@ class Future:
 
     def done(self) -> bool:
         """Whether it has come, or never will."""
-        return self._finished.is_set()
+        return self._finished
 
     def cancelled(self) -> bool:
         """Whether nobody waits for it any more."""
@@ -122,12 +121,8 @@ class Future:
         else:
             self._callbacks.append(callback)
 
-    def wait(self, timeout: float | None = None) -> bool:
-        """Block until done, while another thread spins; whether it is."""
-        return self._finished.wait(timeout)
-
     def _finish(self) -> None:
-        self._finished.set()
+        self._finished = True
         callbacks, self._callbacks = self._callbacks, []
         for callback in callbacks:
             callback(self)
@@ -363,21 +358,6 @@ class Client(Endpoint):
         future = Future()
         self._pending[self._end.send(request)] = future
         return future
-
-    def call(self, request: Message, timeout_sec: float | None = None) -> Any:
-        """Ask and wait, while another thread spins: in a callback of the thread that spins it would never end.
-
-        Raises:
-            TimeoutError: No answer in time.
-        """
-        future = self.call_async(request)
-        if not future.wait(timeout_sec):
-            self.remove_pending_request(future)
-            raise TimeoutError(
-                f"{self.srv_name} did not answer within {timeout_sec} s: spin in another thread, and see whether the "
-                "service runs under Cyclone DDS"
-            )
-        return future.result()
 
     def service_is_ready(self) -> bool:
         """Whether a server is known."""

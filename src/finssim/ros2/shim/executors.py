@@ -89,14 +89,6 @@ class ExternalShutdownException(Exception):
     """The context was shut down by somebody else while an executor spun."""
 
 
-class ShutdownException(Exception):
-    """The executor was shut down."""
-
-
-class TimeoutException(Exception):
-    """Nothing came in time."""
-
-
 class SingleThreadedExecutor:
     """Runs callbacks one at a time.
 

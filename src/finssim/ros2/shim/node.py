@@ -121,8 +121,6 @@ class Node(NodeParameters, NodeGraph):
         namespace: What its relative names stand below.
         use_global_arguments: Whether the process's command line counts too.
         parameter_overrides: Values that win over files and command line.
-        allow_undeclared_parameters: Whether parameters need no declaration.
-        automatically_declare_parameters_from_overrides: Declare every parameter that is given from outside.
         start_parameter_services: Whether `ros2 param` reaches it.
         **services: `enable_rosout` and `enable_logger_service` are accepted; the shim has neither.
     """
@@ -136,14 +134,12 @@ class Node(NodeParameters, NodeGraph):
         namespace: str | None = None,
         use_global_arguments: bool = True,
         parameter_overrides: Sequence[Parameter] | None = None,
-        allow_undeclared_parameters: bool = False,
-        automatically_declare_parameters_from_overrides: bool = False,
         start_parameter_services: bool = True,
         **services: bool,
     ) -> None:
         unknown = set(services) - {"enable_rosout", "enable_logger_service"}
         if unknown:
-            raise TypeError(f"Node takes no argument '{min(unknown)}'")
+            raise TypeError(f"Node: '{min(unknown)}' is no argument, or needs a sourced ROS 2: omit it")
         self._context = context or get_default_context()
         local_arguments = parse_arguments(cli_args or ())
         sources = [self.context.arguments, local_arguments] if use_global_arguments else [local_arguments]
@@ -157,7 +153,7 @@ class Node(NodeParameters, NodeGraph):
         for source in sources:
             overrides |= overrides_for(self.get_fully_qualified_name(), source.parameters)
         overrides |= {p.name: p.value for p in parameter_overrides or ()}
-        NodeParameters.__init__(self, overrides, allow_undeclared_parameters)
+        NodeParameters.__init__(self, overrides)
         self._clock = ROSClock()
         self.context.nodes.append(self)
         event = self.context.participant.codec.message("rcl_interfaces/msg/ParameterEvent")
@@ -165,9 +161,6 @@ class Node(NodeParameters, NodeGraph):
             event, "/parameter_events", qos_profile_parameter_events
         )
         self._time_source: TimeSource | None = None
-        if automatically_declare_parameters_from_overrides:
-            for name, value in overrides.items():
-                self.declare_parameter(name, value, ignore_override=True)
         self._time_source = TimeSource(self, self._clock)
         if start_parameter_services:
             ParameterService(self)

@@ -235,16 +235,13 @@ class NodeParameters:
 
     Args:
         overrides: Values given from outside, by name.
-        undeclared: Whether parameters may be set and read without a declaration.
     """
 
-    def __init__(self, overrides: Mapping[str, Any], undeclared: bool) -> None:
+    def __init__(self, overrides: Mapping[str, Any]) -> None:
         self._overrides = dict(overrides)
-        self._undeclared = undeclared
         self._values: dict[str, Parameter] = {}
         self._descriptors: dict[str, Any] = {}
         self._callbacks: list[SetCallback] = []
-        self._afterwards: list[Callable[[list[Parameter]], None]] = []
 
     def declare_parameter(
         self, name: str, value: Any = None, descriptor: Any = None, ignore_override: bool = False
@@ -335,8 +332,6 @@ class NodeParameters:
             ParameterNotDeclaredException: It is not declared.
             ParameterUninitializedException: It has a type but no value.
         """
-        if name not in self._values and self._undeclared:
-            return Parameter(name)
         dynamic = self._declared(name).dynamic_typing
         parameter = self._values[name]
         if parameter.type_ is Kind.NOT_SET and not dynamic:
@@ -358,19 +353,12 @@ class NodeParameters:
 
     def get_parameter_type(self, name: str) -> Any:
         """Number of its type."""
-        if name not in self._values and self._undeclared:
-            return Kind.NOT_SET
         self._declared(name)
         return self._values[name].type_.value
 
     def get_parameter_types(self, names: Sequence[str]) -> list[Any]:
         """Numbers of several types."""
         return [self.get_parameter_type(name) for name in names]
-
-    def get_parameters_by_prefix(self, prefix: str) -> dict[str, Parameter]:
-        """Parameters below a prefix, by the rest of their name."""
-        start = f"{prefix}{DOT}" if prefix else ""
-        return {n[len(start) :]: p for n, p in self._values.items() if n.startswith(start)}
 
     def list_parameters(self, prefixes: list[str], depth: int) -> Any:
         """Names down to a depth (0: all) below prefixes (none: everywhere), as rcl_interfaces/ListParametersResult.
@@ -413,9 +401,8 @@ class NodeParameters:
         """
         if not all(isinstance(parameter, Parameter) for parameter in parameters):
             raise TypeError("only a Parameter can be set")
-        if not self._undeclared:
-            for parameter in parameters:
-                self._declared(parameter.name)
+        for parameter in parameters:
+            self._declared(parameter.name)
         reason = self._set(list(parameters))
         return codec_of().message("rcl_interfaces/msg/SetParametersResult")(
             successful=not reason, reason=reason
@@ -423,8 +410,6 @@ class NodeParameters:
 
     def describe_parameter(self, name: str) -> Any:
         """Its rcl_interfaces/ParameterDescriptor."""
-        if name not in self._descriptors and self._undeclared:
-            return codec_of().message("rcl_interfaces/msg/ParameterDescriptor")()
         return self._declared(name)
 
     def describe_parameters(self, names: Sequence[str]) -> list[Any]:
@@ -438,10 +423,6 @@ class NodeParameters:
     def remove_on_set_parameters_callback(self, callback: SetCallback) -> None:
         """Ask no more."""
         self._callbacks.remove(callback)
-
-    def add_post_set_parameters_callback(self, callback: Callable[[list[Parameter]], None]) -> None:
-        """Call this after parameters were set."""
-        self._afterwards.insert(0, callback)
 
     def _parameters_changed(
         self, new: list[Parameter], changed: list[Parameter], removed: list[Parameter]
@@ -484,13 +465,8 @@ class NodeParameters:
             (changed if self.get_parameter_or(name).type_ is not Kind.NOT_SET else new).append(parameter)
             if descriptors is not None:
                 self._descriptors[name] = descriptors[name]
-            elif name not in self._descriptors:
-                added = codec_of().message("rcl_interfaces/msg/ParameterDescriptor")
-                self._descriptors[name] = added(name=name, dynamic_typing=True)
             self._values[name] = parameter
         self._parameters_changed(new, changed, removed)
-        for afterwards in self._afterwards:
-            afterwards(parameters)
         return ""
 
     def _refusal(self, parameter: Parameter, descriptor: Any, *, declaring: bool) -> str:
