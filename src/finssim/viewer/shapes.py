@@ -23,24 +23,6 @@ ARROW = 1.2
 """Length of the arrow of the largest thrust, part of the vehicle's length."""
 FAINT = 0.002
 """Part of the largest thrust below which no arrow is drawn."""
-BOX_FACES = np.array(
-    [
-        [0, 2, 1],
-        [1, 2, 3],
-        [4, 5, 6],
-        [5, 7, 6],
-        [0, 1, 4],
-        [1, 5, 4],
-        [2, 6, 3],
-        [3, 6, 7],
-        [0, 4, 2],
-        [2, 4, 6],
-    ]
-    + [[1, 3, 5], [3, 7, 5]]
-)
-"""Of the corners in the order z, y, x: outwards; -z, +z, -y, +y, -x, +x."""
-
-
 FAR, GAMMA = 15.0, 2.2
 """Half the edge of a plane that is drawn [m]; reflectances are shown to this power."""
 
@@ -86,9 +68,9 @@ def tag_plates(vehicle: Vehicle) -> tuple[Mesh, Mesh] | None:
 
 def wall_mesh(lower: Array, upper: Array) -> Mesh:
     """Floor and four walls of a box, seen from inside alone: those between the eye and the water vanish."""
-    box = _box(lower, upper)
-    open_faces = np.r_[0:2, 4:12]  # without the lid
-    return Mesh(box.vertices, box.faces[open_faces][:, ::-1])
+    vertices, faces = _box(lower, upper)
+    lid = (vertices[faces][..., 2] == upper[2]).all(axis=1)
+    return Mesh(vertices, faces[~lid][:, ::-1])
 
 
 def force_arrows(vehicle: Vehicle, force: Array, pose: Pose) -> Array:
@@ -186,11 +168,11 @@ def _mesh_of(shape: Shape) -> Mesh:
 
 
 def _box(lower: Array, upper: Array) -> Mesh:
-    ends = np.stack([lower, upper])
-    vertices = np.array(
-        [[ends[x, 0], ends[y, 1], ends[z, 2]] for z in (0, 1) for y in (0, 1) for x in (0, 1)]
-    )
-    return Mesh(vertices, BOX_FACES)
+    """A box, its corners in the order of x, y, z."""
+    import trimesh.creation as made
+
+    solid = made.box(bounds=[lower, upper])
+    return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces))
 
 
 def _squares(places: list[tuple[Array, Array]], edge: float, lift: float) -> Mesh:
