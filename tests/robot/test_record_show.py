@@ -1,4 +1,4 @@
-"""`finssim record` and `finssim play`: figures of a record, and its messages in their time."""
+"""`finssim record` and `finssim play`: figures of a record, and its messages."""
 
 import json
 
@@ -12,8 +12,6 @@ pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
 
 from finssim.robot.messages import Picture, Telemetry
-from finssim.robot.record_messages import RecordError
-from finssim.robot.record_reader import open_record, play
 from finssim.robot.recorder import Recorder
 from finssim.vehicles import load_vehicle
 
@@ -68,32 +66,12 @@ def test_repair_writes_beside_the_cut_record(run, tmp_path, capsys):
 
 
 def test_play_prints_the_messages_of_the_topics_asked_for(run, capsys):
-    lines = finssim(capsys, "play", run, "--fast", "--topics", "events,camera/image/compressed").splitlines()
+    lines = finssim(capsys, "play", run, "--topics", "events,camera/image/compressed").splitlines()
     assert len(lines) == 2 and "tilted" in lines[0] and "bytes" in lines[1]
 
 
 def test_play_starts_where_it_is_told_and_writes_json(run, capsys):
-    text = finssim(capsys, "play", run, "--fast", "--topics", "telemetry", "--start", 1.9)
+    text = finssim(capsys, "play", run, "--topics", "telemetry", "--start", 1.9)
     lines = [json.loads(line) for line in text.splitlines()]
     assert [line["time"] for line in lines] == pytest.approx([101.9, 101.92, 101.94, 101.96, 101.98, 102.0])
     assert lines[0]["message"]["depth"] == 0.5 and lines[0]["message"]["pressure"] is None
-
-
-@pytest.mark.parametrize(("speed", "takes"), [(1.0, 2.0), (4.0, 0.5), (float("inf"), 0.0)])
-def test_play_keeps_the_time_of_the_record(run, speed, takes):
-    """On a clock of our own: two seconds at speed 1, half a second at 4, none at infinity."""
-    now = 0.0
-
-    def wait(seconds):
-        nonlocal now
-        now += seconds
-
-    with open_record(run) as record:
-        due = [(now, entry.time) for entry in play(record, speed=speed, clock=lambda: now, wait=wait)]
-    assert now == pytest.approx(takes, abs=1e-6)
-    assert all(at == pytest.approx((t - 100.0) / speed, abs=1e-6) for at, t in due)
-
-
-def test_a_speed_that_is_none_is_refused(run):
-    with open_record(run) as record, pytest.raises(RecordError, match="speed is 0"):
-        next(play(record, speed=0.0, clock=lambda: 0.0, wait=lambda s: None))

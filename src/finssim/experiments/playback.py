@@ -1,4 +1,4 @@
-"""`finssim play`: the messages of a record as they came, or an episode of a policy as a film."""
+"""`finssim play`: the messages of a record, or an episode of a policy as a film."""
 
 from __future__ import annotations
 
@@ -30,7 +30,6 @@ def play(
     path: Path,
     *,
     speed: float = 1.0,
-    fast: bool = False,
     topics: Annotated[Sequence[str] | None, ","] = None,
     start: Annotated[float, (0.0, None)] = 0.0,
     video: Path | None = None,
@@ -39,16 +38,15 @@ def play(
     plant: str = "nominal",
     seed: int = 42,
 ) -> None:
-    """Print the messages of a record in real time, as JSON lines [SI units]; or film an episode of a policy.
+    """Print the messages of a record as JSON lines [SI units], or film an episode of a policy.
 
-    Example: finssim play run.mcap --topics odom,events --speed 4
+    Example: finssim play run.mcap --topics odom,events
 
     Example: finssim play runs/see --plant held_out --video see.mp4
 
     Args:
         path (FILE|DIR): Record of a run (.mcap), or directory of a policy.
-        speed (FACTOR): Speed factor relative to the record, or to the episode [-].
-        fast: Print without waiting.
+        speed (FACTOR): Speed factor of a film relative to the episode [-].
         topics (NAMES): Topics of a record to print, separated by commas: odom,thruster_cmd.
         start: Offset from the start of the record [s].
         video (FILE): Film of an episode to write (.mp4).
@@ -58,14 +56,14 @@ def play(
         seed: Of the episode.
 
     Raises:
-        RecordError: Not a record, no such topic, or a speed that is not above zero.
+        RecordError: Not a record, or no such topic.
         PlaybackError: A directory without a film to write, or a film of a record.
         PolicyError, PlantError, EnvironmentSetupError: As they say.
     """
     if not path.is_dir():
         if video is not None:
             raise PlaybackError(f"{path} is no directory of a policy: only an episode of a policy is filmed")
-        play_record(path, speed=speed, fast=fast, topics=topics, start=start)
+        play_record(path, topics=topics, start=start)
         return
     if video is None or video.suffix != ".mp4":
         raise PlaybackError(f"{path} is a policy: give the film to write, --video FILE.mp4")

@@ -8,9 +8,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +22,7 @@ from finssim.mcap_files import MAGIC, intact_mcap
 from finssim.robot.record_messages import METADATA, RecordError, types
 from finssim.yaml_file import json_value
 
-__all__ = ["Entry", "Record", "describe_record", "events_of", "open_record", "play", "repair_record"]
+__all__ = ["Entry", "Record", "describe_record", "events_of", "open_record", "repair_record"]
 
 
 def repair(file: Path, *, out: Path | None = None) -> None:
@@ -309,44 +308,6 @@ def events_of(record: Record) -> list[dict[str, Any]]:
     return events
 
 
-# Records played: their messages one after the other, in the time in which they were recorded.
-
-
-def play(
-    record: Record,
-    *,
-    speed: float,
-    clock: Callable[[], float],
-    wait: Callable[[float], None],
-    topics: Collection[str] | None = None,
-    start: float | None = None,
-) -> Iterator[Entry]:
-    """Messages, each when its time has come.
-
-    Args:
-        record: An open one.
-        speed: Times as fast as recorded [-]; infinite: at once.
-        clock: [s], monotonic.
-        wait: Waits so long [s].
-        topics: Only these.
-        start: From this time of the record on [s].
-
-    Raises:
-        RecordError: A speed that is not above zero, or no such topic.
-    """
-    if not speed > 0.0:
-        raise RecordError(f"speed is {speed:g}, expected a number above 0")
-    began: tuple[float, float] | None = None
-    for entry in record.messages(topics, start):
-        if began is None:
-            began = clock(), entry.time
-        if math.isfinite(speed):
-            pause = began[0] + (entry.time - began[1]) / speed - clock()
-            if pause > 0.0:
-                wait(pause)
-        yield entry
-
-
 def plain(value: Any) -> Any:
     """A message as dictionaries, lists and numbers; pictures by their size."""
     if hasattr(value, "__dataclass_fields__"):
@@ -394,33 +355,24 @@ def info(path: Path, *, as_json: bool = False) -> None:
 def play_record(
     path: Path,
     *,
-    speed: float = 1.0,
-    fast: bool = False,
     topics: Annotated[Sequence[str] | None, ","] = None,
     start: Annotated[float, (0.0, None)] = 0.0,
 ) -> None:
-    """Print the messages of a record as they came, a JSON object a line [s, SI units]; pictures by their size.
-
-    Example: finssim play run.mcap --topics odom,events --speed 4
+    """Print the messages of a record in their order, a JSON object a line [s, SI units]; pictures by their size.
 
     Args:
         path (FILE): Record of a run (.mcap).
-        speed (FACTOR): Times as fast as it was recorded [-].
-        fast: Print without waiting.
         topics (NAMES): Only these, with commas between: odom,thruster_cmd.
         start: Offset from the start of the record [s].
 
     Raises:
-        RecordError: Not a record, no such topic, or a speed that is not above zero.
+        RecordError: Not a record, or no such topic.
     """
     with open_record(path) as record:
         for note in record.notes:
             print(note, file=sys.stderr)
         first = next((at for at, _, _ in record.sizes()), 0.0) + start if start else None
-        pace = math.inf if fast else speed
-        for entry in play(
-            record, speed=pace, clock=time.monotonic, wait=time.sleep, topics=topics, start=first
-        ):
+        for entry in record.messages(topics, first):
             print(json_line(entry), flush=True)
 
 
@@ -446,7 +398,5 @@ def _lines(description: dict[str, Any]) -> list[str]:
     start = description["start_s"]
     lines += [f"{e['time'] - start:10.3f} s  {e['kind']}: {e['text']}" for e in events[:EVENTS_SHOWN]]
     if len(events) > EVENTS_SHOWN:
-        lines.append(
-            f"and {len(events) - EVENTS_SHOWN} more events: finssim play FILE --topics events --fast"
-        )
+        lines.append(f"and {len(events) - EVENTS_SHOWN} more events: finssim play FILE --topics events")
     return lines
