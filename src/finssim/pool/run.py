@@ -9,8 +9,8 @@ import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, 
 from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
 from finssim.robot.goals import station_of
+from finssim.robot.interrupt import interruptible
 from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import (
     Address,
@@ -302,7 +303,7 @@ def serve_realtime(
     sink: UdpSender | None = None,
     camera: Clocked | None = None,
     duration: float = math.inf,
-    until: Callable[[Pace], bool] = lambda pace: False,
+    until: Callable[[], bool] = lambda: False,
     over: Callable[[], None] = lambda: None,
     clock: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
@@ -325,7 +326,7 @@ def serve_realtime(
     sent: dict[str, list[bytes]] = {name: [] for name in site.runtimes}
     frames: dict[str, list[tuple[float, bytes]]] = {name: [] for name in site.runtimes}
     steps, announced = 0, False
-    while now < duration and not until(pace):
+    while now < duration and not until():
         behind = clock() - start - now
         if behind > MOST_BEHIND:
             pace.given_up += behind - TICK
@@ -613,7 +614,7 @@ def _serve_task(
     names = site.task.agents
     if not 0 < port <= 65535 - 10 * len(names):
         raise LinkError(f"port {port}: expected room for ten ports to each of {len(names)} vehicles after it")
-    with _stoppable() as stop_requested, ExitStack() as stack:
+    with interruptible() as interrupted, ExitStack() as stack:
         stack.callback(site.close)
         messages = MediumServer((bind, port + MESSAGES), site.carrier, names)
         stack.callback(messages.close)
@@ -626,7 +627,7 @@ def _serve_task(
         _say(f"messages: {_name(messages.address)}")
         longest = math.inf if duration is None else duration
         notify = partial(_tell_episode, site)
-        pace = serve_realtime(site, transports, messages, duration=longest, until=stop_requested, over=notify)
+        pace = serve_realtime(site, transports, messages, duration=longest, until=interrupted, over=notify)
     if not site.over:
         _tell_episode(site)
     _say(f"ended after {pace.duration:.1f} s")
@@ -691,7 +692,10 @@ def _lockstep(
         stack.callback(world.close)
         reason = "stopped"
         _say(f"lock-step: {_name(server.address)}")
-        with suppress(KeyboardInterrupt), _stoppable(at_once=True):
+        stack.callback(
+            signal.signal, signal.SIGTERM, signal.signal(signal.SIGTERM, signal.default_int_handler)
+        )
+        with suppress(KeyboardInterrupt):
             reason = server.serve(world, duration=duration)
     _say(f"{reason} at {world.time:.1f} s")
 
@@ -704,7 +708,7 @@ def _realtime(
     duration: float,
     links: Callable[[], GroundLinks] | None,
 ) -> None:
-    with _stoppable() as stop_requested, ExitStack() as stack:
+    with interruptible() as interrupted, ExitStack() as stack:
         transport = UdpTransport(bind, robot) if links is None else links()
         stack.callback(transport.close)
         drawn, sink, eye = _camera(plan, _next(bind), _next(robot))
@@ -721,9 +725,7 @@ def _realtime(
         if eye is not None:
             _say(f"pictures: {_name(_next(bind))}, for {_name(_next(robot))}")
         site, transports = Fleet({plan.vehicle.name: world}), {plan.vehicle.name: transport}
-        pace = serve_realtime(
-            site, transports, sink=sink, camera=drawn, duration=duration, until=stop_requested
-        )
+        pace = serve_realtime(site, transports, sink=sink, camera=drawn, duration=duration, until=interrupted)
         _say(pace.sentence)
         if drawn is not None and drawn.dropped:
             _say(drawn.complaint)
@@ -742,27 +744,6 @@ def _camera(
         return None, UdpSender(bind, peer), plan.camera.camera()
     drawn = PictureProcess(plans, bind, peer)
     return drawn, None, drawn
-
-
-@contextmanager
-def _stoppable(*, at_once: bool = False) -> Iterator[Callable[..., bool]]:
-    """Let Ctrl-C and SIGTERM ask for the end, or end a wait at once; gives whether they did. The second ends all."""
-    requested = False
-    before: dict[int, Any] = {}
-
-    def stop(number: int, frame: object) -> None:
-        nonlocal requested
-        if requested or at_once:
-            raise KeyboardInterrupt
-        requested = True
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        before[number] = signal.signal(number, stop)
-    try:
-        yield lambda *_: requested
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _next(address: tuple[str, int]) -> tuple[str, int]:
