@@ -211,7 +211,7 @@ def test_a_duration_of_zero_is_no_time_and_not_for_ever(capsys, pool_file):
     """Nothing but the frames of the end goes out."""
     words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--pictures", "none")
     status, summary = told(
-        capsys, *words, "--robot", "dry-run", "--bind", "127.0.0.1:0", "--duration", 0, "--arm"
+        capsys, *words, "--robot", "udp://127.0.0.1:9", "--bind", "127.0.0.1:0", "--duration", 0, "--arm"
     )
     assert status == 0 and summary["steps"] == 0
 

@@ -73,7 +73,7 @@ def told(graph, tmp_path, **choices):
         ("pool", {"site": "tank"}, "virtual_pool", {"camera": "corners"}),
         ("pool", {"namespace": "robot_1"}, "**", {"frame_prefix": "robot_1/"}),
         ("pool", {"site": "open-water", "positioning": "usbl"}, "virtual_pool", {"camera": "none"}),
-        ("robot", {"robot": "dry-run", "pool_file": FILE}, "camera", {"pictures": "none"}),
+        ("robot", {"robot": "serial:/dev/x", "pool_file": FILE}, "camera", {"pictures": "none"}),
         ("robot", {"pictures": "udp://a:1", "pool_file": FILE}, "camera", {"pictures": "udp://a:1"}),
     ],
 )

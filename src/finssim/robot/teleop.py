@@ -510,7 +510,7 @@ def run(
     Args:
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         device (NAME): Input device: gamepad or keyboard.
-        robot (WIRE): Link to the motor controller: udp://HOST:PORT, serial:DEVICE, dry-run, or pool (the virtual
+        robot (WIRE): Link to the motor controller: udp://HOST:PORT, serial:DEVICE, or pool (the virtual
             pool on this machine); or to an autopilot: mavlink or mavlink://KIND:ADDRESS, as in finssim run.
         bind (ADDRESS:PORT): Local address and port, for UDP.
         pool_file (FILE): Pool file: camera, water plane and frames (.yaml); without it the position is unknown.

@@ -151,7 +151,7 @@ class Options:
     arm: bool = False
     """Arm once, as soon as the state is known; otherwise the topic arm does."""
     robot: str = "pool"
-    """(ADDRESS) Motor controller of a robot: udp://HOST:PORT, serial:DEVICE, dry-run, or pool for a finssim pool on
+    """(ADDRESS) Motor controller of a robot: udp://HOST:PORT, serial:DEVICE, or pool for a finssim pool on
     this machine; or its autopilot: mavlink or mavlink://KIND:ADDRESS, as in finssim run."""
     bind: str = "127.0.0.1:54321"
     """(ADDRESS:PORT) Local address and port for udp; images arrive at the next port."""

@@ -7,7 +7,7 @@ import socket
 import pytest
 
 from finssim.robot.link.frames import LinkError, encode_command, encode_telemetry
-from finssim.robot.link.transports import DryRun, UdpTransport, memory_pair, open_transport
+from finssim.robot.link.transports import UdpTransport, memory_pair, open_transport
 from robot.link.test_frames import COMMAND, TELEMETRY
 
 LOCAL = "127.0.0.1"
@@ -141,7 +141,7 @@ def test_a_second_robot_on_the_same_port_is_refused(ends):
     [
         (
             "tcp://127.0.0.1:1",
-            "unknown wire 'tcp://127.0.0.1:1': give udp://HOST:PORT, serial:DEVICE, mavlink://KIND:WHERE or dry-run",
+            "unknown wire 'tcp://127.0.0.1:1': give udp://HOST:PORT, serial:DEVICE or mavlink://KIND:WHERE",
         ),
         ("udp://127.0.0.1", "no HOST:PORT"),
         ("udp://127.0.0.1:70000", "no HOST:PORT"),
@@ -174,12 +174,3 @@ def test_what_goes_in_at_one_end_of_memory_comes_out_at_the_other():
     robot.send(b"late")
     vehicle.send(b"late")
     assert (vehicle.receive(), robot.receive()) == ([], [])
-
-
-def test_a_dry_run_sends_to_nobody():
-    """It takes frames and counts them."""
-    wire_to_nobody = open_transport("dry-run")
-    assert isinstance(wire_to_nobody, DryRun)
-    wire_to_nobody.send(b"a")
-    wire_to_nobody.send(b"b")
-    assert (wire_to_nobody.sent, wire_to_nobody.last, wire_to_nobody.receive()) == (2, b"b", [])

@@ -8,7 +8,7 @@ from finssim_ros.launching import description
 ARGUMENTS = {
     "robot": (
         "",
-        "udp://HOST:PORT, serial:/dev/..., mavlink://..., dry-run, or pool for the virtual pool on this machine",
+        "udp://HOST:PORT, serial:/dev/..., mavlink://..., or pool for the virtual pool on this machine",
     ),
     "policy": ("", "directory of an exported policy, pid or pid-paper"),
     "pool_file": ("", "calibrated pool and camera"),

@@ -1,4 +1,4 @@
-"""How frames travel: to the motor controller over UDP or a serial line, to nobody, or between two ends in memory."""
+"""How frames travel: to the motor controller over UDP or a serial line, or between two ends in memory."""
 
 from __future__ import annotations
 
@@ -629,30 +629,6 @@ class Transport(Protocol):
         """The wire and how it fares, in a few words."""
 
 
-class DryRun:
-    """No wire: takes every frame, and nothing ever comes."""
-
-    def __init__(self) -> None:
-        self.sent = 0
-        self.last = b""
-
-    def send(self, data: bytes) -> None:
-        """Count the frame and keep it as `last`."""
-        self.sent += 1
-        self.last = data
-
-    def receive(self) -> list[bytes]:
-        """Nothing."""
-        return []
-
-    def close(self) -> None:
-        """Nothing to let go of."""
-
-    def describe(self) -> str:
-        """How many frames went nowhere."""
-        return f"dry run, {self.sent} frames, not sent"
-
-
 class MemoryTransport:
     """One of two ends in one process; what waits beyond 4096 frames pushes out the oldest, as a socket loses some."""
 
@@ -690,8 +666,8 @@ def open_transport(address: str, bind: str = DEFAULT_BIND) -> Transport:
     """The wire that an address names.
 
     Args:
-        address: "udp://HOST:PORT" of the motor controller, "serial:DEVICE" or "serial:DEVICE?baud=57600", "dry-run", or
-            of an autopilot, as `MavlinkAddress` has it.
+        address: "udp://HOST:PORT" of the motor controller, "serial:DEVICE" or "serial:DEVICE?baud=57600", or of
+            an autopilot, as `MavlinkAddress` has it.
         bind: "ADDRESS:PORT" of this end, for UDP.
 
     Raises:
@@ -708,11 +684,7 @@ def open_transport(address: str, bind: str = DEFAULT_BIND) -> Transport:
         return SerialTransport(parts.path, int(baud))
     if address.startswith("mavlink"):
         return MavlinkAddress.of(address).open()
-    if address == "dry-run":
-        return DryRun()
-    raise LinkError(
-        f"unknown wire {address!r}: give udp://HOST:PORT, serial:DEVICE, mavlink://KIND:WHERE or dry-run"
-    )
+    raise LinkError(f"unknown wire {address!r}: give udp://HOST:PORT, serial:DEVICE or mavlink://KIND:WHERE")
 
 
 def host_port(text: str, label: str) -> tuple[str, int]:
