@@ -89,7 +89,7 @@ def test_pymavlink_drives_it_in_real_time_and_its_log_reports(links):
     site = threading.Thread(
         target=serve_realtime,
         args=(Fleet({"it": world}), {"it": links}),
-        kwargs={"until": lambda pace: stop.is_set(), "duration": 60.0},
+        kwargs={"until": stop.is_set, "duration": 60.0},
     )
     site.start()
     log = DvlClient(*links.dvl.address)
