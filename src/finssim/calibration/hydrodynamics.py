@@ -310,7 +310,7 @@ def calibrate_hydrodynamics(
         method (METHOD): regression: each axis by its equation of motion; simulation: least simulation error; auto:
             regression if it replays the trials very well, otherwise simulation unless that replays them worse.
         estimate (NAMES): Further parameters to fit, of
-            thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k or the parameters
+            thrust_scale,thrust_lag,thrust_delay,buoyancy_excess,k or the parameters
             of the vehicle's terms, such as lift.coefficient (simulation method).
         damping (KIND): Drag: linear, quadratic, both, or auto to choose.
         fix (AXIS.m=N): Known inertias, including added mass [kg, kg m²]: yaw.m=0.6,surge.m=24 (regression).

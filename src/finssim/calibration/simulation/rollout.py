@@ -321,7 +321,6 @@ class Rollouts:
         hydrodynamics: str = "calibrated",
         substeps: int | None = None,
         max_delay: float = 0.5,
-        moving_water: bool = False,
     ) -> None:
         """Set up.
 
@@ -332,7 +331,6 @@ class Rollouts:
             substeps: Physics steps in a step; enough for `LONGEST_STEP` if None. Applied forces are linear between
                 samples with one, which is what the default step has; with more they lead by up to half a step.
             max_delay: Longest delay that a candidate may have [s].
-            moving_water: Whether candidates bring currents.
 
         Raises:
             CalibrationError: no segments, steps that differ, or a drive with more than eight channels.
@@ -350,14 +348,14 @@ class Rollouts:
         self.vehicle, self.segments, self.hydrodynamics = vehicle, tuple(segments), hydrodynamics
         self.step = segments[0].step
         self.nominal = vehicle_parameters(vehicle, hydrodynamics)
-        self._moving = moving_water or any(np.any(s.current) for s in segments)
+        self._current = np.stack([s.current for s in segments])[None]
         self._options: dict[str, Any] = {
             "hydrodynamics": hydrodynamics,
             "control_step": self.step,
             "substeps": substeps or max(1, math.ceil(self.step / LONGEST_STEP - 1e-9)),
             "integrator": "rk4",
             "max_delay": max(max_delay, float(self.nominal["delay"])),
-            "water_moves": self._moving,
+            "water_moves": bool(self._current.any()),
         }
         self._simulators: dict[int, Simulator] = {}
         self._lengths = np.array([s.steps for s in segments])
@@ -418,7 +416,6 @@ class Rollouts:
         *,
         initial: Mapping[str, ArrayLike] | None = None,
         disturbance: ArrayLike | None = None,
-        current: ArrayLike | None = None,
         candidates: int | None = None,
     ) -> Response:
         """Simulate every candidate over every segment.
@@ -428,7 +425,6 @@ class Rollouts:
                 those in the vehicle file's water: a trial's own density scales them.
             initial: `nu`, `quaternion`, `position` at the start where they are not the segments' own, (C, S, ...).
             disturbance: Extra wrench about the body origin, body frame [N, N m], (C, S, 6).
-            current: World frame [m/s], in place of the segments' own, (C, S, 3).
             candidates: C; the longest first axis among the arrays if None.
 
         Returns:
@@ -436,7 +432,7 @@ class Rollouts:
         """
         arrays = {f"plant.{k}": np.asarray(v) for k, v in (plant or {}).items()}
         arrays |= {f"initial.{k}": np.asarray(v) for k, v in (initial or {}).items()}
-        arrays |= {k: np.asarray(v) for k, v in (("tau", disturbance), ("current", current)) if v is not None}
+        arrays |= {} if disturbance is None else {"tau": np.asarray(disturbance)}
         C = candidates or max([1, *(a.shape[0] for a in arrays.values())])
         n, S = self._force.shape[:2]
         out = {
@@ -481,9 +477,8 @@ class Rollouts:
         density = np.array([s.density for s in self.segments]) / self.vehicle.water.density
         for name in ("volume", "form_drag", "skin_drag"):
             fields[name] = fields[name] * density
-        if self._moving:
-            own_current = np.stack([s.current for s in self.segments])[None]
-            write(sim.water.current, given.get("current", own_current))
+        if self._current.any():
+            write(sim.water.current, self._current)
         write(sim.command.disturbance, given.get("tau", np.zeros((1, 1, 6))))
         start = {k.removeprefix("initial."): a for k, a in given.items() if k.startswith("initial.")}
         self._place(sim, write, {})
