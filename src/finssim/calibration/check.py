@@ -214,6 +214,19 @@ def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
         console.print(grid, highlight=False)
     if brief:
         return
+    if report.streams:
+        heads = ("columns", "samples", "rate", "jitter", "gaps", "longest", "missing")
+        table = _table(heads, ("columns",))
+        for s in report.streams:
+            rates = (
+                f"{s.rate:.3g} Hz",
+                f"{s.jitter:.0%}",
+                str(s.gaps),
+                f"{s.longest_gap:.2g} s",
+                f"{s.missing:.0%}",
+            )
+            table.add_row(escape(listed(s.columns, 4)), str(s.samples), *rates)
+        console.print(table)
     if report.axes:
         console.print(_axes(report.axes))
         console.print(_identifiability_table(report.axes), highlight=False)
@@ -518,8 +531,6 @@ def with_identifiability(report: AxisReport, motion: Motion, inputs: Drive, vehi
 
 def _blocked(report: AxisReport, inputs: Drive) -> str:
     """Why the axis tells nothing at all, or nothing."""
-    if inputs.source == "passive" and report.axis == "heave":
-        return "passive: the buoyancy acts too: let a dive with the thrusters coast"
     if not report.source:
         return f"no velocity: {NO_VELOCITY[report.axis]}"
     if not np.isfinite(report.fastest):
@@ -556,12 +567,14 @@ def _damping(report: AxisReport) -> dict[str, tuple[bool, str]]:
 
 def _passive_identifiability(report: AxisReport) -> dict[str, tuple[bool, str]]:
     """Parameter -> whether a trial without thrust tells it, and why."""
-    righted = (True, "passive: relative to the vehicle file's restoring moment")
+    force = {"heave": "buoyancy excess", "roll": "restoring moment", "pitch": "restoring moment"}.get(
+        report.axis
+    )
     unknown = (False, "passive, and no force along this axis is known: d1/m_eff and d2/m_eff alone")
     return {
-        "m_eff": righted if report.axis in ("roll", "pitch") else unknown,
+        "m_eff": (True, f"passive: relative to the vehicle file's {force}") if force else unknown,
         **_damping(report),
-        "k": (False, "passive: sets the scale of the others"),
+        **dict.fromkeys(("k", "buoyancy"), (False, "passive: sets the scale of the others")),
     }
 
 

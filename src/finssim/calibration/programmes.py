@@ -14,18 +14,17 @@ from numpy.typing import NDArray
 
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.trials.trial import TAU
-from finssim.calibration.trials.trial_files import write_trial
 from finssim.control.allocation import Allocator
 from finssim.control.pid import axis_model
-from finssim.files import atomic_directory, atomic_write
+from finssim.files import atomic_write
 from finssim.quiet import start_warp
 from finssim.text_table import write_csv
-from finssim.vehicles import AXES, Vehicle, load_vehicle
+from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.capability import level_speed
 from finssim.vehicles.vehicle import Axis
 from finssim.yaml_file import yaml_text
 
-__all__ = ["Programme", "RATE", "programmes", "which_axes"]
+__all__ = ["Programme", "RATE", "programmes", "which_axes", "write_programme"]
 
 
 Array = NDArray[np.float64]
@@ -341,61 +340,6 @@ def _step(axis: Axis, level: float, kind: str, coast: float, repeat: int, repeat
         phase=phase,
         ascent_speed=0.01 if dive else None,
     )
-
-
-# `finssim excite`: excitation programmes written for a robot to run, or run in the simulator to make trials.
-
-
-def excite(
-    axes: str | Sequence[str],
-    *,
-    vehicle: Vehicle | str,
-    out: str | Path,
-    simulate: bool = False,
-    inputs: Sequence[Any] = ("rpm", "wrench"),
-    seed: int = 0,
-    **plan: Any,
-) -> list[Path]:
-    """Write programmes, each into a folder of its own under `out`; or the trials that they make in the simulator.
-
-    Args:
-        axes: `all`, or names separated by commas.
-        vehicle: A `Vehicle`, a catalogue name or a file.
-        out: Folder to make.
-        simulate: Run them in the simulator and write trials, rather than what to run on a robot.
-        inputs: Logged in simulated trials, as for `simulate_programme`.
-        seed: Of a multi-sine's phases, and of a simulation's initial conditions and noise.
-        plan: Further arguments of `programmes`: kind, levels, repeats, coast, duration, band.
-
-    Returns:
-        The folders written.
-
-    Raises:
-        CalibrationError, VehicleError, OutputError: As they say.
-    """
-    start_warp()
-    chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
-    played = programmes(axes, chosen, seed=seed, **plan)
-    out = Path(out)
-    names = [out / programme.name for programme in played]
-    with atomic_directory(out, replaces="programmes.yaml") as folder:
-        if simulate:
-            from finssim.calibration.synthetic import simulate_programme
-
-            for trial in simulate_programme(played, chosen, seed=seed, inputs=inputs):
-                write_trial(trial, folder / trial.name)
-        else:
-            for programme in played:
-                write_programme(programme, chosen, folder / programme.name)
-        about = {
-            "vehicle": {"name": chosen.name, "sha256": chosen.sha256},
-            "kind": plan.get("kind", "published"),
-            "simulated": simulate,
-            "seed": seed,
-            "programmes": [programme.name for programme in played],
-        }
-        (folder / "programmes.yaml").write_text(yaml_text(about), encoding="utf-8")
-    return names
 
 
 def write_programme(programme: Programme, vehicle: Vehicle, folder: Path) -> None:

@@ -16,8 +16,8 @@ from rich.console import Console
 
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers.dispatch import print_folders, read_trials
-from finssim.calibration.programmes import Programme, programmes
-from finssim.calibration.programmes import excite as write_programmes
+from finssim.calibration.programmes import Programme, programmes, write_programme
+from finssim.calibration.synthetic import simulate_programme
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.control import ControlError
@@ -560,24 +560,27 @@ def excite(
         raise CalibrationError("--severity and --pool-vehicle need a virtual pool: give --pool SEED")
     if robot is not None:
         folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, **plan)
-    elif pool is not None:
-        body, pool_vehicle = load_vehicle(vehicle), pool_vehicle or vehicle
-        played, severity = programmes(axes, body, seed=seed, **plan), severity or "realistic"
-        with (
-            atomic_directory(out, replaces=PLAN_FILE) as folder,
-            progress_bar("playing programmes") as progress,
-        ):
+        print_folders(folders, as_json)
+        return folders
+    start_warp()
+    body, pool_vehicle, severity = load_vehicle(vehicle), pool_vehicle or vehicle, severity or "realistic"
+    played = programmes(axes, body, seed=seed, **plan)
+    with atomic_directory(out, replaces=PLAN_FILE) as folder:
+        if pool is not None:
             about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
             take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"pool": about}))
-            record_programmes(
-                {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=pool_vehicle, plant=pool, severity=severity,
-                seed=seed, progress=progress,
-            )  # fmt: skip
-        folders = [Path(out) / programme.name for programme in played]
-    else:
-        folders = write_programmes(
-            axes, vehicle=vehicle, out=out, simulate=simulate, inputs=inputs, seed=seed, **plan
-        )
+            with progress_bar("playing programmes") as progress:
+                record_programmes(
+                    {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=pool_vehicle, plant=pool,
+                    severity=severity, seed=seed, progress=progress,
+                )  # fmt: skip
+        else:
+            take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"simulated": simulate}))
+            for trial in simulate_programme(played, body, seed=seed, inputs=inputs) if simulate else ():
+                write_trial(trial, folder / trial.name)
+            for programme in () if simulate else played:
+                write_programme(programme, body, folder / programme.name)
+    folders = [Path(out) / programme.name for programme in played]
     print_folders(folders, as_json)
     return folders
 

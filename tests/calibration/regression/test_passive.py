@@ -1,4 +1,4 @@
-"""Trials without thrust: frequency and damping of a ring-down, and what was assumed."""
+"""Trials without thrust: frequency and damping of a ring-down, speed and buoyancy of a rise, and what was assumed."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -50,7 +50,7 @@ def test_ring_down_gives_frequency_and_damping(axis, w2, c1, c2):
     # The rate is largest a quarter period after the release.
     assert 3.0 <= best.releases[0].begin < 3.0 + 0.5 * np.pi / np.sqrt(w2)
     assert best.terms == (c1 > 0.0, c2 > 0.0)
-    np.testing.assert_allclose(best.theta, (w2, c1, c2), rtol=0.03)
+    np.testing.assert_allclose(best.theta, (w2, 0.0, c1, c2), rtol=0.03)
     assert best.r2 > 0.95
 
 
@@ -61,7 +61,7 @@ def test_intervals_of_a_ring_down_cover():
     for seed in range(20):
         trial = decay(5.0, 0.5, 0.0, seed=seed, duration=12.0)
         one = free_motion([trial], "roll", VEHICLE, terms=(True, False))[0]
-        ends = [one.interval(lambda ratios, i=i: ratios[i])[1:] for i in (0, 1)]
+        ends = [one.interval(lambda ratios, i=i: ratios[i])[1:] for i in (0, 2)]
         hits += [low <= truth <= high for (low, high), truth in zip(ends, (5.0, 0.5), strict=True)]
     assert (hits >= 16).all()  # 19 expected
 
@@ -70,7 +70,7 @@ def test_a_moving_equilibrium_is_followed():
     """A trim that drifts, as under a moving arm, does not bend the damping."""
     best = free_motion([decay(4.0, 0.4, 0.0, seed=2, drift=0.02, duration=16.0)], "roll", VEHICLE)[0]
     assert best.releases[0].pieces
-    assert best.theta[1] == pytest.approx(0.4, rel=0.1)
+    assert best.theta[2] == pytest.approx(0.4, rel=0.1)
 
 
 def test_a_trial_at_rest_is_refused_with_the_reason():
@@ -105,6 +105,42 @@ def test_regression_takes_up_passive_trials():
     fit = regress([decay(4.0, 0.4, 0.0, seed=s) for s in range(2)], VEHICLE)
     assert fit.estimates["roll.natural_frequency"].estimate == pytest.approx(2.0, rel=0.02)
     assert set(fit.trials) == {"decay0", "decay1"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quadratic", [False, True])
+def test_rise_gives_terminal_speed_and_excess(quadratic):
+    """From rest: the speed where drag equals the excess, and the excess over the mass from the acceleration."""
+    e, top = 0.08, 0.2
+    t = np.arange(0.0, 20.0, 0.05)
+    z, w, h = np.full(len(t), -3.0), 0.0, -3.0
+    for i in range(40, len(t)):
+        z[i] = h
+        for _ in range(20):
+            w += (e * (1.0 - (w / top) ** 2 if quadratic else 1.0 - w / top)) * 0.0025
+            h += w * 0.0025
+    noisy = z + 0.003 * np.random.default_rng(0).normal(size=len(t))
+    rise = Trial(name="rise", t=t, channels={"depth": -noisy}, header=Header(passive=True))
+    best = free_motion([rise], "heave", VEHICLE)[0]
+    assert best.terms == (not quadratic, quadratic)
+    shown = passive([rise], VEHICLE, axes=["heave"]).estimates
+    assert shown["heave.terminal_speed"].estimate == pytest.approx(top, rel=0.02)
+    assert best.theta[1] == pytest.approx(e, rel=0.05)
+    _, low, high = best.interval(lambda ratios: ratios[1])
+    assert low < e < high
+
+
+def test_a_file_that_sinks_where_the_vehicle_rises_is_said():
+    """A rise contradicts a file heavier than water, even where the excess is known too badly to be written."""
+    t = np.arange(0.0, 20.0, 0.05)
+    w = 0.2 * (1.0 - np.exp(-np.maximum(t - 2.0, 0.0) / 2.5))
+    z = -3.0 + np.cumsum(w) * 0.05 + 0.01 * np.random.default_rng(1).normal(size=len(t))
+    rise = Trial(name="rise", t=t, channels={"depth": -z}, header=Header(passive=True))
+    sinks = VEHICLE.replace({"body.displaced_volume": 0.995 * VEHICLE.weight / 9810.0})
+    said = [
+        one for one in passive([rise], sinks, axes=["heave"]).findings if one.code == "buoyancy_contradicted"
+    ]
+    assert [one.subject for one in said] == ["heave"]
 
 
 @pytest.mark.slow
@@ -145,7 +181,7 @@ def test_real_release_is_found_and_fitted():
         best = free_motion([trial], axis, VEHICLE)[0]
         assert 1.0 < best.releases[0].begin < 3.5
         assert 2.0 * np.pi / np.sqrt(best.theta[0]) == pytest.approx(3.1, abs=0.25)
-        assert 0.03 < best.theta[1] / (2.0 * np.sqrt(best.theta[0])) < 0.25
+        assert 0.03 < best.theta[2] / (2.0 * np.sqrt(best.theta[0])) < 0.25
         assert best.r2 > 0.85
 
 

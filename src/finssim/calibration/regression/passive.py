@@ -1,8 +1,8 @@
 """Trials with the thrusters off: one axis with no input, from its release until it rests or something pushes again.
 
-    nu_dot + c1 nu + c2 |nu| nu + w2 (s - s_0) = 0,    s_dot = nu,    c1 = d1/m,  c2 = d2/m
+    nu_dot + c1 nu + c2 |nu| nu + w2 (s - s_0) = e,    s_dot = nu,    c1 = d1/m,  c2 = d2/m
 
-w2 = k/m where the weight rights the vehicle, s being the sine of its roll or pitch. Such a
+w2 = k/m where the weight rights the vehicle, s being the sine of its roll or pitch; e = (B - W)/m of a rise. Such a
 motion shows ratios only, for no force is known; absolute values follow from one number that is given or the vehicle
 file's, which every estimate names. All releases of an axis are fitted at once, with an initial state each.
 """
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.motion import Motion, attitude_samples, motion, white_noise, without_spikes
+from finssim.calibration.motion import Motion, attitude_samples, motion, spans_of, white_noise, without_spikes
 from finssim.calibration.regression.axis_estimates import AxisResult, Number
 from finssim.calibration.regression.axis_fit import Run, simulate_axis
 from finssim.calibration.regression.plant_terms import Matrices, matrices
@@ -36,9 +36,6 @@ Samples = tuple[Array, Array]
 
 SWINGING = ("roll", "pitch")
 """Axes that the weight rights."""
-
-FREE = ("surge", "sway", "roll", "pitch", "yaw")
-"""Axes that coast or swing; in heave the buoyancy acts, which a dive and a coast show."""
 
 FEWEST_SAMPLES = 20
 
@@ -79,8 +76,8 @@ FALLS_TO = 0.7
 GROWS = 1.15
 """Factor above the lowest speed so far at which something pushes again."""
 
-SLOW_START = 0.01
-"""Least speed of the releases from which the drag's start is taken [m/s, rad/s]."""
+RISING, SHORTEST_RISE = 0.01, 3.0
+"""Vertical speed that counts as a rise [m/s] (published procedure), and how long it has to last [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +91,7 @@ class Release:
     rate: Samples
     """Velocity of the axis [m/s, rad/s]; empty where it was not measured."""
     travel: Samples
-    """Heading, or sine of roll or pitch [rad, -]; empty where it was not measured or tells nothing more."""
+    """Height, heading, or sine of roll or pitch [m, rad, -]; empty where it was not measured or tells nothing more."""
     period: float = 0.0
     """Of a swing [s]; 0 where nothing swings."""
     pieces: int = 0
@@ -132,6 +129,8 @@ def _release(trial: Trial, axis: str, vehicle: Vehicle) -> Release:
     if axis in SWINGING:
         seen = rate if len(rate[0]) >= FEWEST_SAMPLES else (travel[0], np.gradient(travel[1], travel[0]))
         begin, end, period = _ringing(seen, trial.name, axis)
+    elif axis == "heave":
+        begin, end = _rising(moved, trial.name)
     else:
         begin, end = _coasting(moved, axis, trial.name)
     rate, travel = (_between(samples, begin, end) for samples in (rate, travel))
@@ -142,6 +141,9 @@ def _samples(trial: Trial, axis: str, moved: Motion) -> tuple[Samples, Samples]:
     """Rate and travel as measured; a derived rate where neither is."""
     i = AXES.index(axis)
     rate, travel = trial.series(NU[i]), (np.empty(0), np.empty(0))
+    if axis == "heave":
+        t, height = trial.series("z") if trial.has("z") else trial.series("depth")
+        return travel, (t, height if trial.has("z") else -height)
     t, q, measured = attitude_samples(trial)
     if axis in SWINGING and axis in measured:
         up = quat_inverse_rotate(q / np.linalg.norm(q, axis=1, keepdims=True), np.array([0.0, 0.0, 1.0]))
@@ -214,6 +216,18 @@ def _coasting(moved: Motion, axis: str, name: str) -> tuple[float, float]:
     return float(t[begin]), float(t[end])
 
 
+def _rising(moved: Motion, name: str) -> tuple[float, float]:
+    """The longest stretch in which the height grows faster than `RISING` [s]."""
+    up = np.gradient(moved.position[:, 2], moved.t) > RISING
+    begin, end = max(spans_of(up), key=lambda e: e[1] - e[0], default=(0, 1))
+    if moved.t[end - 1] - moved.t[begin] < SHORTEST_RISE:
+        raise CalibrationError(
+            f"nothing rises faster than {RISING} m/s for {SHORTEST_RISE:g} s: expected a vehicle let go under water",
+            name,
+        )
+    return float(moved.t[begin]), float(moved.t[end - 1])
+
+
 # The fit of all releases of an axis.
 
 
@@ -226,13 +240,13 @@ class FreeMotion:
     terms: tuple[bool, bool]
     """Whether c1 and c2 are fitted."""
     x: Array = field(init=False)
-    """ln w2 of a swing, the fitted ones of c1 and c2, then what each release has for itself."""
+    """ln w2 of a swing or ln e of a rise, the fitted ones of c1 and c2, then what each release has for itself."""
 
     def __post_init__(self) -> None:
         """Fit; every stream of every release gets the spread that it turns out to have."""
         from scipy.optimize import least_squares
 
-        self.head = int(self.axis in SWINGING)
+        self.head = int(self.axis in (*SWINGING, "heave"))
         self.shared = self.head + sum(self.terms)
         self._at = np.cumsum([self.shared, *(r.own for r in self.releases)])
         sizes = [len(values) for r in self.releases for _, values in (r.rate, r.travel)]
@@ -271,35 +285,39 @@ class FreeMotion:
         """Start and box."""
         longest = max(r.end - r.begin for r in self.releases)
         first = [_first(r) for r in self.releases]
-        speed = max(float(np.median(np.abs([nu for nu, _ in first]))), SLOW_START)
+        speed = max(float(np.median(np.abs([nu for nu, _ in first]))), RISING)
         rate = 2.0 / longest
-        head = []
+        head, wide = [], (2.0, 2.0)
         if self.axis in SWINGING:
             w = 2.0 * np.pi / float(np.median([r.period for r in self.releases]))
             head, rate = [2.0 * math.log(w)], 0.1 * w
+        elif self.axis == "heave":
+            late = [_between(r.travel, 0.7 * r.end + 0.3 * r.begin, r.end) for r in self.releases]
+            speed = max(float(np.median([np.polyfit(*samples, 1)[0] for samples in late])), RISING)
+            head, wide, rate = [math.log(speed)], (6.0, 3.0), 1.0
         drag = np.array([rate, rate / speed])[list(self.terms)]
         own = [_own(r, nu, s) for r, (nu, s) in zip(self.releases, first, strict=True)]
         x = np.concatenate([head, drag, *own])
         low, high = np.full(len(x), -np.inf), np.full(len(x), np.inf)
-        low[: self.head], high[: self.head] = x[: self.head] - 2.0, x[: self.head] + 2.0
+        low[: self.head], high[: self.head] = x[: self.head] - wide[0], x[: self.head] + wide[1]
         low[self.head : self.shared] = 0.0
         return x, low, high
 
-    def ratios(self, shared: Array) -> tuple[Array, Array, Array]:
-        """w2 [1/s²], c1 [1/s], c2 [1/m, 1/rad] of vectors that begin with the shared unknowns, (C, ...)."""
+    def ratios(self, shared: Array) -> tuple[Array, Array, Array, Array]:
+        """w2 [1/s²], e [m/s²], c1 [1/s], c2 [1/m, 1/rad] of vectors that begin with the shared unknowns, (C, ...)."""
         zero = np.zeros(len(shared))
-        w2 = np.exp(shared[:, 0]) if self.head else zero
+        head = np.exp(shared[:, 0]) if self.head else zero
         drag = iter(shared[:, self.head : self.shared].T)
         c1, c2 = (next(drag) if on else zero for on in self.terms)
-        return w2, c1, c2
+        return (zero, head, c1, c2) if self.axis == "heave" else (head, zero, c1, c2)
 
     def _lines(self, points: Sequence[Array]) -> list[tuple[Array, Array]]:
         """Rate and travel of every release on its grid, of vectors of shared and own unknowns (C, ...): (n, C) each."""
         runs, thetas = list[Run](), []
         for release, point in zip(self.releases, points, strict=True):
-            w2, c1, c2 = self.ratios(point)
+            w2, e, c1, c2 = self.ratios(point)
             grid, own = release.grid, point[:, self.shared :].T
-            push = w2[:, None] * _equilibrium(release, grid, own[2:]).T
+            push = e[:, None] + w2[:, None] * _equilibrium(release, grid, own[2:]).T
             place = own[1] if release.own > 1 else np.zeros(len(point))
             step = float(grid[1] - grid[0])
             runs += [
@@ -380,10 +398,10 @@ class FreeMotion:
     # What follows from it.
 
     @property
-    def theta(self) -> tuple[float, float, float]:
-        """w2, c1 and c2; zero for what is not fitted."""
-        w2, c1, c2 = (float(value[0]) for value in self.ratios(self.x[None]))
-        return w2, c1, c2
+    def theta(self) -> tuple[float, float, float, float]:
+        """w2, e, c1 and c2; zero for what is not fitted."""
+        w2, e, c1, c2 = (float(value[0]) for value in self.ratios(self.x[None]))
+        return w2, e, c1, c2
 
     def speeds(self) -> tuple[float, float]:
         """Lowest that stands out of its noise, and highest fitted speed [m/s, rad/s]."""
@@ -409,7 +427,7 @@ class FreeMotion:
         Where the intervals of a few releases one by one do not overlap, the mean of what they show, and its interval.
 
         Args:
-            of: Of w2, c1 and c2, (C,) each -> (C,).
+            of: Of w2, e, c1 and c2, (C,) each -> (C,).
             positive: Whether the interval is one of its logarithm.
         """
         from scipy.stats import norm, t
@@ -439,7 +457,7 @@ class FreeMotion:
     def curves(self) -> list[Curve]:
         """Measured and fitted of every release."""
         out, unit = [], "m/s" if AXES.index(self.axis) < 3 else "rad/s"
-        place = "heading [rad]" if self.axis == "yaw" else "sine of the angle [-]"
+        place = {"heave": "height [m]", "yaw": "heading [rad]"}.get(self.axis, "sine of the angle [-]")
         for g, release in enumerate(self.releases):
             stream = 2 * g + (not len(release.rate[0]))
             t, measured = release.rate if len(release.rate[0]) else release.travel
@@ -491,7 +509,7 @@ def free_motion(
 
     Args:
         trials: Passive ones.
-        axis: Of `FREE`: a decay of roll and pitch, a coast of surge, sway and yaw.
+        axis: One of six: a decay of roll and pitch, a coast of surge, sway and yaw, a rise in heave.
         vehicle: Gives the places of sensors.
         terms: Whether to fit c1 and c2, in place of a choice.
         refused: Takes why a trial shows nothing.
@@ -510,7 +528,8 @@ def free_motion(
             errors.append(error)
     if not releases:
         raise errors[-1] if errors else CalibrationError("no trials were given")
-    kinds = [terms] if terms else [LINEAR, QUADRATIC, BOTH]
+    # A single rise cannot show both kinds of drag.
+    kinds = [terms] if terms else [LINEAR, QUADRATIC] if axis == "heave" else [LINEAR, QUADRATIC, BOTH]
     fits = [FreeMotion(axis=axis, releases=tuple(releases), terms=kind) for kind in kinds]
     best = min(fits, key=lambda fit: fit.criterion(fits[-1]))
     if best.r2 < EXPLAINED:
@@ -534,7 +553,7 @@ def _steady(release: Release, axis: str) -> Release:
 # From free motions to estimates, changes of the vehicle file and findings.
 
 Of = Callable[[tuple[Array, ...]], Array]
-"""A number of w2, c1 and c2, (C,) each -> (C,)."""
+"""A number of w2, e, c1 and c2, (C,) each -> (C,)."""
 
 
 class _Result:
@@ -568,19 +587,22 @@ class _Result:
             self.swing()
             name, of = ("m_eff", inertia) if stiff else ("k", lambda r: inertia(r) * r[0])
             numbers[name] = self.number(free, of, positive=True)
-        self.damping(inertia, numbers, known)
+        elif free.axis == "heave":
+            self.rise(m)
+        if free.axis != "heave":
+            self.damping(inertia, numbers, known)
 
     def number(self, fit: FreeMotion, of: Of, *, positive: bool = False) -> Number:
         """A number with its interval; one that cannot be negative has the interval of its logarithm."""
         value, low, high = fit.interval(of, positive=positive)
         return Number(value, (low if positive else max(low, 0.0), high))
 
-    def add(self, name: str, number: Number, unit: str, note: str = "") -> Estimate:
+    def add(self, name: str, number: Number, unit: str, note: str = "", path: str | None = None) -> Estimate:
         """Take an estimate that rests on no assumption, or on the one that its note names."""
         value, (low, high), _ = number
         sure = bool(value > 0.0 and 0.5 * (high - low) <= USEFUL * value)
         self.estimates[name] = Estimate(
-            name=name, estimate=value, ci95=(low, high), unit=unit, identifiable=sure,
+            name=name, estimate=value, ci95=(low, high), unit=unit, identifiable=sure, path=path,
             note=note or ("" if sure else "uncertain by more than half its value"),
         )  # fmt: skip
         return self.estimates[name]
@@ -591,31 +613,46 @@ class _Result:
         axis, rubbed = self.free.axis, 8.0 / (3.0 * math.pi) * self.top
         frequency = self.number(self.free, lambda r: np.sqrt(r[0]), positive=True)
         ratio = self.number(
-            self.free, lambda r: (r[1] + rubbed * r[2]) / (2.0 * np.sqrt(r[0])), positive=True
+            self.free, lambda r: (r[2] + rubbed * r[3]) / (2.0 * np.sqrt(r[0])), positive=True
         )
         self.add(f"{axis}.natural_frequency", frequency, "rad/s")
         self.add(f"{axis}.damping_ratio", ratio, "-", f"at a swing of {self.top:.2g} rad/s")
+
+    def rise(self, m: float) -> None:
+        """Terminal speed, and the excess of buoyancy that the acceleration shows, which the file does not take over."""
+        linear = self.free.terms == LINEAR
+        speed: Of = (lambda r: r[1] / r[2]) if linear else (lambda r: np.sqrt(r[1] / r[3]))
+        trials = ", ".join(r.trial for r in self.free.releases)
+        note = f"of a rise with {SHAPES[self.free.terms]} drag: {trials}"
+        self.add("heave.terminal_speed", self.number(self.free, speed, positive=True), "m/s", note)
+        excess = self.number(self.free, lambda r: m * r[1], positive=True)
+        note, (low, high) = f"from the acceleration, {self.note}", excess.ends
+        self.add("buoyancy_excess", excess, "N", note, "body.displaced_volume")
+        if not low <= self.file.excess <= high:
+            self.findings.append(
+                finding("buoyancy_contradicted", "heave", file=self.file.excess, low=low, high=high)
+            )
 
     def damping(self, inertia: Of, numbers: dict[str, Number], known: float | None) -> None:
         """Drag over inertia, and the drag itself with what else rests on an assumption."""
         free, top, axis = self.free, self.top, self.free.axis
         rate, share = "m/s" if self.i < 3 else "rad/s", ""
         if free.terms == BOTH:
-            quadratic = free.theta[2] * top / (free.theta[1] + free.theta[2] * top)
+            quadratic = free.theta[3] * top / (free.theta[2] + free.theta[3] * top)
             share = f", {quadratic:.0%} of it quadratic at the fastest"
         alone = "" if free.terms == BOTH else " alone"
         note = f"{SHAPES[free.terms]} drag{alone} explains speeds of {self.low:.2g}-{top:.2g} {rate}{share}"
         dropped = {}
         for j, (name, unit) in enumerate((("d1", "1/s"), ("d2", "1/m" if self.i < 3 else "1/rad"))):
             fit = free if free.terms[j] else self.full
-            ratio = self.number(fit, lambda r, j=j: r[1 + j])
-            drag = self.number(fit, lambda r, j=j: inertia(r) * r[1 + j])
+            ratio = self.number(fit, lambda r, j=j: r[2 + j])
+            drag = self.number(fit, lambda r, j=j: inertia(r) * r[2 + j])
             if free.terms[j]:
                 numbers[name] = drag
             else:
                 ratio, dropped[name] = Number(0.0, (0.0, ratio.ends[1])), (0.0, drag.ends[1])
             self.add(f"{axis}.{name}/m_eff", ratio, unit, note)
-        value, low, high = free.interval(lambda r: inertia(r) * (r[1] + r[2] * top))
+        value, low, high = free.interval(lambda r: inertia(r) * (r[2] + r[3] * top))
         result = AxisResult(
             axis=axis, numbers=numbers, file=self.file, speeds=(self.low, top), dropped=dropped, given=known,
             drag_known=0.5 * (high - low) <= USEFUL * value,
@@ -656,14 +693,14 @@ def passive(
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²], in place of the file's numbers.
 
     Raises:
-        CalibrationError: No trial shows a decay or a coast.
+        CalibrationError: No trial shows a decay, a coast or a rise.
     """
     plant = matrices(vehicle)
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
     quality: dict[str, dict[str, float]] = {}
     findings, curves, refused, used = list[Finding](), list[Curve](), list[CalibrationError](), set[str]()
-    for axis in (a for a in FREE if axes is None or a in axes):
+    for axis in (a for a in AXES if axes is None or a in axes):
         try:
             chosen, *fits = free_motion(trials, axis, vehicle, refused=refused)
         except CalibrationError:
@@ -679,7 +716,7 @@ def passive(
         reasons = "; ".join(str(error) for error in refused if error.subject == trials[0].name)
         others = f"; and {len(trials) - 1} trials more" if len(trials) > 1 else ""
         raise CalibrationError(
-            f"no trial shows a free decay or a coast: {reasons or 'none was given'}{others}"
+            f"no trial shows a free decay, a coast or a rise: {reasons or 'none was given'}{others}"
         )
     # That a trial shows one motion and not the others is no news.
     findings += [

@@ -1639,7 +1639,6 @@ class Stages:
         remarks: list[Finding],
         *,
         damping: str,
-        seed: int,
     ) -> Fit:
         """The finished fit; intervals hold those of the fuller model `first` from which this one was chosen."""
         p, x = stage.problem.parameters, stage.x
@@ -1678,7 +1677,6 @@ class Stages:
             "step": STEP,
             "segments": len(self.segments),
             "iterations": stage.solution.iterations,
-            "seed": seed,
         }
         self.say("done")
         return Fit(
@@ -1715,7 +1713,6 @@ def fit_by_simulation(
     damping: str = "auto",
     horizon: float | None = None,
     begin: Fit | None = None,
-    seed: int = 0,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit by simulation error over all trials at once.
@@ -1733,7 +1730,6 @@ def fit_by_simulation(
         damping: `auto`, `linear`, `quadratic` or `both`.
         horizon: Length of the segments [s]; from the data if None.
         begin: Of another method: it begins with its numbers where these simulate the trials better than the file's.
-        seed: Recorded; nothing here is random.
         progress: Called with the part done and a few words.
 
     Returns:
@@ -1757,7 +1753,7 @@ def fit_by_simulation(
             first = fit.numbers(stage)
             fit.retained = _retained(chosen_kinds, first, stage.problem.parameters)
             stage = fit.next(chosen_kinds, stage)
-    return fit.result(stage, first, remarks, damping=damping, seed=seed)
+    return fit.result(stage, first, remarks, damping=damping)
 
 
 def _check(

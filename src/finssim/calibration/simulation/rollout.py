@@ -122,7 +122,7 @@ def streams(trial: Trial, vehicle: Vehicle) -> Streams:
 
 
 def segments(
-    trial: Trial | Streams,
+    s: Streams,
     vehicle: Vehicle,
     *,
     length: float | None = None,
@@ -133,7 +133,7 @@ def segments(
     """Cut a trial into stretches of about equal length; a gap in the recording always ends one.
 
     Args:
-        trial: The trial, or what `streams` made of it.
+        s: The trial.
         vehicle: Whose it is.
         length: Of each [s]; the whole trial, up to its gaps, if None.
         step: Of the simulation [s].
@@ -148,11 +148,10 @@ def segments(
     """
     if not step > 0.0 or (length is not None and not length > 0.0):
         raise CalibrationError(
-            f"segments of {length} s in steps of {step} s, expected times above 0 s", _name(trial)
+            f"segments of {length} s in steps of {step} s, expected times above 0 s", s.trial.name
         )
-    s = trial if isinstance(trial, Streams) else streams(trial, vehicle)
-    out = []
-    for a, b in _stretches(s, start):
+    out, begin = list[Segment](), float(s.trial.t[0]) + start
+    for a, b in ((max(float(a), begin), float(b)) for a, b in s.drive.spans):
         steps = int(round((b - a) / step - 1e-6))
         parts = 1 if length is None else max(1, round(steps * step / length))
         edges = [steps * i // parts for i in range(parts + 1)]
@@ -162,17 +161,6 @@ def segments(
                 if segment.measured:
                     out.append(segment)
     return out
-
-
-def _name(trial: Trial | Streams) -> str:
-    return trial.name if isinstance(trial, Trial) else trial.trial.name
-
-
-def _stretches(s: Streams, start: float) -> list[tuple[float, float]]:
-    """Spans in which the inputs are known, inside the recording."""
-    begin = float(s.trial.t[0]) + start
-    spans = [(max(float(a), begin), float(b)) for a, b in s.drive.spans]
-    return [(a, b) for a, b in spans if b > a]
 
 
 def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, index: int) -> Segment:
