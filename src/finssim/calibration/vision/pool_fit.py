@@ -62,6 +62,7 @@ __all__ = ["PoolFit", "calibrate_pool", "doubted", "pool_record", "run"]
 Array = NDArray[np.float64]
 
 UP = np.array([0.0, 0.0, 1.0])
+SURFACE_TILT = math.radians(0.2)
 
 DRAWS, DRAWN = 60, 6
 """Samples of that many points, of which those that suit most of the others are kept."""
@@ -284,7 +285,7 @@ def prior_of(model: PoolModel, start: PoolModel, settings: Settings) -> Prior:
         depth = depth_std = ANYWHERE * float(np.linalg.norm(start.camera.position - start.reference))
     return Prior(
         normal=normal,
-        tilt_std=settings.tilt_sigma or np.inf,
+        tilt_std=(SURFACE_TILT if settings.tilt_sigma is None else settings.tilt_sigma) or np.inf,
         depth=depth,
         depth_std=depth_std,
         start=start,
@@ -504,7 +505,7 @@ def refine(
     observed: Observations,
     active: NDArray[np.bool_],
     prior: Prior,
-    noise: Noise,
+    survey: float,
 ) -> Refined:
     """Fit with the errors of pixels and survey estimated on the way, and wrong rows named.
 
@@ -513,7 +514,7 @@ def refine(
         observed: All rows.
         active: Parameters to fit, (18,).
         prior: What is known beforehand.
-        noise: What is believed of the survey's errors.
+        survey: Standard error of a surveyed coordinate, as it was stated [m].
 
     Raises:
         CalibrationError: Too many rows do not fit.
@@ -522,7 +523,8 @@ def refine(
     model = solve(model, observed, robust, active, prior, iterations=40).model
     robust = RobustPixels(model, observed, least=0.05)
     model = solve(model, observed, robust, active, prior, iterations=40).model
-    noise = replace(noise, pixel=max(0.05, float(np.median(_sizes(model, observed))) / 1.1774))
+    pixel = max(0.05, float(np.median(_sizes(model, observed))) / 1.1774)
+    noise = Noise(pixel=pixel, survey=max(survey, 1e-7))
     used = _plausible(model, observed, noise)
     free = np.flatnonzero(active)
     for _ in range(ROUNDS):
@@ -834,9 +836,14 @@ def _conflicts(fit: Refined, settings: Settings) -> Iterator[Finding]:
         change = float(np.exp(pull * prior.lens_std[0]) - 1.0)
         yield finding("focal_pulled", change=change, expected=prior.lens_std[0])
     if np.isfinite(prior.tilt_std) and prior.normal is not None:
-        lean = float(np.arccos(np.clip(model.interface.normal @ prior.normal, -1.0, 1.0)))
+        lean = _lean(model, prior.normal)
         if lean > 3.0 * prior.tilt_std:
             yield finding("tilt_pulled", lean=float(np.degrees(lean)))
+
+
+def _lean(model: PoolModel, normal: Array) -> float:
+    """Angle between the surface's normal and another [rad]."""
+    return float(np.arccos(np.clip(model.interface.normal @ normal, -1.0, 1.0)))
 
 
 def _numbers(fit: Refined, observed: Observations) -> Iterator[Finding]:
@@ -872,6 +879,12 @@ def _above(fit: Refined, observed: Observations) -> NDArray[np.bool_]:
     met = side & (straight < float(chi2.ppf(CERTAIN, 2)))
     return met & (2 * met.sum() > side.sum())  # some are met by chance
 
+
+DOUBT = 20.0
+"""Fall of chi² above which the level of the surface counts as contradicted."""
+
+MAX_LEAN = np.radians(5.0)
+"""A surface tilted further from the survey's z than this is none [rad]."""
 
 LENS_STEPS = (("focal", "center"), ("focal", "center", "distortion"))
 """What the lens gives up where held-out points get better by it."""
@@ -939,7 +952,7 @@ def calibrate_pool(observed: Observations, lens: Lens, settings: Settings | None
         raise CalibrationError("every point is marked dry: at least 4 must be under water")
     start, pinhole_start = search(observed, extended_lens(lens), settings)
     notes = list(observed.findings)
-    fit = _best_lens(observed, start, settings, notes)
+    fit = _released(observed, settings, _best_lens(observed, start, settings, notes), notes)
     if fit.model.interface.normal[2] < 0.0:
         notes.append(finding("camera_below"))
     pinhole = _pinhole(observed, pinhole_start, fit)
@@ -965,10 +978,9 @@ def calibrate_pool(observed: Observations, lens: Lens, settings: Settings | None
 def _best_lens(observed: Observations, start: PoolModel, settings: Settings, notes: list[Finding]) -> Refined:
     """The fit; the lens is fitted too as far as held-out points get better by it."""
     origin = replace(start, interface=replace(start.interface, index_far=settings.index))
-    noise = Noise(pixel=USUAL_PIXEL, survey=max(settings.survey_sigma, 1e-7))
 
     def fitted(model: PoolModel, active: NDArray[np.bool_]) -> Refined:
-        return refine(model, observed, active, prior_of(model, origin, settings), noise)
+        return refine(model, observed, active, prior_of(model, origin, settings), settings.survey_sigma)
 
     best = fitted(start, active_names(settings))
     if not settings.refit_lens:
@@ -1002,6 +1014,27 @@ def _generalisation(fit: Refined, observed: Observations, settings: Settings) ->
 def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
     named = {"focal": "focal", "center": "center_x", "distortion": "distortion_1"}
     return tuple(group for group, name in named.items() if active[NAMES.index(name)])
+
+
+def _released(observed: Observations, settings: Settings, fit: Refined, notes: list[Finding]) -> Refined:
+    """Let the surface tilt freely where the pixels contradict a level one and nobody set how level it is."""
+    if settings.tilt_sigma is not None:
+        return fit
+    try:
+        free = refine(
+            fit.model, observed, fit.active, replace(fit.prior, tilt_std=np.inf), settings.survey_sigma
+        )
+    except (CalibrationError, np.linalg.LinAlgError):
+        return fit
+    level = solve(free.model, observed.subset(free.used), free.whiten, fit.active, fit.prior)
+    assert fit.prior.normal is not None
+    # Small enough to be a tilt, and told by the pixels rather than free to go anywhere.
+    lean = _lean(free.model, fit.prior.normal)
+    error = float(np.sqrt(max(free.covariance[k, k] for k in (6, 7))))
+    if not (2.0 * (level.cost - free.cost) > DOUBT and lean < MAX_LEAN and error < lean / 3.0):
+        return fit
+    notes.append(finding("plane_tilted", lean=float(np.degrees(lean))))
+    return free
 
 
 def _pinhole(observed: Observations, start: PoolModel, fit: Refined) -> Refined:
@@ -1290,7 +1323,8 @@ def run(
         water_height_sigma: Standard deviation of that [m]; 0.005 if not given.
         index: Refractive index of the water.
         index_sigma: Standard deviation of the index; 0.003 if neither is given, 0 (fixed) if only --index is.
-        tilt_sigma: Standard deviation of the surface's tilt [deg]; 0.2 if not given.
+        tilt_sigma: Standard deviation of the surface's tilt [deg]; if not given 0.2, or free where the pixels
+            contradict that.
         focal_sigma: Relative standard deviation of the camera file's focal length; from the file if not given.
         center_sigma: Standard deviation of its optical centre [px]; from the file if not given.
         survey_sigma: Standard deviation of a surveyed coordinate [m].

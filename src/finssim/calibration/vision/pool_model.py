@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -181,8 +180,9 @@ class Settings:
     """Of the water."""
     index_sigma: float = 0.003
     """Of that; 0 holds it."""
-    tilt_sigma: float = math.radians(0.2)
-    """Of the surface's direction, along the survey's z [rad]; 0 holds it."""
+    tilt_sigma: float | None = None
+    """Of the surface's direction, along the survey's z [rad]; 0 holds it; None: 0.2 degrees, or free where the pixels
+    contradict that."""
     refit_lens: bool = True
     """Fit the lens too where held-out points get better by it."""
     focal_sigma: float = 0.0
@@ -197,7 +197,7 @@ class Settings:
     def __post_init__(self) -> None:
         for field, (name, per, least, greatest) in RANGES.items():
             value = getattr(self, field)
-            if not least <= per * value <= greatest:
+            if value is not None and not least <= per * value <= greatest:
                 raise CalibrationError(
                     f"{name} is {per * value:g}, expected a number from {least:g} to {greatest:g}"
                 )
@@ -207,7 +207,7 @@ def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.
     """Which of `NAMES` are fitted, with groups of the lens besides those whose errors are given, (18,)."""
     active = {
         **dict.fromkeys(POSE_NAMES, True),
-        **dict.fromkeys(("tilt_x", "tilt_y"), settings.tilt_sigma > 0.0),
+        **dict.fromkeys(("tilt_x", "tilt_y"), settings.tilt_sigma is None or settings.tilt_sigma > 0.0),
         "depth": settings.water_height is None or settings.water_height_sigma > 0.0,
         "index": settings.index_sigma > 0.0,
     }
