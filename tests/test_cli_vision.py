@@ -165,7 +165,7 @@ def test_camera_reads_a_charuco_board(place, charuco, capsys):
         ([*CAMERA[:-1], "/proc/x/camera.yaml"], "write elsewhere"),
         ([*CAMERA, "--report", "/proc/x/report"], "write elsewhere"),
         ([*CAMERA, "--report", PHOTOGRAPHS], "already holds files"),
-        (["calibrate", "camera", "nowhere.png", "--board", "9x6", "--out", "c.yaml"], "nowhere.png: there is no such file"),
+        (["calibrate", "camera", "nowhere.png", "--board", "9x6", "--out", "c.yaml"], "nowhere.png: there is no such"),
         (["calibrate", "camera", ".", "--board", "9x6", "--out", "c.yaml"], "the folder holds no pictures"),
         (["calibrate", "camera", "--out", "c.yaml"], "Missing argument 'IMAGE"),
         (["calibrate", "camera", *SOME], "Missing option '--out'"),
