@@ -806,9 +806,6 @@ def _separability(
         yield finding("points_narrow", radius=radius, angle=float(np.degrees(steepest)), remedy=tape)
     if levels < COMMON_DEPTH * distance and half > 0.01 * distance:
         yield finding("one_depth", spread=levels, half=1000.0 * half, remedy=tape)
-    if not height.identifiable:
-        low, high = height.ci95
-        yield finding("height_unknown", height.name, estimate=height.estimate, low=low, high=high)
     focal = table["focal"]
     loose = focal.ci95[1] - focal.ci95[0] > 0.02 * focal.estimate
     if fit.active[NAMES.index("focal")] and loose and levels < 0.05 * distance:
