@@ -222,10 +222,10 @@ def _foreign(tree: Mapping[str, Any], label: str) -> Lens:
         fx, fy, cx, cy = fields.numbers("intrinsics", 4)
         distortion = fields.numbers("distortion_coeffs", None, ())
     else:
-        width, height = (_values(fields, f"image_{side}", side) for side in ("width", "height"))
-        if not (width and height):
+        size = [*_values(fields, "image_width", "width"), *_values(fields, "image_height", "height")]
+        if len(size) != 2:
             raise fields.error("the size of the image is missing: add image_width and image_height")
-        (width,), (height,) = width, height
+        width, height = size
         K = _values(fields, "camera_matrix", "K", "k")
         if len(K) != 9:
             raise fields.error("no camera matrix found: give camera_matrix with 9 numbers, or a section lens")
