@@ -96,7 +96,7 @@ def kinds() -> list[Kind]:
     """All of them."""
     camera = "--pool SEEDS/pool.yaml"
     located = f"{camera} --vehicle finsrov --out OUT/rows.csv"
-    fitted = "--camera SEEDS/camera.yaml --interface surface --folds 2 --out OUT/pool.yaml"
+    fitted = "--camera SEEDS/camera.yaml --out OUT/pool.yaml"
     return [
         Kind("vehicle", "vehicle.yaml", (
             "vehicles show {}", "validate {}", "tasks show t1 --vehicle {}",
@@ -114,13 +114,13 @@ def kinds() -> list[Kind]:
             "localize SEEDS/log/detections.csv --vehicle finsrov --out OUT/rows.csv --depth 0.5 --pool {}",
         ), weight=2),
         Kind("camera file", "camera.yaml", (
-            "calibrate pool SEEDS/survey.csv --camera {} --interface surface --folds 2 --out OUT/pool.yaml",
+            "calibrate pool SEEDS/survey.csv --camera {} --out OUT/pool.yaml",
         )),
         Kind("camera file of OpenCV", "left_intrinsics.yml", (
-            "calibrate pool SEEDS/survey.csv --camera {} --interface surface --folds 2 --out OUT/pool.yaml",
+            "calibrate pool SEEDS/survey.csv --camera {} --out OUT/pool.yaml",
         )),
         Kind("survey", "survey.csv", (
-            "calibrate pool {} --camera SEEDS/camera.yaml --interface surface --folds 2 --out OUT/pool.yaml",
+            "calibrate pool {} --camera SEEDS/camera.yaml --out OUT/pool.yaml",
         ), weight=2),
         Kind("points", "points.csv", (f"project {{}} {camera}",)),
         Kind("pixels", "pixels.csv", (f"backproject {{}} {camera} --z 0",)),
@@ -128,9 +128,7 @@ def kinds() -> list[Kind]:
             f"localize {{}} {located} --depth 0.5", f"localize {{}} {located} --depth SEEDS/log/depth.csv",
         ), weight=2),
         Kind("depths", "log/depth.csv", (f"localize SEEDS/log/detections.csv {located} --depth {{}}",)),
-        Kind("truth", "log/truth.csv", (
-            f"localize SEEDS/log/detections.csv {located} --depth 0.5 --truth {{}}",
-        )),
+        Kind("truth in a log", "log/truth.csv", (f"fuse {{}} {located}",), folder=1),
         Kind("log of fuse", "log/imu.csv", (f"fuse {{}} {located}",), folder=1),
         Kind("detections in a log", "log/detections.csv", (f"fuse {{}} {located}",), folder=1),
         Kind("header of a trial", "trials/surge_plus_9/trial.yaml", ("trials check {}",), folder=1, weight=2),
@@ -188,17 +186,17 @@ def kinds() -> list[Kind]:
             "simulate --vehicle finsrov --command surge=5 --duration NUMBER --out OUT/run.csv",
             "simulate --vehicle finsrov --command surge=5 --duration 0.2 --depth NUMBER --out OUT/run.csv",
             "excite surge --vehicle finsrov --levels NUMBER --out OUT/programmes",
-            "excite surge --vehicle finsrov --coast NUMBER --room NUMBER --out OUT/programmes",
+            "excite surge --vehicle finsrov --coast NUMBER --out OUT/programmes",
             "excite surge --vehicle finsrov --kind multisine --duration NUMBER --out OUT/programmes",
             "train t1 --steps 1024 --worlds 16 --set learning_rate=NUMBER --out OUT/policy",
             "train t1 --steps 1024 --worlds 16 --set discount=NUMBER --until NUMBER --out OUT/policy",
             "replay SEEDS/trials --vehicle finsrov --horizon NUMBER",
             "calibrate hydrodynamics SEEDS/trials --vehicle finsrov --method regression --fix surge.m=NUMBER --out OUT/v.yaml",  # noqa: E501
             f"localize SEEDS/log/detections.csv {located} --depth NUMBER --pixel-std NUMBER",
-            f"localize SEEDS/log/detections.csv {located} --depth 0.5 --depth-std NUMBER --tilt-std-deg NUMBER",
+            f"localize SEEDS/log/detections.csv {located} --depth 0.5 --tilt-std-deg NUMBER",
             f"fuse SEEDS/log {located} --rate NUMBER", f"fuse SEEDS/log {located} --pixel-std NUMBER",
-            f"backproject SEEDS/pixels.csv {camera} --z NUMBER", f"backproject SEEDS/pixels.csv {camera} --plane 0,0,1,NUMBER",  # noqa: E501
-            f"calibrate pool SEEDS/survey.csv {fitted} --index NUMBER", f"calibrate pool SEEDS/survey.csv {fitted} --z NUMBER",  # noqa: E501
+            f"backproject SEEDS/pixels.csv {camera} --z NUMBER",
+            f"calibrate pool SEEDS/survey.csv {fitted} --index NUMBER",
             f"calibrate pool SEEDS/survey.csv {fitted} --water-height NUMBER --survey-sigma NUMBER",
             "play SEEDS/run.mcap --fast --start NUMBER", "view SEEDS/run.mcap --no-browser --duration 0 --basin 4,2,NUMBER",  # noqa: E501
             "evaluate pid --trials NUMBER", "collect pid --task t1 --episodes NUMBER --disturb NUMBER --out OUT/set",
@@ -216,7 +214,7 @@ REFUSED = (
     "evaluate SEEDS/strong --trials 1",
     "evaluate SEEDS/endless --trials 1",
     "view SEEDS/run.mcap --no-browser --duration 0 --bind 10.255.255.1",
-    "excite surge --vehicle finsrov --simulate --rate 0 --out OUT/trials",
+    "excite surge --vehicle finsrov --simulate --repeats 0 --out OUT/trials",
 )
 """Commands that must be refused: a log in mm/s, a policy with limits of 1e9 N or a period without end, ..."""
 

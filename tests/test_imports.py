@@ -134,7 +134,7 @@ HOMES = {
         "calibration/vision/pool_fit.py",
         "localization/detection/pictures.py",
         "robot/pictures.py",
-        "worlds/pictures.py",
+        "worlds/model.py",
         "tasks/onlooker.py",
     },
     "pupil_apriltags": {"localization/detection/families.py"},

@@ -8,7 +8,7 @@ from finssim.calibration.findings import CalibrationError
 from finssim.calibration.motor import cut_steps, fit_motor, fit_response
 from finssim.calibration.programmes import programmes
 from finssim.calibration.synthetic import simulate_programme
-from finssim.calibration.thrust_table import find_steps, levels
+from finssim.calibration.thruster import find_steps, levels
 from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 

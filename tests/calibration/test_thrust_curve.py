@@ -10,9 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from finssim.calibration.findings import CalibrationError
-from finssim.calibration.thrust_table import read_table
-from finssim.calibration.thruster import dead_zone, fit_side, fit_thruster
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.thruster import dead_zone, fit_side, fit_thruster, read_table
 from finssim.vehicles import check_vehicle, load_vehicle
 
 T200 = Path(__file__).parents[1] / "data" / "t200"
@@ -91,7 +89,7 @@ def test_signs_come_from_what_has_them(tmp_path, unsigned):
     ("text", "said"),
     [
         ("RPM,Thrust\n1,2\n2,3\n3,4\n", r"'Thrust' has no unit.*one of N, kgf.*'Thrust \(N\)'"),
-        ("a,b\n1,2\n2,3\n", "no column of force and none of speed or pulse among a, b: rename one"),
+        ("a,b\n1,2\n2,3\n", "no column of force among a, b: rename one"),
         ("1,2\n2,3\n3,4\n", "expected a header line"),
         ("RPM (rpm),RPM 2 (rpm),Thrust (N)\n1,1,2\n2,2,3\n3,3,4\n", "speed could be .*: rename the column"),
         (
@@ -313,19 +311,6 @@ def test_tables_that_name_no_group_warn_on_a_vehicle_with_several():
     assert "all.c_plus" in fit.estimates and any(
         one.values.get("groups") == ("CC", "CCW") for one in fit.findings
     )
-
-
-def test_a_bench_trial_is_a_table_of_its_thruster():
-    rpm, force = made(rows=20)
-    rpm, force = np.repeat(rpm, 50), np.repeat(force, 50)
-    t = np.arange(len(rpm)) * 0.05
-    trial = Trial(
-        name="bench", t=t, channels={"rpm_T3": rpm, "force_T3": force, "pwm_T3": 1500.0 - rpm / 8.0}
-    )
-    turned = {"thrusters.T3.motor_sign": -1, "autopilot.directions": (1, 1, -1, 1, 1, 1)}
-    fit = fit_thruster([trial], BLUEROV2.replace(turned))
-    assert fit.estimates["T3.c_plus"].estimate == pytest.approx(1.1e-4, rel=0.01)
-    assert fit.estimates["T3.c_plus"].path == "thrusters.T3.c_plus" and fit.trials == {"bench": trial.sha256}
 
 
 def test_force_and_pulse_without_speed_fit_the_speed_controller_alone(tmp_path):

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from scipy import stats
 
 from finssim.engine.distributions import Distribution
-from finssim.engine.draw_table import widened
+from finssim.engine.randomize import widened
 from finssim.engine.ranges_file import Ranges, RangesError, load_ranges
 from reference.draws import column, draw
 

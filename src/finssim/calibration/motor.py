@@ -18,8 +18,7 @@ from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion import without_spikes
 from finssim.calibration.report import finish, refuse_places, usable_trials
-from finssim.calibration.thrust_table import find_steps
-from finssim.calibration.thruster import jackknife
+from finssim.calibration.thruster import find_steps, jackknife
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
 from finssim.vehicles import Vehicle, load_vehicle

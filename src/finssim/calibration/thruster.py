@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import re
-from collections.abc import Iterable, Sequence
+import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,17 +20,373 @@ from numpy.typing import NDArray
 from finssim.calibration.findings import CalibrationError, Finding, finding, sentences
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.report import finish, refuse_places
-from finssim.calibration.thrust_table import QUANTITIES, STANDING, ThrustTable, read_table, tables_of_trial
-from finssim.calibration.trials.trial import Trial
-from finssim.calibration.trials.trial_files import load_trial
+from finssim.calibration.trials.conversion import UNITS
 from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
+from finssim.text_table import read_text_table
 from finssim.vehicles import Esc, Vehicle, load_vehicle
 from finssim.vehicles.thruster import Thruster
 
-__all__ = ["dead_zone", "fit_esc", "fit_side", "fit_thruster", "jackknife"]
-
+__all__ = ["dead_zone", "find_steps", "fit_esc", "fit_side", "fit_thruster", "jackknife", "read_table"]
 
 Array = NDArray[np.float64]
+
+# Levels of a log over time.
+
+LAST = 0.4
+"""Part of a level that counts as settled: the last 2 s of 5 s."""
+SHORTEST = 0.5
+"""Shortest level that can settle [s]."""
+LEAST_COVERED = 0.5
+"""Share of the time that levels must cover for a log to be one of levels; a slower sweep is used as it is."""
+SHORTEST_HELD = 0.2
+"""Levels of a command shorter than this are no steps [s]."""
+SETTLING = 50
+"""Samples of a run after which its median no longer moves, so that a slow ramp is not one run."""
+TOLERANCE = 0.02
+"""Band around a level within which a measured signal still counts as held, of its range."""
+
+
+class Step(NamedTuple):
+    """A change of a held signal and what follows until the next one."""
+
+    start: float
+    """Time of the last sample before the change, from which the signal could have changed [s]."""
+    time: float
+    """Time of the first sample after the change [s]."""
+    end: float
+    """Time of the last sample before the next change, or of the log [s]."""
+    before: float
+    after: float
+
+
+def levels(x: Array, tolerance: float) -> list[tuple[int, int]]:
+    """Runs of samples that stay within `tolerance` of their running median, [first, last) each, covering all.
+
+    One stray sample does not end a run, two do.
+    """
+    runs, first = [], 0
+    values = x.tolist()
+    centre = values[0] if values else 0.0
+    for i in range(1, len(values)):
+        if values[i] == centre:
+            continue
+        outside = abs(values[i] - centre) > tolerance
+        if outside and (i + 1 >= len(values) or abs(values[i + 1] - centre) > tolerance):
+            runs.append((first, i))
+            first, centre = i, values[i]
+        elif not outside and i - first < SETTLING:
+            centre = statistics.median(values[first : i + 1])
+    if values:
+        runs.append((first, len(values)))
+    return runs
+
+
+def last_parts(values: dict[str, Array]) -> tuple[dict[str, Array], Finding]:
+    """Steady rows of a log over time: the mean over the last 40 % of each level of the pulse or of the speed.
+
+    Args:
+        values: `time` [s] and any of speed, force, pulse, voltage, (n,) each.
+
+    Returns:
+        The same without `time`, one row per level, and a finding; the rows as they are if the log holds no levels (a
+        slow sweep).
+    """
+    times = values["time"]
+    others = {key: value for key, value in values.items() if key != "time"}
+    drive = values.get("pulse", values.get("speed"))
+    assert drive is not None
+    good = np.flatnonzero(np.isfinite(drive) & np.isfinite(times))
+    span = float(np.ptp(drive[good])) if good.size else 0.0
+    band = TOLERANCE * span if "pulse" not in values else 0.002 * span
+    rows, covered = [], 0.0
+    for first, last in levels(drive[good], band):
+        index = good[first:last]
+        length = float(times[index[-1]] - times[index[0]])
+        half = len(index) // 2
+        if length < SHORTEST or half < 2:
+            continue
+        settled = index[times[index] >= times[index[-1]] - LAST * length]
+        drift = abs(np.mean(drive[index[half:]]) - np.mean(drive[index[half // 2 : half]]))
+        if drift <= 0.25 * band:
+            rows.append(settled)
+            covered += length
+    if len(rows) < 3 or covered < LEAST_COVERED * float(times[good[-1]] - times[good[0]]):
+        return others, finding("read_as_sweep", rows=len(times))
+    steady = {key: np.array([_mean(value[row]) for row in rows]) for key, value in others.items()}
+    return steady, finding("read_as_levels", levels=len(rows), share=LAST)
+
+
+def _mean(values: Array) -> float:
+    good = values[np.isfinite(values)]
+    return float(np.mean(good)) if good.size else float("nan")
+
+
+def find_steps(t: Array, command: Array) -> list[Step]:
+    """Every change of a held command that lasts.
+
+    Args:
+        t: Times [s], (n,).
+        command: Its values, finite, (n,).
+
+    Returns:
+        Steps in order of time; none where the command never holds still.
+    """
+    span = float(np.ptp(command)) if command.size else 0.0
+    if span == 0.0:
+        return []
+    runs = levels(command, 0.01 * span)
+    held = [(a, b) for a, b in runs if t[b - 1] - t[a] >= SHORTEST_HELD]
+    if len(runs) > 4 * len(held):  # a command that moves all the time
+        return []
+    return [
+        Step(float(t[a2 - 1]), float(t[a2]), float(t[b2 - 1]), _mean(command[a1:b1]), _mean(command[a2:b2]))
+        for (a1, b1), (a2, b2) in zip(held, held[1:], strict=False)
+    ]
+
+
+# Tables: which column holds what, in which unit, and with which sign.
+
+_N, _RATE = UNITS["force"], UNITS["rate"]
+_UNITS: dict[str, dict[str, float]] = {
+    "speed": {
+        **dict.fromkeys(("rpm", "1/min", "rev/min", "r/min"), _RATE["rpm"]),
+        **dict.fromkeys(("rad/s", "rads", "radps"), 1.0),
+        **dict.fromkeys(("rps", "rev/s", "1/s", "hz"), _RATE["rps"]),
+    },
+    "force": {
+        **dict.fromkeys(("n", "newton", "newtons"), 1.0),
+        **dict.fromkeys(("kgf", "kg", "kp"), _N["kgf"]),
+        **dict.fromkeys(("gf", "g", "gram", "grams"), _N["gf"]),
+        **dict.fromkeys(("lbf", "lb", "lbs"), _N["lbf"]),
+    },
+    "pulse": {"us": 1.0, "usec": 1.0, "ms": 1e3},
+    "voltage": {"v": 1.0, "volt": 1.0, "volts": 1.0, "mv": 1e-3},
+    "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6},
+}
+"""Quantity -> unit, as `_plain` writes it -> rad/s, N, µs, V or s in one of it."""
+_CHOICES = {"speed": "rpm, rad/s, rev/s", "force": "N, kgf, gf, lbf", "pulse": "us, ms"}
+_KEYWORDS = {
+    "speed": {"speed", "rpm", "omega", "rotation", "rotational", "shaft", "rev", "revs", "velocity"},
+    "force": {"force", "thrust", "load", "loadcell"},
+    "pulse": {"pwm", "pulse", "pulsewidth", "esc", "throttle", "signal"},
+    "voltage": {"voltage", "battery", "volt", "volts", "supply", "vbat", "v"},
+    "time": {"time", "t", "timestamp"},
+}
+_IMPLIED = {"rpm": ("speed", _RATE["rpm"]), "pwm": ("pulse", 1.0)}
+"""Words that say the unit too."""
+
+
+def _recognised(header: str) -> tuple[str, float] | None:
+    """Quantity and factor that a header names, as `Force (Kg f)`, `Thrust [N]`, `speed_rpm`, `omega rad/s`, `RPM`.
+
+    The factor is NaN where it gives no unit.
+    """
+    text, unit = header.strip(), ""
+    if brackets := re.fullmatch(r"(.*?)[\s_]*[(\[{](.*)[)\]}]", text):
+        text, unit = brackets[1], _plain(brackets[2])
+    elif tail := re.fullmatch(r"(.+?)[\s_]+(\S+)", re.sub(r"rad_s$", "rad/s", text)):
+        if any(_plain(tail[2]) in units for units in _UNITS.values()):
+            text, unit = tail[1], _plain(tail[2])
+    words = set(re.findall(r"[a-z]+", text.lower()))
+    for word, implied in _IMPLIED.items():
+        if word in words and unit in ("", word):
+            return implied
+    matches = [name for name, keywords in _KEYWORDS.items() if words & keywords]
+    if not unit:
+        fixed = 1.0 if matches in (["voltage"], ["time"]) else math.nan
+        return (matches[0], fixed) if len(matches) == 1 else None
+    matches = [name for name in matches if unit in _UNITS[name]]
+    return (matches[0], _UNITS[matches[0]][unit]) if len(matches) == 1 else None
+
+
+def _plain(unit: str) -> str:
+    """Lower case, without spaces, with u for micro and / for per."""
+    text = unit.strip().lower().replace("µ", "u").replace("μ", "u").replace(" per ", "/")
+    return re.sub(r"[\s.·^]+", "", text)
+
+
+def _columns(headers: Sequence[str], rows: Array, label: str) -> dict[str, tuple[str, Array]]:
+    """Header and values in our units of every quantity that a table has; columns of zeros are passed over."""
+    columns: dict[str, list[tuple[str, float, Array]]] = {}
+    for header, values in zip(headers, rows.T, strict=True):
+        guess = _recognised(header)
+        if guess is not None and np.any(np.nan_to_num(values) != 0.0):
+            columns.setdefault(guess[0], []).append((header.strip(), guess[1], values))
+    out = {}
+    for quantity, candidates in columns.items():
+        clear = [one for one in candidates if not math.isnan(one[1])]
+        candidates = clear if len(clear) == 1 else candidates
+        header, factor, values = candidates[0]
+        if len(candidates) > 1:
+            listed = " or ".join(f"'{one[0]}'" for one in candidates)
+            raise CalibrationError(
+                f"{label}: {quantity} could be {listed}: rename the column that is not meant, or remove it"
+            )
+        if math.isnan(factor):
+            choices = _CHOICES[quantity]
+            raise CalibrationError(
+                f"{label}: column '{header}' has no unit: write it into the header, one of {choices}, such as "
+                f"'{header} ({choices.split(',')[0]})'"
+            )
+        out[quantity] = header, values * factor
+    for need, example in ((("force",), "force (N)"), (("speed", "pulse"), "speed (rpm)")):
+        if not set(need) & set(out):
+            raise CalibrationError(
+                f"{label}: no column of {' or '.join(need)} among {', '.join(h.strip() for h in headers)}: rename one, "
+                f"such as '{example}' (columns of nothing but zeros are passed over)"
+            )
+    return out
+
+
+STANDING = 0.01
+"""Share of the fastest speed below which a shaft counts as standing."""
+PLAUSIBLE = {
+    "pulse": (500.0, 2500.0, "µs"),
+    "speed": (-1e5, 1e5, "rad/s"),
+    "force": (-1e6, 1e6, "N"),
+    "voltage": (0.0, 1e4, "V"),
+}
+"""What a column of a table may hold: least, most, unit; NaN and 0 are passed over."""
+QUANTITIES = tuple(PLAUSIBLE)
+"""Columns of a `ThrustTable`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThrustTable:
+    """Steady values of one thruster (or one type of thruster); NaN where a column or cell is missing."""
+
+    name: str
+    """Of the file."""
+    speed: Array
+    """ω [rad/s], positive for positive thrust, (n,)."""
+    force: Array
+    """T [N], (n,)."""
+    pulse: Array
+    """[µs], (n,)."""
+    voltage: Array
+    """Of the battery [V], (n,)."""
+    sha256: str = ""
+    """Digest of the numbers."""
+    findings: tuple[Finding, ...] = ()
+    """What was taken off, turned or left out."""
+
+    def at(self, rows: NDArray[np.bool_]) -> ThrustTable:
+        """The same table with some of its rows."""
+        return replace(self, **{key: getattr(self, key)[rows] for key in QUANTITIES})
+
+
+def read_table(path: str | os.PathLike[str], *, neutral: float = 1500.0) -> ThrustTable:
+    """Read a table from a CSV file.
+
+    Separators `, ; tab`, comment lines after `#`, and units in the headers (rpm, rad/s, N, kgf, lbf, g, ...) are
+    understood, among them the headers that Blue Robotics publishes. Speeds and forces without sign get it from each
+    other or from the pulse; of a log over time the last part of each level is used (see `last_parts`).
+
+    Args:
+        path: The file.
+        neutral: Pulse at which the motor is off [µs], for signs.
+
+    Raises:
+        CalibrationError: Not a table of thrusts, or it can be read in two ways; the sentence says how to decide.
+    """
+    label, findings = os.fspath(path), list[Finding]()
+    columns = _columns(*_cells(Path(path), label), label)
+    values = {quantity: column for quantity, (_, column) in columns.items()}
+    if "time" in values:
+        values, remark = last_parts(values)
+        findings.append(remark)
+    full = {key: values.get(key, np.full(len(values["force"]), np.nan)) for key in QUANTITIES}
+    good = np.isfinite(full["force"]) & np.isfinite(full["speed" if "speed" in values else "pulse"])
+    if np.count_nonzero(good) < 3:
+        raise CalibrationError(f"{label}: {np.count_nonzero(good)} rows hold numbers, expected at least 3")
+    full = {key: value[good] for key, value in full.items()}
+    for key, (least, greatest, unit) in PLAUSIBLE.items():
+        nonzero = full[key][np.isfinite(full[key]) & (full[key] != 0.0)]
+        if nonzero.size and (nonzero.min() < least or nonzero.max() > greatest):
+            raise CalibrationError(
+                f"{label}: {key}s run from {nonzero.min():g} to {nonzero.max():g} {unit}, expected {least:g} to "
+                f"{greatest:g} {unit}: check the column's name and unit"
+            )
+    full["force"] = _without_offset(full, neutral, findings)
+    full = _signed(full, neutral, columns["force"][0], label, findings)
+    digest = hashlib.sha256(b"".join(np.ascontiguousarray(full[key] + 0.0).tobytes() for key in sorted(full)))
+    return ThrustTable(name=Path(path).stem, **full, sha256=digest.hexdigest(), findings=tuple(findings))
+
+
+def _cells(path: Path, label: str) -> tuple[list[str], Array]:
+    """Headers and numbers of a file; a second header line of units is joined to the first."""
+    table = read_text_table(path, CalibrationError)
+    headers, rows = table.names, table.rows
+
+    def number(cell: str) -> float:
+        value = table.number(cell)
+        return math.nan if value is None else value
+
+    if not rows:
+        raise CalibrationError(f"{label}: no rows below a header line: give a CSV table of speeds and forces")
+    if not any(math.isnan(number(cell)) for cell in headers):
+        raise CalibrationError(
+            f"{label}: the first line holds numbers, expected a header line that names the columns"
+        )
+    if all(math.isnan(number(cell)) for cell in rows[0]):
+        units = [unit.strip(" ()[]") for unit in rows.pop(0)][: len(headers)]
+        headers = [f"{h} ({u})" if u else h for h, u in zip_longest(headers, units, fillvalue="")]
+    width = len(headers)
+    numbers = [[number(cell) for cell in (row + [""] * width)[:width]] for row in rows]
+    return headers, np.array(numbers, dtype=np.float64).reshape(-1, width)
+
+
+def _without_offset(full: Mapping[str, Array], neutral: float, findings: list[Finding]) -> Array:
+    """Forces less the median reading at standstill."""
+    force, speed = full["force"], np.abs(full["speed"])
+    if np.isfinite(speed).any():
+        standing = speed <= STANDING * np.nanmax(speed)
+    else:
+        standing = np.abs(full["pulse"] - neutral) <= 0.02 * neutral / 3.0
+    offset = float(np.median(force[standing])) if standing.any() else 0.0
+    if abs(offset) < 1e-3 * np.max(np.abs(force)):
+        return force
+    findings.append(finding("load_cell_offset", offset=offset))
+    return force - offset
+
+
+def _signed(
+    full: Mapping[str, Array], neutral: float, header: str, label: str, findings: list[Finding]
+) -> dict[str, Array]:
+    """The rows whose direction of rotation is known, with its sign in speed and force.
+
+    The direction is that of the first of speed, pulse and force that has both signs, else of pulse or force.
+    """
+    speed, force = full["speed"], full["force"]
+    small = STANDING * np.max(np.abs(force))
+    turning = np.abs(speed) > STANDING * np.max(np.abs(speed))
+    signs = {
+        "speed": np.sign(speed) * turning,
+        "pulse": np.nan_to_num(np.sign(full["pulse"] - neutral)),
+        "force": np.sign(force) * (np.abs(force) > small),
+    }
+    both = [name for name, sign in signs.items() if sign.min() < 0.0 < sign.max()]
+    source = (both or [name for name in ("pulse", "force") if signs[name].any()] or ["force"])[0]
+    direction, keep = signs[source], np.ones(len(force), bool)
+    if source in both and "force" not in both:
+        findings.append(finding("force_sign", source=source))
+        force = np.abs(force) * direction
+    clear = (np.abs(force) > 5.0 * small) & (direction != 0.0)
+    if np.count_nonzero(np.sign(force[clear]) != direction[clear]) > 0.5 * np.count_nonzero(clear):
+        raise CalibrationError(
+            f"{label}: force is negative where {source} is positive: turn the sign of the column '{header}'"
+        )
+    if source != "speed" and np.isfinite(speed).all():
+        if np.any(direction < 0.0):
+            findings.append(finding("speed_sign"))
+        keep = ~turning | (direction != 0.0)
+        if not keep.all():
+            findings.append(finding("rows_unsigned", rows=np.count_nonzero(~keep)))
+        speed = np.abs(speed) * np.where(turning, direction, 1.0)
+    return {key: value[keep] for key, value in {**full, "speed": speed, "force": force}.items()}
+
+
+# The thrust curve and the dead zone.
 
 BLOCKS = 10
 """Parts of equal weight that a table is cut into for intervals."""
@@ -339,25 +698,29 @@ def _around(value: float, half: float) -> tuple[float, float]:
     return (float(value - half), float(value + half))
 
 
+# What the tables of one thruster, or of several alike, say.
+
 SIDES = (("plus", 1.0), ("minus", -1.0))
 """Name and sign of the two directions of rotation."""
-
 SAME_VOLTAGE = 0.75
 """Voltages nearer than this are one level [V]; a battery's sag within a run is not another level."""
 PULSE_RANGE = (1100.0, 1500.0, 1900.0)
 """Reverse, neutral and forward of hobby speed controllers [µs], where the vehicle file does not say."""
+TO_RPM = 30.0 / math.pi
+CHOSEN_LIMIT = 0.02
+"""A force limit this far below the curve at the speed limit was chosen, not measured: it stays."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
     """What the tables of one target say."""
 
-    levels: tuple[tuple[float, ThrustTable], ...]
-    """Tables by voltage [V], NaN where it is not known."""
+    levels: dict[float, ThrustTable]
+    """All rows of each voltage [V], to 0.1 V; of NaN those whose voltage is not known."""
     voltage: float
     """At which the numbers hold [V]; NaN where it is not known."""
-    fitted: tuple[ThrustTable, ...]
-    """The tables that were fitted; the others only check the prediction."""
+    rows: ThrustTable
+    """Those that were fitted; the others only check the prediction."""
     sides: dict[str, Side]
     """By `plus` and `minus`."""
     dead: dict[str, DeadZone]
@@ -367,17 +730,24 @@ class Bench:
     esc: EscFit | None
     speeds_measured: bool
     """Whether there are speeds; otherwise they follow from the forces by the vehicle file's curve."""
+    before: Thruster
+    """As the vehicle file has it."""
     findings: tuple[Finding, ...]
 
+    def thrust(self, speed: Array) -> Array:
+        """T = c± ω|ω| with the fitted c±, those of the vehicle file where there is none [N], (n,).
 
-def bench(
-    tables: Sequence[ThrustTable],
-    thruster: Thruster,
-    label: str,
-    *,
-    voltage: float | None,
-    pool_voltages: bool,
-) -> Bench:
+        Args:
+            speed: Of the shaft, positive for positive thrust [rad/s], (n,).
+        """
+        plus, minus = (
+            self.sides[name].c if name in self.sides else getattr(self.before, f"c_{name}")
+            for name, _ in SIDES
+        )
+        return np.where(speed >= 0.0, plus, minus) * speed * np.abs(speed)
+
+
+def bench(tables: Sequence[ThrustTable], thruster: Thruster, label: str, voltage: float | None) -> Bench:
     """Analyse tables of one thruster or of several alike.
 
     Args:
@@ -386,7 +756,6 @@ def bench(
         label: How messages call the target.
         voltage: At which the numbers shall hold [V]; where not given, the only one of the tables, else that of the
             vehicle file's ESC, else the middle one.
-        pool_voltages: Fit all voltages together, rather than this one alone.
 
     Raises:
         CalibrationError: The tables hold no such voltage, or nothing to fit.
@@ -401,43 +770,54 @@ def bench(
     levels = [level for table in tables for level in split_by_voltage(table)]
     chosen = _reference([volts for volts, _ in levels], thruster, label, voltage)
     at = [table for volts, table in levels if not abs(volts - chosen) > SAME_VOLTAGE]
-    others = sorted({round(volts, 1) for volts, table in levels if not any(table is t for t in at)})
-    fitted = [table for _, table in levels] if pool_voltages else at
-    if others and not pool_voltages:
+    if others := sorted({round(volts, 1) for volts, _ in levels if abs(volts - chosen) > SAME_VOLTAGE}):
         findings.append(
             finding("voltage_chosen", label, voltage=chosen, others=tuple(f"{v:g}" for v in others))
         )
+    pulse_range = _pulse_range(thruster, tables)
     sides, dead, fastest = {}, {}, {}
     for name, sign in SIDES:
-        side = fit_side([turning(table, sign) for table in fitted]) if measured else None
+        fastest[name] = max((_fastest(table, sign, pulse_range) for table in at), default=(0.0, False, 0.0))
+        side = fit_side([_turning(table, sign) for table in at]) if measured else None
         if side is not None:
             sides[name] = side
-        zones = [zone for zone in (dead_zone(sign * table.speed) for table in at) if zone is not None]
-        if zones and measured:
-            dead[name] = _joint_dead_zone(zones)
-        speeds = [_fastest(table, sign, _pulse_range(thruster, tables)) for table in at]
-        fastest[name] = max(speeds, default=(0.0, False, 0.0))
-    esc = None
+        zones = [zone for table in at if (zone := dead_zone(sign * table.speed)) is not None]
+        if zones and measured:  # their median, over all of their intervals
+            zones = [zone for zone in zones if zone.measured] or zones
+            ends = [end for zone in zones for end in zone.interval]
+            middle = float(np.median([zone.speed for zone in zones]))
+            dead[name] = replace(zones[0], speed=middle, interval=(min(ends), max(ends)))
+    rows, esc = _stack(at), None
     if any(np.isfinite(table.pulse).any() for table in tables):
-        esc = _esc(fitted, thruster, tables, label, chosen, measured, findings)
+        if math.isnan(chosen):
+            findings.append(finding("law_without_voltage", label))
+        else:
+            good = np.isfinite(rows.pulse) & np.isfinite(rows.speed) & (rows.pulse > 0.0)
+            volts = np.where(np.isfinite(rows.voltage), rows.voltage, chosen)[good]
+            speed = rows.speed[good]
+            # Speeds that follow from forces are the surer the faster: dω = dT / (2 c ω).
+            weight = None if measured else np.abs(speed) / np.max(np.abs(speed))
+            try:
+                esc = fit_esc(
+                    rows.pulse[good], speed, volts, pulse_range=pulse_range, weight=weight, at=chosen
+                )
+            except CalibrationError as error:
+                findings.append(finding("law_refused", label, reason=str(error)))
     if not sides and esc is None:
         reasons = "; ".join(sentences(findings)) or f"{label}: no row turns the shaft"
         raise CalibrationError(f"{reasons}: nothing could be fitted")
     findings += [item.about(table.name) for table in tables for item in table.findings]
+    by_voltage: dict[float, list[ThrustTable]] = {}
+    for volts, table in levels:
+        by_voltage.setdefault(round(volts, 1) if math.isfinite(volts) else math.nan, []).append(table)
     return Bench(
-        levels=tuple(levels),
-        voltage=chosen,
-        fitted=tuple(fitted),
-        sides=sides,
-        dead=dead,
-        fastest=fastest,
-        esc=esc,
-        speeds_measured=measured,
+        levels={volts: _stack(by_voltage[volts]) for volts in sorted(by_voltage)}, voltage=chosen, rows=rows,
+        sides=sides, dead=dead, fastest=fastest, esc=esc, speeds_measured=measured, before=thruster,
         findings=tuple(dict.fromkeys(findings)),
-    )
+    )  # fmt: skip
 
 
-def turning(table: ThrustTable, sign: float) -> tuple[Array, Array]:
+def _turning(table: ThrustTable, sign: float) -> tuple[Array, Array]:
     """Speed and thrust along one direction of the rows in which the shaft turns that way."""
     speed = sign * table.speed
     rows = speed > STANDING * float(np.max(np.abs(table.speed)))
@@ -445,7 +825,7 @@ def turning(table: ThrustTable, sign: float) -> tuple[Array, Array]:
 
 
 def split_by_voltage(table: ThrustTable) -> list[tuple[float, ThrustTable]]:
-    """The rows of every voltage level with its mean; (NaN, table) where no voltage is known."""
+    """The rows of every voltage level with its mean [V]; (NaN, table) where no voltage is known."""
     valid = np.isfinite(table.voltage)
     if not valid.any():
         return [(math.nan, table)]
@@ -460,26 +840,12 @@ def _reference(volts: Sequence[float], thruster: Thruster, label: str, requested
     available = sorted(v for v in volts if not math.isnan(v))
     if not available:
         return math.nan if requested is None else requested
-    if requested is None:
-        preferred = thruster.esc.voltage if thruster.esc else math.nan
-        near = [v for v in available if abs(v - preferred) <= SAME_VOLTAGE]
-        return near[0] if near else available[len(available) // 2]
-    near = [v for v in available if abs(v - requested) <= SAME_VOLTAGE]
-    if not near:
+    preferred = requested if requested is not None else thruster.esc.voltage if thruster.esc else math.nan
+    near = [v for v in available if abs(v - preferred) <= SAME_VOLTAGE]
+    if requested is not None and not near:
         listed = ", ".join(f"{v:g}" for v in dict.fromkeys(round(v, 2) for v in available))
         raise CalibrationError(f"{label}: no table at {requested:g} V; there are {listed} V")
-    return min(near, key=lambda v: abs(v - requested))
-
-
-def _joint_dead_zone(zones: Sequence[DeadZone]) -> DeadZone:
-    """One dead zone from those of several tables: their median, over all of their intervals."""
-    measured = [zone for zone in zones if zone.measured]
-    chosen = measured or list(zones)
-    ends = [end for zone in chosen for end in zone.interval]
-    middle = float(np.median([zone.speed for zone in chosen]))
-    return DeadZone(
-        speed=middle, interval=(min(ends), max(ends)), measured=bool(measured), note=chosen[0].note
-    )
+    return min(near, key=lambda v: abs(v - preferred)) if near else available[len(available) // 2]
 
 
 def _pulse_range(thruster: Thruster, tables: Sequence[ThrustTable]) -> tuple[float, float, float]:
@@ -487,10 +853,8 @@ def _pulse_range(thruster: Thruster, tables: Sequence[ThrustTable]) -> tuple[flo
     low, neutral, high = PULSE_RANGE
     if thruster.esc is not None:
         low, neutral, high = thruster.esc.pulse_min, thruster.esc.pulse_neutral, thruster.esc.pulse_max
-    pulses = np.concatenate([table.pulse[np.isfinite(table.pulse) & (table.pulse > 0.0)] for table in tables])
-    if pulses.size == 0:
-        return low, neutral, high
-    return min(low, float(pulses.min())), neutral, max(high, float(pulses.max()))
+    pulses = [x for table in tables for x in table.pulse[table.pulse > 0.0].tolist()]
+    return min([low, *pulses]), neutral, max([high, *pulses])
 
 
 def _fastest(
@@ -498,11 +862,11 @@ def _fastest(
 ) -> tuple[float, bool, float]:
     """Fastest steady speed along a direction, whether the pulse was at its end, and the distance to the next speed."""
     speeds = np.sort(np.maximum(sign * table.speed, 0.0))
-    best, gap = float(speeds[-1]), float(speeds[-1] - speeds[-2])
     low, neutral, high = pulse_range
     end = (high - neutral) if sign > 0.0 else (neutral - low)
     throws = sign * (table.pulse - neutral)
-    return best, bool(np.isfinite(throws).any() and np.nanmax(throws) >= 0.98 * end), gap
+    at_end = bool(np.isfinite(throws).any() and np.nanmax(throws) >= 0.98 * end)
+    return float(speeds[-1]), at_end, float(speeds[-1] - speeds[-2])
 
 
 def _with_speeds(table: ThrustTable, thruster: Thruster) -> ThrustTable:
@@ -511,143 +875,73 @@ def _with_speeds(table: ThrustTable, thruster: Thruster) -> ThrustTable:
     return replace(table, speed=thruster.speed(force))
 
 
-def _esc(
-    on: Sequence[ThrustTable],
-    thruster: Thruster,
-    tables: Sequence[ThrustTable],
-    label: str,
-    volts: float,
-    measured: bool,
-    findings: list[Finding],
-) -> EscFit | None:
-    """The speed controller, or None and a finding that says why not."""
-    pulse, speed, voltage = (
-        np.concatenate([getattr(t, key) for t in on]) for key in ("pulse", "speed", "voltage")
-    )
-    if math.isnan(volts):
-        findings.append(finding("law_without_voltage", label))
-        return None
-    voltage = np.where(np.isfinite(voltage), voltage, volts)
-    good = np.isfinite(pulse) & np.isfinite(speed) & (pulse > 0.0)
-    # Speeds that follow from forces are the surer the faster: dω = dT / (2 c ω).
-    weight = None if measured else np.abs(speed[good]) / np.max(np.abs(speed[good]))
-    try:
-        return fit_esc(
-            pulse[good],
-            speed[good],
-            voltage[good],
-            pulse_range=_pulse_range(thruster, tables),
-            weight=weight,
-            at=volts,
-        )
-    except CalibrationError as error:
-        findings.append(finding("law_refused", label, reason=str(error)))
-        return None
+def _stack(tables: Sequence[ThrustTable]) -> ThrustTable:
+    """All rows of several tables as one."""
+    columns = {key: np.concatenate([getattr(table, key) for table in tables]) for key in QUANTITIES}
+    return ThrustTable(name=tables[0].name, **columns)  # type: ignore[arg-type]
 
 
 # Which tables speak about which thrusters of a vehicle.
 
 
-class Target(NamedTuple):
-    """Thrusters that get the same numbers."""
-
-    name: str
-    """Of the propeller group or the thruster, or `all`."""
-    thrusters: tuple[str, ...]
-    tables: tuple[ThrustTable, ...]
-
-
 def find_targets(
     tables: Sequence[ThrustTable], vehicle: Vehicle, group: str | None
-) -> tuple[list[Target], list[Finding]]:
-    """Targets with their tables, and findings.
+) -> tuple[dict[str, tuple[tuple[str, ...], list[ThrustTable]]], list[Finding]]:
+    """Propeller group, thruster or `all` -> its thrusters and its tables; and findings.
 
-    A group that the caller names comes first. Otherwise a table speaks about the thruster that its columns name; or
-    about the thruster or group whose name is a word of its file's name (`H_LF.csv`, `run2-CCW.csv`); or about all.
+    A group that the caller names comes first. Otherwise a table speaks about the thruster or group whose name is a
+    word of its file's name (`H_LF.csv`, `run2-CCW.csv`); or about all.
 
     Raises:
         CalibrationError: Unknown names.
     """
-    groups = {thruster.group for thruster in vehicle.thrusters.values()} - {""}
+    groups: dict[str, tuple[str, ...]] = {}
+    for name, thruster in vehicle.thrusters.items():
+        if thruster.group:
+            groups[thruster.group] = (*groups.get(thruster.group, ()), name)
     if group is not None:
         if group not in groups:
             raise CalibrationError(
                 f"{vehicle.name} has no propeller group '{group}': it has {', '.join(sorted(groups)) or 'none'}"
             )
-        return [Target(group, _members(vehicle, group), tuple(tables))], []
+        return {group: (groups[group], list(tables))}, []
     by_name: dict[str, list[ThrustTable]] = {}
     for table in tables:
-        by_name.setdefault(_spoken_of(table, vehicle, groups), []).append(table)
-    if "" in by_name and len(by_name) > 1:
+        mentioned = (
+            [
+                name
+                for name in names
+                if re.search(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])", table.name)
+            ]
+            for names in (vehicle.thrusters, groups)
+        )
+        by_name.setdefault(max(next(filter(None, mentioned), [""]), key=len), []).append(table)
+    if "" not in by_name:
+        return {name: (groups.get(name, (name,)), of_name) for name, of_name in by_name.items()}, []
+    if len(by_name) > 1:
         names = ", ".join(table.name for table in by_name[""])
         raise CalibrationError(
             f"{names}: no thruster or group of {vehicle.name} is named, but other tables name theirs: put the name "
             "into the file's name, or fit these by themselves"
         )
-    if "" in by_name:
-        unnamed = []
-        if len(groups) > 1:
-            unnamed.append(finding("groups_unnamed", vehicle=vehicle.name, groups=tuple(sorted(groups))))
-        name = groups.pop() if len(groups) == 1 else "all"
-        return [Target(name, vehicle.thruster_names, tuple(tables))], unnamed
-    return [
-        Target(name, _members(vehicle, name) if name in groups else (name,), tuple(of_name))
-        for name, of_name in by_name.items()
-    ], []
+    findings = []
+    if len(groups) > 1:
+        findings.append(finding("groups_unnamed", vehicle=vehicle.name, groups=tuple(sorted(groups))))
+    name = next(iter(groups)) if len(groups) == 1 else "all"
+    return {name: (vehicle.thruster_names, list(tables))}, findings
 
 
-def _members(vehicle: Vehicle, group: str) -> tuple[str, ...]:
-    return tuple(name for name, thruster in vehicle.thrusters.items() if thruster.group == group)
+# How well the curve and the speed controller describe the tables, also those they were not fitted to.
 
 
-def _spoken_of(table: ThrustTable, vehicle: Vehicle, groups: set[str]) -> str:
-    """Name of the thruster or group that a table names, or ""."""
-    if table.thruster is not None and table.thruster in vehicle.thrusters:
-        return table.thruster
-    if table.thruster is not None and len(vehicle.thrusters) > 1:
-        raise CalibrationError(
-            f"{table.name}: {vehicle.name} has no thruster '{table.thruster}': its thrusters are "
-            f"{', '.join(vehicle.thrusters)}: rename the columns"
-        )
-    for candidates in (list(vehicle.thrusters), sorted(groups)):
-        mentioned = [
-            name
-            for name in candidates
-            if re.search(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])", table.name)
-        ]
-        if mentioned:
-            return max(mentioned, key=len)
-    return ""
-
-
-# How well a thruster's curve and speed controller describe the tables, also those they were not fitted to.
-
-
-def predicted_thrust(result: Bench, before: Thruster, speed: Array) -> Array:
-    """T = c± ω|ω| with the fitted c±, those of the vehicle file where there is none [N], (n,).
-
-    Args:
-        result: The fit.
-        before: The thruster of the vehicle file.
-        speed: Of the shaft, positive for positive thrust [rad/s], (n,).
-    """
-    c = {
-        name: result.sides[name].c if name in result.sides else getattr(before, f"c_{name}")
-        for name, _ in SIDES
-    }
-    return np.where(speed >= 0.0, c["plus"], c["minus"]) * speed * np.abs(speed)
-
-
-def quality_of(name: str, result: Bench, before: Thruster) -> dict[str, dict[str, float]]:
-    """Figures of the fitted tables, and `NAME at V V` for every voltage when there are several.
+def quality_of(name: str, result: Bench) -> dict[str, dict[str, float]]:
+    """Figures of the fitted rows, and `NAME at V V` for every voltage when there are several.
 
     `rmse` are in N or rad/s, `nrmse` are rmse over the largest magnitude in the rows compared.
     """
-    rows = _stack(result.fitted)
-    figures: dict[str, float] = {}
+    rows, figures = result.rows, dict[str, float]()
     if result.speeds_measured:
-        error = predicted_thrust(result, before, rows.speed) - rows.force
-        turning = rows.speed != 0.0
+        error, turning = result.thrust(rows.speed) - rows.force, rows.speed != 0.0
         figures |= {"r2": _r2(rows.force[turning], error[turning]), "rmse": _rms(error[turning])}
         figures["samples"] = float(np.count_nonzero(turning))
         figures["rejected"] = float(sum(side.rejected for side in result.sides.values()))
@@ -657,77 +951,59 @@ def quality_of(name: str, result: Bench, before: Thruster) -> dict[str, dict[str
     if result.esc is not None:
         figures["esc_rmse"] = result.esc.rmse
         figures["esc_nrmse"] = result.esc.rmse / result.esc.fastest
-    figures_by_name = {name: figures}
-    volts = sorted({round(v, 1) for v, _ in result.levels if not math.isnan(v)})
-    for volt in volts if len(volts) > 1 else []:
-        level = _stack([table for v, table in result.levels if round(v, 1) == volt])
-        figures_by_name[f"{name} at {volt:g} V"] = _at_voltage(result, before, level)
-    return figures_by_name
+    several = [volts for volts in result.levels if math.isfinite(volts)]
+    at = {f"{name} at {v:g} V": _at_voltage(result, result.levels[v]) for v in several[1:] and several}
+    return {name: figures, **at}
 
 
-def _at_voltage(result: Bench, before: Thruster, table: ThrustTable) -> dict[str, float]:
+def _at_voltage(result: Bench, table: ThrustTable) -> dict[str, float]:
     """Errors of the thrust told from the speed, and of speed and thrust told from pulse and voltage."""
     figures: dict[str, float] = {}
-    largest = float(np.max(np.abs(table.force)))
+
+    def add(key: str, error: Array, measured: Array) -> None:
+        figures[f"rmse_{key}"] = _rms(error)
+        figures[f"nrmse_{key}"] = _rms(error) / float(np.max(np.abs(measured)))
+
     if result.speeds_measured:
-        error = predicted_thrust(result, before, table.speed) - table.force
         turning = np.abs(table.speed) > STANDING * np.max(np.abs(table.speed))
-        figures |= {
-            "r2_thrust_from_speed": _r2(table.force[turning], error[turning]),
-            "rmse_thrust_from_speed": _rms(error[turning]),
-            "nrmse_thrust_from_speed": _rms(error[turning]) / largest,
-        }
+        error = (result.thrust(table.speed) - table.force)[turning]
+        figures["r2_thrust_from_speed"] = _r2(table.force[turning], error)
+        add("thrust_from_speed", error, table.force)
     if result.esc is not None:
         speed = result.esc.esc.shaft_speed(table.pulse, table.voltage)
-        error = predicted_thrust(result, before, speed) - table.force
-        figures |= {"rmse_thrust_from_pulse": _rms(error), "nrmse_thrust_from_pulse": _rms(error) / largest}
+        add("thrust_from_pulse", result.thrust(speed) - table.force, table.force)
         if result.speeds_measured:
-            error = speed - table.speed
-            fastest = float(np.max(np.abs(table.speed)))
-            figures |= {"rmse_speed_from_pulse": _rms(error), "nrmse_speed_from_pulse": _rms(error) / fastest}
+            add("speed_from_pulse", speed - table.speed, table.speed)
     return figures
 
 
-def curves_of(name: str, result: Bench, before: Thruster) -> list[Curve]:
+def curves_of(name: str, result: Bench) -> list[Curve]:
     """For the report: thrust against speed; speed and thrust against pulse at every voltage."""
-    rows = _stack(result.fitted)
-    order = np.argsort(rows.speed)
-    rpm = rows.speed[order] * TO_RPM
-    fitted = predicted_thrust(result, before, rows.speed[order])
     curves = list[Curve]()
 
     def add(title: str, x_label: str, y_label: str, x: Array, measured: Array, fitted: Array) -> None:
+        order = np.argsort(x)
         labels = {"title": f"{name}: {title}", "x_label": x_label, "y_label": y_label, "kind": "scatter"}
-        curves.append(Curve(x=x, measured=measured, fitted=fitted, **labels))
+        curves.append(Curve(x=x[order], measured=measured[order], fitted=fitted[order], **labels))
 
     if result.speeds_measured:
-        add("thrust", "shaft speed [rpm]", "thrust [N]", rpm, rows.force[order], fitted)
-    if result.esc is None:
-        return curves
-    for volt in sorted({round(v, 1) for v, _ in result.levels if not math.isnan(v)}) or [math.nan]:
-        level = _stack([table for v, table in result.levels if math.isnan(volt) or round(v, 1) == volt])
-        order = np.argsort(level.pulse)
-        pulse, label = level.pulse[order], "" if math.isnan(volt) else f" at {volt:g} V"
-        speed = result.esc.esc.shaft_speed(pulse, level.voltage[order] if label else None)
-        thrust = predicted_thrust(result, before, speed)
+        rows = result.rows
+        axes = ("shaft speed [rpm]", "thrust [N]")
+        add("thrust", *axes, rows.speed * TO_RPM, rows.force, result.thrust(rows.speed))
+    for volts, level in result.levels.items() if result.esc is not None else ():
+        label = "" if math.isnan(volts) else f" at {volts:g} V"
+        assert result.esc is not None
+        speed = result.esc.esc.shaft_speed(level.pulse, level.voltage if label else None)
         if result.speeds_measured:
-            measured, axes = level.speed[order] * TO_RPM, ("pulse [µs]", "shaft speed [rpm]")
-            add(f"speed from pulse{label}", *axes, pulse, measured, speed * TO_RPM)
-        add(f"thrust from pulse{label}", "pulse [µs]", "thrust [N]", pulse, level.force[order], thrust)
+            measured, axes = level.speed * TO_RPM, ("pulse [µs]", "shaft speed [rpm]")
+            add(f"speed from pulse{label}", *axes, level.pulse, measured, speed * TO_RPM)
+        axes = ("pulse [µs]", "thrust [N]")
+        add(f"thrust from pulse{label}", *axes, level.pulse, level.force, result.thrust(speed))
     return curves
 
 
-def _stack(tables: list[ThrustTable] | tuple[ThrustTable, ...]) -> ThrustTable:
-    """All rows of several tables as one."""
-    columns: dict[str, Any] = {
-        key: np.concatenate([getattr(table, key) for table in tables]) for key in QUANTITIES
-    }
-    return ThrustTable(name=tables[0].name, **columns)
-
-
 def _rms(error: Array) -> float:
-    good = error[np.isfinite(error)]
-    return float(np.sqrt(np.mean(good**2))) if good.size else math.nan
+    return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else math.nan
 
 
 def _r2(measured: Array, error: Array) -> float:
@@ -737,53 +1013,54 @@ def _r2(measured: Array, error: Array) -> float:
 
 # The numbers that a bench gives a vehicle file, with their intervals and what they rest on.
 
-TO_RPM = 30.0 / math.pi
-CHOSEN_LIMIT = 0.02
-"""A force limit this far below the curve at the speed limit was chosen, not measured: it stays."""
 
-
-def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estimate]:
+def estimates_of(name: str, path: str, result: Bench) -> list[Estimate]:
     """Everything found about a target, named `TARGET.c_plus` and so on.
 
     A speed limit moves where the table reached the end of the pulse, or went beyond the limit of the vehicle file. The
     force limit is the curve at the speed limit, unless the vehicle file chose a lower one.
+
+    Args:
+        name: Of the target.
+        path: Where its numbers stand in the vehicle file; those of a group in `thruster_groups`.
+        result: What its tables say.
     """
-    before, rows = vehicle.thrusters[target.thrusters[0]], list[Estimate]()
+    before, rows = result.before, list[Estimate]()
     volts = f"{result.voltage:g} V" if math.isfinite(result.voltage) else ""
 
     def add(key: str, value: float, ends: tuple[float, float], unit: str, sure: bool, note: str = "") -> None:
         rows.append(
             Estimate(
-                name=f"{target.name}.{key}", estimate=float(value), ci95=ends, unit=unit, identifiable=sure, note=note,
-                path=None if key == "reverse_ratio" else _path(target, key),
+                name=f"{name}.{key}", estimate=float(value), ci95=ends, unit=unit, identifiable=sure, note=note,
+                path=None if key == "reverse_ratio" else f"{path}.{key}",
             )
         )  # fmt: skip
 
-    for name, sign in SIDES:
-        side, zone = result.sides.get(name), result.dead.get(name)
+    for direction, sign in SIDES:
+        side, zone = result.sides.get(direction), result.dead.get(direction)
         if side is None:
             continue
         sure = math.isfinite(side.half_width) and side.c > side.half_width
         note = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N{volts and ', '}{volts}"
         note += "" if sure else ": too few or too scattered"
-        add(f"c_{name}", side.c, _around(side.c, side.half_width), "N s²/rad²", sure, note)
+        add(f"c_{direction}", side.c, _around(side.c, side.half_width), "N s²/rad²", sure, note)
         if zone is not None:
             low, high = sorted(sign * TO_RPM * end for end in zone.interval)
             note = zone.note or f"slowest speed that turns; {side.c * zone.speed**2:.2g} N there"
-            add(f"dead_rpm_{name}", sign * TO_RPM * zone.speed + 0.0, (low, high), "rpm", zone.measured, note)
+            speed = sign * TO_RPM * zone.speed + 0.0
+            add(f"dead_rpm_{direction}", speed, (low, high), "rpm", zone.measured, note)
     if len(result.sides) == 2:
         plus, minus = result.sides["plus"], result.sides["minus"]
         ratio = minus.c / plus.c
         half = ratio * math.hypot(plus.half_width / plus.c, minus.half_width / minus.c)
         add("reverse_ratio", ratio, _around(ratio, half), "-", math.isfinite(half))
-    for name, sign in SIDES:
-        end, side = "max" if sign > 0.0 else "min", result.sides.get(name)
-        c, old_c = side.c if side else getattr(before, f"c_{name}"), getattr(before, f"c_{name}")
-        old_speed, old_force = (
-            sign * getattr(before, f"rpm_{end}") / TO_RPM,
-            sign * getattr(before, f"force_{end}"),
-        )
-        speed, at_end, scatter = result.fastest[name]
+    for direction, sign in SIDES:
+        end, side = "max" if sign > 0.0 else "min", result.sides.get(direction)
+        old_c = getattr(before, f"c_{direction}")
+        c = side.c if side else old_c
+        old_speed = sign * getattr(before, f"rpm_{end}") / TO_RPM
+        old_force = sign * getattr(before, f"force_{end}")
+        speed, at_end, scatter = result.fastest[direction]
         if speed <= 0.0:
             continue
         moves = at_end or speed > old_speed
@@ -793,45 +1070,41 @@ def estimates_of(target: Target, result: Bench, vehicle: Vehicle) -> list[Estima
         add(f"rpm_{end}", rpm, _around(rpm, scatter * TO_RPM), "rpm", moves, note)
         force = c * (speed if moves else old_speed) ** 2
         half = force * side.half_width / side.c if side else 0.0
+        sure, note = math.isfinite(half), f"c_{direction} at the speed limit"
         if old_force < (1.0 - CHOSEN_LIMIT) * old_c * old_speed**2 and old_force < force:
             force, half, sure, note = old_force, 0.0, False, "the vehicle file's own, below the curve"
-        else:
-            sure, note = math.isfinite(half), f"c_{name} at the speed limit"
         add(f"force_{end}", sign * force, _around(sign * force, half), "N", sure, note)
-    units = {"dead": "µs", "zero": "µs", "emf": "V s/rad", "load": "V s²/rad²"}
-    caution = "zero, emf and load of a direction vary together: the speed they give is surer than each"
-    for key, ends in result.esc.intervals.items() if result.esc is not None else ():
-        note = result.esc.unsure.get(key, "" if key.startswith("dead") else caution)
-        value, sure = float(getattr(result.esc.esc, key)), key not in result.esc.unsure
-        add(f"esc.{key}", value, ends, units[key.partition("_")[0]], sure, note)
+    if result.esc is not None:
+        units = {"dead": "µs", "zero": "µs", "emf": "V s/rad", "load": "V s²/rad²"}
+        caution = "zero, emf and load of a direction vary together: the speed they give is surer than each"
+        for key, ends in result.esc.intervals.items():
+            note = result.esc.unsure.get(key, "" if key.startswith("dead") else caution)
+            value, sure = float(getattr(result.esc.esc, key)), key not in result.esc.unsure
+            add(f"esc.{key}", value, ends, units[key.partition("_")[0]], sure, note)
     return rows
 
 
-def _path(target: Target, key: str) -> str:
-    """Where the number stands in the vehicle file; that of a group in `thruster_groups`."""
-    if target.name in target.thrusters:
-        return f"thrusters.{target.name}.{key}"
-    return f"thrusters.*.{key}" if target.name == "all" else f"thruster_groups.{target.name}.{key}"
+WRITTEN = ("c_", "dead_rpm_", "rpm_", "force_")
+"""Beginnings of the keys of a thruster that an estimate goes to."""
 
 
 def fit_thruster(
-    tables: Iterable[ThrustTable | Trial | str | os.PathLike[str]],
+    tables: Sequence[ThrustTable | str | os.PathLike[str]],
     vehicle: Vehicle,
     *,
     group: str | None = None,
     voltage: float | None = None,
-    pool_voltages: bool = False,
     seed: int = 0,
 ) -> Fit:
     """Fit T = c± ω|ω| (paper, eq. 16) and, where there are pulses, the speed controller's law.
 
     Args:
-        tables: CSV files (see `read_table`), folders of bench trials, or what was read from them.
+        tables: CSV files (see `read_table`), or what was read from them.
         vehicle: Whose thrusters they are.
         group: Propeller group of all tables.
         voltage: At which the numbers shall hold [V], and for tables without a voltage column the voltage they were
             taken at; where not given, the tables' only one, else that of the vehicle file's ESC, else the middle one.
-        pool_voltages: Fit all voltages together; otherwise the others only check the prediction.
+            Tables of other voltages check the prediction.
         seed: For the record; the intervals need no random numbers.
 
     Returns:
@@ -840,28 +1113,37 @@ def fit_thruster(
     Raises:
         CalibrationError: A table that cannot be read, names that the vehicle does not have, too few rows.
     """
-    read = _distinct_names([(item, table) for item in tables for table in _read(item, vehicle)])
+    neutral = next((t.esc.pulse_neutral for t in vehicle.thrusters.values() if t.esc), PULSE_RANGE[1])
+    read = _distinct_names(
+        [(x, x if isinstance(x, ThrustTable) else read_table(x, neutral=neutral)) for x in tables]
+    )
     if not read:
         raise CalibrationError("no table given: name at least one CSV file of speeds and thrusts")
-    _refuse_duplicates(read)
+    first_names: dict[str, str] = {}
+    for table in read:
+        if first := first_names.get(table.sha256):
+            raise CalibrationError(
+                f"{first} and {table.name}: the same numbers are given twice: give every table once"
+            )
+        first_names[table.sha256] = table.name
     targets, findings = find_targets(read, vehicle, group)
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
     quality: dict[str, dict[str, float]] = {}
     curves: list[Curve] = []
-    for target in targets:
-        first = vehicle.thrusters[target.thrusters[0]]
-        result = bench(target.tables, first, target.name, voltage=voltage, pool_voltages=pool_voltages)
-        estimates_of_target = estimates_of(target, result, vehicle)
-        estimates |= {estimate.name: estimate for estimate in estimates_of_target}
-        for estimate in estimates_of_target:
+    for target, (thrusters, of_target) in targets.items():
+        result = bench(of_target, vehicle.thrusters[thrusters[0]], target, voltage)
+        kind = "thrusters" if target in thrusters else "thruster_groups"
+        path = "thrusters.*" if target == "all" else f"{kind}.{target}"
+        for estimate in estimates_of(target, path, result):
+            estimates[estimate.name] = estimate
             key = estimate.name.rpartition(".")[2]
             if estimate.identifiable and key.startswith(WRITTEN):
-                changes |= {f"thrusters.{name}.{key}": estimate.estimate for name in target.thrusters}
+                changes |= {f"thrusters.{name}.{key}": estimate.estimate for name in thrusters}
         if result.esc is not None:
-            changes |= {f"thrusters.{name}.esc": result.esc.esc.values() for name in target.thrusters}
-        quality |= quality_of(target.name, result, first)
-        curves += curves_of(target.name, result, first)
+            changes |= {f"thrusters.{name}.esc": result.esc.esc.values() for name in thrusters}
+        quality |= quality_of(target, result)
+        curves += curves_of(target, result)
         findings += result.findings
     return Fit(
         kind="thruster",
@@ -873,44 +1155,8 @@ def fit_thruster(
         curves=tuple(curves),
         findings=tuple(dict.fromkeys(findings)),
         trials={table.name: table.sha256 for table in read},
-        settings={
-            "voltage": voltage,
-            "pool_voltages": pool_voltages,
-            "group": group,
-            "seed": seed,
-        },
+        settings={"voltage": voltage, "group": group, "seed": seed},
     )
-
-
-WRITTEN = ("c_", "dead_rpm_", "rpm_", "force_")
-"""Beginnings of the keys of a thruster that an estimate goes to."""
-
-
-def _read(item: ThrustTable | Trial | str | os.PathLike[str], vehicle: Vehicle) -> list[ThrustTable]:
-    if isinstance(item, ThrustTable):
-        return [item]
-    neutrals = [thruster.esc.pulse_neutral for thruster in vehicle.thrusters.values() if thruster.esc]
-    neutral = neutrals[0] if neutrals else 1500.0
-    if (
-        isinstance(item, Trial)
-        or Path(item).is_dir()
-        or Path(item).suffix == ".parquet"
-        or _is_trial(Path(item))
-    ):
-        trial = item if isinstance(item, Trial) else load_trial(item)
-        turned = [name for name, thruster in vehicle.thrusters.items() if thruster.motor_sign == -1]
-        return tables_of_trial(trial, neutral=neutral, reversed_wiring=turned)
-    return [read_table(item, neutral=neutral)]
-
-
-def _is_trial(path: Path) -> bool:
-    """Whether a CSV file's header names a thruster's force and what drove it, as trials do."""
-    if not path.is_file():
-        return False
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        header = {word.strip() for word in next(lines, "").split(",")}
-    names = {word.removeprefix("force_") for word in header if word.startswith("force_")}
-    return any({f"rpm_{name}", f"pwm_{name}"} & header for name in names)
 
 
 def _distinct_names(read: Sequence[tuple[Any, ThrustTable]]) -> list[ThrustTable]:
@@ -918,19 +1164,10 @@ def _distinct_names(read: Sequence[tuple[Any, ThrustTable]]) -> list[ThrustTable
     names = [table.name for _, table in read]
     return [
         replace(table, name=f"{Path(item).parent.name}/{table.name}")
-        if isinstance(item, str | os.PathLike) and table.thruster is None and names.count(table.name) > 1
+        if isinstance(item, str | os.PathLike) and names.count(table.name) > 1
         else table
         for item, table in read
     ]
-
-
-def _refuse_duplicates(tables: Sequence[ThrustTable]) -> None:
-    first_names: dict[tuple[str, str | None], str] = {}
-    for table in tables:
-        first = first_names.setdefault((table.sha256, table.thruster), table.name)
-        if sum((t.sha256, t.thruster) == (table.sha256, table.thruster) for t in tables) > 1:
-            names = table.name if first == table.name else f"{first} and {table.name}"
-            raise CalibrationError(f"{names}: the same numbers are given twice: give every table once")
 
 
 def calibrate_thruster(
@@ -940,7 +1177,6 @@ def calibrate_thruster(
     out: Path,
     group: str | None = None,
     voltage: float | None = None,
-    pool_voltages: bool = False,
     report: Path | None = None,
     seed: int = 0,
     as_json: bool = False,
@@ -950,20 +1186,16 @@ def calibrate_thruster(
     Example: finssim calibrate thruster T200-16V.csv --vehicle bluerov2 --out mine.yaml
 
     Args:
-        tables (TABLE): Tables of force against rpm or pulse width (.csv), or trials.
+        tables (TABLE): Tables of force against rpm or pulse width (.csv).
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
         group (NAME): Propeller group of all tables.
-        voltage: Battery voltage of the fit [V], if the tables have several.
-        pool_voltages: Fit all voltages jointly instead of validating one fit on the others.
+        voltage: Battery voltage of the fit [V], if the tables have several; the others validate it.
         report (DIR): Directory for report.html, report.md, figures and fit.json.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
     """
     options = dict(locals())
     refuse_places(out, report, "vehicle")
-    body = load_vehicle(vehicle)
-    fit = fit_thruster(
-        list(tables), body, group=group, voltage=voltage, pool_voltages=pool_voltages, seed=seed
-    )
+    fit = fit_thruster(list(tables), load_vehicle(vehicle), group=group, voltage=voltage, seed=seed)
     return finish("thruster", fit, options)

@@ -1,6 +1,7 @@
 """Domain randomisation: parameters drawn for every episode, inside the batch."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,19 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.engine.distributions import bounds_of
-from finssim.engine.draw_places import (
-    COLUMN,
-    Nominal,
-    drawn_delay,
-    write_body,
-    write_sensors,
-    write_terms,
-    write_tether,
-    write_thrusters,
-    write_water,
-)
-from finssim.engine.draw_table import DrawTable, draw_entry, draw_table, widened
+from finssim.engine.distributions import KINDS, Distribution, bounds_of
 from finssim.engine.launch import Pipeline
 from finssim.engine.measured import SENSORS, Measurement
 from finssim.engine.packed import Packed
@@ -32,8 +21,344 @@ from finssim.engine.surroundings import TetherLine
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.terms.composed import layout
 from finssim.physics.tether import Tether
-from finssim.physics.types import mat66
+from finssim.physics.types import MAX_THRUSTERS, mat66, vec6, vec8
 from finssim.physics.water import WaterArrays
+
+# The table of distributions that the kernel draws from, and one draw.
+
+
+UNIFORM, LOG_UNIFORM, NORMAL, CHOICE = range(len(KINDS))
+
+
+@wp.struct
+class DrawTable:
+    """Distribution of every entry of the table; rows of entries that never vary are not read."""
+
+    count: int
+    drawn: wp.array(dtype=int)  # the entries that vary
+    kind: wp.array(dtype=int)
+    ends: wp.array(dtype=wp.vec4)  # low, high, mean, standard deviation
+    probability: wp.array(dtype=float)  # of being drawn at all
+    nominal: wp.array(dtype=float)
+    stream: wp.array(dtype=int)
+    first_choice: wp.array(dtype=int)
+    choices: wp.array(dtype=int)
+    choice: wp.array(dtype=float)
+    cumulative: wp.array(dtype=float)
+    first_tie: wp.array(dtype=int)
+    ties: wp.array(dtype=int)  # how many normal numbers its own is a sum of; 0: it stands alone
+    tied: wp.array(dtype=int)  # entries of these
+    tie_weight: wp.array(dtype=float)
+
+
+@wp.func
+def normal_part(x: float) -> float:
+    """Share of a standard normal distribution below x."""
+    return 0.5 + 0.5 * wp.erf(0.70710678 * x)
+
+
+@wp.func
+def quantile(t: DrawTable, k: int, u: float) -> float:
+    """The number of entry k below which a share u in [0, 1) of its distribution lies."""
+    e = t.ends[k]
+    kind = t.kind[k]
+    x = e[0] + u * (e[1] - e[0])
+    if kind == LOG_UNIFORM:
+        x = e[0] * wp.exp(u * wp.log(e[1] / e[0]))
+    if kind == NORMAL:
+        x = e[2]
+        if e[3] > 0.0:
+            a = normal_part((e[0] - e[2]) / e[3])
+            b = normal_part((e[1] - e[2]) / e[3])
+            p = wp.clamp(a + u * (b - a), 3.0e-7, 1.0 - 3.0e-7)
+            x = wp.clamp(e[2] + e[3] * 1.41421356 * wp.erfinv(2.0 * p - 1.0), e[0], e[1])
+    if kind == CHOICE:
+        i = t.first_choice[k]
+        last = i + t.choices[k] - 1
+        while i < last and u >= t.cumulative[i]:
+            i += 1
+        x = t.choice[i]
+    return x
+
+
+@wp.func
+def draw_entry(t: DrawTable, k: int, key: int) -> float:
+    """Entry k from the stream of its own that a key gives it: other entries do not change it."""
+    rng = wp.rand_init(key, 2 * t.stream[k])
+    u = wp.randf(rng)
+    gate = wp.randf(rng)
+    if t.ties[k] > 0:
+        z = float(0.0)
+        for i in range(t.first_tie[k], t.first_tie[k] + t.ties[k]):
+            other = wp.rand_init(key, 2 * t.stream[t.tied[i]] + 1)
+            z += t.tie_weight[i] * wp.randn(other)
+        u = normal_part(z)
+    x = quantile(t, k, u)
+    if gate >= t.probability[k]:
+        x = t.nominal[k]
+    return x
+
+
+def widened(distribution: Distribution, nominal: float, part: float) -> tuple[list[float], float]:
+    """Ends [low, high, mean, standard deviation] and probability of a distribution at a part of its width.
+
+    Widths grow from the number of the range that lies nearest to the nominal one. What is drawn from with a
+    probability, and a choice, keep their numbers, and the probability grows.
+
+    Args:
+        distribution: At its full width.
+        nominal: Where nothing is drawn.
+        part: Of the way to both ends, of the standard deviation and of probabilities, in [0, 1].
+    """
+    low, high = distribution.bounds()
+    mean, std = distribution.normal or (0.0, 0.0)
+    if distribution.choice is not None or distribution.probability < 1.0:
+        return [low, high, mean, std], distribution.probability * part
+    anchor = min(max(nominal, low), high)
+    if distribution.log_uniform is not None:
+        down, up = (math.log(end / anchor) for end in (low, high))
+        return [anchor * math.exp(part * down), anchor * math.exp(part * up), 0.0, 0.0], 1.0
+    ends = [anchor + part * (low - anchor), anchor + part * (high - anchor)]
+    if distribution.normal is None:
+        return [*ends, 0.0, 0.0], 1.0
+    return [*ends, anchor + part * (mean - anchor), part * std], 1.0
+
+
+def ties_of(ranges: Ranges) -> dict[int, list[tuple[int, float]]]:
+    """Entry -> the entries whose normal numbers its own is a sum of, with their weights: rows of a square root of R."""
+    rows = {}
+    for group in ranges.correlated:
+        values, vectors = np.linalg.eigh(np.array(group.correlation))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        members = [INDEX[name] for name in group.entries]
+        for k, row in zip(members, root, strict=True):
+            rows[k] = list(zip(members, (row / np.linalg.norm(row)).tolist(), strict=True))
+    return rows
+
+
+def draw_table(
+    drawn: Mapping[str, Distribution], nominal: NDArray[np.float64], ranges: Ranges, device: wp.Device
+) -> DrawTable:
+    """The table at full width.
+
+    Args:
+        drawn: Entry -> distribution, of those that vary.
+        nominal: Of every entry, (len(ENTRIES),).
+        ranges: For the correlations.
+        device: Where.
+    """
+    n = len(ENTRIES)
+    kind, first, choices = np.zeros((3, n), np.int32)
+    ends, probability = np.zeros((n, 4)), np.ones(n)
+    choice, cumulative = list[float](), list[float]()
+    for name, distribution in drawn.items():
+        k = INDEX[name]
+        kind[k] = KINDS.index(distribution.kind)
+        ends[k], probability[k] = widened(distribution, float(nominal[k]), 1.0)
+        first[k], choices[k] = len(choice), len(distribution.choice or ())
+        choice += distribution.choice or ()
+        cumulative += distribution.cumulative()
+    first_tie, ties, tied, weights = _flat(ties_of(ranges), n)
+    t = DrawTable()
+    t.count = len(drawn)
+    integer = {"drawn": [INDEX[name] for name in drawn], "kind": kind, "first_choice": first, "choices": choices,
+             "stream": [e.stream for e in ENTRIES],
+             "first_tie": first_tie, "ties": ties, "tied": tied}  # fmt: skip
+    real = {"probability": probability, "nominal": nominal, "choice": choice, "cumulative": cumulative,
+            "tie_weight": weights}  # fmt: skip
+    for fields, dtype, plain in ((integer, wp.int32, np.int32), (real, wp.float32, np.float32)):
+        for name, values in fields.items():
+            # No kernel reads beyond the counts: one element keeps empty columns valid.
+            column = np.asarray(values if len(values) else [0], dtype=plain)
+            setattr(t, name, wp.array(column, dtype=dtype, device=device))
+    t.ends = wp.array(ends.astype(np.float32), dtype=wp.vec4, device=device)
+    return t
+
+
+def _flat(rows: Mapping[int, list[tuple[int, float]]], n: int) -> tuple[Any, Any, list[int], list[float]]:
+    first, count = np.zeros((2, n), np.int32)
+    tied, weights = list[int](), list[float]()
+    for k, row in rows.items():
+        first[k], count[k] = len(tied), len(row)
+        tied += [other for other, _ in row]
+        weights += [weight for _, weight in row]
+    return first, count, tied, weights
+
+
+# Where drawn numbers go: body, thrusters, water, tether and sensors.
+
+
+COLUMN = INDEX
+"""Entry -> column of the drawn values."""
+
+
+@wp.struct
+class Nominal:
+    """The vehicles as their files have them, by vehicle; and the given water."""
+
+    plant: wp.array2d(dtype=VehicleParameters)  # one world
+    M_A: wp.array(dtype=mat66)  # added mass about the point where its coefficients hold
+    H: wp.array(dtype=mat66)  # twist at that point from the twist at the body origin
+    current: wp.vec3  # of the given water; what is drawn adds to it [m/s]
+    waves: int  # waves of the given water stay in the first slots
+    extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms, one world
+    factor: wp.array(dtype=int)  # entry that multiplies each of them, -1 for none
+    added: wp.array(dtype=int)  # entry that is added to it
+
+
+@wp.func
+def scaled_matrix(M: mat66, factor: vec6) -> mat66:
+    """S M S with S = diag(sqrt(factor)): scales the diagonal by the factors and keeps symmetry and definiteness."""
+    out = mat66()
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = M[i, j] * wp.sqrt(factor[i] * factor[j])
+    return out
+
+
+@wp.func
+def factors(x: wp.array3d(dtype=float), w: int, v: int, column: int) -> vec6:
+    """The common factor, which stands in `column`, times those of the axes, which follow."""
+    out = vec6()
+    for i in range(6):
+        out[i] = x[w, v, column] * x[w, v, column + 1 + i]
+    return out
+
+
+@wp.func
+def offset(x: wp.array3d(dtype=float), w: int, v: int, column: int) -> wp.vec3:
+    """Three numbers that follow each other."""
+    return wp.vec3(x[w, v, column], x[w, v, column + 1], x[w, v, column + 2])
+
+
+@wp.func
+def drawn_delay(x: wp.array3d(dtype=float), w: int, v: int, nominal: float) -> float:
+    """Command delay of the episode, without jitter [s]."""
+    return nominal * x[w, v, wp.static(COLUMN["delay"])] + x[w, v, wp.static(COLUMN["added_delay"])]
+
+
+@wp.func
+def write_body(
+    plant: wp.array2d(dtype=VehicleParameters), n: Nominal, x: wp.array3d(dtype=float), w: int, v: int
+):
+    """Mass, centres, inertia, added mass and damping."""
+    mass = x[w, v, wp.static(COLUMN["mass"])] * n.plant[0, v].mass
+    r_n = n.plant[0, v].r_g
+    r_g = r_n + offset(x, w, v, wp.static(COLUMN["center_of_gravity.x"]))
+    # The factor is on the inertia about the centre of gravity; Steiner's part follows mass and centre.
+    I_n = n.plant[0, v].inertia - n.plant[0, v].mass * (
+        wp.dot(r_n, r_n) * wp.identity(3, dtype=float) - wp.outer(r_n, r_n)
+    )
+    steiner = wp.dot(r_g, r_g) * wp.identity(3, dtype=float) - wp.outer(r_g, r_g)
+    plant[w, v].mass = mass
+    plant[w, v].volume = (
+        x[w, v, wp.static(COLUMN["volume"])] * x[w, v, wp.static(COLUMN["buoyancy"])] * n.plant[0, v].volume
+    )
+    plant[w, v].r_g = r_g
+    plant[w, v].r_b = n.plant[0, v].r_b + offset(x, w, v, wp.static(COLUMN["center_of_buoyancy.x"]))
+    plant[w, v].inertia = x[w, v, wp.static(COLUMN["inertia"])] * I_n + mass * steiner
+    H = n.H[v]
+    M_A = scaled_matrix(n.M_A[v], factors(x, w, v, wp.static(COLUMN["added_mass.all"])))
+    plant[w, v].M_A = wp.transpose(H) * M_A * H
+    plant[w, v].D1 = scaled_matrix(
+        n.plant[0, v].D1, factors(x, w, v, wp.static(COLUMN["linear_damping.all"]))
+    )
+    plant[w, v].D2 = scaled_matrix(
+        n.plant[0, v].D2, factors(x, w, v, wp.static(COLUMN["quadratic_damping.all"]))
+    )
+    drag = x[w, v, wp.static(COLUMN["mesh_drag"])]
+    plant[w, v].form_drag = drag * n.plant[0, v].form_drag
+    plant[w, v].skin_drag = drag * n.plant[0, v].skin_drag
+
+
+@wp.func
+def write_terms(extra: wp.array3d(dtype=float), n: Nominal, x: wp.array3d(dtype=float), w: int, v: int):
+    """The parameters of the vehicle's terms."""
+    for i in range(n.factor.shape[0]):
+        y = n.extra[0, v, i]
+        if n.factor[i] >= 0:
+            y = y * x[w, v, n.factor[i]]
+        if n.added[i] >= 0:
+            y = y + x[w, v, n.added[i]]
+        extra[w, v, i] = y
+
+
+@wp.func
+def write_thrusters(
+    plant: wp.array2d(dtype=VehicleParameters), n: Nominal, x: wp.array3d(dtype=float), w: int, v: int
+):
+    """Gain, lag, delay, slew and dead zone."""
+    gain = vec8()
+    lag = vec8()
+    added = vec8()
+    nominal_lag = n.plant[0, v].time_constant
+    for k in range(MAX_THRUSTERS):
+        gain[k] = (
+            x[w, v, wp.static(COLUMN["thrust.all"])]
+            * x[w, v, wp.static(COLUMN["thrust.each.0"]) + k]
+            * x[w, v, wp.static(COLUMN["thrust.failure.0"]) + k]
+        )
+        each = (
+            x[w, v, wp.static(COLUMN["time_constant.all"])]
+            * x[w, v, wp.static(COLUMN["time_constant.each.0"]) + k]
+        )
+        lag[k] = nominal_lag[k] * each + x[w, v, wp.static(COLUMN["added_time_constant"])]
+        added[k] = x[w, v, wp.static(COLUMN["added_dead_zone"])]
+    plant[w, v].gain = gain
+    plant[w, v].time_constant = lag
+    plant[w, v].delay = drawn_delay(x, w, v, n.plant[0, v].delay)
+    plant[w, v].slew = x[w, v, wp.static(COLUMN["slew"])] * n.plant[0, v].slew
+    wider = x[w, v, wp.static(COLUMN["dead_zone"])]
+    plant[w, v].dead_minus = wider * n.plant[0, v].dead_minus - added
+    plant[w, v].dead_plus = wider * n.plant[0, v].dead_plus + added
+
+
+@wp.func
+def write_water(water: WaterArrays, n: Nominal, x: wp.array3d(dtype=float), w: int, drift: int):
+    """Current, drift and waves of a world."""
+    water.current[w] = n.current + wp.vec3(
+        x[w, 0, wp.static(COLUMN["current.x"])],
+        x[w, 0, wp.static(COLUMN["current.y"])],
+        x[w, 0, wp.static(COLUMN["vertical_current"])],
+    )
+    if drift != 0:
+        deviation = x[w, 0, wp.static(COLUMN["current_drift.deviation"])]
+        water.drift_std[w] = wp.vec3(deviation, deviation, 0.0)
+        water.drift_time[w] = x[w, 0, wp.static(COLUMN["current_drift.time"])]
+        water.drift[w] = wp.vec3()
+        water.drift_rate[w] = wp.vec3()
+    for i in range(n.waves, water.n_waves):
+        column = wp.static(COLUMN["waves.0.amplitude"]) + 4 * (i - n.waves)
+        k = 6.2831853 / wp.max(x[w, 0, column + 1], 0.1)
+        water.wave_amplitude[w, i] = x[w, 0, column]
+        water.wave_number[w, i] = k
+        water.wave_frequency[w, i] = wp.sqrt(water.gravity * k * wp.tanh(k * water.depth))
+        water.wave_heading[w, i] = x[w, 0, column + 2]
+        water.wave_phase[w, i] = x[w, 0, column + 3]
+
+
+@wp.func
+def write_tether(tether: wp.array2d(dtype=Tether), x: wp.array3d(dtype=float), w: int, v: int):
+    """The line to a vehicle."""
+    tether[w, v].diameter = x[w, v, wp.static(COLUMN["tether.diameter"])]
+    tether[w, v].drag_coefficient = x[w, v, wp.static(COLUMN["tether.drag_coefficient"])]
+    tether[w, v].wet_weight = x[w, v, wp.static(COLUMN["tether.wet_weight"])]
+
+
+@wp.func
+def write_sensors(measurement: wp.array2d(dtype=Measurement), x: wp.array3d(dtype=float), w: int, v: int):
+    """What a controller sees of a vehicle."""
+    measurement[w, v].position_std = x[w, v, wp.static(COLUMN["sensors.position_std"])]
+    measurement[w, v].yaw_std = x[w, v, wp.static(COLUMN["sensors.yaw_std"])]
+    measurement[w, v].velocity_std = x[w, v, wp.static(COLUMN["sensors.velocity_std"])]
+    measurement[w, v].rate_std = x[w, v, wp.static(COLUMN["sensors.rate_std"])]
+    measurement[w, v].position_bias = x[w, v, wp.static(COLUMN["sensors.position_bias"])]
+    measurement[w, v].yaw_bias = x[w, v, wp.static(COLUMN["sensors.yaw_bias"])]
+    measurement[w, v].velocity_bias = x[w, v, wp.static(COLUMN["sensors.velocity_bias"])]
+    measurement[w, v].rate_bias = x[w, v, wp.static(COLUMN["sensors.rate_bias"])]
+    measurement[w, v].dropout = x[w, v, wp.static(COLUMN["sensors.dropout"])]
+    measurement[w, v].delay = x[w, v, wp.static(COLUMN["sensors.delay"])]
+
 
 if TYPE_CHECKING:
     from finssim.engine.simulator import Simulator

@@ -9,15 +9,72 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from finssim.experiments import anatomy, faults, seeing, soak, transfer
-from finssim.experiments.tables import Table, markdown_table
+from finssim.experiments import anatomy, faults, soak, transfer
+from finssim.experiments.tables import Table, figure_text, markdown_table
 from finssim.files import atomic_write
+
+# The tables of `results/seeing.json`: of tasks that see, what `train`, `evaluate` and `experiment stack` gave.
+
+SEEING_HEADS = (
+    "task",
+    "controller",
+    "seeds",
+    "success",
+    "after [s]",
+    "off by [cm]",
+    "training [processor-s]",
+)
+
+
+def seeing_tables(result: Mapping[str, Any]) -> list[Table]:
+    """Controllers on the looks that are held out, all seeds together; each seed; and through the stack.
+
+    Args:
+        result: `rows` by task, controller and seed, `pooled` over the seeds, `stack` by task: each with `metrics` as
+            `finssim evaluate` has them.
+    """
+
+    def cells(row: Mapping[str, Any]) -> list[str]:
+        m = row["metrics"]
+        seeds, training = (", ".join(map(str, row.get(key, ()))) for key in ("seeds", "training_s"))
+        figures = [
+            figure_text(m["success"], ".3f"),
+            figure_text(m["success_time"], ".1f"),
+            figure_text(m.get("error"), ".2f", 100.0),
+        ]
+        return [row["task"], row["controller"], seeds or "–", *figures, training or "–"]
+
+    held_out = [[f"`{task}`", f"`{who}`", *rest] for task, who, *rest in map(cells, result["pooled"])]
+    stack = [
+        [
+            f"`{row['task']}`",
+            row["severity"],
+            f"{row['episodes']}",
+            *(figure_text(row[key], ".3f") for key in SEEING_KEYS),
+        ]
+        for row in result["stack"]
+    ]
+    return [
+        Table(title="held_out", heads=SEEING_HEADS, rows=held_out, left=(0, 1)),
+        Table(title="by seed", heads=SEEING_HEADS, rows=[cells(row) for row in result["rows"]], left=(0, 1)),
+        Table(
+            title="through the stack",
+            heads=("task", "water", "episodes", *SEEING_KEYS),
+            rows=stack,
+            left=(0, 1),
+        ),
+    ]
+
+
+SEEING_KEYS = ("stack", "batch")
+"""Where the same policy was played: through the deployed software, and in the batch."""
+
 
 TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Table]]] = {
     **dict.fromkeys(transfer.SPECS, transfer.tables_of),
     "anatomy": anatomy.tables_of,
     "faults": faults.tables_of,
-    "seeing": seeing.tables_of,
+    "seeing": seeing_tables,
     "soak": soak.tables_of,
 }
 """Experiment -> the tables of its result."""

@@ -68,7 +68,7 @@ def write_graph(network: Network, n: int, m: int) -> bytes:
             "past": max(network.history - 1, 0) * n,
             "oldest": n if network.history else 0,
             "last": network.last_action,
-            "cell": network.cell.memory_size if network.cell else 0,
+            "cell": network.cell.units if network.cell else 0,
         }
         parts = graph.split("memory", {name: size for name, size in sizes.items() if size})
     after, state = [], []
@@ -83,8 +83,8 @@ def write_graph(network: Network, n: int, m: int) -> bytes:
     window = [parts[name] for name in ("past", "oldest", "last") if name in parts]
     y = graph.node("Concat", [x, *window], axis=1) if window else x
     if network.cell is not None:
-        y, cell = graph.cell(network.cell, y, parts["cell"])
-        state = [cell]
+        y = graph.cell(network.cell, y, parts["cell"])
+        state = [y]
     graph.stack(network.layers, y)
     if window:
         past = [scaled, *([parts["past"]] if "past" in parts else [])] if network.history else []
@@ -138,26 +138,16 @@ class _Graph:
         selection = np.eye(n, dtype=np.float32)[list(errors)]
         return self.node("Add", ["observation", self.node("MatMul", [z, self.weight(selection)])]), z
 
-    def cell(self, cell: Cell, x: str, memory: str) -> tuple[str, str]:
-        """One step of an LSTM or a GRU, as `Cell.step` has it: its outputs and its memory after."""
-        if cell.kind == "gru":
-            from_x, from_h = (
-                self.gates(self.linear(layer, row), "rzn")
-                for layer, row in ((cell.from_x, x), (cell.from_h, memory))
-            )
-            r, z = (self.node("Sigmoid", [self.node("Add", [from_x[g], from_h[g]])]) for g in "rz")
-            n = self.node("Tanh", [self.node("Add", [from_x["n"], self.node("Mul", [r, from_h["n"]])])])
-            change = self.node("Mul", [z, self.node("Sub", [memory, n])])
-            h = self.node("Add", [n, change])
-            return h, h
-        state = self.split(memory, {"h": cell.units, "c": cell.units})
-        total = self.node("Add", [self.linear(cell.from_x, x), self.linear(cell.from_h, state["h"])])
-        gates = self.gates(total, "ifgo")
-        i, f, o = (self.node("Sigmoid", [gates[name]]) for name in "ifo")
-        g = self.node("Tanh", [gates["g"]])
-        c = self.node("Add", [self.node("Mul", [f, state["c"]]), self.node("Mul", [i, g])])
-        h = self.node("Mul", [o, self.node("Tanh", [c])])
-        return h, self.node("Concat", [h, c], axis=1)
+    def cell(self, cell: Cell, x: str, before: str) -> str:
+        """One step of a GRU, as `Cell.step` has it."""
+        from_x, from_h = (
+            self.gates(self.linear(layer, row), "rzn")
+            for layer, row in ((cell.from_x, x), (cell.from_h, before))
+        )
+        r, z = (self.node("Sigmoid", [self.node("Add", [from_x[g], from_h[g]])]) for g in "rz")
+        n = self.node("Tanh", [self.node("Add", [from_x["n"], self.node("Mul", [r, from_h["n"]])])])
+        change = self.node("Mul", [z, self.node("Sub", [before, n])])
+        return self.node("Add", [n, change])
 
     def gates(self, x: str, names: str) -> dict[str, str]:
         """Equal parts of a row, a letter each."""
@@ -254,9 +244,8 @@ def export_policy(
     """Writes a policy directory whole or not at all, after checking that onnxruntime computes what the network does.
 
     Args:
-        network: A `Network`, or a torch module that maps observations (N, n) float32 to the mean action (N, m), or, as
-            a `RecurrentNetwork`, observations and memory to action and memory; the written one clips the action to
-            [-1, 1]. Or what `onnx_bytes` made of one before, which is not compared again.
+        network: A `Network`, or a torch module that maps observations (N, n) float32 to the mean action (N, m); the
+            written one clips the action to [-1, 1]. Or what `onnx_bytes` made of one, which is not compared again.
         directory: Folder to write. An earlier policy directory is replaced; any other folder with files is refused.
         description: What it was trained with; `memory`, `files`, `provenance` and `created` are filled in.
         curves: Rows of `curves.csv`, with equal keys.
@@ -369,7 +358,9 @@ def _mean_of(model: Any, kind: str) -> nn.Module | Network:
             )
         policy = model.policy
         if hasattr(policy, "lstm_actor"):
-            raise ExportError(f"{kind}: has an LSTM: give RecurrentNetwork(lstm, layers) of its parts")
+            raise ExportError(
+                f"{kind}: has an LSTM, which no policy directory holds: ppo has a GRU (--set memory=32)"
+            )
         if hasattr(policy, "mlp_extractor"):
             return nn.Sequential(policy.mlp_extractor.policy_net, policy.action_net)
         if hasattr(policy, "actor") and hasattr(policy.actor, "latent_pi"):
@@ -419,8 +410,8 @@ def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> 
         return write_graph(plain, n, m)
     if hasattr(network, "memory_size"):
         raise ExportError(
-            "a network that remembers is written as an LSTM of one layer before linear layers and tanh, ReLU or ELU, "
-            "a RecurrentNetwork: this is another"
+            "a torch module that remembers cannot be written: ppo has a GRU (--set memory=32), and a "
+            "finssim.learning.network.Network may have one"
         )
     return _trace(network, n)
 

@@ -34,10 +34,8 @@ class Activation:
 
 @dataclass(frozen=True)
 class Cell:
-    """An LSTM of torch's equations (gates i, f, g, o), or a GRU (r, z, n), one step at a time."""
+    """A GRU of torch's equations (gates r, z, n), one step at a time; its memory is what it put out."""
 
-    kind: str
-    """lstm or gru."""
     from_x: Linear
     """From its inputs to all gates side by side."""
     from_h: Linear
@@ -48,25 +46,13 @@ class Cell:
         """Numbers that it puts out."""
         return int(self.from_h.weight.shape[0])
 
-    @property
-    def memory_size(self) -> int:
-        """Numbers that it hands on: of an LSTM its outputs and its cells, of a GRU its outputs."""
-        return self.units * (2 if self.kind == "lstm" else 1)
-
-    def step(self, x: Array, memory: Array) -> tuple[Array, Array]:
-        """Outputs (N, k) and memory after."""
+    def step(self, x: Array, h: Array) -> Array:
+        """Outputs (N, k) after those before."""
         xp, k = _library(x), self.units
-        h = memory[:, :k]
         a, b = _linear(self.from_x, x), _linear(self.from_h, h)
-        if self.kind == "gru":
-            r, z = _sigmoid(xp, a[:, :k] + b[:, :k]), _sigmoid(xp, a[:, k : 2 * k] + b[:, k : 2 * k])
-            n = xp.tanh(a[:, 2 * k :] + r * b[:, 2 * k :])
-            h = n + z * (h - n)
-            return h, h
-        i, f, g, o = ((a + b)[:, j * k : (j + 1) * k] for j in range(4))
-        c = _sigmoid(xp, f) * memory[:, k:] + _sigmoid(xp, i) * xp.tanh(g)
-        h = _sigmoid(xp, o) * xp.tanh(c)
-        return h, xp.concatenate([h, c], 1)
+        r, z = _sigmoid(xp, a[:, :k] + b[:, :k]), _sigmoid(xp, a[:, k : 2 * k] + b[:, k : 2 * k])
+        n = xp.tanh(a[:, 2 * k :] + r * b[:, 2 * k :])
+        return n + z * (h - n)
 
 
 @dataclass(frozen=True)
@@ -101,7 +87,7 @@ class Network:
     @property
     def memory_size(self) -> int:
         """Numbers that it hands on from a control step to the next."""
-        return len(self.errors) + self.window_size + (self.cell.memory_size if self.cell else 0)
+        return len(self.errors) + self.window_size + (self.cell.units if self.cell else 0)
 
     def step(self, observation: Array, memory: Array | None) -> tuple[Array, Array | None]:
         """Mean action (N, m), not limited, and the memory after.
@@ -120,8 +106,8 @@ class Network:
         y = x if not k else xp.concatenate([x, memory[:, :k]], 1)
         state = []
         if self.cell is not None:
-            y, cell = self.cell.step(y, memory[:, k:])
-            state = [cell]
+            y = self.cell.step(y, memory[:, k:])
+            state = [y]
         for layer in self.layers:
             y = _linear(layer, y) if isinstance(layer, Linear) else _activate(xp, layer, y)
         if k:

@@ -1,4 +1,4 @@
-"""Torch's networks: as learners begin with them, one that remembers, one that sees, and any as a plain `Network`."""
+"""Torch's networks: as learners begin with them, one that sees, and any as a plain `Network`."""
 
 from __future__ import annotations
 
@@ -8,30 +8,10 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import nn
 
-from finssim.learning.network import Activation, Cell, Linear, Network
+from finssim.learning.network import Activation, Linear, Network
 
 ACTIVATIONS = {nn.Tanh: "Tanh", nn.ReLU: "Relu", nn.ELU: "Elu", nn.Identity: "Identity"}
 """Activations with one ONNX operator of the same meaning."""
-
-
-class RecurrentNetwork(nn.Module):
-    """An LSTM of one layer, and layers on what it says: observation and memory to mean action and the memory after."""
-
-    def __init__(self, lstm: nn.LSTM, layers: nn.Sequential) -> None:
-        """Take the LSTM, (n) to (k), and the layers, (k) to (m)."""
-        super().__init__()
-        self.lstm, self.layers = lstm, layers
-
-    @property
-    def memory_size(self) -> int:
-        """Numbers of the memory: what the LSTM said last, and its cells."""
-        return 2 * self.lstm.hidden_size
-
-    def forward(self, observation: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Action (N, m) and memory (N, 2 k) for observations (N, n) and memory (N, 2 k); 0 at an episode's start."""
-        hidden, cells = (part.unsqueeze(0).contiguous() for part in memory.chunk(2, dim=1))
-        answer, (hidden, cells) = self.lstm(observation.unsqueeze(0), (hidden, cells))
-        return self.layers(answer[0]), torch.cat([hidden[0], cells[0]], dim=1)
 
 
 class SeeingNetwork(nn.Module):
@@ -82,21 +62,7 @@ class SeeingNetwork(nn.Module):
 
 
 def plain_network(network: nn.Module) -> Network | None:
-    """The network as plain arrays; None unless it is linear layers and these activations, behind an LSTM or not."""
-    cell = None
-    if isinstance(network, RecurrentNetwork):
-        lstm, network = network.lstm, network.layers
-        if lstm.num_layers > 1 or lstm.bidirectional or lstm.proj_size:
-            return None
-        weights = dict(lstm.named_parameters())
-        from_x, from_h = (
-            Linear(
-                weights[f"weight_{name}_l0"].detach().T,
-                weights[f"bias_{name}_l0"].detach() if lstm.bias else None,
-            )
-            for name in ("ih", "hh")
-        )
-        cell = Cell("lstm", from_x, from_h)
+    """The network as plain arrays; None unless it is linear layers and these activations."""
     layers: list[Linear | Activation] = []
     for layer in _layers(network):
         if isinstance(layer, nn.Linear):
@@ -106,7 +72,7 @@ def plain_network(network: nn.Module) -> Network | None:
             layers.append(Activation(ACTIVATIONS[type(layer)], float(getattr(layer, "alpha", 1.0))))
         else:
             return None
-    return Network(tuple(layers), cell=cell)
+    return Network(tuple(layers))
 
 
 def _layers(module: nn.Module) -> Iterable[nn.Module]:

@@ -296,7 +296,7 @@ class Ppo(ActingLearner):
         policy_input = xp.concatenate([x, self._memory[:, :k]], 1) if k else x
         if self._informed:
             policy_input, drawn = xp.concatenate([policy_input, drawn], 1), None
-        h = self._cell.step(policy_input, self._memory[:, k:])[0] if self.gru else None
+        h = self._cell.step(policy_input, self._memory[:, k:]) if self.gru else None
         parts = [part for part in (policy_input, h, drawn) if part is not None]
         return x, policy_input, h, xp.concatenate(parts, 1) if len(parts) > 1 else policy_input
 
@@ -456,7 +456,7 @@ class Ppo(ActingLearner):
     @property
     def _cell(self) -> Cell:
         W_x, b_x, W_h, b_h = self.gru.weights  # type: ignore[union-attr]
-        return Cell("gru", Linear(W_x, b_x), Linear(W_h, b_h))
+        return Cell(Linear(W_x, b_x), Linear(W_h, b_h))
 
     # What others need of a learner
 
