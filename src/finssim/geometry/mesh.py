@@ -213,27 +213,6 @@ def mesh_centroid(vertices: ArrayLike, faces: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(origin + (volume @ corners.sum(axis=1)) / (4.0 * volume.sum()))
 
 
-def mesh_second_moment(vertices: ArrayLike, faces: ArrayLike) -> NDArray[np.float64]:
-    """Second moment of the enclosed volume about its centroid, integral of r rᵀ dV.
-
-    The inertia of a body of uniform density rho is rho (trace(S) I - S).
-
-    Args:
-        vertices: Vertices (n, 3) [m].
-        faces: Faces (m, 3).
-
-    Returns:
-        S (3, 3) [m⁵].
-    """
-    points = np.asarray(vertices, np.float64) - mesh_centroid(vertices, faces)
-    corners = points[np.asarray(faces)]
-    volume = np.linalg.det(corners) / 6.0
-    total = corners.sum(axis=1)
-    # Over a tetrahedron with one corner at the origin: V/20 (sum of c cᵀ, plus (sum c)(sum c)ᵀ).
-    each = np.einsum("f,fki,fkj->ij", volume, corners, corners)
-    return np.asarray((each + np.einsum("f,fi,fj->ij", volume, total, total)) / 20.0)
-
-
 def _tetrahedra(vertices: ArrayLike, faces: ArrayLike) -> tuple[NDArray[np.float64], Vertices, Vertices]:
     """Signed volumes (m,) of tetrahedra on the faces, corners (m, 3, 3) about their apex, the apex (3,)."""
     points = np.asarray(vertices, np.float64)

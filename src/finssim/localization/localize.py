@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.optics import Lens
-from finssim.geometry.rotations import wrap_angle
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame, read_detections
 from finssim.localization.detection.detector import Detector, RegionTracker, detector
@@ -43,6 +42,8 @@ TILT_STD = math.radians(0.5)
 """Error of an IMU's roll and pitch [rad]."""
 DEPTH_STD = 0.01
 """Error of a depth where the vehicle file has no sensor [m]."""
+LONGEST_GAP = 1.0
+"""Depth and tilt are not interpolated between samples further apart [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,10 +99,8 @@ def prior_sources(
     *,
     depth: str | float | Path | None,
     imu: str | Path | None,
-    depth_std: float | None = None,
     tilt_std: float | None = None,
     shared_pixel_std: float = 0.0,
-    longest_gap: float = 1.0,
 ) -> PriorSources:
     """Read the sources.
 
@@ -111,10 +110,8 @@ def prior_sources(
         vehicle: Where its pressure port is and how well that measures.
         depth: File with columns t, depth, or one number [m], or None.
         imu: File with columns t and roll, pitch or qx, qy, qz, qw, or None.
-        depth_std: Standard deviation of the depth [m]; None: that of the vehicle file's sensor.
         tilt_std: Of roll and pitch [rad]; None: 0.5 degrees with an IMU, 2 degrees without.
         shared_pixel_std: Error that all corners share [px].
-        longest_gap: Nothing is interpolated between samples further apart [s].
 
     Raises:
         LocalizationError: A file without the columns, or a number that is none.
@@ -125,7 +122,7 @@ def prior_sources(
     sensor_std = DEPTH_STD if sensor is None else math.hypot(sensor.noise_std, sensor.bias_initial)
     base = Constraints(
         math.nan,
-        z_std=_spread("depth_std", depth_std, sensor_std),
+        z_std=sensor_std,
         tilt_std=_spread("tilt_std", tilt_std, LEVEL_STD if imu is None else TILT_STD),
         up=up,
         port=(port[0], port[1], port[2]),
@@ -139,7 +136,7 @@ def prior_sources(
         assumed.append(
             f"{vehicle.name} has no depth sensor: the depth is assumed to be that of the body origin"
         )
-    return PriorSources(base, surface, _depth(depth, longest_gap), _tilt(imu, longest_gap), tuple(assumed))
+    return PriorSources(base, surface, _depth(depth), _tilt(imu), tuple(assumed))
 
 
 def _vertical(pool: Pool) -> tuple[tuple[float, float, float], float]:
@@ -156,7 +153,7 @@ def _vertical(pool: Pool) -> tuple[tuple[float, float, float], float]:
     return (x, y, z), float(T_pw[:3, 2] @ T_pw[:3, 3])
 
 
-def _depth(depth: str | float | Path | None, longest_gap: float) -> Series | float | None:
+def _depth(depth: str | float | Path | None) -> Series | float | None:
     if depth is None:
         return None
     try:
@@ -167,7 +164,7 @@ def _depth(depth: str | float | Path | None, longest_gap: float) -> Series | flo
             raise LocalizationError(
                 f"{depth}: no column 'depth' with numbers: expected t [s] and depth [m], positive down"
             ) from None
-        return series("depth", table.t, table.columns("depth"), longest_gap, label=str(depth))
+        return series("depth", table.t, table.columns("depth"), LONGEST_GAP, label=str(depth))
     if not math.isfinite(number):
         raise LocalizationError(
             f"depth is {depth}, expected metres below the surface, or a file with t, depth"
@@ -175,7 +172,7 @@ def _depth(depth: str | float | Path | None, longest_gap: float) -> Series | flo
     return number
 
 
-def _tilt(imu: str | Path | None, longest_gap: float) -> Series | None:
+def _tilt(imu: str | Path | None) -> Series | None:
     """Up in the body frame, whose straight line between rows is how a vehicle leans."""
     if imu is None:
         return None
@@ -186,7 +183,7 @@ def _tilt(imu: str | Path | None, longest_gap: float) -> Series | None:
             f"{imu}: no attitude: expected columns roll, pitch [rad] or qx, qy, qz, qw; of gyro and accelerometer "
             "alone `finssim fuse` makes one"
         )
-    return series("attitude", table.t, up, longest_gap, label=str(imu))
+    return series("attitude", table.t, up, LONGEST_GAP, label=str(imu))
 
 
 def _spread(name: str, value: float | None, default: float) -> float:
@@ -211,7 +208,6 @@ class Locator:
         *,
         method: str = "refractive",
         pixel_std: float = 0.5,
-        family: str | None = None,
     ) -> None:
         """
         Args:
@@ -220,7 +216,6 @@ class Locator:
             prior: Height and tilt over time.
             method: A name of `METHODS`.
             pixel_std: Standard deviation of a corner, per axis [px].
-            family: Of the tags; None: that of the vehicle file.
 
         Raises:
             LocalizationError: As of `TagLocator`, or no depth where the method needs one.
@@ -233,7 +228,7 @@ class Locator:
             )
         self.known, self.tags = prior, tuple(self._locate.tags_b)
         """Ids of the vehicle's tags."""
-        self.family = family_named(family or self._locate.family).name
+        self.family = family_named(self._locate.family).name
 
     def locate(self, frame: Frame) -> Measurement:
         """The pose in one picture, or why there is none."""
@@ -335,90 +330,11 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
             f"median residual {summary['median_residual_px']:.2f} px; standard deviations "
             f"{100 * summary['median_std_m']:.2f} cm, {summary['median_std_yaw_deg']:.2f} degrees (median)"
         )
-    truth = summary.get("truth")
-    if truth:
-        text = f"against the truth, {truth['compared']} pictures: RMSE {100 * truth['rmse_m']:.2f} cm, "
-        text += f"P95 {100 * truth['p95_m']:.2f} cm"
-        if "rmse_yaw_deg" in truth:
-            text += f"; yaw RMSE {truth['rmse_yaw_deg']:.2f} degrees"
-        lines.append(text)
     return lines
 
 
 def _median(values: list[float]) -> float | None:
     return float(np.median(values)) if values else None
-
-
-# How far measured positions are from surveyed ones.
-
-
-class Truth:
-    """Positions by picture, or by time."""
-
-    def __init__(self, by_image: dict[str, Array], by_time: Series | None) -> None:
-        """x, y [m] and yaw (its cosine and sine, NaN where not known), pool frame, (4,) each."""
-        self._by_image, self._by_time = by_image, by_time
-
-    def of(self, image: str, exposure: float) -> Array | None:
-        """x, y [m] and yaw [rad] (or NaN), (3,); None where they are not known."""
-        pose: Array | str | None = self._by_image.get(PurePath(image).name) if image else None
-        if pose is None and self._by_time is not None:
-            pose = self._by_time.at(exposure)
-        if pose is None or isinstance(pose, str):
-            return None
-        return np.array([pose[0], pose[1], math.atan2(pose[3], pose[2])])
-
-    def figures(self, rows: Sequence[Row], latency: float) -> dict[str, Any] | None:
-        """RMSE and 95th percentile of the horizontal distance [m], RMSE of yaw [degrees]; None without any picture.
-
-        Args:
-            rows: What was measured.
-            latency: Time stamp of a picture minus its exposure [s].
-        """
-        errors = []
-        for frame, measurement in rows:
-            true = self.of(frame.image, frame.time - latency)
-            if measurement.ok and true is not None:
-                errors.append(
-                    [
-                        measurement.x - true[0],
-                        measurement.y - true[1],
-                        float(wrap_angle(measurement.yaw - true[2])),
-                    ]
-                )
-        if not errors:
-            return None
-        e = np.array(errors)
-        far = np.hypot(e[:, 0], e[:, 1])
-        figures = {
-            "compared": len(errors),
-            "rmse_m": float(np.sqrt(np.mean(far**2))),
-            "p95_m": float(np.percentile(far, 95)),
-            "mean_x_m": float(e[:, 0].mean()),
-            "mean_y_m": float(e[:, 1].mean()),
-        }
-        turned = e[np.isfinite(e[:, 2]), 2]
-        if len(turned):
-            figures["rmse_yaw_deg"] = float(np.degrees(np.sqrt(np.mean(turned**2))))
-        return figures
-
-
-def load_truth(path: str | Path, longest_gap: float = 1.0) -> Truth:
-    """Read a table with columns x, y [m], and image or t [s], and yaw [rad] or yaw_deg where it is known; pool frame.
-
-    Raises:
-        LocalizationError: Unreadable, or without these columns.
-    """
-    table = read_stream_table(path, timed=False)
-    timed = bool(np.isfinite(table.t).any())
-    if not table.has("x", "y") or not (timed or "image" in table.words):
-        columns = ",".join((*table.words, *table.numbers))[:80]
-        raise LocalizationError(f"{path}: columns {columns}, expected image or t, x, y and perhaps yaw")
-    yaw = table.angle("yaw")
-    values = np.column_stack([table.columns("x", "y"), np.cos(yaw), np.sin(yaw)])
-    images = zip(table.words.get("image", ()), values, strict=False)
-    by_image = {PurePath(name).name: value for name, value in images if name and np.isfinite(value[:2]).all()}
-    return Truth(by_image, series("truth", table.t, values, longest_gap, label=str(path)) if timed else None)
 
 
 # Pictures with the tags found in them: from pictures and videos, or from detection files.
@@ -519,16 +435,12 @@ def run(
     depth: str | float | Path | None = None,
     imu: str | Path | None = None,
     method: str = "refractive",
-    family: str | None = None,
     refine: str = "fit",
     gamma: float = 1.0,
     times: str | Path | None = None,
     pixel_std: float | None = None,
     shared_pixel_std: float = 0.0,
-    depth_std: float | None = None,
     tilt_std_deg: float | None = None,
-    longest_gap: float = 1.0,
-    truth: str | Path | None = None,
     as_json: bool = False,
 ) -> Run:
     """Measure position and yaw in every image: x, y, z [m], yaw [rad], pool frame, with standard deviations.
@@ -543,17 +455,13 @@ def run(
         depth (FILE|Z): Table with columns t, depth, or one depth of the pressure port below the surface [m].
         imu (FILE): Table with columns t and roll, pitch [rad] or qx, qy, qz, qw; level if not given.
         method (METHOD): refractive, refractive-weighted, refractive-6dof, pinhole-depth or pinhole.
-        family (NAME): Family of the tags; that of the vehicle file if not given.
         refine (WAY): Corner refinement: fit, or AprilTag's own edges or none.
         gamma: Gamma of the images: 1 linear, 2.2 video.
         times (FILE): Table with columns image, time [s], if the image names contain none.
         pixel_std: Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
             given.
         shared_pixel_std: Error common to all corners of an image, per axis [px]: waves.
-        depth_std: Error of the depth [m]; that of the vehicle file if not given.
         tilt_std_deg: Error of roll and pitch [deg]; 0.5 with --imu, 2 without, if not given.
-        longest_gap: Longest gap over which depth and tilt are interpolated [s].
-        truth (FILE): Table with columns image or t, x, y, to compare with.
         as_json: Print one JSON object instead of tables.
 
     Raises:
@@ -563,24 +471,17 @@ def run(
     """
     out, paths = Path(out), [Path(p) for p in ([inputs] if isinstance(inputs, (str, Path)) else inputs)]
     refuse_unwritable(atomic_write(out))
-    if not longest_gap >= 0.0:
-        raise LocalizationError(
-            f"longest_gap is {longest_gap}, expected a time in seconds that is not negative"
-        )
     site, body = load_pool(pool), load_vehicle(str(vehicle))
     prior = prior_sources(
         site,
         body,
         depth=depth,
         imu=imu,
-        depth_std=depth_std,
         tilt_std=None if tilt_std_deg is None else math.radians(tilt_std_deg),
         shared_pixel_std=shared_pixel_std,
-        longest_gap=longest_gap,
     )
     pixel_std = site.pixel_std if pixel_std is None else pixel_std
-    locator = Locator(site, body, prior, method=method, pixel_std=pixel_std, family=family)
-    surveyed = None if truth is None else load_truth(truth, longest_gap)
+    locator = Locator(site, body, prior, method=method, pixel_std=pixel_std)
     find = detector(locator.family, refine=refine, gamma=gamma)
     stamps = None if times is None else Path(times)
     notes: list[str] = []
@@ -590,7 +491,6 @@ def run(
     result.summary = {
         "method": method,
         **summary_of(result.rows),
-        **({} if surveyed is None else {"truth": surveyed.figures(result.rows, site.latency)}),
         "assumed": list(prior.assumed) if method in NEEDS_DEPTH else [],
         "notes": notes,
         "out": str(out),

@@ -10,7 +10,6 @@ from finssim.geometry.optics import (
     Interface,
     OpticsError,
     back_project,
-    back_project_jacobian,
     plane_jacobian,
     project,
     projection_jacobians,
@@ -68,29 +67,6 @@ def test_derivatives_of_a_pixel(lens, interface):
     np.testing.assert_array_equal(found.projection.pixels, project(eye, interface, there).pixels)
     direction = lens.rays(project(eye, interface, there).pixels)[0]
     np.testing.assert_allclose(found.lens, lens.parameter_jacobian(direction), rtol=1e-9, atol=1e-9)
-
-
-@every_lens
-@pytest.mark.parametrize("name", ["surface", "tilted 20 degrees", "window", "z down"])
-def test_derivatives_of_a_point(lens, name):
-    """d(x, y)/d(u, v) and d(x, y)/dz of back-projection onto a height."""
-    interface = INTERFACES[name]
-    eye, there = camera(lens, interface), inner_points(interface)
-    pixels, z = project(eye, interface, there).pixels, there[:, 2]
-    by_pixel, by_z = back_project_jacobian(eye, interface, pixels, z)
-    if name == "window":  # a wall: only rays that are steep against the horizon
-        steep = np.abs(back_project(eye, interface, pixels).direction[:, 2]) > 0.2
-        pixels, z, by_pixel, by_z = pixels[steep], z[steep], by_pixel[steep], by_z[steep]
-
-    def hit(p, h):
-        return back_project(eye, interface, p).at_z(h)[0][..., :2]
-
-    e = 1e-3
-    columns = [(hit(pixels + d, z) - hit(pixels - d, z)) / (2 * e) for d in e * np.eye(2)]
-    np.testing.assert_allclose(by_pixel, np.stack(columns, -1), rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(
-        by_z, (hit(pixels, z + STEP) - hit(pixels, z - STEP)) / (2 * STEP), rtol=1e-6, atol=1e-8
-    )
 
 
 @every_interface
@@ -155,8 +131,8 @@ def test_a_point_that_is_not_seen_has_no_derivative():
     """Above the surface, the derivatives of back-projection are NaN, not numbers."""
     interface = INTERFACES["surface"]
     eye = camera(LENSES["pinhole"], interface)
-    by_pixel, by_z = back_project_jacobian(eye, interface, [640.0, 360.0], 2.0)
-    assert np.isnan(by_pixel).all() and np.isnan(by_z).all()
+    there, _ = back_project(eye, interface, [640.0, 360.0]).at_z(2.0)
+    assert np.isnan(plane_jacobian(eye, interface, there, (0.0, 0.0, 1.0))).all()
 
 
 @pytest.mark.parametrize("name", ["surface", "from the water", "window"])

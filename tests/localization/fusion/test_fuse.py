@@ -25,7 +25,7 @@ from finssim.localization.poses import Constraints
 from finssim.localization.poses.methods import METHODS
 from finssim.vehicles import load_vehicle
 from localization.fusion.hinsdale_log import hinsdale, write_table
-from localization.fusion.known_streams import SITE, Noise, attitude, position, streams, yaw
+from localization.fusion.known_streams import SITE, attitude, position, streams, yaw
 
 POOL = """
 camera:
@@ -147,25 +147,20 @@ def test_columns_in_the_sensors_axes_are_turned(tmp_path, pool):
     ]
     names = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
     body = load_log(write_log(tmp_path / "body", items), FINSROV)
-    for name, options, columns in (
-        ("named", {}, names),
-        ("told", {"imu_axes": "sensor"}, ("p", "q", "r", "ax", "ay", "az")),
+    folder = write_log(tmp_path / "sensor", turned, names=names)
+    # Roll and pitch are in the sensor's axes too: half a turn about z negates both.
+    text = [row.split(",") for row in (folder / "imu.csv").read_text().split()]
+    flipped = [[*r[:7], str(-float(r[7])), str(-float(r[8]))] for r in text[1:]]
+    write_table(folder / "imu.csv", text[0], flipped)
+    sensor = load_log(folder, FINSROV)
+    for a, b in zip(
+        [s for s in body.samples if s.stream == "imu"],
+        [s for s in sensor.samples if s.stream == "imu"],
+        strict=True,
     ):
-        folder = write_log(tmp_path / name, turned, names=columns)
-        if name == "told":  # roll and pitch in the sensor's axes: half a turn about z negates both
-            text = [row.split(",") for row in (folder / "imu.csv").read_text().split()]
-            flipped = [[*r[:7], str(-float(r[7])), str(-float(r[8]))] for r in text[1:]]
-            write_table(folder / "imu.csv", text[0], flipped)
-        sensor = load_log(folder, FINSROV, **options)
-        for a, b in zip(
-            [s for s in body.samples if s.stream == "imu"],
-            [s for s in sensor.samples if s.stream == "imu"],
-            strict=True,
-        ):
-            np.testing.assert_allclose(b.omega, a.omega, atol=1e-12)
-            np.testing.assert_allclose(b.force, a.force, atol=1e-12)
-            if name == "told":
-                np.testing.assert_allclose(b.tilt, a.tilt, atol=1e-9)
+        np.testing.assert_allclose(b.omega, a.omega, atol=1e-12)
+        np.testing.assert_allclose(b.force, a.force, atol=1e-12)
+        np.testing.assert_allclose(b.tilt, a.tilt, atol=1e-9)
 
 
 def test_rows_rest_on_what_had_arrived(tmp_path, pool):
@@ -336,9 +331,7 @@ def test_logs_that_cannot_be_used_are_refused_in_a_sentence(tmp_path, pool, writ
     [
         ({"rate": 0.0}, "rate is 0 Hz"),
         ({"mode": "ekf"}, "available: constant-velocity, error-state"),
-        ({"profile": "best"}, "available: default, published"),
         ({"method": "best"}, "available: refractive"),
-        ({"imu_axes": "mine"}, "available: body, sensor"),
     ],
 )
 def test_wrong_words_are_refused(tmp_path, pool, options, sentence):
@@ -410,13 +403,3 @@ def test_an_interrupt_keeps_the_rows_so_far(tmp_path, pool, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv")
     assert 30 < len(read_out(tmp_path / "out.csv")[0]["t"]) < 150
-
-
-def test_the_published_profile_runs(tmp_path, pool):
-    """The paper's numbers on the same log: centimetres, and less sure than it could be."""
-    log = write_log(tmp_path / "log", samples(4.0, noise=Noise()))
-    run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", profile="published")
-    columns, _ = read_out(tmp_path / "out.csv")
-    late = columns["t"] > 1.0
-    assert np.abs(columns["x"][late] - position(columns["t"][late])[:, 0]).max() < 0.1
-    assert columns["std_x"][late].min() > 0.02

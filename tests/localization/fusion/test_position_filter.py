@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from finssim.localization.fusion.fuse_settings import Settings
 from finssim.localization.fusion.position_filter import (
     Motion,
     PositionState,
@@ -58,15 +57,6 @@ def test_slow_decay_ends_in_none(dt):
     nearly = Motion(density=MOTION.density, decay=(1e-7,) * 3)
     np.testing.assert_allclose(process_noise(dt, nearly), process_noise(dt, MOTION), rtol=1e-4)
     np.testing.assert_allclose(transition(dt, nearly), transition(dt, MOTION), rtol=1e-5)
-
-
-def test_the_published_noise_is_diagonal_in_the_published_numbers():
-    """diag(0.02 dt, 0.10 dt), R 0.0025 and a gate of 9 for every dimension."""
-    published = Settings.published()
-    np.testing.assert_allclose(process_noise(0.02, published.motion), np.diag([4e-4] * 3 + [2e-3] * 3))
-    assert published.vision_std[0] ** 2 == pytest.approx(0.0025)
-    assert published.depth_std**2 == pytest.approx(0.0025)
-    assert [published.gate.limit(n) for n in (1, 2)] == [9.0, 9.0]
 
 
 def test_update_is_the_least_squares_answer():

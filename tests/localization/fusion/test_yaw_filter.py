@@ -15,7 +15,6 @@ from finssim.localization.fusion.attitude import (
     restarted,
     yaw_rate,
 )
-from finssim.localization.fusion.fuse_settings import Settings
 from localization.fusion.known_streams import attitude, body_rates, yaw
 
 RUNS = 200
@@ -72,14 +71,14 @@ def test_the_bias_is_found():
 
 def test_without_a_bias_the_gain_is_the_published_one():
     """q = 0.02 /s, R = 0.05: gain P/(P + R) of one scalar."""
-    s = Settings.published()
+    noise, R = YawNoise(rate=np.sqrt(0.02), bias_walk=0.0), 0.05
     P = 10.0
-    state = start(variance=P, bias_std=s.bias_std)
+    state = start(variance=P, bias_std=0.0)
     for _ in range(3):
-        state = predict(state, 0.1, 0.02, s.gyro)
+        state = predict(state, 0.1, 0.02, noise)
         P = P + 0.02 * 0.02
-        found = innovation(state, 0.5, s.vision_std[1] ** 2)
-        after = correct(state, found, s.vision_std[1] ** 2)
+        found = innovation(state, 0.5, R)
+        after = correct(state, found, R)
         assert float((after.yaw - state.yaw) / found.residual) == pytest.approx(P / (P + 0.05))
         state, P = after, P - P**2 / (P + 0.05)
         assert state.P[0, 0] == pytest.approx(P)

@@ -448,23 +448,6 @@ class Jacobians:
         return np.asarray(self._change.k[..., None, None] * (self._by_v - (self._by_v @ n)[..., None] * n))
 
 
-def back_project_jacobian(
-    camera: Camera, interface: Interface, pixels: npt.ArrayLike, z: npt.ArrayLike
-) -> tuple[Array, Array]:
-    """How the point that a pixel sees at height z moves with the pixel and with z.
-
-    Args:
-        pixels: (..., 2).
-        z: Height of the point, pool frame [m], one for all or (...).
-
-    Returns:
-        d(x, y)/d(u, v) [m/px], (..., 2, 2), and d(x, y)/dz [-], (..., 2); NaN where the pixel sees no such point.
-    """
-    points, _ = back_project(camera, interface, pixels).at_z(z)
-    jacobian = plane_jacobian(camera, interface, points, (0.0, 0.0, 1.0))
-    return jacobian[..., :2, :2], jacobian[..., :2, 2]
-
-
 def plane_jacobian(
     camera: Camera, interface: Interface, points_p: npt.ArrayLike, normal: npt.ArrayLike
 ) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -460,8 +460,6 @@ MAX_LOST = 30
 """Pictures after which a lost tag is searched in the whole picture alone."""
 AHEAD = 1.5
 """Regions reach from the last place of a tag, should it have stopped, to this many times its motion since."""
-SIGMAS = 3.0
-"""Standard deviations of a prediction that the padding takes in."""
 
 
 @dataclass
@@ -521,22 +519,12 @@ class RegionTracker:
         self._since_whole = search_every
         self._last_time = math.nan
 
-    def detect(
-        self,
-        image: npt.NDArray[np.uint8],
-        time: float = math.nan,
-        *,
-        predicted: Mapping[int, npt.ArrayLike] | None = None,
-        predicted_std: float = 5.0,
-    ) -> list[Detection]:
-        """Tags in the next picture, each id once.
+    def detect(self, image: npt.NDArray[np.uint8], time: float = math.nan) -> list[Detection]:
+        """Tags in the next picture, each id once; they are searched between their last places and where they move to.
 
         Args:
             image: Gray, (h, w).
             time: Of the picture [s]; pictures without a time count as one second apart.
-            predicted: Tag id -> corners where a filter expects it [px], (4, 2); the others are expected between
-                their last places and where their velocity takes them.
-            predicted_std: Standard deviation of those corners [px].
 
         Raises:
             LocalizationError: The picture is not one of gray bytes.
@@ -544,7 +532,7 @@ class RegionTracker:
         now = time if math.isfinite(time) else (0.0 if math.isnan(self._last_time) else self._last_time + 1.0)
         self.counts.pictures += 1
         self.counts.pixels_given += image.size
-        regions = merged(self._regions(now, predicted or {}, predicted_std))
+        regions = merged(self._regions(now))
         detections = [d for region in regions for d in self._search(image, region)]
         here = {d.tag for d in detections}
         self._since_whole += 1
@@ -571,20 +559,12 @@ class RegionTracker:
         detections = self._detector.detect(image, region)
         return [d for d in detections if self._tags is None or d.tag in self._tags]
 
-    def _regions(
-        self, now: float, predicted: Mapping[int, npt.ArrayLike], predicted_std: float
-    ) -> list[Region]:
+    def _regions(self, now: float) -> list[Region]:
         regions = []
-        for tag in sorted(self._seen.keys() | predicted.keys()):
-            remembered = self._seen.get(tag)
-            lost = remembered.lost if remembered else 0
-            if tag in predicted:
-                corners = np.asarray(predicted[tag], float)
-                if np.isfinite(corners).all():
-                    regions.append(region_around(corners, SIGMAS * predicted_std, lost))
-            elif remembered and lost <= MAX_LOST:
-                ahead = remembered.corners + AHEAD * remembered.velocity * (now - remembered.time)
-                regions.append(region_around(np.vstack([remembered.corners, ahead]), 0.0, lost))
+        for _, tag in sorted(self._seen.items()):
+            if tag.lost <= MAX_LOST:
+                ahead = tag.corners + AHEAD * tag.velocity * (now - tag.time)
+                regions.append(region_around(np.vstack([tag.corners, ahead]), tag.lost))
         return regions
 
     def _remember(self, detections: list[Detection], now: float) -> None:
@@ -599,17 +579,16 @@ class RegionTracker:
         self._last_time = now
 
 
-def region_around(corners: Array, uncertainty: float = 0.0, lost: int = 0) -> Region:
+def region_around(corners: Array, lost: int = 0) -> Region:
     """The part of a picture in which a tag is searched.
 
     Args:
         corners: Where it is expected [px], (n, 2).
-        uncertainty: Distance by which it may lie elsewhere [px].
         lost: Pictures since it was last found.
     """
     low, high = corners.min(axis=0), corners.max(axis=0)
     edge = float(np.linalg.norm(corners[1] - corners[0]) + np.linalg.norm(corners[2] - corners[1])) / 2.0
-    padding = max(LEAST, BESIDE * edge) + uncertainty + PER_LOSS * lost * edge
+    padding = max(LEAST, BESIDE * edge) + PER_LOSS * lost * edge
     left, top = np.floor(low - padding).astype(int).tolist()
     right, bottom = (np.ceil(high + padding).astype(int) + 1).tolist()
     return left, top, right, bottom

@@ -525,7 +525,7 @@ _H_VELOCITY = np.eye(6)[3:]
 def vision_covariance(sample: VisionSample, settings: Settings) -> Array:
     """Covariance of x, y and yaw that a fix is given, (3, 3)."""
     floor = _diagonal(settings.vision_floor)
-    if sample.covariance is None or settings.vision_fixed:
+    if sample.covariance is None:
         return _diagonal(settings.vision_std) + floor
     return np.array(sample.covariance) + floor
 

@@ -208,10 +208,8 @@ def run(
     out: str | Path,
     rate: float = 60.0,
     mode: str = "constant-velocity",
-    profile: str = "default",
     method: str = "refractive",
     pixel_std: float | None = None,
-    imu_axes: str | None = None,
     as_json: bool = False,
 ) -> Run:
     """Fuse vision, depth and IMU in the order of arrival: position [m], velocity [m/s], yaw [rad], health.
@@ -225,12 +223,10 @@ def run(
         out (FILE): Table to write (.csv).
         rate: Rows per second [Hz].
         mode (MODE): constant-velocity (paper, eq. 14-15) or error-state (uses IMU acceleration).
-        profile (NAME): Noise of the filter: default, or published as in the paper.
         method (METHOD): Localization method: refractive, refractive-weighted, refractive-6dof, pinhole-depth or
             pinhole.
         pixel_std: Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
             given.
-        imu_axes (AXES): Axes of the IMU's columns: body or sensor; from their names if not given.
         as_json: Print one JSON object instead of tables.
 
     Raises:
@@ -241,9 +237,9 @@ def run(
     out = Path(out)
     refuse_unwritable(atomic_write(out))
     site, body = load_pool(pool), load_vehicle(str(vehicle))
-    read = load_log(log, body, latency=site.latency, imu_axes=imu_axes)
+    read = load_log(log, body, latency=site.latency)
     pixel_std = site.pixel_std if pixel_std is None else pixel_std
-    fused = fuse(read, site, body, rate=rate, mode=mode, profile=profile, method=method, pixel_std=pixel_std)
+    fused = fuse(read, site, body, rate=rate, mode=mode, method=method, pixel_std=pixel_std)
     write_rows(fused.rows, out)
     if as_json:
         print(json.dumps({"out": str(out), "notes": read.notes, **fused.summary}, allow_nan=False))
@@ -265,7 +261,6 @@ def fuse(
     *,
     rate: float = 60.0,
     mode: str = "constant-velocity",
-    profile: str = "default",
     method: str = "refractive",
     pixel_std: float = 0.5,
 ) -> Run:
@@ -277,7 +272,7 @@ def fuse(
     if not 0.0 < rate <= FASTEST:
         raise LocalizationError(f"rate is {rate:g} Hz, expected above 0 and up to {FASTEST:g}")
     check_method(method)
-    estimator = Estimator(settings_of(vehicle, profile), site_of(pool, vehicle), mode=mode)
+    estimator = Estimator(settings_of(vehicle), site_of(pool, vehicle), mode=mode)
     if mode == "error-state" and not any(getattr(s, "force", None) for s in log.samples):
         raise LocalizationError(
             "mode error-state needs accelerations with gravity (ax, ay, az beside p, q, r): use constant-velocity"

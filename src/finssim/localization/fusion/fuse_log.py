@@ -226,22 +226,18 @@ class Log:
     """What was repaired or left out."""
 
 
-def load_log(path: str | Path, vehicle: Vehicle, *, latency: float = 0.0, imu_axes: str | None = None) -> Log:
+def load_log(path: str | Path, vehicle: Vehicle, *, latency: float = 0.0) -> Log:
     """Read a log.
 
     Args:
         path: A folder with imu.csv, depth.csv, vision.csv or detections.csv, and perhaps truth.csv; or one table.
         vehicle: Says how the IMU is mounted and how old samples are when they arrive.
         latency: Of the camera: stamp of a picture minus the middle of its exposure [s].
-        imu_axes: `body` or `sensor`: axes of the IMU's columns. None: `gyro_x`, `accel_x`, ... are the sensor's, `p`,
-            `ax`, ... the body's.
 
     Raises:
         LocalizationError: Nothing there, or a table without the columns of its stream.
     """
     path = Path(path)
-    if imu_axes not in (None, "body", "sensor"):
-        raise LocalizationError(f"unknown IMU axes '{imu_axes}'; available: body, sensor")
     log = Log()
     if path.is_dir():
         tables = {n: read_stream_table(path / f"{n}.csv") for n in _STREAMS if (path / f"{n}.csv").is_file()}
@@ -261,7 +257,7 @@ def load_log(path: str | Path, vehicle: Vehicle, *, latency: float = 0.0, imu_ax
     for name, table in tables.items():
         if not _present(name, table):
             raise LocalizationError(f"{table.name}: expected the columns {_EXPECTED[name]}")
-        log.samples += readers[name](table, vehicle, log, latency=latency, imu_axes=imu_axes)
+        log.samples += readers[name](table, vehicle, log, latency)
     log.notes += list(dict.fromkeys(note for table in tables.values() for note in table.notes))
     here = {sample.stream for sample in log.samples} | ({"vision"} if log.frames else set())
     log.notes += [note for stream, note in _MISSING.items() if stream not in here]
@@ -303,19 +299,18 @@ class ImuColumns(NamedTuple):
     """Axes of the columns to body axes, xyzw, (4,)."""
 
 
-def imu_columns(table: StreamTable, sensor: Imu | None, axes: str | None = None) -> ImuColumns:
-    """The columns of an IMU, turned into body axes where they are in its own.
+def imu_columns(table: StreamTable, sensor: Imu | None) -> ImuColumns:
+    """The columns of an IMU: `gyro_x`, `accel_x`, ... are in its own axes, and turned into the body's; `p`, `ax`, ...
+    are in the body's.
 
     Args:
         table: The table.
         sensor: How the IMU is mounted.
-        axes: `body` or `sensor`; None: `gyro_x`, `accel_x`, ... are the sensor's, `p`, `ax`, ... the body's.
 
     Raises:
         LocalizationError: Columns are in the sensor's axes, whose mount is not known; or no attitude can be so.
     """
-    in_sensor_axes = table.has(*SENSOR_RATES) and not table.has(*RATES)
-    turned = axes == "sensor" or (in_sensor_axes and axes is None)
+    turned = table.has(*SENSOR_RATES) and not table.has(*RATES)
     if turned and sensor is None:
         raise LocalizationError(
             f"{table.name}: rates in the IMU's axes, but the vehicle file has no sensors.imu.orientation: add it"
@@ -323,18 +318,16 @@ def imu_columns(table: StreamTable, sensor: Imu | None, axes: str | None = None)
     mount = np.array(sensor.orientation if turned and sensor is not None else (0.0, 0.0, 0.0, 1.0), float)
     vectors = [np.full((len(table.t), 3), np.nan)] * 2
     forces = SENSOR_FORCE if table.has(*SENSOR_FORCE) else FORCE
-    for i, names in enumerate((SENSOR_RATES if in_sensor_axes else RATES, forces)):
+    for i, names in enumerate((SENSOR_RATES if turned else RATES, forces)):
         if table.has(*names):
             vectors[i] = in_body_axes(table.columns(*names), mount)
     up = table.up()
     return ImuColumns(vectors[0], vectors[1], None if up is None else in_body_axes(up, mount), mount)
 
 
-def _imu(
-    table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
-) -> list[Sample]:
+def _imu(table: StreamTable, vehicle: Vehicle, log: Log, latency: float) -> list[Sample]:
     sensor = vehicle.sensors.imu
-    omega, force, up, _ = imu_columns(table, sensor, imu_axes)
+    omega, force, up, _ = imu_columns(table, sensor)
     size = float(np.nanmedian(np.linalg.norm(force, axis=1))) if np.isfinite(force).any() else math.nan
     if size < 0.5 * vehicle.water.gravity:
         log.notes.append(f"accelerations of {size:.2g} m/s² hold no gravity and were left out")
@@ -370,18 +363,14 @@ def _carried(t: Array, values: Array) -> Array:
     return np.where(fresh[:, None], values[np.maximum(last, 0)], np.nan)
 
 
-def _depth(
-    table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
-) -> list[Sample]:
+def _depth(table: StreamTable, vehicle: Vehicle, log: Log, latency: float) -> list[Sample]:
     sensor, depth = vehicle.sensors.depth, table.numbers["depth"]
     arrival = _arrival(table, 0.0 if sensor is None else sensor.latency)
     rows = _thinned(np.flatnonzero(~np.isnan(depth)), depth[:, None], "depth", log)
     return [DepthSample(float(table.t[k]), float(depth[k]), float(arrival[k])) for k in rows]
 
 
-def _vision(
-    table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
-) -> list[Sample]:
+def _vision(table: StreamTable, vehicle: Vehicle, log: Log, latency: float) -> list[Sample]:
     xy = table.columns("x", "y")
     yaw = table.angle("yaw")
     usable = ~np.isnan(xy).any(axis=1)

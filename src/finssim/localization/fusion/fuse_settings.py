@@ -1,4 +1,4 @@
-"""Everything that can be tuned in the fusion, with the published values beside ours."""
+"""Everything that can be tuned in the fusion."""
 
 from __future__ import annotations
 
@@ -31,8 +31,6 @@ class Gate:
 
     probability: float = 0.999
     """Share of honest measurements that pass."""
-    fixed: float | None = None
-    """One limit for every dimension, in place of the chi-square quantile; the published software has 9."""
     reacquire_after: float = 1.0
     """A run of refused measurements that agree with one another takes over after this long [s]; inf: never."""
     reacquire_samples: int = 5
@@ -40,7 +38,7 @@ class Gate:
 
     def limit(self, dimension: int) -> float:
         """Largest squared Mahalanobis distance that passes, for a measurement of that many numbers."""
-        return self.fixed if self.fixed is not None else _quantile(dimension, self.probability)
+        return _quantile(dimension, self.probability)
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class Aids:
 
 @dataclass(frozen=True)
 class Settings:
-    """Of the estimator. Times in seconds; `published` gives those of the FinsROV software."""
+    """Of the estimator. Times in seconds."""
 
     fresh: float = 0.25
     """Age of vision up to which the state is called fresh."""
@@ -89,8 +87,6 @@ class Settings:
     """Of x and y [m] and of yaw [rad], where a measurement brings no covariance."""
     vision_floor: tuple[float, float] = (0.002, 0.003)
     """Added to a measurement's own standard deviations, in squares [m, rad]: errors that its covariance leaves out."""
-    vision_fixed: bool = False
-    """Take `vision_std` even where a measurement brings its covariance."""
     depth_std: float = 0.01
     """[m]"""
     gyro: YawNoise = YawNoise()
@@ -114,30 +110,12 @@ class Settings:
     """Of Doppler log and compass; None where there are none. Between fixes the position then drifts, as its covariance
     tells, and is ready up to `largest_variance`."""
 
-    @classmethod
-    def published(cls) -> Settings:
-        """The FinsROV software: its noises, one gate of 9 for all, no bias, and a gate that never gives in."""
-        return cls(
-            gate=Gate(fixed=9.0, reacquire_after=math.inf),
-            motion=Motion(density=(0.10,) * 3, walk=(0.02,) * 3, integrated=False),
-            speed_std=math.sqrt(10.0),
-            vision_std=(0.05, math.sqrt(0.05)),
-            vision_floor=(0.0, 0.0),
-            vision_fixed=True,
-            depth_std=0.05,
-            gyro=YawNoise(rate=math.sqrt(0.02), bias_walk=0.0),
-            bias_std=0.0,
-            ready_position=4.0,
-            ready_yaw=1.0,
-        )
-
     @property
     def decay(self) -> float:
         """Rate at which a held velocity dies away [1/s]."""
         return math.log(2.0) / self.half_life
 
 
-PROFILES = ("default", "published")
 LOST = 100.0
 """Standard deviation per axis with which a vehicle that navigates by log and compass is lost [m]."""
 
@@ -195,20 +173,8 @@ def site_of(pool: Pool | None, vehicle: Vehicle) -> Site:
     )
 
 
-def settings_of(vehicle: Vehicle, profile: str = "default") -> Settings:
-    """Settings with the vehicle file's sensor noises, never below what mounting and sampling leave besides them.
-
-    Args:
-        vehicle: The vehicle.
-        profile: `default` or `published`; the latter takes nothing from the vehicle.
-
-    Raises:
-        LocalizationError: Unknown profile.
-    """
-    if profile == "published":
-        return Settings.published()
-    if profile != "default":
-        raise LocalizationError(f"unknown profile '{profile}'; available: {', '.join(PROFILES)}")
+def settings_of(vehicle: Vehicle) -> Settings:
+    """Settings with the vehicle file's sensor noises, never below what mounting and sampling leave besides them."""
     settings, imu, depth = Settings(), vehicle.sensors.imu, vehicle.sensors.depth
     if imu is not None:
         settings = replace(

@@ -29,20 +29,14 @@ class Motion:
 
         Q = q [dt³/3  dt²/2; dt²/2  dt].
 
-    The published filter has Q = diag(0.02 dt, 0.10 dt) instead (`integrated=False`): its velocity block is ours with
-    q = 0.10 m²/s³; its position block is a random walk of its own that no motion causes, of 14 cm in a second.
     With `decay` λ > 0 the velocity returns to zero, v_dot = -λ v + w, as water slows a vehicle: its variance then
     settles at q / 2λ instead of growing for ever.
     """
 
     density: tuple[float, float, float] = (0.05, 0.05, 0.02)
     """Spectral density q of the acceleration [m²/s³]."""
-    walk: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Density of a random walk added to the position [m²/s]."""
     decay: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Rate λ at which velocity dies away [1/s]."""
-    integrated: bool = True
-    """False: velocity noise does not reach position within a step, as published."""
 
 
 @dataclass(frozen=True)
@@ -88,11 +82,9 @@ def process_noise(dt: float, motion: Motion) -> Array:
     vv = np.where(slow, dt, (1.0 - np.exp(-2.0 * l * dt)) / (2.0 * l))
     pv = np.where(slow, 0.5 * dt**2, decayed**2 / (2.0 * l**2))
     pp = np.where(slow, dt**3 / 3.0, (dt - decayed / l - 0.5 * decayed**2 / l) / l**2)
-    if not motion.integrated:
-        pv, pp = np.zeros(3), np.zeros(3)
     Q = np.zeros((6, 6))
     i, j = [0, 1, 2], [3, 4, 5]
-    Q[i, i] = q * pp + np.array(motion.walk) * dt
+    Q[i, i] = q * pp
     Q[i, j] = Q[j, i] = q * pv
     Q[j, j] = q * vv
     return Q
@@ -103,9 +95,7 @@ def _noise_powers(motion: Motion) -> Array:
     """What goes with dt, dt²/2 and dt³/3 in the noise of a step where nothing decays, (3, 36)."""
     first, second, third = powers = np.zeros((3, 6, 6))
     i, j = [0, 1, 2], [3, 4, 5]
-    first[i, i], first[j, j] = motion.walk, motion.density
-    if motion.integrated:
-        second[i, j] = second[j, i] = third[i, i] = motion.density
+    first[j, j] = second[i, j] = second[j, i] = third[i, i] = motion.density
     return powers.reshape(3, 36)
 
 

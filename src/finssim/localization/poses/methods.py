@@ -77,14 +77,19 @@ class RigidFit:
         return np.asarray(-self.inverse @ (in_pixels @ self.weighted_J.reshape(-1, 3)).T)
 
     def inflation(self, std: float) -> float:
-        """Factor on the variance where the misses are larger than noise of `std` [px] explains.
+        """Factor on the variance where the misses are larger than noise of `std` [px] explains."""
+        return _inflation(self.missed, 3, std)
 
-        It is 1 up to the 99 % quantile of chi² (Wilson and Hilferty's approximation), and the ratio to it beyond.
-        """
-        dof = 2 * len(self.missed) - 3
-        k = 2.0 / (9.0 * dof)
-        quantile = dof * (1.0 - k + 2.326 * math.sqrt(k)) ** 3
-        return max(1.0, float(self.missed @ self.missed) / std**2 / quantile)
+
+def _inflation(missed: Array, parameters: int, std: float) -> float:
+    """Factor on a variance where misses are larger than noise of `std` [px] explains.
+
+    It is 1 up to the 99 % quantile of chi² (Wilson and Hilferty's approximation), and the ratio to it beyond.
+    """
+    dof = max(2 * len(missed) - parameters, 1)
+    k = 2.0 / (9.0 * dof)
+    quantile = dof * (1.0 - k + 2.326 * math.sqrt(k)) ** 3
+    return max(1.0, float(missed @ missed) / std**2 / quantile)
 
 
 def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | None:
@@ -661,12 +666,7 @@ class RefinedPose:
     def covariance(self, pixel_std: float) -> Array:
         """Of position and a turn about pool axes, (6, 6); where nothing else is known it is enlarged where the misses
         exceed the noise by far."""
-        factor = 1.0
-        if len(self.H) == 6:
-            dof = max(2 * len(self.missed) - 6, 1)
-            k = 2.0 / (9.0 * dof)
-            quantile = dof * (1.0 - k + 2.326 * math.sqrt(k)) ** 3
-            factor = max(1.0, float(self.missed @ self.missed) / pixel_std**2 / quantile)
+        factor = _inflation(self.missed, 6, pixel_std) if len(self.H) == 6 else 1.0
         scale = 1.0 / np.sqrt(np.diagonal(self.H))
         inverse = np.linalg.pinv(self.H * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
         return np.asarray(inverse[:6, :6] * (pixel_std**2 * factor))
