@@ -186,7 +186,7 @@ def kinds() -> list[Kind]:
             "simulate --vehicle finsrov --command surge=5 --duration NUMBER --out OUT/run.csv",
             "simulate --vehicle finsrov --command surge=5 --duration 0.2 --depth NUMBER --out OUT/run.csv",
             "excite surge --vehicle finsrov --levels NUMBER --out OUT/programmes",
-            "excite surge --vehicle finsrov --coast NUMBER --room NUMBER --out OUT/programmes",
+            "excite surge --vehicle finsrov --coast NUMBER --out OUT/programmes",
             "excite surge --vehicle finsrov --kind multisine --duration NUMBER --out OUT/programmes",
             "train t1 --steps 1024 --worlds 16 --set learning_rate=NUMBER --out OUT/policy",
             "train t1 --steps 1024 --worlds 16 --set discount=NUMBER --until NUMBER --out OUT/policy",
@@ -214,7 +214,7 @@ REFUSED = (
     "evaluate SEEDS/strong --trials 1",
     "evaluate SEEDS/endless --trials 1",
     "view SEEDS/run.mcap --no-browser --duration 0 --bind 10.255.255.1",
-    "excite surge --vehicle finsrov --simulate --rate 0 --out OUT/trials",
+    "excite surge --vehicle finsrov --simulate --repeats 0 --out OUT/trials",
 )
 """Commands that must be refused: a log in mm/s, a policy with limits of 1e9 N or a period without end, ..."""
 

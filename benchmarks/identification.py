@@ -168,9 +168,7 @@ def coverage(
     start = time.perf_counter()
     fits = []
     for trials in measured_again(recording, plan, vehicle, repetitions, **arguments):
-        fits.append(
-            regress(trials, guess) if method == "regression" else fit_by_simulation(trials, guess, seed=0)
-        )
+        fits.append(regress(trials, guess) if method == "regression" else fit_by_simulation(trials, guess))
     return {
         "method": method,
         "repetitions": repetitions,
@@ -185,7 +183,7 @@ def held_out(vehicle: Vehicle, axes: str, method: str) -> dict[str, Any]:
     fitted = simulate_programme(programmes(axes, vehicle), vehicle, seed=1)
     kept = simulate_programme(programmes(axes, vehicle, kind="validation"), vehicle, seed=2)
     guess = blind(vehicle)
-    fit = regress(fitted, guess) if method == "regression" else fit_by_simulation(fitted, guess, seed=0)
+    fit = regress(fitted, guess) if method == "regression" else fit_by_simulation(fitted, guess)
     report = replay(kept, guess.replace(fit.changes), hydrodynamics=("calibrated",), seed=0)
     return report.as_json()
 

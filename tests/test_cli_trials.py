@@ -86,8 +86,6 @@ def test_check_says_what_trials_can_tell(capsys, trials):
         (["excite", "surge", "--vehicle", "finsrov", "--kind", "chirp"], "unknown kind of programme 'chirp'"),
         (["excite", "surge", "--vehicle", "finsrov", "--levels", "ten"], "expected numbers such as 5,10"),
         (["excite", "surge", "--vehicle", "finsrov", "--levels", "5", "--levels", "yaw=1"], "one of the two"),
-        (["excite", "surge", "--vehicle", "finsrov", "--noise", "loud", "--simulate"], "loud"),
-        (["excite", "surge", "--vehicle", "finsrov", "--rate", "0", "--simulate"], "rate is 0 Hz"),
         (
             ["excite", "surge", "--vehicle", "finsrov", "--kind", "multisine", "--duration", "0"],
             "duration is 0 s",

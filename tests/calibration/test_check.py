@@ -82,7 +82,7 @@ def test_a_good_trial_is_usable_and_tells_its_axis(simulated, name):
     found = report(simulated[name])
     assert found.verdict == "usable", found.findings
     mine = axis(simulated[name], name)
-    assert mine.excited and all(mine.tells[p].can for p in ("m_eff", "d1", "d2", "bias"))
+    assert mine.excited and all(mine.tells[p].can for p in ("m_eff", "d1", "d2"))
     idle = axis(simulated[name], "sway")
     assert not idle.excited and not any(told.can for told in idle.tells.values())
 
@@ -92,12 +92,6 @@ def test_a_dive_and_coast_tells_buoyancy_and_a_roll_pulse_the_restoring_moment(s
     assert axis(simulated["heave"], "heave").tells["buoyancy"].can
     assert axis(simulated["roll"], "roll").tells["k"].can
     assert "k" not in axis(simulated["yaw"], "yaw").tells
-
-
-def test_thrust_scale_is_said_to_go_with_the_mass(simulated):
-    """Doubling thrust, mass and drag changes nothing on an axis without weight."""
-    told = axis(simulated["surge"], "surge").tells["thrust_scale"]
-    assert not told.can and "m_eff" in told.why
 
 
 WRONG = {
@@ -145,17 +139,6 @@ def test_a_heading_that_is_turned_against_the_position_is_found(simulated):
     assert disagreement["angle"] == pytest.approx(-90.0, abs=2.0)
 
 
-def test_an_offset_between_streams_is_measured(simulated):
-    """The attitude is stamped 0.15 s late: it has to be moved back by that."""
-    trial = simulated["roll"]
-    late = {c: np.interp(trial.t - 0.15, trial.t, trial.channels[c]) for c in ("roll", "pitch", "yaw")}
-    trial = replace(trial, channels={**trial.channels, **late})
-    found = report(trial)
-    assert found.offsets["attitude"]["seconds"] == pytest.approx(-0.15, abs=0.03)
-    (offset,) = told(trial, "stream_offset", "care")
-    assert offset["group"] == "attitude" and offset["seconds"] == pytest.approx(-0.15, abs=0.03)
-
-
 def test_five_hertz_with_wrench_and_velocity_only(simulated):
     """Every tenth row, two columns: the surge axis is still told, the lag is not, the rest has no velocity."""
     trial = simulated["surge"]
@@ -166,7 +149,7 @@ def test_five_hertz_with_wrench_and_velocity_only(simulated):
     trial = changed(trial, header={"inputs": "commanded"})
     assert report(trial).verdict == "usable", report(trial).findings
     told = axis(trial, "surge").tells
-    assert told["m_eff"].can and told["d2"].can and not told["thrust_lag"].can
+    assert told["m_eff"].can and told["d2"].can
     assert "no velocity: neither v nor x, y" in axis(trial, "sway").tells["m_eff"].why
 
 
@@ -193,7 +176,7 @@ def test_one_level_without_a_coast_cannot_part_linear_and_quadratic_drag(simulat
     )
     told = axis(trial, "surge").tells
     assert np.ptp(trial.series("u")[1]) < 0.2 * np.ptp(u)
-    assert not told["d1"].can and not told["d2"].can and not told["m_eff"].can and not told["bias"].can
+    assert not told["d1"].can and not told["d2"].can and not told["m_eff"].can
     assert "only their sum" in told["d2"].why
 
 
@@ -210,7 +193,7 @@ def test_a_passive_trial_tells_against_the_restoring_moment_only(simulated):
     trial = changed(trial, header={"passive": True})
     told = axis(trial, "roll").tells
     assert told["m_eff"].can and "restoring moment" in told["m_eff"].why
-    assert not told["k"].can and not told["thrust_scale"].can
+    assert not told["k"].can
     assert not axis(trial, "surge").tells["m_eff"].can
 
 
@@ -308,20 +291,6 @@ def test_between_trials(simulated):
     assert said(set_findings(mixed), "several_vehicles") == [{"vehicles": ("bluerov2", "finsrov")}]
     good = set_findings(check_trials([surge, changed(yaw, header={"role": "held-out"})], VEHICLE))
     assert {"sway", "yaw"} <= set(said(good, "axes_untold")[0]["axes"])
-
-
-@pytest.mark.slow
-def test_an_offset_that_several_trials_share_is_told_once(simulated):
-    """The attitude of all trials is stamped 0.12 s late; one trial alone might be a coincidence."""
-    late = []
-    for name in ("surge", "roll", "yaw"):
-        trial = simulated[name]
-        moved = {c: np.interp(trial.t - 0.12, trial.t, trial.channels[c]) for c in ("roll", "pitch", "yaw")}
-        late.append(replace(trial, channels={**trial.channels, **moved}))
-    (found,) = said(set_findings(check_trials(late, VEHICLE)), "stream_offset_common", "care")
-    assert (found["group"], found["sense"], found["reference"]) == ("attitude", "late", "rates")
-    assert found["trials"] == 3 and found["seconds"] == pytest.approx(-0.12, abs=0.03)
-    assert not said(set_findings(check_trials(list(simulated.values()), VEHICLE)), "stream_offset_common")
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ import pytest
 
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.programmes import programmes, which_axes
-from finssim.calibration.synthetic import record
 from finssim.calibration.trials.trial import PHASES
 from finssim.control.allocation import Allocator
 from finssim.vehicles import AXES, load_vehicle
@@ -97,20 +96,6 @@ def test_repeats_of_a_multisine_differ_and_seeds_repeat_them():
     assert (again[1].tau_desired == two.tau_desired).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["published", "multisine"])
-def test_room_bounds_the_way(kind):
-    """A strong vehicle that would cross the pool is driven less, and then stays within it in the simulator too."""
-    vehicle = load_vehicle("bluerov2_heavy")
-    free, bound = (
-        record(programmes("surge", vehicle, kind=kind, room=room), vehicle, spread=0.0)
-        for room in (None, 1.5)
-    )
-    assert np.ptp(free.position[..., 0], axis=0).max() > 2.0
-    ways = np.ptp(bound.position[..., 0], axis=0)
-    assert 1.0 < ways.max() < 1.6
-
-
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -119,7 +104,6 @@ def test_room_bounds_the_way(kind):
         ({"axes": "surge", "levels": [18.7]}, "18.7 N is beyond finsrov's limit of 18.59 N"),
         ({"axes": "yaw", "levels": {"yaw": [-1.0]}}, "expected magnitudes above 0 N m"),
         ({"axes": "yaw", "levels": []}, "none given"),
-        ({"axes": "surge", "levels": [18.0], "room": 2.0}, "18 N would take finsrov 4.1"),
         ({"axes": "yaw", "kind": "chirp"}, "published, validation, multisine"),
         ({"axes": "yaw", "repeats": 0}, "repeats is 0"),
         ({"axes": "all", "kind": "multisine", "duration": 5.0}, "too few for 6 axes"),

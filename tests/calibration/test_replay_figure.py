@@ -7,10 +7,8 @@ import pytest
 
 from finssim.calibration.replay import (
     Pair,
-    draw_ahead,
     draw_overlay,
     draw_response_envelopes,
-    error_ahead,
     find_phases,
     normalised,
 )
@@ -96,18 +94,6 @@ def test_a_passive_trial_has_no_panel_of_inputs():
     pair.tau[:] = 0.0
     figure = draw_overlay(pair)
     assert [a.get_ylabel() for a in figure.axes] == ["$u$ [m/s]"] and "passive" in figure.get_suptitle()
-
-
-def test_the_error_ahead_is_drawn_for_every_model_beside_persistence():
-    ahead = np.arange(0, 101) / 50.0
-    measured = np.outer(ahead, np.ones(3))
-    found = {m: error_ahead(np.zeros(3), ahead, measured, g * measured, 2.0, [1.0, 2.0]) for m, g in MODELS}
-    figure = draw_ahead({"surge": found, "yaw": found})
-    assert [a.get_title(loc="left") for a in figure.axes if a.get_visible()] == ["surge", "yaw"]
-    drawn = lines(figure.axes[0])
-    np.testing.assert_allclose(drawn["Calibrated Fossen"], [0.1, 0.2])
-    np.testing.assert_allclose(drawn["Physics-mesh"], [0.25, 0.5])
-    np.testing.assert_allclose(drawn["persistence"], [0.5, 1.0])
 
 
 def test_no_line_joins_two_replays():

@@ -24,19 +24,17 @@ M = 12.11 + 15.0346985  # m + M_A of surge, finsrov.yaml
 D1 = 39.073593
 
 
-@pytest.mark.parametrize("sampling", ["held", "instant"])
 @pytest.mark.parametrize("rate", [50.0, 5.0])
-def test_momentum_between_rows_is_the_impulse_of_the_inputs(rate, sampling):
-    """m Δu = ∫ (tau - d1 u) dt from row to row: states at t_k, inputs over [t_k, t_k + dt)."""
-    trial = simulate_programme(SURGE, FINSROV, noise="none", spread=0.0, rate=rate, sampling=sampling)[0]
+def test_momentum_between_rows_is_the_impulse_of_the_inputs(rate):
+    """m Δu = ∫ (tau - d1 u) dt from row to row: states and inputs at t_k."""
+    trial = simulate_programme(SURGE, FINSROV, noise="none", spread=0.0, rate=rate)[0]
     u, tau, x = (trial.channels[c] for c in ("u", "tau_x", "x"))
     heading = trial.channels["qz"][0], trial.channels["qw"][0]
     assert heading == pytest.approx((0.0, 1.0), abs=1e-6)
-    push = (tau[:-1] if sampling == "held" else 0.5 * (tau[1:] + tau[:-1])) / rate
-    missing = M * np.diff(u) + D1 * np.diff(x) - push
-    # `held` is exact but for single precision; of instants the trapezoid errs by dt³ tau''/12 where motors start.
+    missing = M * np.diff(u) + D1 * np.diff(x) - 0.5 * (tau[1:] + tau[:-1]) / rate
+    # The trapezoid errs by dt³ tau''/12 where motors start.
     scale = 12.0 / rate
-    assert np.abs(missing).max() < (2e-3 if sampling == "held" else 0.12) * scale
+    assert np.abs(missing).max() < 0.12 * scale
     assert abs(missing.sum()) < 2e-3 * scale
 
 
@@ -58,10 +56,10 @@ def test_accelerometer_reads_the_acceleration_of_its_place_and_gravity():
 
 
 @pytest.mark.slow
-def test_equal_seeds_give_equal_trials_and_worlds_do_not_matter():
+def test_equal_seeds_give_equal_trials():
     """A trial is the same bit for bit when run again; other seeds give other motion and noise."""
     digest = [t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=4)]
-    assert digest == [t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=4, threads=1)]
+    assert digest == [t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=4)]
     assert not set(digest) & {t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=5)}
     assert len(set(digest)) == len(SURGE)
 

@@ -17,14 +17,12 @@ from finssim.calibration.findings import SEVERITIES, CalibrationError, Finding, 
 from finssim.calibration.motion import (
     AttitudeSignal,
     Motion,
-    Offset,
     attitude_samples,
     attitude_signal,
     holds_gravity,
     longest_step,
     motion,
     on_grid,
-    stream_offsets,
     up_in_body,
 )
 from finssim.calibration.trials.inputs import Drive, drive, implausible
@@ -37,9 +35,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 # What holds between the trials of a set: vehicles, roles, names, what all of them tell together.
-
-AGREE = 0.7
-"""Correlation of two streams below which their offset is not counted."""
 
 
 def identified_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> list[str]:
@@ -75,38 +70,9 @@ def set_findings(reports: Sequence[TrialReport]) -> list[Finding]:
     fitting = len(good) - len(held_out)
     if 0 < fitting < 5:
         findings.append(finding("few_trials", trials=fitting))
-    findings += _late(good)
     nothing = [a for a in AXES if not any(identified_by(reports, a, parameter) for parameter in PARAMETERS)]
     if nothing and len(nothing) < len(AXES):
         findings.append(finding("axes_untold", axes=tuple(map(str, nothing))))
-    return findings
-
-
-def _late(reports: Sequence[TrialReport]) -> list[Finding]:
-    """Streams that are late or early by the same time in three trials or more."""
-    findings = []
-    for group in dict.fromkeys(group for report in reports for group in report.offsets):
-        offsets = [report.offsets[group] for report in reports if group in report.offsets]
-        seconds = np.array([offset["seconds"] for offset in offsets if offset["correlation"] > AGREE])
-        if len(seconds) < 3:
-            continue
-        middle = float(np.median(seconds))
-        spread = 1.4826 * float(np.median(np.abs(seconds - middle)))
-        if (
-            abs(middle) > max(LATE, 3.0 * spread / np.sqrt(len(seconds)))
-            and np.mean(seconds * middle > 0.0) > 0.8
-        ):
-            findings.append(
-                finding(
-                    "stream_offset_common",
-                    group=group,
-                    offset=abs(middle),
-                    sense="early" if middle > 0.0 else "late",
-                    reference=offsets[0]["reference"],
-                    trials=len(seconds),
-                    seconds=middle,
-                )
-            )
     return findings
 
 
@@ -114,11 +80,8 @@ def _late(reports: Sequence[TrialReport]) -> list[Finding]:
 
 Verdict = Literal["usable", "usable with care", "refused"]
 
-PARAMETERS = ("m_eff", "d1", "d2", "bias", "k", "thrust_scale", "thrust_lag", "buoyancy")
+PARAMETERS = ("m_eff", "d1", "d2", "k", "buoyancy")
 """What a trial may tell of an axis; k of roll and pitch, buoyancy of heave."""
-
-THRUST = ("bias", "k", "thrust_scale", "thrust_lag", "buoyancy")
-"""Of these, what a passive trial does not tell because no thrust is known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,8 +153,6 @@ class TrialReport:
     """What drove it: rpm, force, tau, pwm, command, passive, or nothing."""
     streams: tuple[StreamReport, ...] = ()
     axes: tuple[AxisReport, ...] = ()
-    offsets: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Group of columns -> reference, seconds, std and correlation."""
     findings: tuple[Finding, ...] = ()
     sha256: str = ""
 
@@ -228,7 +189,11 @@ def print_reports(reports: Sequence[TrialReport], console: Console, common: Sequ
     for report in reports:
         _print_trial(report, console, brief=len(reports) > MANY)
     if len(reports) > 1:
-        _print_overview(reports, console)
+        table = _table(("axis", *PARAMETERS), ("axis",), "trials that tell")
+        for axis in AXES:
+            counts = [len(identified_by(reports, axis, parameter)) for parameter in PARAMETERS]
+            table.add_row(axis, *(str(count) if count else "[dim]-[/dim]" for count in counts))
+        console.print(table)
     for entry in common:
         console.print(f"{MARKS[entry.severity]} {escape(str(entry))}")
 
@@ -250,10 +215,21 @@ def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
     if brief:
         return
     if report.streams:
-        console.print(_streams(report.streams))
+        heads = ("columns", "samples", "rate", "jitter", "gaps", "longest", "missing")
+        table = _table(heads, ("columns",))
+        for s in report.streams:
+            rates = (
+                f"{s.rate:.3g} Hz",
+                f"{s.jitter:.0%}",
+                str(s.gaps),
+                f"{s.longest_gap:.2g} s",
+                f"{s.missing:.0%}",
+            )
+            table.add_row(escape(listed(s.columns, 4)), str(s.samples), *rates)
+        console.print(table)
     if report.axes:
         console.print(_axes(report.axes))
-        console.print(_identifiability_table(report.axes, report.inputs == "passive"), highlight=False)
+        console.print(_identifiability_table(report.axes), highlight=False)
     console.print()
 
 
@@ -263,29 +239,6 @@ def _table(heads: Sequence[str], left_aligned: Sequence[str], title: str | None 
     for name in heads:
         table.add_column(name, justify="left" if name in left_aligned else "right", overflow="fold")
     return table
-
-
-def _streams(streams: Sequence[StreamReport]) -> Table:
-    heads = ("columns", "samples", "rate", "jitter", "gaps", "longest", "missing")
-    table = _table(heads, ("columns",))
-    for s in streams:
-        times = (
-            f"{s.rate:.3g} Hz",
-            f"{s.jitter:.0%}",
-            str(s.gaps),
-            f"{s.longest_gap:.2g} s",
-            f"{s.missing:.0%}",
-        )
-        table.add_row(escape(_short(s.columns)), str(s.samples), *times)
-    return table
-
-
-def _short(columns: Sequence[str]) -> str:
-    """Names with what they begin with in common said once: `pwm_T1 T2 T3`."""
-    head = columns[0].split("_")[0] + "_"
-    if len(columns) > 2 and all(column.startswith(head) for column in columns):
-        return " ".join([columns[0], *(column.removeprefix(head) for column in columns[1:])])
-    return " ".join(columns)
 
 
 def _axes(axes: Sequence[AxisReport]) -> Table:
@@ -303,14 +256,12 @@ def _axes(axes: Sequence[AxisReport]) -> Table:
     return table
 
 
-def _identifiability_table(axes: Sequence[AxisReport], passive: bool) -> Table:
+def _identifiability_table(axes: Sequence[AxisReport]) -> Table:
     """What each axis tells, and why not the rest; reasons that several share are said once."""
     grid = Table.grid(padding=(0, 1))
     for a in axes:
-        # Of a passive trial it goes without saying that nothing is known of thrust.
-        displayed = {n: t for n, t in a.tells.items() if t.can or not (passive and n in THRUST)}
         by_reason: dict[tuple[bool, str], list[str]] = {}
-        for name, verdict in displayed.items():
+        for name, verdict in a.tells.items():
             by_reason.setdefault((verdict.can, verdict.why), []).append(name)
         if len(by_reason) == 1 and not next(iter(by_reason))[0]:
             grid.add_row("", a.axis, f"[red]nothing[/red]: {escape(next(iter(by_reason))[1])}")
@@ -323,15 +274,6 @@ def _identifiability_table(axes: Sequence[AxisReport], passive: bool) -> Table:
             ]
             grid.add_row("", a.axis, "; ".join(parts))
     return grid
-
-
-def _print_overview(reports: Sequence[TrialReport], console: Console) -> None:
-    """Trials that tell each parameter of each axis, together."""
-    table = _table(("axis", *PARAMETERS), ("axis",), "trials that tell")
-    for axis in AXES:
-        counts = [len(identified_by(reports, axis, parameter)) for parameter in PARAMETERS]
-        table.add_row(axis, *(str(count) if count else "[dim]-[/dim]" for count in counts))
-    console.print(table)
 
 
 # Sampling of a trial's columns: rates, gaps, jitter, values that stick, hold or clip.
@@ -570,9 +512,6 @@ SHORT = 0.5
 LEAST_INERTIA = 0.05
 """Part of the strongest wrench that went into a change of speed, for the effective mass to be seen."""
 
-SLOW = 8.0
-"""Rate below which a motor's lag lies between two samples [Hz]."""
-
 
 def with_identifiability(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> AxisReport:
     """The report with what the axis tells."""
@@ -583,7 +522,7 @@ def with_identifiability(report: AxisReport, motion: Motion, inputs: Drive, vehi
     verdicts = (
         _passive_identifiability(report)
         if inputs.source == "passive"
-        else _driven_identifiability(report, motion, inputs, vehicle)
+        else _driven_identifiability(report, motion, vehicle)
     )
     return replace(
         report, tells={name: Identifiability(can=verdicts[name][0], why=verdicts[name][1]) for name in names}
@@ -628,25 +567,19 @@ def _damping(report: AxisReport) -> dict[str, tuple[bool, str]]:
 
 def _passive_identifiability(report: AxisReport) -> dict[str, tuple[bool, str]]:
     """Parameter -> whether a trial without thrust tells it, and why."""
-    scale, nothing = "passive: sets the scale of the others", "passive: no thrust"
-    m_eff = {
-        "heave": (True, "passive: relative to the vehicle file's buoyancy excess"),
-        **dict.fromkeys(
-            ("roll", "pitch"), (True, "passive: relative to the vehicle file's restoring moment")
-        ),
-    }
+    force = {"heave": "buoyancy excess", "roll": "restoring moment", "pitch": "restoring moment"}.get(
+        report.axis
+    )
     unknown = (False, "passive, and no force along this axis is known: d1/m_eff and d2/m_eff alone")
     return {
-        "m_eff": m_eff.get(report.axis, unknown),
+        "m_eff": (True, f"passive: relative to the vehicle file's {force}") if force else unknown,
         **_damping(report),
-        "bias": (False, "passive: goes with the force that moves it"),
-        **dict.fromkeys(("k", "buoyancy"), (False, scale)),
-        **dict.fromkeys(("thrust_scale", "thrust_lag"), (False, nothing)),
+        **dict.fromkeys(("k", "buoyancy"), (False, "passive: sets the scale of the others")),
     }
 
 
 def _driven_identifiability(
-    report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle
+    report: AxisReport, motion: Motion, vehicle: Vehicle
 ) -> dict[str, tuple[bool, str]]:
     """Parameter -> whether a trial with inputs tells it, and why."""
     i, q = AXES.index(report.axis), motion.quaternion
@@ -655,11 +588,6 @@ def _driven_identifiability(
     fastest = float(np.nanmax(change)) if np.isfinite(change).any() else 0.0
     impulse = float(vehicle.rigid_body_mass_matrix()[i, i]) * fastest
     turns = impulse >= LEAST_INERTIA * report.strongest * SHORT and fastest >= 3.0 * report.noise
-    bias = "one direction and no rest: goes with d1"
-    if report.both_directions:
-        bias = "driven both ways"
-    elif report.rests >= 1.0:
-        bias = f"{report.rests:.1f} s of rest"
     valid = np.isfinite(q).all(axis=1)
     # Small angles about the mean.
     angle = 2.0 * float(np.std(q[valid, 0 if report.axis == "roll" else 1])) if valid.sum() >= 10 else 0.0
@@ -668,13 +596,6 @@ def _driven_identifiability(
         if valid.sum() >= 10
         else "no roll and pitch"
     )
-    weighed = report.axis in ("heave", "roll", "pitch")
-    rate = 1.0 / float(np.median(np.diff(inputs.t)))
-    lag = f"commands at {rate:.3g} Hz, by simulation"
-    if not inputs.commanded:
-        lag = "the inputs are what acted, after the lag"
-    elif rate < SLOW:
-        lag = f"inputs at {rate:.2g} Hz: a lag lies between two samples"
     floats = report.coasts >= 1.0 or report.rests >= 1.0 or report.both_directions
     buoyancy = "one direction and no coast: goes with d1; dive and coast"
     if floats:
@@ -686,15 +607,7 @@ def _driven_identifiability(
             "the speed changes" if turns else "speeds hardly change: steps, pulses or coasts are missing",
         ),
         **_damping(report),
-        "bias": (report.both_directions or report.rests >= 1.0, bias),
         "k": (angle >= LEAST_TILT, k if angle >= LEAST_TILT or valid.sum() < 10 else f"{k} only"),
-        "thrust_scale": (
-            weighed,
-            "against the weight and centres of the vehicle file, if those are right"
-            if weighed
-            else "goes with m_eff, d1, d2: doubling all of them changes nothing",
-        ),
-        "thrust_lag": (inputs.commanded and rate >= SLOW, lag),
         "buoyancy": (floats, buoyancy),
     }
 
@@ -741,17 +654,16 @@ def _degrees(name: str, value: float, unit: str) -> Finding:
     return finding("degrees", column=name, value=value, unit=unit)
 
 
-def frame_findings(trial: Trial, vehicle: Vehicle, offsets: dict[str, Offset]) -> list[Finding]:
+def frame_findings(trial: Trial, vehicle: Vehicle) -> list[Finding]:
     """Gravity against the attitude, rates against its changes, velocity against those of position and depth."""
     t = np.arange(trial.t[0], trial.t[-1], 1.0 / RATE)
     if len(t) < FEWEST:
         return []
-    by = offsets["attitude"].seconds if "attitude" in offsets else 0.0
-    attitude = attitude_signal(trial, t - by)
+    attitude = attitude_signal(trial, t)
     return [
         *_gravity(trial, vehicle.water.gravity, t, attitude),
         *_rates(trial, t, attitude),
-        *_heading(trial, by),
+        *_heading(trial),
         *_vertical(trial, t, attitude),
         *_horizontal(trial, t, attitude),
     ]
@@ -819,13 +731,13 @@ def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     return findings
 
 
-def _heading(trial: Trial, late: float) -> list[Finding]:
+def _heading(trial: Trial) -> list[Finding]:
     """The heading against the integrated gyro, psi_dot = (q sin(roll) + r cos(roll)) / cos(pitch)."""
     t, r = trial.series("r")
     at, q, named = attitude_samples(trial)
     if len(t) < FEWEST or "yaw" not in named or len(at) < FEWEST:
         return []
-    at, (roll, pitch, yaw) = at - late, quat_to_euler(q)
+    roll, pitch, yaw = quat_to_euler(q)
     inside = (t >= at[0]) & (t <= at[-1])
     if inside.sum() < FEWEST:
         return []
@@ -1006,10 +918,6 @@ def work_findings(reports: list[AxisReport], motion: Motion, named: tuple[str, .
     return findings
 
 
-LATE = 0.03
-"""Offset between streams that a fit must know of [s]."""
-
-
 def check(
     paths: Sequence[Path],
     *,
@@ -1088,15 +996,11 @@ def _report_of(trial: Trial, user_vehicle: Vehicle | None) -> TrialReport:
     if vehicle is None:
         return replace(report, findings=tuple(findings))
     inputs, axes = _motion_of(trial, vehicle, findings)
-    offsets = stream_offsets(trial, vehicle)
-    late = {group: o for group, o in offsets.items() if abs(o.seconds) > max(LATE, 3.0 * o.std)}
-    findings += [_offset(group, offset) for group, offset in late.items()]
-    findings += frame_findings(trial, vehicle, offsets)
+    findings += frame_findings(trial, vehicle)
     return replace(
         report,
         inputs=inputs,
         axes=tuple(axes),
-        offsets={group: offset._asdict() for group, offset in offsets.items()},
         findings=tuple(dict.fromkeys(findings)),
     )
 
@@ -1145,18 +1049,3 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
         if not axis.excited:
             findings.append(finding("axis_still", axis=str(named)))
     return inputs.source, axes
-
-
-def _offset(group: str, offset: Offset) -> Finding:
-    # Slow motion looks alike at several offsets: a single trial is believed if the streams agree very well.
-    sure = abs(offset.seconds) > 6.0 * offset.std and offset.correlation > 0.95
-    return finding(
-        "stream_offset",
-        severity="care" if sure else "note",
-        group=group,
-        offset=abs(offset.seconds),
-        sense="early" if offset.seconds > 0.0 else "late",
-        reference=offset.reference,
-        half=2.0 * offset.std,
-        seconds=offset.seconds,
-    )

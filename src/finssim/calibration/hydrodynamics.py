@@ -68,7 +68,6 @@ def fit_hydrodynamics(
     damping: str = "auto",
     known: Mapping[str, float] | None = None,
     horizon: float | None = None,
-    seed: int = 0,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit added mass, damping, buoyancy and stiffness.
@@ -82,11 +81,10 @@ def fit_hydrodynamics(
         vehicle: Gives the rigid body, the motors and what is not fitted.
         axes: Axes to fit; those that the trials excite if None.
         method: One of `METHODS`.
-        estimate: Further parameters, of `ESTIMATE` and of the vehicle's terms; simulation only.
+        estimate: Further parameters, of `EXTRAS` and of the vehicle's terms; simulation only.
         damping: `auto`, `linear`, `quadratic` or `both`.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²]; regression only.
         horizon: Longest stretch that is simulated without a restart [s]; simulation only.
-        seed: Of everything random.
         progress: Called with the part done and a few words.
 
     Raises:
@@ -106,14 +104,14 @@ def fit_hydrodynamics(
 
     def regression(body: Vehicle, **given: Any) -> Fit:
         settings = {"known": known} | given
-        return regress(trials, body, axes=axes, damping=damping, seed=seed, **settings)
+        return regress(trials, body, axes=axes, damping=damping, **settings)
 
     def simulation(body: Vehicle, begin: Fit | None = None) -> Fit:
         from finssim.calibration.simulation.fit import fit_by_simulation
 
         begin = begin or _or_none(lambda body: regression(body, known={}, file_prior=False), body)
         return fit_by_simulation(
-            trials, body, axes=axes, estimate=estimate, damping=damping, horizon=horizon, begin=begin, seed=seed,
+            trials, body, axes=axes, estimate=estimate, damping=damping, horizon=horizon, begin=begin,
             progress=progress,
         )  # fmt: skip
 
@@ -296,7 +294,6 @@ def calibrate_hydrodynamics(
     horizon: float | None = None,
     report: Path | None = None,
     ranges: Path | None = None,
-    seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
     """Fit added mass [kg, kg m²] and damping [N s/m, N s²/m², ...] to trials, axis by axis or by simulation.
@@ -310,15 +307,13 @@ def calibrate_hydrodynamics(
         axes (AXES): Axes to fit, of surge,sway,heave,roll,pitch,yaw; the excited ones if not given.
         method (METHOD): regression: each axis by its equation of motion; simulation: least simulation error; auto:
             regression if it replays the trials very well, otherwise simulation unless that replays them worse.
-        estimate (NAMES): Further parameters to fit, of
-            thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k or the parameters
-            of the vehicle's terms, such as lift.coefficient (simulation method).
+        estimate (NAMES): Further parameters to fit, of thrust_scale,thrust_lag,thrust_delay,buoyancy_excess,k or the
+            parameters of the vehicle's terms, such as lift.coefficient (simulation method).
         damping (KIND): Drag: linear, quadratic, both, or auto to choose.
         fix (AXIS.m=N): Known inertias, including added mass [kg, kg m²]: yaw.m=0.6,surge.m=24 (regression).
         horizon: Longest segment simulated without a restart [s] (simulation method).
         report (DIR): Directory for report.html, report.md, figures and fit.json.
         ranges (FILE): Ranges file to write from the 95 % intervals, for `finssim train --randomize`.
-        seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 
     Returns:
@@ -347,7 +342,6 @@ def calibrate_hydrodynamics(
             damping=damping,
             known=known,
             horizon=horizon,
-            seed=seed,
             progress=progress,
         )
     return finish("hydrodynamics", fit, options)

@@ -30,7 +30,7 @@ from finssim.vehicles import Vehicle
 
 __all__ = [
     "AttitudeSignal", "Motion", "Offset", "attitude_samples", "attitude_signal", "holds_gravity", "motion",
-    "offset", "on_grid", "phase_at", "stream_offsets", "up_in_body",
+    "offset", "on_grid", "phase_at", "up_in_body",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -274,14 +274,6 @@ def _derived(
 ACCELERATION = ("ax", "ay", "az")
 
 
-def accelerometer_place(trial: Trial, vehicle: Vehicle) -> Array:
-    """Body point of the accelerometer [m], (3,): the header's, the vehicle's IMU, or the origin."""
-    if trial.header.acceleration_at is not None:
-        return np.asarray(trial.header.acceleration_at, float)
-    imu = vehicle.sensors.imu
-    return np.zeros(3) if imu is None else np.asarray(imu.position, float)
-
-
 def holds_gravity(trial: Trial, gravity: float) -> bool:
     """Whether the accelerations are specific force, from the header or from their size.
 
@@ -393,7 +385,7 @@ def _valid(tau: Array, nu: Array) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(tau).all(axis=1) & known.any(axis=1) & known[:, counted].all(axis=1))
 
 
-# Constant time offsets between streams that see the same motion.
+# Constant time offset between two signals of the same motion.
 
 
 RATE = 100.0
@@ -418,69 +410,11 @@ class Offset(NamedTuple):
     reference: str
     """Group of columns that it was compared with."""
     seconds: float
-    """What to add to the stream's times so that both agree: a value for `time_offsets` of a map."""
+    """What to add to the stream's times so that both agree."""
     std: float
     """Standard deviation of `seconds` [s]."""
     correlation: float
     """Of the two streams once they agree, -1 to 1."""
-
-
-def stream_offsets(trial: Trial, vehicle: Vehicle) -> dict[str, Offset]:
-    """Offsets of streams whose motion another stream measures too.
-
-    They hold together, so that all of them may be given at once: a stream is compared with others as those are once
-    their own offsets are taken off. The chain is gyro, attitude, acceleration, velocity, position, depth. An
-    accelerometer sampled with the gyro is on its clock, and tells whether the velocity is late, as a DVL's is; any
-    other is compared with velocity and attitude.
-
-    Args:
-        trial: The trial.
-        vehicle: Gives gravity.
-
-    Returns:
-        Group of columns -> its offset to another group. Groups that nothing else sees, or whose motion is not above the
-        noise, are left out.
-    """
-    t = np.arange(trial.t[0], trial.t[-1], 1.0 / RATE)
-    if len(t) < 10:
-        return {}
-    omega, _ = on_grid(trial, ("p", "q", "r"), t, 2)
-    attitude = attitude_signal(trial, t)
-    found = {"attitude": offset("rates", omega, attitude.rates)}
-    if found["attitude"] is not None:  # the others are compared through the attitude as it should be
-        attitude = attitude_signal(trial, t - found["attitude"].seconds)
-    nu, nu_slope = on_grid(trial, ("u", "v", "w"), t, 2)
-    reference, predicted = _predicted(trial, vehicle, t, attitude.quaternion, nu, nu_slope, omega)
-    measured = on_grid(trial, ACCELERATION, t, 2)[0]
-    if not _sampled_together(trial):
-        found["acceleration"] = offset(reference, predicted, measured)
-    elif reference == "velocity":
-        weight = _gravity(trial, vehicle, attitude.quaternion)
-        found["velocity"] = offset("acceleration", measured - weight, predicted - weight)
-    nu = on_grid(trial, ("u", "v", "w"), t - _seconds(found.get("velocity")), 2)[0]
-    through_world = quat_rotate(attitude.turn, nu)
-    if not attitude.tilt:
-        through_world[:, 2] = np.nan
-    found["position"] = offset("velocity", through_world, on_grid(trial, ("x", "y", "z"), t, 3)[1])
-    if trial.has("z"):
-        vertical = on_grid(trial, ("z",), t - _seconds(found["position"]), 3)[1]
-    else:
-        vertical = through_world[:, 2:]
-    depth = on_grid(trial, ("depth",), t, 3)[1]
-    found["depth"] = offset("position" if trial.has("z") else "velocity", vertical, -depth)
-    return {group: offset for group, offset in found.items() if offset is not None}
-
-
-def _seconds(offset: Offset | None) -> float:
-    return 0.0 if offset is None else offset.seconds
-
-
-def _sampled_together(trial: Trial) -> bool:
-    """Whether accelerometer and gyro have the same times nearly everywhere: one instrument, one clock."""
-    if not trial.has("p", "q", "r", *ACCELERATION):
-        return False
-    rates, felt = np.isfinite(trial.channels["r"]), np.isfinite(trial.channels["ax"])
-    return bool(np.sum(rates & felt) >= 0.9 * np.sum(felt))
 
 
 def on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int = 2) -> tuple[Array, Array]:
@@ -492,32 +426,6 @@ def on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int = 2) ->
             s = smooth(at, y[:, None], t, order=order)
             value[:, i], slope[:, i] = s.value[:, 0], s.slope[:, 0]
     return value, slope
-
-
-def _predicted(
-    trial: Trial, vehicle: Vehicle, t: Array, quaternion: Array, v: Array, v_dot: Array, omega: Array
-) -> tuple[str, Array]:
-    """What the accelerometer should read by the other streams, and the group that tells most of it, (m, 3).
-
-    Velocity, rates and attitude have their right times here, and the accelerometer is compared as it is: gravity taken
-    off a late signal would leave what the tilt did meanwhile.
-    """
-    if np.isfinite(v).any(axis=0).all():
-        group = "velocity"
-        turning = np.nan_to_num(omega)
-        turning_dot = np.nan_to_num(on_grid(trial, ("p", "q", "r"), t, 2)[1])
-        r = accelerometer_place(trial, vehicle)
-        a = v_dot + np.cross(turning, v) + np.cross(turning_dot, r) + np.cross(turning, np.cross(turning, r))
-    else:
-        group, a = "attitude", np.zeros((len(t), 3))
-    return group, a + _gravity(trial, vehicle, quaternion)
-
-
-def _gravity(trial: Trial, vehicle: Vehicle, quaternion: Array) -> Array:
-    """What the accelerometer feels of gravity at an attitude, (m, 3); nothing if it was taken off before."""
-    if holds_gravity(trial, vehicle.water.gravity):
-        return np.asarray(vehicle.water.gravity * up_in_body(quaternion))
-    return np.zeros((len(quaternion), 3))
 
 
 def offset(reference: str, fixed: Array, moved: Array) -> Offset | None:

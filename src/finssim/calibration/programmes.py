@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,76 +14,20 @@ from numpy.typing import NDArray
 
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.trials.trial import TAU
-from finssim.calibration.trials.trial_files import write_trial
 from finssim.control.allocation import Allocator
 from finssim.control.pid import axis_model
-from finssim.files import atomic_directory, atomic_write
+from finssim.files import atomic_write
 from finssim.quiet import start_warp
 from finssim.text_table import write_csv
-from finssim.vehicles import AXES, Vehicle, load_vehicle
+from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.capability import level_speed
-from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.vehicle import Axis
 from finssim.yaml_file import yaml_text
 
-__all__ = ["Programme", "RATE", "programmes", "travel", "which_axes"]
+__all__ = ["Programme", "RATE", "programmes", "which_axes", "write_programme"]
 
 
 Array = NDArray[np.float64]
-
-# How far a programme takes a vehicle along one axis, by the damping of its file.
-
-
-def travel(force: Array, rate: float, axis: Axis, vehicle: Vehicle) -> float:
-    """Way from the nearest to the farthest point along one axis alone, from rest [m].
-
-    m v_dot = force - (d1 + d2 |v|) v, of the set `calibrated` or else the first; without damping where that is a mesh.
-
-    Args:
-        force: Along the axis, body frame, held over each row [N], (n,).
-        rate: Of the rows [Hz].
-        axis: surge, sway or heave.
-        vehicle: Whose mass and damping count.
-    """
-    i = AXES.index(axis)
-    name = "calibrated" if "calibrated" in vehicle.hydrodynamics else next(iter(vehicle.hydrodynamics))
-    chosen = vehicle.hydrodynamics[name]
-    m, h = float(vehicle.mass_matrix(name)[i, i]), 1.0 / rate
-    d1 = d2 = 0.0
-    if isinstance(chosen, HydrodynamicSet):
-        d1, d2 = float(chosen.linear_damping[i, i]), float(chosen.quadratic_damping[i, i])
-    v = x = near = far = 0.0
-    for f in force:
-        # Implicit in the damping, so that a light and draggy vehicle does not ring.
-        v = (v + h * f / m) / (1.0 + h * (d1 + d2 * abs(v)) / m)
-        x += h * v
-        near, far = min(near, x), max(far, x)
-    return float(far - near)
-
-
-def within(room: float, force: Array, rate: float, axis: Axis, vehicle: Vehicle) -> float:
-    """Factor up to 1 on a force that keeps the way along one axis within a room.
-
-    Args:
-        room: Longest way [m].
-        force: Along the axis, body frame, held over each row [N], (n,).
-        rate: Of the rows [Hz].
-        axis: surge, sway or heave.
-        vehicle: Whose mass and damping count.
-    """
-    return _largest(lambda factor: travel(factor * force, rate, axis, vehicle) <= room)
-
-
-def _largest(fits: Callable[[float], bool]) -> float:
-    """Largest factor up to 1 that fits, to 0.1 %; all below one that fits do."""
-    low, high = 0.0, 1.0
-    if fits(high):
-        return high
-    for _ in range(10):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low
-
 
 # Multi-sines: all axes at once, each with frequencies of its own, for fits of coupled dynamics.
 
@@ -99,7 +43,6 @@ def multisine(
     seed: int = 0,
     duration: float = 60.0,
     band: tuple[float, float] = (0.05, 1.0),
-    room: float | None = None,
 ) -> Programme:
     """One programme that drives several axes with interleaved harmonics of 1/duration.
 
@@ -116,7 +59,6 @@ def multisine(
         seed: Of the phases.
         duration: Of the excitation [s].
         band: Lowest and highest frequency [Hz].
-        room: Longest way along a linear axis, by the damping of the vehicle's file [m]; no bound if None.
 
     Raises:
         CalibrationError: The band is too narrow for so many axes in this time, or too fast for the commands.
@@ -140,8 +82,6 @@ def multisine(
     for i, (axis, peak) in enumerate(peaks.items()):
         shape = _lowest_peak(harmonics[i :: len(peaks)], t / duration, rng)
         tau[:, AXES.index(axis)] = peak * shape / np.abs(shape).max()
-        if room is not None and AXES.index(axis) < 3:
-            tau[:, AXES.index(axis)] *= within(room, tau[:, AXES.index(axis)], RATE, axis, vehicle)
     tau *= _feasible(tau, vehicle)
     parts = (("rest", 50), ("baseline", 50), ("excitation", len(t)), ("coast", 100), ("rest", 50))
     phase = np.concatenate([np.full(count, word) for word, count in parts])
@@ -165,12 +105,16 @@ def _feasible(tau: Array, vehicle: Vehicle) -> float:
     allocator = Allocator.from_vehicle(vehicle)
     weights = np.where(vehicle.wrench_limits > 0.0, 1.0 / np.maximum(vehicle.wrench_limits, 1e-9), 0.0)
 
-    def given(factor: float) -> bool:
+    low, high = 0.0, 1.0
+    factor = high
+    for _ in range(11):
         thrust = allocator.allocate(factor * tau)
         missing = np.abs(allocator.achieved(thrust) - factor * tau) * weights
-        return bool(missing.max() < 2e-3)
-
-    return _largest(given)
+        low, high = (factor, high) if missing.max() < 2e-3 else (low, factor)
+        if low == 1.0:
+            break
+        factor = 0.5 * (low + high)
+    return low
 
 
 KINDS = ("published", "validation", "multisine")
@@ -282,7 +226,6 @@ def programmes(
     coast: float = 30.0,
     duration: float = 60.0,
     band: tuple[float, float] = (0.05, 1.0),
-    room: float | None = None,
 ) -> list[Programme]:
     """Programmes that excite some axes of a vehicle, in the order in which to run them.
 
@@ -292,9 +235,7 @@ def programmes(
     FinsROV was validated. `multisine` drives all axes at once, for coupled fits; see `multisine`.
 
     Levels are FinsROV's, times the ratio of this vehicle's wrench limit to FinsROV's on that axis (two digits), and
-    never above the limit; steps on surge and sway of a vehicle that hovers stay below what tilts it. Where `room` is
-    given, the levels of a linear axis are brought down together until the strongest step, with its coast, stays within
-    it by the damping of the vehicle's file.
+    never above the limit; steps on surge and sway of a vehicle that hovers stay below what tilts it.
 
     Args:
         axes: As for `which_axes`.
@@ -306,7 +247,6 @@ def programmes(
         coast: Longest coast after a dive [s].
         duration: Of one multi-sine [s].
         band: Of a multi-sine [Hz].
-        room: Longest way along a linear axis [m]; no bound where not given.
 
     Raises:
         CalibrationError: An axis, level, kind or count that cannot be.
@@ -316,22 +256,17 @@ def programmes(
         raise CalibrationError(f"unknown kind of programme '{kind}'; available: {', '.join(KINDS)}")
     if repeats < 1:
         raise CalibrationError(f"repeats is {repeats}, expected at least 1")
-    if room is not None and not room > 0.0:
-        raise CalibrationError(f"room is {room:g} m, expected a length above 0 m")
     by_axis = {axis: _levels(axis, vehicle, levels, kind) for axis in chosen}
     if kind == "multisine":
         peaks = {axis: values[-1] for axis, values in by_axis.items()}
         return [
-            multisine(peaks, vehicle, index=r + 1, seed=seed + r, duration=duration, band=band, room=room)
+            multisine(peaks, vehicle, index=r + 1, seed=seed + r, duration=duration, band=band)
             for r in range(repeats)
         ]
     if not (math.isfinite(coast) and coast > 0.0):
         raise CalibrationError(f"coast is {coast} s, expected a time above 0 s")
     out = []
     for axis in chosen:
-        if room is not None and AXES.index(axis) < 3:
-            requested = levels.get(axis) if isinstance(levels, Mapping) else levels
-            by_axis[axis] = _in_room(room, by_axis[axis], requested is not None, axis, vehicle)
         for level in by_axis[axis]:
             for sign in (1.0, -1.0):
                 out += [_step(axis, sign * level, kind, coast, r, repeats) for r in range(repeats)]
@@ -378,24 +313,6 @@ def _levels(
     return tuple(sorted({float(x) for x in requested}))
 
 
-def _in_room(
-    room: float, levels: tuple[float, ...], requested: bool, axis: Axis, vehicle: Vehicle
-) -> tuple[float, ...]:
-    """Levels of a linear axis that stay within `room`; given ones are refused rather than changed."""
-    hold, after = (np.full(round(seconds * RATE), x) for seconds, x in ((9.0, levels[-1]), (3.0, 0.0)))
-    force = np.concatenate([hold, after])
-    if not requested:
-        factor = within(room, force, RATE, axis, vehicle)
-        return levels if factor == 1.0 else tuple(sorted({float(f"{factor * x:.2g}") for x in levels}))
-    way = travel(force, RATE, axis, vehicle)
-    if way > room:
-        raise CalibrationError(
-            f"levels of {axis}: {levels[-1]:g} N would take {vehicle.name} {way:.3g} m, the room is {room:g} m: "
-            "give less"
-        )
-    return levels
-
-
 def _two_digits(x: float) -> float:
     """x rounded to two significant digits, three where it starts with 1."""
     digits = 2 if f"{x:e}"[0] == "1" else 1
@@ -423,65 +340,6 @@ def _step(axis: Axis, level: float, kind: str, coast: float, repeat: int, repeat
         phase=phase,
         ascent_speed=0.01 if dive else None,
     )
-
-
-# `finssim excite`: excitation programmes written for a robot to run, or run in the simulator to make trials.
-
-
-def excite(
-    axes: str | Sequence[str],
-    *,
-    vehicle: Vehicle | str,
-    out: str | Path,
-    simulate: bool = False,
-    noise: str = "sensors",
-    seed: int = 0,
-    simulation: Mapping[str, Any] | None = None,
-    **plan: Any,
-) -> list[Path]:
-    """Write programmes, each into a folder of its own under `out`; or the trials that they make in the simulator.
-
-    Args:
-        axes: `all`, or names separated by commas.
-        vehicle: A `Vehicle`, a catalogue name or a file.
-        out: Folder to make.
-        simulate: Run them in the simulator and write trials, rather than what to run on a robot.
-        noise: Name of a noise profile, for simulated trials.
-        seed: Of a multi-sine's phases, and of a simulation's initial conditions and noise.
-        simulation: Further arguments of `simulate_programme`: rate, hydrodynamics, columns, inputs.
-        plan: Further arguments of `programmes`: kind, levels, repeats, coast, duration, band, room.
-
-    Returns:
-        The folders written.
-
-    Raises:
-        CalibrationError, VehicleError, OutputError: As they say.
-    """
-    start_warp()
-    chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
-    played = programmes(axes, chosen, seed=seed, **plan)
-    out = Path(out)
-    names = [out / programme.name for programme in played]
-    with atomic_directory(out, replaces="programmes.yaml") as folder:
-        if simulate:
-            from finssim.calibration.synthetic import simulate_programme
-
-            for trial in simulate_programme(played, chosen, noise=noise, seed=seed, **(simulation or {})):
-                write_trial(trial, folder / trial.name)
-        else:
-            for programme in played:
-                write_programme(programme, chosen, folder / programme.name)
-        about = {
-            "vehicle": {"name": chosen.name, "sha256": chosen.sha256},
-            "kind": plan.get("kind", "published"),
-            "simulated": simulate,
-            "seed": seed,
-            "programmes": [programme.name for programme in played],
-        }
-        if simulate:
-            about["noise"] = noise
-        (folder / "programmes.yaml").write_text(yaml_text(about), encoding="utf-8")
-    return names
 
 
 def write_programme(programme: Programme, vehicle: Vehicle, folder: Path) -> None:

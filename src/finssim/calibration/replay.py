@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Aggregate", "Ahead", "Pair", "RESAMPLES", "Replay", "Score", "UNITS", "aggregate", "error_ahead",
-    "excited_axes", "find_phases", "models_of", "nrmse", "onset", "phase_score", "replay", "response_span",
+    "excited_axes", "find_phases", "models_of", "nrmse", "onset", "replay", "response_span",
     "run_replay", "score", "span",
 ]  # fmt: skip
 
@@ -255,31 +255,20 @@ def response_span(pair: Pair, response: str) -> Score:
     return Score(width)
 
 
-def score(pair: Pair, model: str, response: str, *, raw: bool = False) -> Score:
-    """NRMSE of one response of one model over the excitation and the coast of a trial.
+def score(pair: Pair, model: str, response: str, phase: str | None = None) -> Score:
+    """NRMSE of one response of one model over the excitation and the coast of a trial, or over one phase.
+
+    The RMSE is of the phase, the span is that of the trial, so that phases can be compared.
 
     Args:
         pair: Trial and replays.
         model: Which replay.
         response: Of `RESPONSES`.
-        raw: Against the measurement as it is, with its noise, rather than smoothed.
+        phase: Of `PHASES`; excitation and coast if None.
     """
-    if raw and response not in pair.raw:
-        return Score(None, "not measured")
-    return _scored(pair, model, response, pair.scored(), pair.raw if raw else pair.measured)
-
-
-def phase_score(pair: Pair, model: str, response: str, phase: str) -> Score:
-    """NRMSE in one phase; the RMSE is of the phase, the span is that of the trial, so that phases can be compared."""
-    mask = pair.phase == phase
+    mask = pair.scored() if phase is None else pair.phase == phase
     if not mask.any():
         return Score(None, f"the trial has no {phase}")
-    return _scored(pair, model, response, mask, pair.measured)
-
-
-def _scored(
-    pair: Pair, model: str, response: str, mask: NDArray[np.bool_], measured: Mapping[str, Array]
-) -> Score:
     width = response_span(pair, response)
     if width.value is None:
         return width
@@ -287,7 +276,7 @@ def _scored(
         return Score(
             None, f"the simulation does not stay finite: it ends {pair.diverged[model]:.2f} s into the trial"
         )
-    return nrmse(measured[response], pair.simulated[model][response], width.value, mask)
+    return nrmse(pair.measured[response], pair.simulated[model][response], width.value, mask)
 
 
 class Aggregate(NamedTuple):
@@ -304,19 +293,17 @@ class Aggregate(NamedTuple):
 
 def aggregate(
     scores: Sequence[Mapping[Any, float | None]],
-    statistic: Callable[..., Array] = np.nanmedian,
     *,
     resamples: int = RESAMPLES,
     seed: int = SEED,
 ) -> Aggregate:
-    """Equal-weight mean over the axes of the median (or mean) over the trials of an axis.
+    """Equal-weight mean over the axes of the median over the trials of an axis.
 
     The bootstrap draws whole trials with replacement, among those that have the same axes, so that every axis keeps as
     many trials as it has. An axis with one trial has nothing to draw from: then there is no interval.
 
     Args:
         scores: For each trial, axis -> NRMSE or None.
-        statistic: `np.nanmedian` or `np.nanmean`.
         resamples: How many.
         seed: Of the draws.
     """
@@ -327,7 +314,7 @@ def aggregate(
         [[np.nan if row.get(a) is None else row[a] for a in axes] for row in scores], dtype=float
     )
     table = table[np.isfinite(table).any(axis=1)]
-    by_axis = statistic(table, axis=0)
+    by_axis = np.nanmedian(table, axis=0)
     value = float(by_axis.mean())
     named = {a: float(x) for a, x in zip(axes, by_axis, strict=True)}
     lonely = [a for a, n in zip(axes, np.isfinite(table).sum(axis=0), strict=True) if n < 2]
@@ -341,7 +328,7 @@ def aggregate(
     for k in range(len(patterns)):
         members = np.flatnonzero(stratum.reshape(-1) == k)
         rows[:, members] = random.choice(members, (resamples, len(members)))
-    replicates = statistic(table[rows], axis=1).mean(axis=1)
+    replicates = np.nanmedian(table[rows], axis=1).mean(axis=1)
     low, high = np.percentile(replicates, (2.5, 97.5))
     return Aggregate(value, (float(low), float(high)), named, len(table))
 
@@ -357,8 +344,6 @@ class Ahead(NamedTuple):
     """The same of the prediction that nothing changes, (H,)."""
     nrmse: Array
     """Root mean square of error / span, (H,)"""
-    nrmse_persistence: Array
-    """The same of persistence, (H,)."""
     count: NDArray[np.int64]
     """Predictions compared, (H,)."""
 
@@ -396,7 +381,7 @@ def error_ahead(
 
     rmse = rms(ours)
     scale = np.asarray(width, dtype=np.float64)
-    return Ahead(horizons, rmse, rms(theirs), rms(ours / scale), rms(theirs / scale), count)
+    return Ahead(horizons, rmse, rms(theirs), rms(ours / scale), count)
 
 
 # Drive models with the recorded inputs of trials, from their recorded initial states.
@@ -727,19 +712,12 @@ class Replay:
         """Whether there is no held-out trial: then all numbers rest on trials that the vehicle was fitted on."""
         return bool(self.pairs) and all(pair.in_sample for pair in self.pairs)
 
-    def aggregate(
-        self,
-        model: str,
-        *,
-        in_sample: bool | None = None,
-        statistic: Callable[..., Array] = np.nanmedian,
-    ) -> Aggregate:
-        """Equal-weight mean over the axes of the median (or mean) over trials, with its bootstrap interval.
+    def aggregate(self, model: str, *, in_sample: bool | None = None) -> Aggregate:
+        """Equal-weight mean over the axes of the median over trials, with its bootstrap interval.
 
         Args:
             model: One of `models`.
             in_sample: Of the in-sample or the held-out trials; the held-out ones where there are any if None.
-            statistic: `np.nanmedian` or `np.nanmean`, over the trials of an axis.
         """
         requested = self.in_sample if in_sample is None else in_sample
         chosen = [
@@ -751,7 +729,7 @@ class Replay:
                 None, None, {}, len(chosen), f"the simulation of {broken[0]} does not stay finite"
             )
         rows = [{axis: score.value for axis, score in scores.items()} for _, scores in chosen]
-        return aggregate(rows, statistic, seed=self.seed)
+        return aggregate(rows, seed=self.seed)
 
     def as_json(self) -> dict[str, Any]:
         """What `--json` prints."""
@@ -883,7 +861,7 @@ MODEL_LABELS = {"calibrated": "Calibrated Fossen", "mesh": "Physics-mesh", "simp
 COLORS = {"calibrated": "#0072B2", "mesh": "#009E73", "simplified": "#D55E00"}
 OTHERS = ("#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito's palette: tells models apart for the colour-blind too."""
-BLACK, GRAY = "#1a1a1a", "0.6"
+BLACK = "#1a1a1a"
 STYLES = {"calibrated": (0, ()), "mesh": (0, (6, 1.6)), "simplified": (0, (1.6, 1.2))}
 """Line styles, for a print without colours."""
 
@@ -997,36 +975,6 @@ def draw_overlay(pair: Pair) -> Figure:
         ", in-sample" if pair.in_sample else ""
     )
     figure.suptitle(label, fontsize=10, color="#a00000" if pair.in_sample else BLACK)
-    return figure
-
-
-def draw_ahead(ahead: Mapping[Axis, Mapping[str, Ahead]]) -> Figure:
-    """Error of predictions from measured states by how far they look ahead, a panel for each axis.
-
-    Relative to the span of the response; persistence, the prediction that nothing changes, is gray.
-
-    Args:
-        ahead: Axis -> model -> error.
-    """
-    columns = min(len(ahead), 3)
-    rows = -(-len(ahead) // columns)
-    figure, axes_of = _panels(len(ahead), rows, columns, (1.2 + 2.4 * columns, 2.0 * rows + 0.5))
-    for axes, (axis, by_model) in zip(axes_of.flat, ahead.items(), strict=False):
-        for model, a in by_model.items():
-            label, color = _label(model), _color(model, tuple(by_model))
-            style = {"color": color, "linestyle": _style(model), "linewidth": 1.4}
-            axes.plot(a.seconds, a.nrmse, marker="o", markersize=3, label=label, **style)
-        first = next(iter(by_model.values()))
-        axes.plot(first.seconds, first.nrmse_persistence, "s-", color=GRAY, ms=3, lw=1.2, label="persistence")
-        axes.set_title(axis, fontsize=9, loc="left")
-        axes.set_xlabel("seconds ahead")
-        axes.set_ylim(bottom=0.0)
-        axes.set_xlim(left=0.0)
-        _tidy(axes)
-    for row in axes_of:
-        row[0].set_ylabel("error / span")
-    handles, labels = axes_of.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8.5)
     return figure
 
 
@@ -1160,9 +1108,9 @@ def _tidy(axes: Any) -> None:
 
 DEFINITION = (
     "nrmse: RMSE / (P95 - P5 of the measured response), both over excitation and coast of a trial; phases use the "
-    "same span. Measured velocities and angles are smoothed as for a fit; nrmse_unsmoothed counts their noise too. "
-    "aggregate: median over the trials of an axis, then the mean of the axes; aggregate_mean: mean over the trials "
-    "instead. ci95: trial bootstrap. Held-out trials count where there are any; in_sample says that there are none."
+    "same span. Measured velocities and angles are smoothed as for a fit. aggregate: median over the trials of an "
+    "axis, then the mean of the axes. ci95: trial bootstrap. Held-out trials count where there are any; in_sample "
+    "says that there are none."
 )
 
 PHASES = ("excitation", "coast")
@@ -1194,7 +1142,6 @@ def replay_json(replay: Replay) -> dict[str, Any]:
 
 def _model(replay: Replay, model: str) -> dict[str, Any]:
     main = replay.aggregate(model)
-    mean = replay.aggregate(model, statistic=np.nanmean)
     axes = list(dict.fromkeys(axis for pair in replay.pairs for axis in pair.axes))
     rows = list(zip(replay.pairs, replay.scores[model], strict=True))
     return {
@@ -1202,8 +1149,6 @@ def _model(replay: Replay, model: str) -> dict[str, Any]:
         "nrmse_by_axis": {a: main.by_axis.get(a) for a in axes},
         "aggregate": main.value,
         "ci95": main.ci95,
-        "aggregate_mean": mean.value,
-        "ci95_mean": mean.ci95,
         "why": main.why,
         "held_out": _aggregate(replay.aggregate(model, in_sample=False)),
         "in_sample_only": _aggregate(replay.aggregate(model, in_sample=True)),
@@ -1242,14 +1187,10 @@ def _trial(replay: Replay, i: int, pair: Pair) -> dict[str, Any]:
         "models": {
             model: {
                 "nrmse": {a: s.value for a, s in replay.scores[model][i].items()},
-                "nrmse_unsmoothed": {
-                    a: score(pair, model, pair.response(a), raw=True).value for a in pair.axes
-                },
                 "late_s": pair.late.get(model, 0.0),
                 "why": {a: s.why for a, s in replay.scores[model][i].items() if s.why},
                 "phases": {
-                    a: {p: phase_score(pair, model, pair.response(a), p).value for p in PHASES}
-                    for a in pair.axes
+                    a: {p: score(pair, model, pair.response(a), p).value for p in PHASES} for a in pair.axes
                 },
                 "other_responses": {
                     r: value for r in others if (value := score(pair, model, r).value) is not None
@@ -1268,30 +1209,39 @@ Rows = list[list[str]]
 def print_replay(replay: Replay, console: Console) -> None:
     """Print NRMSE by axis and model, the trials, and what could not be scored."""
     console.print(_headline(replay), highlight=False, markup=False)
-    _print_table(console, *_axis_table(replay))
-    if replay.ahead:
-        console.print(
-            "error ahead, relative to the span; in brackets the skill against persistence", highlight=False
-        )
-        _print_table(console, *_ahead_table(replay))
-    console.print(f"NRMSE of {_label(replay.models[0])} by trial", highlight=False, markup=False)
-    _print_table(console, *_trial_table(replay))
+    for title, heads, rows in _tables(replay):
+        if title:
+            console.print(title, highlight=False, markup=False)
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+        for k, head in enumerate(heads):
+            table.add_column(Text(head), justify="left" if k == 0 else "right", no_wrap=k == 0)
+        for row in rows:
+            table.add_row(*map(Text, row), style="bold" if row[0].startswith("aggregate") else None)
+        console.print(table)
     for sentence in _remarks(replay):
         console.print(sentence, highlight=False, markup=False)
 
 
 def replay_markdown(replay: Replay) -> str:
     """`replay.md`."""
-    parts = [f"# Replay of {replay.vehicle.name}", _headline(replay), _markdown(*_axis_table(replay))]
+    parts = [f"# Replay of {replay.vehicle.name}", _headline(replay)]
+    for title, heads, rows in _tables(replay):
+        lines = [heads, ["---"] + ["--:"] * (len(heads) - 1), *rows]
+        parts += [f"## {title}" if title else "", "\n".join("| " + " | ".join(line) + " |" for line in lines)]
     if any(p.axes for p in replay.pairs):
         parts.append("![Response envelopes](envelope.png)")
-    if replay.ahead:
-        parts += ["## Error ahead", "Relative to the span; in brackets the skill against persistence."]
-        parts += [_markdown(*_ahead_table(replay)), "![Error ahead](ahead.png)"]
-    parts += [f"## Trials with {_label(replay.models[0])}", _markdown(*_trial_table(replay))]
     parts += ["\n".join(f"- {sentence}" for sentence in _remarks(replay)), DEFINITION]
     parts.append(f"Vehicle {replay.vehicle.sha256}.")
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _tables(replay: Replay) -> list[tuple[str, list[str], Rows]]:
+    """Title, heads and rows of each table."""
+    tables = [("", *_axis_table(replay))]
+    if replay.ahead:
+        title = "Error ahead, relative to the span; in brackets the skill against persistence"
+        tables.append((title, *_ahead_table(replay)))
+    return [*tables, (f"NRMSE of {_label(replay.models[0])} by trial", *_trial_table(replay))]
 
 
 def write_replay(replay: Replay, out: Path) -> None:
@@ -1308,8 +1258,6 @@ def write_replay(replay: Replay, out: Path) -> None:
             draw_response_envelopes(replay.pairs).savefig(folder / "envelope.png", dpi=200)
         except ValueError:
             pass  # nothing was measured on an excited axis; the tables say so
-        if replay.ahead:
-            draw_ahead(replay.ahead).savefig(folder / "ahead.png", dpi=200)
         (folder / "trials").mkdir()
         for pair in replay.pairs:
             name = "".join(c if c.isalnum() or c in "-_.+" else "_" for c in pair.name)
@@ -1350,10 +1298,10 @@ def _trial_table(replay: Replay) -> tuple[list[str], Rows]:
     model = replay.models[0]
     rows: Rows = []
     for pair, scores in zip(replay.pairs, replay.scores[model], strict=True):
-        for axis, score in scores.items():
-            phases = [_number(phase_score(pair, model, pair.response(axis), p).value) for p in PHASES]
+        for axis, total in scores.items():
+            phases = [_number(score(pair, model, pair.response(axis), p).value) for p in PHASES]
             kind = "in-sample" if pair.in_sample else "held-out"
-            rows.append([pair.name, axis, kind, _number(score.value), *phases])
+            rows.append([pair.name, axis, kind, _number(total.value), *phases])
     return ["trial", "axis", "", "NRMSE", "excitation", "coast"], rows
 
 
@@ -1404,17 +1352,3 @@ def _number(value: float | None) -> str:
 
 def _interval(a: Aggregate) -> str:
     return "–" if a.ci95 is None else f"[{a.ci95[0]:.3f}, {a.ci95[1]:.3f}]"
-
-
-def _print_table(console: Console, heads: Sequence[str], rows: Rows) -> None:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for k, head in enumerate(heads):
-        table.add_column(Text(head), justify="left" if k == 0 else "right", no_wrap=k == 0)
-    for row in rows:
-        table.add_row(*map(Text, row), style="bold" if row[0].startswith("aggregate") else None)
-    console.print(table)
-
-
-def _markdown(heads: Sequence[str], rows: Rows) -> str:
-    lines = [heads, ["---"] + ["--:"] * (len(heads) - 1), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

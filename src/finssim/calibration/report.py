@@ -98,59 +98,16 @@ BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
 PER_FIGURE = 6
 MAX_CURVES = 48
 """More are not drawn; the report says so."""
-WIDE = 1.0
-"""Half width of the axis of relative intervals."""
 
 
 def fit_pictures(fit: Fit) -> dict[str, tuple[str, bytes]]:
     """File name -> what the picture shows, and the PNG; equal fits give equal pictures."""
     pictures: dict[str, tuple[str, Figure]] = {}
-    estimates = draw_estimates(list(fit.estimates.values()))
-    if estimates is not None:
-        pictures["estimates.png"] = ("95 % intervals relative to the estimates", estimates)
     if fit.correlation is not None and len(fit.correlation.names) > 1:
         pictures["correlation.png"] = ("Correlation of the errors", draw_correlation(fit.correlation))
     for i, figure in enumerate(draw_curves(fit.curves), start=1):
         pictures[f"curves_{i}.png"] = ("Measured and fitted, and the residual", figure)
     return {name: (text, png(figure)) for name, (text, figure) in pictures.items()}
-
-
-def draw_estimates(estimates: Sequence[Estimate]) -> Figure | None:
-    """95 % intervals relative to their estimates, one row each; None where no interval is finite.
-
-    Biases, which should be nothing, have no place in it.
-    """
-    drawn = [
-        e
-        for e in estimates
-        if e.estimate != 0.0
-        and not e.name.endswith("bias")
-        and all(map(math.isfinite, (e.estimate, *e.ci95)))
-    ]
-    if not drawn:
-        return None
-    figure = new_figure(7.2, 0.9 + 0.27 * len(drawn))
-    axes = figure.subplots()
-    rows = np.arange(len(drawn))[::-1]
-    for row, estimate in zip(rows, drawn, strict=True):
-        low, high = sorted(x / estimate.estimate - 1.0 for x in estimate.ci95)
-        color = BLUE if estimate.identifiable else ORANGE
-        axes.plot(np.clip([low, high], -WIDE, WIDE), [row, row], color=color, linewidth=3, alpha=0.6)
-        axes.plot([0.0], [row], "o" if estimate.identifiable else "x", color=color, markersize=5)
-        for end, mark in ((low, "<"), (high, ">")):
-            if abs(end) > WIDE:
-                axes.plot([math.copysign(WIDE, end)], [row], mark, color=color, markersize=6)
-    axes.set_yticks(rows, [f"{e.name}  {e.estimate:.4g} {e.unit}" for e in drawn], fontsize=8)
-    axes.set_ylim(-0.8, len(drawn) - 0.2)
-    axes.axvline(0.0, color=GRAY, linewidth=0.8)
-    reach = max(abs(x / e.estimate - 1.0) for e in drawn for x in e.ci95)
-    axes.set_xlim(-1.05 * min(reach, WIDE), 1.05 * min(reach, WIDE))
-    axes.xaxis.set_major_formatter(lambda x, _: f"{100 * x:+.3g} %" if x else "0")
-    axes.set_xlabel("95 % interval relative to the estimate; crosses: not identified")
-    axes.grid(True, axis="x", color="0.9", linewidth=0.6)
-    axes.spines[["top", "right", "left"]].set_visible(False)
-    axes.tick_params(axis="y", length=0)
-    return figure
 
 
 def draw_correlation(correlation: Correlation) -> Figure:

@@ -5,8 +5,7 @@ Time stamps. Row k of a trial at `rate` has time t_k = k / rate and holds
 - the state at t_k: velocity of the body origin, attitude, position, angular rate, and what an accelerometer at the
   IMU's place reads at t_k (later by the sensor's latency where the vehicle's own sensors measure);
 - commands that are held over [t_k, t_k + 1/rate);
-- applied inputs (`rpm_*`, `force_*`, `tau_*`) as `sampling` says: `instant`, the value at t_k, as telemetry gives it
-  (motors lag, so they are continuous); or `held`, the mean over [t_k, t_k + 1/rate), the impulse of the row.
+- applied inputs (`rpm_*`, `force_*`, `tau_*`) at t_k, as telemetry gives them (motors lag, so they are continuous).
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from finssim.calibration.findings import CalibrationError
 from finssim.calibration.programmes import Programme
 from finssim.calibration.trials.trial import TAU, Header, Trial, TrialWater
 from finssim.control.allocation import Allocator
-from finssim.engine import Pool, Simulator, TetherLine, Water
+from finssim.engine import Simulator, TetherLine, Water
 from finssim.geometry.rotations import (
     quat_from_euler,
     quat_inverse_rotate,
@@ -75,11 +74,9 @@ def record(
     plant: Mapping[str, ArrayLike] | None = None,
     disturbance: ArrayLike = 0.0,
     water: Water | None = None,
-    pool: Pool | None = None,
     tether: TetherLine | None = None,
-    depth: float | None = None,
+    depth: float = 20.0,
     spread: float = 1.0,
-    threads: int | None = None,
     each_step: Callable[[Simulator], None] | None = None,
 ) -> Recording:
     """The motion that programmes cause, each in a world of one simulator, through motors and allocation.
@@ -92,12 +89,10 @@ def record(
         plant: Where the real plant differs from the file: field of `VehicleParameters` -> value, or one for each world.
         disturbance: Extra wrench about the body origin, body frame [N, N m], (6,) or (W, 6).
         water: Currents and waves; still water if None.
-        pool: Walls and floor; open water if None.
         tether: None if None.
-        depth: Of the body origin at the start [m]; 20 m in open water, the middle of a pool.
+        depth: Of the body origin at the start [m].
         spread: Scales the initial conditions, which are at rest and level at 0: at 1, standard deviations of 0.02 m/s,
-            0.02 rad/s, 0.01 rad of roll and pitch, and any heading (in a pool 0.05 rad).
-        threads: Of the simulator.
+            0.02 rad/s, 0.01 rad of roll and pitch, and any heading.
         each_step: Called before every step, for what the engine does not have: it may read the simulator's state and
             write `command.disturbance` or plant fields that nothing is derived from, such as `gain`.
 
@@ -117,15 +112,13 @@ def record(
         substeps=1,
         integrator="rk4",
         water=water,
-        pool=pool,
         tether=tether,
         seed=seed,
-        threads=threads,
         max_delay=_longest_delay(vehicle, plant),
     )
     _override(simulator, plant or {})
     simulator.command.disturbance.numpy()[:, 0] = np.asarray(disturbance)
-    _start(simulator, pool, depth, spread, seed)
+    _start(simulator, depth, spread, seed)
     command = np.repeat(_commands(programmes, vehicle), per_command, axis=0)
     n, k = len(command) + 1, len(vehicle.thrusters)
     shapes = {"position": 3, "quaternion": 4, "velocity": 6, "acceleration": 6, "actuator": k}
@@ -168,14 +161,12 @@ def _override(simulator: Simulator, plant: Mapping[str, ArrayLike]) -> None:
     simulator.refresh()
 
 
-def _start(simulator: Simulator, pool: Pool | None, depth: float | None, spread: float, seed: int) -> None:
+def _start(simulator: Simulator, depth: float, spread: float, seed: int) -> None:
     rng = np.random.default_rng([seed, 1])
     worlds = simulator.worlds
     tilt = 0.01 * spread * rng.standard_normal((2, worlds))
-    yaw = spread * (0.05 * rng.standard_normal(worlds) if pool else rng.uniform(-np.pi, np.pi, worlds))
+    yaw = spread * rng.uniform(-np.pi, np.pi, worlds)
     velocity = 0.02 * spread * rng.standard_normal((worlds, 6))
-    if depth is None:
-        depth = 0.5 * pool.depth if pool else 20.0
     simulator.place(
         position=(0.0, 0.0, -depth),
         quaternion=quat_from_euler(tilt[0], tilt[1], yaw)[:, None],
@@ -406,8 +397,8 @@ def simulate_programme(
         programmes: What to run.
         vehicle: The vehicle, whose file says what it believes of itself.
         seed: Of initial conditions and noise; equal seeds give equal trials.
-        options: Arguments of `trials_of` (noise, rate, columns, inputs, sampling) and of `record` (hydrodynamics,
-            plant, disturbance, water, pool, tether, depth, spread, threads).
+        options: Arguments of `trials_of` (noise, rate, columns, inputs) and of `record` (hydrodynamics,
+            plant, disturbance, water, tether, depth, spread).
 
     Raises:
         CalibrationError: An argument that cannot be.
@@ -419,7 +410,7 @@ def simulate_programme(
     return trials_of(recording, programmes, vehicle, seed=seed, **measured)
 
 
-MEASURED = {"noise", "rate", "columns", "inputs", "sampling"}
+MEASURED = {"noise", "rate", "columns", "inputs"}
 """Arguments of `simulate_programme` that say how the motion is measured."""
 
 
@@ -433,7 +424,6 @@ def trials_of(
     rate: float = 50.0,
     columns: Sequence[str] | None = None,
     inputs: Sequence[Input] = ("rpm", "wrench"),
-    sampling: Literal["instant", "held"] = "instant",
     current: tuple[float, float, float] | None = None,
 ) -> list[Trial]:
     """Trials that measure a recording.
@@ -449,7 +439,6 @@ def trials_of(
         rate: Of the rows [Hz].
         columns: Measured columns to log; `DEFAULT_COLUMNS` if None.
         inputs: Which inputs to log.
-        sampling: See the module.
         current: What the header says of the water's velocity, world frame [m/s].
 
     Raises:
@@ -468,7 +457,7 @@ def trials_of(
             raise CalibrationError(
                 f"synthetic trials have no column '{name}'; available: {', '.join(measured)}"
             )
-    logged = _inputs(recording, vehicle, inputs, every, sampling)
+    logged = _inputs(recording, vehicle, inputs, every)
     water = TrialWater(current=current) if current is not None else TrialWater()
     out = []
     for w, programme in enumerate(programmes):
@@ -487,7 +476,6 @@ def trials_of(
                     axis=programme.axes,
                     description=f"simulated: {programme.name}",
                     inputs="commanded" if set(inputs) <= {"command", "pwm"} else "applied",
-                    inputs_between="held" if sampling == "held" else None,
                     acceleration="specific_force",
                     water=water,
                 ),
@@ -504,21 +492,12 @@ def _profile(noise: NoiseProfile | str) -> NoiseProfile:
     return NOISE_PROFILES[noise]
 
 
-def _inputs(
-    recording: Recording, vehicle: Vehicle, inputs: Sequence[str], every: int, sampling: str
-) -> dict[str, Array]:
+def _inputs(recording: Recording, vehicle: Vehicle, inputs: Sequence[str], every: int) -> dict[str, Array]:
     """Input columns, (rows, W) each."""
     for name in inputs:
         if name not in get_args(Input):
             raise CalibrationError(f"unknown input '{name}'; available: {', '.join(get_args(Input))}")
-    thrust = recording.thrust.astype(float)
-    if sampling == "held":
-        # Thrust is linear between states, to second order in the step: the mean is the trapezoid's.
-        rows = (len(thrust) - 1) // every
-        middle = 0.5 * (thrust[1:] + thrust[:-1])[: rows * every]
-        thrust = middle.reshape(rows, every, *thrust.shape[1:]).mean(axis=1)
-    else:
-        thrust = thrust[::every]
+    thrust = recording.thrust[::every].astype(float)
     command = recording.command[::every].astype(float)
     out: dict[str, Array] = {}
     thrusters = list(enumerate(vehicle.thrusters.items()))

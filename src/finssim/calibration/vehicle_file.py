@@ -250,34 +250,20 @@ def _common(
 
     Values of one origin and source that differ in their notes share the section's, each with its note alone.
     """
-    notes: dict[tuple[Any, str], list[str]] = {}
-    counted: set[tuple[Key, Provenance]] = set()
-    for leaf, _ in leaves(node, path):
-        value = leaf[:-1] if leaf[-1].isdigit() else leaf
-        if leaf in origins and (value, origins[leaf]) not in counted:
-            counted.add((value, origins[leaf]))
-            notes.setdefault(origins[leaf][:2], []).append(origins[leaf].note)
-    if not notes:
+    values = dict.fromkeys(
+        (leaf[:-1] if leaf[-1].isdigit() else leaf, origins[leaf])
+        for leaf, _ in leaves(node, path)
+        if leaf in origins
+    )
+    counts = Counter(origin[:2] for _, origin in values)
+    if not counts:
         return inherited
-    best = max(notes, key=lambda pair: len(notes[pair]))
-    note = _shared(notes[best])
-    if inherited is not None:
-        same = notes.get(inherited[:2], [])
-        if inherited[:2] == best and same.count(note) <= same.count(inherited.note):
-            return inherited
-        if inherited[:2] != best and len(same) >= len(notes[best]):
-            return inherited
-    return Provenance(*best, note)
-
-
-def _shared(notes: list[str]) -> str:
-    """The note to state for values of one origin and source: the most frequent one, if several values have it.
-
-    A value without a note under one needs its origin and source again, so these count double.
-    """
-    note = max(notes, key=notes.count)
-    several = len(notes) == 1 or notes.count(note) > 1
-    return note if several and notes.count(note) > 2 * notes.count("") else ""
+    best = max(counts, key=lambda pair: (counts[pair], inherited is not None and pair == inherited[:2]))
+    notes = Counter(origin.note for _, origin in values if origin[:2] == best)
+    if inherited is not None and inherited[:2] == best and inherited.note in notes:
+        return inherited
+    # A value without a note under one would need its origin and source again.
+    return Provenance(*best, "" if "" in notes else notes.most_common(1)[0][0])
 
 
 def _marks(origin: Provenance | None, inherited: Provenance | None) -> dict[str, str]:

@@ -231,7 +231,7 @@ def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identific
     write_vehicle(rough_vehicle(truth), folder / start_file)
     folders = record({role: folder / TRIALS / role for role in ("fit", "held-out")}, str(folder / start_file))
     recorded = {role: load_trials(paths) for role, paths in folders.items()}
-    fit = regress(recorded["fit"], load_vehicle(folder / start_file), seed=seed)
+    fit = regress(recorded["fit"], load_vehicle(folder / start_file))
     identified = calibrated(fit)
     findings = tuple(all_findings(fit, identified))
     identified = _named(
@@ -245,7 +245,7 @@ def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identific
         fit,
         folder / "calibration",
         vehicle,
-        command=commands(folder, name, seed)[1],
+        command=commands(folder, name)[1],
         findings=findings,
         out=folder / vehicle_file,
     )
@@ -256,13 +256,13 @@ def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identific
     return Identification(vehicle, fit, scored, truth, findings, time.perf_counter() - began)
 
 
-def commands(folder: Path, name: str, seed: int) -> list[str]:
+def commands(folder: Path, name: str) -> list[str]:
     """Command lines that identify and replay from the trials again."""
     start, vehicle = (folder / file.format(name) for file in VEHICLE_FILES)
     trials = folder / TRIALS
     return [
         f"finssim trials check {trials / 'fit'} --vehicle {start}",
-        f"finssim calibrate hydrodynamics {trials / 'fit'} --vehicle {start} --out {vehicle} --seed {seed}",
+        f"finssim calibrate hydrodynamics {trials / 'fit'} --vehicle {start} --out {vehicle}",
         f"finssim replay {trials / 'held-out'} --vehicle {vehicle}",
     ]
 
@@ -621,7 +621,7 @@ class _Demonstration:
         learn = f"finssim train t1 --vehicle {identified} {options} --out policy"
         drive = f"finssim run --policy policy --vehicle {identified} --goal 1,0.3,-0.5,90"
         excite = f"finssim excite all --vehicle {rough} --coast {COAST:g} --out more-trials"
-        middle = [*commands(out, name, seed), learn]
+        middle = [*commands(out, name), learn]
         if self.robot is not None:
             robot = f"{self.robot.options} --arm"
             evaluated = f"finssim evaluate run.mcap --task t1 --vehicle {identified}"

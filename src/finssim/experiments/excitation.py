@@ -16,8 +16,8 @@ from rich.console import Console
 
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.importers.dispatch import print_folders, read_trials
-from finssim.calibration.programmes import Programme, programmes
-from finssim.calibration.programmes import excite as write_programmes
+from finssim.calibration.programmes import Programme, programmes, write_programme
+from finssim.calibration.synthetic import simulate_programme
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.control import ControlError
@@ -511,13 +511,9 @@ def excite(
     pool: Annotated[int | None, (0, None)] = None,
     severity: str | None = None,
     pool_vehicle: str | None = None,
-    hydrodynamics: str = "calibrated",
-    noise: str = "sensors",
     inputs: Annotated[Sequence[str], ","] = ("rpm", "wrench"),
-    rate: float = 50.0,
     coast: float = 30.0,
     duration: float = 60.0,
-    room: float | None = None,
     robot: OnRobot | None = None,
     seed: int = 0,
     as_json: bool = False,
@@ -539,13 +535,9 @@ def excite(
         pool (SEED): Seed of a virtual pool, in which the robot's software plays them, records, and writes trials.
         severity (NAME): Severity of that pool: nominal, realistic or hard; realistic if not given.
         pool_vehicle (NAME|FILE): Vehicle around which that pool's plant is drawn; the robot's if not given.
-        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        noise (NAME): Noise of simulated trials: sensors, published or none.
         inputs (NAMES): Inputs logged in simulated trials, of wrench,rpm,force,pwm,command.
-        rate: Rows of a simulated trial per second [Hz].
         coast: Longest coast after a dive [s].
         duration: Duration of a multi-sine [s].
-        room: Longest distance along a linear axis [m]: lowers the levels to fit a pool.
         robot: The robot that plays them, in place of a simulation.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
@@ -562,31 +554,33 @@ def excite(
     of_pool = severity is not None or pool_vehicle is not None
     if robot is not None and (simulate or pool is not None or of_pool):
         raise CalibrationError("--robot excludes --simulate, --pool and their options")
-    if pool is not None and (simulate or room is not None):
-        raise CalibrationError("--pool goes with neither --simulate nor --room: a pool has its own room")
+    if pool is not None and simulate:
+        raise CalibrationError("--pool excludes --simulate: give one of them")
     if pool is None and of_pool:
         raise CalibrationError("--severity and --pool-vehicle need a virtual pool: give --pool SEED")
     if robot is not None:
-        folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, room=room, **plan)
-    elif pool is not None:
-        body, pool_vehicle = load_vehicle(vehicle), pool_vehicle or vehicle
-        played, severity = programmes(axes, body, seed=seed, **plan), severity or "realistic"
-        with (
-            atomic_directory(out, replaces=PLAN_FILE) as folder,
-            progress_bar("playing programmes") as progress,
-        ):
+        folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, **plan)
+        print_folders(folders, as_json)
+        return folders
+    start_warp()
+    body, pool_vehicle, severity = load_vehicle(vehicle), pool_vehicle or vehicle, severity or "realistic"
+    played = programmes(axes, body, seed=seed, **plan)
+    with atomic_directory(out, replaces=PLAN_FILE) as folder:
+        if pool is not None:
             about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
             take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"pool": about}))
-            record_programmes(
-                {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=pool_vehicle, plant=pool, severity=severity,
-                seed=seed, progress=progress,
-            )  # fmt: skip
-        folders = [Path(out) / programme.name for programme in played]
-    else:
-        folders = write_programmes(
-            axes, vehicle=vehicle, out=out, simulate=simulate, noise=noise, seed=seed, room=room,
-            simulation={"rate": rate, "hydrodynamics": hydrodynamics, "inputs": inputs}, **plan,
-        )  # fmt: skip
+            with progress_bar("playing programmes") as progress:
+                record_programmes(
+                    {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=pool_vehicle, plant=pool,
+                    severity=severity, seed=seed, progress=progress,
+                )  # fmt: skip
+        else:
+            take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"simulated": simulate}))
+            for trial in simulate_programme(played, body, seed=seed, inputs=inputs) if simulate else ():
+                write_trial(trial, folder / trial.name)
+            for programme in () if simulate else played:
+                write_programme(programme, body, folder / programme.name)
+    folders = [Path(out) / programme.name for programme in played]
     print_folders(folders, as_json)
     return folders
 

@@ -71,9 +71,7 @@ class ReplayPlant:
     def trials(self, programmes: Sequence[Programme], vehicle: Vehicle, seed: int) -> list[Trial]:
         """Trials as sensors and telemetry log them: propeller speeds, velocity, IMU, attitude, position, depth."""
         recording = self.record(programmes, vehicle, seed)
-        logged = trials_of(
-            recording, programmes, vehicle, noise="sensors", seed=seed, inputs=("rpm",), sampling="instant"
-        )
+        logged = trials_of(recording, programmes, vehicle, noise="sensors", seed=seed, inputs=("rpm",))
         random = np.random.default_rng([seed, 2])
         trials = []
         for trial in logged:
@@ -275,7 +273,7 @@ def experiment_seed(
 ) -> SeedResult:
     """One seed of the experiment; arguments as for `replay_experiment`."""
     trials = plant.trials(programmes(axes, vehicle, kind="published", repeats=repeats), vehicle, seed)
-    fit = regress(trials[0::2], vehicle, axes=axes, seed=seed)
+    fit = regress(trials[0::2], vehicle, axes=axes)
     fitted = calibrated(fit)
     same = replay(trials[1::2], fitted, hydrodynamics=MODELS)
     sweeps = plant.trials(programmes(axes, vehicle, kind="validation"), vehicle, seed + 1_000_000)

@@ -137,7 +137,9 @@ def test_a_file_that_sinks_where_the_vehicle_rises_is_said():
     z = -3.0 + np.cumsum(w) * 0.05 + 0.01 * np.random.default_rng(1).normal(size=len(t))
     rise = Trial(name="rise", t=t, channels={"depth": -z}, header=Header(passive=True))
     sinks = VEHICLE.replace({"body.displaced_volume": 0.995 * VEHICLE.weight / 9810.0})
-    said = [one for one in passive([rise], sinks, axes=["heave"]).findings if one.code == "buoyancy_sign"]
+    said = [
+        one for one in passive([rise], sinks, axes=["heave"]).findings if one.code == "buoyancy_contradicted"
+    ]
     assert [one.subject for one in said] == ["heave"]
 
 

@@ -628,11 +628,10 @@ class _Result:
         excess = self.number(self.free, lambda r: m * r[1], positive=True)
         note, (low, high) = f"from the acceleration, {self.note}", excess.ends
         self.add("buoyancy_excess", excess, "N", note, "body.displaced_volume")
-        fields = {"file": self.file.excess, "low": low, "high": high}
-        if self.file.excess < 0.0 < low:
-            self.findings.append(finding("buoyancy_sign", "heave", **fields))
-        elif not low <= self.file.excess <= high:
-            self.findings.append(finding("buoyancy_contradicted", "heave", **fields))
+        if not low <= self.file.excess <= high:
+            self.findings.append(
+                finding("buoyancy_contradicted", "heave", file=self.file.excess, low=low, high=high)
+            )
 
     def damping(self, inertia: Of, numbers: dict[str, Number], known: float | None) -> None:
         """Drag over inertia, and the drag itself with what else rests on an assumption."""

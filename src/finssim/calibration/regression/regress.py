@@ -297,7 +297,6 @@ def regress(
     damping: str = "auto",
     known: Mapping[str, float] | None = None,
     file_prior: bool = True,
-    seed: int = 0,
 ) -> Fit:
     """Effective mass, damping, bias and, in roll and pitch, stiffness of every axis that the trials excite.
 
@@ -313,7 +312,6 @@ def regress(
         damping: `auto`, `linear`, `quadratic` or `both`.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
         file_prior: Whether the inertia and drag of the vehicle file count as a prior, within a factor of two or so.
-        seed: Kept with the fit; nothing here is random.
 
     Raises:
         CalibrationError: No trial can be used, one is held out, an axis or damping is unknown, or two share a
@@ -384,7 +382,6 @@ def regress(
             "damping": damping,
             "axes": [AXES[i] for i in chosen],
             **({"fix": {f"{axis}.m": m for axis, m in known.items()}} if known else {}),
-            "seed": seed,
         },
     )
 

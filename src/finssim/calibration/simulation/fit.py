@@ -58,14 +58,14 @@ from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
 from finssim.vehicles.terms import TERMS, unit_of
 
-__all__ = ["ESTIMATE", "fit_by_simulation"]
+__all__ = ["EXTRAS", "fit_by_simulation"]
 
 Array = NDArray[np.float64]
 
 
 # The fit of simulations to segments; finite differences are worlds.
 
-EXTRAS = ("thrust_scale", "thrust_lag", "thrust_delay", "current", "buoyancy_excess", "k")
+EXTRAS = ("thrust_scale", "thrust_lag", "thrust_delay", "buoyancy_excess", "k")
 """What can be estimated besides the axes' own numbers and the parameters of the vehicle's terms."""
 
 MARGIN = 0.95
@@ -102,8 +102,6 @@ class Plants:
     """Fields of `VehicleParameters`, (W, 1, ...)."""
     bias: Array
     """Constant wrench that acts, about the body origin, body frame [N, N m], (W, 1, 6)."""
-    current: Array | None
-    """World frame [m/s], to be added to the segments' own, (W, 1, 3)."""
     lag: Array | None
     """Time constant of the motors [s], (W,)."""
     delay: Array | None
@@ -213,16 +211,13 @@ class Parameters:
         tc = float(np.mean([t.time_constant for t in w.thrusters.values()]))
         late = float(np.mean([t.delay for t in w.thrusters.values()]))
         table = {
-            "k": [Coordinate("k", "N m/rad", max(float(k), 1e-3), 0.0, inf, max(float(k), 0.02 * B))],
-            "buoyancy_excess": [
-                Coordinate("buoyancy_excess", "N", B - weight, -0.9 * weight, 10.0 * weight, 0.02 * weight)
-            ],
-            "thrust_scale": [Coordinate("thrust_scale", "-", 1.0, 0.05, 20.0, 1.0)],
-            "thrust_lag": [Coordinate("thrust_lag", "s", max(tc, 0.02), SHORTEST_LAG, 5.0, 2.0)],
-            "thrust_delay": [Coordinate("thrust_delay", "s", late, 0.0, LONGEST_DELAY, 0.2)],
-            "current": [Coordinate(f"current.{a}", "m/s", 0.0, -5.0, 5.0, 0.2) for a in "xy"],
+            "thrust_scale": ("-", 1.0, 0.05, 20.0, 1.0),
+            "thrust_lag": ("s", max(tc, 0.02), SHORTEST_LAG, 5.0, 2.0),
+            "thrust_delay": ("s", late, 0.0, LONGEST_DELAY, 0.2),
+            "buoyancy_excess": ("N", B - weight, -0.9 * weight, 10.0 * weight, 0.02 * weight),
+            "k": ("N m/rad", max(float(k), 1e-3), 0.0, inf, max(float(k), 0.02 * B)),
         }
-        out += [c for extra in EXTRAS if extra in self.extras for c in table[extra]]
+        out += [Coordinate(name, *numbers) for name, numbers in table.items() if name in self.extras]
         out += [term_coordinate(self.set, w, path) for path in self.terms]
         out += [self._of_axis(axis, "bias", -inf) for axis in self.biases]
         for axis in self.imposed:
@@ -315,14 +310,9 @@ class Parameters:
         bias = np.zeros((W, 1, 6))
         for axis in self.biases:
             bias[:, 0, AXES.index(axis)] = -self.value(x, f"{axis}.bias")
-        current = None
-        if "current.x" in self._at:
-            current = np.zeros((W, 1, 3))
-            current[:, 0, 0], current[:, 0, 1] = self.value(x, "current.x"), self.value(x, "current.y")
         return Plants(
             fields=fields,
             bias=bias @ self.H,
-            current=current,
             lag=self.value(x, "thrust_lag"),
             delay=self.value(x, "thrust_delay"),
         )
@@ -538,13 +528,12 @@ class Residuals:
     def __len__(self) -> int:
         return len(self.value)
 
-    def predicted(self, response: Response, late: Array, current: Array | None = None) -> tuple[Array, Array]:
+    def predicted(self, response: Response, late: Array) -> tuple[Array, Array]:
         """What every candidate's sensors would have read at the samples' times, and its rate of change.
 
         Args:
             response: Of the candidates.
             late: By how much each sample lags what it shows [s], (N, C) or (N, 1).
-            current: World frame [m/s], in place of the segments' own, (C, S, 3).
 
         Returns:
             (N, C) each [unit of the channel, and the same per second]; NaN where a candidate diverged. Before a
@@ -555,7 +544,7 @@ class Residuals:
         value, rate = (np.empty((len(self), candidates)) for _ in range(2))
         for j, name in enumerate(self.names):
             which = np.flatnonzero(self.channel == j)
-            grid = channel(name, response, self.segments, current)
+            grid = channel(name, response, self.segments)
             for c in range(late.shape[1]):
                 those = slice(None) if late.shape[1] == 1 else slice(c, c + 1)
                 at = (self.time[which] - late[which, c]) / step
@@ -625,16 +614,13 @@ class Residuals:
         return out
 
 
-def channel(
-    name: str, response: Response, segments: Sequence[Segment], current: Array | None = None
-) -> NDArray[np.float32]:
+def channel(name: str, response: Response, segments: Sequence[Segment]) -> NDArray[np.float32]:
     """A measured column on the simulation's grid.
 
     Args:
         name: Of `CHANNELS`.
         response: Of every candidate over these segments.
         segments: Give the sensors' places.
-        current: World frame [m/s], in place of the segments' own, (C, S, 3).
 
     Returns:
         (n + 1, C, S)
@@ -649,7 +635,7 @@ def channel(
         out = nu[..., i] + (nu[..., 3 + j] * at[:, k] - nu[..., 3 + k] * at[:, j] if at.any() else 0.0)
         in_water = np.array([s.velocity_in_water for s in segments])
         if in_water.any():
-            flow = np.stack([s.current for s in segments])[None] if current is None else current
+            flow = np.stack([s.current for s in segments])
             body = quat_rotate(quat_conjugate(q), np.broadcast_to(flow, (*q.shape[1:3], 3)))[..., i]
             out = out - np.where(in_water, body, 0.0)
         return np.asarray(out, np.float32)
@@ -821,10 +807,9 @@ FLOOR = 1e-4
 
 
 class Shooting:
-    """Residuals of segments under parameters, trial biases and initial states.
+    """Residuals of segments under parameters and initial states.
 
     Attributes:
-        axes_of_trials: Axes with a constant wrench that differs from trial to trial.
         edges: First sample of each segment, and N, (S + 1,).
         low: Least theta, (P,).
         high: Largest theta, (P,).
@@ -840,7 +825,6 @@ class Shooting:
         parameters: Parameters,
         channels: Sequence[str],
         *,
-        trial_biases: Sequence[str] = (),
         lagged: NDArray[np.bool_] | None = None,
         few: bool = False,
     ) -> None:
@@ -850,7 +834,6 @@ class Shooting:
             segments: What to fit.
             parameters: What is free.
             channels: Measured columns to compare.
-            trial_biases: Axes whose constant wrench is free in every trial.
             lagged: Which segments' inputs an estimated lag or delay acts on, (S,); the commanded ones if None.
             few: Whether some axis is excited by too few trials to show how trials differ.
         """
@@ -861,7 +844,6 @@ class Shooting:
             parameters.vehicle,
             segments,
             max_delay=LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5,
-            moving_water="current.x" in parameters.names,
         )
         self.edges = self.measured.edges
         self.groups = np.array([s.index for s in segments])
@@ -869,21 +851,17 @@ class Shooting:
         self.judged = len(parameters.names) - parameters.nuisances
         self.errors = SensorErrors(self.measured)
         far = np.full(len(self.errors.streams), LATEST)
-        self.axes_of_trials = tuple(a for a in AXES if a in trial_biases)
-        self._bias_rows = np.array([AXES.index(a) for a in self.axes_of_trials], int)
-        free = np.full((int(self.groups.max()) + 1) * len(self._bias_rows), np.inf)
-        self.low = np.concatenate([parameters.low, -far, -free])
-        self.high = np.concatenate([parameters.high, far, free])
+        self.low = np.concatenate([parameters.low, -far])
+        self.high = np.concatenate([parameters.high, far])
         # Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a
         # solution, over short segments, nothing else keeps them from infinity. Streams tell the same time to hundredths
         # of a second.
-        none = np.zeros(len(free))
-        self.prior_mean = np.concatenate([parameters.expected, 0.0 * far, none])
+        self.prior_mean = np.concatenate([parameters.expected, 0.0 * far])
         imposed = np.arange(len(parameters.low)) >= self.judged
         wide = [VAGUE * (name != "thrust_scale") for name in parameters.names]
         size = np.where(imposed, 1.0, np.array(wide, float)) * parameters.scale
         known = np.where(size > 0.0, np.maximum(size, 1e-150) ** -2.0, 0.0)
-        self.prior_precision = np.concatenate([known, 0.0 * far + LATE_STD**-2.0, none])
+        self.prior_precision = np.concatenate([known, 0.0 * far + LATE_STD**-2.0])
         if "thrust_delay" in parameters.names:
             # A common lag of all streams is a delay of the thrust: the first stream is the clock then.
             self.prior_precision[len(parameters.names)] = EXACT_CLOCK**-2.0
@@ -895,16 +873,8 @@ class Shooting:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of theta: the parameters, the lags of the streams [s], then the biases of trial after trial [N, N m]."""
-        late = tuple(f"{stream}.late" for stream in self.errors.streams)
-        trials = range(int(self.groups.max()) + 1)
-        biases = tuple(f"{axis}.bias of trial {g}" for g in trials for axis in self.axes_of_trials)
-        return self.parameters.names + late + biases
-
-    @property
-    def shared(self) -> int:
-        """How many of theta are parameters or lags of streams."""
-        return len(self.parameters.names) + len(self.errors.streams)
+        """Of theta: the parameters, then the lags of the streams [s]."""
+        return self.parameters.names + tuple(f"{stream}.late" for stream in self.errors.streams)
 
     def start(self) -> Point:
         """The vehicle file's numbers, the measured initial states, no errors of sensors."""
@@ -935,22 +905,13 @@ class Shooting:
                 tail = (1,) * (own[name].ndim - 1)
                 mask = self.lagged.reshape(-1, *tail)
                 fields[name] = np.where(mask, values.reshape(-1, 1, *tail), own[name])
-        extra = np.zeros((C, len(self.segments), 6))
-        if len(self._bias_rows):
-            biases = points.theta[:, self.shared :].reshape(C, -1, len(self._bias_rows))
-            extra[..., self._bias_rows] = biases[:, self.groups]
-        current = None
-        if p.current is not None:
-            current = p.current + np.stack([s.current for s in self.segments])
         response = self.rollouts.run(
             fields,
             initial=self.states.initial(points.z[..., : len(self.states.free)]),
-            disturbance=p.bias + extra @ self.parameters.H,
-            current=current,
+            disturbance=p.bias,
             candidates=C,
         )
-        late = self.errors.late(points.theta[:, P : self.shared])
-        return self.measured.predicted(response, late, current)
+        return self.measured.predicted(response, self.errors.late(points.theta[:, P:]))
 
     def linearise(self, point: Point) -> Linear:
         """Residuals and derivatives: central differences for what moves the vehicle, exact for what sensors add."""
@@ -963,37 +924,29 @@ class Shooting:
                 rise[which] = wrap_angle(rise[which])
         slopes = np.nan_to_num(rise / wide)
         late, offset = self.errors.slopes(np.nan_to_num(rate[:, 0]))
-        P, b = len(self.parameters.names), len(self._bias_rows)
-        # A bias moves its own trial alone: all of an axis were moved at once.
-        trial = self.groups[self.measured.segment]
-        own = trial[:, None] == np.arange(int(self.groups.max()) + 1)
-        biases = (own[:, :, None] * slopes[:, None, P : P + b]).reshape(len(slopes), -1)
+        P = len(self.parameters.names)
         one = Point(*(part[:1] for part in points))
         return Linear(
             self._residual(one, value[:, :1])[:, 0],
-            np.concatenate([slopes[:, :P], late, biases], axis=1),
-            np.concatenate([slopes[:, P + b :], offset], axis=1),
+            np.concatenate([slopes[:, :P], late], axis=1),
+            np.concatenate([slopes[:, P:], offset], axis=1),
         )
 
     def _neighbours(self, point: Point) -> tuple[Point, Array]:
         """The point, one on either side of it for every unknown that moves the vehicle, and their distances."""
-        P, b, q = len(self.parameters.names), len(self._bias_rows), len(self.states.free)
-        count = P + b + q
+        P = len(self.parameters.names)
+        count = P + len(self.states.free)
         theta, z = (np.repeat(part[None], 1 + 2 * count, axis=0) for part in point)
         up, down = 1 + 2 * np.arange(count), 2 + 2 * np.arange(count)
         i = np.arange(P)
         step = RELATIVE_STEP * np.maximum(np.abs(point.theta[:P]), 0.25 * self.parameters.scale)
         theta[up[:P], i] = np.minimum(point.theta[:P] + step, self.high[:P])
         theta[down[:P], i] = np.maximum(point.theta[:P] - step, self.low[:P])
-        wide = [theta[up[:P], i] - theta[down[:P], i]]
-        push = RELATIVE_STEP * np.diag(self.parameters.M_RB)[self._bias_rows]
-        for k in range(b):
-            theta[up[P + k], self.shared + k :: b] += push[k]
-            theta[down[P + k], self.shared + k :: b] -= push[k]
+        wide = theta[up[:P], i] - theta[down[:P], i]
         for k, step_k in enumerate(self.states.steps):
-            z[up[P + b + k], :, k] += step_k
-            z[down[P + b + k], :, k] -= step_k
-        return Point(theta, z), np.concatenate([*wide, 2.0 * push, 2.0 * self.states.steps])
+            z[up[P + k], :, k] += step_k
+            z[down[P + k], :, k] -= step_k
+        return Point(theta, z), np.concatenate([wide, 2.0 * self.states.steps])
 
     def growth(self, point: Point) -> Array:
         """Largest factor by which a small change of the initial velocity grows within each segment, (S,)."""
@@ -1012,7 +965,7 @@ class Shooting:
 
     def hold_clocks(self, hold: bool) -> None:
         """Keep the lags of all streams at zero, or let them go: far from a solution they imitate inertia."""
-        late, far = slice(len(self.parameters.names), self.shared), 0.0 if hold else LATEST
+        late, far = slice(len(self.parameters.names), None), 0.0 if hold else LATEST
         self.low[late], self.high[late] = -far, far
 
     def size(self) -> Array:
@@ -1046,10 +999,10 @@ class Confidence(NamedTuple):
 
 
 def confidence(problem: Shooting, solution: Solution) -> Confidence:
-    """Evidence of theta, after initial states, offsets and trial biases are eliminated, and what follows from it."""
-    evidence, P = evidence_of(problem, solution), problem.shared
+    """Evidence of theta, after initial states and offsets are eliminated, and what follows from it."""
+    evidence = evidence_of(problem, solution)
     covariance = trial_covariance(evidence)
-    theta, low, high = (part[:P] for part in (solution.point.theta, problem.low, problem.high))
+    theta, low, high = solution.point.theta, problem.low, problem.high
     free = theta
     if ((theta <= low) | (theta >= high)).any():
         normal, score = evidence.normal.sum(axis=0), evidence.score.sum(axis=0)
@@ -1065,37 +1018,30 @@ def confidence(problem: Shooting, solution: Solution) -> Confidence:
 
 def evidence_of(problem: Shooting, solution: Solution) -> Evidence:
     """Normal matrices and scores by trial, or by blocks of rows where fewer than `FEWEST_TRIALS` excite an axis."""
-    linear, P = solution.linear, problem.shared
+    linear = solution.linear
     weight = weights_of(linear.residual, solution.std)
-    # Derivatives without what each segment's own unknowns, and then the biases of trials, take up of every sample.
+    # Derivatives without what each segment's own unknowns take up of every sample.
     slopes = linear.shared.copy()
     for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
-        prior = np.diag(problem.prior_std[s] ** -2.0)
-        slopes[a:b] = _without(slopes[a:b], linear.own[a:b], weight[a:b], prior)
-    biases = slopes[:, P:]
-    slopes = _without(slopes[:, :P], biases, weight, 1e-12 * np.eye(biases.shape[1]))
+        own, weighted = linear.own[a:b], linear.own[a:b].T * weight[a:b]
+        normal = weighted @ own + np.diag(problem.prior_std[s] ** -2.0)
+        slopes[a:b] -= own @ np.linalg.solve(normal, weighted @ slopes[a:b])
     trial = problem.groups[problem.measured.segment]
     unit, group = "trials", trial
     if problem.few or len(np.unique(trial)) < FEWEST_TRIALS:
         unit, group = "blocks", _blocks(problem, trial)
     parts = [np.flatnonzero(group == label) for label in np.unique(group)]
     # What is known beforehand is one more witness.
-    known = problem.prior_precision[:P]
-    pull = known * (problem.prior_mean - solution.point.theta)[:P]
+    known = problem.prior_precision
+    pull = known * (problem.prior_mean - solution.point.theta)
     normal = [(slopes[rows].T * weight[rows]) @ slopes[rows] for rows in parts]
     score = [(slopes[rows].T * weight[rows]) @ linear.residual[rows] for rows in parts]
     return Evidence(
-        names=problem.names[:P],
+        names=problem.names,
         normal=np.array([*normal, np.diag(known)]),
         score=np.array([*score, pull]),
         unit=unit,
     )
-
-
-def _without(slopes: Array, own: Array, weight: Array, prior: Array) -> Array:
-    """Derivatives less the best combination of others of the same rows, (n, P)."""
-    weighted = own.T * weight
-    return np.asarray(slopes - own @ np.linalg.solve(weighted @ own + prior, weighted @ slopes))
 
 
 def _blocks(problem: Shooting, trial: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -1123,13 +1069,8 @@ PATHS = {
     "thrust_scale": None,
     "thrust_lag": "thrusters.*.time_constant",
     "thrust_delay": "thrusters.*.delay",
-    "current.x": None,
-    "current.y": None,
 }
 """Coordinates besides those of the axes that are reported, and where they stand in the vehicle file."""
-
-SIGNED = ("buoyancy_excess", "current.x", "current.y")
-"""Of these, those that may well be zero: determined wherever they have an interval."""
 
 
 def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> dict[str, Number]:
@@ -1199,7 +1140,9 @@ def other_estimates(
     for name, unit in units.items():
         value, (low, high), free = numbers[name]
         half, note = 0.5 * (high - low), ""
-        limit = LAG_CERTAIN if name == "thrust_delay" else np.inf if name in SIGNED else CERTAIN * abs(value)
+        # An excess may well be zero: it is determined wherever it has an interval.
+        limits = {"thrust_delay": LAG_CERTAIN, "buoyancy_excess": np.inf}
+        limit = limits.get(name, CERTAIN * abs(value))
         if free is not None:
             note = f"held at its bound; free, it would be {free:.3g} {unit}"
             bounds.append(finding("at_bound", name, free=free, unit=unit))
@@ -1436,7 +1379,7 @@ def fit_findings(
         out.append(finding("not_converged", iterations=solution.iterations))
     P = len(problem.parameters.names)
     for stream, late, (low, high) in zip(
-        problem.errors.streams, solution.point.theta[P : problem.shared], found.interval[P:], strict=True
+        problem.errors.streams, solution.point.theta[P:], found.interval[P:], strict=True
     ):
         if abs(late) > LATE and (low > 0.0 or high < 0.0):
             sense = "lags" if late > 0.0 else "leads"
@@ -1568,14 +1511,12 @@ class Stages:
         self.retained: tuple[str, ...] = ()
         self.used: list[Streams] = []
         self.segments: list[Segment] = []
-        self.extras = {word for word in estimate if word not in ("bias", "trial_bias")}
+        self.extras = set(estimate)
         if "heave" in axes:
             self.extras.add("buoyancy_excess")
         if {"roll", "pitch"} & set(axes):
             self.extras.add("k")
-        biased = [a for a in axes if a != "heave"]
-        self.trial_biases = biased if "trial_bias" in estimate else []
-        self.biases = [] if self.trial_biases else biased
+        self.biases = [a for a in axes if a != "heave"]
 
     def first(self, kinds: dict[str, str]) -> Stage:
         """Short segments from the better of the starts, then segments of the length that the answer calls for."""
@@ -1687,7 +1628,6 @@ class Stages:
             self.segments,
             parameters,
             sorted({c for s in self.segments for c in s.measured}),
-            trial_biases=self.trial_biases,
             lagged=self.lagged,
             few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
         )
@@ -1699,7 +1639,6 @@ class Stages:
         remarks: list[Finding],
         *,
         damping: str,
-        seed: int,
     ) -> Fit:
         """The finished fit; intervals hold those of the fuller model `first` from which this one was chosen."""
         p, x = stage.problem.parameters, stage.x
@@ -1733,12 +1672,11 @@ class Stages:
         settings: dict[str, Any] = {
             "axes": list(self.axes),
             "damping": damping,
-            "estimate": sorted(self.extras) + (["trial_bias"] if self.trial_biases else []),
+            "estimate": sorted(self.extras),
             "horizon": round(self.length, 3),
             "step": STEP,
             "segments": len(self.segments),
             "iterations": stage.solution.iterations,
-            "seed": seed,
         }
         self.say("done")
         return Fit(
@@ -1765,9 +1703,6 @@ def _matrices(p: Parameters, x: Array) -> dict[str, Any]:
 
 Progress = Callable[[float, str], None]
 
-ESTIMATE = (*EXTRAS, "bias", "trial_bias")
-"""Words for `estimate`; `trial_bias` gives every trial a bias of its own, as a tether does."""
-
 
 def fit_by_simulation(
     trials: Sequence[Trial],
@@ -1778,7 +1713,6 @@ def fit_by_simulation(
     damping: str = "auto",
     horizon: float | None = None,
     begin: Fit | None = None,
-    seed: int = 0,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit by simulation error over all trials at once.
@@ -1791,12 +1725,11 @@ def fit_by_simulation(
         trials: Of any inputs, rates and measured columns.
         vehicle: Gives the rigid body, the motors and everything that is not fitted.
         axes: Axes to fit; those that the trials excite if None.
-        estimate: Words of `ESTIMATE`, and parameters of the vehicle's terms, such as `lift.coefficient`. Buoyancy comes
+        estimate: Of `EXTRAS`, and parameters of the vehicle's terms, such as `lift.coefficient`. Buoyancy comes
             with heave, stiffness with roll and pitch, a bias with the others.
         damping: `auto`, `linear`, `quadratic` or `both`.
         horizon: Length of the segments [s]; from the data if None.
         begin: Of another method: it begins with its numbers where these simulate the trials better than the file's.
-        seed: Recorded; nothing here is random.
         progress: Called with the part done and a few words.
 
     Returns:
@@ -1821,7 +1754,7 @@ def fit_by_simulation(
             tops = {axis: speeds([t.motion for t in fit.used], axis)[1] for axis in chosen}
             fit.retained = _retained(chosen_kinds, first, stage.problem.parameters, tops)
             stage = fit.next(chosen_kinds, stage)
-    return fit.result(stage, first, remarks, damping=damping, seed=seed)
+    return fit.result(stage, first, remarks, damping=damping)
 
 
 def _check(
@@ -1836,7 +1769,7 @@ def _check(
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
     chosen = vehicle.hydrodynamics.get("calibrated")
-    known = [*ESTIMATE, *(chosen.term_scalars if isinstance(chosen, HydrodynamicSet) else ())]
+    known = [*EXTRAS, *(chosen.term_scalars if isinstance(chosen, HydrodynamicSet) else ())]
     for word in estimate:
         if word not in known:
             raise CalibrationError(

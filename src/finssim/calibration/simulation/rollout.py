@@ -122,7 +122,7 @@ def streams(trial: Trial, vehicle: Vehicle) -> Streams:
 
 
 def segments(
-    trial: Trial | Streams,
+    s: Streams,
     vehicle: Vehicle,
     *,
     length: float | None = None,
@@ -133,7 +133,7 @@ def segments(
     """Cut a trial into stretches of about equal length; a gap in the recording always ends one.
 
     Args:
-        trial: The trial, or what `streams` made of it.
+        s: The trial.
         vehicle: Whose it is.
         length: Of each [s]; the whole trial, up to its gaps, if None.
         step: Of the simulation [s].
@@ -148,11 +148,10 @@ def segments(
     """
     if not step > 0.0 or (length is not None and not length > 0.0):
         raise CalibrationError(
-            f"segments of {length} s in steps of {step} s, expected times above 0 s", _name(trial)
+            f"segments of {length} s in steps of {step} s, expected times above 0 s", s.trial.name
         )
-    s = trial if isinstance(trial, Streams) else streams(trial, vehicle)
-    out = []
-    for a, b in _stretches(s, start):
+    out, begin = list[Segment](), float(s.trial.t[0]) + start
+    for a, b in ((max(float(a), begin), float(b)) for a, b in s.drive.spans):
         steps = int(round((b - a) / step - 1e-6))
         parts = 1 if length is None else max(1, round(steps * step / length))
         edges = [steps * i // parts for i in range(parts + 1)]
@@ -162,17 +161,6 @@ def segments(
                 if segment.measured:
                     out.append(segment)
     return out
-
-
-def _name(trial: Trial | Streams) -> str:
-    return trial.name if isinstance(trial, Trial) else trial.trial.name
-
-
-def _stretches(s: Streams, start: float) -> list[tuple[float, float]]:
-    """Spans in which the inputs are known, inside the recording."""
-    begin = float(s.trial.t[0]) + start
-    spans = [(max(float(a), begin), float(b)) for a, b in s.drive.spans]
-    return [(a, b) for a, b in spans if b > a]
 
 
 def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, index: int) -> Segment:
@@ -321,7 +309,6 @@ class Rollouts:
         hydrodynamics: str = "calibrated",
         substeps: int | None = None,
         max_delay: float = 0.5,
-        moving_water: bool = False,
     ) -> None:
         """Set up.
 
@@ -332,7 +319,6 @@ class Rollouts:
             substeps: Physics steps in a step; enough for `LONGEST_STEP` if None. Applied forces are linear between
                 samples with one, which is what the default step has; with more they lead by up to half a step.
             max_delay: Longest delay that a candidate may have [s].
-            moving_water: Whether candidates bring currents.
 
         Raises:
             CalibrationError: no segments, steps that differ, or a drive with more than eight channels.
@@ -350,14 +336,14 @@ class Rollouts:
         self.vehicle, self.segments, self.hydrodynamics = vehicle, tuple(segments), hydrodynamics
         self.step = segments[0].step
         self.nominal = vehicle_parameters(vehicle, hydrodynamics)
-        self._moving = moving_water or any(np.any(s.current) for s in segments)
+        self._current = np.stack([s.current for s in segments])[None]
         self._options: dict[str, Any] = {
             "hydrodynamics": hydrodynamics,
             "control_step": self.step,
             "substeps": substeps or max(1, math.ceil(self.step / LONGEST_STEP - 1e-9)),
             "integrator": "rk4",
             "max_delay": max(max_delay, float(self.nominal["delay"])),
-            "water_moves": self._moving,
+            "water_moves": bool(self._current.any()),
         }
         self._simulators: dict[int, Simulator] = {}
         self._lengths = np.array([s.steps for s in segments])
@@ -418,7 +404,6 @@ class Rollouts:
         *,
         initial: Mapping[str, ArrayLike] | None = None,
         disturbance: ArrayLike | None = None,
-        current: ArrayLike | None = None,
         candidates: int | None = None,
     ) -> Response:
         """Simulate every candidate over every segment.
@@ -428,7 +413,6 @@ class Rollouts:
                 those in the vehicle file's water: a trial's own density scales them.
             initial: `nu`, `quaternion`, `position` at the start where they are not the segments' own, (C, S, ...).
             disturbance: Extra wrench about the body origin, body frame [N, N m], (C, S, 6).
-            current: World frame [m/s], in place of the segments' own, (C, S, 3).
             candidates: C; the longest first axis among the arrays if None.
 
         Returns:
@@ -436,7 +420,7 @@ class Rollouts:
         """
         arrays = {f"plant.{k}": np.asarray(v) for k, v in (plant or {}).items()}
         arrays |= {f"initial.{k}": np.asarray(v) for k, v in (initial or {}).items()}
-        arrays |= {k: np.asarray(v) for k, v in (("tau", disturbance), ("current", current)) if v is not None}
+        arrays |= {} if disturbance is None else {"tau": np.asarray(disturbance)}
         C = candidates or max([1, *(a.shape[0] for a in arrays.values())])
         n, S = self._force.shape[:2]
         out = {
@@ -481,9 +465,8 @@ class Rollouts:
         density = np.array([s.density for s in self.segments]) / self.vehicle.water.density
         for name in ("volume", "form_drag", "skin_drag"):
             fields[name] = fields[name] * density
-        if self._moving:
-            own_current = np.stack([s.current for s in self.segments])[None]
-            write(sim.water.current, given.get("current", own_current))
+        if self._current.any():
+            write(sim.water.current, self._current)
         write(sim.command.disturbance, given.get("tau", np.zeros((1, 1, 6))))
         start = {k.removeprefix("initial."): a for k, a in given.items() if k.startswith("initial.")}
         self._place(sim, write, {})

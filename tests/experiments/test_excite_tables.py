@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import yaml
 
-from finssim.calibration.programmes import excite, programmes
+from finssim.calibration.programmes import programmes
 from finssim.calibration.synthetic import simulate_programme
 from finssim.calibration.trials.trial_files import load_trial
+from finssim.experiments.excitation import excite
 from finssim.files import OutputError
 from finssim.vehicles import load_vehicle
 
@@ -17,7 +18,7 @@ BLUEROV2 = load_vehicle("bluerov2")
 
 def test_a_written_programme_holds_the_thrusts_of_its_wrench(tmp_path):
     """B times the thruster columns is the wrench column, in every row; times and phases are the programme's."""
-    folders = excite("sway,yaw", vehicle=BLUEROV2, out=tmp_path / "plan", levels=[5.0])
+    folders = excite("sway,yaw", vehicle="bluerov2", out=tmp_path / "plan", levels=["5"])
     plan = programmes("sway,yaw", BLUEROV2, levels=[5.0])
     assert [f.name for f in folders] == [p.name for p in plan]
     for folder, programme in zip(folders, plan, strict=True):
@@ -37,17 +38,19 @@ def test_a_written_programme_holds_the_thrusts_of_its_wrench(tmp_path):
 @pytest.mark.slow
 def test_simulated_trials_open_as_they_were_made(tmp_path):
     """A trial read back from its folder has the digest of the one in memory."""
-    folders = excite("surge", vehicle=BLUEROV2, out=tmp_path / "trials", levels=[5.0], simulate=True, seed=3)
+    folders = excite(
+        "surge", vehicle="bluerov2", out=tmp_path / "trials", levels=["5"], simulate=True, seed=3
+    )
     made = simulate_programme(programmes("surge", BLUEROV2, levels=[5.0]), BLUEROV2, seed=3)
     assert [load_trial(folder).sha256 for folder in folders] == [trial.sha256 for trial in made]
 
 
 def test_an_earlier_output_is_replaced_and_a_foreign_folder_is_not(tmp_path):
     """Running again replaces the programmes; a folder with anything else in it is refused."""
-    excite("surge", vehicle=BLUEROV2, out=tmp_path / "plan", levels=[5.0, 6.0])
-    excite("surge", vehicle=BLUEROV2, out=tmp_path / "plan", levels=[5.0])
+    excite("surge", vehicle="bluerov2", out=tmp_path / "plan", levels=["5,6"])
+    excite("surge", vehicle="bluerov2", out=tmp_path / "plan", levels=["5"])
     assert len(list((tmp_path / "plan").iterdir())) == 2 + 1
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").touch()
     with pytest.raises(OutputError, match="already holds files"):
-        excite("surge", vehicle=BLUEROV2, out=tmp_path / "mine")
+        excite("surge", vehicle="bluerov2", out=tmp_path / "mine")
