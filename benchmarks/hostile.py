@@ -96,7 +96,7 @@ def kinds() -> list[Kind]:
     """All of them."""
     camera = "--pool SEEDS/pool.yaml"
     located = f"{camera} --vehicle finsrov --out OUT/rows.csv"
-    fitted = "--camera SEEDS/camera.yaml --out OUT/pool.yaml"
+    fitted = "--camera SEEDS/camera.yaml --interface surface --folds 2 --out OUT/pool.yaml"
     return [
         Kind("vehicle", "vehicle.yaml", (
             "vehicles show {}", "validate {}", "tasks show t1 --vehicle {}",
@@ -114,13 +114,13 @@ def kinds() -> list[Kind]:
             "localize SEEDS/log/detections.csv --vehicle finsrov --out OUT/rows.csv --depth 0.5 --pool {}",
         ), weight=2),
         Kind("camera file", "camera.yaml", (
-            "calibrate pool SEEDS/survey.csv --camera {} --out OUT/pool.yaml",
+            "calibrate pool SEEDS/survey.csv --camera {} --interface surface --folds 2 --out OUT/pool.yaml",
         )),
         Kind("camera file of OpenCV", "left_intrinsics.yml", (
-            "calibrate pool SEEDS/survey.csv --camera {} --out OUT/pool.yaml",
+            "calibrate pool SEEDS/survey.csv --camera {} --interface surface --folds 2 --out OUT/pool.yaml",
         )),
         Kind("survey", "survey.csv", (
-            "calibrate pool {} --camera SEEDS/camera.yaml --out OUT/pool.yaml",
+            "calibrate pool {} --camera SEEDS/camera.yaml --interface surface --folds 2 --out OUT/pool.yaml",
         ), weight=2),
         Kind("points", "points.csv", (f"project {{}} {camera}",)),
         Kind("pixels", "pixels.csv", (f"backproject {{}} {camera} --z 0",)),
@@ -195,8 +195,8 @@ def kinds() -> list[Kind]:
             f"localize SEEDS/log/detections.csv {located} --depth NUMBER --pixel-std NUMBER",
             f"localize SEEDS/log/detections.csv {located} --depth 0.5 --tilt-std-deg NUMBER",
             f"fuse SEEDS/log {located} --rate NUMBER", f"fuse SEEDS/log {located} --pixel-std NUMBER",
-            f"backproject SEEDS/pixels.csv {camera} --z NUMBER",
-            f"calibrate pool SEEDS/survey.csv {fitted} --index NUMBER",
+            f"backproject SEEDS/pixels.csv {camera} --z NUMBER", f"backproject SEEDS/pixels.csv {camera} --plane 0,0,1,NUMBER",  # noqa: E501
+            f"calibrate pool SEEDS/survey.csv {fitted} --index NUMBER", f"calibrate pool SEEDS/survey.csv {fitted} --z NUMBER",  # noqa: E501
             f"calibrate pool SEEDS/survey.csv {fitted} --water-height NUMBER --survey-sigma NUMBER",
             "play SEEDS/run.mcap --fast --start NUMBER", "view SEEDS/run.mcap --no-browser --duration 0 --basin 4,2,NUMBER",  # noqa: E501
             "evaluate pid --trials NUMBER", "collect pid --task t1 --episodes NUMBER --disturb NUMBER --out OUT/set",

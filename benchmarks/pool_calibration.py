@@ -16,13 +16,15 @@ import numpy as np
 from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
 from finssim.calibration.vision.pool_model import Settings
 from finssim.calibration.vision.survey import Observations
-from finssim.geometry.optics import Camera, Interface, Lens, project
+from finssim.geometry.optics import Camera, Interface, Layer, Lens, project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_from_yaw, quat_to_matrix
 from finssim.localization.detection.families import corners
 
 DISTORTION = (0.02944176, -0.05975546, 0.00088098, 0.00179148, 0.01256862)
 LENS = Lens(1280, 720, 540.9305, 540.9305, 682.2341, 348.6136, "plumb_bob", DISTORTION)
+TANK_LENS = Lens(1280, 720, 900.0, 900.0, 640.0, 360.0, "plumb_bob", (-0.1, 0.05, 0.0, 0.0))
 SURVEY, TURN, PIXEL, TAPE = 0.002, np.radians(0.5), 0.25, 0.002
+FIT = ("pose", "height", "tilt", "index")
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class Case:
     reach: tuple[float, float] = (1.9, 0.95)
     tape: bool = False
     focal: bool = False
+    wall: float | None = None
+    plane: bool = False
 
 
 CASES = {
@@ -45,12 +49,18 @@ CASES = {
     "two depths, tape": Case(heights=(0.0, 0.5), tape=True),
     "near the axis": Case(reach=(0.2, 0.2), locations=40),
     "near the axis, tape": Case(reach=(0.2, 0.2), locations=40, tape=True),
+    "wall 0": Case(wall=0.0, locations=60),
+    "wall 40": Case(wall=40.0, locations=60),
+    "wall 0, plane": Case(wall=0.0, locations=60, plane=True),
+    "wall 40, plane": Case(wall=40.0, locations=60, plane=True),
 }
 
 
 def draw(case: Case, rng: np.random.Generator) -> tuple[Camera, Interface, Observations, Settings]:
     """One pool with its survey, and what its owner knows."""
     index = 1.333 + 0.003 * rng.standard_normal()
+    if case.wall is not None:
+        return _tank(case, rng, index)
     view = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
     lean = quat_to_matrix(quat_from_rotvec(0.05 * rng.standard_normal(3)))
     camera = Camera(LENS, np.array([0.03, -0.17, 2.2]), matrix_to_quat(lean @ view))
@@ -59,12 +69,37 @@ def draw(case: Case, rng: np.random.Generator) -> tuple[Camera, Interface, Obser
     seen = _tags(case, rng, camera, water)
     height = float(water.height(*seen.points[:, :2].mean(axis=0)))
     settings = Settings(
+        interface="surface",
         water_height=height + TAPE * rng.standard_normal() if case.tape else None,
         water_height_sigma=TAPE,
-        refit_lens=False,
-        focal_sigma=0.05 if case.focal else 0.0,
+        fit=FIT + (("focal",) if case.focal else ()),
+        focal_sigma=0.0,
     )
     return camera, water, seen, settings
+
+
+def _tank(
+    case: Case, rng: np.random.Generator, index: float
+) -> tuple[Camera, Interface, Observations, Settings]:
+    """Points in a tank seen through 10 mm of glass, at z up and the wall at y = 0."""
+    angle = np.radians(case.wall or 0.0)
+    position = np.array([0.6 * np.sin(angle), -0.6 * np.cos(angle), 0.2])
+    ahead = np.array([0.0, 0.15, 0.2]) - position
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right = right / np.linalg.norm(right)
+    camera = Camera(TANK_LENS, position, matrix_to_quat(np.stack([right, np.cross(ahead, right), ahead], 1)))
+    glass = (Layer(0.010, 1.52),)
+    wall = Interface(np.array([0.0, -1.0, 0.0]), 0.0, index_far=index, window=glass)
+    points = rng.uniform((-0.3, 0.03, 0.0), (0.3, 0.35, 0.4), (4000, 3))
+    seen = _seen(points[:, None, :], 0.0005, 0.0, rng, camera, wall, case.locations)
+    lean = 1e-3 * rng.standard_normal(2)
+    known = (float(lean[0]), -1.0, float(lean[1]), TAPE * rng.standard_normal()) if case.plane else None
+    settings = Settings(
+        interface="wall", plane=known, water_height_sigma=TAPE, tilt_sigma=1e-3 if case.plane else None,
+        window=glass, survey_sigma=0.0005, fit=FIT,
+    )  # fmt: skip
+    return camera, wall, seen, settings
 
 
 def _tags(case: Case, rng: np.random.Generator, camera: Camera, water: Interface) -> Observations:
@@ -100,6 +135,7 @@ def _seen(
         location=np.repeat(np.arange(count), k),
         names=tuple(f"{i}/{j}" for i in range(count) for j in range(k)),
         locations=tuple(str(i) for i in range(count)),
+        sigma=np.full(count * k, np.nan),
         arm=arm[whole].reshape(-1, 3),
         dry=np.zeros(count * k, bool),
     )
@@ -107,14 +143,18 @@ def _seen(
 
 def errors(fit: PoolFit, camera: Camera, plane: Interface) -> dict[str, tuple[float, float]]:
     """Estimate minus truth, and half the interval, of each parameter that the truth has."""
+    surface = fit.surface
     truth = {f"camera_{axis}": float(camera.position[k]) for k, axis in enumerate("xyz")}
     clearance = float(plane.normal @ camera.position + plane.offset)
-    truth["camera_height"] = clearance
+    truth["camera_height" if surface else "camera_distance"] = clearance
     truth["index"] = plane.index_far
-    truth["water_height"] = float(plane.height(0.0, 0.0))
-    truth["tilt_x"], truth["tilt_y"] = (
-        float(np.degrees(np.arctan2(plane.normal[k], plane.normal[2]))) for k in range(2)
-    )
+    if surface:
+        truth["water_height"] = float(plane.height(0.0, 0.0))
+        truth["tilt_x"], truth["tilt_y"] = (
+            float(np.degrees(np.arctan2(plane.normal[k], plane.normal[2]))) for k in range(2)
+        )
+    else:
+        truth["normal_x"], truth["normal_z"] = float(plane.normal[0]), float(plane.normal[2])
     if fit.lens_fitted:
         truth["focal"] = camera.lens.fx
     table = fit.estimates

@@ -578,15 +578,23 @@ def test_points_as_json(points, capsys, command, out):
     assert ("table" in found) != out and ("out" in found) == out == (points / "out.csv").exists()
 
 
-def test_backproject_at_a_height(points, capsys):
-    """--z is the height."""
+def test_backproject_on_planes(points, capsys):
+    """--z is the height, --plane any plane: z = 0.2 written either way is the same, a wall is another."""
     (points / "uv.csv").write_text("u,v\n600,300\n900,500\n")
-    found = []
-    for z in ("0.2", "0"):
-        assert finssim("backproject", "uv.csv", "--pool", "pool.yaml", "--z", z) == 0
-        found.append(read(capsys.readouterr().out))
-    assert float(found[0][0]["z"]) == pytest.approx(0.2)
-    assert float(found[1][1]["x"]) > float(found[0][1]["x"]) + 1e-3
+    found = {}
+    for name, words in {
+        "z": ["--z", "0.2"],
+        "plane": ["--plane", "0,0,2,-0.4"],
+        "floor": ["--z", "0"],
+        "wall": ["--plane", "1,0,0,-0.6"],
+    }.items():
+        assert finssim("backproject", "uv.csv", "--pool", "pool.yaml", *words) == 0
+        found[name] = read(capsys.readouterr().out)
+    for a, b in zip(found["z"], found["plane"], strict=True):
+        assert [float(a[k]) for k in "xyz"] == pytest.approx([float(b[k]) for k in "xyz"], abs=1e-8)
+        assert float(a["z"]) == pytest.approx(0.2)
+    assert float(found["floor"][1]["x"]) > float(found["z"][1]["x"]) + 1e-3
+    assert [float(row["x"]) for row in found["wall"] if row["x"]] == [pytest.approx(0.6)]
 
 
 def test_backproject_tells_the_error_of_points(points, capsys):
@@ -615,7 +623,9 @@ def test_backproject_tells_the_error_of_points(points, capsys):
         (["project", "points.csv", "--pool", "pool.yaml", "--out", "/proc/x/y.csv"], "write elsewhere"),
         (["project", "points.csv"], "Missing option '--pool'"),
         (["project", "--pool", "pool.yaml"], "Missing argument 'POINTS'"),
-        (["backproject", "uv.csv", "--pool", "pool.yaml"], "give --z, or a column z"),
+        (["backproject", "uv.csv", "--pool", "pool.yaml"], "give a height z, a plane, or a column z"),
+        (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "0", "--plane", "0,0,1,0"], "give one of them"),
+        (["backproject", "uv.csv", "--pool", "pool.yaml", "--plane", "0,0,1"], "expected four numbers a,b,c,d"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "floor"], "Invalid value for '--z'"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "nan"], "'--z': nan is not a number"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "0", "--pixel-std", "0"], "positive number"),

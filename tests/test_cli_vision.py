@@ -7,15 +7,15 @@ import pytest
 
 from calibration.vision.board_views import PHOTOGRAPHS
 from calibration.vision.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
-from calibration.vision.surveyed_pools import PLUMB_BOB, SOLID, overhead, survey
+from calibration.vision.surveyed_pools import FLOOR, PLUMB_BOB, SOLID, overhead, survey
 from finssim import boundary
 from finssim.calibration.vehicle_file import write_vehicle
 from finssim.cli import app
-from finssim.geometry.optics import Interface
+from finssim.geometry.optics import Interface, Layer
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.localization.camera_file import load_camera, write_camera
 from finssim.localization.detection.families import bitmap
-from finssim.localization.detection.pictures import write_picture
+from finssim.localization.detection.pictures import read_picture, write_picture
 from finssim.localization.pool import load_pool, write_pool
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene
 from finssim.vehicles import Provenance, load_vehicle
@@ -107,6 +107,17 @@ def test_camera_as_json_and_as_a_file(place, capsys):
 
 
 @pytest.mark.slow
+def test_camera_finds_the_board_by_itself_and_says_so(place, capsys):
+    """Without --board; as a table. The pictures are small, for every common size is tried."""
+    for path in SOME[:4]:
+        write_picture(np.ascontiguousarray(read_picture(path)[::2, ::2]), place / f"{path.stem}.png")
+    assert finssim("calibrate", "camera", place, "--out", "camera.yaml") == 0
+    out, err = capsys.readouterr()
+    assert "found a chessboard of 9x6 inner corners" in err and "written: camera.yaml" in out
+    assert "fx" in out and "95 % interval" in out
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["plumb_bob", "rational", "fisheye"])
 def test_camera_fits_the_lens_that_it_is_told(place, capsys, model):
     found = found_by(capsys, *CAMERA, "--board", "9x6", "--model", model)
@@ -153,7 +164,6 @@ def test_camera_reads_a_charuco_board(place, charuco, capsys):
         ([*CAMERA, "--board", "5x4"], "check the count of the board's corners"),
         ([*CAMERA, "--board", "2x2"], "the board has 2x2 corners, expected at least 3"),
         ([*CAMERA, "--board", "9x6", "--charuco", "7x5"], "--board and --charuco are both given"),
-        (CAMERA, "neither --board nor --charuco is given"),
         ([*CAMERA, "--charuco", "seven"], "--charuco is 'seven'"),
         ([*CAMERA, "--charuco", "7x5", "--marker", "0.05"], "the marker is 0.05 m"),
         ([*CAMERA, "--charuco", "7x5", "--dictionary", "DICT_9"], "unknown dictionary 'DICT_9'"),
@@ -165,8 +175,8 @@ def test_camera_reads_a_charuco_board(place, charuco, capsys):
         ([*CAMERA[:-1], "/proc/x/camera.yaml"], "write elsewhere"),
         ([*CAMERA, "--report", "/proc/x/report"], "write elsewhere"),
         ([*CAMERA, "--report", PHOTOGRAPHS], "already holds files"),
-        (["calibrate", "camera", "nowhere.png", "--board", "9x6", "--out", "c.yaml"], "nowhere.png: there is no such"),
-        (["calibrate", "camera", ".", "--board", "9x6", "--out", "c.yaml"], "the folder holds no pictures"),
+        (["calibrate", "camera", "nowhere.png", "--out", "c.yaml"], "nowhere.png: there is no such file"),
+        (["calibrate", "camera", ".", "--out", "c.yaml"], "the folder holds no pictures"),
         (["calibrate", "camera", "--out", "c.yaml"], "Missing argument 'IMAGE"),
         (["calibrate", "camera", *SOME], "Missing option '--out'"),
     ],
@@ -190,13 +200,14 @@ def combined(path, seen, names="id,u,v,x,y,z", scale=1.0):
 
 @pytest.fixture(scope="session")
 def pool_files(tmp_path_factory):
-    """A solid survey of 24 points below 1 m of water."""
+    """A solid survey of 24 points, one of a floor, and a picture of tags on that floor, all below 1 m of water."""
     folder = tmp_path_factory.mktemp("surveyed")
     write_camera(folder / "camera.yaml", PLUMB_BOB, {})
     water = Interface.water(1.0)
-    solid = survey(overhead(), water, SOLID, 24, seed=2)
+    solid, floor = (survey(overhead(), water, box, 24, seed=2) for box in (SOLID, FLOOR))
     combined(folder / "points.csv", solid)
     combined(folder / "millimetres.csv", solid, scale=1000.0)
+    combined(folder / "floor.csv", floor, "id,u,v,x,y")
     combined(folder / "pixels.csv", solid, "id,u,v")
     combined(folder / "survey.csv", solid, "id,x,y,z")
     (folder / "bad.csv").write_text("id,u,v,x,y,z\na,600,300,0,0,0\nb,600,low,0,0,0\n")
@@ -212,7 +223,7 @@ TAG_EDGE = 0.16
 def tag_files(pool_files):
     """The floor's tags, with 4 mm of survey error, in one picture drawn through the water."""
     pytest.importorskip("pupil_apriltags")
-    rng, tags, rows = np.random.default_rng(5), [], ["tag,x,y,z,yaw_deg,edge"]
+    rng, tags, rows = np.random.default_rng(5), [], ["tag,x,y,z,yaw_deg"]
     for i, (x, y) in enumerate((x, y) for x in (-1.2, -0.4, 0.5, 1.3) for y in (-0.7, 0.0, 0.6)):
         yaw = rng.uniform(-np.pi, np.pi)
         q = tuple(quat_from_euler(0.0, 0.0, yaw).tolist())
@@ -225,7 +236,7 @@ def tag_files(pool_files):
             )
         )
         off = 0.004 * rng.standard_normal(2)
-        rows.append(f"{i},{x + off[0]},{y + off[1]},0,{np.degrees(yaw) + rng.normal()},{TAG_EDGE}")
+        rows.append(f"{i},{x + off[0]},{y + off[1]},0,{np.degrees(yaw) + rng.normal()}")
     basin = Basin(lower=(-2.0, -1.0, -0.02), upper=(2.0, 1.0, 1.1))
     scene = Scene(
         camera=overhead(), interface=Interface.water(1.0), basin=basin, tags=tuple(tags), sensor=Sensor()
@@ -243,12 +254,13 @@ def surveyed(pool_files, tmp_path, monkeypatch):
 
 
 WITH = ["--camera", "camera.yaml"]
+SURFACE = ["--interface", "surface", "--fit", "pose,height,tilt,index", "--folds", "2"]
 TAPE = ["--water-height", "1.0"]
 
 
-def pool_by(capsys, out, *words, inputs=("points.csv",)):
+def pool_by(capsys, out, *words, inputs=("points.csv",), surface=SURFACE):
     """What `finssim calibrate pool` finds, and the pool that it writes."""
-    found = found_by(capsys, "calibrate", "pool", *inputs, *WITH, "--out", out / "p.yaml", *words)
+    found = found_by(capsys, "calibrate", "pool", *inputs, *WITH, *surface, "--out", out / "p.yaml", *words)
     return found, load_pool(out / "p.yaml")
 
 
@@ -261,7 +273,7 @@ def plain(pool_files):
     text = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(text):
         patch.chdir(pool_files)
-        words = ["calibrate", "pool", "points.csv", *WITH, *TAPE, "--out", "plain.yaml", "--json"]
+        words = ["calibrate", "pool", "points.csv", *WITH, *SURFACE, *TAPE, "--out", "plain.yaml", "--json"]
         assert finssim(*words) == 0
     return json.loads(text.getvalue()), load_pool(pool_files / "plain.yaml")
 
@@ -271,10 +283,10 @@ def test_pool_as_json_and_as_a_file(surveyed, plain):
     """The keys of the contract; near the truth; what was known beforehand is in the file's record."""
     found, pool = plain
     assert found.keys() >= {
-        *("kind", "parameters", "residual", "held_out", "pinhole", "lens_fitted", "outliers"),
+        *("kind", "interface", "parameters", "residual", "held_out", "pinhole", "lens_fitted", "outliers"),
         *("correlation", "findings", "settings", "inputs", "out", "provenance"),
     }
-    assert found["kind"] == "pool" and found["out"] == "plain.yaml"
+    assert found["kind"] == "pool" and found["interface"] == "surface" and found["out"] == "plain.yaml"
     assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())
     assert np.linalg.norm(pool.camera.position - overhead().position) < 0.02
     assert pool.interface.height(0.0, 0.0) == pytest.approx(1.0, abs=0.01)
@@ -308,37 +320,65 @@ def test_pool_matches_a_survey_with_pixels(surveyed, plain, capsys):
 
 
 @pytest.mark.slow
-def test_pool_refuses_lengths_without_their_unit(surveyed, capsys):
-    """Millimetres without a word of it spread over kilometres."""
-    words = ["calibrate", "pool", "millimetres.csv", *WITH, *TAPE, "--out", surveyed / "p.yaml"]
-    refused(capsys, surveyed, words, "write the unit into")
+def test_pool_reads_lengths_in_the_unit(surveyed, plain, capsys):
+    """Millimetres without a word of it spread over kilometres and are refused; with --unit they are the same survey."""
+    words = ["calibrate", "pool", "millimetres.csv", *WITH, *SURFACE, *TAPE, "--out", surveyed / "p.yaml"]
+    refused(capsys, surveyed, words, "give --unit")
+    _, pool = pool_by(capsys, surveyed, *TAPE, "--unit", "mm", inputs=("millimetres.csv",))
+    np.testing.assert_allclose(pool.camera.position, plain[1].camera.position, atol=1e-6)
+
+
+def test_pool_takes_the_height_of_a_floor(surveyed, capsys):
+    """A table without z: refused without --z; another height of the floor moves the camera with it."""
+    words = ["calibrate", "pool", "floor.csv", *WITH, *SURFACE, "--out", surveyed / "p.yaml"]
+    refused(capsys, surveyed, words, "no column 'z'")
+    heights = []
+    for z in (0.0, 0.5):
+        _, pool = pool_by(capsys, surveyed, "--z", z, "--water-height", 1.0 + z, inputs=("floor.csv",))
+        heights.append(pool.camera.position[2])
+    assert heights[1] - heights[0] == pytest.approx(0.5, abs=1e-4)
 
 
 OPTIONS = {
+    "interface": (["--interface", "wall"], lambda a, b, p: a["interface"] == "wall"),
+    "plane": (["--plane", "0,0,1,-1.02"], lambda a, b, p: abs(p.interface.height(0, 0) - 1.02) < 0.01),
+    "window": (["--window", "0.02:1.49"], lambda a, b, p: p.interface.window == (Layer(0.02, 1.49),)),
+    "two windows": (
+        ["--window", "0.02:1.49", "--window", "0.01:1.52"],
+        lambda a, b, p: p.interface.window == (Layer(0.02, 1.49), Layer(0.01, 1.52)),
+    ),
     "water-height": (
         ["--water-height", "1.03", "--water-height-sigma", "0.0005"],
         lambda a, b, p: abs(a["parameters"]["water_height"]["estimate"] - 1.03) < 0.005,
+    ),
+    "water-depth": (
+        ["--water-depth", "0.5", "--water-height-sigma", "0.0005"],
+        lambda a, b, p: a["settings"]["water_depth"] == 0.5
+        and abs(a["parameters"]["water_height"]["estimate"] - b["parameters"]["water_height"]["estimate"]) > 0.1,
     ),
     "water-height-sigma": (
         [*TAPE, "--water-height-sigma", "0.0005"],
         lambda a, b, p: 3.0 * width(a, "water_height") < width(b, "water_height"),
     ),
     "index": (
-        [*TAPE, "--index", "1.34"],
+        [*TAPE, "--index", "1.34", "--fit", "pose,height,tilt"],
         lambda a, b, p: p.interface.index_far == 1.34 and a["settings"]["index_sigma"] == 0.0,
     ),
     "index-sigma": ([*TAPE, "--index-sigma", "0.03"], lambda a, b, p: width(a, "index") > 1.5 * width(b, "index")),
     "tilt-sigma": ([*TAPE, "--tilt-sigma", "0.01"], lambda a, b, p: width(a, "tilt_x") < 0.5 * width(b, "tilt_x")),
+    "fit": ([*TAPE, "--fit", "pose,height"], lambda a, b, p: a["parameters"]["tilt_x"]["note"] == "as given"),
     "focal-sigma": ([*TAPE, "--focal-sigma", "0.01"], lambda a, b, p: width(a, "focal") > width(b, "focal") == 0.0),
     "center-sigma": (
         [*TAPE, "--center-sigma", "5"],
         lambda a, b, p: width(a, "center_x") > width(b, "center_x") == 0.0,
     ),
+    "pixel-sigma": ([*TAPE, "--pixel-sigma", "1.5"], lambda a, b, p: a["residual"]["pixel_sigma"] == 1.5),
     "survey-sigma": (
         [*TAPE, "--survey-sigma", "0.0002"],
         lambda a, b, p: a["residual"]["survey_sigma_mm"] < 0.5,
     ),
     "latency": ([*TAPE, "--latency", "0.04"], lambda a, b, p: p.latency == 0.04),
+    "folds": ([*TAPE, "--folds", "4"], lambda a, b, p: a["held_out"]["folds"] == 4 != b["held_out"]["folds"]),
     "seed": ([*TAPE, "--seed", "7"], lambda a, b, p: a["held_out"]["rms_px"] != b["held_out"]["rms_px"]),
 }  # fmt: skip
 """Option -> words, and what is then otherwise than without: JSON now, JSON without, pool now."""
@@ -356,14 +396,20 @@ def test_pool_does_what_each_option_says(surveyed, plain, capsys, name):
 
 @pytest.mark.slow
 def test_pool_finds_the_tags_of_a_picture(surveyed, tag_files, capsys):
-    """Of the family that --family says: camera and water within 1.5 cm."""
+    """Of the family that --family says, with the edge that --edge says: camera and water within 1.5 cm."""
     words = ["--surveyed", "tags.csv", *TAPE]
-    found, pool = pool_by(capsys, surveyed, *words, "--family", "tag36h11", inputs=("tags.png",))
+    given = {"inputs": ("tags.png",)}
+    found, pool = pool_by(capsys, surveyed, *words, "--family", "tag36h11", "--edge", TAG_EDGE, **given)
     assert found["residual"]["points"] == 48 and found["residual"]["locations"] == 12
     assert np.linalg.norm(pool.camera.position - overhead().position) < 0.02
+    yaw = ["--survey-yaw-sigma", "4", "--family", "tag36h11", "--edge", TAG_EDGE]
+    other, _ = pool_by(capsys, surveyed, *words, *yaw, **given)
+    assert other["parameters"]["camera_x"] != found["parameters"]["camera_x"]
+    assert other["settings"]["survey_yaw_sigma"] == pytest.approx(np.radians(4.0))
     command = ["calibrate", "pool", "tags.png", *words, *WITH, "--out", surveyed / "q.yaml"]
-    refused(capsys, surveyed, [*command, "--family", "16h5"], "tags.png")
-    refused(capsys, surveyed, [*command, "--family", "99h9"], "unknown tag family '99h9'")
+    refused(capsys, surveyed, [*command, "--family", "tag36h11"], "a tag without its edge")
+    refused(capsys, surveyed, [*command, "--family", "16h5", "--edge", TAG_EDGE], "tags.png")
+    refused(capsys, surveyed, [*command, "--family", "99h9", "--edge", TAG_EDGE], "unknown tag family '99h9'")
 
 
 POOL_WORDS = ["calibrate", "pool", "points.csv", *WITH, "--out", "OUT"]
@@ -373,16 +419,33 @@ POOL_WORDS = ["calibrate", "pool", "points.csv", *WITH, "--out", "OUT"]
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
+        ([*POOL_WORDS, "--interface", "glass"], "unknown interface 'glass'; available: auto, surface, wall"),
+        ([*POOL_WORDS, "--plane", "0,1"], "plane is '0,1', expected n_x,n_y,n_z,b"),
+        ([*POOL_WORDS, "--plane", "0,0,0,1"], "expected a direction"),
+        ([*POOL_WORDS, "--window", "thick"], "window is 'thick', expected THICKNESS:INDEX"),
+        ([*POOL_WORDS, "--window", "-1:1.5"], "window is '-1:1.5'"),
         ([*POOL_WORDS, "--water-height", "-1"], "other side"),
+        ([*POOL_WORDS, "--water-height", "1", "--water-depth", "1"], "given twice"),
         ([*POOL_WORDS, "--index", "5"], "index is 5, expected a number from 1 to 2.5"),
+        ([*POOL_WORDS, "--fit", "pose,colour"], "unknown 'colour' to fit; available: pose"),
+        ([*POOL_WORDS, "--fit", "height"], "fit leaves the pose out"),
+        ([*POOL_WORDS, "--fit", "pose"], "give --water-height"),
+        ([*POOL_WORDS, "--pixel-sigma", "0"], "pixel sigma is 0"),
         ([*POOL_WORDS, "--survey-sigma", "-1"], "survey sigma is -1"),
         ([*POOL_WORDS, "--focal-sigma", "-1"], "focal sigma is -1"),
         ([*POOL_WORDS, "--center-sigma", "-1"], "center sigma is -1"),
         ([*POOL_WORDS, "--index-sigma", "-1"], "index sigma is -1"),
         ([*POOL_WORDS, "--tilt-sigma", "-1"], "tilt sigma [deg] is -1"),
         ([*POOL_WORDS, "--water-height", "1", "--water-height-sigma", "-1"], "water height sigma is -1"),
+        ([*POOL_WORDS, "--survey-yaw-sigma", "-1"], "survey yaw sigma [deg] is -1"),
         ([*POOL_WORDS, "--water-height", "nan"], "'--water-height': nan is not a number"),
+        ([*POOL_WORDS, "--water-depth", "nan"], "'--water-depth': nan is not a number"),
+        ([*POOL_WORDS, "--plane", "0,nan,1,0"], "plane"),
         ([*POOL_WORDS, "--latency", "nan"], "'--latency': nan is not a number"),
+        ([*POOL_WORDS, "--z", "nan"], "'--z': nan is not a number"),
+        ([*POOL_WORDS, "--edge", "nan"], "'--edge': nan is not a number"),
+        ([*POOL_WORDS, "--unit", "mile"], "mile"),
+        ([*POOL_WORDS, "--folds", "1"], "Invalid value for '--folds'"),
         ([*POOL_WORDS, "--seed", "-1"], "Invalid value for '--seed'"),
         ([*POOL_WORDS, "--surveyed", "nowhere.csv"], "nowhere.csv"),
         ([*POOL_WORDS, "--camera", "nowhere.yaml"], "nowhere.yaml"),

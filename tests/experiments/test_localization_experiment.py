@@ -118,6 +118,7 @@ def test_a_user_can_calibrate_the_same_pool_again(done, tmp_path, capsys):
     words = ["calibrate", "pool", out / "detections.csv", "--surveyed", out / "survey.csv"]
     words += ["--camera", out / "camera.yaml", "--out", tmp_path / "again.yaml"]
     for name in (
+        "interface",
         "water_height",
         "water_height_sigma",
         "survey_sigma",

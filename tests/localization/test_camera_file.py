@@ -1,5 +1,7 @@
 """Camera files say the same lens in every dialect, and what is missing in one sentence."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,8 @@ from finssim.localization.camera_file import load_camera, write_camera
 NUMBERS = {"width": 640, "height": 480, "fx": 535.9, "fy": 536.2, "cx": 342.3, "cy": 235.6}
 FIVE = (-0.266, -0.0386, 0.00178, -0.00028, 0.238)
 FOUR = (0.01, -0.02, 0.003, -0.004)
-FLAT = [535.9, 0.0, 342.3, 0.0, 536.2, 235.6, 0.0, 0.0, 1.0]
+K = [[535.9, 0.0, 342.3], [0.0, 536.2, 235.6], [0.0, 0.0, 1.0]]
+FLAT = [x for row in K for x in row]
 
 OPENCV = f"""%YAML:1.0
 ---
@@ -58,9 +61,13 @@ DIALECTS = {
     "ros rational": (ros("rational_polynomial", EIGHT), Lens(**NUMBERS, model="rational", distortion=EIGHT)),
     "ros fisheye": (ros("equidistant", FOUR), Lens(**NUMBERS, model="fisheye", distortion=FOUR)),
     "kalibr": (KALIBR, Lens(**NUMBERS, model="fisheye", distortion=FOUR)),
-    "ros message": (
-        f"height: 480\nwidth: 640\nK: {FLAT}\nD: {list(FIVE)}\n",
+    "nested json": (
+        json.dumps({"camera_matrix": K, "dist_coeffs": [list(FIVE)], "image_size": [640, 480]}),
         Lens(**NUMBERS, distortion=FIVE),
+    ),
+    "plain numbers": (
+        "width: 640\nheight: 480\nfx: 535.9\nfy: 536.2\ncx: 342.3\ncy: 235.6\nk1: 0.1\nk2: -0.2\n",
+        Lens(**NUMBERS, distortion=(0.1, -0.2, 0.0, 0.0, 0.0)),
     ),
     "no distortion": ("image_width: 640\nimage_height: 480\nK: " + str(FLAT) + "\n", Lens(**NUMBERS)),
     "ours": (

@@ -100,11 +100,13 @@ def test_there_and_back_through_files(tmp_path, pool, monkeypatch, capsys):
         np.testing.assert_allclose([float(row[f"{axis}_given"]) for row in rows], values)
 
 
-def test_height_and_column(tmp_path, pool, capsys):
-    """A column z goes before the height."""
+def test_height_plane_and_column(tmp_path, pool, capsys):
+    """A height and the plane at that height give the same points; a column z goes before the height."""
     pixels = given(tmp_path, "u,v\n600,300\n700,420\n")
     run_backproject(pixels, pool=pool, z=0.2)
     by_height = table(capsys.readouterr().out)
+    run_backproject(pixels, pool=pool, plane="0, 0, -2, 0.4")
+    assert table(capsys.readouterr().out) == by_height
     run_backproject(given(tmp_path, "u,v,z\n600,300,0.2\n700,420,0.2\n", "z.csv"), pool=pool, z=-5.0)
     with_column = table(capsys.readouterr().out)
     assert [row["x"] for row in with_column] == [row["x"] for row in by_height]
@@ -124,10 +126,10 @@ def test_a_plane_above_the_water_is_not_met(tmp_path, pool, capsys):
 
 def test_the_error_of_a_pixel_becomes_one_of_the_point(tmp_path, pool, capsys):
     """sigma equals the scatter of the points of pixels that scatter by that much, within 5 % for 4000 draws."""
-    run_backproject(given(tmp_path, "u,v\n900,200\n"), pool=pool, z=0.0, pixel_std=0.5)
+    run_backproject(given(tmp_path, "u,v\n900,200\n"), pool=pool, plane="0.3,0,1,0", pixel_std=0.5)
     (row,) = table(capsys.readouterr().out)
     pixels = np.array([900.0, 200.0]) + 0.5 * np.random.default_rng(0).standard_normal((4000, 2))
-    scatter = back_project(CAMERA, WATER, pixels).at_z(0.0)[0].std(axis=0)
+    scatter = back_project(CAMERA, WATER, pixels).at_plane((0.3, 0.0, 1.0), 0.0)[0].std(axis=0)
     found = [float(row[f"sigma_{axis}"]) for axis in "xyz"]
     np.testing.assert_allclose(found, scatter, rtol=0.05)  # standard error of a standard deviation: 1.1 %
 
@@ -171,7 +173,10 @@ def test_wrong_tables_are_refused_by_line(tmp_path, pool, text, words):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({}, "the height of the points is missing"),
+        ({}, "the plane of the points is missing"),
+        ({"z": 0.1, "plane": "0,0,1,0"}, "give one of them"),
+        ({"plane": "0,0,1"}, "expected four numbers a,b,c,d"),
+        ({"plane": "0,0,0,1"}, "not all zero"),
         ({"z": float("nan")}, "expected a finite height"),
         ({"z": 0.1, "pixel_std": 0.0}, "expected a positive number of pixels"),
     ],

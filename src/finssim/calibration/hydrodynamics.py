@@ -38,9 +38,10 @@ further to speeds that no trial had."""
 WORSE = 1.05
 """Factor on the vehicle file's NRMSE above which the fit replays an axis worse than the file."""
 
-LIKELY_SCALE, SCALE_STD = 0.9, 0.25
+LIKELY_SCALE, SCALE_STD = 0.88, 0.17
 """Thrust of a battery on its way from full to empty, to that at the voltage of the thruster's table, and the standard
-deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4.2 V a cell."""
+deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4.2 V a cell (0.14), and propellers of
+one make differ by a tenth."""
 
 ADDED_MASS_STD = 0.7
 """Of the logarithm of a catalogue's added mass, a factor of two: published sets of one vehicle differ by as much."""

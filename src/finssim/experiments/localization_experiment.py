@@ -320,6 +320,7 @@ def calibrate(campaign: Campaign, observed: Sequence[Picture]) -> Calibrated:
     frames = [Frame(np.nan, p.name, (p.detection,)) for p in chosen if p.detection is not None]
     rows = survey_rows(campaign, chosen)
     settings = Settings(
+        interface="surface",
         water_height=campaign.water_read,
         water_height_sigma=max(campaign.conditions.tape, 5e-4),
         survey_sigma=max(campaign.conditions.survey, 1e-4),

@@ -1,4 +1,4 @@
-"""Camera files: a lens with its record, ours or as OpenCV, ROS and Kalibr write it."""
+"""Camera files: a lens with its record, ours or as OpenCV, ROS, Kalibr and plain lists of numbers write it."""
 
 from __future__ import annotations
 
@@ -106,8 +106,24 @@ class Fields:
         return float(value)
 
 
+_SECTIONS = ("lens", "camera", "intrinsics", "cam0")
+"""Where foreign files keep a camera, if not at the top."""
+_WIDTH = ("image_width", "width", "img_width")
+_HEIGHT = ("image_height", "height", "img_height")
+_SIZE = ("image_size", "resolution", "img_size", "size")
+_MATRIX = ("camera_matrix", "K", "mtx", "intrinsic_matrix", "cameraMatrix", "intrinsics", "camera_intrinsics")
+_DISTORTION = (
+    "distortion_coefficients",
+    "distortion_coeffs",
+    "dist_coeffs",
+    "distCoeffs",
+    "dist_coefs",
+    "distortion",
+    "dist",
+    "D",
+)
+_MODEL = ("distortion_model", "model", "lens_model", "camera_model", "projection_model")
 _FISHEYE = ("fisheye", "equidistant", "equi", "kannala_brandt4", "kb4")
-"""Names of the fisheye's distortion in other people's files."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +138,8 @@ class CameraFile:
 def load_camera(path: str | Path) -> CameraFile:
     """Read a camera file.
 
-    Ours (`lens:`), OpenCV's FileStorage YAML, ROS's `camera_info` (its file, or the message), Kalibr's camchain, and
-    our pool files.
+    Ours (`lens:`), OpenCV's FileStorage YAML, ROS's `camera_info` YAML, Kalibr's camchain, JSON or YAML with
+    `camera_matrix` (or K) and distortion under one of their usual names, and our pool files.
 
     Raises:
         LocalizationError: Unreadable, or without image size or focal length; names the file and what to write.
@@ -214,42 +230,98 @@ def _standard(text: str) -> str:
 
 
 def _foreign(tree: Mapping[str, Any], label: str) -> Lens:
-    """The lens of OpenCV, ROS or Kalibr."""
-    kalibr = isinstance(tree.get("cam0"), Mapping)
-    fields = Fields(tree["cam0"] if kalibr else tree, f"{label}: cam0" if kalibr else label)
-    if kalibr:
-        width, height = fields.numbers("resolution", 2)
-        fx, fy, cx, cy = fields.numbers("intrinsics", 4)
-        distortion = fields.numbers("distortion_coeffs", None, ())
-    else:
-        size = [*_values(fields, "image_width", "width"), *_values(fields, "image_height", "height")]
-        if len(size) != 2:
-            raise fields.error("the size of the image is missing: add image_width and image_height")
-        width, height = size
-        K = _values(fields, "camera_matrix", "K", "k")
-        if len(K) != 9:
-            raise fields.error("no camera matrix found: give camera_matrix with 9 numbers, or a section lens")
-        if abs(K[1]) > 1e-6 * abs(K[0]):
-            raise fields.error(
-                f"the camera matrix has a skew of {K[1]:.4g} px, expected 0: calibrate without skew"
-            )
-        fx, fy, cx, cy = K[0], K[4], K[2], K[5]
-        distortion = _values(fields, "distortion_coefficients", "D", "d")
-    name = fields.word("distortion_model", "").lower()
-    if len(distortion) > 8 and not any(distortion[8:]):
-        raise fields.error(f"{len(distortion)} distortion coefficients: keep the first 8")
-    model = "rational" if name.startswith("rational") or len(distortion) == 8 else "plumb_bob"
-    arguments = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": distortion}
-    model = "fisheye" if name in _FISHEYE else model
-    return _lens({"width": int(width), "height": int(height), "model": model, **arguments}, label)
+    """The lens in other people's words."""
+    for key in _SECTIONS:
+        inner = tree.get(key)
+        if isinstance(inner, Mapping) and _first(inner, (*_MATRIX, "fx")) is not None:
+            return _foreign({**{k: v for k, v in tree.items() if k != key}, **inner}, f"{label}: {key}")
+    width, height = _size(tree, label)
+    fx, fy, cx, cy = _focal(tree, label)
+    distortion = _distortion(tree, label)
+    word = next((str(tree[key]).lower() for key in _MODEL if isinstance(tree.get(key), str)), "")
+    return _lens(
+        {
+            "width": width,
+            "height": height,
+            "fx": fx,
+            "fy": fy,
+            "cx": cx,
+            "cy": cy,
+            "model": _model(tree, word, distortion, label),
+            "distortion": distortion,
+        },
+        label,
+    )
 
 
-def _values(fields: Fields, *names: str) -> tuple[float, ...]:
-    """Numbers under the first of some names that is there: one, a list, or OpenCV's and ROS's {rows, cols, data}."""
-    key = next((name for name in names if fields.has(name)), None)
-    value = None if key is None else fields.take(key)
+def _first(tree: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+    return next((tree[name] for name in names if tree.get(name) is not None), None)
+
+
+def _flat(value: Any, label: str) -> tuple[float, ...]:
+    """Numbers of a list, of nested lists, or of OpenCV's and ROS's {rows, cols, data}."""
     if isinstance(value, Mapping):
-        fields, key = Fields(value, f"{fields.where}: {key}"), "data"
-    elif key is not None and not isinstance(value, (list, tuple)):
-        return (fields.number(key),)
-    return () if key is None else fields.numbers(key, None)
+        value = value.get("data")
+    if isinstance(value, (list, tuple)):
+        return tuple(x for item in value for x in _flat(item, label))
+    return Fields({"it": value}, label).numbers("it", None, ()) if value is None else (_number(value, label),)
+
+
+def _number(value: Any, label: str) -> float:
+    return Fields({"a coefficient": value}, label).number("a coefficient")
+
+
+def _size(tree: Mapping[str, Any], label: str) -> tuple[int, int]:
+    size = _first(tree, _SIZE)
+    width, height = _first(tree, _WIDTH), _first(tree, _HEIGHT)
+    if width is None and size is not None:
+        width, height = _flat(size, label)[:2]
+    if width is None or height is None:
+        raise LocalizationError(
+            f"{label}: the size of the image is missing: add image_width and image_height"
+        )
+    return int(_number(width, label)), int(_number(height, label))
+
+
+def _focal(tree: Mapping[str, Any], label: str) -> tuple[float, float, float, float]:
+    value = _first(tree, _MATRIX)
+    if value is None and tree.get("fx") is not None:
+        fields = Fields(tree, label)
+        fx = fields.number("fx")
+        return fx, fields.number("fy", fx), fields.number("cx"), fields.number("cy")
+    numbers = _flat(value, label)
+    if len(numbers) == 4:
+        return numbers[0], numbers[1], numbers[2], numbers[3]
+    if len(numbers) == 9:
+        if abs(numbers[1]) > 1e-6 * abs(numbers[0]):
+            raise LocalizationError(
+                f"{label}: the camera matrix has a skew of {numbers[1]:.4g} px, expected 0: calibrate without skew"
+            )
+        return numbers[0], numbers[4], numbers[2], numbers[5]
+    raise LocalizationError(
+        f"{label}: no camera matrix found: give fx, fy, cx, cy [px], or camera_matrix with 9 numbers"
+    )
+
+
+def _distortion(tree: Mapping[str, Any], label: str) -> tuple[float, ...]:
+    value = _first(tree, _DISTORTION)
+    if value is not None:
+        return _flat(value, label)
+    names = [name for name in ("k1", "k2", "p1", "p2", "k3", "k4") if tree.get(name) is not None]
+    if "p1" not in names and ("k3" in names or "k4" in names):
+        return tuple(_number(tree.get(name, 0.0), label) for name in ("k1", "k2", "k3", "k4"))
+    return tuple(
+        _number(tree.get(name, 0.0), label) for name in ("k1", "k2", "p1", "p2", "k3")[: 5 if names else 0]
+    )
+
+
+def _model(tree: Mapping[str, Any], word: str, distortion: tuple[float, ...], label: str) -> str:
+    fisheye = any(tree.get(key) is True for key in ("fisheye", "is_fisheye")) or word in _FISHEYE
+    four_radial = "p1" not in tree and tree.get("k4") is not None and not _first(tree, _DISTORTION)
+    if fisheye or four_radial:
+        return "fisheye"
+    if word.startswith("rational") or len(distortion) == 8:
+        return "rational"
+    if len(distortion) > 8 and not any(distortion[8:]):
+        raise LocalizationError(f"{label}: {len(distortion)} distortion coefficients: keep the first 8")
+    return "plumb_bob"

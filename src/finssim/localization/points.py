@@ -162,11 +162,12 @@ def run_backproject(
     *,
     pool: Path,
     z: float | None = None,
+    plane: str | None = None,
     pixel_std: float | None = None,
     out: Path | None = None,
     as_json: bool = False,
 ) -> None:
-    """Back-project pixels to points [m] at a height in the water.
+    """Back-project pixels to points [m] on a plane in the water.
 
     Example: finssim backproject pixels.csv --pool pool.yaml --z 0
 
@@ -174,12 +175,14 @@ def run_backproject(
         pixels (PIXELS): Table with columns u, v [px]; - for standard input.
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
         z: Height of the points, pool frame [m]; a column z has priority.
+        plane: Plane of the points, instead of --z: a,b,c,d with a x + b y + c z + d = 0 [m].
         pixel_std: Error of a pixel [px]; adds columns with the error of the points [m].
         out (FILE): Table to write; standard output if not given.
         as_json: Print one JSON object instead of tables.
 
     Raises:
-        LocalizationError: A file that cannot be used (wrong rows are named), no height, or a number that is no error.
+        LocalizationError: A file that cannot be used (wrong rows are named), no plane or two, or numbers that make no
+            plane or error.
         OutputError: `out` cannot be written.
     """
     if out is not None:
@@ -189,21 +192,42 @@ def run_backproject(
     scene = load_pool(pool)
     table = read_points(pixels, ("u", "v"), ("z",))
     rays = back_project(scene.camera, scene.interface, np.stack([table.numbers[c] for c in "uv"], axis=-1))
-    if z is not None and not np.isfinite(z):
-        raise LocalizationError(f"z is {z}, expected a finite height in metres")
-    height = table.numbers.get("z", z)
-    if height is None:
-        raise LocalizationError(
-            f"{table.label}: the height of the points is missing: give --z, or a column z"
-        )
-    points, status = rays.at_z(height)
+    normal, offset = _plane(table, z, plane)
+    if plane is None:
+        points, status = rays.at_z(-offset)
+    else:
+        points, status = rays.at_plane(normal, offset)
     columns = {axis: _cells(points[:, i], 9) for i, axis in enumerate("xyz")}
     columns["status"] = _status_names(status)
     if pixel_std is not None:
-        by_pixel = plane_jacobian(scene.camera, scene.interface, points, (0.0, 0.0, 1.0))[..., :2]
+        by_pixel = plane_jacobian(scene.camera, scene.interface, points, normal)[..., :2]
         sigma = pixel_std * np.sqrt(np.sum(by_pixel**2, axis=-1))
         columns |= {f"sigma_{axis}": _cells(sigma[:, i], 9) for i, axis in enumerate("xyz")}
     _give(table, columns, status, "backproject", "pixels have a point", out, as_json)
+
+
+def _plane(table: PointTable, z: float | None, plane: str | None) -> tuple[Array, Array | float]:
+    """Normal and offset of the plane, from the only place that gives one."""
+    up = np.array([0.0, 0.0, 1.0])
+    if plane is not None:
+        if z is not None:
+            raise LocalizationError("both a height z and a plane are given: give one of them")
+        try:
+            a, b, c, d = (float(word) for word in plane.replace(",", " ").split())
+        except ValueError:
+            raise LocalizationError(f"plane is '{plane}', expected four numbers a,b,c,d") from None
+        if not (np.isfinite([a, b, c, d]).all() and (a, b, c) != (0.0, 0.0, 0.0)):
+            raise LocalizationError(f"plane is '{plane}', expected finite numbers, a, b and c not all zero")
+        return np.array([a, b, c]), d
+    if "z" in table.numbers:
+        return up, -table.numbers["z"]
+    if z is None:
+        raise LocalizationError(
+            f"{table.label}: the plane of the points is missing: give a height z, a plane, or a column z"
+        )
+    if not np.isfinite(z):
+        raise LocalizationError(f"z is {z}, expected a finite height in metres")
+    return up, -float(z)
 
 
 def _cells(values: Array, digits: int) -> list[str]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.findings import CalibrationError
-from finssim.calibration.vision.survey import observe, read_survey
+from finssim.calibration.vision.survey import observe, observe_combined, read_survey
 from finssim.localization.detection.detections import Detection, Frame, write_detections
 
 SQUARE = np.array([[10.0, 10.0], [20.0, 10.0], [20.0, 20.0], [10.0, 20.0]])
@@ -73,10 +73,23 @@ def test_a_moved_tag_is_found_by_its_picture(tmp_path):
     ],
 )
 def test_pixel_and_point_in_one_row(tmp_path, text):
-    path = written(tmp_path, "c.csv", text)
-    seen = observe([path], read_survey(path))
+    seen = observe_combined([written(tmp_path, "c.csv", text)])
     np.testing.assert_allclose(seen.pixels, [[5.0, 6.0]])
     np.testing.assert_allclose(seen.points, [[1.0, 2.0, 3.0]])
+
+
+def test_a_floor_needs_no_column_of_heights(tmp_path):
+    path = written(tmp_path, "c.csv", "u,v,x,y\n5,6,1,2\n")
+    with pytest.raises(CalibrationError, match="no column 'z'.*--z"):
+        observe_combined([path])
+    assert observe_combined([path], z=0.0).points[0].tolist() == [1.0, 2.0, 0.0]
+
+
+def test_numbers_that_cannot_be_metres_are_refused(tmp_path):
+    path = written(tmp_path, "c.csv", "u,v,x,y,z\n5,6,1500,200,0\n")
+    with pytest.raises(CalibrationError, match="spread over 1500 m.*--unit mm"):
+        observe_combined([path])
+    assert observe_combined([path], unit="mm").points[0, 0] == pytest.approx(1.5)
 
 
 def test_nothing_in_common_is_refused(tmp_path):

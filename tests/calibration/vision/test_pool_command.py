@@ -13,7 +13,7 @@ from finssim.geometry.optics import Interface, back_project
 from finssim.localization.camera_file import write_camera
 from finssim.localization.pool import load_pool
 
-from .surveyed_pools import FLOOR, PLUMB_BOB, overhead, survey
+from .surveyed_pools import FLOOR, GLASS, PLUMB_BOB, TANK, TANK_LENS, before_tank, overhead, survey, wall
 
 WATER = Interface.water(1.0)
 
@@ -96,6 +96,22 @@ def test_a_report_has_its_pictures(pool):
 
 
 @pytest.mark.slow
+def test_a_tank_with_its_wall_surveyed(tmp_path, capsys):
+    camera, plane = before_tank(30.0), wall(window=GLASS)
+    write_camera(tmp_path / "camera.yaml", TANK_LENS, {})
+    table(tmp_path / "points.csv", survey(camera, plane, TANK, 50, error=0.0005))
+    run(
+        [tmp_path / "points.csv"], camera=tmp_path / "camera.yaml", out=tmp_path / "pool.yaml",
+        plane="0,1,0,0", window=["0.010:1.52"], survey_sigma=0.0005,
+    )  # fmt: skip
+    found = load_pool(tmp_path / "pool.yaml")
+    assert found.interface.window == GLASS
+    assert found.interface.normal[1] < -0.999
+    assert np.linalg.norm(found.camera.position - camera.position) < 0.01
+    assert "camera_distance" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_equal_inputs_write_equal_files(pool):
     for name in ("a.yaml", "b.yaml"):
         run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / name, water_height=1.0)
@@ -106,9 +122,13 @@ def test_equal_inputs_write_equal_files(pool):
     ("options", "words"),
     [
         ({"out": "pool.txt"}, "expected .yaml"),
+        ({"plane": "0,1"}, "expected n_x,n_y,n_z,b"),
+        ({"window": ["thick"]}, "expected THICKNESS:INDEX"),
         ({"inputs": "nowhere.csv"}, "no such file"),
+        ({"window": ["10:1.52"]}, "window is 10 m thick.*metres"),
         ({"water_height": -1.0}, "other side"),
-        ({"water_height": 100.0}, "--water-height 100 puts the surface 100 m from the points.*unit"),
+        ({"water_height": 100.0}, "--water-height 100 puts the plane 100 m from the points.*unit"),
+        ({"fit": "pose,colour"}, "unknown 'colour'"),
     ],
 )
 def test_refusals_write_nothing(pool, options, words):
@@ -139,7 +159,9 @@ def test_parts_of_the_picture_are_no_pixels(pool):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, {"focal_sigma": 0.003}, {"focal_sigma": 0.0}])
+@pytest.mark.parametrize(
+    "options", [{}, {"focal_sigma": 0.003}, {"focal_sigma": 0.0}, {"fit": "pose,height,focal"}]
+)
 def test_a_lens_taken_as_exact_is_said(pool, capsys, options):
     """As a note in the table and a finding in JSON, unless somebody told its errors or it is fitted."""
     files = {"camera": pool / "camera.yaml", "out": pool / "pool.yaml", "water_height": 1.0}

@@ -32,10 +32,18 @@ def test_one_point_in_many_spellings(tmp_path, text):
     np.testing.assert_allclose(survey.points["a"].points, [[1.5, -0.25, 0.5]])
 
 
-def test_millimetres_without_a_word_are_refused(tmp_path):
+def test_a_unit_may_be_given_beside(tmp_path):
     path = written(tmp_path, "id,x,y,z\na,1500,0,0\nb,0,900,0\n")
-    with pytest.raises(CalibrationError, match="spread over 1500 m.*x_mm"):
+    with pytest.raises(CalibrationError, match="spread over 1500 m.*--unit mm"):
         read_survey(path)
+    np.testing.assert_allclose(read_survey(path, unit="mm").points["b"].points, [[0.0, 0.9, 0.0]])
+
+
+def test_one_height_may_be_given_beside(tmp_path):
+    path = written(tmp_path, "id,x,y\na,1,2\n")
+    with pytest.raises(CalibrationError, match="no column 'z'.*--z"):
+        read_survey(path)
+    assert read_survey(path, z=-1.0).points["a"].points[0, 2] == -1.0
 
 
 def test_a_fixed_tag_gives_its_corners(tmp_path):
@@ -45,8 +53,8 @@ def test_a_fixed_tag_gives_its_corners(tmp_path):
 
 
 def test_a_moved_tag_belongs_to_its_picture(tmp_path):
-    text = "image,x_mm,y_mm,z_mm,yaw_deg,edge_mm\na.png,100,0,0,0,100\nb.png,200,0,0,0,100\n"
-    survey = read_survey(written(tmp_path, text))
+    text = "image,x_mm,y_mm,z_mm,yaw_deg\na.png,100,0,0,0\nb.png,200,0,0,0\n"
+    survey = read_survey(written(tmp_path, text), edge=0.1)
     ((tag, placed),) = survey.locations["b.png"]
     assert tag is None
     np.testing.assert_allclose(placed.points.mean(axis=0), [0.2, 0.0, 0.0], atol=1e-12)
@@ -62,11 +70,12 @@ def test_directions_in_degrees_or_radians(tmp_path, head, cells, radians):
     assert np.arctan2(along[1], along[0]) == pytest.approx(radians)
 
 
-def test_dry_points_and_targets(tmp_path):
-    text = "id,x,y,z,dry,group\na,0,0,0,,left\nb,1,0,1.2,yes,\n"
+def test_own_errors_dry_points_and_targets(tmp_path):
+    text = "id,x,y,z,sigma_mm,dry,group\na,0,0,0,5,,left\nb,1,0,1.2,,yes,\n"
     survey = read_survey(written(tmp_path, text))
-    assert survey.points["a"].group == "left" and not survey.points["a"].dry
-    assert survey.points["b"].dry
+    assert survey.points["a"].sigma == pytest.approx(0.005)
+    assert survey.points["a"].group == "left"
+    assert survey.points["b"].dry and np.isnan(survey.points["b"].sigma)
 
 
 @pytest.mark.parametrize(
@@ -98,3 +107,17 @@ def test_rows_without_a_number_are_left_out_and_said(tmp_path):
 
 def test_a_repeated_row_is_no_contradiction(tmp_path):
     assert len(read_survey(written(tmp_path, "id,x,y,z\na,1,2,3\na,1,2,3\n")).points) == 1
+
+
+def test_a_grid_of_tags(tmp_path):
+    """Turned by 90 degrees, the columns run along y; the second row lies at smaller x."""
+    path = tmp_path / "grid.yaml"
+    text = "grid: {first: 5, columns: 3, rows: 2, spacing: [0.2, 0.3], edge: 0.1, position: [1, 2, 0], yaw_deg: 90}"
+    path.write_text(text, encoding="utf-8")
+    tags = read_survey(path).tags
+    assert sorted(tags) == [5, 6, 7, 8, 9, 10]
+    np.testing.assert_allclose(tags[7].points.mean(axis=0), [1.0, 2.4, 0.0], atol=1e-12)
+    np.testing.assert_allclose(tags[8].points.mean(axis=0), [0.7, 2.0, 0.0], atol=1e-12)
+    path.write_text(text.replace("edge: 0.1", "edge: 0.5"), encoding="utf-8")
+    with pytest.raises(CalibrationError, match="spacing above the edge"):
+        read_survey(path)

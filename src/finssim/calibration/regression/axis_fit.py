@@ -770,8 +770,11 @@ def _offset(found: Signals, axis: int) -> Array:
 Damping = Literal["auto", "linear", "quadratic", "both"]
 DAMPING: tuple[Damping, ...] = ("auto", "linear", "quadratic", "both")
 
+SIGNIFICANT = 0.03
+"""A second damping term stays where it is significant at this level: one that is superfluous should be rare, for it is
+carried to speeds that no trial had."""
 AKAIKE = 0.157
-"""Akaike's criterion keeps one more term when it is significant at this level (χ² of one degree above 2)."""
+"""The same of a smoothing of the inputs, which costs little (Akaike's criterion: χ² of one degree above 2)."""
 
 TELLING = 6.0
 """Twice a logarithm of likelihoods below which linear drag is not preferred to quadratic: odds of 20 to 1."""
@@ -796,8 +799,8 @@ class Selection:
 def select(data: AxisData, damping: str = "auto") -> Selection:
     """Fit an axis with the dampings that the data support.
 
-    `auto` starts from both and leaves out a term that is negative or that Akaike's criterion, with the standard error
-    from the disagreement of the trials, does not keep; of two such terms the one with less evidence. One always stays,
+    `auto` starts from both and leaves out a term that is negative or not `SIGNIFICANT`, by the standard error from the
+    disagreement of the trials; of two such terms the one with less evidence. One always stays,
     and where the data hardly tell linear from quadratic it is the quadratic one: a bluff body's drag is, and a linear
     one would be far off at higher speeds. The intervals hold both answers.
 
@@ -810,7 +813,7 @@ def select(data: AxisData, damping: str = "auto") -> Selection:
     smoothed = fit_axis(data, _without(data.terms, left_out) if left_out else data.terms)
     full = _without_needless_smoothing(data, smoothed)
     p_value = {} if left_out else {name: _p_value(full, TERMS.index(name)) for name in ("d1", "d2")}
-    weak = [name for name, p in p_value.items() if p > AKAIKE]
+    weak = [name for name, p in p_value.items() if p > SIGNIFICANT]
     if damping == "both" or not weak:
         interval = _with_lag(data, _interval(full), smoothed)
         return Selection(fit=full, full=full, dropped=(), p_value=p_value, interval=interval)

@@ -22,7 +22,7 @@ from finssim.calibration.regression.axis_estimates import (
     drag_known,
     hydrostatics,
 )
-from finssim.calibration.regression.axis_fit import AKAIKE, DAMPING
+from finssim.calibration.regression.axis_fit import DAMPING, SIGNIFICANT
 from finssim.calibration.regression.plant_terms import matrices
 from finssim.calibration.simulation.rollout import (
     CHANNELS,
@@ -1692,7 +1692,8 @@ def fit_by_simulation(
         chosen_kinds = _select(kinds, stage)
         if chosen_kinds != kinds:
             first = fit.numbers(stage)
-            fit.retained = _retained(chosen_kinds, first, stage.problem.parameters)
+            tops = {axis: speeds([t.motion for t in fit.used], axis)[1] for axis in chosen}
+            fit.retained = _retained(chosen_kinds, first, stage.problem.parameters, tops)
             stage = fit.next(chosen_kinds, stage)
     return fit.result(stage, first, remarks, damping=damping)
 
@@ -1755,16 +1756,29 @@ def _select(kinds: dict[str, str], stage: Stage) -> dict[str, str]:
                 2.0 * norm.sf(max(stage.found.free[c], 0.0) / max(std[c], 1e-300)) if known else 1.0
             )
         weakest = max(p_value, key=lambda name: p_value[name])
-        if p_value[weakest] > AKAIKE:
+        if p_value[weakest] > SIGNIFICANT:
             new[axis] = "quadratic" if weakest == "d1" else "linear"
     return new
 
 
-def _retained(kinds: dict[str, str], first: Mapping[str, Number], p: Parameters) -> tuple[str, ...]:
+NEGLIGIBLE = 0.1
+"""Of the drag."""
+
+
+def _retained(
+    kinds: dict[str, str], first: Mapping[str, Number], p: Parameters, tops: Mapping[str, float]
+) -> tuple[str, ...]:
     """Damping that was left out and stays the vehicle file's, because the data exclude that no more than zero.
 
     Slow swings show no quadratic drag, and a vehicle without any would tumble at speeds that no trial had. None where
-    the scale of thrust is free: the file's number would decide that.
+    the scale of thrust is free: the file's number would decide that; nor where the interval holds no more than
+    `NEGLIGIBLE` of the drag at the top speed: there the axis was seen to have one shape alone.
+
+    Args:
+        kinds: Damping of each axis.
+        first: Estimates with both dampings.
+        p: What is free.
+        tops: Top speed of each axis [m/s, rad/s].
     """
     if "thrust_scale" in p.names:
         return ()
@@ -1774,6 +1788,11 @@ def _retained(kinds: dict[str, str], first: Mapping[str, Number], p: Parameters)
         if kind in absent:
             name, D = absent[kind]
             i = AXES.index(axis)
-            if 0.0 < D[i][i] <= first[f"{axis}.{name}"].ends[1]:
+            high, other = (
+                first[f"{axis}.{name}"].ends[1],
+                first[f"{axis}.{'d1' if name == 'd2' else 'd2'}"].value,
+            )
+            drag, rest = (high * tops[axis], other) if name == "d2" else (high, other * tops[axis])
+            if 0.0 < D[i][i] <= high and drag > NEGLIGIBLE * rest:
                 out.append(f"{axis}.{name}")
     return tuple(out)

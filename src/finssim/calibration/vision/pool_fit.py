@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,14 +40,15 @@ from finssim.calibration.vision.pool_model import (
     Settings,
     Solution,
     active_names,
+    clearances,
     extended_lens,
     lens_std,
     normal_equations,
     residuals,
     solve,
 )
-from finssim.calibration.vision.survey import Observations, observe, read_survey
-from finssim.geometry.optics import Camera, Interface, Lens, back_project
+from finssim.calibration.vision.survey import Observations, observe, observe_combined, read_survey
+from finssim.geometry.optics import Camera, Interface, Layer, Lens, back_project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_euler, quat_to_matrix
 from finssim.localization.camera_file import CameraFile, load_camera
 from finssim.localization.pool import Pool, write_pool
@@ -56,13 +57,13 @@ from finssim.provenance import provenance
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["PoolFit", "calibrate_pool", "doubted", "pool_record", "run"]
+__all__ = ["CAMERA", "PoolFit", "calibrate_pool", "doubted", "pool_record", "run"]
 
 
 Array = NDArray[np.float64]
 
 UP = np.array([0.0, 0.0, 1.0])
-SURFACE_TILT = math.radians(0.2)
+SURFACE_TILT, PLANE_TILT = np.radians(0.2), np.radians(0.5)
 
 DRAWS, DRAWN = 60, 6
 """Samples of that many points, of which those that suit most of the others are kept."""
@@ -89,6 +90,9 @@ weak that it only decides where the pixels say nothing."""
 
 MIRRORED = 0.6
 """Residual of the mirror image over that of the best model, below which the survey's frame is left-handed."""
+
+SAME = 1.15
+"""A surface that fits within this factor of a wall is taken for a surface."""
 
 
 class RobustPixels:
@@ -212,37 +216,53 @@ def _distinct(solutions: list[Solution]) -> list[Solution]:
     return selected
 
 
-def surface_starts(pinhole: PoolModel, observed: Observations, settings: Settings) -> Iterator[PoolModel]:
-    """The straight-line pose with a level surface put before the points and the camera moved back to match.
+def plane_starts(
+    pinhole: PoolModel, normals: Sequence[Array], plane: Interface, observed: Observations, depth: float
+) -> Iterator[PoolModel]:
+    """The straight-line pose with a plane put before the points and the camera moved back to match.
 
     Points d under the surface look as if d / n under it, so a camera found at H stands at H + d (1 - 1 / n).
 
     Args:
         pinhole: Straight-line pose.
+        normals: Directions to try, each turned to the camera's side.
+        plane: Holds indices and window.
         observed: Of which the points under water count.
-        settings: Hold the index, and the height of the surface where it is known.
+        depth: Distance of the plane from the reference point where it is known [m], or NaN.
     """
     camera, reference = pinhole.camera, pinhole.reference
-    normal, depth = stated_surface(pinhole, settings)
-    apparent = float(normal @ (camera.position - reference))
-    heights = (observed.points[~observed.dry] - reference) @ normal
-    leasts = [float(np.quantile(heights, share)) for share in REACHED]
-    depths = (
-        [depth]
-        if np.isfinite(depth)
-        else sorted({max(s * apparent, 1.02 * least + 1e-4) for s in SHARES for least in leasts})
-    )
-    for d in depths:
-        surface = Interface(normal, -float(normal @ reference) - d, index_far=settings.index)
-        position = camera.position + normal * d * (1.0 - surface.index_near / surface.index_far)
-        short = d + 0.05 * apparent - float(normal @ (position - reference))
-        if short > 0.04 * apparent:
-            position = position + normal * short
-        yield replace(pinhole, camera=replace(camera, position=position), interface=surface, refractive=True)
+    wet = observed.points[~observed.dry]
+    for direction in normals:
+        apparent = float(direction @ (camera.position - reference))
+        normal, apparent = (direction, apparent) if apparent > 0.0 else (-direction, -apparent)
+        heights = (wet - reference) @ normal
+        leasts = [float(np.quantile(heights, share)) + plane.thickness for share in REACHED]
+        depths = (
+            [depth]
+            if np.isfinite(depth)
+            else sorted({max(s * apparent, 1.02 * least + 1e-4) for s in SHARES for least in leasts})
+        )
+        for d in depths:
+            ratio = plane.index_near / plane.index_far
+            position = camera.position + normal * d * (1.0 - ratio)
+            if float(normal @ (position - reference)) - d < 0.01 * apparent:
+                position = position + normal * (d + 0.05 * apparent - float(normal @ (position - reference)))
+            here = replace(plane, normal=normal, offset=-float(normal @ reference) - d)
+            yield replace(pinhole, camera=replace(camera, position=position), interface=here, refractive=True)
 
 
-def search(observed: Observations, lens: Lens, settings: Settings) -> tuple[PoolModel, PoolModel]:
-    """The best of many starts with robust weights, and the best straight-line pose.
+@dataclass(frozen=True)
+class BestStart:
+    """Where the search ended."""
+
+    model: PoolModel
+    pinhole: PoolModel
+    surface: bool
+    """The plane's normal is along the survey's z."""
+
+
+def search(observed: Observations, lens: Lens, settings: Settings) -> BestStart:
+    """The best of many starts, with robust weights.
 
     Raises:
         CalibrationError: No pose explains the pixels, the survey is left-handed, or contradicts what was measured.
@@ -252,63 +272,115 @@ def search(observed: Observations, lens: Lens, settings: Settings) -> tuple[Pool
         observed = observed.subset(np.sort(sample))
     poses = pinhole_poses(observed, lens, settings.seed)
     near = [p.model for p in poses[:3] if p.cost < 3.0 * poses[0].cost + 0.5]
-    starts: list[PoolModel] = []
-    for pinhole in near:
-        _refuse_wrong_side(pinhole, settings)
-        starts += surface_starts(pinhole, observed, settings)
-    ends: list[tuple[float, PoolModel]] = []
-    for counts, count in (((6, 4), len(starts)), ((30, 40), 4)):
-        models = [_descend(model, observed, settings, counts) for model in starts[:count]]
-        ends = [(_score(model, observed), model) for model in models if model is not None]
-        ends.sort(key=lambda pair: pair[0])
-        starts = [model for _, model in ends]
+    runs: list[tuple[float, PoolModel, bool]] = []
+    for surface, normals in _families(near[0], observed, settings):
+        runs += _family(near, normals, observed, settings, surface)
     # Bent rays come first: straight ones may fit the mirror image of a good survey better than the survey.
-    _refuse_mirrored(observed, lens, min([_score(near[0], observed), *(value for value, _ in ends)]))
-    if not ends:
+    _refuse_mirrored(observed, lens, min([_score(near[0], observed), *(run[0] for run in runs)]))
+    if not runs:
         raise CalibrationError(
-            "no height of the water between camera and points explains the pixels: check the water height and its sign"
+            "no place of the plane between camera and points explains the pixels: check the water height, its sign and "
+            "the interface"
         )
-    return ends[0][1], near[0]
+    chosen = _choose(runs, len(observed))
+    return BestStart(chosen[1], near[0], chosen[2])
 
 
-def prior_of(model: PoolModel, start: PoolModel, settings: Settings) -> Prior:
-    """What is known of the surface before the pictures, as the fit wants it.
+def prior_of(
+    model: PoolModel, start: PoolModel, settings: Settings, surface: bool, stds: tuple[float, ...]
+) -> Prior:
+    """What is known of the plane before the pictures, as the fit wants it.
 
     Args:
         model: On whose side of the points the camera is.
         start: Holds the index and the lens as given.
         settings: Options.
+        surface: The normal is along the survey's z.
+        stds: Of the lens's parameters.
     """
-    normal, depth = stated_surface(model, settings)
+    normal, depth = stated_plane(model, settings, surface)
+    tilt = settings.tilt_sigma
+    if tilt is None:
+        tilt = float(PLANE_TILT if settings.plane is not None else SURFACE_TILT if surface else np.inf)
     depth_std = max(settings.water_height_sigma, 1e-6)
     if not np.isfinite(depth):
-        depth = depth_std = ANYWHERE * float(np.linalg.norm(start.camera.position - start.reference))
+        apparent = float(np.linalg.norm(start.camera.position - start.reference))
+        depth, depth_std = ANYWHERE * apparent, ANYWHERE * apparent
     return Prior(
         normal=normal,
-        tilt_std=(SURFACE_TILT if settings.tilt_sigma is None else settings.tilt_sigma) or np.inf,
+        tilt_std=tilt if tilt > 0.0 else np.inf,
         depth=depth,
         depth_std=depth_std,
         start=start,
-        index_std=settings.index_sigma or np.inf,
-        lens_std=lens_std(settings, model.camera.lens.width),
+        index_std=settings.index_sigma if settings.index_sigma > 0.0 else np.inf,
+        lens_std=stds,
     )
 
 
-def stated_surface(model: PoolModel, settings: Settings) -> tuple[Array, float]:
-    """Normal towards the camera, and distance of the surface from the reference point: NaN where unknown."""
-    normal = UP if model.camera.position[2] > model.reference[2] else -UP
-    if settings.water_height is None:
-        return normal, np.nan
-    return normal, float(normal[2] * (settings.water_height - model.reference[2]))
+def stated_plane(model: PoolModel, settings: Settings, surface: bool) -> tuple[Array | None, float]:
+    """Normal towards the camera, and distance of the plane from the reference point; None and NaN where unknown."""
+    towards, depth = model.camera.position - model.reference, settings.water_depth
+    if settings.plane is not None:
+        normal, offset = settings.unit_plane
+        sign = 1.0 if normal @ towards > 0.0 else -1.0
+        return sign * normal, float(-sign * (normal @ model.reference + offset))
+    normal = UP if towards[2] > 0.0 else -UP
+    if surface and settings.water_height is not None:
+        return normal, float(normal[2] * (settings.water_height - model.reference[2]))
+    return normal if surface else None, np.nan if depth is None else depth
+
+
+def _families(
+    pinhole: PoolModel, observed: Observations, settings: Settings
+) -> list[tuple[bool, list[Array]]]:
+    """(surface?, normals to try)."""
+    if settings.plane is not None:
+        normal, _ = settings.unit_plane
+        return [(bool(abs(normal[2]) > 0.9), [normal])]
+    surface = [(True, [UP])]
+    if settings.interface == "surface" or settings.interface == "auto" and settings.water_height is not None:
+        return surface
+    towards = pinhole.camera.position - pinhole.reference
+    towards = towards / np.linalg.norm(towards)
+    axes = np.linalg.svd(observed.points - observed.points.mean(axis=0), full_matrices=True)[2]
+    facing: list[Array] = []
+    for n in (towards, -np.asarray(pinhole.camera.R_pc)[:, 2], *np.eye(3), *axes):
+        n = n if n @ towards > 0.0 else -n
+        if n @ towards > 0.35 and all(n @ other < 0.995 for other in facing):
+            facing.append(n)
+    return [*(surface if settings.interface == "auto" else []), (False, facing)]
+
+
+def _family(
+    poses: Sequence[PoolModel],
+    normals: Sequence[Array],
+    observed: Observations,
+    settings: Settings,
+    surface: bool,
+) -> list[tuple[float, PoolModel, bool]]:
+    """Ends of the search from all starts of one family: residual [px], model, surface?; the best first."""
+    plane = Interface(UP, 0.0, settings.index_near, settings.index, settings.window)
+    starts: list[PoolModel] = []
+    for pinhole in poses:
+        _refuse_wrong_side(pinhole, settings, surface)
+        _, depth = stated_plane(pinhole, settings, surface)
+        starts += plane_starts(pinhole, normals, plane, observed, depth)
+    ends: list[tuple[float, PoolModel]] = []
+    for counts, count in (((6, 4), len(starts)), ((30, 40), 4)):
+        models = [_descend(model, observed, settings, surface, counts) for model in starts[:count]]
+        ends = [(_score(model, observed), model) for model in models if model is not None]
+        ends.sort(key=lambda pair: pair[0])
+        starts = [model for _, model in ends]
+    return [(value, model, surface) for value, model in ends]
 
 
 def _descend(
-    model: PoolModel, observed: Observations, settings: Settings, counts: tuple[int, int]
+    model: PoolModel, observed: Observations, settings: Settings, surface: bool, counts: tuple[int, int]
 ) -> PoolModel | None:
-    """Pose alone, then pose and surface."""
+    """Pose alone, then pose and plane."""
     start = model
     for count, names in zip(counts, (NAMES[:6], NAMES[:9]), strict=True):
-        prior = replace(prior_of(model, start, settings), lens_std=(np.inf,) * 8)
+        prior = prior_of(model, start, settings, surface, (np.inf,) * 8)
         active = np.array([name in names for name in NAMES])
         whiten = RobustPixels(model, observed)
         model, cost = solve(model, observed, whiten, active, prior, iterations=count, tolerance=1e-7)
@@ -334,16 +406,32 @@ def _refuse_mirrored(observed: Observations, lens: Lens, best: float) -> None:
         )
 
 
-def _refuse_wrong_side(pinhole: PoolModel, settings: Settings) -> None:
-    _, depth = stated_surface(pinhole, settings)
-    if depth <= 0.0:
+def _refuse_wrong_side(pinhole: PoolModel, settings: Settings, surface: bool) -> None:
+    _, depth = stated_plane(pinhole, settings, surface)
+    if np.isfinite(depth) and depth <= 0.0:
         sense = "below" if pinhole.camera.position[2] < pinhole.reference[2] else "above"
+        plane_name = "the plane given" if settings.water_height is None else "the water's height given"
         raise CalibrationError(
-            f"the pixels put the camera at z {sense} the points, and the water's height given is {-depth:.3g} m on the "
-            f"other side of them: the survey's z points {'down' if sense == 'below' else 'up'}, or its x and y make it "
-            "left-handed (seen from the camera, y must lie to the left of x where z is up); give the water's height "
-            "with the other sign, or negate y in the survey"
+            f"the pixels put the camera at z {sense} the points, and {plane_name} is {-depth:.3g} m on the other side "
+            "of "
+            f"them: the survey's z points {'down' if sense == 'below' else 'up'}, or its x and y make it left-handed "
+            "(seen from the camera, y must lie to the left of x where z is up); give the water's height with the other "
+            "sign, or negate y in the survey"
         )
+
+
+def _choose(runs: list[tuple[float, PoolModel, bool]], count: int) -> tuple[float, PoolModel, bool]:
+    """The best run; a level surface wherever it does as well as a wall, or the points are too few to tell."""
+    best = min(runs, key=lambda run: run[0])
+    surfaces = [run for run in runs if run[2]]
+    if surfaces and not best[2]:
+        level = min(surfaces, key=lambda run: run[0])
+        upright = abs(float(best[1].interface.normal[2])) > np.cos(np.radians(5.0))
+        spare = 2.0 * count - 9.0  # a wall's parameters are nine, two more than a surface's
+        freedom = np.sqrt((spare + 2.0) / spare) if spare > 0.0 else 1.0
+        if spare <= 0.0 or level[0] <= SAME * freedom * best[0] + 0.02 or upright:
+            return level
+    return best
 
 
 # The fit proper: full weights, the size of the errors, wrong rows left out, errors at points not seen.
@@ -368,8 +456,8 @@ class Noise:
     pixel: float
     """Of each image coordinate [px]."""
     survey: float = 0.002
-    """Of each coordinate of a location [m]."""
-    survey_yaw: float = math.radians(0.5)
+    """Of each coordinate of a location, where the survey does not give its own [m]."""
+    survey_yaw: float = 0.0087
     """Of the direction in which a tag was laid [rad]."""
     scale: float = 1.0
     """Of all survey errors, as the residuals tell it."""
@@ -381,8 +469,9 @@ class Noise:
             J_point: Derivative of the pixel by the point, (N, 2, 3).
             observed: The rows.
         """
+        sigma = np.where(np.isfinite(observed.sigma), observed.sigma, self.survey)[:, None, None]
         turn = self.survey_yaw * np.einsum("nij,nj->ni", J_point, observed.arm)[..., None]
-        return np.asarray(self.scale * np.concatenate([J_point * self.survey, turn], axis=-1))
+        return np.asarray(self.scale * np.concatenate([J_point * sigma, turn], axis=-1))
 
 
 class Whitener:
@@ -430,6 +519,8 @@ def estimate_noise(
     observed: Observations,
     noise: Noise,
     prior: Array,
+    *,
+    fixed_pixel: bool,
 ) -> Noise:
     """Most likely standard errors of pixels and survey (restricted likelihood: what the fit swallowed is given back).
 
@@ -440,6 +531,7 @@ def estimate_noise(
         observed: The rows.
         noise: What is believed before.
         prior: Information of the priors on the parameters, (P, P).
+        fixed_pixel: The pixel's error is given and stays.
     """
     if len(observed) > NOISE_ROWS:  # two numbers need no more; whole locations, evenly
         every = int(np.ceil(len(observed) / NOISE_ROWS))
@@ -448,7 +540,8 @@ def estimate_noise(
             residual, J, J_point, observed = residual[rows], J[rows], J_point[rows], observed.subset(rows)
 
     def at(x: Array) -> Noise:
-        return replace(noise, pixel=max(LEAST_PIXEL, math.exp(x[1])), scale=math.exp(x[0]))
+        pixel = noise.pixel if fixed_pixel else max(LEAST_PIXEL, math.exp(x[1]))
+        return replace(noise, pixel=pixel, scale=math.exp(x[0]))
 
     def cost(x: Array) -> float:
         if np.abs(x).max() > 12.0:
@@ -460,12 +553,14 @@ def estimate_noise(
         logdet = float(np.linalg.slogdet(N / np.outer(scale, scale))[1]) + 2.0 * float(np.log(scale).sum())
         g = A.T @ r
         chi2 = float(r @ r) - float(g @ np.linalg.lstsq(N, g, rcond=None)[0])
-        usual = (x[0] / STATED_SURVEY) ** 2 + ((x[1] - math.log(USUAL_PIXEL)) / STATED_PIXEL) ** 2
+        usual = (x[0] / STATED_SURVEY) ** 2
+        if not fixed_pixel:
+            usual += ((x[1] - math.log(USUAL_PIXEL)) / STATED_PIXEL) ** 2
         return chi2 + whiten.logdet + logdet + usual
 
-    start = np.array([0.0, math.log(max(noise.pixel, LEAST_PIXEL))])
+    start = [0.0, math.log(max(noise.pixel, LEAST_PIXEL))][: 1 if fixed_pixel else 2]
     solution = minimize(
-        cost, start, method="Nelder-Mead", options={"xatol": 0.01, "fatol": 0.01, "maxiter": 120}
+        cost, np.array(start), method="Nelder-Mead", options={"xatol": 0.01, "fatol": 0.01, "maxiter": 120}
     )
     return at(solution.x)
 
@@ -477,6 +572,14 @@ MAX_WRONG = 0.4
 """Share of wrong rows beyond which nothing is believed."""
 
 ROUNDS = 6
+
+TOUCHING = 0.0001
+"""Distance of the plane from a point or the camera, below which the one keeps the other from moving on [m]."""
+
+PRESSED = 9.0
+"""Fall of chi² that a plane held by a point or the camera would gain beyond it, from which that is no chance."""
+
+CAMERA = "the camera"
 
 
 @dataclass(frozen=True)
@@ -505,7 +608,9 @@ def refine(
     observed: Observations,
     active: NDArray[np.bool_],
     prior: Prior,
-    survey: float,
+    noise: Noise,
+    *,
+    fixed_pixel: bool = False,
 ) -> Refined:
     """Fit with the errors of pixels and survey estimated on the way, and wrong rows named.
 
@@ -514,7 +619,8 @@ def refine(
         observed: All rows.
         active: Parameters to fit, (18,).
         prior: What is known beforehand.
-        survey: Standard error of a surveyed coordinate, as it was stated [m].
+        noise: What is believed of the errors.
+        fixed_pixel: The pixel's error is given.
 
     Raises:
         CalibrationError: Too many rows do not fit.
@@ -523,8 +629,9 @@ def refine(
     model = solve(model, observed, robust, active, prior, iterations=40).model
     robust = RobustPixels(model, observed, least=0.05)
     model = solve(model, observed, robust, active, prior, iterations=40).model
-    pixel = max(0.05, float(np.median(_sizes(model, observed))) / 1.1774)
-    noise = Noise(pixel=pixel, survey=max(survey, 1e-7))
+    if not fixed_pixel:
+        size = np.linalg.norm(residuals(model, observed)[0], axis=1)
+        noise = replace(noise, pixel=max(0.05, float(np.median(size)) / 1.1774))
     used = _plausible(model, observed, noise)
     free = np.flatnonzero(active)
     for _ in range(ROUNDS):
@@ -533,7 +640,7 @@ def refine(
         J, J_point = model.jacobians(rows.points, rows.dry)
         J_prior = prior.rows(model)[1][:, free]
         off, information = residuals(model, rows)[0], J_prior.T @ J_prior
-        noise = estimate_noise(off, J[..., free], J_point, rows, noise, information)
+        noise = estimate_noise(off, J[..., free], J_point, rows, noise, information, fixed_pixel=fixed_pixel)
         whiten = Whitener(J_point, rows, noise)
         (model, cost), before = solve(model, rows, whiten, active, prior), used
         used = _plausible(model, observed, noise)
@@ -542,6 +649,29 @@ def refine(
     covariance = _covariance(model, rows, whiten, free, prior)
     dof = max(3.0, 2.0 * len(rows) - len(free))
     return Refined(model, noise, before, whiten, active, prior, covariance, cost, dof)
+
+
+def touched(fit: Refined, observed: Observations) -> tuple[str, ...]:
+    """Points used, and the camera, that the plane and its window have come to rest against although the pixels want it
+    further on; the nearest first.
+
+    Args:
+        fit: Of these rows.
+        observed: All rows.
+    """
+    wet = fit.used & ~observed.dry
+    distance = np.where(wet, clearances(fit.model, observed.points), np.inf)
+    near = [i for i in np.argsort(distance) if distance[i] < TOUCHING]
+    if not near and fit.model.clearance >= TOUCHING:
+        return ()
+    N, g = normal_equations(
+        fit.model, observed.subset(fit.used), fit.whiten, np.flatnonzero(fit.active), fit.prior
+    )
+    scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
+    if float((g / scale) @ np.linalg.lstsq(N / np.outer(scale, scale), g / scale, rcond=1e-9)[0]) < PRESSED:
+        return ()
+    names = dict.fromkeys(observed.locations[observed.location[i]] for i in near)
+    return (*((CAMERA,) if fit.model.clearance < TOUCHING else ()), *names)
 
 
 def _plausible(model: PoolModel, observed: Observations, noise: Noise) -> NDArray[np.bool_]:
@@ -599,9 +729,6 @@ def _covariance(
     return covariance
 
 
-FOLDS = 5
-"""Parts of the cross-validation."""
-
 FEW = 4
 """Locations below which single rows are held out instead: a target or two have no parts to leave out."""
 
@@ -631,18 +758,20 @@ class HeldOut:
         }
 
 
-def held_out(fit: Refined, observed: Observations, seed: int) -> HeldOut | None:
+def held_out(fit: Refined, observed: Observations, folds: int, seed: int, normal: Array) -> HeldOut | None:
     """Refit without each part of the locations in turn; None where too few would be left.
 
     Args:
         fit: To all rows; its outliers stay out.
         observed: All rows.
+        folds: Parts, at most one for each location.
         seed: Of the parts.
+        normal: Of the planes, one through each point, on which pixels are back-projected: unit, pool frame [-], (3,).
     """
     used = np.flatnonzero(fit.used)
     group = observed.location if len(np.unique(observed.location[used])) >= FEW else np.arange(len(observed))
     names = np.unique(group[used])
-    folds = min(FOLDS, len(names))
+    folds = min(folds, len(names))
     if folds < 2:
         return None
     fold = np.empty(int(group.max()) + 1, int)
@@ -661,13 +790,18 @@ def held_out(fit: Refined, observed: Observations, seed: int) -> HeldOut | None:
         r, ok = residuals(model, here)
         rows.append(outside[ok])
         pixels.append(r[ok])
-        points.append(error_vectors(model, here)[ok])
+        points.append(error_vectors(model, here, normal)[ok])
     return HeldOut(np.concatenate(pixels), np.concatenate(points), np.concatenate(rows), folds)
 
 
-def error_vectors(model: PoolModel, observed: Observations) -> Array:
-    """Where each pixel's ray meets the horizontal plane through its point, minus the point [m], (N, 3); NaN where it
-    does not."""
+def error_vectors(model: PoolModel, observed: Observations, normal: Array) -> Array:
+    """Where each pixel's ray meets the plane through its point, minus the point [m], (N, 3); NaN where it does not.
+
+    Args:
+        model: Camera and water.
+        observed: Pixels and points.
+        normal: Unit normal of the planes, pool frame [-], (3,).
+    """
     rays, ok = model.camera.lens.rays(observed.pixels)
     origin = np.broadcast_to(np.asarray(model.camera.position), observed.points.shape).copy()
     direction = np.where(ok[:, None], rays, np.nan) @ np.asarray(model.camera.R_pc).T
@@ -675,7 +809,7 @@ def error_vectors(model: PoolModel, observed: Observations) -> Array:
         water = back_project(model.camera, model.interface, observed.pixels[~observed.dry])
         origin[~observed.dry], direction[~observed.dry] = water.origin, water.direction
     with np.errstate(all="ignore"):
-        length = (observed.points - origin)[:, 2] / direction[:, 2]
+        length = ((observed.points - origin) @ normal) / (direction @ normal)
     return np.asarray(origin + length[:, None] * direction - observed.points)
 
 
@@ -683,10 +817,6 @@ def error_vectors(model: PoolModel, observed: Observations) -> Array:
 
 IDENTIFIED = 0.7
 """A standard error above this part of what was known before means that the pictures tell next to nothing."""
-
-CONTRADICTED = math.sqrt(20.0)
-"""Standard errors between what tape and pixels say of the water's height, above which one is wrong: by chance once in
-20000 surveys, more in very poor ones."""
 
 FAR = 0.05
 """Standard error of a distance, over the whole distance, above which it counts as not determined."""
@@ -698,18 +828,19 @@ STEPS = np.array([1e-5] * 3 + [1e-6] * 5 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-6, 
 """Of the derivatives by the parameters."""
 
 
-def estimates(fit: Refined, settings: Settings) -> tuple[dict[str, Estimate], Correlation]:
+def estimates(fit: Refined, surface: bool, settings: Settings) -> tuple[dict[str, Estimate], Correlation]:
     """Table of estimates, and the correlation of their errors, without what was not fitted.
 
     Args:
         fit: The fit.
+        surface: The plane is a water surface.
         settings: Options.
     """
-    table, quantile = _quantities(fit.model), float(student.ppf(0.975, fit.dof))
+    table, quantile = _quantities(fit.model, surface), float(student.ppf(0.975, fit.dof))
     G = np.zeros((len(table), len(NAMES)))
     for k in np.flatnonzero(fit.active):
         step = STEPS[k] * np.eye(len(NAMES))[k]
-        ends = (_quantities(fit.model.moved(s)).values() for s in (step, -step))
+        ends = (_quantities(fit.model.moved(s), surface).values() for s in (step, -step))
         after, before = (np.array([value for _, value in end]) for end in ends)
         G[:, k] = (after - before) / (2.0 * STEPS[k])
     V = G @ fit.covariance @ G.T
@@ -722,7 +853,7 @@ def estimates(fit: Refined, settings: Settings) -> tuple[dict[str, Estimate], Co
     return rows, correlation(names, V[np.ix_(moved, moved)])
 
 
-def _quantities(model: PoolModel) -> dict[str, tuple[str, float]]:
+def _quantities(model: PoolModel, surface: bool) -> dict[str, tuple[str, float]]:
     """Name -> unit and value of everything that is told."""
     camera, lens, n = model.camera, model.camera.lens, model.interface.normal
     rows = dict(zip(("camera_x", "camera_y", "camera_z"), (("m", x) for x in camera.position), strict=True))
@@ -730,9 +861,13 @@ def _quantities(model: PoolModel) -> dict[str, tuple[str, float]]:
     rows |= dict(
         zip(("camera_roll", "camera_pitch", "camera_yaw"), (("deg", x) for x in angles), strict=True)
     )
-    rows["camera_height"] = ("m", model.clearance)
-    rows["water_height"] = ("m", float(model.interface.height(*model.reference[:2])))
-    rows["tilt_x"], rows["tilt_y"] = (("deg", np.degrees(np.arctan2(x, abs(n[2])))) for x in n[:2])
+    if surface:
+        rows["camera_height"] = ("m", model.clearance)
+        rows["water_height"] = ("m", float(model.interface.height(*model.reference[:2])))
+        rows["tilt_x"], rows["tilt_y"] = (("deg", np.degrees(np.arctan2(x, abs(n[2])))) for x in n[:2])
+    else:
+        rows["camera_distance"], rows["point_distance"] = ("m", model.clearance), ("m", model.depth)
+        rows |= {f"normal_{axis}": ("1", x) for axis, x in zip("xyz", n, strict=True)}
     rows["index"], rows["focal"] = ("1", model.interface.index_far), ("px", lens.fx)
     rows["center_x"], rows["center_y"] = ("px", lens.cx), ("px", lens.cy)
     return rows | {name: ("1", x) for name, x in zip(LENS_NAMES[3:], lens.distortion, strict=False)}
@@ -750,11 +885,11 @@ def _doubt(name: str, std: float, fit: Refined, settings: Settings) -> str:
     elif name in LENS_NAMES:
         before = prior.lens_std[LENS_NAMES.index(name)] * (model.camera.lens.fx if name == "focal" else 1.0)
         sentence = "not determined by the pixels: fixed at the camera file's"
-    elif name == "water_height" and settings.water_height is not None:
+    elif name in ("water_height", "point_distance") and settings.stated_depth:
         before, sentence = prior.depth_std, "rests on the measured height"
-    elif name in ("camera_height", "water_height"):
-        if min(model.clearance, model.depth) < AT_BOUND * reach:
-            return "at its bound: the surface touches the camera or a point"
+    elif name in ("camera_height", "camera_distance", "water_height", "point_distance"):
+        if min(model.clearance, model.depth - model.interface.thickness) < AT_BOUND * reach:
+            return "at its bound: the plane touches the camera or a point"
         before, sentence = FAR * reach / IDENTIFIED, "not determined by the pixels"
     return sentence if np.isfinite(before) and std > IDENTIFIED * before else ""
 
@@ -770,64 +905,89 @@ COMMON_DEPTH = 0.02
 CERTAIN = 0.999
 """Share of the marks above the water that are taken for such."""
 
+FULL_LENS = "--fit pose,height,tilt,index,focal,center,distortion"
+
 
 def advice(
-    fit: Refined, observed: Observations, settings: Settings, table: Mapping[str, Estimate]
+    fit: Refined,
+    observed: Observations,
+    surface: bool,
+    settings: Settings,
+    table: Mapping[str, Estimate],
+    touching: Sequence[str],
+    contradicted: Sequence[Finding],
 ) -> Iterator[Finding]:
     """Findings for the user, the gravest first.
 
     Args:
         fit: The fit.
         observed: All rows.
+        surface: The plane is a water surface.
         settings: Options.
         table: Estimates.
+        touching: What the plane came to rest against.
+        contradicted: On measurements that the pixels contradict.
     """
-    yield from _conflicts(fit, settings)
-    yield from _separability(fit, observed, settings, table)
+    if touching:
+        yield finding("plane_touches", places=tuple(touching))
+    yield from contradicted
+    yield from _separability(fit, observed, surface, settings, table)
+    yield from _conflicts(fit, surface, settings)
     yield from _numbers(fit, observed)
-    yield from _excluded_rows(fit, observed)
+    yield from _excluded_rows(fit, observed, surface)
 
 
 def _separability(
-    fit: Refined, observed: Observations, settings: Settings, table: Mapping[str, Estimate]
+    fit: Refined, observed: Observations, surface: bool, settings: Settings, table: Mapping[str, Estimate]
 ) -> Iterator[Finding]:
     """On camera height, water height and index, which few points cannot separate."""
     model, wet = fit.model, observed.subset(fit.used & ~observed.dry)
-    height, n = table["camera_height"], model.interface.normal
+    height = table["camera_height" if surface else "camera_distance"]
     half = 0.5 * (height.ci95[1] - height.ci95[0])
+    n = model.interface.normal
     across = (wet.points - model.camera.position) - ((wet.points - model.camera.position) @ n)[:, None] * n
     radius = float(np.linalg.norm(across, axis=1).max())
     distance = model.clearance + model.depth
     steepest = float(np.arctan2(radius, distance))
     levels = float(np.ptp(wet.points @ n))
+    quantities = "camera height, water height" if surface else "distances of camera and points from the wall"
     tape = "measure the water's height with a tape and give --water-height"
-    tape = "" if settings.water_height is not None else f": {tape}"
+    tape = (
+        ""
+        if settings.stated_depth
+        else f": {tape if surface else 'measure where the wall is and give --plane'}"
+    )
     if steepest < NARROW:
-        yield finding("points_narrow", radius=radius, angle=float(np.degrees(steepest)), remedy=tape)
+        angle = float(np.degrees(steepest))
+        yield finding("points_narrow", radius=radius, angle=angle, quantities=quantities, remedy=tape)
     if levels < COMMON_DEPTH * distance and half > 0.01 * distance:
-        yield finding("one_depth", spread=levels, half=1000.0 * half, remedy=tape)
+        yield finding("one_depth", spread=levels, quantities=quantities, half=1000.0 * half, remedy=tape)
+    if not height.identifiable:
+        low, high = height.ci95
+        yield finding("height_unknown", height.name, estimate=height.estimate, low=low, high=high)
     focal = table["focal"]
     loose = focal.ci95[1] - focal.ci95[0] > 0.02 * focal.estimate
     if fit.active[NAMES.index("focal")] and loose and levels < 0.05 * distance:
         yield finding("focal_of_one_depth")
 
 
-def _conflicts(fit: Refined, settings: Settings) -> Iterator[Finding]:
+def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[Finding]:
     """Where the pixels pull an estimate far from what was known."""
     prior, model = fit.prior, fit.model
-    focal, depth = NAMES.index("focal"), NAMES.index("depth")
-    if settings.water_height is not None and fit.active[depth]:
-        # Of independent errors: what the pixels say by themselves is the estimate less its share of the tape.
-        moved, retained = model.depth - prior.depth, fit.covariance[depth, depth] / prior.depth_std**2
-        told = max(1.0 - retained, 1e-9)
-        if abs(moved) > CONTRADICTED * prior.depth_std * math.sqrt(told):
-            sense = "nearer to" if moved > 0.0 else "further from"
-            yield finding("plane_contradicted", distance=1000.0 * abs(moved) / told, sense=sense)
+    focal = NAMES.index("focal")
+    plane_name = "water's height" if surface else "plane's place"
+    lens = "" if fit.active[focal] else f"; or let the lens be fitted ({FULL_LENS})"
     if np.isfinite(prior.index_std):
         pull = (model.interface.index_far - settings.index) / prior.index_std
         if abs(pull) > 3.0:
-            index = model.interface.index_far
-            yield finding("index_pulled", index=index, given=settings.index, times=abs(pull))
+            yield finding(
+                "index_pulled",
+                index=model.interface.index_far,
+                given=settings.index,
+                times=abs(pull),
+                place=plane_name,
+                remedy=lens,
+            )
     pull = np.log(model.camera.lens.fx / prior.start.camera.lens.fx) / prior.lens_std[0]
     if fit.active[focal] and abs(pull) > 2.0:
         change = float(np.exp(pull * prior.lens_std[0]) - 1.0)
@@ -835,12 +995,7 @@ def _conflicts(fit: Refined, settings: Settings) -> Iterator[Finding]:
     if np.isfinite(prior.tilt_std) and prior.normal is not None:
         lean = _lean(model, prior.normal)
         if lean > 3.0 * prior.tilt_std:
-            yield finding("tilt_pulled", lean=float(np.degrees(lean)))
-
-
-def _lean(model: PoolModel, normal: Array) -> float:
-    """Angle between the surface's normal and another [rad]."""
-    return float(np.arccos(np.clip(model.interface.normal @ normal, -1.0, 1.0)))
+            yield finding("tilt_pulled", lean=float(np.degrees(lean)), remedy=lens)
 
 
 def _numbers(fit: Refined, observed: Observations) -> Iterator[Finding]:
@@ -848,19 +1003,20 @@ def _numbers(fit: Refined, observed: Observations) -> Iterator[Finding]:
     if locations < 12:
         yield finding("few_places", places=locations)
     if fit.noise.pixel > 1.5:
-        yield finding("residuals_large", residual=fit.noise.pixel)
+        yield finding("residuals_large", residual=fit.noise.pixel, options=FULL_LENS)
     if fit.noise.scale > 2.0:
         error = 1000.0 * fit.noise.survey * fit.noise.scale
         yield finding("survey_rough", times=fit.noise.scale, error=error)
 
 
-def _excluded_rows(fit: Refined, observed: Observations) -> Iterator[Finding]:
+def _excluded_rows(fit: Refined, observed: Observations, surface: bool) -> Iterator[Finding]:
     """Rows that were left out: marks above the water that nobody called dry, and others."""
     above = _above(fit, observed)
     wrong = int((~fit.used & ~above).sum())
     if above.any():
         names = tuple(observed.names[i] for i in np.flatnonzero(above))
-        yield finding("marks_dry", marks=names)
+        side_name = "above the water found" if surface else "on the camera's side of the plane found"
+        yield finding("marks_dry", marks=names, place=side_name)
     if wrong:
         yield finding("rows_wrong", rows=wrong)
 
@@ -878,7 +1034,10 @@ def _above(fit: Refined, observed: Observations) -> NDArray[np.bool_]:
 
 
 DOUBT = 20.0
-"""Fall of chi² above which the level of the surface counts as contradicted."""
+"""Fall of chi² above which a prior counts as contradicted: by chance once in 20000 surveys, more in very poor ones."""
+
+LEVEL = np.radians(3.0)
+"""A plane of any direction that is found this near to level is a water surface [rad]."""
 
 MAX_LEAN = np.radians(5.0)
 """A surface tilted further from the survey's z than this is none [rad]."""
@@ -894,6 +1053,8 @@ BETTER = 0.9
 class PoolFit(Refined):
     """The result, in the survey's frame."""
 
+    surface: bool
+    """The plane was taken for a water surface, its normal along the survey's z."""
     settings: Settings
     estimates: dict[str, Estimate]
     correlation: Correlation
@@ -910,6 +1071,8 @@ class PoolFit(Refined):
     """Groups of `FITTED` that the lens gave up."""
     findings: tuple[Finding, ...]
     """The gravest first, then what is merely worth knowing."""
+    touching: tuple[str, ...]
+    """Places of the survey, or the camera, that the plane came to rest against: it can pass neither."""
 
     @property
     def outliers(self) -> list[str]:
@@ -947,42 +1110,69 @@ def calibrate_pool(observed: Observations, lens: Lens, settings: Settings | None
     settings = settings or Settings()
     if observed.dry.all():
         raise CalibrationError("every point is marked dry: at least 4 must be under water")
-    start, pinhole_start = search(observed, extended_lens(lens), settings)
+    best_start = search(observed, extended_lens(lens), settings)
     notes = list(observed.findings)
-    fit = _released(observed, settings, _best_lens(observed, start, settings, notes), notes)
-    if fit.model.interface.normal[2] < 0.0:
+    fit = _best_lens(observed, best_start, settings, notes)
+    level = abs(float(fit.model.interface.normal[2])) > np.cos(LEVEL)
+    if level and not best_start.surface and settings.interface == "auto" and settings.plane is None:
+        best_start, notes = replace(best_start, surface=True), list(observed.findings)
+        fit = _best_lens(observed, best_start, settings, notes)
+    fit = _released(observed, settings, fit, notes)
+    if best_start.surface and fit.model.interface.normal[2] < 0.0:
         notes.append(finding("camera_below"))
-    pinhole = _pinhole(observed, pinhole_start, fit)
-    parts = [held_out(f, observed, settings.seed) for f in (fit, pinhole)]
-    table, errors = estimates(fit, settings)
+    pinhole = _pinhole(observed, best_start, settings, fit)
+    normal = UP if best_start.surface else fit.model.interface.normal
+    parts = [held_out(f, observed, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
+    table, errors = estimates(fit, best_start.surface, settings)
+    touching = touched(fit, observed)
+    contradicted = _contradicted(observed, settings, fit)
     return PoolFit(
         **vars(fit),
+        surface=best_start.surface,
         settings=settings,
         estimates=table,
         correlation=errors,
         observed=observed,
         residual=residuals(fit.model, observed)[0],
-        error=error_vectors(fit.model, observed),
+        error=error_vectors(fit.model, observed, normal),
         held_out=parts[0],
         pinhole=pinhole,
         pinhole_residual=residuals(pinhole.model, observed)[0],
         pinhole_held_out=parts[1],
         lens_fitted=_lens_groups(fit.active),
-        findings=(*advice(fit, observed, settings, table), *notes),
+        findings=(
+            *advice(fit, observed, best_start.surface, settings, table, touching, contradicted),
+            *notes,
+        ),
+        touching=touching,
     )
 
 
-def _best_lens(observed: Observations, start: PoolModel, settings: Settings, notes: list[Finding]) -> Refined:
-    """The fit; the lens is fitted too as far as held-out points get better by it."""
-    origin = replace(start, interface=replace(start.interface, index_far=settings.index))
+def _refined(
+    observed: Observations, model: PoolModel, settings: Settings, active: NDArray[np.bool_], prior: Prior
+) -> Refined:
+    pixel, survey = settings.pixel_sigma or 0.4, max(settings.survey_sigma, 1e-7)
+    noise = Noise(pixel=pixel, survey=survey, survey_yaw=settings.survey_yaw_sigma)
+    return refine(model, observed, active, prior, noise, fixed_pixel=settings.pixel_sigma is not None)
+
+
+def _best_lens(
+    observed: Observations, best_start: BestStart, settings: Settings, notes: list[Finding]
+) -> Refined:
+    """The fit as asked; where nobody asked, the lens is fitted as far as held-out points get better by it."""
+    start = replace(best_start.model, interface=replace(best_start.model.interface, index_far=settings.index))
 
     def fitted(model: PoolModel, active: NDArray[np.bool_]) -> Refined:
-        return refine(model, observed, active, prior_of(model, origin, settings), settings.survey_sigma)
+        stds = lens_std(settings, model.camera.lens.width)
+        return _refined(
+            observed, model, settings, active, prior_of(model, start, settings, best_start.surface, stds)
+        )
 
-    best = fitted(start, active_names(settings))
-    if not settings.refit_lens:
+    best = fitted(best_start.model, active_names(settings))
+    if settings.fit is not None:
         return best
-    error = _generalisation(best, observed, settings)
+    normal = UP if best_start.surface else best.model.interface.normal
+    error = _generalisation(best, observed, settings, normal)
     for extra in LENS_STEPS:
         active = active_names(settings, extra)
         if 2 * len(observed) < 3 * active.sum() or not np.isfinite(error):
@@ -991,7 +1181,7 @@ def _best_lens(observed: Observations, start: PoolModel, settings: Settings, not
             other = fitted(best.model, active)
         except (CalibrationError, np.linalg.LinAlgError):
             continue
-        further = _generalisation(other, observed, settings)
+        further = _generalisation(other, observed, settings, normal)
         if further < BETTER * error:
             best, error = other, further
     if groups := _lens_groups(best.active & ~active_names(settings)):
@@ -999,9 +1189,9 @@ def _best_lens(observed: Observations, start: PoolModel, settings: Settings, not
     return best
 
 
-def _generalisation(fit: Refined, observed: Observations, settings: Settings) -> float:
+def _generalisation(fit: Refined, observed: Observations, settings: Settings, normal: Array) -> float:
     """Held-out error in the picture [px], rows that the fit left out counted as far as they lie."""
-    out = held_out(fit, observed, settings.seed)
+    out = held_out(fit, observed, settings.folds, settings.seed, normal)
     if out is None:
         return float("nan")
     excluded = residuals(fit.model, observed.subset(~fit.used))[0]
@@ -1015,28 +1205,51 @@ def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
 
 def _released(observed: Observations, settings: Settings, fit: Refined, notes: list[Finding]) -> Refined:
     """Let the surface tilt freely where the pixels contradict a level one and nobody set how level it is."""
-    if settings.tilt_sigma is not None:
+    if not np.isfinite(fit.prior.tilt_std) or settings.tilt_sigma is not None or not fit.active[6]:
         return fit
-    try:
-        free = refine(
-            fit.model, observed, fit.active, replace(fit.prior, tilt_std=np.inf), settings.survey_sigma
-        )
-    except (CalibrationError, np.linalg.LinAlgError):
-        return fit
-    level = solve(free.model, observed.subset(free.used), free.whiten, fit.active, fit.prior)
+    free = _without(observed, settings, fit, replace(fit.prior, tilt_std=np.inf))
     assert fit.prior.normal is not None
+    if free is None:
+        return fit
     # Small enough to be a tilt, and told by the pixels rather than free to go anywhere.
     lean = _lean(free.model, fit.prior.normal)
     error = float(np.sqrt(max(free.covariance[k, k] for k in (6, 7))))
-    if not (2.0 * (level.cost - free.cost) > DOUBT and lean < MAX_LEAN and error < lean / 3.0):
+    if not (lean < MAX_LEAN and error < lean / 3.0):
         return fit
     notes.append(finding("plane_tilted", lean=float(np.degrees(lean))))
     return free
 
 
-def _pinhole(observed: Observations, start: PoolModel, fit: Refined) -> Refined:
+def _lean(model: PoolModel, normal: Array) -> float:
+    """Angle between the plane's normal and another [rad]."""
+    return float(np.arccos(np.clip(model.interface.normal @ normal, -1.0, 1.0)))
+
+
+def _contradicted(observed: Observations, settings: Settings, fit: Refined) -> list[Finding]:
+    """A finding where the pixels by themselves put the plane elsewhere than it was measured."""
+    if not settings.stated_depth or not fit.active[NAMES.index("depth")]:
+        return []
+    free = _without(observed, settings, fit, replace(fit.prior, depth_std=np.inf))
+    if free is None:
+        return []
+    by = 1000.0 * (free.model.depth - fit.prior.depth)
+    sense = "nearer to" if by > 0.0 else "further from"
+    return [finding("plane_contradicted", distance=abs(by), sense=sense)]
+
+
+def _without(observed: Observations, settings: Settings, fit: Refined, loose: Prior) -> Refined | None:
+    """The fit with a prior loosened, where the pixels contradict that prior; else None."""
+    try:
+        free = _refined(observed, fit.model, settings, fit.active, loose)
+    except (CalibrationError, np.linalg.LinAlgError):
+        return None
+    held = solve(free.model, observed.subset(free.used), free.whiten, fit.active, fit.prior)
+    return free if 2.0 * (held.cost - free.cost) > DOUBT else None
+
+
+def _pinhole(observed: Observations, best_start: BestStart, settings: Settings, fit: Refined) -> Refined:
     """Straight lines fitted to the same rows, as plain calibrations do."""
-    model = replace(start, camera=replace(start.camera, lens=fit.model.camera.lens))
+    model = replace(best_start.pinhole, camera=replace(best_start.pinhole.camera, lens=fit.model.camera.lens))
     active = fit.active & np.array([name in NAMES[:6] or name in NAMES[10:] for name in NAMES])
     prior = replace(fit.prior, normal=None, depth=np.nan, depth_std=np.inf, index_std=np.inf)
     part = observed.subset(fit.used)
@@ -1087,17 +1300,28 @@ def doubted(fit: PoolFit, *, lens_stated: bool = True) -> PoolFit:
 
 
 def _refuse_depth(fit: PoolFit) -> None:
-    """Refuse a surface told so far from the points that the camera, seen through it, would be between."""
-    height, camera = fit.settings.water_height, fit.pinhole.model
-    if height is None:
-        return
-    depth = abs(height - float(fit.observed.points[~fit.observed.dry].mean(axis=0)[2]))
+    """Refuse a plane told so far from the points that the camera, seen through it, would be between."""
+    depth, option = _measured_depth(fit)
+    camera = fit.pinhole.model
     apparent = abs(float(fit.model.interface.normal @ (camera.camera.position - camera.reference)))
     if depth > TOO_DEEP * fit.model.interface.index_far * apparent:
         raise CalibrationError(
-            f"--water-height {height:g} puts the surface {depth:.3g} m from the points, but by the pixels the camera "
-            f"is about {apparent:.3g} m from them: check its unit (metres) and the survey's; nothing is written"
+            f"{option} puts the plane {depth:.3g} m from the points, but by the pixels the camera is only about "
+            f"{apparent:.3g} m from them: check its unit (metres) and the survey's; nothing is written"
         )
+
+
+def _measured_depth(fit: PoolFit) -> tuple[float, str]:
+    """Distance of the plane from the middle of the points under water as it was measured [m], and by which option."""
+    settings, middle = fit.settings, fit.observed.points[~fit.observed.dry].mean(axis=0)
+    if settings.water_height is not None:
+        return abs(settings.water_height - float(middle[2])), f"--water-height {settings.water_height:g}"
+    if settings.water_depth is not None:
+        return abs(settings.water_depth), f"--water-depth {settings.water_depth:g}"
+    if settings.plane is not None:
+        normal, offset = settings.unit_plane
+        return abs(float(normal @ middle) + offset), "--plane"
+    return 0.0, ""
 
 
 def _touching(fit: PoolFit) -> list[Finding]:
@@ -1107,9 +1331,10 @@ def _touching(fit: PoolFit) -> list[Finding]:
         return []
     if error > ABSURD:
         raise CalibrationError(
-            f"the fitted camera is on the surface itself, with residuals of {error:.0f} px: no camera before it fits "
-            "the points; check the unit and sign of the water's height, the index, and whether there is water between "
-            "at all; nothing is written"
+            f"the fitted camera is on the plane itself, with residuals of {error:.0f} px: no camera "
+            "in front of this plane fits the points; check the unit and sign of the water's height, the "
+            "window's thickness [m], the index, and "
+            "whether there is water between at all; nothing is written"
         )
     return [finding("camera_on_plane", residual=error)]
 
@@ -1127,7 +1352,10 @@ def _straight(fit: PoolFit) -> list[Finding]:
 
 def _handed(fit: PoolFit) -> list[Finding]:
     """A flat survey whose z points down, or is left-handed: the same pixels, unless the water's height is told."""
-    if fit.model.interface.normal[2] > 0.0 or fit.settings.water_height is not None:
+    settings = fit.settings
+    if not fit.surface or fit.model.interface.normal[2] > 0.0:
+        return []
+    if settings.water_height is not None or settings.plane is not None:
         return []
     values = np.linalg.svd(fit.observed.points - fit.observed.points.mean(axis=0), compute_uv=False)
     if values[2] >= LEAST_THICKNESS * values[1]:
@@ -1174,6 +1402,7 @@ def pool_json(
     }
     return {
         "kind": "pool",
+        "interface": "surface" if fit.surface else "wall",
         "parameters": {name: estimate.as_json() for name, estimate in fit.estimates.items()},
         **plain(figures),
         "lens_fitted": list(fit.lens_fitted),
@@ -1213,10 +1442,11 @@ def pool_report(fit: PoolFit) -> Report:
     if fit.outliers:
         more = ", ..." if len(fit.outliers) > MAX_NAMES else ""
         summary.append(f"left out as wrong: {', '.join(fit.outliers[:MAX_NAMES])}{more}")
+    kind = "water surface" if fit.surface else "wall"
     return Report(
-        title=f"Camera and water surface from {figures['locations']} surveyed places",
+        title=f"Camera and {kind} from {figures['locations']} surveyed places",
         heads=(*HEADS, "note"),
-        headline=f"camera before a water surface, from {figures['locations']} surveyed places",
+        headline=f"camera before a {kind}, from {figures['locations']} surveyed places",
         estimates=list(fit.estimates.values()),
         cells=_cells,
         summary=summary,
@@ -1246,8 +1476,10 @@ def _survey_share(fit: PoolFit) -> float:
     """
     if fit.held_out is None or not len(fit.held_out.rows):
         return math.nan
-    turn = fit.noise.survey_yaw**2 * np.sum(fit.observed.arm[fit.held_out.rows] ** 2, axis=1)
-    return 100.0 * fit.noise.scale * float(np.sqrt(np.mean(2.0 * fit.noise.survey**2 + turn)))
+    held_out_rows, noise = fit.observed.subset(fit.held_out.rows), fit.noise
+    sigma = np.where(np.isfinite(held_out_rows.sigma), held_out_rows.sigma, noise.survey)
+    turn = noise.survey_yaw**2 * np.sum(held_out_rows.arm**2, axis=1)
+    return 100.0 * noise.scale * float(np.sqrt(np.mean(2.0 * sigma**2 + turn)))
 
 
 # Pictures of a calibrated pool: errors on the map and in the picture, and beside straight lines.
@@ -1265,12 +1497,15 @@ def pool_pictures(fit: PoolFit) -> dict[str, tuple[str, bytes]]:
 
 
 def _map(fit: PoolFit) -> Figure:
-    """Seen from above."""
+    """Seen along the plane's normal."""
     figure = new_figure(7.4, 5.6)
     axes = figure.subplots()
-    axes.plot(*fit.model.camera.position[:2], "^", color="black", markersize=8, label="camera")
-    draw_arrows(axes, fit.observed.points[:, :2], 1000.0 * fit.error[:, :2], fit.used, "mm", 1000.0)
-    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    across, names = np.eye(3)[:2], ("x [m]", "y [m]")
+    if not fit.surface:
+        across, names = fit.model.tangents, ("along the wall [m]", "along the wall, across [m]")
+    axes.plot(*(across @ fit.model.camera.position), "^", color="black", markersize=8, label="camera")
+    draw_arrows(axes, fit.observed.points @ across.T, 1000.0 * fit.error @ across.T, fit.used, "mm", 1000.0)
+    axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
     return figure
 
 
@@ -1290,43 +1525,65 @@ def run(
     out: Path,
     surveyed: Path | None = None,
     report: Path | None = None,
+    interface: str = "auto",
+    plane: str | None = None,
+    window: Sequence[str] = (),
     water_height: float | None = None,
+    water_depth: float | None = None,
     water_height_sigma: float | None = None,
     index: float = 1.333,
     index_sigma: float | None = None,
     tilt_sigma: float | None = None,
+    fit: str | None = None,
     focal_sigma: float | None = None,
     center_sigma: float | None = None,
+    pixel_sigma: float | None = None,
     survey_sigma: float = 0.002,
+    survey_yaw_sigma: float = 0.5,
+    unit: str | None = None,
+    z: float | None = None,
+    edge: float | None = None,
     family: str | None = None,
     latency: float = 0.0,
+    folds: Annotated[int, (2, 1000)] = 5,
     seed: int = 0,
     as_json: bool = False,
 ) -> PoolFit:
-    """Estimate camera pose [m, deg] and water surface (height [m], tilt [deg], index) from surveyed points in the
+    """Estimate camera pose [m, deg] and water plane (height [m], tilt [deg], index) from surveyed points in the
     water.
 
     Example: finssim calibrate pool points.csv --surveyed survey.csv --camera camera.yaml --out pool.yaml
 
     Args:
-        inputs (INPUT): Detections (.csv), pixels (id,u,v), one table of pixels with points (id,u,v,x,y,z), or images
-            of tags.
+        inputs (INPUT): Detections (.csv), pixels (id,u,v), pixels with points (u,v,x,y,z), or images of tags.
         camera (FILE): Camera file: ours, or one of OpenCV, ROS or Kalibr.
         out (FILE): Pool file to write (.yaml).
         surveyed (FILE): Survey (.csv): id,x,y,z of points, or tag,x,y,z,yaw_deg,edge of tags, or
-            image,x,y,z,yaw_deg,edge of one moved tag; not needed if the input contains the points.
+            image,x,y,z,yaw_deg,edge of one moved tag; not needed if the inputs contain the points.
         report (DIR): Directory for the report and its figures.
+        interface (KIND): Interface between camera and water: surface, wall, or auto.
+        plane (PLANE): Surveyed interface plane n_x,n_y,n_z,b with n . X + b = 0 [m].
+        window (LAYER): Solid layer THICKNESS:INDEX, such as 0.010:1.52 for 10 mm of glass; several in order from
+            the camera.
         water_height: z of the surface in the survey's frame, from a tape measure [m].
-        water_height_sigma: Standard deviation of that [m]; 0.005 if not given.
+        water_depth: Depth of the surveyed points below the surface [m], instead of --water-height.
+        water_height_sigma: Standard deviation of either, or of the plane's position [m]; 0.005 if not given.
         index: Refractive index of the water.
         index_sigma: Standard deviation of the index; 0.003 if neither is given, 0 (fixed) if only --index is.
-        tilt_sigma: Standard deviation of the surface's tilt [deg]; if not given 0.2, or free where the pixels
-            contradict that.
+        tilt_sigma: Standard deviation of the plane's tilt [deg]; 0.2 for a surface, 0.5 for --plane, free for a
+            wall.
+        fit (NAMES): Parameters to fit, of pose,height,tilt,index,focal,center,distortion; automatic if not given.
         focal_sigma: Relative standard deviation of the camera file's focal length; from the file if not given.
         center_sigma: Standard deviation of its optical centre [px]; from the file if not given.
+        pixel_sigma: Standard deviation of a pixel [px]; from the residuals if not given.
         survey_sigma: Standard deviation of a surveyed coordinate [m].
+        survey_yaw_sigma: Standard deviation of a tag's heading [deg].
+        unit (UNIT): Unit of lengths in tables without one: m, cm, mm, in, ft.
+        z: Height of points in tables without z [m].
+        edge: Edge of tags in surveys without that column [m].
         family (NAME): Family of the tags in images.
         latency: Time stamps of images minus their exposure [s], written to the file.
+        folds: Folds of the cross-validation.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 
@@ -1345,7 +1602,7 @@ def run(
     refuse_places(out, report, "pool")
     file = load_camera(camera)
     settings = _settings(arguments, file)
-    observed = _observations(list(map(Path, inputs)), surveyed, family)
+    observed = _observations(list(map(Path, inputs)), surveyed, unit, z, edge, family)
     _refuse_pixels(observed, file)
     lens_stated = focal_sigma is not None or center_sigma is not None or any(_lens_sigma(file))
     pool_fit = doubted(calibrate_pool(observed, file.lens, settings), lens_stated=lens_stated)
@@ -1371,26 +1628,36 @@ def run(
 
 
 def _settings(arguments: Mapping[str, Any], file: CameraFile) -> Settings:
-    """The options as `Settings`: degrees as radians, what is not given from the camera file."""
+    """The options as `Settings`: texts read, degrees as radians, what is not given from the camera file."""
     options = {f.name: arguments[f.name] for f in fields(Settings) if arguments.get(f.name) is not None}
-    if "tilt_sigma" in options:
-        options["tilt_sigma"] = math.radians(options["tilt_sigma"])
+    options["plane"] = _plane(arguments["plane"])
+    options["window"] = tuple(_layer(text) for text in arguments["window"])
+    fit = arguments["fit"]
+    options["fit"] = None if fit in (None, "auto") else tuple(filter(None, map(str.strip, fit.split(","))))
+    for name in {"tilt_sigma", "survey_yaw_sigma"} & options.keys():
+        options[name] = math.radians(options[name])
     focal, center = _lens_sigma(file)
+    held = arguments["index"] != Settings.index and "index" not in (options["fit"] or ())
     defaults = {"focal_sigma": focal, "center_sigma": center}
-    if arguments["index"] != Settings.index:
-        defaults["index_sigma"] = 0.0
-    return Settings(**{**defaults, **options})
+    return Settings(**{**defaults, **({"index_sigma": 0.0} if held else {}), **options})
 
 
-def _observations(paths: Sequence[Path], surveyed: Path | None, family: str | None) -> Observations:
+def _observations(
+    paths: Sequence[Path],
+    surveyed: Path | None,
+    unit: str | None,
+    z: float | None,
+    edge: float | None,
+    family: str | None,
+) -> Observations:
+    if not paths:
+        raise CalibrationError("no input: give detections, pixels or pictures")
     for path in paths:
         if not path.exists():
             raise CalibrationError(f"{path}: no such file")
-    if surveyed is None and len(paths) != 1:
-        raise CalibrationError(
-            "no survey: give --surveyed, or one table of pixels with points (id,u,v,x,y,z)"
-        )
-    return observe(paths, read_survey(paths[0] if surveyed is None else surveyed), family=family)
+    if surveyed is None or all(path.resolve() == Path(surveyed).resolve() for path in paths):
+        return observe_combined(paths, unit=unit, z=z)
+    return observe(paths, read_survey(surveyed, unit=unit, edge=edge, z=z), family=family)
 
 
 def _refuse_pixels(observed: Observations, file: CameraFile) -> None:
@@ -1424,3 +1691,25 @@ def _remembered(file: CameraFile, name: str) -> float:
     except (KeyError, TypeError, ValueError):
         return 0.0
     return max(0.0, (high - low) / 3.92)
+
+
+def _plane(text: str | None) -> tuple[float, float, float, float] | None:
+    if text is None:
+        return None
+    try:
+        x, y, z, b = (float(word) for word in text.split(","))
+    except ValueError:
+        raise CalibrationError(
+            f"plane is '{text}', expected n_x,n_y,n_z,b with n . X + b = 0, such as 0,1,0,0 for a wall at y = 0"
+        ) from None
+    return x, y, z, b
+
+
+def _layer(text: str) -> Layer:
+    thickness, mark, index = text.partition(":")
+    try:
+        return Layer(float(thickness), float(index) if mark else 1.52)
+    except ValueError as error:
+        raise CalibrationError(
+            f"window is '{text}', expected THICKNESS:INDEX in metres, such as 0.010:1.52 ({error})"
+        ) from None

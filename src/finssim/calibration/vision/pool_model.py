@@ -1,7 +1,8 @@
-"""One camera above one water surface: predicted pixels, what is known beforehand, and least squares for both."""
+"""One camera before one plane: predicted pixels, what is known beforehand, and least squares for both."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.least_squares import descent
 from finssim.calibration.vision.survey import Observations
-from finssim.geometry.optics import Camera, Interface, Lens, Status, project, projection_jacobians
+from finssim.geometry.optics import Camera, Interface, Layer, Lens, Status, project, projection_jacobians
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, skew
 
 Array = NDArray[np.float64]
@@ -149,8 +151,18 @@ def _lens_moved(lens: Lens, step: Array) -> Lens:
     )
 
 
-LENS_GROUPS = {"focal": ("focal",), "center": ("center_x", "center_y"), "distortion": NAMES[13:]}
-"""What of the lens may be fitted -> its parameters."""
+INTERFACES = ("auto", "surface", "wall")
+
+FITTED = {
+    "pose": NAMES[:6],
+    "height": ("depth",),
+    "tilt": ("tilt_x", "tilt_y"),
+    "index": ("index",),
+    "focal": ("focal",),
+    "center": ("center_x", "center_y"),
+    "distortion": NAMES[13:],
+}
+"""What may be fitted -> its parameters."""
 
 LENS_STD = (0.05, 0.03, 0.03, 0.15, 0.15, 0.02, 0.02, 0.1)
 """How far a camera file that is only roughly right may be off: log focal, centre in widths of the image, distortion."""
@@ -162,59 +174,119 @@ RANGES = {
     "tilt_sigma": ("tilt sigma [deg]", np.degrees(1.0), 0.0, 180.0),
     "water_height_sigma": ("water height sigma", 1.0, 0.0, 10.0),
     "survey_sigma": ("survey sigma", 1.0, 0.0, 1.0),
+    "survey_yaw_sigma": ("survey yaw sigma [deg]", np.degrees(1.0), 0.0, 180.0),
     "focal_sigma": ("focal sigma", 1.0, 0.0, 10.0),
     "center_sigma": ("center sigma", 1.0, 0.0, 1e4),
+    "pixel_sigma": ("pixel sigma", 1.0, 1e-3, 100.0),
 }
 """Setting -> what it is called, units that one of its own makes, least and most in those."""
+
+THICKEST = 0.5
+"""Thickness of a window beyond which another unit than metres is meant [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """Options; standard deviations are of what is known before the pictures."""
 
+    interface: str = "auto"
+    """`surface` (normal along the survey's z), `wall` (any direction) or `auto`."""
+    plane: tuple[float, float, float, float] | None = None
+    """Surveyed plane n . X + b = 0 as n_x, n_y, n_z, b [m]; the sense of n does not matter."""
+    window: tuple[Layer, ...] = ()
+    """Layers between, the first one next to the camera."""
     water_height: float | None = None
     """z of the surface in the survey's frame [m]."""
+    water_depth: float | None = None
+    """Distance from the middle of the surveyed points to the surface [m], for a survey of one plane."""
     water_height_sigma: float = 0.005
-    """Of that [m]."""
+    """Of either, or of the surveyed plane's position [m]."""
     index: float = 1.333
     """Of the water."""
     index_sigma: float = 0.003
     """Of that; 0 holds it."""
+    index_near: float = 1.0003
+    """On the camera's side."""
     tilt_sigma: float | None = None
-    """Of the surface's direction, along the survey's z [rad]; 0 holds it; None: 0.2 degrees, or free where the pixels
-    contradict that."""
-    refit_lens: bool = True
-    """Fit the lens too where held-out points get better by it."""
+    """Of the plane's direction [rad]; None: 0.2 degrees for a surface, 0.5 for a surveyed plane, free for a wall."""
+    fit: tuple[str, ...] | None = None
+    """Of `FITTED`; None: pose, height, tilt and index, and the lens where held-out points get better by it."""
     focal_sigma: float = 0.0
-    """Of the camera file's focal length, relative; 0 holds it unless the lens is fitted."""
+    """Of the camera file's focal length, relative; 0 holds it unless `fit` names it."""
     center_sigma: float = 0.0
-    """Of the camera file's optical centre along each axis [px]; 0 holds it unless the lens is fitted."""
+    """Of the camera file's optical centre along each axis [px]; 0 holds it unless `fit` names it."""
+    pixel_sigma: float | None = None
+    """Of a pixel [px]; None: from the residuals."""
     survey_sigma: float = 0.002
     """Of a surveyed coordinate [m]."""
+    survey_yaw_sigma: float = math.radians(0.5)
+    """Of a tag's direction [rad]."""
+    folds: int = 5
+    """Folds of the cross-validation."""
     seed: int = 0
     """Of the parts and of samples."""
 
     def __post_init__(self) -> None:
+        if self.interface not in INTERFACES:
+            raise CalibrationError(
+                f"unknown interface '{self.interface}'; available: {', '.join(INTERFACES)} (a window or wall of known "
+                "place is --plane)"
+            )
+        for name in self.fit or ():
+            if name not in FITTED:
+                raise CalibrationError(f"unknown '{name}' to fit; available: {', '.join(FITTED)}")
+        if self.fit is not None and "pose" not in self.fit:
+            raise CalibrationError("fit leaves the pose out: the camera's pose is always fitted, add pose")
+        stated = [self.water_height is not None, self.water_depth is not None, self.plane is not None]
+        if sum(stated) > 1:
+            raise CalibrationError(
+                "the place of the water is given twice: give one of its height, depth and plane"
+            )
+        if self.fit is not None and "height" not in self.fit and not any(stated):
+            raise CalibrationError(
+                "fit leaves the height out and none is given: add height, or give --water-height"
+            )
+        for layer in self.window:
+            if layer.thickness > THICKEST:
+                raise CalibrationError(
+                    f"window is {layer.thickness:g} m thick, expected at most {THICKEST:g}: thickness is in metres, "
+                    "10 mm of glass are 0.010:1.52"
+                )
         for field, (name, per, least, greatest) in RANGES.items():
             value = getattr(self, field)
             if value is not None and not least <= per * value <= greatest:
                 raise CalibrationError(
                     f"{name} is {per * value:g}, expected a number from {least:g} to {greatest:g}"
                 )
+        if self.folds < 2:
+            raise CalibrationError(f"folds is {self.folds}, expected at least 2")
+        if self.plane is not None and not np.linalg.norm(self.plane[:3]) > 0.0:
+            raise CalibrationError(f"plane has normal {self.plane[:3]}, expected a direction")
+
+    @property
+    def stated_depth(self) -> bool:
+        """Whether a measurement of the plane's place is given."""
+        return any(x is not None for x in (self.water_height, self.water_depth, self.plane))
+
+    @property
+    def unit_plane(self) -> tuple[Array, float]:
+        """n of length 1, (3,), and b [m] of the surveyed plane."""
+        assert self.plane is not None
+        length = float(np.linalg.norm(self.plane[:3]))
+        return np.array(self.plane[:3]) / length, self.plane[3] / length
 
 
 def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.bool_]:
-    """Which of `NAMES` are fitted, with groups of the lens besides those whose errors are given, (18,)."""
-    active = {
-        **dict.fromkeys(POSE_NAMES, True),
-        **dict.fromkeys(("tilt_x", "tilt_y"), settings.tilt_sigma is None or settings.tilt_sigma > 0.0),
-        "depth": settings.water_height is None or settings.water_height_sigma > 0.0,
-        "index": settings.index_sigma > 0.0,
+    """Which of `NAMES` are fitted, (18,)."""
+    held = {
+        "index": settings.index_sigma <= 0.0,
+        "tilt": settings.tilt_sigma is not None and settings.tilt_sigma <= 0.0,
+        "height": settings.stated_depth and settings.water_height_sigma <= 0.0,
     }
-    for group, names in LENS_GROUPS.items():
-        fitted = group in extra or getattr(settings, f"{group}_sigma", 0.0) > 0.0
-        active |= dict.fromkeys(names, fitted)
-    return np.array([active[name] for name in NAMES])
+    groups = {*(settings.fit or ("pose", "height", "tilt", "index")), *extra}
+    groups |= {name for name in ("focal", "center") if getattr(settings, f"{name}_sigma") > 0.0}
+    names = {name for group in groups if not held.get(group) for name in FITTED[group]}
+    return np.array([name in names for name in NAMES])
 
 
 def lens_std(settings: Settings, width: int) -> tuple[float, ...]:
@@ -227,6 +299,12 @@ def lens_std(settings: Settings, width: int) -> tuple[float, ...]:
 
 LOST = 500.0
 """Residual that stands for a point the model cannot see at all [px]."""
+
+NEARER = 0.1
+"""Part of its distance from a point or the camera that one step must leave the plane."""
+
+MAX_BOUNDS = 60
+"""Points looked at in one step, those that the plane comes nearest to."""
 
 Whitening = Callable[[Array], Array]
 
@@ -305,18 +383,13 @@ def solve(
 
     def steps_from(model: PoolModel) -> Callable[[float], PoolModel | None]:
         N, g = normal_equations(model, observed, whiten, free, prior)
-        scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
+        bounds, scale = _bounds(model, observed, free), np.sqrt(np.maximum(np.diagonal(N), 1e-300))
         H, b = N / np.outer(scale, scale), g / scale
 
         def stepped(damping: float) -> PoolModel | None:
             step = np.zeros(len(NAMES))
-            step[free] = np.linalg.solve(H + damping * np.eye(len(free)), b) / scale
-            if not np.isfinite(step).all() or np.abs(step[3:8]).max() > 1.0 or abs(step[10]) > 0.5:
-                return None
-            try:
-                return model.moved(step)
-            except ValueError:
-                return None
+            step[free] = _sliding(H + damping * np.eye(len(free)), b, scale, bounds) / scale
+            return _stepped(model, step, observed, 8 in free)
 
         return stepped
 
@@ -341,3 +414,71 @@ def normal_equations(
     r_prior, J_prior = prior.rows(model)
     J_prior = J_prior[:, free]
     return A.T @ A + J_prior.T @ J_prior, A.T @ e - J_prior.T @ r_prior
+
+
+def clearances(model: PoolModel, points: Array) -> Array:
+    """Distances of points from the far side of the plane and its window, on their own side positive, (N,) [m]."""
+    return model.depth - (points - model.reference) @ model.interface.normal - model.interface.thickness
+
+
+def _bounds(model: PoolModel, observed: Observations, free: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Clearances of the points in the water and of the camera (M,), and their derivatives by the parameters (M, P)."""
+    if not model.refractive:
+        return np.zeros(0), np.zeros((0, len(free)))
+    wet, n = observed.points[~observed.dry], model.interface.normal
+    distance = clearances(model, wet)
+    wet, distance = wet[distance > 0.0], distance[distance > 0.0]
+    rows = np.zeros((len(wet) + 1, len(NAMES)))
+    rows[:-1, 6:8] = -(wet - model.reference) @ model.tangents.T
+    rows[:-1, 8] = 1.0
+    rows[-1, :3] = n
+    rows[-1, 6:8] = model.tangents @ (model.camera.position - model.reference)
+    rows[-1, 8] = -1.0
+    return np.append(distance, model.clearance), rows[:, free]
+
+
+def _sliding(H: Array, b: Array, scale: Array, bounds: tuple[Array, Array]) -> Array:
+    """The least of x H x / 2 - b x among steps that leave every clearance a tenth of what it is.
+
+    A problem of least distance, solved by non-negative least squares (Lawson and Hanson, Solving Least Squares
+    Problems, ch. 23).
+    """
+    x = np.linalg.solve(H, b)
+    distance, rows = bounds
+    clearance = distance + (rows / scale) @ x
+    if np.all(clearance >= NEARER * distance):
+        return x
+    near = np.argsort(clearance / np.maximum(distance, 1e-300))[:MAX_BOUNDS]
+    values, vectors = np.linalg.eigh(H)
+    root = vectors / np.sqrt(np.maximum(values, 1e-14))
+    G = (rows[near] / scale) @ root
+    length = np.maximum(np.linalg.norm(G, axis=1), 1e-300)
+    h = (NEARER * distance[near] - clearance[near]) / length
+    size = float(np.abs(h).max())
+    E = np.concatenate([(G / length[:, None]).T, h[None] / size])
+    try:
+        weight, off = nnls(E, np.append(np.zeros(len(x)), 1.0))
+    except RuntimeError:
+        return x
+    r = E @ weight - np.append(np.zeros(len(x)), 1.0)
+    return x if off < 1e-9 else np.asarray(x - root @ r[:-1] / r[-1] * size)
+
+
+def _stepped(model: PoolModel, step: Array, observed: Observations, movable: bool) -> PoolModel | None:
+    """The model a step away, or None where the step leads out of all sense.
+
+    What a turn of the plane takes from a clearance beyond first order is given back by its depth where that may move.
+    """
+    if not np.isfinite(step).all() or np.abs(step[3:8]).max() > 1.0 or abs(step[10]) > 0.5:
+        return None
+    try:
+        trial = model.moved(step)
+        if model.refractive and movable:
+            before = clearances(model, observed.points)
+            held = (before > 0.0) & ~observed.dry
+            short = 0.5 * NEARER * before - clearances(trial, observed.points)
+            if held.any() and (back := float(short[held].max())) > 0.0:
+                trial = model.moved(step + back * (np.arange(len(NAMES)) == 8))
+        return trial
+    except ValueError:
+        return None

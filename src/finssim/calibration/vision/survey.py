@@ -15,17 +15,20 @@ from numpy.typing import NDArray
 from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.trials.conversion import UNITS
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
+from finssim.localization import LocalizationError
+from finssim.localization.camera_file import Fields
 from finssim.localization.detection.detections import Frame, best_detections, read_detections
 from finssim.localization.detection.families import corners
 from finssim.text_table import TextTable, read_text, read_text_table, text_table
 from finssim.text_table import number as _number
+from finssim.yaml_file import read_mapping
 
 Array = NDArray[np.float64]
 
 METRES = {**UNITS["length"], "inch": 0.0254}
 """Metres in one of each."""
 
-LENGTHS, ANGLES = ("x", "y", "z", "edge"), ("yaw", "roll", "pitch")
+LENGTHS, ANGLES = ("x", "y", "z", "sigma", "edge"), ("yaw", "roll", "pitch")
 
 WIDEST = 300.0
 """Spread of coordinates beyond which metres are not believed unless the file says so [m]."""
@@ -44,6 +47,7 @@ _ALIASES = {
     "id": "id point pointid pt ptid name marker markerid label n no nr index",
     "tag": "tag tagid",
     "image": "image img file filename imagename picture photo frame",
+    "sigma": "sigma std error uncertainty survey_sigma surveysigma",
     "edge": "edge size tagsize tagedge side",
     "yaw": "yaw heading psi",
     "roll": "roll phi",
@@ -78,15 +82,9 @@ class Row:
         """Of some columns, those without a number."""
         return [name for name in names if name not in self.numbers]
 
-    @property
-    def name(self) -> str:
-        """The point's id, or that of its tag; its line where it has none."""
-        return self.words.get("id") or self.words.get("tag") or f"line {self.line}"
-
-    @property
-    def position(self) -> Array:
-        """x, y and z [m], (3,)."""
-        return np.array([self.numbers[axis] for axis in "xyz"])
+    def position(self, z: float | None) -> Array:
+        """x, y and z [m], (3,); `z` where the table has none."""
+        return np.array([self.numbers["x"], self.numbers["y"], self.numbers.get("z", z)], float)
 
     @property
     def pixel(self) -> Array:
@@ -98,6 +96,7 @@ class Row:
         return Placed(
             name,
             points,
+            self.numbers.get("sigma", math.nan),
             dry=self.words.get("dry", "").lower() in ("1", "1.0", "true", "yes", "y", "dry", "x"),
             group=self.words.get("group", ""),
         )
@@ -111,14 +110,14 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[Row, ...]
     united: bool
-    """Whether the file says the unit of lengths."""
+    """Whether the file, or its reader, says the unit of lengths."""
 
     def refuse_other_units(self, spread: float) -> None:
         """Refuse coordinates that would be metres only in a lake."""
         if spread > WIDEST and not self.united:
             raise CalibrationError(
                 f"{self.path}: the points spread over {spread:.0f} m: if they are not in metres, write the unit into "
-                "the header (x_mm) or a line '# unit: mm' above it"
+                "the header (x_mm) or give --unit mm"
             )
 
     def refuse(self, row: Row, sentence: str) -> CalibrationError:
@@ -126,12 +125,16 @@ class Table:
         return CalibrationError(f"{self.path}: line {row.line}: {sentence}")
 
 
-def read_table(path: str | Path) -> Table:
+def read_table(path: str | Path, *, unit: str | None = None) -> Table:
     """Read a table of points, pixels or tags.
 
     Columns may have any case and order; lengths may carry their unit (`x_mm`, `x [mm]`, `X (cm)`) or a comment line may
-    (`# unit: mm`); else they are metres. Angles are `yaw_deg` or `yaw_rad`; a bare `yaw` is in radians
+    (`# unit: mm`); else they are metres, or of `unit`. Angles are `yaw_deg` or `yaw_rad`; a bare `yaw` is in radians
     if all of its numbers are below 2 pi, else in degrees. Separators: comma, semicolon, tab or blanks.
+
+    Args:
+        path: The file.
+        unit: Of lengths, where the file does not say.
 
     Raises:
         CalibrationError: Unreadable, no header, a cell that must be a number is none; names the line.
@@ -155,7 +158,7 @@ def read_table(path: str | Path) -> Table:
             f"{path}: the first line is no header: name the columns, such as id,x,y,z or u,v,x,y,z"
         )
     stated = next((m[1].lower() for line in table.comments if (m := _UNIT_COMMENT.match(line))), None)
-    return _table(str(path), table, "m" if stated and stated.startswith("met") else stated)
+    return _table(str(path), table, "m" if stated and stated.startswith("met") else stated or unit)
 
 
 def _table(path: str, text: TextTable, default: str | None) -> Table:
@@ -227,6 +230,57 @@ def _recognised(names: Sequence[str]) -> int:
     return sum(bool(_column(word)[0]) for word in names)
 
 
+# Tags on one board, surveyed as a whole: a YAML file that says where the first lies and how the others follow.
+
+PRINTED = 0.0005
+"""Standard error of a tag on a board where the file gives none [m]: printers and glue do no better."""
+
+
+def grid_points(path: str | Path) -> tuple[dict[int, np.ndarray], float]:
+    """Corners of the tags of a grid.
+
+        grid: {first: 0, columns: 6, rows: 4, spacing: [0.13, 0.13], edge: 0.1, position: [0.2, 0.3, 0], yaw_deg: 90}
+
+    Ids run along a column's x, then from row to row; `spacing` is from centre to centre along the printed x and y (a
+    negative second number counts rows downwards); `position` is the centre of the first tag; `yaw_deg`, `pitch_deg`,
+    `roll_deg` turn the board.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Tag id -> corners in the survey's frame [m], (4, 3); and their standard error within the board (`sigma`) [m].
+
+    Raises:
+        CalibrationError: A key is missing, unknown or senseless.
+    """
+    try:
+        tree = read_mapping(Path(path), LocalizationError, such_as="grid: {first: 0, columns: 6, rows: 4}")
+        top = Fields(tree, str(path))
+        fields = top.section("grid")
+        top.finish()
+        first, columns, rows = (int(fields.number(key)) for key in ("first", "columns", "rows"))
+        dx, dy = fields.numbers("spacing", 2)
+        edge, position = fields.number("edge"), fields.numbers("position", 3)
+        angles = [fields.number(f"{name}_deg", 0.0) for name in ("roll", "pitch", "yaw")]
+        sigma = fields.number("sigma", PRINTED)
+        fields.finish()
+    except LocalizationError as error:
+        raise CalibrationError(str(error)) from None
+    if columns < 1 or rows < 1 or edge <= 0.0 or min(abs(dx), abs(dy)) < edge:
+        raise CalibrationError(
+            f"{path}: grid of {columns} x {rows} tags of {edge:g} m every {dx:g}, {dy:g} m: expected at least one tag, "
+            "an edge above 0 and a spacing above the edge"
+        )
+    turn = quat_from_euler(*np.radians(angles))
+    points = {}
+    for row in range(rows):
+        for column in range(columns):
+            flat = corners(edge) + np.array([column * dx, row * dy, 0.0])
+            points[first + row * columns + column] = np.asarray(position) + quat_rotate(turn, flat)
+    return points, sigma
+
+
 @dataclass(frozen=True, eq=False)
 class Placed:
     """Points that were surveyed together, so that one error moves them all: a tag's corners, or a single point."""
@@ -234,6 +288,8 @@ class Placed:
     name: str
     points: Array
     """Pool frame [m], (K, 3); a tag's corners in the order of `localization.tags.corners`."""
+    sigma: float
+    """Standard error of each coordinate [m]; NaN where the survey does not say."""
     dry: bool = False
     """On the camera's side of the water."""
     group: str = ""
@@ -259,34 +315,47 @@ class Survey:
     findings: tuple[Finding, ...] = ()
 
 
-def read_survey(path: str | Path) -> Survey:
+def read_survey(
+    path: str | Path, *, unit: str | None = None, edge: float | None = None, z: float | None = None
+) -> Survey:
     """Read a survey.
 
     Columns `id,x,y,z` for points; `tag,x,y,z,yaw_deg[,roll_deg,pitch_deg],edge` for fixed tags (centre and attitude
-    of the tag frame); `image,x,y,z,yaw_deg[,tag],edge` for one tag that was moved from picture to picture. `dry` marks
-    what is above the water, `group` ties points to one target. Where a table has pixels too, points need no id.
+    of the tag frame); `image,x,y,z,yaw_deg[,tag],edge` for one tag that was moved from picture to picture. `sigma`
+    gives a row its own standard error, `dry` marks what is above the water, `group` ties points to one target.
+
+    Args:
+        path: CSV file, or YAML of a grid of tags (`survey_grid.grid_points`).
+        unit: Of lengths where the file says none.
+        edge: Of all tags [m] where the table has no such column.
+        z: Height of all points [m] where the table has no such column.
 
     Raises:
         CalibrationError: A column or number is missing, or an id has two positions; names the line.
     """
-    table = read_table(path)
-    for name in ("x", "y", "z"):
+    if Path(path).suffix.lower() in (".yaml", ".yml"):
+        tags, sigma = grid_points(path)
+        placed = {tag: Placed(f"tag {tag}", at, sigma) for tag, at in tags.items()}
+        return Survey(str(path), tags=placed)
+    table = read_table(path, unit=unit)
+    for name in ("x", "y"):
         if name not in table.columns:
             raise CalibrationError(
-                f"{table.path}: no column '{name}': a survey has id,x,y,z or tag,x,y,z,yaw_deg,edge, or give one with "
-                "--surveyed"
+                f"{table.path}: no column '{name}': a survey has id,x,y,z or tag,x,y,z,yaw_deg,edge"
             )
-    if not {"id", "tag", "image", "u"} & set(table.columns):
+    if "z" not in table.columns and z is None:
+        raise CalibrationError(f"{table.path}: no column 'z': add it, or give the height of all points (--z)")
+    if not {"id", "tag", "image"} & set(table.columns):
         raise CalibrationError(f"{table.path}: no column names the points: add id, tag or image")
     findings: list[Finding] = []
     survey, lines, every = Survey(str(path)), {}, []
     for row in table.rows:
-        if missing := row.missing("x", "y", "z"):
+        if missing := row.missing("x", "y", *(["z"] if z is None else [])):
             findings.append(finding("row_incomplete", table.path, line=row.line, missing=tuple(missing)))
             continue
-        name, tag, here = _surveyed(table, row)
+        name, tag, here = _surveyed(table, row, edge, z)
         every.append(here.points)
-        if "image" in row.words and "u" not in table.columns:
+        if "image" in row.words:
             survey.locations.setdefault(name, []).append((tag, here))
             continue
         before = survey.points.get(name) if tag is None else survey.tags.get(tag)
@@ -306,22 +375,23 @@ def read_survey(path: str | Path) -> Survey:
     return replace(survey, findings=tuple(findings))
 
 
-def _surveyed(table: Table, row: Row) -> tuple[str, int | None, Placed]:
+def _surveyed(table: Table, row: Row, edge: float | None, z: float | None) -> tuple[str, int | None, Placed]:
     """What a row places: its name, the number of its tag (None: a point, or any tag), and where it is."""
-    word = row.words.get("tag") or (row.words.get("id") if "edge" in row.numbers else None)
-    if "u" in table.columns or ("image" not in row.words and word is None):
-        if "u" not in table.columns and "id" not in row.words:
+    edge = row.numbers.get("edge", edge)
+    word = row.words.get("tag") or (row.words.get("id") if edge is not None else None)
+    if "image" not in row.words and word is None:
+        name = row.words.get("id", "")
+        if not name:
             raise table.refuse(row, "no id")
-        return row.name, None, row.placed(row.name, row.position[None])
-    edge = row.numbers.get("edge", 0.0)
-    if edge <= 0.0:
-        raise table.refuse(row, "a tag without its edge: add a column edge [m]")
+        return name, None, row.placed(name, row.position(z)[None])
+    if edge is None or edge <= 0.0:
+        raise table.refuse(row, "a tag without its edge: add a column edge [m], or give --edge")
     if word is not None and _number(word) is None:
         raise table.refuse(row, f"tag is '{word}', expected its number")
     tag = None if word is None else int(float(word))
     name = row.words.get("image") or f"tag {tag}"
     turn = quat_from_euler(*(row.numbers.get(n, 0.0) for n in ("roll", "pitch", "yaw")))
-    return name, tag, row.placed(name, row.position + quat_rotate(turn, corners(edge)))
+    return name, tag, row.placed(name, row.position(z) + quat_rotate(turn, corners(edge)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,6 +407,8 @@ class Observations:
     names: tuple[str, ...]
     """What each row is called: the point's id or tag/corner, with its picture where there are several."""
     locations: tuple[str, ...]
+    sigma: Array
+    """Standard error of the survey [m], (N,); NaN where it does not say."""
     arm: Array
     """Displacement of the point by a turn of its location about z [m/rad], (N, 3); zero for single points."""
     dry: NDArray[np.bool_]
@@ -349,7 +421,7 @@ class Observations:
     def subset(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
         """Some of the rows; locations keep their indices."""
         index = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
-        columns = ("pixels", "points", "location", "arm", "dry")
+        columns = ("pixels", "points", "location", "sigma", "arm", "dry")
         return replace(
             self,
             **{name: getattr(self, name)[index] for name in columns},
@@ -384,6 +456,39 @@ def observe(inputs: Sequence[Path], survey: Survey, *, family: str | None = None
     if pictures:
         _match_frames(rows, _detect(pictures, family), survey)
     return rows.observations(", ".join(str(path) for path in inputs), survey)
+
+
+def observe_combined(
+    paths: Sequence[Path], *, unit: str | None = None, z: float | None = None
+) -> Observations:
+    """Read tables that hold pixel and point in one row: `u,v,x,y,z`, with `id`, `group`, `sigma`, `dry` where given.
+
+    Raises:
+        CalibrationError: A column or number is missing.
+    """
+    rows, points = _Rows(), {}
+    for path in paths:
+        table = read_table(path, unit=unit)
+        needed = ["u", "v", "x", "y", *(["z"] if z is None else [])]
+        missing = [name for name in needed if name not in table.columns]
+        if missing:
+            raise CalibrationError(
+                f"{path}: no column '{missing[0]}': name the columns u,v,x,y,z, or give a survey (--surveyed)"
+                + ("; points of one height may leave z out and give --z" if missing == ["z"] else "")
+            )
+        complete = [row for row in table.rows if not row.missing(*needed)]
+        table.refuse_other_units(max((np.abs(row.position(z)).max() for row in complete), default=0.0))
+        for row in complete:
+            name = row.words.get("id") or row.words.get("tag") or f"line {row.line}"
+            new = row.placed(name, row.position(z)[None])
+            placed = points.setdefault((name, *new.points[0].tolist()), new)
+            rows.add(_Match(row.words.get("image", ""), name, placed, 0, row.pixel))
+        rows.findings += [
+            finding("row_incomplete", str(path), line=row.line, missing=tuple(missing))
+            for row in table.rows
+            if (missing := row.missing(*needed))
+        ]
+    return rows.observations(", ".join(map(str, paths)), None)
 
 
 class _Match(NamedTuple):
@@ -435,6 +540,7 @@ class _Rows:
                 for m in matches
             ),
             locations=tuple(labels[key] for key in order),
+            sigma=np.array([m.placed.sigma for m in matches]),
             arm=np.stack([m.placed.arm(m.corner) for m in matches]),
             dry=np.array([m.placed.dry for m in matches]),
             findings=(*(survey.findings if survey else ()), *self.findings),
@@ -470,18 +576,19 @@ def _match_frames(rows: _Rows, frames: Sequence[Frame], survey: Survey) -> None:
 
 def _match_table(rows: _Rows, table: Table, survey: Survey) -> None:
     missing = [name for name in ("u", "v") if name not in table.columns]
-    if not {"id", "tag"} & set(table.columns) and table.path != survey.path:
-        missing.append("id")
-    if missing:
-        raise CalibrationError(f"{table.path}: no column '{missing[0]}': pixels are a table of id,u,v")
+    if missing or not {"id", "tag"} & set(table.columns):
+        raise CalibrationError(
+            f"{table.path}: no column '{missing[0] if missing else 'id'}': pixels are a table of id,u,v"
+        )
     for row in table.rows:
-        placed, corner = _find(survey, row.name)
+        name = row.words.get("id") or row.words.get("tag") or ""
+        placed, corner = _find(survey, name)
         if placed is None:
-            rows.unknown[row.name] = None
+            rows.unknown[name or f"line {row.line}"] = None
         elif row.missing("u", "v"):
-            rows.findings.append(finding("pixel_missing", table.path, line=row.line, point=row.name))
+            rows.findings.append(finding("pixel_missing", table.path, line=row.line, point=name))
         else:
-            rows.add(_Match(row.words.get("image", ""), row.name, placed, corner, row.pixel))
+            rows.add(_Match(row.words.get("image", ""), name, placed, corner, row.pixel))
 
 
 def _find(survey: Survey, name: str) -> tuple[Placed | None, int]:
