@@ -680,51 +680,6 @@ LATE_STD = 0.05
 """By how much streams lag or lead, as far as one knows beforehand [s]: noisy data cannot tell a lag from inertia."""
 
 
-class SensorErrors:
-    """Offsets by segment, and lags of the streams common to all segments.
-
-    Attributes:
-        streams: Names of the streams in use.
-        offsets: Names of the channels that have an offset.
-        std: Prior of the offsets, (k,).
-    """
-
-    def __init__(self, measured: Residuals) -> None:
-        """Allow for what the channels in use may suffer from."""
-        names = measured.names
-        self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(names))
-        # The initial height already takes up an offset of the depth, unless z is measured too.
-        self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
-        self.std = np.array([OFFSETS[c] for c in self.offsets])
-        stream_of = {c: i for i, stream in enumerate(self.streams) for c in STREAMS[stream]}
-        self._stream = np.array([stream_of[c] for c in names], int)[measured.channel]
-        self._offset = np.zeros((len(measured), len(self.offsets)))
-        for k, name in enumerate(self.offsets):
-            self._offset[measured.channel == names.index(name), k] = 1.0
-        self._segment = measured.segment
-
-    def late(self, late: Array) -> Array:
-        """Lag of every sample [s], (N, C), or (N, 1) where all candidates agree, from the streams', (C, streams)."""
-        same = bool((late == late[:1]).all())
-        return np.asarray((late[:1] if same else late).T[self._stream])
-
-    def offset(self, offset: Array) -> Array:
-        """What offsets (C, S, k) add to every sample, (N, C)."""
-        out = np.zeros((len(self._segment), len(offset)))
-        for k in range(offset.shape[2]):
-            out += self._offset[:, k : k + 1] * offset[:, self._segment, k].T
-        return out
-
-    def slopes(self, rate: Array) -> tuple[Array, Array]:
-        """Derivatives of the readings by lag (N, streams) and by offset (N, k).
-
-        Args:
-            rate: Of change of the predicted readings [unit of the channel/s], (N,).
-        """
-        late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -rate[:, None], 0.0)
-        return late, self._offset
-
-
 # Where each segment begins: what was measured there, and how far a fit may move it.
 
 STATES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
@@ -747,44 +702,6 @@ SHOWN_BY = (
 
 STEPS = np.array([0.002] * 9 + [0.005] * 3)
 """Of the finite differences: small, for what is unstable multiplies them."""
-
-
-class InitialStates:
-    """Deviations z of the segments' initial states from the measured ones, with a prior.
-
-    Attributes:
-        free: Which of `STATES` a fit moves, indices (q,).
-        std: Of the prior, (S, q).
-    """
-
-    def __init__(self, segments: Sequence[Segment]) -> None:
-        """Free velocities and tilt everywhere, heading and place where some segment knows them."""
-        known = np.stack([s.known for s in segments])
-        self.free = np.concatenate([np.arange(8), 8 + np.flatnonzero(known[:, 8:].any(axis=0))])
-        seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
-        self.std = np.where(known, np.where(seen, LOOSE, TIGHT), UNKNOWN)[:, self.free]
-        self._nu = np.stack([s.nu for s in segments])
-        self._quaternion = np.stack([s.quaternion for s in segments])
-        self._position = np.stack([s.position for s in segments])
-
-    @property
-    def steps(self) -> Array:
-        """Finite difference of each free number, (q,)."""
-        return np.asarray(STEPS[self.free])
-
-    def initial(self, z: Array) -> dict[str, Array]:
-        """`nu`, `quaternion` and `position` for `Rollouts.run`.
-
-        Args:
-            z: Deviations, (C, S, q); C may be 1.
-        """
-        full = np.zeros((*z.shape[:2], 12))
-        full[..., self.free] = z
-        return {
-            "nu": self._nu + full[..., :6],
-            "quaternion": quat_multiply(self._quaternion, quat_from_rotvec(full[..., 6:9])),
-            "position": self._position + full[..., 9:],
-        }
 
 
 RELATIVE_STEP = 0.006
@@ -810,6 +727,10 @@ class Shooting:
     """Residuals of segments under parameters and initial states.
 
     Attributes:
+        streams: Names of the streams in use; each may lag the inputs.
+        offsets: Names of the channels with an offset of their own in every segment.
+        free: Which of `STATES` a fit moves from the measured ones, indices (q,): velocities and tilt everywhere,
+            heading and place where some segment knows them.
         edges: First sample of each segment, and N, (S + 1,).
         low: Least theta, (P,).
         high: Largest theta, (P,).
@@ -839,7 +760,18 @@ class Shooting:
         """
         self.segments, self.parameters = tuple(segments), parameters
         self.measured = Residuals(segments, channels)
-        self.states = InitialStates(segments)
+        names = self.measured.names
+        known = np.stack([s.known for s in segments])
+        self.free = np.concatenate([np.arange(8), 8 + np.flatnonzero(known[:, 8:].any(axis=0))])
+        seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
+        states_std = np.where(known, np.where(seen, LOOSE, TIGHT), UNKNOWN)[:, self.free]
+        self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(names))
+        # The initial height already takes up an offset of the depth, unless z is measured too.
+        self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
+        stream_of = {c: i for i, stream in enumerate(self.streams) for c in STREAMS[stream]}
+        self._stream = np.array([stream_of[c] for c in names], int)[self.measured.channel]
+        rows = [names.index(name) for name in self.offsets]
+        self._offset = (self.measured.channel[:, None] == np.array(rows, int)).astype(float)
         self.rollouts = Rollouts(
             parameters.vehicle,
             segments,
@@ -849,8 +781,7 @@ class Shooting:
         self.groups = np.array([s.index for s in segments])
         self.few = few
         self.judged = len(parameters.names) - parameters.nuisances
-        self.errors = SensorErrors(self.measured)
-        far = np.full(len(self.errors.streams), LATEST)
+        far = np.full(len(self.streams), LATEST)
         self.low = np.concatenate([parameters.low, -far])
         self.high = np.concatenate([parameters.high, far])
         # Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a
@@ -865,8 +796,8 @@ class Shooting:
         if "thrust_delay" in parameters.names:
             # A common lag of all streams is a delay of the thrust: the first stream is the clock then.
             self.prior_precision[len(parameters.names)] = EXACT_CLOCK**-2.0
-        width = (len(segments), len(self.errors.std))
-        self.prior_std = np.concatenate([self.states.std, np.broadcast_to(self.errors.std, width)], axis=1)
+        offsets_std = np.tile([OFFSETS[c] for c in self.offsets], (len(segments), 1))
+        self.prior_std = np.concatenate([states_std, offsets_std], axis=1)
         self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
         self._floor = FLOOR * self.measured.spread() + 1e-12
         self.first_noise = np.maximum(self.measured.roughness(), self._floor)
@@ -874,7 +805,7 @@ class Shooting:
     @property
     def names(self) -> tuple[str, ...]:
         """Of theta: the parameters, then the lags of the streams [s]."""
-        return self.parameters.names + tuple(f"{stream}.late" for stream in self.errors.streams)
+        return self.parameters.names + tuple(f"{stream}.late" for stream in self.streams)
 
     def start(self) -> Point:
         """The vehicle file's numbers, the measured initial states, no errors of sensors."""
@@ -891,8 +822,10 @@ class Shooting:
         return self._residual(points, self._predicted(points)[0])
 
     def _residual(self, points: Point, value: Array) -> Array:
-        offset = points.z[..., len(self.states.free) :]
-        return self.measured.difference(value + self.errors.offset(offset))
+        offset, out = points.z[..., len(self.free) :], np.zeros((len(self.measured), len(points.z)))
+        for k in range(offset.shape[2]):
+            out += self._offset[:, k : k + 1] * offset[:, self.measured.segment, k].T
+        return self.measured.difference(value + out)
 
     def _predicted(self, points: Point) -> tuple[Array, Array]:
         """What sensors without offsets would have read and its rate of change, (N, C) each."""
@@ -905,13 +838,20 @@ class Shooting:
                 tail = (1,) * (own[name].ndim - 1)
                 mask = self.lagged.reshape(-1, *tail)
                 fields[name] = np.where(mask, values.reshape(-1, 1, *tail), own[name])
-        response = self.rollouts.run(
-            fields,
-            initial=self.states.initial(points.z[..., : len(self.states.free)]),
-            disturbance=p.bias,
-            candidates=C,
+        full = np.zeros((*points.z.shape[:2], 12))
+        full[..., self.free] = points.z[..., : len(self.free)]
+        nu, quaternion, position = (
+            np.stack([getattr(s, name) for s in self.segments]) for name in ("nu", "quaternion", "position")
         )
-        return self.measured.predicted(response, self.errors.late(points.theta[:, P:]))
+        initial = {
+            "nu": nu + full[..., :6],
+            "quaternion": quat_multiply(quaternion, quat_from_rotvec(full[..., 6:9])),
+            "position": position + full[..., 9:],
+        }
+        response = self.rollouts.run(fields, initial=initial, disturbance=p.bias, candidates=C)
+        late = points.theta[:, P:]
+        same = bool((late == late[:1]).all())
+        return self.measured.predicted(response, (late[:1] if same else late).T[self._stream])
 
     def linearise(self, point: Point) -> Linear:
         """Residuals and derivatives: central differences for what moves the vehicle, exact for what sensors add."""
@@ -923,19 +863,20 @@ class Shooting:
                 which = self.measured.channel == j
                 rise[which] = wrap_angle(rise[which])
         slopes = np.nan_to_num(rise / wide)
-        late, offset = self.errors.slopes(np.nan_to_num(rate[:, 0]))
+        rate = np.nan_to_num(rate[:, :1])
+        late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -rate, 0.0)
         P = len(self.parameters.names)
         one = Point(*(part[:1] for part in points))
         return Linear(
             self._residual(one, value[:, :1])[:, 0],
             np.concatenate([slopes[:, :P], late], axis=1),
-            np.concatenate([slopes[:, P:], offset], axis=1),
+            np.concatenate([slopes[:, P:], self._offset], axis=1),
         )
 
     def _neighbours(self, point: Point) -> tuple[Point, Array]:
         """The point, one on either side of it for every unknown that moves the vehicle, and their distances."""
         P = len(self.parameters.names)
-        count = P + len(self.states.free)
+        count, steps = P + len(self.free), STEPS[self.free]
         theta, z = (np.repeat(part[None], 1 + 2 * count, axis=0) for part in point)
         up, down = 1 + 2 * np.arange(count), 2 + 2 * np.arange(count)
         i = np.arange(P)
@@ -943,10 +884,10 @@ class Shooting:
         theta[up[:P], i] = np.minimum(point.theta[:P] + step, self.high[:P])
         theta[down[:P], i] = np.maximum(point.theta[:P] - step, self.low[:P])
         wide = theta[up[:P], i] - theta[down[:P], i]
-        for k, step_k in enumerate(self.states.steps):
+        for k, step_k in enumerate(steps):
             z[up[P + k], :, k] += step_k
             z[down[P + k], :, k] -= step_k
-        return Point(theta, z), np.concatenate([wide, 2.0 * self.states.steps])
+        return Point(theta, z), np.concatenate([wide, 2.0 * steps])
 
     def growth(self, point: Point) -> Array:
         """Largest factor by which a small change of the initial velocity grows within each segment, (S,)."""
@@ -1379,7 +1320,7 @@ def fit_findings(
         out.append(finding("not_converged", iterations=solution.iterations))
     P = len(problem.parameters.names)
     for stream, late, (low, high) in zip(
-        problem.errors.streams, solution.point.theta[P:], found.interval[P:], strict=True
+        problem.streams, solution.point.theta[P:], found.interval[P:], strict=True
     ):
         if abs(late) > LATE and (low > 0.0 or high < 0.0):
             sense = "lags" if late > 0.0 else "leads"
