@@ -96,10 +96,10 @@ def test_the_world_on_the_page_loads(tmp_path):
     assert load_world(tmp_path / "buoy.yaml").objects["buoy"].frame == "mooring"
 
 
-def test_every_range_on_the_page_of_randomisation_loads(tmp_path):
+def test_every_range_of_the_section_on_randomisation_loads(tmp_path):
     """Whole files, and the schedules line by line, of which a file has one."""
     path = tmp_path / "ranges.yaml"
-    first, tied, schedules = blocks(ROOT / "docs" / "randomisation.md", "yaml")
+    *_, first, tied, schedules = blocks(ROOT / "docs" / "simulation.md", "yaml")
     for example in (first, tied, *(f"mass: [0.9, 1.1]\n{line}" for line in schedules.splitlines())):
         path.write_text(example, encoding="utf-8")
         load_ranges(path)
