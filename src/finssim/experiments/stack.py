@@ -23,7 +23,6 @@ from finssim.pool.plant_spec import Severity
 from finssim.pool.task_site import TaskSite
 from finssim.robot.pilots import make_pilot
 from finssim.tasks import Task
-from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -41,7 +40,6 @@ def site_of(
     plant: int = 0,
     severity: Severity = "nominal",
     guide: Guide | None = None,
-    communication: Communication | None = None,
     record: Path | None = None,
 ) -> TaskSite:
     """One episode of a task in the virtual site, with a controller for all agents.
@@ -57,7 +55,6 @@ def site_of(
         plant: Seed of every vehicle's plant.
         severity: How far the plants are from the vehicle files.
         guide: The reference, of a task that follows one.
-        communication: Of what the vehicles tell each other; the task's own if None.
         record: Folder that takes PLACE.mcap and PLACE.truth of every agent; None: nothing is kept.
 
     Raises:
@@ -78,7 +75,7 @@ def site_of(
         state_sources if pool else None,
         seed=seed,
         guide=guide,
-        communication=communication or getattr(fitted, "communication", None),
+        communication=getattr(fitted, "communication", None),
         camera=(lambda v: PoolCamera(v, site, mode="corners", settings=settings, seed=seed))
         if pool
         else None,

@@ -291,7 +291,6 @@ def make_pilot(
     *,
     task: str | None = None,
     agent: str | None = None,
-    period: float | None = None,
 ) -> AgentPilot:
     """A PID by its name, the policy of a directory, or a baseline of the task.
 
@@ -301,7 +300,6 @@ def make_pilot(
         task: Its name, or FILE.py:CLASS of one's own, which a policy was trained for; None: whatever a policy
             was trained for, and T1 of a PID.
         agent: Its place in a task of several; the first if None.
-        period: Time between two decisions at which a policy would be asked [s]; None: its own.
 
     Raises:
         PolicyError, ControlError: It does not fit the vehicle or the task, in one sentence.
@@ -326,9 +324,7 @@ def make_pilot(
     mode = mode_from_dict(trained.action, vehicle)
     observed = Observer(task or trained.task, vehicle, agent=agent, action=mode.name)
     shapes = {name: about["shape"] for name, about in trained.pictures.items()}
-    return AgentPilot(
-        PolicyAgent(controller, vehicle, observed.task, period=period), vehicle, observed, shapes
-    )
+    return AgentPilot(PolicyAgent(controller, vehicle, observed.task), vehicle, observed, shapes)
 
 
 def _state(reading: Measured) -> tuple[Any, Any, Any]:

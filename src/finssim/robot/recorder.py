@@ -301,17 +301,16 @@ class Recorder:
         if shafts is not None:
             self._put("shafts", received, shafts)
 
-    def reading(self, now: float, reading: Reading, health: Mapping[str, Any] | None = None) -> None:
+    def reading(self, now: float, reading: Reading) -> None:
         """The estimate, as Odometry, transform and EstimatorStatus.
 
         Args:
             now: [s]
             reading: What a controller is given; the record's stamp is its time.
-            health: Fields of EstimatorStatus that a reading does not tell, such as `vision_age`.
         """
         at, make = self._ns(now), self._messages
         stamp = self._ns(reading.time)
-        self._put("estimator", at, make.estimator(stamp, reading, health or {}))
+        self._put("estimator", at, make.estimator(stamp, reading, {}))
         if np.isfinite(reading.position).all():
             self._put("odometry", at, make.odometry(stamp, reading))
             self._put("transform", at, make.transform(stamp, reading))

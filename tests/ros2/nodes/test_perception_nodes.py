@@ -26,7 +26,7 @@ from finssim.ros2.nodes.frames import Pose, urdf_of
 from finssim.ros2.nodes.localizer import Localizer
 from finssim.ros2.nodes.state_estimation import StateEstimation
 from finssim.ros2.topics import TOPICS, quality_profile
-from finssim.ros2_worlds.ideal_sensors import IdealSensors
+from finssim.ros2_worlds.sim import IdealSensors
 from finssim.vehicles import load_vehicle
 
 PATIENCE = 40.0  # [s] on a busy machine

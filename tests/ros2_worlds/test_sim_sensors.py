@@ -5,7 +5,7 @@ import pytest
 
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate, quat_multiply
 from finssim.robot.reading import Reading
-from finssim.ros2_worlds.ideal_sensors import IdealSensors
+from finssim.ros2_worlds.sim import IdealSensors
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("finsrov")
