@@ -162,7 +162,7 @@ def test_pictures_carry_the_time_of_the_machine():
     clock, (pool, _) = Clock(), memory_pair()
     eye = plan.camera.camera()
     pace = serve_realtime(
-        alone(camera=eye), {"it": pool}, sink=Sink(), duration=1.0, clock=clock, wait=clock.wait
+        alone(camera=eye), {"it": pool}, sinks=[Sink()], duration=1.0, clock=clock, wait=clock.wait
     )
     assert pace.pictures == len(Sink.times) >= 27
     assert all(0.0 <= now - came < 0.01 and 100.0 < came < 101.1 for came, now in Sink.times)

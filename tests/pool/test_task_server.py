@@ -1,4 +1,4 @@
-"""Several vehicles in real time: one process is the water, others are the robots."""
+"""Several vehicles in real time: one process is the water, others are the robots; one camera sees the tags of all."""
 
 import json
 import signal
@@ -12,11 +12,15 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.control.guidance import Track
-from finssim.pool.fleet import Medium
-from finssim.pool.run import MediumServer
+from finssim.control.guidance import Station, Track
+from finssim.pool.fleet import Medium, one_picture
+from finssim.pool.run import MediumServer, swimming
+from finssim.robot.pilots import make_pilot
 from finssim.robot.record_reader import open_record
+from finssim.robot.runtime import Runtime
 from finssim.robot.team import decode_track, encode_track
+from finssim.vehicles import load_vehicle
+from finssim.vehicles.defaults import numbered
 
 HERE = Track(np.array([1.0, 2.0, -3.0]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6), 0.0)
 
@@ -42,6 +46,31 @@ def test_a_message_reaches_the_others_and_nobody_under_a_strange_name():
         end.close()
 
 
+@pytest.mark.slow
+def test_one_camera_tells_vehicles_apart_by_their_tags():
+    """Three FinsROV in the pool, every picture with the tags of all: each knows where it is and goes where it is to."""
+    finsrov = load_vehicle("finsrov")
+    fleet, known = swimming([finsrov] * 3, 1, "nominal", "corners", "pool", "none", truth=None, seed=1)
+    names, sent = list(fleet.worlds), {name: [] for name in fleet.worlds}
+    runtimes, tags = {}, set()
+    for i, (name, world) in enumerate(fleet.worlds.items()):
+        x, y, z = world.plant.position.astype(float)
+        station = Station((x, y + 0.3, z), 0.0)
+        pilot = make_pilot("pid", finsrov)
+        runtimes[name] = Runtime(numbered(finsrov, i), known, pilot, station, arm=True)
+    for k in range(1, 901):
+        arrived = {name: fleet.worlds[name].exchange(k / 60.0, sent[name]) for name in names}
+        pictures = one_picture(p for delivery in arrived.values() for p in delivery.pictures)
+        tags |= {tag.tag_id for picture in pictures for tag in picture.tags}
+        for name in names:
+            sent[name] = runtimes[name].step(k / 60.0, arrived[name].frames, pictures)
+    assert tags == {15, 16, 17, 18, 19, 20}
+    for name in names:
+        runtime, truth = runtimes[name], fleet.worlds[name].plant.position
+        assert np.linalg.norm(runtime.reading.position - truth) < 0.02 and not runtime.bridge.reason
+        assert np.linalg.norm(truth - runtime.guide.position) < 0.05
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -49,7 +78,8 @@ def test_a_message_reaches_the_others_and_nobody_under_a_strange_name():
             ["pool", "--team", "finsrov,finsrov", "--task", "formation"],
             "--team names 2 vehicles, but task 'formation' has 3",
         ),
-        (["pool", "--team", "finsrov,finsrov"], "--team names the vehicles of a task: give --task"),
+        (["pool", "--team", "finsrov,finsrov", "--camera", "pictures"], "give --camera corners, or none"),
+        (["pool", "--team", "finsrov,finsrov,finsrov,finsrov"], "4 vehicles 1.1 m apart have no room in 4 m"),
         (["run", "--team", "lead"], "--team lead is a baseline: give its task with --task"),
         (["run", "--team", "lead", "--task", "pursuit"], "has one agent: run it with --policy lead"),
         (["run", "--team", "consensus", "--task", "formation", "--agent", "corner_1"], "leave --agent"),

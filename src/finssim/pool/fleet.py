@@ -1,20 +1,22 @@
-"""Vehicles in one water: a plant and a motor controller each, and what they send each other."""
+"""Several vehicles in one water: a plant and a motor controller each, and one camera that sees the tags of all."""
 
 from __future__ import annotations
 
 import heapq
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.pool.virtual_pool import VirtualPool
+from finssim.robot.messages import Picture
 from finssim.robot.runtime import Runtime
 from finssim.tasks.communication import Communication
 
-__all__ = ["Fleet", "Medium"]
+__all__ = ["Fleet", "Medium", "one_picture"]
 
 
 # What vehicles send each other, on its way through the water: late by the way, and sometimes lost, as in training.
@@ -96,3 +98,13 @@ class Fleet:
         """Finish the truth files."""
         for world in self.worlds.values():
             world.close()
+
+
+def one_picture(pictures: Iterable[Picture]) -> list[Picture]:
+    """Corners of each vehicle, of the same exposures, as the one camera has them: a picture with all tags."""
+    by_exposure: dict[tuple[str, int], Picture] = {}
+    for picture in pictures:
+        key = picture.source, picture.sequence
+        before = by_exposure.get(key)
+        by_exposure[key] = picture if before is None else replace(before, tags=before.tags + picture.tags)
+    return [by_exposure[key] for key in sorted(by_exposure)]

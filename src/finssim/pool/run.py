@@ -21,9 +21,9 @@ import numpy as np
 from finssim.control.guidance import Station
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.localization.pool import Pool, write_pool
-from finssim.pool.camera import camera_of
+from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
-from finssim.pool.fleet import Fleet, Medium
+from finssim.pool.fleet import Fleet, Medium, one_picture
 from finssim.pool.onboard import Cameras, OnboardPlan, site_of_world
 from finssim.pool.pictures import CameraPlan, PictureProcess, Plan, UdpSender
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
@@ -43,15 +43,16 @@ from finssim.robot.link.transports import (
 )
 from finssim.robot.link.water_linked import DvlServer
 from finssim.robot.lockstep import LockstepError, decode_request, encode_delivery, encode_refusal, receive
+from finssim.robot.messages import Picture
 from finssim.robot.team import decode_track
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
-from finssim.vehicles.defaults import vehicle_at
+from finssim.vehicles.defaults import numbered, vehicle_at
 from finssim.worlds import load_world
 
 __all__ = [
     "GroundLinks", "LockstepServer", "MCU_PORT", "MediumServer", "Pace", "PoolPlan", "make_plan", "run",
-    "serve_realtime",
+    "serve_realtime", "swimming",
 ]  # fmt: skip
 
 
@@ -300,7 +301,7 @@ def serve_realtime(
     transports: Mapping[str, Transport],
     messages: MediumServer | None = None,
     *,
-    sink: UdpSender | None = None,
+    sinks: Sequence[UdpSender] = (),
     camera: Clocked | None = None,
     duration: float = math.inf,
     until: Callable[[], bool] = lambda: False,
@@ -314,7 +315,7 @@ def serve_realtime(
         site: With robots in other processes, at time 0.
         transports: To the robot of each of these vehicles, by name, from the motor controllers' end.
         messages: Between the robots; None: they tell each other nothing.
-        sink: Takes the pictures of a camera that does not send them itself.
+        sinks: Take the one camera's pictures, one for each robot.
         camera: One that sends its pictures itself.
         duration: How long [s].
         until: Ends it where it says so; asked at every tick.
@@ -334,13 +335,16 @@ def serve_realtime(
         if camera is not None:
             camera.start = start
         now = min(max(clock() - start, now), duration)
+        pictures: list[Picture] = []
         for name, transport in transports.items():
             received = transport.receive()
             delivery = site.worlds[name].exchange(now, received)
+            pictures += delivery.pictures
             for _, frame in delivery.frames:
                 transport.send(frame)
             pace.received, pace.sent = pace.received + len(received), pace.sent + len(delivery.frames)
-            for picture in delivery.pictures if sink is not None else ():
+        for picture in one_picture(pictures):
+            for sink in sinks:
                 sink.send(replace(picture, time=start + picture.time), clock())
                 pace.pictures += 1
         due = now * RATE >= steps + 1
@@ -371,6 +375,8 @@ MCU_PORT = 58766
 """Of the motor controller; pictures come from the next port, lock-step is the one after."""
 MESSAGES = 5
 """The messages of a team are this far from the first port."""
+ROOM = 2.0
+"""Vehicles of a team start so many lengths of the longest apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -510,20 +516,21 @@ def run(
         severity (NAME): How much a drawn plant and its camera differ from the files: nominal, realistic or hard.
         lockstep: Advance time as fast as one robot requests, instead of in real time.
         camera (KIND): Output of the camera: pictures, corners (of the tags) or none. Default: pictures; corners for
-            a tank; none in open water, with a world or a task, and with ardusub.
+            a team or a tank; none in open water, with a world or a task, and with ardusub.
         port: UDP port of the motor controller; images use the next port, lock-step (TCP) the one after. With
             ardusub, 0 selects a free one.
         bind (ADDRESS): Local address; only this machine if not given.
         robot (HOST:PORT): The only robot that may send commands in real time; images are sent to the next port.
         pool_file (FILE): Pool file to write, with the calibrated camera (.yaml).
-        truth (FILE): File for the true states, for scoring.
+        truth (FILE): File for the true states, for scoring; for a team a folder.
         start (X,Y,Z,YAW): Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; the centre, or the viewpoint
             of a world, if not given.
-        task (TASK): Run the site of a task in open water, in real time, and score the truth. The ports of each
-            further agent's motor controller and robot are higher by ten than --port and --robot; messages between
-            robots use the port of --port plus five. Other vehicles of the task are simulated.
-        team (NAME,NAME): The vehicles of a task's agents: names or files separated by commas; all of --vehicle if
-            not given.
+        task (TASK): Run the site of a task in open water, in real time, with ports as for --team; messages between
+            robots use the port of --port plus five. Other agents of the task are simulated, and the task scores the
+            truth.
+        team (NAME,NAME): Several vehicles at one site, in real time: names or files separated by commas, as agents
+            of --task or without a task. The ports of each further motor controller and robot are higher by ten than
+            --port and --robot. A camera sees all of them, with different tag ids.
         site (NAME): Site: pool (default), tank or open-water (current, waves, 20 m deep); for a world the default
             is its basin, or open water down to its seabed.
         world (SITE|FILE): World for the vehicle's own cameras, sonars and altimeters, drawn from --seed: a site of
@@ -544,23 +551,26 @@ def run(
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
     positioning_of(positioning, seed)  # refuses what is none
     ardusub = firmware == "ardusub"
-    if team is not None and task is None:
-        raise PlantSpecError(
-            "--team names the vehicles of a task: give --task, or start a finssim pool for each vehicle, with its own "
-            "--port and --robot"
-        )
-    if task is not None:
+    if task is not None or team is not None:
         if ardusub:
-            raise PlantSpecError("--firmware ardusub is for one vehicle: leave --task out")
-        files = pool_file is not None or truth is not None
+            raise PlantSpecError("--firmware ardusub is for one vehicle: leave --team and --task out")
+        files = task is not None and (pool_file is not None or truth is not None)
         if not plant.isdecimal() or lockstep or start is not None or files or world is not None:
             raise PlantSpecError(
-                "--task draws its plants, its time is real and its starts are its own: give a seed for --plant, and "
-                "leave --lockstep, --start, --world, --pool-file and --truth out"
+                "--team and --task draw their plants, their time is real and their starts are their own: give a seed "
+                "for --plant, leave --lockstep, --start and --world out, and of a task --pool-file and --truth"
             )
+        site = site or "pool"
         bodies = [load_vehicle(name.strip()) for name in (team or vehicle).split(",")]
-        playing = _playing(task, bodies, int(plant), severity, positioning, seed)
-        _serve_task(playing, (bind, port), host_port(robot, "--robot"), duration)
+        calibrated = None
+        if task is None:
+            fleet, calibrated = swimming(
+                bodies, int(plant), severity, camera or ("none" if site == "open-water" else "corners"), site,
+                positioning, truth=truth, seed=seed,
+            )  # fmt: skip
+        else:
+            fleet = _playing(task, bodies, int(plant), severity, positioning, seed)
+        _serve_team(fleet, calibrated, (bind, port), host_port(robot, "--robot"), pool_file, duration)
         return
     usual: Any = {"pool": "pictures", "tank": "corners"}.get(
         site or ("pool" if world is None else ""), "none"
@@ -606,30 +616,46 @@ def run(
         _realtime(plan, make_world, (bind, port), host_port(robot, "--robot"), longest, links)
 
 
-def _serve_task(
-    site: TaskSite, ours: tuple[str, int], theirs: tuple[str, int], duration: float | None
+def _serve_team(
+    fleet: Fleet,
+    calibrated: Pool | None,
+    ours: tuple[str, int],
+    theirs: tuple[str, int],
+    pool_file: Path | None,
+    duration: float | None,
 ) -> None:
-    """Serve the agents of a task, each to a robot of its own, from their first addresses on ten ports apart."""
+    """Serve several vehicles, each to a robot of its own, from their first addresses on ten ports apart."""
     (bind, port), (host, first) = ours, theirs
-    names = site.task.agents
+    names = fleet.task.agents if isinstance(fleet, TaskSite) else tuple(fleet.worlds)
     if not 0 < port <= 65535 - 10 * len(names):
         raise LinkError(f"port {port}: expected room for ten ports to each of {len(names)} vehicles after it")
     with interruptible() as interrupted, ExitStack() as stack:
-        stack.callback(site.close)
-        messages = MediumServer((bind, port + MESSAGES), site.carrier, names)
-        stack.callback(messages.close)
+        stack.callback(fleet.close)
+        messages, sinks = None, []
+        if isinstance(fleet, TaskSite):
+            messages = MediumServer((bind, port + MESSAGES), fleet.carrier, names)
+            stack.callback(messages.close)
         transports = {}
         for i, name in enumerate(names):
             transports[name] = UdpTransport((bind, port + 10 * i), (host, first + 10 * i))
             stack.callback(transports[name].close)
             _say(f"{name}: {_name(transports[name].address)}, for {_name(transports[name].peer)} alone")
-        _tell_goal(site)
-        _say(f"messages: {_name(messages.address)}")
+            if calibrated is not None:
+                sinks.append(UdpSender((bind, port + 10 * i + 1), (host, first + 10 * i + 1)))
+                stack.callback(sinks[-1].close)
+        if calibrated is not None and pool_file is not None:
+            write_pool(calibrated, pool_file)
+            _say(f"pool file: {pool_file}")
+        if messages is not None and isinstance(fleet, TaskSite):
+            _tell_goal(fleet)
+            _say(f"messages: {_name(messages.address)}")
         longest = math.inf if duration is None else duration
-        notify = partial(_tell_episode, site)
-        pace = serve_realtime(site, transports, messages, duration=longest, until=interrupted, over=notify)
-    if not site.over:
-        _tell_episode(site)
+        notify = partial(_tell_episode, fleet)
+        pace = serve_realtime(
+            fleet, transports, messages, sinks=sinks, duration=longest, until=interrupted, over=notify
+        )
+    if not fleet.over:
+        _tell_episode(fleet)
     _say(f"ended after {pace.duration:.1f} s")
 
 
@@ -656,6 +682,74 @@ def _playing(
     )
 
 
+def swimming(
+    bodies: Sequence[Vehicle],
+    plant: int,
+    severity: Severity,
+    camera: str,
+    site: str,
+    positioning: str,
+    *,
+    truth: Path | None,
+    seed: int,
+) -> tuple[Fleet, Pool | None]:
+    """Vehicles side by side, robot_1 and so on, and what their robots may know of the one camera.
+
+    Args:
+        bodies: As their files have them.
+        plant: Seed of the first plant and of the camera; the others' follow.
+        severity: Of plants and camera.
+        camera: corners or none.
+        site: Where, a name of `SITES`.
+        positioning: On every robot's wire: none, motion-capture or usbl.
+        truth: Folder that takes NAME.truth of each; none if None.
+        seed: Of instruments and noise.
+
+    Raises:
+        PlantSpecError: They have no room, or the camera cannot be there.
+    """
+    if camera == "pictures" and site != "open-water":
+        raise PlantSpecError("the one camera over a team sends corners: give --camera corners, or none")
+    if site == "open-water" and camera != "none":
+        raise PlantSpecError("no camera hangs over open water: give --camera none, and a positioning")
+    ours = [numbered(vehicle_at(site, body), i) for i, body in enumerate(bodies)]
+    specs = [site_of(site, draw_plant(v, plant + i, severity)) for i, v in enumerate(ours)]
+    basin = specs[0].basin
+    spacing = ROOM * max(max(v.body.size) for v in ours)
+    if spacing * len(ours) > basin.length:
+        raise PlantSpecError(
+            f"{len(ours)} vehicles {spacing:.1f} m apart have no room in {basin.length:g} m: take a larger --site"
+        )
+    eyes: list[PoolCamera | None] = [None] * len(ours)
+    calibrated = None
+    if camera == "corners":
+        true, calibrated, settings = camera_of(ours[0], plant, severity, basin=basin)
+        for i, v in enumerate(ours):
+            robot_settings = camera_of(v, plant, severity, basin=basin)[2]
+            eyes[i] = PoolCamera(
+                v,
+                true,
+                mode="corners",
+                settings=replace(settings, mounts=robot_settings.mounts),
+                seed=seed,
+                noise_seed=seed + 1000 * (i + 1),
+            )
+    worlds = {}
+    for i, (v, spec, eye) in enumerate(zip(ours, specs, eyes, strict=True)):
+        name = f"robot_{i + 1}"
+        x = spacing * (i - 0.5 * (len(ours) - 1))
+        worlds[name] = VirtualPool(
+            v,
+            spec,
+            camera=eye,
+            positioning=positioning_of(positioning, seed + i),
+            start=((x, 0.0, -0.5 * basin.depth), quat_from_yaw(0.0)),
+            seed=seed + i,
+            truth=None if truth is None else truth / f"{name}.truth",
+        )
+    return Fleet(worlds), calibrated
+
+
 def _tell_goal(site: TaskSite) -> None:
     """Where the task's goal is, of one that stands still."""
     if site.task.moving:
@@ -665,8 +759,10 @@ def _tell_goal(site: TaskSite) -> None:
     _say(f"goal: {x:.3f},{y:.3f},{z:.3f},{yaw:.1f}")
 
 
-def _tell_episode(site: TaskSite) -> None:
+def _tell_episode(site: Fleet) -> None:
     """How the episode went, in a line."""
+    if not isinstance(site, TaskSite):
+        return
     if site.referee.over:
         _say("episode: " + ", ".join(f"{name} {value:.4g}" for name, value in site.referee.metrics().items()))
     else:
@@ -724,8 +820,11 @@ def _realtime(
             _say(f"motor controller: {_name(transport.address)}, for {_name(transport.peer)} alone")
         if eye is not None:
             _say(f"pictures: {_name(_next(bind))}, for {_name(_next(robot))}")
-        site, transports = Fleet({plan.vehicle.name: world}), {plan.vehicle.name: transport}
-        pace = serve_realtime(site, transports, sink=sink, camera=drawn, duration=duration, until=interrupted)
+        site, sinks = Fleet({plan.vehicle.name: world}), [] if sink is None else [sink]
+        transports = {plan.vehicle.name: transport}
+        pace = serve_realtime(
+            site, transports, sinks=sinks, camera=drawn, duration=duration, until=interrupted
+        )
         _say(pace.sentence)
         if drawn is not None and drawn.dropped:
             _say(drawn.complaint)

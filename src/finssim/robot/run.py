@@ -36,7 +36,7 @@ from finssim.robot.runtime import USED, Runtime
 from finssim.robot.team import Team
 from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
-from finssim.vehicles.defaults import vehicle_at
+from finssim.vehicles.defaults import numbered, vehicle_at
 
 __all__ = ["APART", "FAULT", "POOL_ADDRESS", "UNHEARD", "Wiring", "run", "run_team"]
 
@@ -313,6 +313,7 @@ def run(
     site: str | None = None,
     team: str | None = None,
     messages: str = "",
+    number: Annotated[int, (0, 1000)] = 0,
     vehicle: str = "finsrov",
     let_in: str | None = None,
     mode: str | None = None,
@@ -357,6 +358,7 @@ def run(
             --messages.
         messages (ADDRESS): Relay of messages between vehicles, such as finssim pool --task: HOST:PORT. With --team
             the default is the port of --robot plus five.
+        number: This vehicle's index among several under one camera, which offsets its tag ids.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         let_in (X,Y): Position at the start, world frame [m], known to 5 cm: for dead reckoning by DVL and compass,
             without camera and position fixes.
@@ -379,9 +381,10 @@ def run(
             "no controller: give --policy for this vehicle, or --team for all agents of a task"
         )
     if team is not None:
-        if agent is not None or trajectory is not None or lockstep or let_in is not None:
+        if agent is not None or trajectory is not None or lockstep or number or let_in is not None:
             raise ControlError(
-                "--team has every agent in its place: leave --agent, --trajectory, --lockstep and --let-in out"
+                "--team has every agent in its place: leave --agent, --trajectory, --lockstep, --number and --let-in "
+                "out"
             )
         options = {
             "--site": site or "open-water",
@@ -405,7 +408,7 @@ def run(
             "with --pool-file, or give --pool-file none without a camera"
         )
     filed = load_vehicle(vehicle)
-    ours = vehicle_at(site, filed, navigation=robot.startswith("mavlink"))
+    ours = numbered(vehicle_at(site, filed, navigation=robot.startswith("mavlink")), number)
     pilot = _pilot(policy, filed, task, agent=agent, follows=trajectory is not None)
     sees = getattr(pilot, "pictures", {})
     free = goal is None and trajectory is None

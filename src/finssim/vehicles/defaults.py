@@ -37,6 +37,7 @@ __all__ = [
     "default_safety",
     "default_sensors",
     "default_tags",
+    "numbered",
     "room",
     "vehicle_at",
     "with_navigation",
@@ -176,6 +177,16 @@ def vehicle_at(site: str, vehicle: Vehicle, *, navigation: bool = False) -> Vehi
         "workspace_upper": np.array([0.5 * length, 0.5 * width, 0.0]),
     }
     return vehicle.model_copy(update={"safety": vehicle.safety.model_copy(update=box)})
+
+
+def numbered(vehicle: Vehicle, number: int) -> Vehicle:
+    """The vehicle as one of several under one camera, from 0: its tags' ids go on after those of the one before."""
+    tags = vehicle.tags
+    if number == 0 or tags is None:
+        return vehicle
+    step = max(tags.mounts) - min(tags.mounts) + 1
+    mounts = {tag + number * step: mount for tag, mount in tags.mounts.items()}
+    return vehicle.model_copy(update={"tags": tags.model_copy(update={"mounts": mounts})})
 
 
 def default_mcu(values: Mapping[str, Any]) -> Mcu:

@@ -19,7 +19,7 @@ from finssim.robot.interrupt import follow_parent
 from finssim.ros2.nodes.conversions import RosMessages, nanoseconds, ros_type
 from finssim.ros2.topics import TOPICS, own_topics, quality_profile
 from finssim.vehicles import load_vehicle
-from finssim.vehicles.defaults import vehicle_at
+from finssim.vehicles.defaults import numbered, vehicle_at
 
 URGENCY = -10
 """Niceness of a node that others wait for; only a privileged user may have it, others do without."""
@@ -62,10 +62,11 @@ class RobotNode(Node):
         """The vehicle as its file has it, which policies are trained for."""
         self.robot = self.parameter("robot", "pool")
         """Address of the motor controller, or of an autopilot, whose vehicle has a Doppler log and a compass."""
-        self.vehicle = vehicle_at(
+        equipped = vehicle_at(
             self.parameter("site", "pool"), self.filed, navigation=self.robot.startswith("mavlink")
         )
-        """The same as it is equipped for the site."""
+        self.vehicle = numbered(equipped, self.parameter("number", 0))
+        """The same as it is equipped for the site, with the tags of its number among several."""
         self.table = TOPICS | own_topics(self.vehicle)
         """Those of every robot, and of this vehicle's own cameras, sonars and altimeters."""
         self.make = RosMessages(self.vehicle, self.parameter("frame_prefix", ""))
