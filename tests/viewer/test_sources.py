@@ -15,7 +15,7 @@ from finssim.vehicles import VehicleError, load_vehicle
 from finssim.viewer.app import draw_own
 from finssim.viewer.frame import ViewError
 from finssim.viewer.run import Choice, open_source
-from finssim.viewer.sources import PoolSource, RunSource
+from finssim.viewer.sources import PoolSource, RunSource, SimulatorSource
 from finssim.worlds import WorldLayout
 
 
@@ -44,6 +44,16 @@ def test_the_pool_is_the_one_that_was_asked_for():
     assert len(plain.stage.path) > 100 and plain.frame(0.3).picture.image.shape == (720, 1280)
     other = open_source(Choice(plant="3", severity="hard", policy="pid-paper", task="t2"))
     assert "hard plant 3: pid-paper, ellipse" in other.stage.title
+
+
+def test_the_simulator_is_a_source(tmp_path):
+    """It holds a station from its state alone, in the model that was asked for."""
+    source = open_source(Choice(source="sim", goal="0.3,0.1,-0.6,30"))
+    assert isinstance(source, SimulatorSource)
+    frame = source.frame(10.0)
+    assert frame.estimate is None and np.linalg.norm(frame.truth.position - [0.3, 0.1, -0.6]) < 0.1
+    other = open_source(Choice(source="sim", goal="0.3,0.1,-0.6,30", hydrodynamics="simplified"))
+    assert not np.allclose(other.frame(2.0).truth.position, source.frame(2.0).truth.position)
 
 
 def test_a_run_of_the_engine_is_a_source(tmp_path):
@@ -82,7 +92,7 @@ def test_the_vehicle_that_a_run_names_is_of_the_catalogue(tmp_path, monkeypatch,
     ("choice", "sentence"),
     [
         (Choice(source="nowhere.mcap"), "no such file or folder"),
-        (Choice(source="sim"), "no such file or folder"),
+        (Choice(source="sim", plant="3"), "--plant is for pool, not for a sim"),
         (Choice(source="pool", basin="4,2,1"), "--basin is for record, not for a pool"),
         (Choice(source="pool", goal="5,0,-0.5,0"), "outside the workspace"),
         (Choice(source="pool", camera="none"), "camera"),

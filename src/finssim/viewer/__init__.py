@@ -1,1 +1,1 @@
-"""A live view in the browser: of the virtual pool and of what was recorded."""
+"""A live view in the browser: of the virtual pool, of the simulator, and of what was recorded."""

@@ -17,8 +17,10 @@ from finssim.viewer.frame import Source, ViewError
 from finssim.viewer.sources import guide_for
 from finssim.worlds import load_world
 
+_DRIVEN = {"policy", "task", "goal", "trajectory", "seed"}
 HEEDED = {
-    "pool": {"policy", "task", "goal", "trajectory", "seed", "plant", "severity", "camera", "world"},
+    "pool": _DRIVEN | {"plant", "severity", "camera", "world"},
+    "sim": _DRIVEN | {"hydrodynamics"},
     "record": {"truth", "truth_offset", "basin", "world", "seed"},
     "folder": {"world"},
 }
@@ -30,18 +32,18 @@ class Choice:
     """What a person wants to look at."""
 
     source: Annotated[str, "argument"] = "pool"
-    """(pool|FILE|FOLDER) Source: pool (the virtual pool with a robot in it), a record (.mcap), or a folder written by
-    the engine's recorder."""
+    """(pool|sim|FILE|FOLDER) Source: pool (the virtual pool with a robot in it), sim (the simulator), a record
+    (.mcap), or a folder written by the engine's recorder."""
     vehicle: str | None = None
     """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file; finsrov, or that of the record, if not
     given."""
     policy: str = "pid"
-    """(DIR|pid|pid-paper) Controller in the pool: a policy's directory, pid or pid-paper."""
+    """(DIR|pid|pid-paper) Controller in pool and sim: a policy's directory, pid or pid-paper."""
     task: str | None = None
     """(TASK) Task that the policy must have been trained for: t1 or t2; t2 follows a default trajectory if none is
     given."""
     goal: str | None = None
-    """(X,Y,Z,YAW|FILE) Station to keep in the pool: x,y,z [m] in the world frame and heading [deg], or a file."""
+    """(X,Y,Z,YAW|FILE) Station to keep in pool and sim: x,y,z [m] in the world frame and heading [deg], or a file."""
     trajectory: str | None = None
     """(NAME|FILE) Trajectory to follow instead of a goal: a name or a file."""
     plant: str = "1"
@@ -50,6 +52,8 @@ class Choice:
     """(NAME) Severity of a drawn plant: nominal, realistic or hard."""
     camera: str = "corners"
     """(KIND) Output of the pool's camera: pictures, or corners (of the tags)."""
+    hydrodynamics: str = "calibrated"
+    """(MODEL) Hydrodynamic model: calibrated, simplified or mesh."""
     truth: Path | None = None
     """(FILE) Truth file of the pool, to show beside a record."""
     truth_offset: float | None = None
@@ -74,6 +78,8 @@ def open_source(choice: Choice) -> Source:
     _refuse_strangers(choice)
     if choice.source == "pool":
         return _pool(choice)
+    if choice.source == "sim":
+        return _simulator(choice)
     path = Path(choice.source)
     if path.is_dir():
         from finssim.viewer.sources import RunSource
@@ -84,7 +90,7 @@ def open_source(choice: Choice) -> Source:
         return RunSource(path, world=number, vehicle=choice.vehicle)
     if not path.is_file():
         raise ViewError(
-            f"{choice.source}: no such file or folder; give pool, a record (.mcap) or a run's folder"
+            f"{choice.source}: no such file or folder; give pool, sim, a record (.mcap) or a run's folder"
         )
     from finssim.viewer.sources import RecordSource
 
@@ -168,6 +174,20 @@ def _pool(choice: Choice) -> Source:
         seed=choice.seed,
         world=choice.world,
         **kinds,
+    )
+
+
+def _simulator(choice: Choice) -> Source:
+    from finssim.viewer.sources import SimulatorSource
+
+    vehicle = load_vehicle(choice.vehicle or "finsrov")
+    return SimulatorSource(
+        vehicle,
+        guide_for(choice.goal, choice.trajectory, choice.task, vehicle),
+        policy=choice.policy,
+        task=choice.task,
+        hydrodynamics=choice.hydrodynamics,
+        seed=choice.seed,
     )
 
 
