@@ -198,7 +198,7 @@ def kinds() -> list[Kind]:
             f"backproject SEEDS/pixels.csv {camera} --z NUMBER", f"backproject SEEDS/pixels.csv {camera} --plane 0,0,1,NUMBER",  # noqa: E501
             f"calibrate pool SEEDS/survey.csv {fitted} --index NUMBER", f"calibrate pool SEEDS/survey.csv {fitted} --z NUMBER",  # noqa: E501
             f"calibrate pool SEEDS/survey.csv {fitted} --water-height NUMBER --survey-sigma NUMBER",
-            "play SEEDS/run.mcap --start NUMBER", "view SEEDS/run.mcap --no-browser --duration 0 --basin 4,2,NUMBER",  # noqa: E501
+            "play SEEDS/run.mcap --start NUMBER", "view SEEDS/run.mcap --no-browser --duration 0 --basin 4,2,NUMBER",
             "evaluate pid --trials NUMBER", "collect pid --task t1 --episodes NUMBER --disturb NUMBER --out OUT/set",
             "run --policy pid --goal 0,0,NUMBER,NUMBER --pool-file none --robot udp://127.0.0.1:9 --bind 127.0.0.1:0 "
             "--duration 0", "pool --camera none --port 50321 --duration 0 --start 0,0,-0.5,NUMBER",

@@ -1,4 +1,5 @@
 """Copies of one world side by side, as Newton's ray caster takes them, with what light and sound find on each shape."""
+# mypy: ignore-errors
 
 from __future__ import annotations
 
