@@ -150,7 +150,7 @@ def show_vehicle(
 
         for sensor in vehicle.perception:
             device_of(vehicle, sensor)
-    print_vehicle(vehicle, Console(), None)
+    print_vehicle(vehicle, Console())
     if picture is not None:
         from finssim.files import atomic_write
         from finssim.vehicles.show import draw_vehicle

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,35 +36,25 @@ _LEGEND = "no mark: measured or published    · derived    ? guessed"
 def print_catalogue(console: Console) -> None:
     """One line per vehicle that comes with FinsSim."""
     table = Table(title="Vehicles", title_justify="left", box=None, pad_edge=False)
-    for column, justify in (
-        ("name", "left"),
-        ("mass [kg]", "right"),
-        ("thrusters", "right"),
-        ("axes", "right"),
-    ):
-        table.add_column(Text(column), justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    for column in ("name", "mass [kg]", "thrusters", "axes"):
+        table.add_column(Text(column), justify="left" if column == "name" else "right", no_wrap=True)
     table.add_column("hydrodynamics")
     table.add_column("what it is", overflow="fold")
     for name in catalogue():
         vehicle = load_vehicle(name)
+        numbers = (f"{vehicle.body.mass:g}", len(vehicle.thrusters), len(vehicle.controlled_axes))
         table.add_row(
-            f"[bold]{name}[/bold]",
-            f"{vehicle.body.mass:g}",
-            str(len(vehicle.thrusters)),
-            str(len(vehicle.controlled_axes)),
-            " ".join(vehicle.hydrodynamics),
-            escape(vehicle.title),
+            f"[bold]{name}[/bold]", *map(str, numbers), " ".join(vehicle.hydrodynamics), escape(vehicle.title)
         )
     console.print(table)
 
 
-def print_vehicle(vehicle: Vehicle, console: Console, picture: Path | None = None) -> None:
+def print_vehicle(vehicle: Vehicle, console: Console) -> None:
     """Everything about one vehicle: numbers with their origin, what it can do, what its checks found.
 
     Args:
         vehicle: Any vehicle, of the catalogue or of a user's file.
         console: Where to print.
-        picture: Where to save a picture of the thruster layout, or None for none.
     """
     console.print(f"[bold]{escape(vehicle.title)}[/bold]")
     console.print(escape(vehicle.description.strip()))
@@ -76,28 +67,55 @@ def print_vehicle(vehicle: Vehicle, console: Console, picture: Path | None = Non
     )
     for record in vehicle.calibrations:
         console.print(f"calibrated: {record.sentence()}", highlight=False, markup=False)
-    console.print(_body(vehicle))
+    for table in _tables(vehicle):
+        console.print(table)
+
+
+def _tables(vehicle: Vehicle) -> Iterator[Table]:
+    yield _table("Body", ("", "value", "unit"), _body(vehicle))
     for name, chosen in vehicle.hydrodynamics.items():
-        console.print(_hydrodynamics(vehicle, name, chosen))
-        if isinstance(chosen, HydrodynamicSet) and chosen.terms:
-            console.print(_terms(vehicle, name, chosen))
-    console.print(_thrusters(vehicle))
+        if isinstance(chosen, MeshSet):
+            path = f"hydrodynamics.{name}"
+            numbers = (f"{getattr(chosen, key):g}{_mark(vehicle, f'{path}.{key}')}" for key in DRAG)
+            yield _table(
+                f"Hydrodynamics: {name}", ("", "form drag", "skin drag"), [("coefficient", *numbers)]
+            )
+            continue
+        yield _table(f"Hydrodynamics: {name} (diagonals)", ("", *AXES), _matrices(vehicle, name, chosen))
+        if chosen.terms:
+            yield _table(f"Terms: {name}", ("", "value", "unit"), _terms(vehicle, name, chosen))
+    heads = ("", "position [m]", "axis", "force [N]", "rpm", "lag [s]", "acts on", "motor")
+    yield _table("Thrusters", heads, _thrusters(vehicle))
     if "perception" not in vehicle.defaults:
-        console.print(_perception(vehicle))
-    console.print(_performance(vehicle))
-    console.print(_sources(vehicle))
+        heads = ("", "device", "position [m]", "rate [Hz]", "latency [s]", "lost")
+        sensors = (
+            (n, escape(Path(s.device).name), _rounded(s.position), f"{s.rate:g}", f"{s.latency:g}", f"{s.dropout:.1%}")
+            for n, s in vehicle.perception.items()
+        )  # fmt: skip
+        yield _table("Cameras, sonars, altimeters", heads, sensors)
+    title = "What it can do (each axis alone, about the wrench reference)"
+    yield _table(title, ("", *AXES), _performance(vehicle))
+    heads = ("numbers", "origin", "source and note")
+    yield _table("Where the numbers come from", heads, _sources(vehicle), words=True)
     if vehicle.defaults:
-        console.print(_defaults(vehicle))
-    console.print(_findings(vehicle))
-    if picture is not None:
-        draw_vehicle(vehicle, picture)
-        console.print(f"thruster layout: {picture}", markup=False)
+        title = "Defaults (the file does not give these: for the virtual world; measure your own)"
+        rows = ((name, escape(DEFAULTS[name])) for name in vehicle.defaults)
+        yield _table(title, ("", "what stands for it"), rows, words=True)
+    marks = {True: "[green]pass[/green]", False: "[red]fail[/red]"}
+    found = ((marks[f.passed], f.name, escape(f.sentence)) for f in check_vehicle(vehicle))
+    yield _table("Checks", ("", "check", "finding"), found, words=True)
 
 
-def _table(title: str, *columns: str) -> Table:
+DRAG = ("form_drag", "skin_drag")
+
+
+def _table(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], *, words: bool = False) -> Table:
+    """A table of numbers to the right of their names, or of words."""
     table = Table(title=Text(title, "bold"), title_justify="left", box=None, pad_edge=False)
-    for index, column in enumerate(columns):
-        table.add_column(Text(column), justify="left" if index == 0 else "right")
+    for k, head in enumerate(heads):
+        table.add_column(Text(head), justify="left" if words or k == 0 else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
@@ -113,55 +131,36 @@ def _numbers(values: Any) -> str:
     return " ".join(f"{value:g}" for value in values)
 
 
-def _body(vehicle: Vehicle) -> Table:
-    table = _table("Body", "", "value", "unit")
+def _rounded(vector: Any) -> str:
+    return " ".join(f"{value:6.3f}" for value in vector)
+
+
+def _body(vehicle: Vehicle) -> Iterator[Sequence[str]]:
     body = vehicle.body
-    inertia = body.inertia
-    rows = [
+    for label, path, value, unit in (
         ("mass", "body.mass", f"{body.mass:g}", "kg"),
-        ("inertia, roll pitch yaw", "body.inertia", _numbers(np.diag(inertia)), "kg m²"),
+        ("inertia, roll pitch yaw", "body.inertia", _numbers(np.diag(body.inertia)), "kg m²"),
         ("displaced volume", "body.displaced_volume", f"{body.displaced_volume:g}", "m³"),
         ("centre of gravity", "body.center_of_gravity", _numbers(body.center_of_gravity), "m"),
         ("centre of buoyancy", "body.center_of_buoyancy", _numbers(body.center_of_buoyancy), "m"),
         ("size", "body.size", _numbers(body.size), "m"),
         ("water density", "water.density", f"{vehicle.water.density:g}", "kg/m³"),
-    ]
-    for label, path, value, unit in rows:
-        table.add_row(label, value + _mark(vehicle, path), unit)
-    table.add_row("weight, buoyancy", f"{vehicle.weight:.2f} {vehicle.buoyancy:.2f}", "N")
-    return table
-
-
-def _hydrodynamics(vehicle: Vehicle, name: str, chosen: HydrodynamicSet | MeshSet) -> Table:
-    path = f"hydrodynamics.{name}"
-    if isinstance(chosen, MeshSet):
-        table = _table(f"Hydrodynamics: {name}", "", "form drag", "skin drag")
-        table.add_row(
-            "coefficient",
-            f"{chosen.form_drag:g}{_mark(vehicle, f'{path}.form_drag')}",
-            f"{chosen.skin_drag:g}{_mark(vehicle, f'{path}.skin_drag')}",
-        )
-        return table
-    table = _table(f"Hydrodynamics: {name} (diagonals)", "", *AXES)
-    for label, key in (
-        ("M_A", "added_mass"),
-        ("D1", "linear_damping"),
-        ("D2", "quadratic_damping"),
     ):
+        yield label, value + _mark(vehicle, path), unit
+    yield "weight, buoyancy", f"{vehicle.weight:.2f} {vehicle.buoyancy:.2f}", "N"
+
+
+def _matrices(vehicle: Vehicle, name: str, chosen: HydrodynamicSet) -> Iterator[Sequence[str]]:
+    for label, key in (("M_A", "added_mass"), ("D1", "linear_damping"), ("D2", "quadratic_damping")):
         matrix = getattr(chosen, key)
-        if not np.any(matrix):
-            continue
-        full = bool(np.any(matrix - np.diag(np.diag(matrix))))
-        marks = [_mark(vehicle, f"{path}.{key}.{i}" + (f".{i}" if full else "")) for i in range(6)]
-        table.add_row(
-            label + (" (full)" if full else ""),
-            *(f"{value:.6g}{mark}" for value, mark in zip(np.diag(matrix), marks, strict=True)),
-        )
-    return table
+        if np.any(matrix):
+            full = bool(np.any(matrix - np.diag(np.diag(matrix))))
+            paths = (f"hydrodynamics.{name}.{key}.{i}" + (f".{i}" if full else "") for i in range(6))
+            cells = (f"{x:.6g}{_mark(vehicle, path)}" for x, path in zip(np.diag(matrix), paths, strict=True))
+            yield label + (" (full)" if full else ""), *cells
 
 
-def _terms(vehicle: Vehicle, name: str, chosen: HydrodynamicSet) -> Table:
-    table = _table(f"Terms: {name}", "", "value", "unit")
+def _terms(vehicle: Vehicle, name: str, chosen: HydrodynamicSet) -> Iterator[Sequence[str]]:
     for key, value in chosen.terms.items():
         units = iter(TERMS[key].units.values())
         for path, number in TERMS[key].numbers(value).items():
@@ -169,114 +168,51 @@ def _terms(vehicle: Vehicle, name: str, chosen: HydrodynamicSet) -> Table:
             rows = np.atleast_2d(number)
             for i, row in enumerate(rows):
                 stated = any(
-                    f"{full}.".startswith(f"{key}.") or key.startswith(f"{full}.")
-                    for key in vehicle.provenance
+                    f"{full}.".startswith(f"{other}.") or other.startswith(f"{full}.")
+                    for other in vehicle.provenance
                 )
                 marks = _mark(vehicle, f"{full}.{i}" if len(rows) > 1 else full) if stated else ""
-                table.add_row(path if i == 0 else "", _numbers(row) + marks, next(units) if i == 0 else "")
-    return table
+                yield path if i == 0 else "", _numbers(row) + marks, next(units) if i == 0 else ""
 
 
-def _thrusters(vehicle: Vehicle) -> Table:
-    table = _table("Thrusters", "", "position [m]", "axis", "force [N]", "rpm", "lag [s]", "acts on", "motor")
-    for name, thruster in vehicle.thrusters.items():
+def _thrusters(vehicle: Vehicle) -> Iterator[Sequence[str]]:
+    for name, t in vehicle.thrusters.items():
         path = f"thrusters.{name}"
-        motor = (
-            "" if thruster.motor_index is None else f"M{thruster.motor_index + 1} {thruster.motor_sign:+d}"
-        )
-        table.add_row(
+        yield (
             escape(name),
-            _rounded(thruster.position),
-            _rounded(thruster.axis),
-            f"{thruster.force_min:.2f} {thruster.force_max:+.2f}{_mark(vehicle, f'{path}.force_max')}",
-            f"{thruster.rpm_min:.0f} {thruster.rpm_max:+.0f}",
-            f"{thruster.delay:g} + {thruster.time_constant:g}{_mark(vehicle, f'{path}.time_constant')}",
-            thruster.domain,
-            motor,
+            _rounded(t.position),
+            _rounded(t.axis),
+            f"{t.force_min:.2f} {t.force_max:+.2f}{_mark(vehicle, f'{path}.force_max')}",
+            f"{t.rpm_min:.0f} {t.rpm_max:+.0f}",
+            f"{t.delay:g} + {t.time_constant:g}{_mark(vehicle, f'{path}.time_constant')}",
+            t.domain,
+            "" if t.motor_index is None else f"M{t.motor_index + 1} {t.motor_sign:+d}",
         )
-    return table
 
 
-def _perception(vehicle: Vehicle) -> Table:
-    table = _table(
-        "Cameras, sonars, altimeters", "", "device", "position [m]", "rate [Hz]", "latency [s]", "lost"
-    )
-    for name, sensor in vehicle.perception.items():
-        numbers = (f"{sensor.rate:g}", f"{sensor.latency:g}", f"{sensor.dropout:.1%}")
-        table.add_row(name, escape(Path(sensor.device).name), _rounded(sensor.position), *numbers)
-    return table
+def _performance(vehicle: Vehicle) -> Iterator[Sequence[str]]:
+    def cells(values: Any) -> Iterator[str]:
+        return (f"{value:.3f}" if math.isfinite(value) else "-" for value in values)
 
-
-def _rounded(vector: Any) -> str:
-    return " ".join(f"{value:6.3f}" for value in vector)
-
-
-def _performance(vehicle: Vehicle) -> Table:
     capability = wrench_capability(vehicle)
-    table = _table("What it can do (each axis alone, about the wrench reference)", "", *AXES)
-    table.add_row("wrench + [N, N m]", *(f"{value:.3f}" for value in capability.positive))
-    table.add_row("wrench - [N, N m]", *(f"{value:.3f}" for value in capability.negative))
+    yield "wrench + [N, N m]", *cells(capability.positive)
+    yield "wrench - [N, N m]", *cells(capability.negative)
     for name, chosen in vehicle.hydrodynamics.items():
-        if not isinstance(chosen, HydrodynamicSet):
-            continue
-        table.add_row(
-            escape(f"speed [m/s, rad/s] ({name})"),
-            *(f"{value:.3f}" for value in terminal_speeds(vehicle, name)),
-        )
-        table.add_row(
-            escape(f"time constant [s] ({name})"),
-            *(_finite(value) for value in time_constants(vehicle, name)),
-        )
-        swing = restoring(vehicle, name)
-        table.add_row(
-            f"natural frequency [Hz] ({name})",
-            "",
-            "",
-            "",
-            *(f"{value:.3f}" for value in swing.natural_frequency),
-            "",
-        )
-        table.add_row(
-            f"damping ratio ({name})", "", "", "", *(f"{value:.3f}" for value in swing.damping_ratio), ""
-        )
-    return table
+        if isinstance(chosen, HydrodynamicSet):
+            swing, of = restoring(vehicle, name), escape(f"({name})")
+            yield f"{escape('speed [m/s, rad/s]')} {of}", *cells(terminal_speeds(vehicle, name))
+            yield f"{escape('time constant [s]')} {of}", *cells(time_constants(vehicle, name))
+            yield f"{escape('natural frequency [Hz]')} {of}", "", "", "", *cells(swing.natural_frequency), ""
+            yield f"damping ratio {of}", "", "", "", *cells(swing.damping_ratio), ""
 
 
-def _finite(value: float) -> str:
-    return f"{value:.3f}" if math.isfinite(value) else "-"
-
-
-def _sources(vehicle: Vehicle) -> Table:
-    table = _table("Where the numbers come from")
-    table.add_column("numbers")
-    table.add_column("origin")
-    table.add_column("source and note", overflow="fold")
+def _sources(vehicle: Vehicle) -> Iterator[Sequence[str]]:
     entries: dict[tuple[str, str, str], list[str]] = {}
     for path, provenance in vehicle.provenance.items():
         entries.setdefault((provenance.origin, provenance.source, provenance.note), []).append(path)
     for (origin, source, note), paths in entries.items():
         text = paths[0] if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
-        table.add_row(escape(text), origin, escape("; ".join(filter(None, [source, note]))))
-    return table
-
-
-def _defaults(vehicle: Vehicle) -> Table:
-    table = _table("Defaults (the file does not give these: for the virtual world; measure your own)")
-    table.add_column("what stands for it", overflow="fold")
-    for name in vehicle.defaults:
-        table.add_row(name, escape(DEFAULTS[name]))
-    return table
-
-
-def _findings(vehicle: Vehicle) -> Table:
-    table = _table("Checks")
-    table.add_column("")
-    table.add_column("check")
-    table.add_column("finding", overflow="fold")
-    for finding in check_vehicle(vehicle):
-        mark = "[green]pass[/green]" if finding.passed else "[red]fail[/red]"
-        table.add_row(mark, finding.name, escape(finding.sentence))
-    return table
+        yield escape(text), origin, escape("; ".join(filter(None, [source, note])))
 
 
 # A picture of a vehicle's thruster layout.
