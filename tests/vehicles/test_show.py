@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from finssim.vehicles import CalibrationRecord, Provenance, catalogue, load_vehicle
-from finssim.vehicles.show import print_catalogue, print_vehicle
+from finssim.vehicles.show import draw_vehicle, print_catalogue, print_vehicle
 from vehicles.minnow import MINNOW
 
 
@@ -54,7 +54,7 @@ def test_guesses_are_marked_beside_the_number():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["finsrov", "remus100", "rexrov"])
 def test_a_picture_of_the_layout_is_saved(name, tmp_path):
-    print_vehicle(load_vehicle(name), console(), tmp_path / "layout.png")
+    draw_vehicle(load_vehicle(name), tmp_path / "layout.png")
     assert (tmp_path / "layout.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
@@ -62,7 +62,8 @@ def test_a_file_of_ones_own_is_printed_like_the_catalogue(tmp_path):
     path = tmp_path / "minnow.yaml"
     path.write_text(MINNOW, encoding="utf-8")
     screen = console()
-    print_vehicle(load_vehicle(path), screen, tmp_path / "minnow.svg")
+    print_vehicle(load_vehicle(path), screen)
+    draw_vehicle(load_vehicle(path), tmp_path / "minnow.svg")
     assert "front_left" in printed(screen)
     assert (tmp_path / "minnow.svg").stat().st_size > 1000
 
