@@ -1762,7 +1762,7 @@ def _select(kinds: dict[str, str], stage: Stage) -> dict[str, str]:
 
 
 NEGLIGIBLE = 0.1
-"""Of the drag."""
+"""Share of the drag at top speed."""
 
 
 def _retained(
