@@ -48,6 +48,8 @@ def write(path, header, *columns):
         ("Shaft speed (1/min),Load (g)", RPM, 9.80665e-3),
         ("Motor Optical Speed (RPM),Thrust (lbf)", RPM, 4.4482216),
         ("rotation rev/s,force kgf", 2 * math.pi, 9.80665),
+        ("shaft_speed_rad_s,thrust_force_N", 1.0, 1.0),
+        ("motor_shaft_speed_rpm,measured_thrust_kgf", RPM, 9.80665),
     ],
 )
 def test_units_are_read_from_the_headers(tmp_path, header, speed_unit, force_unit):
@@ -55,6 +57,28 @@ def test_units_are_read_from_the_headers(tmp_path, header, speed_unit, force_uni
     table = read_table(write(tmp_path / "a.csv", header, rpm * RPM / speed_unit, force / force_unit))
     np.testing.assert_allclose(table.speed, rpm * RPM, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(table.force, force, rtol=1e-6, atol=1e-9)
+
+
+def test_the_unit_is_the_last_word_of_a_header(tmp_path):
+    rpm, force = made(noise=0.0)
+    table = read_table(
+        write(
+            tmp_path / "a.csv",
+            "log_time_s,rpm,thrust_N,battery_voltage_mV",
+            np.arange(len(rpm)),
+            rpm,
+            force,
+            0 * rpm + 7400.0,
+        )
+    )
+    np.testing.assert_allclose(table.voltage, 7.4)
+
+
+def test_an_empty_pulse_leaves_the_sign_to_the_force(tmp_path):
+    rpm, force = made(noise=0.0)
+    pulse = np.where(np.arange(len(rpm)) % 3 == 0, 1500.0 + rpm / 8.0, np.nan)
+    table = read_table(write(tmp_path / "a.csv", "RPM,Thrust (N),PWM (µs)", np.abs(rpm), force, pulse))
+    np.testing.assert_allclose(table.speed, rpm * RPM, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("path", [AT_16_V, ALL_VOLTAGES], ids=lambda path: path.stem)

@@ -78,7 +78,7 @@ def folder(tmp_path):
 
 def test_the_action_is_the_network_of_the_observation(folder):
     """clip(GAIN x): by hand for one vehicle, and row by row for many."""
-    policy = Policy.load(folder, vehicle=MINNOW, task=TASK, mode=MODE, control_period=0.1)
+    policy = Policy.load(folder, vehicle=MINNOW, task=TASK, mode=MODE)
     np.testing.assert_allclose(policy.act([1.0, 2.0, 0.25]), [0.5, -0.25], atol=1e-7)
     np.testing.assert_allclose(policy.act([8.0, 0.0, -3.0]), [1.0, -1.0], atol=0)
     many = np.random.default_rng(0).normal(size=(4, 5, 3))
@@ -124,7 +124,6 @@ def observation_with(entry: int, **changes):
         ),
         ({"mode": MODE | {"slew": 4.0}}, "action.slew is not in the policy"),
         ({"vehicle": TROUT}, "trained for vehicle minnow abababababab, but this is trout cdcdcdcdcdcd"),
-        ({"control_period": 0.05}, "control period of 0.1 s, but it would be called every 0.05 s"),
     ],
 )
 def test_a_policy_refuses_what_it_was_not_trained_with(folder, given, sentence):

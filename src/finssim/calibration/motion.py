@@ -407,8 +407,6 @@ LEAST = 0.6
 class Offset(NamedTuple):
     """How one stream lies in time to another."""
 
-    reference: str
-    """Group of columns that it was compared with."""
     seconds: float
     """What to add to the stream's times so that both agree."""
     std: float
@@ -428,11 +426,10 @@ def on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int = 2) ->
     return value, slope
 
 
-def offset(reference: str, fixed: Array, moved: Array) -> Offset | None:
+def offset(fixed: Array, moved: Array) -> Offset | None:
     """The offset of a signal to another of the same motion, from the peak of their correlation.
 
     Args:
-        reference: Name of the fixed signal.
         fixed: At `RATE`, NaN where unknown, (m, c).
         moved: The same of the signal whose times are in question, (m, c).
 
@@ -459,7 +456,7 @@ def offset(reference: str, fixed: Array, moved: Array) -> Offset | None:
     spread = float(np.sqrt((BLOCKS - 1) * np.var(parts)))  # jackknife: one short event must not look certain
     if not np.isfinite(spread):  # without one part there is no peak
         return None
-    return Offset(reference, -float(lags[0] + place) / RATE, max(spread, 0.1) / RATE, height)
+    return Offset(-float(lags[0] + place) / RATE, max(spread, 0.1) / RATE, height)
 
 
 def _peak(correlation: Array, near: NDArray[np.bool_]) -> tuple[float, float]:

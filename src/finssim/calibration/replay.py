@@ -896,14 +896,13 @@ def normalised(pair: Pair, values: Array, axis: Axis) -> tuple[Array, Array] | N
     return pair.t - pair.t[begin], sign * values / width
 
 
-def draw_response_envelopes(pairs: Sequence[Pair], title: str = "") -> Figure:
+def draw_response_envelopes(pairs: Sequence[Pair]) -> Figure:
     """Axis-wise envelopes: a panel for each axis, pointwise median and middle half over its trials.
 
     Held-out trials are drawn where there are any; else those the vehicle was fitted on, and the figure says so.
 
     Args:
         pairs: Trials with their replays.
-        title: Written above, or left out when empty.
 
     Raises:
         ValueError: No trial has a response that could be drawn.
@@ -931,10 +930,8 @@ def draw_response_envelopes(pairs: Sequence[Pair], title: str = "") -> Figure:
         axes.set_xlabel("time since onset [s]")
     handles, labels = axes_of.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8.5)
-    warning = "" if held_out else "in-sample: the vehicle was fitted on these trials"
-    if title or warning:
-        heading = "\n".join(filter(None, (title, warning)))
-        figure.suptitle(heading, fontsize=10, color="#a00000" if warning else BLACK)
+    if not held_out:
+        figure.suptitle("in-sample: the vehicle was fitted on these trials", fontsize=10, color="#a00000")
     return figure
 
 

@@ -161,7 +161,7 @@ _UNITS: dict[str, dict[str, float]] = {
     },
     "pulse": {"us": 1.0, "usec": 1.0, "ms": 1e3},
     "voltage": {"v": 1.0, "volt": 1.0, "volts": 1.0, "mv": 1e-3},
-    "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6},
+    "time": {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
 }
 """Quantity -> unit, as `_plain` writes it -> rad/s, N, µs, V or s in one of it."""
 _CHOICES = {"speed": "rpm, rad/s, rev/s", "force": "N, kgf, gf, lbf", "pulse": "us, ms"}
@@ -184,7 +184,7 @@ def _recognised(header: str) -> tuple[str, float] | None:
     text, unit = header.strip(), ""
     if brackets := re.fullmatch(r"(.*?)[\s_]*[(\[{](.*)[)\]}]", text):
         text, unit = brackets[1], _plain(brackets[2])
-    elif tail := re.fullmatch(r"(.+?)[\s_]+(\S+)", re.sub(r"rad_s$", "rad/s", text)):
+    elif tail := re.fullmatch(r"(.+)[\s_]+([^\s_]+)", re.sub(r"rad_s$", "rad/s", text)):
         if any(_plain(tail[2]) in units for units in _UNITS.values()):
             text, unit = tail[1], _plain(tail[2])
     words = set(re.findall(r"[a-z]+", text.lower()))
@@ -371,6 +371,8 @@ def _signed(
     if source in both and "force" not in both:
         findings.append(finding("force_sign", source=source))
         force = np.abs(force) * direction
+    elif source == "pulse":  # a cell may be empty
+        direction = np.where(direction != 0.0, direction, signs["force"])
     clear = (np.abs(force) > 5.0 * small) & (direction != 0.0)
     if np.count_nonzero(np.sign(force[clear]) != direction[clear]) > 0.5 * np.count_nonzero(clear):
         raise CalibrationError(
@@ -982,6 +984,8 @@ def curves_of(name: str, result: Bench) -> list[Curve]:
     curves = list[Curve]()
 
     def add(title: str, x_label: str, y_label: str, x: Array, measured: Array, fitted: Array) -> None:
+        if not np.isfinite(x).any():
+            return
         order = np.argsort(x)
         labels = {"title": f"{name}: {title}", "x_label": x_label, "y_label": y_label, "kind": "scatter"}
         curves.append(Curve(x=x[order], measured=measured[order], fitted=fitted[order], **labels))

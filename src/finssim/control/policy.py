@@ -217,7 +217,6 @@ class Policy:
         vehicle: Identified | None = None,
         task: Mapping[str, Any] | None = None,
         mode: Mapping[str, Any] | None = None,
-        control_period: float | None = None,
     ) -> Policy:
         """Reads a policy directory and checks that it fits what it will control; what is None goes unchecked.
 
@@ -226,7 +225,6 @@ class Policy:
             vehicle: The vehicle it will control; its SHA-256 must be the one trained with.
             task: The task's description, with keys `name` and `observation` (the schema as plain data).
             mode: The action mode's `describe()`: name, size, limits, scale.
-            control_period: Time between two actions [s].
 
         Raises:
             PolicyError: One sentence naming the file or the first value that does not fit.
@@ -244,12 +242,6 @@ class Policy:
             raise PolicyError(
                 f"{folder}: trained for vehicle {trained.name} {trained.sha256[:12]}, but this is {vehicle.name} "
                 f"{vehicle.sha256[:12]}: train again, or give the vehicle file it was trained with"
-            )
-        period = description.control_period
-        if control_period is not None and not math.isclose(control_period, period, rel_tol=1e-9):
-            raise PolicyError(
-                f"{folder}: trained with a control period of {period:g} s, "
-                f"but it would be called every {control_period:g} s: run it at its own rate"
             )
         return cls(description, _open_network(folder, description))
 

@@ -63,6 +63,10 @@ def play(
     if not path.is_dir():
         if video is not None:
             raise PlaybackError(f"{path} is no directory of a policy: only an episode of a policy is filmed")
+        if speed != 1.0:
+            raise PlaybackError(
+                "--speed is of a film: the messages of a record are printed at once, leave it out"
+            )
         play_record(path, topics=topics, start=start)
         return
     if video is None or video.suffix != ".mp4":

@@ -788,9 +788,9 @@ def _lockstep(
         stack.callback(world.close)
         reason = "stopped"
         _say(f"lock-step: {_name(server.address)}")
-        stack.callback(
-            signal.signal, signal.SIGTERM, signal.signal(signal.SIGTERM, signal.default_int_handler)
-        )
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+                stack.callback(signal.signal, number, signal.signal(number, signal.default_int_handler))
         with suppress(KeyboardInterrupt):
             reason = server.serve(world, duration=duration)
     _say(f"{reason} at {world.time:.1f} s")

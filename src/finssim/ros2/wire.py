@@ -136,13 +136,12 @@ class Quality:
 LATCHED = Quality(depth=1, transient_local=True)
 
 
-def dds_qos(quality: Quality, user_data: bytes = b"", *, ignore_local: bool = False) -> Qos:
+def dds_qos(quality: Quality, user_data: bytes = b"") -> Qos:
     """Cyclone's form.
 
     Args:
         quality: The policies.
         user_data: What the endpoint tells its peers, e.g. the hash of its type.
-        ignore_local: For readers: do not match writers of the same process.
     """
     history = Policy.History.KeepLast(quality.depth) if quality.depth else Policy.History.KeepAll
     policies = [
@@ -159,8 +158,6 @@ def dds_qos(quality: Quality, user_data: bytes = b"", *, ignore_local: bool = Fa
         policies.append(Policy.Lifespan(round(quality.lifespan * 1e9)))
     if user_data:
         policies.append(Policy.Userdata(user_data))
-    if ignore_local:
-        policies.append(Policy.IgnoreLocal.Participant)
     return Qos(*policies)
 
 

@@ -1077,23 +1077,20 @@ class Agent(Protocol):
 class PolicyAgent:
     """A policy directory, run with onnxruntime."""
 
-    def __init__(
-        self, directory: str | Path, vehicle: Vehicle, task: Task, *, period: float | None = None
-    ) -> None:
+    def __init__(self, directory: str | Path, vehicle: Vehicle, task: Task) -> None:
         """Load a policy for the vehicle and task.
 
         Args:
             directory: Of the policy.
             vehicle: It must be the very one that the policy was trained for.
             task: It must have been trained for.
-            period: Time between two decisions at which it would be asked [s]; None: its own.
 
         Raises:
             PolicyError, ControlError: It was trained for another vehicle, task, observation or other limits.
         """
         schema = task.schema.model_dump(mode="json")
         task_data = {"name": task.name, "observation": schema}
-        policy = Policy.load(directory, vehicle=vehicle, task=task_data, control_period=period)
+        policy = Policy.load(directory, vehicle=vehicle, task=task_data)
         mode = mode_from_dict(policy.description.action, vehicle)
         self.period = policy.description.control_period
         self.action = mode.name

@@ -69,7 +69,7 @@ def tag_plates(vehicle: Vehicle) -> tuple[Mesh, Mesh] | None:
 def wall_mesh(lower: Array, upper: Array) -> Mesh:
     """Floor and four walls of a box, seen from inside alone: those between the eye and the water vanish."""
     vertices, faces = _box(lower, upper)
-    lid = (vertices[faces][..., 2] == upper[2]).all(axis=1)
+    lid = (vertices[faces][..., 2] > 0.5 * (lower[2] + upper[2])).all(axis=1)
     return Mesh(vertices, faces[~lid][:, ::-1])
 
 

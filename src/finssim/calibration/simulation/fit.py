@@ -1739,10 +1739,7 @@ def _axes(
 
 
 def _select(kinds: dict[str, str], stage: Stage) -> dict[str, str]:
-    """Damping of each axis by Akaike's criterion.
-
-    It compares likelihoods, hence errors that are independent: a term that stays for nothing costs little.
-    """
+    """Damping of each axis: the weaker term goes where it is not `SIGNIFICANT`."""
     from scipy.stats import norm
 
     names, new = stage.problem.parameters.names, dict(kinds)

@@ -86,7 +86,7 @@ class Header(_Section):
     position_at: Point = (0.0, 0.0, 0.0)
     """Body point whose position x, y, z are [m]."""
     acceleration_at: Point | None = None
-    """Body point of the accelerometer [m]; the vehicle's IMU where not given."""
+    """Body point of the accelerometer [m], for the record: no check or fit needs it."""
     depth_at: Point | None = None
     """Body point of the pressure sensor [m]; the vehicle's depth sensor where not given."""
     acceleration: Literal["specific_force", "kinematic", "auto"] = "auto"

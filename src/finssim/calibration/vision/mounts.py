@@ -925,7 +925,7 @@ def imu_clock(
     if len(turn) < FEWEST or len(t) < FEWEST:
         return None
     turn_rate = smooth(t_picture, heading[:, None], t, order=3).slope
-    lag = offset("pictures", turn_rate, smooth(t_imu, vertical_rate[:, None], t).value)
+    lag = offset(turn_rate, smooth(t_imu, vertical_rate[:, None], t).value)
     if lag is None:
         return None
     half = 1.96 * lag.std

@@ -99,7 +99,7 @@ class InformedTeacher:
         settings = replace(
             s, steps=s.informed_steps, teacher="", history=0, last_action=False, memory=0, normalize=False
         )
-        self.trained, self._student = False, student
+        self.trained = False
         self._ppo = Ppo(
             student.environment, settings, seed=student._seed, device=student._device, arrays=student.arrays,
             informed=True,

@@ -145,14 +145,13 @@ def series(quantity: str, t: Array, values: Array, longest_gap: float, *, label:
     return Series(quantity, t[last], values[last], longest_gap)
 
 
-def read_stream_table(path: str | Path, *, timed: bool = True) -> StreamTable:
+def read_stream_table(path: str | Path) -> StreamTable:
     """The columns of a CSV file with a line of names; separated by commas, semicolons or tabs; # begins a comment.
 
     A last line that a crash cut short is left out, and so are others of the wrong length.
 
     Args:
         path: The file.
-        timed: Refuse a table without a column of times; else they are NaN.
 
     Raises:
         LocalizationError: Unreadable, without names, without a column of times, or without rows.
@@ -160,7 +159,7 @@ def read_stream_table(path: str | Path, *, timed: bool = True) -> StreamTable:
     text = read_text_table(path, LocalizationError)
     names = [name.lower() for name in text.names]
     time = next((name for name in TIME if name in names), None)
-    if (timed and time is None) or len(set(names)) < len(names):
+    if time is None or len(set(names)) < len(names):
         raise LocalizationError(
             f"{path}: expected a line of different column names with t, such as t,depth; found "
             f"'{','.join(names)[:60]}'"

@@ -234,4 +234,6 @@ class SingleThreadedExecutor:
 def __getattr__(name: str) -> Any:
     if name in ("MultiThreadedExecutor", "Executor", "EventsExecutor"):
         raise ImportError(f"rclpy.executors.{name} needs a sourced ROS 2: use SingleThreadedExecutor")
+    if name in ("ShutdownException", "TimeoutException"):
+        raise ImportError(f"rclpy.executors.{name} needs a sourced ROS 2: nothing raises it here")
     raise AttributeError(f"rclpy.executors has no '{name}'")
