@@ -97,6 +97,9 @@ def test_a_module_that_remembers_is_not_exported(tmp_path):
     """Torch's exporter knows nothing of memories."""
     with pytest.raises(ExportError, match="a torch module that remembers cannot be written"):
         written(Counting(), tmp_path / "p", StationKeeping(), 6)
+    size = StationKeeping().schema.size
+    with pytest.raises(ExportError, match="a torch module that remembers cannot be written"):
+        written(torch.nn.LSTM(size, 6), tmp_path / "p", StationKeeping(), 6)
 
 
 def test_a_pilot_remembers_until_it_is_reset(policy):

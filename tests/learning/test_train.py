@@ -62,7 +62,6 @@ def test_the_policy_loads_for_what_it_was_trained_with(trained):
         vehicle=vehicle,
         task={"name": "t1", "observation": schema},
         mode=action_mode("wrench6", vehicle).describe(),
-        control_period=0.1,
     )
     action = policy.step(policy.reset(3), np.zeros((3, 16)))[0]
     assert action.shape == (3, 6) and np.abs(action).max() <= 1.0

@@ -408,11 +408,6 @@ def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> 
     plain = plain_network(network)
     if plain is not None:
         return write_graph(plain, n, m)
-    if hasattr(network, "memory_size"):
-        raise ExportError(
-            "a torch module that remembers cannot be written: ppo has a GRU (--set memory=32), and a "
-            "finssim.learning.network.Network may have one"
-        )
     return _trace(network, n)
 
 
@@ -493,6 +488,11 @@ def _answer(
         with torch.no_grad():
             tensors = {name: torch.from_numpy(x) for name, x in pictures.items()}
             parts = answer_of(copy, *(None if x is None else torch.from_numpy(x) for x in inputs), tensors)
+        if memory is not None or isinstance(parts[0], tuple):
+            raise ExportError(
+                "a torch module that remembers cannot be written: ppo has a GRU (--set memory=32), and a "
+                "finssim.learning.network.Network may have one"
+            )
         action, after = (None if x is None else x.numpy() for x in parts)
     action = np.clip(action, -1.0, 1.0) if limited else action
     return action if after is None else np.concatenate([action, after], axis=1)
