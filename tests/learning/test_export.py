@@ -25,7 +25,7 @@ from finssim.control.policy import (
 )
 from finssim.files import OutputError
 from finssim.learning.export import ExportError, export_policy, save_policy
-from finssim.learning.recurrent import ACTIVATIONS
+from finssim.learning.torch_networks import ACTIVATIONS
 from finssim.tasks import task_named
 from finssim.tasks.agents import agent_for
 from finssim.vehicles import load_vehicle

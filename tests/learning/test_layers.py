@@ -17,7 +17,7 @@ from finssim.learning.network import (
     first_memory,
     with_integrals,
 )
-from finssim.learning.recurrent import plain_network
+from finssim.learning.torch_networks import plain_network
 
 LIBRARIES = pytest.mark.parametrize("device", [None, "cpu"], ids=["numpy", "torch"])
 

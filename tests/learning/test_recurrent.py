@@ -16,7 +16,7 @@ from finssim.control.policy import Policy, PolicyError
 from finssim.learning.episodes import HeldEvaluation
 from finssim.learning.export import ExportError
 from finssim.learning.network import Cell, Linear
-from finssim.learning.recurrent import plain_network
+from finssim.learning.torch_networks import plain_network
 from finssim.robot.pilots import make_pilot
 from finssim.robot.reading import Reading
 from finssim.tasks import StationKeeping

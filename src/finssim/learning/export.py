@@ -401,7 +401,7 @@ def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> 
         )
     if isinstance(network, Network):
         return write_graph(network, n, m)
-    from finssim.learning.recurrent import SeeingNetwork, plain_network
+    from finssim.learning.torch_networks import SeeingNetwork, plain_network
 
     if isinstance(network, SeeingNetwork):
         return write_seeing(network, n, m)

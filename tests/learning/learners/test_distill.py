@@ -17,7 +17,7 @@ from finssim.experiments.trials import run_episodes
 from finssim.learning.demonstrations import Episode, collect, load, save
 from finssim.learning.export import write_seeing
 from finssim.learning.learners import LearningError, learner_named
-from finssim.learning.recurrent import SeeingNetwork
+from finssim.learning.torch_networks import SeeingNetwork
 from finssim.learning.train import train
 from finssim.tasks import Environment, make
 from finssim.tasks.agents import NOWHERE, agent_for

@@ -10,8 +10,8 @@ from torch import nn
 
 from finssim.learning.learners.imitation import demonstrations_for
 from finssim.learning.learners.torchrl_ppo import TorchRlPpo, TorchRlSettings
-from finssim.learning.recurrent import stack
 from finssim.learning.tensors import Tensors
+from finssim.learning.torch_networks import stack
 from finssim.tasks import Environment
 
 

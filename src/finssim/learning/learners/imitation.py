@@ -17,9 +17,9 @@ from finssim.learning.demonstrations import Demonstrations, load
 from finssim.learning.learners.base import ActingLearner, expert_in
 from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.learners.distill import varied
-from finssim.learning.recurrent import SeeingNetwork, stack
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
+from finssim.learning.torch_networks import SeeingNetwork, stack
 from finssim.tasks import Environment
 from finssim.tasks.agents import NOWHERE, memory_from, memory_leaves, restarted
 
