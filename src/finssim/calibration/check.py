@@ -1041,7 +1041,7 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
         for axis in axis_reports(trial_motion, inputs, vehicle)
     ]
     findings += work_findings(axes, trial_motion, trial.header.axis)
-    if not any(axes_told.can for axis in axes for axes_told in axis.tells.values()):
+    if not any(axis.excited or any(one.can for one in axis.tells.values()) for axis in axes):
         moved = any(axis.source for axis in axes)
         findings.append(finding("nothing_excited") if moved else finding("nothing_measured"))
     for named in trial.header.axis:

@@ -174,7 +174,8 @@ def test_check_judges_such_a_dive(tmp_path):
 @pytest.mark.slow
 def test_a_dive_of_sticks_alone_identifies_the_vehicle(tmp_path):
     """Steps ahead, astern and of yaw in the water of `ardusub-sitl`, with sticks, attitude and a DVL's deltas on the
-    ground station's log: the fit finds the damping and the added mass of the vehicle file."""
+    ground station's log: the fit finds the damping and the added mass of the vehicle file, as well as the scale of
+    thrust, 6 % low by its prior, is known."""
     world, mixer, dive = SitlWorld(HEAVY, position=(0.0, 0.0, -20.0)), Mixer.of_frame("VECTORED_6DOF"), Dive()
     noise, travelled = np.random.default_rng(0), np.zeros(3)
     for i in range(4400):
@@ -212,4 +213,6 @@ def test_a_dive_of_sticks_alone_identifies_the_vehicle(tmp_path):
         ("yaw.d2", 1.5),
         ("yaw.added_mass", 0.2215),
     ):
-        assert found[name].estimate == pytest.approx(true, rel=0.15)
+        low, high = found[name].ci95
+        assert low < true < high
+        assert found[name].estimate == pytest.approx(true, rel=0.25 if name == "yaw.added_mass" else 0.15)
