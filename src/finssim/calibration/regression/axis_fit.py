@@ -771,10 +771,13 @@ Damping = Literal["auto", "linear", "quadratic", "both"]
 DAMPING: tuple[Damping, ...] = ("auto", "linear", "quadratic", "both")
 
 SIGNIFICANT = 0.03
-"""A second damping term stays where it is significant at this level: one that is superfluous should be rare, for it is
-carried to speeds that no trial had."""
+"""A second damping term that is a small share of the drag stays where it is significant at this level: one that is
+superfluous should be rare, for it is carried to speeds that no trial had."""
+SMALL = 0.1
+"""Share of the drag at the greatest speed below which a term is small. Precise data leave a superfluous term 1 % or
+less; a larger one of scattered data may well be there."""
 AKAIKE = 0.157
-"""The same of a smoothing of the inputs, which costs little (Akaike's criterion: χ² of one degree above 2)."""
+"""The level of larger terms, and of a smoothing of the inputs (Akaike's criterion: χ² of one degree above 2)."""
 
 TELLING = 6.0
 """Twice a logarithm of likelihoods below which linear drag is not preferred to quadratic: odds of 20 to 1."""
@@ -799,8 +802,9 @@ class Selection:
 def select(data: AxisData, damping: str = "auto") -> Selection:
     """Fit an axis with the dampings that the data support.
 
-    `auto` starts from both and leaves out a term that is negative or not `SIGNIFICANT`, by the standard error from the
-    disagreement of the trials; of two such terms the one with less evidence. One always stays,
+    `auto` starts from both and leaves out a term that is negative or not significant, by the standard error from the
+    disagreement of the trials, at the level `SIGNIFICANT` if it is `SMALL`, else at `AKAIKE`; of two such terms the one
+    with less evidence. One always stays,
     and where the data hardly tell linear from quadratic it is the quadratic one: a bluff body's drag is, and a linear
     one would be far off at higher speeds. The intervals hold both answers.
 
@@ -813,7 +817,8 @@ def select(data: AxisData, damping: str = "auto") -> Selection:
     smoothed = fit_axis(data, _without(data.terms, left_out) if left_out else data.terms)
     full = _without_needless_smoothing(data, smoothed)
     p_value = {} if left_out else {name: _p_value(full, TERMS.index(name)) for name in ("d1", "d2")}
-    weak = [name for name, p in p_value.items() if p > SIGNIFICANT]
+    share = _shares(data, full)
+    weak = [name for name, p in p_value.items() if p > (SIGNIFICANT if share[name] < SMALL else AKAIKE)]
     if damping == "both" or not weak:
         interval = _with_lag(data, _interval(full), smoothed)
         return Selection(fit=full, full=full, dropped=(), p_value=p_value, interval=interval)
@@ -830,6 +835,16 @@ def select(data: AxisData, damping: str = "auto") -> Selection:
         hull = np.stack([np.fmin.reduce(ends[..., 0]), np.fmax.reduce(ends[..., 1])], axis=-1)
     interval = _with_lag(data, hull, smoothed)
     return Selection(fit=fit, full=full, dropped=(dropped,), p_value=p_value, interval=interval)
+
+
+def _shares(data: AxisData, fit: AxisFit) -> dict[str, float]:
+    """What each damping is of the drag at the greatest speed [-], by name."""
+    X = np.concatenate([rows.X for rows in data.rows])
+    top = {
+        n: float(np.max(np.abs(X[:, TERMS.index(n)]))) * max(fit.free[TERMS.index(n)], 0.0)
+        for n in ("d1", "d2")
+    }
+    return {name: force / max(sum(top.values()), 1e-300) for name, force in top.items()}
 
 
 def _without(terms: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:
