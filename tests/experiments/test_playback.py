@@ -29,6 +29,8 @@ def test_an_episode_of_a_policy_is_filmed(tmp_path, monkeypatch):
         play(policy)
     with pytest.raises(PlaybackError, match="no directory of a policy"):
         play(tmp_path / "run.mcap", video=tmp_path / "run.mp4")
+    with pytest.raises(PlaybackError, match="--speed is of a film"):
+        play(tmp_path / "run.mcap", speed=4.0)
 
 
 def test_the_onlooker_sees_the_vehicle_ahead_of_it_wherever_that_is():

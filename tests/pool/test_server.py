@@ -248,6 +248,21 @@ def test_the_command_in_lockstep(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_lockstep_in_order(number):
+    """Ctrl-C too where a script that started it in the background had it ignored."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        pool = Process("--lockstep", "--camera", "none")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    with pool:
+        pool.until("lock-step")
+        assert pool.end(number) == 0
+    assert pool.lines[-1].startswith("stopped at")
+
+
+@pytest.mark.slow
 def test_the_command_in_real_time(tmp_path):
     """Telemetry and tags of a subprocess arrive at the rates of their instruments; Ctrl-C closes its files."""
     truth = tmp_path / "truth.fst"

@@ -57,7 +57,7 @@ def play(
 
     Raises:
         RecordError: Not a record, or no such topic.
-        PlaybackError: A directory without a film to write, or a film of a record.
+        PlaybackError: A directory without a film to write, or a film or speed of a record.
         PolicyError, PlantError, EnvironmentSetupError: As they say.
     """
     if not path.is_dir():
