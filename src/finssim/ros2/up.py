@@ -410,7 +410,7 @@ def run_node(name: str, *arguments: str) -> int:
     Args:
         name (NAME): camera, controller, hardware_bridge, localizer, recorder, sim, state_estimation, teleop or
             virtual_pool; after it --ros-args as for any ROS 2 node.
-        arguments: What follows it on the command line.
+        arguments: What follows it on the command line; those of the process if none is given.
 
     Returns:
         The exit status.
@@ -420,7 +420,8 @@ def run_node(name: str, *arguments: str) -> int:
     """
     from finssim.quiet import start_warp
 
-    sys.argv = [name, *arguments]
+    if arguments:
+        sys.argv = [name, *arguments]
     if name not in NODES:
         raise Ros2Error(f"unknown node '{name}'; available: {', '.join(NODES)}")
     start_warp()

@@ -1,12 +1,19 @@
 """One function per node, for `ros2 run finssim_ros NODE`."""
 
+import sys
 from functools import partial
 
-from finssim.ros2.up import NODES, run_node
+from finssim.boundary import run
+from finssim.cli import app
+from finssim.ros2.up import NODES
 
 
 def __getattr__(node):
-    """The function that runs a node."""
+    """Return the function that runs a node with the arguments of the process."""
     if node not in NODES:
         raise AttributeError(f"finssim_ros has no node '{node}'; available: {', '.join(NODES)}")
-    return partial(run_node, node)
+    return partial(_run, node)
+
+
+def _run(node):
+    return run(app, ["ros2", "node", node, *sys.argv[1:]])
