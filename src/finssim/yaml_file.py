@@ -233,4 +233,6 @@ def first_problem(error: Any) -> str:
     """
     problem = error.errors()[0]
     location, message = ".".join(map(str, problem["loc"])), str(problem["msg"]).removeprefix("Value error, ")
+    if problem["type"] == "literal_error":
+        message = f"is {problem['input']!r}, expected {problem['ctx']['expected']}"
     return f"{location}: {message}" if location else message

@@ -69,6 +69,28 @@ DIALECTS = {
         "width: 640\nheight: 480\nfx: 535.9\nfy: 536.2\ncx: 342.3\ncy: 235.6\nk1: 0.1\nk2: -0.2\n",
         Lens(**NUMBERS, distortion=(0.1, -0.2, 0.0, 0.0, 0.0)),
     ),
+    "named coefficients of a fisheye": (
+        "width: 640\nheight: 480\nfx: 535.9\nfy: 536.2\ncx: 342.3\ncy: 235.6\nmodel: fisheye\nk1: 0.1\nk3: 0.02\n",
+        Lens(**NUMBERS, model="fisheye", distortion=(0.1, 0.0, 0.02, 0.0)),
+    ),
+    "named coefficients with k3": (
+        "width: 640\nheight: 480\nfx: 535.9\nfy: 536.2\ncx: 342.3\ncy: 235.6\nk1: 0.1\nk3: 0.02\n",
+        Lens(**NUMBERS, distortion=(0.1, 0.0, 0.0, 0.0, 0.02)),
+    ),
+    "opencv's fisheye": (
+        OPENCV.replace("flags: 2", "fisheye_model: 1").replace(str(list(FIVE)), str(list(FOUR))),
+        Lens(**NUMBERS, model="fisheye", distortion=FOUR),
+    ),
+    **{
+        word: (ros(word, FOUR), Lens(**NUMBERS, model="fisheye", distortion=FOUR))
+        for word in ("kannala_brandt", "KannalaBrandt8", "opencv_fisheye", "OPENCV_FISHEYE", "kb4", "fisheye")
+    },
+    "colmap": (ros("FULL_OPENCV", EIGHT), Lens(**NUMBERS, model="rational", distortion=EIGHT)),
+    "ours with another's word": (
+        "lens: {model: kannala_brandt, width: 640, height: 480, fx: 535.9, fy: 536.2, cx: 342.3, cy: 235.6, "
+        "distortion: [0.01, -0.02, 0.003, -0.004]}\n",
+        Lens(**NUMBERS, model="fisheye", distortion=FOUR),
+    ),
     "no distortion": ("image_width: 640\nimage_height: 480\nK: " + str(FLAT) + "\n", Lens(**NUMBERS)),
     "ours": (
         "lens: {model: fisheye, width: 640, height: 480, fx: 535.9, fy: 536.2, cx: 342.3, cy: 235.6, "
@@ -112,6 +134,38 @@ REFUSED = {
     ),
     "unknown key": ("lens: {width: 640, height: 480, fx: 5, cx: 1, cy: 1, k1: 0.1}\n", "unknown key 'k1'"),
     "empty": ("", "found nothing"),
+    "unknown model": (ros("eucm", FOUR), "unknown lens model 'eucm'"),
+    "unknown projection": (KALIBR.replace("pinhole", "omni"), "unknown lens model 'omni'"),
+    "two models": (ros("plumb_bob", FOUR) + "fisheye: true\n", "two lens models, fisheye and plumb_bob"),
+    "unknown model of ours": (
+        "lens: {width: 640, height: 480, fx: 5, cx: 1, cy: 1, model: eucm}\n",
+        "unknown lens model 'eucm'",
+    ),
+    "unknown key with numbers": (ros("plumb_bob", FIVE) + "xi: 1.2\n", "unknown key 'xi' holds numbers"),
+    "distortion under another name": (
+        f"width: 640\nheight: 480\nK: {FLAT}\nRadialDistortion: [0.1, 0.2]\n",
+        "unknown key 'RadialDistortion' holds numbers",
+    ),
+    "two cameras": (KALIBR + KALIBR.replace("cam0", "cam1"), "unknown key 'cam1' holds numbers"),
+    "binned": (ros("plumb_bob", FIVE) + "binning_x: 2\n", "binning_x is 2"),
+    "part of the picture": (ros("plumb_bob", FIVE) + "roi: {x_offset: 8, width: 9}\n", "roi is {"),
+    "transposed": (
+        f"width: 640\nheight: 480\nK: {[list(row) for row in zip(*K, strict=True)]}\n",
+        "the camera matrix is transposed",
+    ),
+    "no camera matrix": (
+        f"width: 640\nheight: 480\nK: {[1.0, *FLAT[1:8], 2.0]}\n",
+        "expected rows [fx, 0, cx]",
+    ),
+    "k4 of plumb_bob": (
+        f"width: 640\nheight: 480\nK: {FLAT}\nmodel: plumb_bob\nk1: 0.1\nk4: 0.1\n",
+        "a plumb_bob lens has no k4",
+    ),
+    "one size": (f"image_size: [640]\nK: {FLAT}\n", "size of the image is missing"),
+    "key beside our lens": (
+        "lens: {width: 640, height: 480, fx: 5, cx: 1, cy: 1}\nlense: {fx: 6}\n",
+        "unknown key 'lense'",
+    ),
 }
 
 

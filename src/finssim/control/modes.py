@@ -354,7 +354,7 @@ def mode_from_dict(description: Mapping[str, Any], vehicle: Any) -> ActionMode:
     """
     mode = action_mode(str(description.get("mode")), vehicle, description.get("scale", 1.0))
     here = mode.describe()
-    recorded = plain_data({key: description.get(key) for key in here})
+    recorded = plain_data({**dict.fromkeys(here), **description})
     difference = first_difference(recorded, here, mode.name, tolerance=TOLERANCE)
     if difference:
         raise ControlError(f"{difference}: use the vehicle file that the policy was trained with")

@@ -415,7 +415,9 @@ def _from_mapping(name: str, data: Mapping[str, Any]) -> Trajectory:
         return through_points(name, data["points"], **options)
     shape = data["shape"]
     if not isinstance(shape, Mapping) or shape.get("kind") not in SHAPES:
-        raise ControlError(f"shape: expected a mapping whose 'kind' is one of {', '.join(SHAPES)}")
+        raise ControlError(
+            f"shape is {shape!r}, expected a mapping whose 'kind' is one of {', '.join(SHAPES)}"
+        )
     try:
         arguments = {str(key): value for key, value in shape.items() if key != "kind"}
         duration, motion = SHAPES[shape["kind"]](**arguments)

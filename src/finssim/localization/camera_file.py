@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from finssim.files import atomic_write
-from finssim.geometry.optics import Lens, OpticsError
+from finssim.geometry.optics import COEFFICIENTS, Lens, OpticsError, lens_model
 from finssim.localization import LocalizationError
 from finssim.yaml_file import read_mapping, yaml_text
 
@@ -122,8 +122,31 @@ _DISTORTION = (
     "dist",
     "D",
 )
-_MODEL = ("distortion_model", "model", "lens_model", "camera_model", "projection_model")
-_FISHEYE = ("fisheye", "equidistant", "equi", "kannala_brandt4", "kb4")
+_MODEL = (
+    "distortion_model",
+    "model",
+    "lens_model",
+    "camera_model",
+    "projection_model",
+    "camera_type",
+    "distortion_type",
+)
+_ANY_MODEL = ("pinhole", "perspective", "none")
+"""Words that leave the distortion open."""
+_FISHEYE = ("fisheye", "is_fisheye", "fisheye_model")
+"""Keys of a truth value."""
+_PART_OF_PICTURE = ("binning_x", "binning_y", "roi")
+"""Keys that change what a pixel is, unless their numbers are 0 or 1."""
+_NAMES = ("fx", "fy", "cx", "cy", *COEFFICIENTS["rational"], "p1", "p2")
+_NO_LENS = set(
+    "nframes nrofframes boardwidth boardheight squaresize markersize aspectratio fixaspectratio flags calibrationtime "
+    "avgreprojectionerror perviewreprojectionerrors reprojectionerror meanreprojectionerror extrinsicparameters "
+    "imagepoints gridpoints rms rmserror meanerror error ret rvecs tvecs rectificationmatrix projectionmatrix r p seq "
+    "ratehz "
+    "header stamp timestamp date time tcamimu timucam tcncnm1 tbs timeshiftcamimu camoverlaps fps framerate rate "
+    "version format id cameraid serial serialnumber numimages nimages calibration".split()
+)
+"""Keys, in small letters and digits alone, whose numbers are no part of a lens."""
 
 
 @dataclass(frozen=True)
@@ -150,8 +173,10 @@ def load_camera(path: str | Path) -> CameraFile:
     )
     top = tree.get("camera")
     if isinstance(top, Mapping) and isinstance(top.get("lens"), Mapping):  # a pool file
+        _only(tree, ("format", "camera", "interface", "frames", "calibration"), str(path))
         return CameraFile(lens_from(top["lens"], f"{path}: camera: lens"))
     if isinstance(tree.get("lens"), Mapping):
+        _only(tree, ("lens", "calibration"), str(path))
         record = tree.get("calibration")
         return CameraFile(
             lens_from(tree["lens"], f"{path}: lens"), record if isinstance(record, Mapping) else {}
@@ -209,11 +234,25 @@ def lens_from(values: Mapping[Any, Any], label: str) -> Lens:
         "fy": fields.number("fy", fx),
         "cx": fields.number("cx"),
         "cy": fields.number("cy"),
-        "model": fields.word("model", "plumb_bob"),
+        "model": _model_of(fields.word("model", "plumb_bob"), label),
         "distortion": fields.numbers("distortion", None, ()),
     }
     fields.finish()
     return _lens(arguments, label)
+
+
+def _only(tree: Mapping[Any, Any], known: tuple[str, ...], label: str) -> None:
+    fields = Fields(tree, label)
+    for key in known:
+        fields.take(key)
+    fields.finish()
+
+
+def _model_of(word: str, label: str) -> str:
+    try:
+        return lens_model(word)
+    except OpticsError as error:
+        raise LocalizationError(f"{label}: {error}") from None
 
 
 def _lens(arguments: dict[str, Any], label: str) -> Lens:
@@ -235,10 +274,12 @@ def _foreign(tree: Mapping[str, Any], label: str) -> Lens:
         inner = tree.get(key)
         if isinstance(inner, Mapping) and _first(inner, (*_MATRIX, "fx")) is not None:
             return _foreign({**{k: v for k, v in tree.items() if k != key}, **inner}, f"{label}: {key}")
+    _refuse_strange(tree, label)
     width, height = _size(tree, label)
     fx, fy, cx, cy = _focal(tree, label)
-    distortion = _distortion(tree, label)
-    word = next((str(tree[key]).lower() for key in _MODEL if isinstance(tree.get(key), str)), "")
+    value = _first(tree, _DISTORTION)
+    given = None if value is None else _flat(value, label)
+    model = _model(tree, given, label)
     return _lens(
         {
             "width": width,
@@ -247,11 +288,37 @@ def _foreign(tree: Mapping[str, Any], label: str) -> Lens:
             "fy": fy,
             "cx": cx,
             "cy": cy,
-            "model": _model(tree, word, distortion, label),
-            "distortion": distortion,
+            "model": model,
+            "distortion": _named(tree, model, label) if given is None else given,
         },
         label,
     )
+
+
+def _refuse_strange(tree: Mapping[Any, Any], label: str) -> None:
+    """Refuse numbers that would be ignored although they may belong to the lens."""
+    known = {*_WIDTH, *_HEIGHT, *_SIZE, *_MATRIX, *_DISTORTION, *_MODEL, *_FISHEYE, *_NAMES}
+    for key, value in tree.items():
+        if key in _PART_OF_PICTURE:
+            if any(x not in (0, 1) for x in _numbers_in(value)):
+                raise LocalizationError(
+                    f"{label}: {key} is {value!r}, expected the whole picture, every pixel: calibrate without it"
+                )
+        elif key not in known and re.sub("[^a-z0-9]", "", str(key).lower()) not in _NO_LENS:
+            if any(_numbers_in(value)):
+                raise LocalizationError(
+                    f"{label}: unknown key '{key}' holds numbers: remove it, or rename it, if it belongs to the lens, "
+                    f"to one of {', '.join(sorted(known))}"
+                )
+
+
+def _numbers_in(value: Any) -> Iterator[float]:
+    """All numbers in lists and mappings of any depth."""
+    if isinstance(value, (Mapping, list, tuple)):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _numbers_in(item)
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        yield value
 
 
 def _first(tree: Mapping[str, Any], names: tuple[str, ...]) -> Any:
@@ -261,6 +328,7 @@ def _first(tree: Mapping[str, Any], names: tuple[str, ...]) -> Any:
 def _flat(value: Any, label: str) -> tuple[float, ...]:
     """Numbers of a list, of nested lists, or of OpenCV's and ROS's {rows, cols, data}."""
     if isinstance(value, Mapping):
+        _only(value, ("type_id", "rows", "cols", "dt", "data"), label)
         value = value.get("data")
     if isinstance(value, (list, tuple)):
         return tuple(x for item in value for x in _flat(item, label))
@@ -275,7 +343,7 @@ def _size(tree: Mapping[str, Any], label: str) -> tuple[int, int]:
     size = _first(tree, _SIZE)
     width, height = _first(tree, _WIDTH), _first(tree, _HEIGHT)
     if width is None and size is not None:
-        width, height = _flat(size, label)[:2]
+        width, height = (*_flat(size, label), None, None)[:2]
     if width is None or height is None:
         raise LocalizationError(
             f"{label}: the size of the image is missing: add image_width and image_height"
@@ -293,9 +361,18 @@ def _focal(tree: Mapping[str, Any], label: str) -> tuple[float, float, float, fl
     if len(numbers) == 4:
         return numbers[0], numbers[1], numbers[2], numbers[3]
     if len(numbers) == 9:
+        if (numbers[2], numbers[5]) == (0.0, 0.0) and (numbers[6], numbers[7]) != (0.0, 0.0):
+            raise LocalizationError(
+                f"{label}: the camera matrix is transposed, as MATLAB writes it: write its columns as rows, and "
+                "subtract 1 from cx and cy if MATLAB computed them (its first pixel is 1, here it is 0)"
+            )
         if abs(numbers[1]) > 1e-6 * abs(numbers[0]):
             raise LocalizationError(
                 f"{label}: the camera matrix has a skew of {numbers[1]:.4g} px, expected 0: calibrate without skew"
+            )
+        if (numbers[3], *numbers[6:]) != (0.0, 0.0, 0.0, 1.0):
+            raise LocalizationError(
+                f"{label}: the camera matrix is {list(numbers)}, expected rows [fx, 0, cx], [0, fy, cy], [0, 0, 1]"
             )
         return numbers[0], numbers[4], numbers[2], numbers[5]
     raise LocalizationError(
@@ -303,25 +380,40 @@ def _focal(tree: Mapping[str, Any], label: str) -> tuple[float, float, float, fl
     )
 
 
-def _distortion(tree: Mapping[str, Any], label: str) -> tuple[float, ...]:
-    value = _first(tree, _DISTORTION)
-    if value is not None:
-        return _flat(value, label)
-    names = [name for name in ("k1", "k2", "p1", "p2", "k3", "k4") if tree.get(name) is not None]
-    if "p1" not in names and ("k3" in names or "k4" in names):
-        return tuple(_number(tree.get(name, 0.0), label) for name in ("k1", "k2", "k3", "k4"))
-    return tuple(
-        _number(tree.get(name, 0.0), label) for name in ("k1", "k2", "p1", "p2", "k3")[: 5 if names else 0]
-    )
+def _model(tree: Mapping[str, Any], given: tuple[float, ...] | None, label: str) -> str:
+    """The model that the file names, or else that its coefficients mean.
 
+    Args:
+        tree: The file.
+        given: Its list of coefficients; None where it names each, or none.
+        label: What messages call it.
 
-def _model(tree: Mapping[str, Any], word: str, distortion: tuple[float, ...], label: str) -> str:
-    fisheye = any(tree.get(key) is True for key in ("fisheye", "is_fisheye")) or word in _FISHEYE
-    four_radial = "p1" not in tree and tree.get("k4") is not None and not _first(tree, _DISTORTION)
-    if fisheye or four_radial:
+    Raises:
+        LocalizationError: An unknown word, or two words that differ.
+    """
+    words = {key: Fields(tree, label).word(key) for key in _MODEL if tree.get(key) is not None}
+    models = {_model_of(word, label) for word in words.values() if word.lower() not in _ANY_MODEL}
+    models |= {"fisheye" for key in _FISHEYE if tree.get(key) in (True, 1)}
+    if len(models) > 1:
+        raise LocalizationError(
+            f"{label}: the file names two lens models, {' and '.join(sorted(models))}: keep one"
+        )
+    if models == {"plumb_bob"} and len(given or ()) == 8:
+        return "rational"  # OpenCV's superset
+    if models:
+        return models.pop()
+    names = {name for name in _NAMES if tree.get(name) is not None}
+    if given is None and "k4" in names and not names & {"p1", "p2", "k5", "k6"}:
         return "fisheye"
-    if word.startswith("rational") or len(distortion) == 8:
-        return "rational"
-    if len(distortion) > 8 and not any(distortion[8:]):
-        raise LocalizationError(f"{label}: {len(distortion)} distortion coefficients: keep the first 8")
-    return "plumb_bob"
+    return "rational" if len(given or ()) >= 8 or names & {"k4", "k5", "k6"} else "plumb_bob"
+
+
+def _named(tree: Mapping[str, Any], model: str, label: str) -> tuple[float, ...]:
+    """Coefficients that stand alone, each under its name; none where there are none."""
+    names = [name for name in COEFFICIENTS["rational"] if tree.get(name) is not None]
+    for name in names:
+        if name not in COEFFICIENTS[model]:
+            raise LocalizationError(
+                f"{label}: a {model} lens has no {name}: remove it, or name another model"
+            )
+    return tuple(_number(tree.get(name) or 0.0, label) for name in COEFFICIENTS[model]) if names else ()

@@ -94,10 +94,12 @@ def load_pool(path: str | Path) -> Pool:
         raise top.error(f"format is {tree['format']}, expected {FORMAT}: this FinsSim cannot read it")
     camera, latency = _camera(top.section("camera"), path)
     interface = _interface(top.section("interface"))
-    world = top.section("frames").section("world")
+    frames = top.section("frames")
+    world = frames.section("world")
     position = world.numbers("position", 3) if world.has("position") else None
     orientation = _unit(world, "orientation", world.numbers("orientation", 4, (0.0, 0.0, 0.0, 1.0)))
     world.finish()
+    frames.finish()
     top.section("calibration")  # a record, not read any further
     top.finish()
     return Pool(

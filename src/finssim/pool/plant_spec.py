@@ -15,7 +15,7 @@ from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import POOL, room
-from finssim.yaml_file import read_mapping, yaml_text
+from finssim.yaml_file import first_problem, read_mapping, yaml_text
 
 __all__ = [
     "HEADROOM",
@@ -418,6 +418,4 @@ def load_plant_spec(path: str | Path) -> PlantSpec:
     try:
         return PlantSpec.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(x) for x in first["loc"])
-        raise PlantSpecError(f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}") from None
+        raise PlantSpecError(f"{path}: {first_problem(error)}") from None

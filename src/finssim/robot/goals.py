@@ -117,9 +117,12 @@ def check_reachable(guide: Guide, vehicle: Vehicle) -> None:
 
 
 def _goal_in(path: Path) -> list[object]:
-    goal = read_mapping(path, GoalError, such_as="goal: [x, y, z, yaw_deg]").get("goal")
+    tree = read_mapping(path, GoalError, such_as="goal: [x, y, z, yaw_deg]")
+    goal = tree.pop("goal", None)
     if not isinstance(goal, list):
         raise GoalError(f"{path}: no goal in it: write goal: [x, y, z, yaw_deg]")
+    if tree:
+        raise GoalError(f"{path}: unknown key '{next(iter(tree))}', expected goal: [x, y, z, yaw_deg] alone")
     return goal
 
 

@@ -180,7 +180,12 @@ def _expand_groups(values: Tree, origins: Origins, label: str) -> tuple[Tree, Or
     """Give every thruster the numbers of its group; its own come first."""
     groups = values.pop("thruster_groups", {})
     thrusters = values.get("thrusters")
-    if not isinstance(groups, dict) or not isinstance(thrusters, dict):
+    for group, numbers in groups.items() if isinstance(groups, dict) else [("", groups)]:
+        if not isinstance(numbers, dict):
+            raise VehicleError(
+                f"{label}: thruster_groups: {group} is {numbers!r}, expected a section of keys"
+            )
+    if not isinstance(thrusters, dict):
         return values, origins
     for name, thruster in thrusters.items():
         if not isinstance(thruster, dict) or "group" not in thruster:

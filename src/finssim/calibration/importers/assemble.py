@@ -315,16 +315,17 @@ class ColumnMap(Part):
         keys = {**(recorded or {}), **self.header, **self.trials.get(trial, {})}
         if vehicle is not None:
             keys["vehicle"] = vehicle
+        place = f"trials.{trial}" if trial else ""
         for key in keys:
             if key not in HEADER_KEYS:
                 raise CalibrationError(
-                    f"trials.{trial}: unknown key '{key}'{did_you_mean(str(key), list(HEADER_KEYS))} "
+                    f"{place and f'{place}: '}unknown key '{key}'{did_you_mean(str(key), list(HEADER_KEYS))} "
                     f"known keys: {', '.join(HEADER_KEYS)}"
                 )
         try:
             return Header.model_validate(keys)
         except ValidationError as error:
-            raise CalibrationError(sentence_of(error.errors()[0], "", "add it")) from None
+            raise CalibrationError(sentence_of(error.errors()[0], place, "add it")) from None
 
 
 def read_map(path: Path) -> ColumnMap:
@@ -336,7 +337,8 @@ def read_map(path: Path) -> ColumnMap:
     tree = read_mapping(path, CalibrationError, such_as="files: {log.csv: {time: t, columns: {u: vel_x}}}")
     try:
         column_map = ColumnMap.model_validate(tree)
-        column_map.header_of("", None)
+        for trial in ("", *column_map.trials):
+            column_map.header_of(trial, None)
     except ValidationError as error:
         raise CalibrationError(sentence_of(error.errors()[0], str(path), "add it")) from None
     except CalibrationError as error:

@@ -33,7 +33,7 @@ from finssim.calibration.report import (
 )
 from finssim.calibration.uncertainty import Covariance, Evidence, correlation, intervals, trial_covariance
 from finssim.calibration.vision.least_squares import Pose, arrow_evidence, block_of, rms
-from finssim.geometry.optics import Lens
+from finssim.geometry.optics import COEFFICIENTS, Lens
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix, skew
 from finssim.localization.camera_file import write_camera
 from finssim.localization.detection.pictures import pictures
@@ -243,13 +243,7 @@ def _charuco(image: NDArray[np.uint8], board: Board) -> tuple[Array, NDArray[np.
 
 # A lens and the poses of all boards, from the pixels of their corners.
 
-DISTORTION_NAMES = {
-    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
-    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "fisheye": ("k1", "k2", "k3", "k4"),
-}
-
-MODELS = tuple(DISTORTION_NAMES)
+MODELS = tuple(COEFFICIENTS)
 
 FOCAL_SHARES = (1.0 / math.pi, 0.6, 1.2)
 """Focal lengths from which a fisheye is fitted, in widths of the image."""
@@ -319,7 +313,7 @@ class Bundle:
 
 def lens_names(model: str) -> tuple[str, ...]:
     """Names of a lens's numbers, in the order of `Lens.parameter_jacobian`."""
-    return ("fx", "fy", "cx", "cy", *DISTORTION_NAMES[model])
+    return ("fx", "fy", "cx", "cy", *COEFFICIENTS[model])
 
 
 def lens_vector(lens: Lens) -> Array:
@@ -347,7 +341,7 @@ def adjust(views: Sequence[BoardView], model: str) -> Bundle:
     finally:
         cv2.setNumThreads(threads)
     fx, _, cx, _, fy, cy = map(float, np.ravel(K)[:6])
-    lens = Lens(*size, fx, fy, cx, cy, model, tuple(np.ravel(distortion)[: len(DISTORTION_NAMES[model])]))
+    lens = Lens(*size, fx, fy, cx, cy, model, tuple(np.ravel(distortion)[: len(COEFFICIENTS[model])]))
     poses = tuple(
         Pose(quat_to_matrix(quat_from_rotvec(np.ravel(turn))), np.ravel(shift))
         for turn, shift in zip(turns, shifts, strict=True)

@@ -15,7 +15,16 @@ from scipy.optimize import nnls
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.least_squares import descent
 from finssim.calibration.vision.survey import Observations
-from finssim.geometry.optics import Camera, Interface, Layer, Lens, Status, project, projection_jacobians
+from finssim.geometry.optics import (
+    COEFFICIENTS,
+    Camera,
+    Interface,
+    Layer,
+    Lens,
+    Status,
+    project,
+    projection_jacobians,
+)
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, skew
 
 Array = NDArray[np.float64]
@@ -27,12 +36,10 @@ NAMES = (*POSE_NAMES, "tilt_x", "tilt_y", "depth", "index", *LENS_NAMES)
 reference point [rad], distance of the plane from the reference point [m], index beyond it, logarithm of the focal
 length, optical centre [px], first five coefficients of distortion as the lens lists them."""
 
-_LENGTHS = {"plumb_bob": 5, "rational": 8, "fisheye": 4}
-
 
 def extended_lens(lens: Lens) -> Lens:
     """The same lens with room for coefficients of distortion that it leaves out."""
-    missing = _LENGTHS[lens.model] - len(lens.distortion)
+    missing = len(COEFFICIENTS[lens.model]) - len(lens.distortion)
     return replace(lens, distortion=(*lens.distortion, *([0.0] * missing))) if missing > 0 else lens
 
 

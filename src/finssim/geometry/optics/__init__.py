@@ -1,7 +1,7 @@
 """Camera optics: lenses, planar refracting interfaces with or without a window, and both ways through them."""
 
 from finssim.geometry.optics.interface import Interface, Layer
-from finssim.geometry.optics.lens import LENS_MODELS, Camera, Lens, OpticsError
+from finssim.geometry.optics.lens import COEFFICIENTS, LENS_MODELS, Camera, Lens, OpticsError, lens_model
 from finssim.geometry.optics.rays import (
     Jacobians,
     Projection,
@@ -15,6 +15,7 @@ from finssim.geometry.optics.rays import (
 )
 
 __all__ = [
+    "COEFFICIENTS",
     "LENS_MODELS",
     "Camera",
     "Interface",
@@ -27,6 +28,7 @@ __all__ = [
     "WaterRays",
     "back_project",
     "count_rejections",
+    "lens_model",
     "plane_jacobian",
     "project",
     "projection_jacobians",

@@ -7,6 +7,7 @@ OpenCV. All functions take a leading `...` batch.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -313,6 +314,44 @@ LENS_MODELS: dict[str, tuple[type[RadialTangential] | type[Fisheye], tuple[int, 
     "fisheye": (Fisheye, (0, 4)),
 }
 """Model -> its distortion, and how many coefficients it takes."""
+COEFFICIENTS = {
+    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+"""Model -> names of its coefficients, in OpenCV's order."""
+_WORDS = {
+    word: model
+    for model, words in {
+        "plumb_bob": "plumbbob radtan radialtangential brown brownconrady opencv pinholeradtan",
+        "rational": "rational rationalpolynomial fullopencv",
+        "fisheye": "fisheye equidistant equi kannalabrandt kannalabrandt4 kannalabrandt8 kb kb4 kb8 opencvfisheye "
+        "pinholeequi",
+    }.items()
+    for word in words.split()
+}
+"""Word of another program, in small letters alone -> model."""
+
+
+def lens_model(word: str) -> str:
+    """Translate the word of another program for a lens model.
+
+    Args:
+        word: Such as `kannala_brandt`, `opencv_fisheye` or `equidistant`, which are `fisheye`.
+
+    Returns:
+        Key of `LENS_MODELS`.
+
+    Raises:
+        OpticsError: The word is unknown.
+    """
+    try:
+        return _WORDS[re.sub(r"[^a-z0-9]", "", word.lower())]
+    except KeyError:
+        raise OpticsError(
+            f"unknown lens model '{word[:40]}'; available: {', '.join(LENS_MODELS)} (also radtan, "
+            "rational_polynomial, equidistant, kannala_brandt, opencv_fisheye)"
+        ) from None
 
 
 @dataclass(frozen=True)
