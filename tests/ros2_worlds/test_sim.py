@@ -16,8 +16,9 @@ import rclpy
 from rclpy.node import Node
 
 from finssim.ros2.nodes.conversions import RosMessages, ros_type
+from finssim.ros2.shim.arguments import parse_arguments
 from finssim.ros2.topics import TOPICS, quality_profile
-from finssim.ros2_worlds.sim import STEP, Sim
+from finssim.ros2_worlds.sim import MOST_BEHIND, STEP, Sim
 
 PATIENCE = 30.0  # [s] on a busy machine
 STATES = ("disarmed", "armed", "hold", "fault")
@@ -226,3 +227,98 @@ def test_services_say_what_the_topics_do(world):
         assert world.until(lambda wanted=wanted: world.state == ("armed" if wanted else "disarmed"))
     world.steps(2)
     assert world.heard["odometry"][-1].pose.pose.position.z == pytest.approx(-0.5, abs=0.01)
+
+
+def sim_in(namespace):
+    """A simulator as `--namespace` starts one."""
+    context = rclpy.get_default_context()
+    before, words = context.arguments, ["--ros-args", "-r", f"__ns:=/{namespace}"]
+    context.arguments = parse_arguments(words)
+    try:
+        return Sim()
+    finally:
+        context.arguments = before
+
+
+@pytest.fixture
+def pair(wire):
+    """Two simulators of one domain, whose own time stands still; the later has the name that comes first."""
+    sims = [sim_in("robot_2"), sim_in("robot_1")]
+    for sim in sims:
+        for timer in list(sim.timers):
+            if timer.callback == sim._turn:
+                sim.destroy_timer(timer)
+    yield sims
+    for sim in sims:
+        sim.destroy_node()
+
+
+def spun(nodes, condition, each=lambda: None):
+    """Run callbacks until a condition holds; whether it does in time."""
+    end = time.monotonic() + PATIENCE
+    while not condition() and time.monotonic() < end:
+        each()
+        for node in nodes:
+            rclpy.spin_once(node, timeout_sec=0.002)
+    return condition()
+
+
+def test_of_two_simulators_one_publishes_the_clock_and_both_live_by_it(pair):
+    """One publisher of /clock; every stamp of the second is of that time, and its vehicle moves by the same steps."""
+    first, second = pair
+    heard, peer = [], Node("peer")
+    kind, quality = ros_type(TOPICS["odometry"].type), quality_profile(TOPICS["odometry"].quality)
+    peer.create_subscription(kind, "/robot_1/odom", heard.append, quality)
+    assert first.clock.ours and not second.clock.ours
+    assert peer.count_publishers("/clock") == 1
+    first.time = 40.0
+    assert spun([first, second, peer], lambda: heard, first._step)
+    stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in heard]
+    assert 40.0 - MOST_BEHIND * STEP < min(stamps) and max(stamps) <= first.time + 1e-6
+    before = len(heard)
+    for _ in range(10):  # one at a time, none is lost
+        first._step()
+        assert spun([second, peer], lambda: second.time == pytest.approx(first.time, abs=0.1 * STEP))
+    assert spun([peer], lambda: len(heard) >= before + 10)
+    peer.destroy_node()
+
+
+def test_a_simulator_that_cannot_keep_up_leaves_steps_out_but_not_time(pair):
+    """After a leap of the clock its stamps are those of the clock, so that nobody takes its state for an old one."""
+    first, second = pair
+    assert spun([second], lambda: second.time > 0.0, first._step)
+    made = []
+    step = second._step
+    second._step = lambda: (made.append(second.time), step())
+    second._follow(second.time + 100 * STEP)
+    assert len(made) == MOST_BEHIND and made[0] == pytest.approx(second.time - MOST_BEHIND * STEP)
+    second._follow(1.0)
+    assert second.time == 1.0, "the other clock began anew"
+
+
+def test_who_followed_takes_over_without_a_jump(pair):
+    """When the first simulator has left."""
+    first, second = pair
+    first.time = 7.0
+    assert spun([second], lambda: second.time > 7.0, first._step)
+    time_then = second.time
+    first.destroy_node()
+    assert spun([second], lambda: second.clock.ours)
+    second._step()
+    assert second.time == pytest.approx(time_then + STEP) and second.count_publishers("/clock") == 1
+
+
+def test_of_two_that_started_together_one_gives_way(pair, monkeypatch):
+    """Both published before they saw each other: the first by name continues, and soon there is one clock."""
+    monkeypatch.setattr("finssim.ros2_worlds.sim.CLAIMING", math.inf)  # whatever time the test takes
+    first, second = pair
+    now = 1e-9 * second.clock._steady.now().nanoseconds
+    second.clock._claim(now)
+    first.clock._claimed = now
+    assert spun([first], lambda: first.count_publishers("/clock") == 2)
+    for sim in (second, first):
+        sim.clock.look()
+    assert second.clock.ours and not first.clock.ours
+    assert spun([first], lambda: first.count_publishers("/clock") == 1)
+    second.time = 3.0
+    assert spun([first], lambda: first.time > 3.0, second._step)

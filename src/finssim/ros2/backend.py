@@ -109,6 +109,7 @@ PARTS = {
     ),
     "exceptions": ("exceptions",),
     "executors": ("executors", "timer"),
+    "graph": ("topic_endpoint_info", "type_hash"),
     "logging": ("logging",),
     "node": ("node",),
     "parameter": ("parameter", "parameter_service"),

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from cyclonedds._clayer import ddspy_take
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
@@ -360,6 +360,9 @@ class Reader(Endpoint):
 # One DDS participant, as ROS 2 has one per context: its endpoints, and the nodes it tells its peers about.
 
 
+FOREVER = 2**63 - 1
+"""Duration without limit in DDS [ns]."""
+
 NODE_LIST = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 
 _domains: dict[int, Domain] = {}
@@ -375,6 +378,40 @@ class NodeRecord:
     readers: list[bytes] = field(default_factory=list)
     """Identifiers of its readers, 16 bytes each."""
     writers: list[bytes] = field(default_factory=list)
+
+
+class EndpointRecord(NamedTuple):
+    """A writer or reader on the wire, as discovery has it."""
+
+    topic: str
+    """With its prefix."""
+    dds_type: str
+    gid: bytes
+    """16 bytes."""
+    qos: Qos
+
+    @property
+    def user_data(self) -> bytes:
+        """What the endpoint tells its peers."""
+        return next((bytes(p.data) for p in self.qos if isinstance(p, Policy.Userdata)), b"")
+
+    @property
+    def quality(self) -> Quality:
+        """Its policies; the depth of another vendor's endpoint is not known."""
+        spans = {
+            kind: getattr(policy, key)
+            for policy in self.qos
+            for kind, key in ((Policy.Deadline, "deadline"), (Policy.Lifespan, "lifespan"))
+            if isinstance(policy, kind) and getattr(policy, key) < FOREVER
+        }
+        depths = [p.depth for p in self.qos if isinstance(p, Policy.History.KeepLast)]
+        return Quality(
+            depth=depths[0] if depths else 0,
+            reliable=Policy.Reliability.BestEffort not in self.qos,
+            transient_local=Policy.Durability.TransientLocal in self.qos,
+            deadline=1e-9 * spans.get(Policy.Deadline, 0),
+            lifespan=1e-9 * spans.get(Policy.Lifespan, 0),
+        )
 
 
 class Participant:
@@ -442,8 +479,8 @@ class Participant:
             self._seen = {gid: nodes for gid, nodes in self._seen.items() if gid in alive}
             return [node for nodes in self._seen.values() for node in nodes]
 
-    def endpoints(self, kind: str) -> list[tuple[str, str]]:
-        """Topic with its prefix, and ROS type, of every endpoint on the wire.
+    def endpoints(self, kind: str) -> list[EndpointRecord]:
+        """Return every endpoint on the wire.
 
         Args:
             kind: "publications" or "subscriptions".
@@ -457,7 +494,7 @@ class Participant:
             for s in samples
             if s.sample_info.instance_state == InstanceState.Alive and hasattr(s, "topic_name")
         ]
-        return [(sample.topic_name, ros_type_name(sample.type_name)) for sample in alive]
+        return [EndpointRecord(s.topic_name, s.type_name, s.key.bytes, s.qos) for s in alive]
 
     def close(self) -> None:
         """Leave the wire at once: peers are told, and wait for nothing."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -80,13 +81,70 @@ class IdealSensors:
         )
 
 
+CLAIMING = 1.0
+"""Time in which simulators that started together find each other [s]."""
+LOOK = 0.5
+"""Between two looks at who publishes /clock [s]."""
+
+
+class SharedClock:
+    """Topic /clock of a domain: one simulator publishes it and every other one follows it.
+
+    A simulator that finds another publisher follows it. Of simulators that began to publish within `CLAIMING` of each
+    other, the first by name continues. One that follows takes over, without a jump, when the publisher has left.
+    """
+
+    def __init__(self, node: RobotNode, follow: Callable[[float], None], lead: Callable[[], None]) -> None:
+        """
+        Args:
+            node: Node of the simulator.
+            follow: Takes each time of the other's clock [s].
+            lead: Called when time becomes the node's own.
+        """
+        self._node, self._follow, self._lead = node, follow, lead
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.ours = False
+        self._claimed = 0.0
+        self._heard: Any = None
+        self.look()
+        node.create_timer(LOOK, self.look, clock=self._steady)
+
+    def look(self) -> None:
+        """Claim /clock, or give way to another publisher."""
+        node, now = self._node, 1e-9 * self._steady.now().nanoseconds
+        own = node.get_fully_qualified_name()
+        infos = node.get_publishers_info_by_topic(node.topic("clock"))
+        others = sorted({f"{i.node_namespace.rstrip('/')}/{i.node_name}" for i in infos} - {own})
+        if self.ours:
+            if others and others[0] < own and now - self._claimed < CLAIMING:
+                self._give_way(others[0])
+        elif not others:
+            self._claim(now)
+        elif self._heard is None:
+            self._give_way(others[0])
+
+    def _claim(self, now: float) -> None:
+        self.ours, self._claimed = True, now
+        if self._heard is not None:
+            self._node.destroy_subscription(self._heard)
+            self._node.event("clock", "no other node publishes /clock any more: this simulator does")
+        self._node.sends("clock")
+        self._lead()
+
+    def _give_way(self, other: str) -> None:
+        node, self.ours = self._node, False
+        node.withdraw("clock")
+        self._heard = node.hears("clock", lambda message: self._follow(node.seconds(message.clock)))
+        node.event("clock", f"{other} publishes /clock: this simulator follows it, at its pace")
+
+
 class Sim(RobotNode):
-    """Simulated time begins at 0 and is everybody's; the state is the truth, so nothing has to be estimated."""
+    """Simulated time begins at 0, or follows /clock where somebody publishes it already; the state is the truth."""
 
     def __init__(self) -> None:
         super().__init__("sim")
         self.base, self.time = 0, 0.0
-        self.sends("clock", "odometry", "estimator", "imu", "pressure", "event", "diagnostics")
+        self.sends("odometry", "estimator", "imu", "pressure", "event", "diagnostics")
         hydrodynamics, seed = self.parameter("hydrodynamics", "calibrated"), self.parameter("seed", 0)
         self.sim = Simulator(
             self.vehicle, hydrodynamics=hydrodynamics, control_step=STEP, substeps=SUBSTEPS, seed=seed
@@ -100,20 +158,35 @@ class Sim(RobotNode):
         self.create_service(ros_type(service.type), self.below(service.name), self._on_reset)
         self._reset()
         self.frames = Frames(self)
-        self._factor, steady = (
+        self._factor, self._steady = (
             self.parameter("real_time_factor", 1.0),
             Clock(clock_type=ClockType.STEADY_TIME),
         )
-        self._steady, self._began = steady, steady.now().nanoseconds
-        self._made = 0
-        self.create_timer(STEP / self._factor if self._factor > 0.0 else 0.0, self._turn, clock=steady)
+        self.clock = SharedClock(self, self._follow, self._lead)
+        self.create_timer(STEP / self._factor if self._factor > 0.0 else 0.0, self._turn, clock=self._steady)
 
     def now(self) -> float:
         """Simulated time [s]."""
         return self.time
 
+    def _lead(self) -> None:
+        """Count steps from now on."""
+        self._began, self._made = self._steady.now().nanoseconds, 0
+
+    def _follow(self, now: float) -> None:
+        """Step up to a time of another's clock [s]; no more than a few steps, the rest is left out."""
+        if now < self.time - MOST_BEHIND * STEP:  # that clock began anew
+            self.time = now
+        due = int((now - self.time) / STEP + 0.01)
+        steps = min(due, MOST_BEHIND)
+        self.time += (due - steps) * STEP
+        for _ in range(steps):
+            self._step()
+
     def _turn(self) -> None:
-        """As many steps as are due, but no more than a few."""
+        """Make as many steps as are due, but no more than a few."""
+        if not self.clock.ours:
+            return
         passed = (self._steady.now().nanoseconds - self._began) * 1e-9 * self._factor / STEP
         due = int(passed) - self._made if self._factor > 0.0 else 1
         for _ in range(min(due, MOST_BEHIND)):
@@ -130,7 +203,8 @@ class Sim(RobotNode):
 
     def _publish(self, normalised: Any) -> None:
         stamp, reading, make = self.ns(self.time), self._reading(), self.make
-        self.send("clock", make.clock(stamp))
+        if self.clock.ours:
+            self.send("clock", make.clock(stamp))
         self.send("odometry", make.odometry(stamp, reading))
         self.frames.tell(stamp, reading)
         self.send("estimator", make.estimator(stamp, reading, {}))

@@ -129,6 +129,11 @@ class RobotNode(Node):
             kind, quality = ros_type(self.table[key].type), quality_profile(self.table[key].quality)
             self._out[key] = self.create_publisher(kind, self.topic(key), quality)
 
+    def withdraw(self, key: str) -> None:
+        """Remove a publisher, if there is one."""
+        if key in self._out:
+            self.destroy_publisher(self._out.pop(key))
+
     def send(self, key: str, message: Any) -> None:
         """Publish; None is nothing to say."""
         if message is not None:

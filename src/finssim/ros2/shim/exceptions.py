@@ -33,6 +33,10 @@ class InvalidServiceNameException(NameValidationException):
     """A service's name is malformed."""
 
 
+class NodeNameNonExistentError(RuntimeError):
+    """No node of that name is on the wire."""
+
+
 class ParameterException(Exception):
     """Something is wrong with a parameter."""
 

@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 from finssim.ros2.codec import codec_of
 from finssim.ros2.shim.arguments import (
     check_node,
-    expanded,
     full_node_name,
     overrides_for,
     parse_arguments,
@@ -24,7 +23,9 @@ from finssim.ros2.shim.endpoint import (
     SubscriptionEventCallbacks,
 )
 from finssim.ros2.shim.exceptions import InvalidHandle
+from finssim.ros2.shim.exceptions import NodeNameNonExistentError as NodeNameNonExistentError
 from finssim.ros2.shim.executors import Timer
+from finssim.ros2.shim.graph import NodeGraph
 from finssim.ros2.shim.logging import RcutilsLogger, get_logger
 from finssim.ros2.shim.parameter import NodeParameters, Parameter, ParameterService
 from finssim.ros2.shim.qos import (
@@ -35,44 +36,6 @@ from finssim.ros2.shim.qos import (
 )
 from finssim.ros2.shim.time import Clock, ROSClock, Time
 from finssim.ros2.wire import NodeRecord
-
-
-class NodeGraph:
-    """The part of `Node` that looks at the graph."""
-
-    context: Any
-    _name: str
-    _namespace: str
-
-    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
-        """Every node on the wire, this one among them."""
-        return sorted((node.name, node.namespace) for node in self.context.participant.nodes())
-
-    def get_node_names(self) -> list[str]:
-        """Names of every node on the wire."""
-        return [name for name, _ in self.get_node_names_and_namespaces()]
-
-    def count_publishers(self, topic: str) -> int:
-        """Publishers known on a topic."""
-        return self._count(topic, "publications")
-
-    def count_subscribers(self, topic: str) -> int:
-        """Subscriptions known on a topic."""
-        return self._count(topic, "subscriptions")
-
-    def get_topic_names_and_types(self) -> list[tuple[str, list[str]]]:
-        """Every topic on the wire with its types."""
-        types_by_topic: dict[str, set[str]] = {}
-        for kind in ("publications", "subscriptions"):
-            for topic, name in self.context.participant.endpoints(kind):
-                if topic.startswith("rt/"):
-                    types_by_topic.setdefault(topic[2:], set()).add(name)
-        return sorted((topic, sorted(names)) for topic, names in types_by_topic.items())
-
-    def _count(self, topic: str, kind: str) -> int:
-        full = f"rt{expanded(topic, self._name, self._namespace)}"
-        return sum(endpoint_name == full for endpoint_name, _ in self.context.participant.endpoints(kind))
-
 
 # Simulated time: the topic /clock drives a node's clock where its parameter `use_sim_time` is true.
 
