@@ -1,6 +1,9 @@
 """Our message files are legal ROS 2, and the workspace builds from the very same ones."""
 
 import ast
+import contextlib
+import importlib
+import inspect
 import re
 import runpy
 import subprocess
@@ -12,10 +15,14 @@ from pathlib import Path
 import pytest
 import yaml
 
+from finssim.robot.wiring import POOL_ADDRESS
+from finssim.ros2 import Ros2Error
+from finssim.ros2.backend import activate
 from finssim.ros2.codec import INTERFACES
 from finssim.ros2.shim.arguments import overrides_for, parse_arguments
 from finssim.ros2.topics import OWN_TOPICS, SERVICES, TOPICS
 from finssim.ros2.up import NODES as GRAPH_NODES
+from finssim.ros2.up import Options, plan_of
 from finssim.vehicles.loader import catalogue
 
 MESSAGES = sorted(INTERFACES.glob("finssim_msgs/msg/*.msg"))
@@ -179,7 +186,19 @@ def parameters_of(lines, node, namespace="finsrov"):
         ("robot", {"robot": "udp://1.2.3.4:5"}, "hardware_bridge", {"robot": "udp://1.2.3.4:5"}),
         ("robot", {"record": "a.mcap"}, "recorder", {"record": "a.mcap"}),
         ("robot", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper", "vehicle": "finsrov"}),
-        ("robot", {"policy": "runs/hold", "teleop": "true"}, "teleop", {"other": "policy"}),
+        ("robot", {"policy": "runs/hold", "teleop": "true"}, "teleop", {"other": "policy", "device": "joy"}),
+        ("robot", {"teleop": "gamepad"}, "hardware_bridge", {"need_reading": False}),
+        ("robot", {"bind": "10.0.0.1:6000"}, "hardware_bridge", {"bind": "10.0.0.1:6000"}),
+        ("robot", {"bind": "10.0.0.1:6000"}, "camera", {"pictures_bind": "10.0.0.1:6001"}),
+        ("robot", {"robot": "udp://a:1", "pictures": "udp://b:2"}, "camera", {"pictures": "udp://b:2"}),
+        ("robot", {"let_in": "1,2"}, "state_estimation", {"let_in": "1,2", "mode": "error-state"}),
+        ("robot", {"goal": "0,0,-0.5,0"}, "controller", {"goal": "0,0,-0.5,0"}),
+        ("robot", {"namespace": "robot_1"}, "camera", {"frame_prefix": "robot_1/"}),
+        ("robot", {"namespace": "robot_1", "frame_prefix": "a/"}, "camera", {"frame_prefix": "a/"}),
+        ("pool", {"positioning": "usbl", "site": "open-water"}, "virtual_pool", {"positioning": "usbl"}),
+        ("pool", {"port": "6000", "seed": "4"}, "virtual_pool", {"port": 6000, "seed": 4}),
+        ("pool", {}, "virtual_pool", {"pool_file": "pool.yaml"}),
+        ("sim", {"start": "0,0,-1,0"}, "sim", {"start": "0,0,-1,0", "use_sim_time": False}),
         ("robot", {"pool_file": "1.yaml"}, "localizer", {"pool_file": "1.yaml"}),
         ("robot", {"vehicle": "warpauv"}, "camera", {"vehicle": "warpauv"}),
         ("robot", {}, "controller", {"policy": "pid", "vehicle": "finsrov"}),
@@ -190,7 +209,78 @@ def parameters_of(lines, node, namespace="finsrov"):
 )
 def test_launch_arguments_win_over_parameter_files(launched, graph, given, node, parameters):
     """Files that begin with /**, as ours do, lose against what is given at launch, and win over what is not."""
-    assert parameters.items() <= parameters_of(launched(graph, **given), node).items()
+    namespace = given.get("namespace") or given.get("vehicle", "finsrov")
+    assert parameters.items() <= parameters_of(launched(graph, **given), node, namespace).items()
+
+
+def defaults_of(node):
+    """Parameter -> default of a node, as its source and that of every node declare them."""
+    module = importlib.import_module(GRAPH_NODES[node].partition(":")[0])
+    found = {}
+    for part in (importlib.import_module("finssim.ros2.nodes.robot_node"), module):
+        for call in ast.walk(ast.parse(inspect.getsource(part))):
+            if (
+                isinstance(call, ast.Call)
+                and ast.unparse(call.func) == "self.parameter"
+                and len(call.args) == 2
+            ):
+                name, default = call.args
+                with contextlib.suppress(NameError):  # one that depends on the vehicle
+                    found[ast.literal_eval(name)] = eval(ast.unparse(default), vars(part))
+    return found
+
+
+EQUAL = [
+    ("sim", {}),
+    ("sim", {"vehicle": "bluerov2_heavy", "policy": "pid-paper", "goal": "0.5,0,-0.7,45", "seed": "3"}),
+    ("sim", {"namespace": "robot_1", "hydrodynamics": "mesh", "record": "a.mcap", "teleop": "joy"}),
+    ("robot", {"site": "open-water", "pool_file": "none", "camera": "none", "record": "x.mcap"}),
+    ("robot", {"pool_file": "none", "robot": "udp://192.168.0.2:58766", "bind": "192.168.0.10:54321"}),
+    ("robot", {"pool_file": "/a/pool.yaml", "robot": "serial:/dev/x", "pictures": "udp://b:2"}),
+    ("robot", {"site": "open-water", "let_in": "1,-2", "trajectory": "helix", "teleop": "gamepad"}),
+    ("pool", {"pool_file": "/a/pool.yaml"}),
+    ("pool", {"pool_file": "/a/pool.yaml", "site": "tank", "plant": "7", "severity": "hard", "port": "6000"}),
+    ("pool", {"site": "open-water", "positioning": "usbl", "world": "dock", "start": "0,1,-3,0"}),
+]
+
+
+@pytest.mark.parametrize(("graph", "given"), EQUAL)
+def test_launch_files_start_what_up_starts(launched, graph, given):
+    """The same namespace, the same nodes, each parameter the same; the pool's robot is its own launch file."""
+    pytest.importorskip("cyclonedds")
+    activate(announce=False)
+    typed = {name: int(text) if name in ("seed", "port") else text for name, text in given.items()}
+    plan = plan_of(graph, Options(**typed), given.get("pool_file", "pool.yaml"))
+    lines = launched(graph, **given)
+    if graph == "pool":
+        shared = {"namespace", "site", "bind", "port", "pool_file"} & given.keys()
+        assert set(lines) == {"virtual_pool"}
+        pictures = {"pictures": "udp://127.0.0.1:58767"} if "world" in given else {}
+        lines |= launched("robot", **{name: given[name] for name in shared}, robot="pool", **pictures)
+    assert set(lines) == set(plan.nodes)
+    for node in plan.nodes:
+        wanted = {**defaults_of(node), **plan.parameters["/**"], **plan.parameters.get(node, {})}
+        found = {**defaults_of(node), **parameters_of(lines, node, plan.namespace)}
+        for values in (wanted, found):
+            values["robot"] = POOL_ADDRESS if values["robot"] == "pool" else values["robot"]
+            if node == "sim":
+                values.pop("real_time_factor")
+        assert found == wanted, node
+
+
+def test_a_number_that_is_none_is_refused(launched):
+    """At launch, before any process."""
+    with pytest.raises(Ros2Error, match="seed:=x: expected a whole number"):
+        launched("sim", seed="x")
+
+
+def test_a_recorder_is_started_where_a_parameter_file_names_its_file(launched, tmp_path):
+    """As launch files always did; otherwise only with record:=."""
+    path = tmp_path / "own.yaml"
+    path.write_text("/**/recorder:\n  ros__parameters: {record: a.mcap}\n")
+    lines = launched("robot", params_file=str(path))
+    assert parameters_of(lines, "recorder") == {"record": "a.mcap"}
+    assert "recorder" not in launched("robot")
 
 
 def test_a_parameter_file_of_ones_own_keeps_what_launch_does_not_say(launched, tmp_path):
@@ -202,6 +292,7 @@ def test_a_parameter_file_of_ones_own_keeps_what_launch_does_not_say(launched, t
         "vehicle": "lauv",
         "policy": "runs/a",
         "rate": 30.0,
+        "frame_prefix": "deep/blue/",
     }
     lines = launched("robot", params_file=str(path), policy="pid")
     assert parameters_of(lines, "controller")["policy"] == "pid"
@@ -210,8 +301,9 @@ def test_a_parameter_file_of_ones_own_keeps_what_launch_does_not_say(launched, t
 def test_launch_files_start_what_is_installed(launched):
     """Every executable has an entry point, and every node is one."""
     started = [set(launched(graph)) for graph in ("sim", "pool", "robot")] + [
-        set(launched("robot", teleop="true"))
+        set(launched("robot", teleop="true", record="a.mcap"))
     ]
+    assert set(launched("robot", camera="false")) == {"hardware_bridge", "state_estimation", "controller"}
     assert set().union(*started) == entry_points() == set(GRAPH_NODES)
     run = runpy.run_path(str(NODES / "finssim_ros/run.py"))
     with pytest.raises(AttributeError, match="available: camera"):

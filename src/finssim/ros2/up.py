@@ -7,8 +7,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,7 +27,18 @@ from finssim.vehicles.defaults import vehicle_at
 if TYPE_CHECKING:
     from finssim.ros2.nodes.remote import Watcher
 
-__all__ = ["GRAPHS", "MCU_PORT", "NODES", "Options", "Plan", "plan_of", "run_node", "topics_of"]
+__all__ = [
+    "GRAPHS",
+    "MCU_PORT",
+    "NODES",
+    "Options",
+    "Plan",
+    "launch_arguments",
+    "launched",
+    "plan_of",
+    "run_node",
+    "topics_of",
+]
 
 
 PATIENCE = 10.0
@@ -132,6 +143,8 @@ class Options:
     namespace: str | None = None
     """(NAME) Namespace of the vehicle's topics and prefix of its frames, such as robot_1, if there are several
     vehicles. The vehicle's name, without prefix, if not given."""
+    frame_prefix: str | None = None
+    """(PREFIX/) Prefix of the vehicle's frames in /tf, if not the namespace's."""
     site: str = "pool"
     """(NAME) Site: pool, tank or open-water (DVL and compass instead of a camera)."""
     world: str | None = None
@@ -158,14 +171,14 @@ class Options:
     pictures: str | None = None
     """(ADDRESS) Overhead camera of a robot: udp://HOST:PORT or none; the pool's with --robot pool."""
     pool_file: Path | None = None
-    """(FILE|none) Pool file: read by a robot, written by a virtual pool (.yaml); none without a camera."""
+    """(FILE|none) Pool file: read by a robot, written by a virtual pool (.yaml); none without an overhead camera."""
     plant: str = "1"
     """(SEED|FILE) Plant of a virtual pool: a seed, or a file."""
     severity: str = "realistic"
     """(NAME) Of a drawn plant: nominal, realistic or hard."""
     camera: str | None = None
-    """(KIND) Output of a virtual pool's camera: pictures, corners (of the tags) or none. Default: pictures, in a
-    tank corners."""
+    """(KIND) Output of a virtual pool's camera: pictures, corners (of the tags) or none, which is none for a robot
+    too. Default: pictures, in a tank corners."""
     port: int = 58766
     """UDP port of a virtual pool; images use the next port."""
     truth: Path | None = None
@@ -184,68 +197,119 @@ class Options:
     """Seed of every random number; equal seeds give equal results."""
 
 
-def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
-    """Nodes and parameters.
+LAUNCHED = {
+    "sim": "policy task goal trajectory start hydrodynamics seed record teleop",
+    "robot": "robot bind port pictures camera pool_file let_in policy task goal trajectory record teleop",
+    "pool": "bind port plant severity camera pool_file positioning world start truth seed",
+}
+"""Graph -> options that its launch file takes besides those of every vehicle; arming needs a message there."""
+
+
+def launch_arguments(graph: str) -> list[str]:
+    """Return the options that a graph's launch file takes as arguments."""
+    return f"vehicle namespace frame_prefix site {LAUNCHED[graph]}".split()
+
+
+def launched(graph: str, given: Mapping[str, str]) -> tuple[str, dict[str, dict[str, Any]]]:
+    """Plan a launch file: as `up` does, but what is not given is left to parameter files and nodes.
+
+    The launch file `pool` starts the virtual pool alone, and `robot` the robot in it.
+
+    Args:
+        graph: sim, pool or robot.
+        given: Launch argument -> text, of those that a person gave.
+
+    Returns:
+        Namespace, and node -> parameters.
+
+    Raises:
+        Ros2Error, VehicleError, GoalError, ControlError: As of `plan_of`, or a number that is none.
+    """
+    values: dict[str, Any] = {**given}
+    for name in {"port", "seed"} & given.keys():
+        if not given[name].isdecimal():
+            raise Ros2Error(f"{name}:={given[name]}: expected a whole number")
+        values[name] = int(given[name])
+    nothing = dict.fromkeys((option.name for option in fields(Options)), None)
+    pool_file = given.get("pool_file", "pool.yaml" if graph == "pool" else None)
+    plan = plan_of(graph, Options(**{**nothing, **values}), pool_file)
+    nodes = [node for node in plan.nodes if graph != "pool" or node not in ROBOT]
+    shared = plan.parameters["/**"]
+    return plan.namespace, {node: {**shared, **plan.parameters.get(node, {})} for node in nodes}
+
+
+def plan_of(graph: str, options: Options, pool_file: Path | str | None) -> Plan:
+    """Return nodes and parameters; an option that is None leaves a parameter to the node.
 
     Args:
         graph: sim, pool or robot.
         options: As the person chose.
-        pool_file: That robot's nodes read, and the virtual pool writes.
+        pool_file: That robot's nodes read, and the virtual pool writes; None: the nodes' own.
 
     Raises:
-        Ros2Error: There is no such graph, or a robot without pool file.
+        Ros2Error: There is no such graph.
         VehicleError, GoalError, ControlError: A vehicle, goal or trajectory that cannot be used.
     """
-    o, vehicle = options, vehicle_at(options.site, load_vehicle(options.vehicle))
-    blind = o.site == "open-water" or str(o.pool_file) == "none"
-    if o.goal is not None or o.trajectory is not None:
+    o, vehicle = options, vehicle_at(options.site or "pool", load_vehicle(options.vehicle or "finsrov"))
+    blind = o.site == "open-water" or "none" in (str(o.pool_file), o.camera)
+    if o.vehicle is not None and (o.goal is not None or o.trajectory is not None):
         check_reachable(guide_of(o.goal, o.trajectory), vehicle)
     extra = (*(("recorder",) if o.record else ()), *(("teleop",) if o.teleop else ()))
     namespace = o.namespace or vehicle.name.replace("-", "_")
-    sees = o.world is not None or o.pictures is not None
+    sees = o.world is not None or o.pictures not in (None, "none")
     plan = Plan(graph, o.vehicle, namespace, extra=extra, blind=blind, sees=sees)
-    if graph == "robot" and o.pool_file is None and not blind:
+    if (
+        graph == "robot" and not blind and o.pool_file is None and pool_file is not None
+    ):  # our own, still unwritten
         raise Ros2Error("a robot needs its pool file: give --pool-file, or none without a camera")
-    plan.set("/**", site=o.site, frame_prefix=f"{o.namespace}/" if o.namespace else None)
+    prefix = o.frame_prefix or (f"{o.namespace}/" if o.namespace else None)
+    plan.set("/**", site=o.site, frame_prefix=prefix)
     plan.set("controller", policy=o.policy, task=o.task, goal=o.goal, trajectory=o.trajectory)
     plan.set("sim", start=o.start, hydrodynamics=o.hydrodynamics, seed=o.seed)
-    _wire(plan, o)
+    if graph != "sim":
+        _wire(plan, o)
+    located = None if pool_file is None else str(pool_file)
     for node in ("camera", "localizer", "state_estimation"):
-        plan.set(node, pool_file="none" if blind else str(pool_file))
+        plan.set(node, pool_file="none" if blind else located)
     if o.let_in is not None:
         place_of(o.let_in)  # refuses what is none
         plan.set("state_estimation", let_in=o.let_in, mode="error-state")
     if o.record is not None:
-        located = graph != "sim" and not blind
-        plan.set("recorder", record=str(o.record), pool_file=str(pool_file) if located else None)
-    plan.set("teleop", device=o.teleop, other=o.policy if o.policy.startswith("pid") else "policy")
+        plan.set("recorder", record=str(o.record), pool_file=None if graph == "sim" or blind else located)
+    named = o.policy is None or o.policy.startswith("pid")
+    plan.set("teleop", device=o.teleop, other=o.policy if named else "policy")
+    camera = o.camera or (None if o.site is None else "corners" if o.site == "tank" else "pictures")
     if graph == "pool":
         plan.set(
             "virtual_pool",
             plant=o.plant,
             severity=o.severity,
-            camera="none" if blind else o.camera or ("corners" if o.site == "tank" else "pictures"),
+            camera="none" if blind else camera,
             port=o.port,
             seed=o.seed,
             positioning=o.positioning,
             world=o.world,
+            bind=o.bind,
+            pool_file=None if blind else located,
+            start=o.start,
+            truth=None if o.truth is None else str(o.truth),
         )
-        plan.set("virtual_pool", bind=o.bind, pool_file=None if blind else str(pool_file), start=o.start)
-        plan.set("virtual_pool", truth=None if o.truth is None else str(o.truth))
     return plan
 
 
 def _wire(plan: Plan, o: Options) -> None:
     """Addresses: pictures come from the port after the motor controller's, to the port after our own end's."""
-    host, _, port = o.bind.rpartition(":")
-    if not port.isdecimal():
-        raise Ros2Error(f"--bind {o.bind}: expected ADDRESS:PORT")
-    pool = plan.graph == "pool" or o.robot == "pool"
-    address = f"udp://127.0.0.1:{o.port}" if pool else o.robot
-    camera = o.pictures or (f"udp://127.0.0.1:{o.port + 1}" if pool else "none")
-    plan.set("/**", robot=address)
+    if o.bind is not None:
+        host, _, port = o.bind.rpartition(":")
+        if not port.isdecimal():
+            raise Ros2Error(f"--bind {o.bind}: expected ADDRESS:PORT")
+        plan.set("camera", pictures_bind=f"{host}:{int(port) + 1}")
+    pool = plan.graph == "pool" or o.robot in (None, "pool")
+    here = f"udp://127.0.0.1:{o.port}" if pool and o.port is not None else None
+    eye = f"udp://127.0.0.1:{o.port + 1}" if here else None if pool else "none"
+    plan.set("/**", robot=here or o.robot)
     plan.set("hardware_bridge", bind=o.bind, need_reading=False if o.teleop else None)
-    plan.set("camera", pictures=camera, pictures_bind=f"{host}:{int(port) + 1}")
+    plan.set("camera", pictures=o.pictures or eye)
 
 
 def up(graph: str, *, options: Options, notify: Callable[[str], None] = print) -> int:
@@ -361,7 +425,7 @@ class Plan:
     """A graph before it lives."""
 
     graph: str
-    vehicle: str
+    vehicle: str | None
     namespace: str
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Node, or `/**` for all -> parameters."""
@@ -375,7 +439,7 @@ class Plan:
     def __post_init__(self) -> None:
         if self.graph not in GRAPHS:
             raise Ros2Error(f"unknown graph '{self.graph}'; available: {', '.join(GRAPHS)}")
-        everywhere: dict[str, Any] = {"vehicle": self.vehicle}
+        everywhere: dict[str, Any] = {} if self.vehicle is None else {"vehicle": self.vehicle}
         if self.graph == "sim":
             everywhere["use_sim_time"] = True
             self.set("sim", use_sim_time=False)

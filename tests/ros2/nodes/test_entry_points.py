@@ -86,6 +86,19 @@ def test_an_installed_node_refuses_a_missing_file_in_a_sentence(entry, lived, ca
     assert "gone.yaml" in capsys.readouterr().err and not Path("x.mcap").exists()
 
 
+def test_a_recorder_without_a_pool_records(entry, lived, tmp_path):
+    """pool_file:=none is no file to be copied; a localizer without one has nothing to do, and says so."""
+    record = tmp_path / "x.mcap"
+    assert entry("recorder", "--ros-args", "-p", "pool_file:=none", "-p", f"record:={record}") == 0
+    assert lived and record.exists()
+
+
+def test_a_localizer_without_a_pool_is_refused(entry, lived, capsys):
+    """In a sentence that says what to do."""
+    assert entry("localizer", "--ros-args", "-p", "pool_file:=none") == 2 and not lived
+    assert "start none where no camera looks" in capsys.readouterr().err
+
+
 def test_an_older_workspace_that_gives_no_arguments_keeps_those_of_the_process(monkeypatch, lived, capsys):
     """Its functions call `run_node` with the name alone."""
     monkeypatch.setattr(RobotNode, "listening", 0.0)

@@ -1,6 +1,8 @@
-"""What the launch files share: arguments that win over parameter files, but only where somebody gave them."""
+"""Launch files from the options of `finssim ros2 up`; arguments win over parameter files, but only where given."""
 
 import os
+import re
+from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
@@ -8,64 +10,50 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-COMMON = {
-    "vehicle": ("", "vehicle of the catalogue, or its YAML file; finsrov where neither this nor a file says"),
-    "namespace": ("finsrov", "what the vehicle's topics stand below"),
-    "frame_prefix": ("", "of the vehicle's own frames in /tf, such as robot_1/, where several share a graph"),
-    "site": ("", "pool, tank or open-water"),
-    "params_file": ("", "your own parameter file, in place of the package's"),
-}
+from finssim.command_line import read
+from finssim.ros2.up import launch_arguments, launched
 
-EVERYWHERE = ("vehicle", "frame_prefix", "site")
-"""Parameters of every node."""
+OLDER = {"camera": {"true": "", "false": "none"}, "teleop": {"true": "joy", "false": ""}}
+"""Words of earlier launch files, and what they are now."""
+FILE = "params_file"
 
 
-def description(graph, arguments, nodes):
-    """A launch description.
-
-    Args:
-        graph: Name of the package's parameter file.
-        arguments: Launch argument -> (default, meaning); an argument left empty leaves a parameter to the file.
-        nodes: Function of the arguments' values that gives executable -> its parameters, all but `EVERYWHERE`.
-    """
-    declared = {**COMMON, **arguments}
+def description(graph):
+    """Return the launch description of a graph; an argument left empty leaves a parameter to the file."""
+    options = read("finssim.ros2.up:Options").options
+    meanings = {option.name: f"{option.metavar or 'NUMBER'}: {option.help}" for option in options}
+    declared = {name: meanings[name] for name in launch_arguments(graph)}
+    declared[FILE] = "FILE: Your own parameter file, in place of the package's."
     own = os.path.join(get_package_share_directory("finssim_ros"), "config", f"{graph}.yaml")
 
     def start(context):
-        given = {name: context.launch_configurations[name] for name in declared}
+        words = {name: context.launch_configurations[name] for name in declared}
+        words = {name: OLDER.get(name, {}).get(word.lower(), word) for name, word in words.items()}
+        file = words.pop(FILE) or own
+        namespace, nodes = launched(graph, {name: word for name, word in words.items() if word})
+        if graph != "pool" and re.search(r"^[^#]*\brecord:", Path(file).read_text(), re.MULTILINE):
+            nodes.setdefault("recorder", {})
         return [
             Node(
                 package="finssim_ros",
-                executable=executable,
+                executable=node,
                 # With name and namespace launch_ros writes the parameters below the node's full name; without, below
                 # /**, which loses against every node that a file names after a /** of its own.
-                name=executable,
-                namespace=given["namespace"],
-                parameters=[
-                    given["params_file"] or own,
-                    *_given({**{name: given[name] for name in EVERYWHERE}, **parameters}),
-                ],
+                name=node,
+                namespace=namespace,
+                parameters=[file, *([_words(parameters)] if parameters else [])],
                 output="screen",
             )
-            for executable, parameters in nodes(given).items()
+            for node, parameters in nodes.items()
         ]
 
-    return LaunchDescription(
-        [
-            *(
-                DeclareLaunchArgument(n, default_value=d, description=text)
-                for n, (d, text) in declared.items()
-            ),
-            OpaqueFunction(function=start),
-        ]
-    )
+    arguments = [DeclareLaunchArgument(n, default_value="", description=d) for n, d in declared.items()]
+    return LaunchDescription([*arguments, OpaqueFunction(function=start)])
 
 
-def _given(parameters):
-    """A dictionary of those that were given, if any; words stay words, whatever they look like."""
-    given = {
+def _words(parameters):
+    """Return parameters whose words stay words, whatever they look like."""
+    return {
         name: ParameterValue(value, value_type=str) if isinstance(value, str) else value
         for name, value in parameters.items()
-        if value != ""
     }
-    return [given] if given else []

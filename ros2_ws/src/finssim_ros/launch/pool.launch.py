@@ -2,14 +2,6 @@
 
 from finssim_ros.launching import description
 
-ARGUMENTS = {
-    "severity": ("", "nominal, realistic or hard"),
-    "plant": ("", "seed or file of the plant"),
-    "pool_file": ("pool.yaml", "file to write its calibrated pool and camera to, for the robot"),
-}
-
 
 def generate_launch_description():
-    return description(
-        "pool", ARGUMENTS, lambda given: {"virtual_pool": {name: given[name] for name in ARGUMENTS}}
-    )
+    return description("pool")

@@ -2,12 +2,6 @@
 
 from finssim_ros.launching import description
 
-ARGUMENTS = {"policy": ("", "directory of an exported policy, pid or pid-paper")}
-
 
 def generate_launch_description():
-    return description(
-        "sim",
-        ARGUMENTS,
-        lambda given: {"sim": {}, "controller": {"policy": given["policy"], "use_sim_time": True}},
-    )
+    return description("sim")

@@ -27,7 +27,10 @@ class Localizer(RobotNode):
 
     def __init__(self) -> None:
         super().__init__("localizer")
-        self.pool = load_pool(self.parameter("pool_file", "pool.yaml"))
+        file = self.parameter("pool_file", "pool.yaml")
+        if file == "none":
+            raise ValueError("pool_file is none, but a localizer needs one: start none where no camera looks")
+        self.pool = load_pool(file)
         method = self.parameter("method", "refractive")
         self.perception = Perception(self.vehicle, self.pool, method=method)
         self.perception.fixes = self.fixes = _Kept(self.perception.fixes)

@@ -29,7 +29,7 @@ class RecorderNode(RobotNode):
         if not path:
             self.get_logger().info("nothing is recorded: give a file by the parameter record")
             return
-        files = {"pool.yaml": pool_file} if pool_file else {}
+        files = {"pool.yaml": pool_file} if pool_file not in ("", "none") else {}
         names = {key: self.resolve_topic_name(self.topic(key)) for key in self.table}
         self.mcap = _WireRecord(Path(path), self.filed, {"command": "ros2 recorder"}, files, names)
         for key, topic in self.table.items():
