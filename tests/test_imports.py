@@ -33,6 +33,7 @@ ARROWS = {
 
 FOUNDATION = {
     "",
+    "budget",
     "files",
     "mcap_files",
     "page",
@@ -130,6 +131,7 @@ HOMES = {
         "ros2/codec.py",
     },
     "cv2": {
+        "budget.py",
         "calibration/vision/camera.py",
         "calibration/vision/pool_fit.py",
         "localization/detection/pictures.py",

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from finssim.budget import CHUNK as CHUNK_BYTES
+
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
 ATTACHMENT, METADATA, DATA_END = 0x09, 0x0C, 0x0F
@@ -19,9 +21,6 @@ LAYOUTS = {
     HEADER: "ss", SCHEMA: "2ssm", CHANNEL: "22sst", MESSAGE: "2488", ATTACHMENT: "88ssb4", METADATA: "st", DATA_END: "4"
 }  # fmt: skip
 """Kind -> its parts: so many bytes; text (s), bytes (m) or a table (t) after 4 bytes of length, bytes (b) after 8."""
-LARGEST = 1 << 30
-"""Chunk that is unpacked [bytes]."""
-
 END = struct.pack("<BQI", DATA_END, 4, 0) + struct.pack("<BQQQI", FOOTER, 20, 0, 0, 0) + MAGIC
 """What closes a file without a summary: end of data without a checksum, an empty footer, the magic."""
 TAIL = 29 + len(MAGIC)
@@ -141,7 +140,7 @@ def _sound_chunk(body: bytes) -> bool:
         return False
     size, crc, length = struct.unpack_from("<QII", body, 16)
     compression, begin = body[32 : 32 + length], 40 + length
-    if size > LARGEST or len(body) != begin + int.from_bytes(body[32 + length : begin], "little"):
+    if size > CHUNK_BYTES or len(body) != begin + int.from_bytes(body[32 + length : begin], "little"):
         return False
     try:
         records = _unpacked(compression.decode("ascii"), body[begin:])
@@ -201,11 +200,11 @@ def _unpacked(compression: str, packed: bytes) -> bytes:
             from compression import zstd  # since Python 3.14
         except ImportError:
             from backports import zstd
-        return bytes(zstd.ZstdDecompressor().decompress(packed, LARGEST))
+        return bytes(zstd.ZstdDecompressor().decompress(packed, CHUNK_BYTES))
     if compression == "lz4":
         import lz4.frame
 
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, LARGEST))
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, CHUNK_BYTES))
     return b""
 
 

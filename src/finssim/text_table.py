@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from finssim.budget import TEXT, read_bytes
 from finssim.files import atomic_write
 
 EMPTY = frozenset({"", "nan", "none", "null", "na", "n/a", "-", "--"})
@@ -73,10 +74,7 @@ def read_text(path: str | os.PathLike[str], error: type[Exception]) -> tuple[str
         path: The file.
         error: What is raised where it cannot be read.
     """
-    try:
-        raw = Path(path).read_bytes()
-    except OSError as reason:
-        raise error(f"{path}: cannot be read: {reason.strerror or reason}") from None
+    raw = read_bytes(Path(path), error, limit=TEXT)
     intact = raw.split(b"\0", 1)[0]
     try:
         text = intact.decode("utf-8-sig")

@@ -9,6 +9,8 @@ from typing import Any
 
 import yaml
 
+from finssim.budget import read_bytes
+
 LONGEST = 32 << 20
 """Of a YAML file [bytes]."""
 LARGEST = 200_000
@@ -172,10 +174,7 @@ def read_json(path: Path, refuse: type[Exception], *, such_as: str) -> dict[str,
     Raises:
         refuse: The file is missing or unreadable, no JSON, or holds no mapping with that key.
     """
-    try:
-        tree = json_value(path.read_bytes(), refuse, str(path))
-    except OSError as error:
-        raise refuse(f"{path}: cannot be read: {error.strerror or error}") from None
+    tree = json_value(read_bytes(path, refuse), refuse, str(path))
     if not isinstance(tree, dict) or such_as not in tree:
         raise refuse(f"{path}: expected a JSON object with the key '{such_as}'")
     return tree

@@ -136,7 +136,7 @@ def test_a_missing_directory_or_file_is_named(folder):
     with pytest.raises(PolicyError, match="nowhere: no such policy directory"):
         Policy.load(folder / "nowhere")
     (folder / "policy.onnx").unlink()
-    with pytest.raises(PolicyError, match=r"policy\.onnx: cannot be read \(No such file or directory\)"):
+    with pytest.raises(PolicyError, match=r"policy\.onnx: cannot be read: No such file or directory"):
         Policy.load(folder)
     (folder / "policy.yaml").unlink()
     with pytest.raises(PolicyError, match=r"policy\.yaml: cannot be read"):
@@ -148,7 +148,13 @@ def test_a_missing_directory_or_file_is_named(folder):
     [
         ({"format": 2}, "format is 2, but this version reads format 1"),
         ({"colour": "red"}, "colour: Extra inputs are not permitted"),
-        ({"control_period": -0.1}, "control_period: Input should be greater than 0"),
+        ({"control_period": -0.1}, "control_period: Input should be greater than or equal to 0.001"),
+        ({"control_period": 1e-9}, "control_period: Input should be greater than or equal to 0.001"),
+        ({"memory": 10**12}, "memory: Input should be less than or equal to 1048576"),
+        (
+            {"observation": {"size": 10**12, "entries": []}},
+            "size: Input should be less than or equal to 1048576",
+        ),
         ({"control_period": float("inf")}, "control_period: Input should be less than or equal to 10"),
         (
             {"action": {"mode": "wrench2"}},
@@ -215,3 +221,30 @@ def test_running_a_policy_needs_no_torch(folder):
         "assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_network_with_other_names_is_refused(folder):
+    """An input that is called otherwise would fail at the first action."""
+    write(folder, network().replace(b"observation", b"observatlon"))
+    with pytest.raises(PolicyError, match="maps observatlon to action, expected observation to action"):
+        Policy.load(folder)
+
+
+def test_a_network_that_takes_too_much_memory_is_refused(folder):
+    """Two weights of 400 kB whose product has 10^10 numbers."""
+    wide = numpy_helper.from_array(np.ones((100_000, 1), np.float32), "wide")
+    nodes = [helper.make_node("MatMul", ["observation", "gain"], ["x"])]
+    nodes += [
+        helper.make_node("MatMul", ["wide", "tall"], ["y"]),
+        helper.make_node("ReduceSum", ["y"], ["z"]),
+    ]
+    nodes += [helper.make_node("Add", ["x", "z"], ["action"])]
+    x = helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["N", 3])
+    y = helper.make_tensor_value_info("action", TensorProto.FLOAT, ["N", 2])
+    tall = numpy_helper.from_array(np.ones((1, 100_000), np.float32), "tall")
+    weights = [numpy_helper.from_array(GAIN.T.copy(), "gain"), wide, tall]
+    graph = helper.make_graph(nodes, "policy", [x], [y], weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    write(folder, model.SerializeToString())
+    with pytest.raises(PolicyError, match="not a network onnxruntime can run"):
+        Policy.load(folder)

@@ -1,6 +1,7 @@
 """World and sensor files: the catalogue loads, what cannot be is refused in one sentence, formulas of sound."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from finssim.geometry.rotations import quat_rotate
 from finssim.sensors.overhead_camera import Water
 from finssim.worlds.description import (
+    DEVICES,
     SITES,
     Object,
     WorldError,
@@ -64,8 +66,13 @@ def test_every_sensor_says_where_its_figures_are_from(name):
         ("size: [20, 10]", "size: [20, 0]", "seabed: size is [20.0, 0.0], expected 2 numbers > 0"),
         ("slope: [0.1, 0.0]", "slope: [0.1, .inf]", "seabed: slope holds inf, expected 2 numbers"),
         ("depth: 3.0", "depth: 3.0, heights: ../x.csv", "has a separator of folders"),
-        ("depth: 3.0", "depth: 3.0, heights: none.csv", "cannot read none.csv"),
+        ("depth: 3.0", "depth: 3.0, heights: none.csv", "none.csv: cannot be read"),
         ("spacing: 1.0", "spacing: 0.001", "more than 1048576 heights"),
+        ("size: [20, 10], spacing: 1.0", "size: [2e6, 1e-6], spacing: 1.0", "more than 1048576 heights"),
+        ("radius: 0.3", "radius: 1e308", "objects: ball: radius holds 1e+308, expected 0 or a number from 1e-09 to"),
+        ("position: [0, 1, 0]", "position: [0, -1e12, 0]", "objects: ball: position holds -1e+12, expected"),
+        ("radius: 0.3", "radius: 0.3, texture: {kind: mottled, size: 1e-300}", "texture: size holds 1e-300, expected"),
+        ("radius: 0.3", "radius: 0.3, texture: {kind: mottled, size: 1e-6}", "size is 1e-06, expected >= 0.0001"),
         ("daylight_attenuation: [0.3", "daylight_attenuation: [0.5", "diffuse light fades no faster than a beam"),
         ("about: A ball over a floor.", "about: A ball.\nname: x", "unknown key 'name'"),
         ("shape: sphere, position: [0, 1, 0]", "shape: mesh, file: a.stl, position: [0, 1, 0]", "has no radius"),
@@ -85,6 +92,16 @@ def test_a_sensor_of_no_kind_and_a_site_of_no_name_are_refused(tmp_path):
         load_device(written(tmp_path, "kind: radar\n"))
     with pytest.raises(WorldError, match="kind is \\['camera'\\], expected one of"):
         load_device(written(tmp_path, "kind: [camera]\n"))
+    camera = (DEVICES / "low_light_camera.yaml").read_text()
+    for key in ("width", "height"):
+        camera = re.sub(rf"(?m)^{key}: \d+", f"{key}: 8192", camera)
+    with pytest.raises(WorldError, match="8192 x 8192 pixels, expected at most 8 million"):
+        load_device(written(tmp_path, camera))
+    sonar = (DEVICES / "oculus_m750d.yaml").read_text()
+    for key in ("beams", "bins"):
+        sonar = re.sub(rf"(?m)^{key}: \d+", f"{key}: 4096", sonar)
+    with pytest.raises(WorldError, match="4096 beams with 4096 bins .* expected at most 8 million"):
+        load_device(written(tmp_path, sonar))
     with pytest.raises(WorldError, match="unknown site 'dok', did you mean 'dock'?"):
         load_world("dok")
 

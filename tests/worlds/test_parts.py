@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from finssim.geometry.mesh import write_stl
 from finssim.geometry.rotations import quat_to_matrix
 from finssim.worlds import WorldError, WorldLayout
 from finssim.worlds.parts import PartsError, parts_of
@@ -59,6 +60,7 @@ def write(folder, name, text):
     return folder / name
 
 
+@pytest.mark.slow
 def test_an_mjcf_is_its_geoms_at_rest(tmp_path):
     """A turned box, a capsule between two points, and a mesh that MuJoCo has moved to its centre of mass."""
     pytest.importorskip("mujoco")
@@ -74,6 +76,7 @@ def test_an_mjcf_is_its_geoms_at_rest(tmp_path):
     assert all(np.abs(corners - corner).max(axis=1).min() < 1e-5 for corner in expected)
 
 
+@pytest.mark.slow
 def test_a_urdf_is_its_collision_shapes(tmp_path):
     """A cylinder that lies along y, 0.4 m up."""
     pytest.importorskip("mujoco")
@@ -83,6 +86,7 @@ def test_a_urdf_is_its_collision_shapes(tmp_path):
     np.testing.assert_allclose(part.position, [0, 0, 0.4], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_usd_stage_becomes_metres_with_z_up(tmp_path):
     """Centimetres with y up: what is up there is up here, and what comes towards the viewer goes along -y."""
     pytest.importorskip("pxr", reason="usd-core is not installed")
@@ -99,6 +103,7 @@ def test_a_usd_stage_becomes_metres_with_z_up(tmp_path):
     assert tile.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
+@pytest.mark.slow
 def test_a_model_stands_in_a_world_with_its_own_colours(tmp_path):
     """Twice as large, moved and turned as its object; a colour of the world file comes before the model's."""
     pytest.importorskip("mujoco")
@@ -134,6 +139,94 @@ def test_files_outside_the_folder_are_refused_however_they_are_named(tmp_path):
         parts_of(write(tmp_path / "own", "rack.usda", layered))
 
 
+SHAPE = "<worldbody><geom type='sphere' size='0.1'/></worldbody>"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "key", ["model name='s'", "mesh name='s'", "texture type='cube' fileup='a.png' name='s'"]
+)
+def test_files_that_a_model_reaches_through_another_are_of_its_folder(tmp_path, key):
+    """A model in a model names its own folder of meshes, outside of this one; a link leads there."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "own").mkdir()
+    inner = (
+        f"<mujoco><compiler meshdir='{tmp_path}'/><asset><mesh name='m' file='secret.stl'/></asset></mujoco>"
+    )
+    write(tmp_path / "own", "s.xml", inner)
+    model = f"<mujoco><asset><{key} file='s.xml'/></asset>{SHAPE}</mujoco>"
+    with pytest.raises(PartsError, match=f"names the file '{tmp_path}'"):
+        parts_of(write(tmp_path / "own", "rack.xml", model))
+    (tmp_path / "own" / "s.xml").unlink()
+    (tmp_path / "own" / "s.xml").symlink_to(write(tmp_path, "secret.xml", "<mujoco/>"))
+    with pytest.raises(PartsError, match="names the file 's.xml', which is a link"):
+        parts_of(tmp_path / "own" / "rack.xml")
+
+
+@pytest.mark.slow
+def test_a_model_may_name_files_of_its_folder_and_below(tmp_path):
+    """A file that it includes, and in a folder below a mesh, of which another model has a copy."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "meshes").mkdir()
+    write_stl(tmp_path / "meshes" / "a.stl", np.eye(4, 3, k=-1), [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+    mesh = "<compiler meshdir='meshes'/><asset><mesh name='m' file='a.stl'/></asset>"
+    body = "<worldbody><body name='b'><geom type='mesh' mesh='m'/></body></worldbody>"
+    write(tmp_path, "mesh.xml", f"<mujoco>{mesh}</mujoco>")
+    write(tmp_path, "s.xml", f"<mujoco>{mesh}{body}</mujoco>")
+    text = "<mujoco><include file='mesh.xml'/><asset><model name='s' file='s.xml'/></asset>" + body.replace(
+        "</worldbody>", "<attach model='s' body='b' prefix='x_'/></worldbody>"
+    )
+    assert [part.kind for part in parts_of(write(tmp_path, "rack.xml", f"{text}</mujoco>"))] == [
+        "mesh",
+        "mesh",
+    ]
+
+
+@pytest.mark.parametrize(
+    "times, deep, sentence", [(2, 25, "more than 100000 elements"), (1, 1500, "50 deep")]
+)
+def test_includes_of_includes_are_counted_before_any_is_followed(tmp_path, times, deep, sentence):
+    """2^25 elements in 25 files, and a chain of 1500 files."""
+    for i in range(deep):
+        write(
+            tmp_path,
+            f"{i}.xml",
+            f"<mujoco>{times * f'<include file={chr(34)}{i + 1}.xml{chr(34)}/>'}</mujoco>",
+        )
+    write(tmp_path, f"{deep}.xml", "<mujoco/>")
+    with pytest.raises(PartsError, match=sentence):
+        parts_of(tmp_path / "0.xml")
+    write(tmp_path, "0.xml", "<mujoco><include file='0.xml'/></mujoco>")
+    with pytest.raises(PartsError, match="includes '0.xml' in itself"):
+        parts_of(tmp_path / "0.xml")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "text, sentence",
+    [
+        (
+            "<asset><hfield name='h' nrow='30000' ncol='30000' size='1 1 1 1'/></asset>" + SHAPE,
+            "memory|allocate",
+        ),
+        (
+            "<worldbody><geom type='box' size='1e308 1 1'/></worldbody>",
+            "is not a model|expected less than 100000",
+        ),
+        (
+            "<worldbody><geom type='box' size='1 1 1' pos='1e200 0 0'/></worldbody>",
+            "expected less than 100000",
+        ),
+    ],
+)
+def test_a_model_that_takes_too_much_is_refused(tmp_path, text, sentence):
+    """A height field of 3.6 GB, and numbers without bounds."""
+    pytest.importorskip("mujoco")
+    with pytest.raises(PartsError, match=sentence):
+        parts_of(write(tmp_path, "rack.xml", f"<mujoco>{text}</mujoco>"))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [

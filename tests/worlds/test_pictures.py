@@ -82,8 +82,15 @@ def test_textures_that_cannot_be_are_refused(tmp_path):
         WorldError, match=r"texture: file is for kind: picture, which needs it; kind is picture"
     ):
         make(tmp_path, PLATE.format("{kind: picture, size: 0.8}"))
-    with pytest.raises(WorldError, match="cannot read none.png: give a PNG or JPEG"):
+    with pytest.raises(WorldError, match="none.png is not there: give a PNG or JPEG"):
         make(tmp_path, PLATE.format("{kind: picture, file: none.png, size: 0.8}"))
+    (tmp_path / "huge.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (60_000).to_bytes(4, "big") * 2
+    )
+    with pytest.raises(
+        WorldError, match="huge.png is a picture of 60000 x 60000 pixels.*: give a PNG or JPEG"
+    ):
+        make(tmp_path, PLATE.format("{kind: picture, file: huge.png, size: 0.8}"))
     with pytest.raises(WorldError, match="tag 99999 of 4x4_50: it has 50 tags"):
         make(tmp_path, PLATE.format("{kind: tag, tag: 99999, family: 4x4_50, size: 0.8}"))
     with pytest.raises(WorldError, match="tag 1 of 9x9: no such family"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,12 +18,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from finssim.budget import SECONDS, limited_memory, read_bytes
 from finssim.yaml_file import first_problem, read_mapping
 
 # What a policy directory says of itself: `policy.yaml`, its schema and how two of them are compared.
 
 
 FORMAT = 1
+LARGEST = 1 << 20
+"""Numbers in an observation, an action or a memory."""
 """Version of the directory's layout; raised when an older reader would misread it."""
 
 NETWORK_FILE = "policy.onnx"
@@ -55,7 +59,7 @@ class ObservationEntry(_Record):
 class ObservationSchema(_Record):
     """The observation's layout: which quantity stands where, in which unit and scale."""
 
-    size: int = Field(gt=0)
+    size: int = Field(gt=0, le=LARGEST)
     entries: tuple[ObservationEntry, ...]
 
     @model_validator(mode="after")
@@ -89,9 +93,9 @@ class PolicyDescription(_Record):
     (height, width, 3), rate [Hz] and latency [s]."""
     action: dict[str, Any]
     """The action mode, as its `describe()` gives it: at least `mode` (name), `size`, and its limits and scale."""
-    control_period: float = Field(gt=0.0, le=10.0)
+    control_period: float = Field(ge=1e-3, le=10.0)
     """Time between two actions [s]."""
-    memory: int = Field(default=0, ge=0)
+    memory: int = Field(default=0, ge=0, le=LARGEST)
     """Numbers that the network hands on to its next action, zeros at an episode's start; 0: it remembers nothing."""
     vehicle: VehicleIdentity
     hydrodynamics: str
@@ -116,7 +120,7 @@ class PolicyDescription(_Record):
     def _names_mode_and_size(cls, action: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(action.get("mode"), str):
             raise ValueError("needs `mode`, the action mode's name")
-        if not isinstance(action.get("size"), int) or action["size"] < 1:
+        if not isinstance(action.get("size"), int) or not 1 <= action["size"] <= LARGEST:
             raise ValueError(f"size is {action.get('size')!r}, expected a positive whole number")
         return action
 
@@ -129,10 +133,9 @@ class PolicyDescription(_Record):
 def read_file(path: Path) -> bytes:
     """Content of one file of a policy directory; a `PolicyError` where it cannot be read."""
     try:
-        return path.read_bytes()
-    except OSError as error:
-        sentence = f"{path}: cannot be read ({error.strerror}): this is not a complete policy directory"
-        raise PolicyError(sentence) from error
+        return read_bytes(path, PolicyError)
+    except PolicyError as error:
+        raise PolicyError(f"{error}: this is not a complete policy directory") from error
 
 
 def read_description(folder: Path) -> PolicyDescription:
@@ -343,11 +346,16 @@ def _open_network(folder: Path, description: PolicyDescription) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
+
+    def refused(error: Exception) -> PolicyError:
+        reason = " ".join(str(error).split())[:300]
+        return PolicyError(f"{path}: not a network onnxruntime can run ({reason})")
+
     try:
-        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        with limited_memory():
+            session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a class per error code, with no common base but Exception
-        reason = " ".join(str(error).split())
-        raise PolicyError(f"{path}: not a network onnxruntime can run ({reason})") from error
+        raise refused(error) from error
     k = [description.memory] if description.memory else []
     shapes: list[Any] = [tuple(picture["shape"]) for picture in description.pictures.values()]
     described: list[list[Any]] = [[description.observation.size, *k, *shapes], [description.action_size, *k]]
@@ -361,6 +369,31 @@ def _open_network(folder: Path, description: PolicyDescription) -> Any:
             f"{path}: maps {sides_text[0][0]} values to {sides_text[0][1]}, but {DESCRIPTION_FILE} describes "
             f"{sides_text[1][0]} to {sides_text[1][1]}"
         )
+    names = [[tensor.name for tensor in side] for side in (session.get_inputs(), session.get_outputs())]
+    expected_names = [
+        ["observation", *(["memory"] if k else []), *description.pictures],
+        OUTPUTS[: 1 + len(k)],
+    ]
+    if names != expected_names:
+        here, there = (" to ".join(", ".join(side) for side in sides) for sides in (names, expected_names))
+        raise PolicyError(f"{path}: maps {here}, expected {there}: export it with these names")
+    zeros: dict[str, Any] = {"observation": np.zeros((1, description.observation.size), np.float32)}
+    zeros |= {"memory": np.zeros((1, *k), np.float32)} if k else {}
+    zeros |= {
+        name: np.zeros((1, *shape), np.uint8)
+        for name, shape in zip(description.pictures, shapes, strict=True)
+    }
+    stop = onnxruntime.RunOptions()
+    timer = threading.Timer(SECONDS, setattr, (stop, "terminate", True))
+    timer.daemon = True
+    timer.start()
+    try:  # once, so that what it needs shows here and not on the way
+        with limited_memory():
+            session.run(names[1], zeros, stop)
+    except Exception as error:
+        raise refused(error) from error
+    finally:
+        timer.cancel()
     return session
 
 

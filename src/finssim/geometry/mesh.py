@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from finssim.budget import read_bytes
+
 # Hull shapes in the cube [-1, 1]³: ellipsoid, tube, rounded box, and the open frame of a small ROV.
 
 _ROUND = 0.5  # reciprocal exponent of a circle
@@ -138,7 +140,7 @@ def load_stl(path: str | Path) -> tuple[Vertices, Faces]:
     Raises:
         MeshError: The file is neither form of STL, is cut short, holds no triangle, or a number beyond reason.
     """
-    data = Path(path).read_bytes()
+    data = read_bytes(Path(path), MeshError)
     triangles = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
     # A binary file may begin with "solid" too, so its length decides, not its first word.
     if len(data) == 84 + 50 * triangles:

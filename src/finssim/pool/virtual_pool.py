@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from finssim.budget import read_bytes
 from finssim.pool.firmware import Firmware, PoolSensors, Sample
 from finssim.pool.plant import RPM, Plant
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError
@@ -139,13 +140,11 @@ def read_truth(path: str | Path) -> Truth:
     Raises:
         TruthError: It is not there or no truth file.
     """
+    data = read_bytes(Path(path), TruthError, limit=1 << 30)
     try:
-        data = Path(path).read_bytes()
         header = json_value(data[: data.index(b"\n")], TruthError, str(path))
         if header["format"] != FORMAT:
             raise KeyError
-    except OSError as error:
-        raise TruthError(f"{path}: cannot be read: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError):
         raise TruthError(f"{path}: is no truth file: give one that 'finssim pool --truth' wrote") from None
     n = len(header["thrusters"])

@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from finssim.budget import decoded_picture
 from finssim.localization.detection.detector import RegionTracker, detector
 from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import UdpTransport, host_port
@@ -50,8 +51,8 @@ def picture_of(data: Image | bytes, *, colour: bool = False) -> Image | None:
     import cv2
 
     kind = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), kind) if len(data) else None
-    return None if image is None else np.asarray(image[..., ::-1] if colour else image, np.uint8)
+    image = decoded_picture(bytes(data), kind)
+    return None if isinstance(image, str) else image[..., ::-1] if colour else image
 
 
 def resized(image: Image | None, shape: Sequence[int]) -> Image:

@@ -6,6 +6,7 @@ green, blue); radiance 1 is that of white paper lying level just below the surfa
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from pathlib import Path
@@ -13,8 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError, model_validator
 
+from finssim.budget import read_bytes
 from finssim.files import plain_name
 from finssim.geometry.mesh import MeshError, load_stl
 from finssim.geometry.optics import LENS_MODELS, Lens, OpticsError
@@ -48,6 +50,10 @@ LARGEST = 4096
 """Shapes in one world."""
 FINEST = 1 << 20
 """Heights of a seabed."""
+PIXELS = 1 << 23
+"""Of a sensor that is computed: pixels, rays, or cells of range and beam."""
+SMALLEST, GREATEST = 1e-9, 1e9
+"""Magnitude of a number in a world or a sensor that is not 0."""
 
 
 class WorldError(ValueError):
@@ -97,7 +103,7 @@ class Texture(Part):
     kind: Literal["checker", "stripes", "tiles", "mottled", "picture", "tag"]
     """Squares of two colours; bands along z; tiles with joints; patches of random brightness, as sand has; a picture or
     a printed tag in the middle of each face, upright along z, on faces across z along y."""
-    size: Positive
+    size: Annotated[float, Field(strict=True, ge=1e-4, le=1e6)]
     """Of a square, a pair of bands, a tile, a patch; width of a picture; edge of a tag's black border [m]."""
     file: str | None = None
     """Of a picture: PNG or JPEG beside the world file."""
@@ -271,7 +277,7 @@ class Seabed(Finish):
             raise refuse_section(f"size is {list(self.size)}, expected 2 numbers > 0")
         if self.size is None and rough:
             raise refuse_section("roughness and heights need a size: add it, such as size: [40, 40]")
-        if self.size is not None and self.size[0] / self.spacing * self.size[1] / self.spacing > FINEST:
+        if self.size is not None and math.prod(max(2.0, x / self.spacing + 1.0) for x in self.size) > FINEST:
             raise refuse_section(f"more than {FINEST} heights: give a smaller size or a wider spacing")
         return self
 
@@ -462,6 +468,8 @@ class World(Part):
     """Largest factor by which colour and glow of each object are drawn darker or brighter, log-uniformly."""
     name: str = Field(exclude=True)
     path: Path = Field(exclude=True)
+    _models: dict[str, list[ModelPart]] = PrivateAttr(default_factory=dict)
+    """Object -> its shapes from a model file, which is read once."""
 
     @model_validator(mode="after")
     def _objects_fit(self) -> World:
@@ -509,13 +517,16 @@ class World(Part):
         """The shapes of an object from a model file, unscaled, in the object's axes."""
         from finssim.worlds.parts import PartsError, parts_of
 
+        if name in self._models:
+            return self._models[name]
         path = self.beside(self.objects[name].file or "", f"objects.{name}: file")
         if not path.is_file():
             raise WorldError(f"{self.path}: objects.{name}: no file {path.name} beside it")
         try:
-            return parts_of(path)
+            self._models[name] = parts_of(path)
         except PartsError as error:
             raise WorldError(f"{self.path}: objects.{name}: {path.name} {error}") from None
+        return self._models[name]
 
     def seabed_heights(self) -> Array | None:
         """z of the seabed on a grid over its size [m], (ny, nx), row 0 at the least y; None for a plane."""
@@ -538,9 +549,10 @@ class World(Part):
 
     def _table(self, file: str) -> Array:
         path = self.beside(file, "seabed: heights")
+        data = read_bytes(path, WorldError, f"{self.path}: seabed: heights: {file}", limit=64 << 20)
         try:
-            table = np.loadtxt(path, delimiter=",", ndmin=2, max_rows=4096)
-        except (OSError, ValueError) as error:
+            table = np.loadtxt(io.BytesIO(data), delimiter=",", ndmin=2, max_rows=4096)
+        except ValueError as error:
             raise WorldError(f"{self.path}: seabed: heights: cannot read {file}: {error}") from None
         if min(table.shape) < 2 or table.size > FINEST or not np.isfinite(table).all():
             raise WorldError(
@@ -627,6 +639,10 @@ class CameraDevice(Part):
 
     @model_validator(mode="after")
     def _optics(self) -> CameraDevice:
+        if self.width * self.height > PIXELS:
+            raise refuse_section(
+                f"{self.width} x {self.height} pixels, expected at most {PIXELS >> 20} million"
+            )
         try:
             self.lens()
         except OpticsError as error:
@@ -701,6 +717,13 @@ class SonarDevice(Part):
     rate: Positive
     """[Hz]"""
     mount: Mount = Field(default_factory=lambda: Mount())
+
+    @model_validator(mode="after")
+    def _computable(self) -> SonarDevice:
+        if self.beams * max(self.elevations, self.bins) > PIXELS:
+            raise refuse_section(f"{self.beams} beams with {self.bins} bins and {self.elevations} elevations, "
+                                 f"expected at most {PIXELS >> 20} million rays or cells")  # fmt: skip
+        return self
 
     @model_validator(mode="after")
     def _two_sides(self) -> SonarDevice:
@@ -860,10 +883,24 @@ def _locate(
 
 def _read(path: Path, label: str, such_as: str) -> dict[Any, Any]:
     tree = read_mapping(path, WorldError, such_as=such_as, label=label)
+    _refuse_unphysical(tree, label)
     for key in ("name", "path"):
         if key in tree:
             raise WorldError(f"{label}: unknown key '{key}': the name is that of the file")
     return tree
+
+
+def _refuse_unphysical(value: Any, label: str) -> None:
+    """Refuse numbers that are out of reach of single precision, in which worlds are computed."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            if key != "seed":
+                _refuse_unphysical(item, f"{label}: {key}" if isinstance(value, dict) else label)
+    elif type(value) in (int, float) and value and not SMALLEST <= abs(value) <= GREATEST:
+        if math.isfinite(value):  # others are refused where they stand
+            raise WorldError(
+                f"{label} holds {value:g}, expected 0 or a number from {SMALLEST:g} to {GREATEST:g}"
+            )
 
 
 P = TypeVar("P", bound=Part)

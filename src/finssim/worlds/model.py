@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from finssim.budget import decoded_picture, read_bytes
 from finssim.geometry.rotations import quat_rotate
 from finssim.worlds.description import Light, Look, Texture, World, WorldError
 from finssim.worlds.layout import WorldLayout
@@ -47,11 +48,14 @@ def picture_of(world: World, texture: Texture) -> tuple[np.ndarray, float, float
         colour = np.repeat((INK + (PAPER - INK) * gray)[..., None], 3, axis=2)
         return colour, texture.size * (len(bits) + 2.0) / len(bits), 1.0
     path = world.beside(texture.file, "texture: file")
-    data = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
-    if data is None:
-        raise WorldError(
-            f"{world.path}: texture: cannot read {texture.file}: give a PNG or JPEG beside the world file"
-        )
+    label = f"{world.path}: texture: {texture.file}"
+    data = (
+        decoded_picture(read_bytes(path, WorldError, label), cv2.IMREAD_COLOR)
+        if path.is_file()
+        else "is not there"
+    )
+    if isinstance(data, str):
+        raise WorldError(f"{label} {data}: give a PNG or JPEG beside the world file")
     small = cv2.resize(data, (SIDE, SIDE), interpolation=cv2.INTER_AREA)[..., ::-1]
     return (small / 255.0) ** 2.2, texture.size, data.shape[0] / data.shape[1]
 

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from finssim.budget import DEPTH, FILE, NODES, in_child, read_bytes
+from finssim.geometry.mesh import FARTHEST
 from finssim.geometry.rotations import matrix_to_quat, quat_multiply, quat_rotate
 
 SUFFIXES = (".xml", ".mjcf", ".urdf", ".usd", ".usda", ".usdc", ".usdz")
@@ -66,20 +68,35 @@ def parts_of(path: Path) -> list[ModelPart]:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise PartsError(f"ends in '{path.suffix}', expected one of {', '.join(SUFFIXES)}")
-    parts = list(_usd(path) if suffix.startswith(".usd") else _mujoco(path))
+    model = str(path.resolve()) if suffix.startswith(".usd") else (path.name, _files_of(path))
+    parts = [ModelPart(**part) for part in in_child(_shapes, model, PartsError)]
     if not parts:
         raise PartsError("has no shapes")
+    for part in parts:
+        numbers = np.concatenate(
+            [part.position, part.size, np.ravel(0.0 if part.vertices is None else part.vertices)]
+        )
+        if not np.abs(numbers).max() < FARTHEST:
+            raise PartsError(
+                f"has a {part.kind} at or of {np.abs(numbers).max():.3g} m, expected less than {FARTHEST:g}"
+            )
     return parts
 
 
-def _mujoco(path: Path) -> Iterator[ModelPart]:
+def _shapes(model: str | tuple[str, dict[str, bytes]]) -> list[dict[str, Any]]:
+    """The shapes of a model as plain data, in the child process: a USD file's path, or a name and MuJoCo's files."""
+    parts = _usd(Path(model)) if isinstance(model, str) else _mujoco(*model)
+    return [dict(vars(part)) for part in parts]
+
+
+def _mujoco(name: str, files: dict[str, bytes]) -> Iterator[ModelPart]:
     try:
         import mujoco
     except ImportError:
         raise PartsError("needs mujoco: pip install 'finssim[mujoco]'") from None
-    _refuse_outside(path)
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))
+        text = files.pop(name).decode("utf-8", "replace")
+        model = mujoco.MjModel.from_xml_string(text, assets=files)  # a file system of these files alone
     except ValueError as error:
         raise PartsError(f"is not a model: {' '.join(str(error).split())[:160]}") from None
     data = mujoco.MjData(model)
@@ -106,19 +123,68 @@ def _mujoco(path: Path) -> Iterator[ModelPart]:
         )  # fmt: skip
 
 
-def _refuse_outside(path: Path, including: tuple[Path, ...] = ()) -> None:
-    """Refuse a model that names files outside its folder, itself or by a file that it includes."""
-    try:
-        tree = ElementTree.parse(path)
-    except (OSError, ElementTree.ParseError) as error:
-        raise PartsError(f"cannot be read: {error}") from None
-    for element in tree.iter():
-        for key in ("file", "filename", "meshdir", "texturedir", "assetdir"):
-            name = element.get(key, "")
-            if name.startswith(("/", "~")) or re.search(r"^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)", name):
-                raise PartsError(f"names the file '{name}': put it into the model's folder or below")
-        if element.tag == "include" and (included := path.parent / element.get("file", "")) not in including:
-            _refuse_outside(included, (*including, path))
+def _files_of(path: Path) -> dict[str, bytes]:
+    """The model and the files of its folder that it may name, by their paths below that folder.
+
+    Raises:
+        PartsError: A file names one outside the folder, or too much is included.
+    """
+    folder, files, sizes = path.parent, dict[str, bytes](), dict[str, int]()
+
+    def add(name: str) -> bool:
+        if name in files or not (folder / name).is_file():
+            return name in files
+        if name != path.name and not (folder / name).resolve().is_relative_to(folder.resolve()):
+            raise PartsError(
+                f"names the file '{name}', which is a link: put it into the model's folder or below"
+            )
+        files[name] = read_bytes(folder / name, PartsError, "has a file that")
+        if sum(map(len, files.values())) > FILE:
+            raise PartsError(f"has files of more than {FILE >> 20} MiB: make them smaller")
+        return True
+
+    def elements_of(name: str, including: tuple[str, ...]) -> int:
+        """Elements of a model file, with those of the files that it includes; 0 if it is no model."""
+        if name in including or len(including) > DEPTH:
+            raise PartsError(f"includes '{name}' in itself or more than {DEPTH} deep: include each file once")
+        if name in sizes:
+            return sizes[name]
+        try:
+            tree = ElementTree.fromstring(files[name])
+        except ElementTree.ParseError as error:
+            if including:
+                return 0
+            raise PartsError(f"cannot be read: {error}") from None
+        elements = list(tree.iter())
+        if len(elements) > NODES:
+            raise PartsError(f"has more than {NODES} elements: make it smaller")
+        named = [(element, key, value) for element in elements for key, value in element.items()
+                 if key.startswith("file") or key.endswith("dir")]  # fmt: skip
+        for _, _, value in named:
+            if value.startswith(("/", "\\", "~")) or re.search(r"^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)", value):
+                raise PartsError(f"names the file '{value}': put it into the model's folder or below")
+        places = ["", *(value for _, key, value in named if key.endswith("dir")), str(Path(name).parent)]
+        count = len(elements)
+        for _, key, value in named:
+            for place in () if key.endswith("dir") else dict.fromkeys(places):
+                for below in dict.fromkeys((value.removeprefix("package://"), Path(value).name)):
+                    found = (Path(place) / below).as_posix()
+                    if add(found) and _is_model(files[found]):
+                        count += elements_of(found, (*including, name))
+                        if count > NODES:
+                            raise PartsError(f"includes more than {NODES} elements: include each file once")
+        sizes[name] = count
+        return count
+
+    if not add(path.name):
+        raise PartsError("cannot be read: no such file")
+    elements_of(path.name, ())
+    return files
+
+
+def _is_model(data: bytes) -> bool:
+    """Whether a file may be XML: meshes and pictures are not."""
+    return data[:64].lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
 
 
 def _usd(path: Path) -> Iterator[ModelPart]:

@@ -214,8 +214,8 @@ def mottled(local: wp.vec3, grain: wp.array2d(dtype=float)) -> float:
     n = grain.shape[0]
     x = float(n) * (u - wp.floor(u))
     y = float(n) * (v - wp.floor(v))
-    a = wp.min(int(x), n - 1)
-    b = wp.min(int(y), n - 1)
+    a = wp.clamp(int(x), 0, n - 1)  # of a point that is no number too
+    b = wp.clamp(int(y), 0, n - 1)
     c = wp.where(a + 1 == n, 0, a + 1)
     d = wp.where(b + 1 == n, 0, b + 1)
     fy = y - float(b)
@@ -279,7 +279,7 @@ def painted(
         v = local[2]
     x = u + 0.5
     y = 0.5 - v / aspect
-    if x < 0.0 or x > 1.0 or y < 0.0 or y > 1.0:
+    if not (x >= 0.0 and x <= 1.0 and y >= 0.0 and y <= 1.0):
         return base
     rows = pictures.shape[1]
     columns = pictures.shape[2]
@@ -579,7 +579,9 @@ def _take_picture(
                 drawn = normal_quantiles[int(bits & wp.uint32(1023))]
                 bits = bits >> wp.uint32(11)
                 charge += drawn * wp.sqrt(charge + noise_floor)
-            picture[v, i, j, k] = code[int(wp.clamp(charge * digits, 0.0, float(code.shape[0] - 1)) + 0.5)]
+            last_digit = code.shape[0] - 1
+            digit = int(wp.clamp(charge * digits, 0.0, float(last_digit)) + 0.5)
+            picture[v, i, j, k] = code[wp.clamp(digit, 0, last_digit)]  # of a charge that is no number too
 
 
 @wp.kernel(enable_backward=False)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from finssim.budget import CELLS
 from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.trials.conversion import ordered, sampled, tidy_quaternions, upside_down
 from finssim.calibration.trials.trial import (
@@ -195,6 +196,12 @@ def _read_parquet(path: Path) -> Table:
     except ImportError:
         raise CalibrationError(f"{path}: reading Parquet needs pyarrow: pip install pyarrow") from None
     try:
+        about = pyarrow.parquet.read_metadata(path)
+        if about.num_rows * about.num_columns > CELLS:
+            raise CalibrationError(
+                f"{path}: has {about.num_rows} rows of {about.num_columns} columns, expected at most {CELLS >> 20} "
+                "million cells: cut it into several files"
+            )
         content = pyarrow.parquet.read_table(path)
     except (OSError, pyarrow.ArrowException) as error:
         raise CalibrationError(

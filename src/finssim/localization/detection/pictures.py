@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from finssim.budget import PIXELS, decoded_picture, read_bytes
 from finssim.files import atomic_write
 from finssim.localization import LocalizationError
 from finssim.text_table import read_text_table
@@ -67,22 +68,15 @@ def read_picture(path: Path) -> Image:
     """
     import cv2
 
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise LocalizationError(f"{path}: cannot be read: {error.strerror or error}") from None
+    raw = read_bytes(path, LocalizationError)
     if not raw:
         raise LocalizationError(f"{path}: the file is empty")
     if _cut_short(raw):
         raise LocalizationError(f"{path}: the picture is cut short")
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = cv2.imdecode(np.frombuffer(raw, np.uint8), flags)
-    except cv2.error:
-        image = None
-    if image is None:
-        raise LocalizationError(f"{path}: is no picture that can be read")
-    return np.asarray(image, np.uint8)
+    image = decoded_picture(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if isinstance(image, str):
+        raise LocalizationError(f"{path}: {image}")
+    return image
 
 
 def write_picture(image: npt.NDArray[np.uint8], path: Path | str) -> None:
@@ -180,6 +174,11 @@ def _of_video(file: Path, name: str, notify: Callable[[str], None]) -> Iterator[
     try:
         rate = float(video.get(cv2.CAP_PROP_FPS))
         announced = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        if width * height > PIXELS:
+            raise LocalizationError(
+                f"{file}: its pictures have {width:g} x {height:g} pixels, expected at most {PIXELS >> 20} million"
+            )
         count, last = 0, -math.inf
         while True:
             there, image = video.read()
