@@ -11,6 +11,7 @@ from rich.console import Console
 from finssim.calibration.check import check, check_trials, print_reports, set_findings
 from finssim.calibration.programmes import programmes
 from finssim.calibration.synthetic import simulate_programme
+from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.vehicles import load_vehicle
 
@@ -137,6 +138,52 @@ def test_a_heading_that_is_turned_against_the_position_is_found(simulated):
     trial = changed(simulated["surge"], yaw=lambda y: y + np.pi / 2)
     (disagreement,) = told(trial, "heading_disagrees", "care")
     assert disagreement["angle"] == pytest.approx(-90.0, abs=2.0)
+
+
+def test_noise_of_the_heading_is_not_taken_for_a_wrong_sign():
+    """1.4 degrees of noise on a heading that hardly moves: the changes of a smoothed heading are mostly noise."""
+    for seed in (7, 15, 26, 27, 47, 53, 117):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0.0, 8.0, 0.2)
+        r = 0.004 * np.sin(2.0 * np.pi * (t / rng.uniform(4.0, 12.0) + rng.random()))
+        yaw = 0.2 * np.cumsum(r) + 0.025 * rng.standard_normal(len(t))
+        channels = {"r": r + 0.001 * rng.standard_normal(len(t)), "yaw": yaw}
+        assert not told(Trial(name=f"drift_{seed}", t=t, channels=channels), "rate_sign")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bluerov2_einarsson", "bluerov2_heavy_morgan"])
+def test_the_buoyancy_of_the_vehicle_file_is_not_taken_for_a_wrong_sign(name):
+    """Pushes of 2 % against a buoyancy of 4 N, and against a weight of 7 N: the inputs take energy out of heave."""
+    vehicle = load_vehicle(name)
+    weak = programmes(["heave"], vehicle, levels={"heave": (0.02 * vehicle.wrench_limits[2],)})
+    trials = simulate_programme(weak, vehicle, seed=3, columns=COLUMNS, inputs=("wrench",))
+    found = [told(trial, "energy_taken", vehicle=vehicle) for trial in trials]
+    assert not any(found)
+
+
+def test_a_depth_in_another_unit_is_told(simulated):
+    """Feet and centimetres, against z and against w."""
+    trial = simulated["heave"]
+    (against_z,) = told(changed(trial, depth=lambda d: d / 0.3048), "speed_ratio", "care")
+    assert against_z["ratio"] == pytest.approx(0.3048, abs=0.02)
+    (against_w,) = told(changed(trial, z=None, depth=lambda d: 100.0 * d), "speed_ratio", "care")
+    assert against_w["ratio"] == pytest.approx(100.0, rel=0.1) and against_w["velocity"] == "w"
+
+
+def test_a_heading_that_samples_slowly_or_a_vehicle_on_its_nose_has_no_drift():
+    """A turn of 4 rad/s seen by a heading of 1 Hz, and a somersault, in which the heading jumps by half a turn."""
+    t = np.arange(0.0, 20.0, 0.02)
+    spin = Trial(
+        name="spin",
+        t=t,
+        channels={"r": np.full(len(t), 4.0), "yaw": np.where(np.arange(len(t)) % 50, np.nan, 4.0 * t % 6.28)},
+    )
+    assert not told(spin, "heading_drift")
+    angle = 0.5 * t
+    flip = {"qy": np.sin(0.5 * angle), "qw": np.cos(0.5 * angle), "qx": 0.0 * t, "qz": 0.0 * t}
+    rates = {"p": 0.0 * t, "q": 0.0 * t + 0.5, "r": 0.0 * t}
+    assert not told(Trial(name="somersault", t=t, channels=flip | rates), "heading_drift")
 
 
 def test_five_hertz_with_wrench_and_velocity_only(simulated):

@@ -12,6 +12,7 @@ import numpy as np
 from rich import box
 from rich.markup import escape
 from rich.table import Table
+from scipy.signal import lfilter
 
 from finssim.calibration.findings import SEVERITIES, CalibrationError, Finding, finding, listed, plain
 from finssim.calibration.motion import (
@@ -24,7 +25,9 @@ from finssim.calibration.motion import (
     motion,
     on_grid,
     up_in_body,
+    white_noise,
 )
+from finssim.calibration.significance import Relation, relation
 from finssim.calibration.trials.inputs import Drive, drive, implausible
 from finssim.calibration.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
 from finssim.calibration.trials.trial_files import load_trial, trials_at
@@ -620,6 +623,9 @@ RATE = 25.0
 AGAINST = -0.5
 """Correlation below which two columns that should agree run against each other."""
 
+NEGATIVE = 3.0
+"""Factor by which noise, smoothing and errors of scale change a slope of -1 at most."""
+
 WITH = 0.7
 """Correlation above which their ratio means something."""
 
@@ -630,6 +636,18 @@ DEGREES = 57.3
 
 DRIFTS = 0.2
 """Range of the heading less the integrated gyro and its constant error that is a drift [rad]."""
+
+WALK = 2.5
+"""Range of a random walk without its trend, in standard deviations of its end, that chance hardly exceeds."""
+
+LARGEST_TURN = 1.0
+"""Turn between two samples of an attitude above which its rates may be aliases [rad]."""
+
+STEEP = 0.3
+"""Cosine of the pitch below which the heading means nothing."""
+
+LEVEL = 0.7
+"""Cosine of the tilt below which restoring moments act on yaw and weight on surge and sway."""
 
 GYRO_BIAS = 0.03
 """Steady difference between heading and integrated gyro that no calibrated gyro has [rad/s]."""
@@ -700,34 +718,44 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
     if cosine < np.cos(np.radians(15.0)):
         against = "the attitude" if attitude.tilt else "level"
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        findings.append(finding("accelerometer_turned", angle=angle, reference=against))
+        # Without an attitude a vehicle that is level at any time shows that its accelerometer is.
+        cosines = np.sum(f * up, axis=1) / np.linalg.norm(f, axis=1)
+        if attitude.tilt or np.percentile(cosines, 90.0) < np.cos(np.radians(15.0)):
+            findings.append(finding("accelerometer_turned", angle=angle, reference=against))
     for i, angle_name in ((0, "pitch"), (1, "roll")):
         swing = g * np.std(up[:, i])
-        if swing > 0.4 and _correlation(f[:, i], up[:, i]) < AGAINST:
+        if swing > 0.4 and _against(relation(g * up[:, i], f[:, i], nuisances=np.ones((len(f), 1)))):
             findings.append(finding("acceleration_sign", column=f"a{'xy'[i]}", angle=angle_name))
     return findings
 
 
 def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
-    findings = []
+    findings: list[Finding] = []
+    _, q, _ = attitude_samples(trial)
+    if len(q) < FEWEST:
+        return []
+    turns = 2.0 * np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=1)), 0.0, 1.0))
+    if np.percentile(turns, 98.0) > LARGEST_TURN:
+        return []
     gyro, _ = on_grid(trial, ("p", "q", "r"), t)
+    angles = quat_to_euler(q)
     for i, (rate, angle) in enumerate((("p", "roll"), ("q", "pitch"), ("r", "yaw"))):
         derived = attitude.rates[:, i]
         moving = (
             np.isfinite(gyro[:, i]) & np.isfinite(derived) & (np.abs(derived) > 3.0 * attitude.rates_std[i])
         )
-        if moving.sum() < FEWEST:
+        if moving.sum() < FEWEST or not _stands_out(derived, np.unwrap(angles[i])):
             continue
-        still = np.isfinite(gyro[:, i]) & (np.abs(derived) <= 3.0 * attitude.rates_std[i])
-        bias = float(np.median(gyro[still, i])) if still.sum() >= FEWEST else 0.0
-        x, y = derived[moving], gyro[moving, i] - bias
-        correlation, ratio = float(_cosine(x, y)), float(np.sum(x * y) / np.sum(x * x))
-        if correlation < AGAINST:
+        found = relation(derived, gyro[:, i], nuisances=np.ones((len(t), 1)))  # a gyro may have a bias
+        with_it = found.correlation > WITH and found.sure
+        if _against(found):
             findings.append(finding("rate_sign", column=rate, other=angle))
-        elif correlation > WITH and 0.6 * DEGREES < ratio < 1.6 * DEGREES:
+        elif with_it and 0.6 * DEGREES < found.slope < 1.6 * DEGREES:
             findings.append(_degrees(rate, float(np.abs(gyro[:, i][moving]).max()), "rad/s"))
-        elif correlation > WITH and 0.6 < ratio * DEGREES < 1.6:
-            findings.append(_degrees(angle, float(np.nanmax(np.abs(trial.channels.get(angle, x)))), "rad"))
+        elif with_it and 0.6 < found.slope * DEGREES < 1.6:
+            findings.append(
+                _degrees(angle, float(np.nanmax(np.abs(trial.channels.get(angle, derived)))), "rad")
+            )
     return findings
 
 
@@ -744,44 +772,66 @@ def _heading(trial: Trial) -> list[Finding]:
     t, r = t[inside], r[inside]
     phi, theta = np.interp(t, at, roll), np.interp(t, at, pitch)
     q_at = np.interp(t, *trial.series("q")) if trial.has("q") else np.zeros(len(t))
-    rate = (q_at * np.sin(phi) + r * np.cos(phi)) / np.maximum(np.cos(theta), 0.2)
-    # A gap of the gyro hides a turn: each stretch begins anew.
+    if not {"roll", "pitch"} & set(named):  # taken level, which a gyro may contradict
+        p_at = np.interp(t, *trial.series("p")) if trial.has("p") else q_at
+        for tilting in (p_at - np.median(p_at), q_at - np.median(q_at)):
+            if np.ptp(np.cumsum(tilting[1:] * np.diff(t))) > LARGEST_TURN:
+                return []
+    rate = (q_at * np.sin(phi) + r * np.cos(phi)) / np.maximum(np.cos(theta), STEEP)
+    # A gap of the gyro hides a turn, and a vehicle on its nose has no heading: each stretch begins anew.
     step = np.diff(t)
-    wide = step > longest_step(t)
-    turned = np.concatenate([[0.0], np.cumsum(np.where(wide, 0.0, 0.5 * (rate[1:] + rate[:-1]) * step))])
-    difference = np.interp(t, at, np.unwrap(yaw)) - turned
+    wide = (step > longest_step(t)) | (np.cos(theta[1:]) < STEEP) | (np.cos(theta[:-1]) < STEEP)
+    turns = np.where(wide, 0.0, 0.5 * (rate[1:] + rate[:-1]) * step)
+    turned = np.concatenate([[0.0], np.cumsum(turns)])
+    # The gyro bridges a turn of more than half a circle between two samples of the heading.
+    difference = np.interp(t, at, np.unwrap(yaw - np.interp(at, t, turned)))
     for edge in np.flatnonzero(wide):
         difference[edge + 1 :] += difference[edge] - difference[edge + 1]
     bias, _ = np.polyfit(t - t[0], difference, 1) if t[-1] - t[0] > 5.0 else (0.0, 0.0)
     rest = difference - bias * (t - t[0])
     noise = 1.4826 * float(np.median(np.abs(np.diff(difference)))) * 6.0
+    # Noise of the gyro adds up to a random walk, and every second sample shows what is lost between samples.
+    noise += WALK * white_noise(r) * float(np.sqrt(np.median(step) * (t[-1] - t[0])))
+    coarse = np.cumsum(0.5 * (rate[2::2] + rate[:-2:2]) * (step[1::2] + step[: 2 * (len(step) // 2) : 2]))
+    noise += float(np.ptp(coarse - np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)[1::2]))
     wander = float(np.ptp(rest)) - noise
-    if wander < DRIFTS and abs(bias) < GYRO_BIAS:
+    if wander < DRIFTS and abs(bias) * (t[-1] - t[0]) < GYRO_BIAS * (t[-1] - t[0]) + noise:
         return []
     drift = float(np.ptp(difference)) - noise
     return [finding("heading_drift", drift=drift)]
 
 
 def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
-    findings = []
     _, up = on_grid(trial, ("z", "depth"), t, 3)
-    both = np.isfinite(up).all(axis=1)
-    if (
-        both.sum() >= FEWEST
-        and np.std(up[both, 0]) > 0.01
-        and _correlation(up[both, 0], up[both, 1]) > -AGAINST
-    ):
-        findings.append(finding("z_down"))
-        return findings
+    both = relation(-up[:, 1], up[:, 0], nuisances=np.ones((len(t), 1)))
+    if _against(both):
+        return [finding("z_down")]
+    if wrong_unit := _unit_ratio(-up[:, 1], up[:, 0], "z", "depth"):
+        return wrong_unit
+    vertical = "z" if trial.has("z") else "depth"
     rising = np.where(np.isfinite(up[:, 0]), up[:, 0], -up[:, 1])
     through = _through_world(trial, t, attitude)[:, 2]
     good = np.isfinite(rising) & np.isfinite(through)
-    if good.sum() >= FEWEST and min(np.std(rising[good]), np.std(through[good])) > 0.015:
-        correlation = _correlation(rising[good], through[good])
-        vertical = "z" if trial.has("z") else "depth"
-        if correlation < AGAINST:
-            findings.append(finding("rate_sign", column="w", other=vertical))
-    return findings
+    if good.sum() < FEWEST or min(np.std(rising[good]), np.std(through[good])) < 0.015:
+        return []
+    if not _stands_out(np.where(good, rising, np.nan), trial.series(vertical)[1]):
+        return []
+    found = relation(rising, through, nuisances=np.ones((len(t), 1)))
+    if _against(found):
+        return [finding("rate_sign", column="w", other=vertical)]
+    return _unit_ratio(through, rising, vertical, "w") if attitude.tilt else []
+
+
+def _unit_ratio(x: Array, y: Array, of: str, over: str) -> list[Finding]:
+    """Return a finding if y surely goes with x and is another multiple of it than noise in either explains."""
+    one = np.ones((len(x), 1))
+    found, back = relation(x, y, nuisances=one), relation(y, x, nuisances=one)
+    if found.correlation < WITH or not found.sure:
+        return []
+    low, high = found.slope, 1.0 / back.slope
+    if low > 1.6 or high < 0.6:
+        return [finding("speed_ratio", columns=of, ratio=float(np.sqrt(low * high)), velocity=over)]
+    return []
 
 
 def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
@@ -792,9 +842,17 @@ def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Findin
     good = np.isfinite(world).all(axis=1) & np.isfinite(through).all(axis=1)
     if good.sum() < FEWEST or min(np.std(world[good]), np.std(through[good])) < 0.02:
         return []
+    if not any(_stands_out(world[good, i], trial.series("xy"[i])[1]) for i in range(2)):
+        return []
     a, b = (v[good, 0] + 1j * v[good, 1] for v in (through, world))
     size = np.linalg.norm(a) * np.linalg.norm(b)
     turned, mirrored = np.vdot(a, b) / size, np.vdot(a.conj(), b) / size
+    likelier = mirrored if abs(mirrored) > abs(turned) else turned
+    expected = through * [1.0, -1.0 if likelier is mirrored else 1.0]
+    c, s = likelier.real / abs(likelier), likelier.imag / abs(likelier)
+    expected = expected @ np.array([[c, s], [-s, c]])
+    if not relation(np.where(good[:, None], expected, np.nan).T.ravel(), world.T.ravel()).sure:
+        return []
     if abs(turned) > WITH and abs(np.angle(turned)) > np.radians(15.0):
         angle = float(np.degrees(np.angle(turned)))
         return [finding("heading_disagrees", angle=angle)]
@@ -802,7 +860,7 @@ def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Findin
         return [finding("mirrored")]
     ratio = float(np.linalg.norm(b) / np.linalg.norm(a))
     if abs(turned) > WITH and not 0.6 < ratio < 1.6:
-        return [finding("speed_ratio", ratio=ratio)]
+        return [finding("speed_ratio", columns="x, y", ratio=ratio, velocity="u, v")]
     return []
 
 
@@ -817,13 +875,15 @@ def _through_world(trial: Trial, t: Array, attitude: AttitudeSignal) -> Array:
     return np.asarray(through)
 
 
-def _correlation(x: Array, y: Array) -> float:
-    return _cosine(x - x.mean(), y - y.mean())
+def _stands_out(rates: Array, samples: Array) -> bool:
+    """Return whether what changed at these rates on the grid moved by more than the noise of one sample."""
+    moved = np.cumsum(np.nan_to_num(rates - np.nanmean(rates))) / RATE
+    return not float(np.std(moved)) < white_noise(samples)
 
 
-def _cosine(x: Array, y: Array) -> float:
-    size = np.linalg.norm(x) * np.linalg.norm(y)
-    return float(x @ y / size) if size > 0.0 else 0.0
+def _against(found: Relation) -> bool:
+    """Return whether a signal is surely the negative of another that it should equal, rather than noise beside it."""
+    return found.correlation < AGAINST and found.sure and -NEGATIVE < found.slope < -1.0 / NEGATIVE
 
 
 # Excitation of every axis of a trial: speeds, wrenches, levels, coasts, work.
@@ -845,6 +905,9 @@ LONG_PUSH = 3.0
 
 HOLD = 0.5
 """[s]"""
+
+ANSWERS = (0.1, 0.3, 1.0, 3.0, 10.0)
+"""Time constants of the speeds of vehicles [s]."""
 
 
 def axis_reports(motion: Motion, inputs: Drive, vehicle: Vehicle) -> list[AxisReport]:
@@ -890,32 +953,66 @@ def _strong(values: Array, least: float) -> float:
     return float(np.percentile(above if len(above) else values, 95.0))
 
 
-def work_findings(reports: list[AxisReport], motion: Motion, named: tuple[str, ...]) -> list[Finding]:
-    """Axes on which the inputs took energy out, where drag should have: a sign is wrong.
+def work_findings(
+    reports: list[AxisReport], motion: Motion, named: tuple[str, ...], excess: float = 0.0
+) -> list[Finding]:
+    """Return the axes on which the inputs took energy out, where drag should have: a sign is wrong.
 
-    On roll and pitch the restoring moment gives back what it took; along heave the weight does work too.
+    On roll and pitch the restoring moment gives back what it took. The work of the buoyancy that the vehicle file
+    states is added to that of the inputs. What else may push (a tether, trim, a current) does not follow the inputs:
+    the speed has to answer their changes the wrong way.
+
+    Args:
+        reports: By axis.
+        motion: Of the trial.
+        named: Axes that the header names.
+        excess: Buoyancy less weight [N].
     """
     findings = []
+    up = up_in_body(np.where(np.isfinite(motion.quaternion), motion.quaternion, [0.0, 0.0, 0.0, 1.0]))
     for i, report in enumerate(reports):
-        both = np.isfinite(motion.nu[:, i]) & np.isfinite(motion.tau[:, i])
-        effort = float(np.sum(np.abs(motion.tau[both, i] * motion.nu[both, i])) / motion.rate)
-        if not report.excited or effort == 0.0 or report.axis in ("roll", "pitch"):
+        if not report.excited or report.axis in ("roll", "pitch"):
             continue
-        ratio = report.work / effort
-        if ratio < -0.4:
-            held = np.abs(motion.tau[both, i]) > QUIET * report.strongest
+        nu = motion.nu[:, i]
+        tau = np.where(up[:, 2] > LEVEL, motion.tau[:, i], np.nan)
+        power = (tau + (excess * up[:, i] if i < 3 else 0.0)) * nu
+        both = np.isfinite(power)
+        work, effort = float(np.sum(power[both])), float(np.sum(np.abs(power[both])))
+        if effort == 0.0 or work > -0.4 * effort:
+            continue
+        answer = _answer(nu, tau, motion.rate)
+        if answer.sure and answer.correlation < AGAINST:
+            held = np.abs(tau[both]) > QUIET * report.strongest
             sure = report.axis in named or (not named and held.sum() / motion.rate > LONG_PUSH)
             findings.append(
                 finding(
                     "energy_taken",
-                    severity="refused" if sure and ratio < -0.6 and report.axis != "heave" else "care",
-                    work=-report.work,
+                    severity="refused"
+                    if sure and work < -0.6 * effort and report.axis != "heave"
+                    else "care",
+                    work=-work / motion.rate,
                     axis=str(report.axis),
                     wrench=TAU[i],
                     velocity=NU[i],
                 )
             )
     return findings
+
+
+def _answer(nu: Array, tau: Array, rate: float) -> Relation:
+    """Return how a speed follows its wrench through a lag of first order, apart from a constant push and the start.
+
+    The lag is the one of `ANSWERS` that explains most; the significance allows for the choice.
+    """
+    known = np.isfinite(nu) & np.isfinite(tau)
+    relations = []
+    for lag in ANSWERS:
+        decay = np.exp(-1.0 / (rate * lag))
+        followed = lfilter([1.0 - decay], [1.0, -decay], np.nan_to_num(tau))
+        others = np.stack([np.ones(len(nu)), decay ** np.arange(len(nu))], axis=-1)
+        relations.append(relation(np.where(known, followed, np.nan), nu, nuisances=others))
+    best = max(relations, key=lambda found: abs(found.correlation))
+    return best._replace(chance=len(ANSWERS) * best.chance)
 
 
 def check(
@@ -1040,7 +1137,9 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
         with_identifiability(axis, trial_motion, inputs, vehicle)
         for axis in axis_reports(trial_motion, inputs, vehicle)
     ]
-    findings += work_findings(axes, trial_motion, trial.header.axis)
+    density = (trial.header.water.density or vehicle.water.density) / vehicle.water.density
+    excess = vehicle.buoyancy * density - vehicle.weight
+    findings += work_findings(axes, trial_motion, trial.header.axis, excess)
     if not any(axis.excited or any(one.can for one in axis.tells.values()) for axis in axes):
         moved = any(axis.source for axis in axes)
         findings.append(finding("nothing_excited") if moved else finding("nothing_measured"))
