@@ -100,6 +100,37 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, tmp_path, words, s
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_vehicle_of_imported_trials_is_found_from_any_directory(capsys, tmp_path, monkeypatch):
+    """Vehicle file beside the logs, by a relative path; then elsewhere; then the whole folder moved."""
+    home, away = tmp_path / "dive", tmp_path / "moved"
+    (home / "sub").mkdir(parents=True)
+    (home / "own.yaml").write_text("extends: bluerov2\n", encoding="utf-8")
+    rows = "\n".join(f"{0.1 * i:.1f},{min(i, 10)},{0.01 * i}" for i in range(40))
+    (home / "pool.csv").write_text(f"t,tau_x,u\n{rows}\n", encoding="utf-8")
+    monkeypatch.chdir(home)
+    assert finssim("trials", "import", "pool.csv", "--vehicle", "own.yaml", "--out", "trials") == 0
+
+    def refused(trials):
+        capsys.readouterr()
+        finssim("trials", "check", trials, "--json")
+        (trial,) = json.loads(capsys.readouterr().out)["trials"]
+        return "vehicle_refused" in {entry["code"] for entry in trial["findings"]}
+
+    monkeypatch.chdir(tmp_path)
+    assert not refused(home / "trials")
+    home.rename(away)
+    assert not refused(away / "trials")
+    (away / "own.yaml").unlink()
+    assert refused(away / "trials")
+
+
+def test_check_ends_with_3_if_no_trial_can_be_used(capsys, tmp_path):
+    """A script sees it."""
+    (tmp_path / "still.csv").write_text("t,u\n0,0\n0.1,0\n0.2,0\n", encoding="utf-8")
+    assert finssim("trials", "check", tmp_path, "--vehicle", "bluerov2") == 3
+    assert "refused" in capsys.readouterr().out
+
+
 def test_check_refuses_what_is_no_trial(capsys, tmp_path):
     """A folder without trials, and a path that is not there."""
     assert "holds no trial" in refusal(capsys, "trials", "check", tmp_path)

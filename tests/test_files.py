@@ -1,14 +1,25 @@
 """Output is whole or absent, and a refusal is one sentence."""
 
+import json
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
 
 import pytest
 
-from finssim.files import OutputError, atomic_directory, atomic_write, plain_name, refuse_unwritable
+from finssim import boundary
+from finssim.cli import app
+from finssim.files import (
+    OutputError,
+    atomic_directory,
+    atomic_write,
+    plain_name,
+    refuse_unwritable,
+    sole_writer,
+)
 
 
 def entries(directory):
@@ -233,3 +244,34 @@ def test_a_plain_name_is_one_file_of_its_folder(tmp_path, name):
     with atomic_write(tmp_path / f"{plain_name(name, 'trial', KeyError)}.yaml") as temporary:
         assert temporary.parent == tmp_path
     assert [file.name for file in tmp_path.iterdir()] == [f"{name}.yaml"]
+
+
+def test_a_directory_has_one_writer(tmp_path, capsys):
+    """The second is told who writes; afterwards, and after a refused command, nothing stays of the lock."""
+    out = tmp_path / "new" / "hold"
+    with sole_writer(out), sole_writer(tmp_path / "new" / "other"):
+        with pytest.raises(
+            OutputError, match=rf"hold: '.*' \(process {os.getpid()} on .*\) is writing there"
+        ):
+            with sole_writer(tmp_path / "new" / ".." / "new" / "hold"):
+                pytest.fail("two writers")
+        assert boundary.run(app, ["train", "t1", "--out", str(out)]) == 2
+        assert "is writing there" in capsys.readouterr().err
+        out.mkdir()
+    assert entries(tmp_path / "new") == ["hold"]
+    assert boundary.run(app, ["train", "nosuch", "--out", str(tmp_path / "a" / "b")]) == 2
+    assert entries(tmp_path) == ["new"]
+
+
+def test_a_lock_of_a_dead_process_is_replaced_and_one_of_another_computer_is_not(tmp_path):
+    """A killed training may be resumed at once."""
+    lock = tmp_path / ".hold.lock"
+    for host, refused in ((socket.gethostname(), False), ("elsewhere", True)):
+        lock.write_text(json.dumps({"pid": 2**30, "host": host, "command": "finssim train"}))
+        if refused:
+            with pytest.raises(OutputError, match="on elsewhere"), sole_writer(tmp_path / "hold"):
+                pytest.fail("two writers")
+        else:
+            with sole_writer(tmp_path / "hold"):
+                assert json.loads(lock.read_text())["pid"] == os.getpid()
+            assert entries(tmp_path) == []

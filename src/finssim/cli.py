@@ -93,7 +93,10 @@ app = command_app(
 
 
 def main() -> None:
-    """Run the command line and exit: 0 well, 1 a fault of FinsSim, 2 a refused input, 130 interrupted."""
+    """Run the command line and exit.
+
+    Statuses: 0 well, 1 a fault of FinsSim, 2 a refused input, 3 a result that is negative, 130 interrupted.
+    """
     sys.exit(boundary.run(app, sys.argv[1:]))
 
 

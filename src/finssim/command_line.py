@@ -15,10 +15,11 @@ once:
         \"\"\"
 
 What comes before `*` is typed by its place, the rest as `--name`; a bool is a flag, a `Sequence` may be given several
-times. `Annotated` adds bounds as `(low, high)`, another `"--name"`, or `","` where one option holds several words. What
-is no text, number, flag or path, or is annotated "python", is no option and keeps its default, but for the types of
-`MAKERS`. `**options`, "As of `module.function`, without rows, robot.", are those of that function but for some. What
-is returned is the exit status, or a result, whose `ok` makes it 0 or 3.
+times. A directory `out (DIR)` is written by one command at a time. `Annotated` adds bounds as `(low, high)`, another
+`"--name"`, or `","` where one option holds several words. What is no text, number, flag or path, or is annotated
+"python", is no option and keeps its default, but for the types of `MAKERS`. `**options`, "As of `module.function`,
+without rows, robot.", are those of that function but for some. What is returned is the exit status, or a result, whose
+`ok` makes it 0 or 3.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ import ast
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -36,6 +38,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from finssim.files import sole_writer
 
 ROOT = Path(__file__).parents[1]
 KINDS: Mapping[str, Any] = {
@@ -52,6 +56,8 @@ SEEDS = (0, 2**31 - 1)
 LARGEST = 1e9
 """Of a number on the command line, whatever its unit."""
 SETTINGS: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
+WRITTEN = ("out", "lerobot")
+"""Options whose directories are written."""
 JSON = "Print one JSON object instead of tables."
 
 
@@ -313,9 +319,12 @@ def _handler(name: str, work: Work, *, group: bool = False) -> Callable[..., Any
     def handle(context: typer.Context, **typed: Any) -> Any:
         if group and context.invoked_subcommand is not None:
             return None
-        if experiment is not None:
-            return _experiment(name, definition, typed)
-        return _status(definition.call(typed, *(context.args if definition.extra else ())))
+        with ExitStack() as locks:
+            for place in _directories(options, typed):
+                locks.enter_context(sole_writer(place))
+            if experiment is not None:
+                return _experiment(name, definition, typed)
+            return _status(definition.call(typed, *(context.args if definition.extra else ())))
 
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
     parameters = [context, *(option.parameter() for option in options)]
@@ -324,6 +333,17 @@ def _handler(name: str, work: Work, *, group: bool = False) -> Callable[..., Any
     handle.__doc__ = definition.help
     handle.definition = definition  # type: ignore[attr-defined]
     return handle
+
+
+def _directories(options: Sequence[Option], typed: Mapping[str, Any]) -> list[Path]:
+    """Return the directories that a command writes into, which no other command may do at the same time."""
+    return [
+        typed[option.name] if typed[option.name] is not None else option.default
+        for option in options
+        if option.name in WRITTEN
+        and option.metavar in ("DIR", "DATASET")
+        and (typed[option.name] or option.default)
+    ]
 
 
 def _experiment(name: str, definition: Definition, typed: Mapping[str, Any]) -> int:

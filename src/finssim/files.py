@@ -6,9 +6,12 @@ And names that may become part of a path: one that came from data is never a pat
 from __future__ import annotations
 
 import errno
+import json
 import os
 import secrets
 import shutil
+import socket
+import sys
 import unicodedata
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -106,6 +109,101 @@ def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = Non
             shutil.rmtree(temporary, ignore_errors=True)
             raise
         _flush(target.parent)
+
+
+@contextmanager
+def sole_writer(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Refuse a directory that another process writes into, and keep others out while the block lasts.
+
+    A hidden file beside the directory names the process. One that a killed process left behind is replaced.
+
+        with sole_writer("runs/hold"):
+            train(...)
+
+    Args:
+        path: Directory, which need not exist.
+
+    Raises:
+        OutputError: Another process writes there, or there is no place beside the directory.
+    """
+    target = Path(os.path.realpath(path))
+    lock = target.with_name(f".{target.name[:100]}.lock")
+    with _as_output_error(target, label=path):
+        made = [folder for folder in lock.parents if not folder.exists()]
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        file = _locked(lock, path)
+    try:
+        yield
+    finally:
+        os.close(file)
+        lock.unlink(missing_ok=True)
+        for folder in made:  # of a refused command nothing stays
+            try:
+                folder.rmdir()
+            except OSError:
+                break
+
+
+def _locked(lock: Path, label: str | os.PathLike[str]) -> int:
+    """Make the lock file and return its descriptor, which stays open: Windows removes no open file."""
+    about = {"pid": os.getpid(), "host": socket.gethostname(), "command": " ".join(["finssim", *sys.argv[1:]])[:200]}
+    for _ in range(10):
+        try:
+            file = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+        except FileExistsError:
+            _remove_stale(lock, label)
+            continue
+        os.write(file, json.dumps(about).encode())
+        return file
+    raise OutputError(f"cannot write {label}: {lock} cannot be replaced: remove it")
+
+
+def _remove_stale(lock: Path, label: str | os.PathLike[str]) -> None:
+    """Remove the lock of a process that has ended.
+
+    Raises:
+        OutputError: The process may still run.
+    """
+    try:
+        text = lock.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return
+    try:
+        about = json.loads(text)
+        pid, host, command = int(about["pid"]), str(about["host"]), str(about["command"])
+    except (ValueError, KeyError, TypeError):  # killed, or seen, before it was written
+        pid, host, command = 0, "", "another process"
+    if host == socket.gethostname() and not _runs(pid):
+        aside = _beside(lock)
+        try:
+            os.rename(lock, aside)
+        except FileNotFoundError:
+            return  # another process was faster
+        except PermissionError:
+            pass  # Windows: it is open
+        else:
+            if aside.read_text(encoding="utf-8") != text:  # it was made anew in between
+                os.rename(aside, lock)
+            else:
+                aside.unlink()
+                return
+    raise OutputError(
+        f"cannot write {label}: '{command}' (process {pid} on {host or 'an unknown computer'}) is writing there: wait "
+        f"for its end or give another directory; if it does not run any more, remove {lock}"
+    )
+
+
+def _runs(pid: int) -> bool:
+    """Return whether a process of this computer runs; not asked on Windows, where its open file cannot be renamed."""
+    if os.name == "nt":
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def plain_name(name: str, subject: str, error: type[Exception]) -> str:

@@ -152,7 +152,7 @@ def test_by_the_command(tmp_path, capsys):
 
 
 def test_what_cannot_be_exported_is_refused(tmp_path, capsys):
-    """A set of an earlier version, a rate that is no whole number, two sets at once: nothing is written."""
+    """An old set, a rate that is no whole number, two sets, a folder in the set: nothing is written."""
     out = tmp_path / "out"
     old = save(tmp_path / "sets/old", EPISODES, {k: x for k, x in DESCRIBED.items() if k != "period"})
     with pytest.raises(DatasetError, match="has no period: collect it again"):
@@ -164,6 +164,9 @@ def test_what_cannot_be_exported_is_refused(tmp_path, capsys):
         export_lerobot(odd, out)
     assert boundary.run(app, ["datasets", str(tmp_path / "sets"), "--lerobot", str(out)]) == 2
     assert "2 data sets are named, expected one" in capsys.readouterr().err
+    inside = tmp_path / "sets/odd/lerobot"
+    assert boundary.run(app, ["datasets", str(tmp_path / "sets/odd"), "--lerobot", str(inside)]) == 2
+    assert "lies in the data set" in capsys.readouterr().err and not inside.exists()
     assert not out.exists()
 
 

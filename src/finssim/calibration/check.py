@@ -30,7 +30,7 @@ from finssim.calibration.motion import (
 from finssim.calibration.significance import Relation, relation
 from finssim.calibration.trials.inputs import Drive, drive, implausible
 from finssim.calibration.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
-from finssim.calibration.trials.trial_files import load_trial, trials_at
+from finssim.calibration.trials.trial_files import load_trial, trials_at, vehicle_of
 from finssim.geometry.rotations import quat_rotate, quat_to_euler
 from finssim.vehicles import AXES, Vehicle, VehicleError, load_vehicle
 
@@ -1020,7 +1020,7 @@ def check(
     *,
     vehicle: str | None = None,
     as_json: bool = False,
-) -> None:
+) -> int:
     """Report what trials can and cannot identify: rates [Hz], gaps [s], clock jumps, saturation, excitation.
 
     Example: finssim trials check trials --vehicle bluerov2
@@ -1029,6 +1029,9 @@ def check(
         paths (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
         vehicle (NAME|FILE): Vehicle of the trials, if their headers name none.
         as_json: Print one JSON object instead of tables.
+
+    Returns:
+        Exit status: 0 if a trial can be used, 3 if every trial is refused.
 
     Raises:
         CalibrationError: There is no trial at a path.
@@ -1045,15 +1048,17 @@ def check(
             trials.append(TrialReport(name=location.name, findings=(finding("unusable", reason=str(error)),)))
     reports = check_trials(trials, loaded)
     common = set_findings(reports)
+    status = 3 if all(report.verdict == "refused" for report in reports) else 0
     if as_json:
         records = [entry.as_json() for entry in reports], [entry.as_json() for entry in common]
         print(
             json.dumps(dict(zip(("trials", "together"), records, strict=True)), indent=2, ensure_ascii=False)
         )
-        return
+        return status
     from rich.console import Console
 
     print_reports(reports, Console(), common)
+    return status
 
 
 def check_trials(trials: Sequence[Trial | TrialReport], vehicle: Vehicle | None = None) -> list[TrialReport]:
@@ -1107,10 +1112,8 @@ def _header_vehicle(trial: Trial, findings: list[Finding]) -> Vehicle | None:
     if trial.header.vehicle is None:
         findings.append(finding("no_vehicle"))
         return None
-    named = trial.header.vehicle
-    beside = Path(trial.path or ".") / named
     try:
-        return load_vehicle(beside if beside.is_file() else named)
+        return vehicle_of(trial)
     except VehicleError as error:
         findings.append(finding("vehicle_refused", reason=str(error)))
         return None

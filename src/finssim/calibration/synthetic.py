@@ -34,7 +34,7 @@ from finssim.geometry.rotations import (
 from finssim.physics.plant import DERIVED
 from finssim.physics.types import vec6
 from finssim.sensors import SensorSuite
-from finssim.vehicles import Vehicle
+from finssim.vehicles import Vehicle, catalogue
 
 __all__ = ["NoiseProfile", "Recording", "record", "simulate_programme", "trials_of"]
 
@@ -472,7 +472,9 @@ def trials_of(
                 | {name: measured[name][: len(t), w].copy() for name in chosen},
                 phase=programme.phase[rows],
                 header=Header(
-                    vehicle=vehicle.name,
+                    vehicle=vehicle.name
+                    if vehicle.name in catalogue() or vehicle.path is None
+                    else str(vehicle.path.resolve()),
                     axis=programme.axes,
                     description=f"simulated: {programme.name}",
                     inputs="commanded" if set(inputs) <= {"command", "pwm"} else "applied",

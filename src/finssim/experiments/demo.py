@@ -442,7 +442,7 @@ def demo(
     Example: finssim demo --robot udp://10.0.0.2:58766 --pool-file pool.yaml --arm --out demo
 
     Args:
-        out: Directory of trials, vehicle, policy, results and report.
+        out (DIR): Directory of trials, vehicle, policy, results and report.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         seed: Seed of every random number; equal seeds give equal results.
         steps: Control steps of the training, summed over all worlds; the task's default if not given.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,10 @@ def export_lerobot(source: str | Path, out: str | Path) -> dict[str, Any]:
     """
     import pandas as pd
 
+    if Path(os.path.realpath(out)).is_relative_to(os.path.realpath(source)):
+        raise DatasetError(
+            f"--lerobot {out}: lies in the data set {source}, which is read: give a folder beside it"
+        )
     described = about(source)
     fps, title = _rate(described, source), str(described.get("title") or described["task"])
     with atomic_directory(out, replaces=INFO_FILE) as folder:

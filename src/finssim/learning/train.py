@@ -64,7 +64,7 @@ def train(
         task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking,
             pursuit, team-pursuit, formation; with a camera camera-docking, pipeline or gate, with a sonar net; or
             your own, FILE.py:CLASS.
-        out: Directory of the policy; an earlier policy there is replaced at the end.
+        out (DIR): Directory of the policy; an earlier policy there is replaced at the end.
         learner (NAME): Learner: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; one agent also torchrl-ppo,
             several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; tasks with images
             distill, their default; or your own, FILE.py:CLASS.

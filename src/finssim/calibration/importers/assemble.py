@@ -37,6 +37,7 @@ from finssim.calibration.trials.trial import (
     Trial,
     column_of,
 )
+from finssim.calibration.trials.trial_files import vehicle_reference
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.vehicles import load_vehicle
@@ -315,6 +316,8 @@ class ColumnMap(Part):
         keys = {**(recorded or {}), **self.header, **self.trials.get(trial, {})}
         if vehicle is not None:
             keys["vehicle"] = vehicle
+        if isinstance(keys.get("vehicle"), str):
+            keys["vehicle"] = vehicle_reference(keys["vehicle"])
         place = f"trials.{trial}" if trial else ""
         for key in keys:
             if key not in HEADER_KEYS:

@@ -27,6 +27,7 @@ from finssim.calibration.trials.trial import (
 )
 from finssim.files import OutputError, atomic_directory
 from finssim.text_table import TextTable, number, read_text_table, write_csv
+from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean, sentence_of
 from finssim.yaml_file import read_mapping, yaml_text
 
@@ -503,6 +504,39 @@ def load_trials(paths: Iterable[str | os.PathLike[str]]) -> list[Trial]:
         replace(trial, name=name) if name != trial.name else trial
         for trial, name in zip(trials, names, strict=True)
     ]
+
+
+ABOVE = 3
+"""Folders, from the trial's own upwards, in which a vehicle file is looked for that is not where it was."""
+
+
+def vehicle_reference(name: str) -> str:
+    """Return how a trial names a vehicle: a name of the catalogue, or the absolute path of a file that exists."""
+    path = Path(name)
+    is_file = (path.suffix in (".yaml", ".yml") or path.name != name) and path.is_file()
+    return str(path.resolve()) if is_file else name
+
+
+def vehicle_of(trial: Trial) -> Vehicle:
+    """Return the vehicle that the header of a trial names.
+
+    A relative path counts from the trial's folder, or else from the working directory. A file that is not there is
+    looked for by its name in the trial's folder and the two above, so that trials and vehicle can be moved together.
+
+    Raises:
+        VehicleError: There is no such vehicle, or its file is refused.
+    """
+    named = str(trial.header.vehicle)
+    beside = Path(trial.path or ".") / named
+    if beside.is_file():
+        return load_vehicle(beside)
+    path = Path(named)
+    if trial.path and path.suffix in (".yaml", ".yml") and not path.is_file():
+        folder = Path(trial.path).resolve()
+        for place in [folder, *folder.parents][:ABOVE]:
+            if (place / path.name).is_file():
+                return load_vehicle(place / path.name)
+    return load_vehicle(named)
 
 
 def write_trial(
