@@ -146,7 +146,11 @@ def sole_writer(path: str | os.PathLike[str]) -> Iterator[None]:
 
 def _locked(lock: Path, label: str | os.PathLike[str]) -> int:
     """Make the lock file and return its descriptor, which stays open: Windows removes no open file."""
-    about = {"pid": os.getpid(), "host": socket.gethostname(), "command": " ".join(["finssim", *sys.argv[1:]])[:200]}
+    about = {
+        "pid": os.getpid(),
+        "host": socket.gethostname(),
+        "command": " ".join(["finssim", *sys.argv[1:]])[:200],
+    }
     for _ in range(10):
         try:
             file = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
