@@ -207,7 +207,10 @@ def _runs(pid: int) -> bool:
         return False
     except PermissionError:
         return True
-    return True
+    try:  # one that ended, but for its parent to notice
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return True
 
 
 def plain_name(name: str, subject: str, error: type[Exception]) -> str:
