@@ -14,6 +14,7 @@ from finssim.control.controllers import controller
 from finssim.control.guidance import Station, goal_at
 from finssim.control.modes import action_mode
 from finssim.control.policy import PolicyError
+from finssim.control.trajectories import through_points
 from finssim.geometry.rotations import quat_from_euler
 from finssim.robot.goals import GoalError, check_reachable, guide_of, station_of
 from finssim.robot.pilots import ModeSwitch, WrenchPilot, make_pilot
@@ -275,6 +276,20 @@ def test_a_goal_outside_the_workspace_is_refused():
     for place in ("0,0,0.2,0", "2.5,0,-0.5,0"):
         with pytest.raises(GoalError, match="outside the workspace"):
             check_reachable(station_of(place), VEHICLE)
+
+
+def test_a_way_that_is_faster_than_the_vehicle_is_refused():
+    """Between any two of its points, however short that is; a vehicle that cannot go sideways follows a curve."""
+    way = [
+        (0.0, 0.0, 0.0, -0.5),
+        (500.0, 0.5, 0.0, -0.5),
+        (500.001, 0.6, 0.0, -0.5),
+        (1000.0, 0.6, 0.1, -0.5),
+    ]
+    with pytest.raises(GoalError, match="m/s at 500 s, but finsrov goes 0.6"):
+        check_reachable(through_points("way", way), VEHICLE)
+    check_reachable(through_points("way", way[:2] + way[3:]), VEHICLE)
+    check_reachable(guide_of(None, "lemniscate"), load_vehicle("lauv"))
 
 
 def test_the_published_pid_has_a_profile_for_each_task():

@@ -203,6 +203,8 @@ class Trajectory:
     """[rad]"""
     turning: Callable[[Array], Array] | None = field(default=None, repr=False)
     """A heading of its own at times within the duration [rad], in place of a fixed one; `yaw` is added."""
+    knots: Array | None = field(default=None, repr=False, compare=False)
+    """Times of the points that it goes through [s], (n,); None without points."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.duration <= LONGEST:
@@ -328,10 +330,38 @@ def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
     able = terminal_speeds(vehicle)[:3]
     if np.any(speed > able):
         i, axis = np.argwhere(speed > able)[0]
-        raise ControlError(
-            f"trajectory {trajectory.name}: {('surge', 'sway', 'heave')[axis]} of {speed[i, axis]:.4g} m/s at "
-            f"{t[i]:.2f} s, but {vehicle.name} goes {able[axis]:.4g} m/s at most: make it longer or smaller"
+        raise _too_fast(
+            trajectory, ("surge", "sway", "heave")[axis], speed[i, axis], t[i], able[axis], vehicle
         )
+
+
+def check_speed(trajectory: Trajectory, vehicle: Vehicle) -> None:
+    """Refuse a trajectory that is faster than a vehicle can go in any direction, wherever its points lie.
+
+    Raises:
+        ControlError: Names the speed and when.
+    """
+    from finssim.vehicles.capability import terminal_speeds
+
+    t = np.linspace(0.0, trajectory.duration, 2001)
+    if trajectory.knots is not None:
+        t = np.unique(
+            np.concatenate([t, trajectory.knots, 0.5 * (trajectory.knots[1:] + trajectory.knots[:-1])])
+        )
+    speed = np.linalg.norm(trajectory.at(t).velocity, axis=-1)
+    able = float(np.linalg.norm(terminal_speeds(vehicle)[:3]))
+    if np.any(speed > able):
+        i = int(np.argmax(speed))
+        raise _too_fast(trajectory, "a speed", speed[i], t[i], able, vehicle)
+
+
+def _too_fast(
+    trajectory: Trajectory, what: str, speed: float, time: float, able: float, vehicle: Vehicle
+) -> ControlError:
+    return ControlError(
+        f"trajectory {trajectory.name}: {what} of {speed:.4g} m/s at {time:.4g} s, but {vehicle.name} goes "
+        f"{able:.4g} m/s at most: make it longer or smaller"
+    )
 
 
 # Trajectory files: points in time as CSV or YAML, or a shape with its measures as YAML.
@@ -395,6 +425,7 @@ def through_points(name: str, points: npt.ArrayLike, **options: Any) -> Trajecto
     def motion(time: Array) -> tuple[Array, Array]:
         return position(time), drift(time)
 
+    options["knots"] = t
     if table.shape[1] == 5:
         options["turning"] = CubicHermiteSpline(t, table[:, 4], slopes[:, 3])
     return Trajectory(name=name, duration=float(t[-1]), motion=motion, **options)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from finssim.control import ControlError
 from finssim.control.guidance import Guide, Reference, Station, Track
 from finssim.geometry.rotations import quat_rotate, quat_yaw
 from finssim.vehicles import Vehicle
@@ -99,10 +100,10 @@ def guide_of(goal: str | None, trajectory: str | None) -> Guide:
 
 
 def check_reachable(guide: Guide, vehicle: Vehicle) -> None:
-    """Refuse a motion that leaves the box in which the vehicle may move.
+    """Refuse a motion that leaves the box in which the vehicle may move, or that is faster than it can go.
 
     Raises:
-        GoalError: It does; says where.
+        GoalError: It does, or is; says where or when.
     """
     end = guide.duration if math.isfinite(guide.duration) else 0.0
     places = guide.at(np.linspace(0.0, end, 401)).position
@@ -114,6 +115,14 @@ def check_reachable(guide: Guide, vehicle: Vehicle) -> None:
             f"{guide.name} leads to {point}, outside the workspace {lower.tolist()} to {upper.tolist()} of "
             f"{vehicle.name} (world frame, z = 0 on the water): choose another, or change safety in the vehicle file"
         )
+    if end:
+        from finssim.control.trajectories import Trajectory, check_speed
+
+        if isinstance(guide, Trajectory):
+            try:
+                check_speed(guide, vehicle)
+            except ControlError as error:
+                raise GoalError(str(error)) from None
 
 
 def _goal_in(path: Path) -> list[object]:

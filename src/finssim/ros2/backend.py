@@ -103,7 +103,7 @@ def _shim(interfaces: Sequence[Path], reason: str) -> Backend:
 # What lets `import rclpy`, `import nav_msgs.msg` and `import std_srvs.srv` find the shim and the codec's classes.
 
 PARTS = {
-    "context": ("context", "utilities"),
+    "context": ("context", "signals", "utilities"),
     "endpoint": (
         "callback_groups", "client", "event_handler", "publisher", "serialization", "service", "subscription", "task",
     ),

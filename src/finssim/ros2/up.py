@@ -332,6 +332,7 @@ def up(graph: str, *, options: Options, notify: Callable[[str], None] = print) -
     """
     activate()
     import rclpy
+    from rclpy.signals import SignalHandlerOptions
 
     from finssim.ros2.nodes.remote import Watcher
 
@@ -347,7 +348,8 @@ def up(graph: str, *, options: Options, notify: Callable[[str], None] = print) -
                 f"{name}:='{shared[name]}'" for name in ("vehicle", "site", "frame_prefix") if name in shared
             )
             arguments = [word for setting in settings for word in ("-p", setting)]
-            rclpy.init(args=["--ros-args", "-r", f"__ns:=/{plan.namespace}", *arguments])
+            words = ["--ros-args", "-r", f"__ns:=/{plan.namespace}", *arguments]
+            rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)  # `interruptible` has them
             try:
                 watcher = Watcher(plan.nodes, arm=options.arm)
                 with Supervisor(plan, parameters, notify) as nodes:

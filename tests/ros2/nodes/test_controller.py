@@ -224,6 +224,12 @@ def test_a_way_is_shown_again_when_it_begins(wire):
     )
 
 
+def leap(path):
+    """A metre in a millisecond."""
+    path.poses[1].pose.position.x = path.poses[0].pose.position.x + 1.0
+    path.poses[1].header.stamp.sec, path.poses[1].header.stamp.nanosec = 0, 10**6
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -238,6 +244,7 @@ def test_a_way_is_shown_again_when_it_begins(wire):
             "pose 2: a goal that is not finite",
         ),
         (lambda path: setattr(path.poses[1].pose.position, "x", 50.0), "outside the workspace"),
+        (leap, "1500 m/s at"),
     ],
 )
 def test_a_path_that_cannot_be_followed_is_refused(wire, change, words):
@@ -255,6 +262,20 @@ def test_parameters_of_a_running_node_stay_as_they_are(wire):
     stage = wire(Controller, "-p", "policy:=pid-paper")
     (result,) = stage.node.set_parameters([Parameter("policy", value="pid")])
     assert not result.successful and "read-only: set it at the start" in result.reason
+
+
+def test_a_node_keeps_its_clock(wire):
+    """use_sim_time on an armed robot would put its time elsewhere: refused with the reason, and nothing happens."""
+    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'")
+    stage.state = "armed"
+    assert stage.until(lambda: stage.heard["command"])
+    (result,) = stage.node.set_parameters([Parameter("use_sim_time", value=True)])
+    assert not result.successful and "start it again" in result.reason
+    assert not stage.node.get_parameter("use_sim_time").value
+    (result,) = stage.node.set_parameters([Parameter("use_sim_time", value=False)])
+    assert result.successful
+    stage.heard["command"].clear()
+    assert stage.until(lambda: stage.heard["command"])
 
 
 def test_a_silent_estimator_ends_commands(wire):

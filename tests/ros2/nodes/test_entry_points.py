@@ -107,6 +107,37 @@ def test_an_older_workspace_that_gives_no_arguments_keeps_those_of_the_process(m
     assert run_node("sim") == 2 and not lived
 
 
+def test_a_node_whose_context_is_shut_down_during_a_call_ends_in_order(monkeypatch, capsys):
+    """As real rclpy does at SIGTERM, whatever the node is doing; a fault of its own keeps its traceback."""
+    monkeypatch.setattr(RobotNode, "urgent", False)
+    monkeypatch.setattr("finssim.ros2.nodes.robot_node.LISTENING", 0.0)
+    monkeypatch.setattr(RobotNode, "listening", 0.0)
+    monkeypatch.setattr(sys, "argv", ["node"])
+    closed = []
+
+    class Left(RobotNode):
+        def __init__(self, leave):
+            super().__init__("left")
+            self.sends("event", "diagnostics")
+            self.create_timer(0.01, lambda: (leave(), self.event("late", "words"), 1 / 0))
+
+        def close(self):
+            closed.append(self)
+
+    class Leaves(Left):
+        def __init__(self):
+            super().__init__(rclpy.shutdown)
+
+    class Fails(Left):
+        def __init__(self):
+            super().__init__(lambda: None)
+
+    assert Leaves.run() == 0 and len(closed) == 1
+    with pytest.raises(ZeroDivisionError):
+        Fails.run()
+    assert len(closed) == 2
+
+
 @pytest.mark.slow
 def test_the_script_that_colcon_installs_exits_with_the_status(tmp_path):
     """The text that setuptools writes, as a process."""

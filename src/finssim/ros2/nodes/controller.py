@@ -15,6 +15,7 @@ from finssim.control import ControlError
 from finssim.control.controllers import CONTROLLERS, COSTLY
 from finssim.control.guidance import Guide, Measured, Station
 from finssim.control.policy import NETWORK_FILE
+from finssim.control.trajectories import check_speed, through_points
 from finssim.geometry.rotations import quat_yaw
 from finssim.robot.goals import GoalError, check_reachable, guide_of
 from finssim.robot.messages import Picture
@@ -142,6 +143,8 @@ class Controller(RobotNode):
         )
         self.guide: Guide | None = None
         self.armed = False
+        # What the first path needs is imported and computed now: armed, the loop may not wait for it.
+        check_speed(through_points("", [(0.0, 0.0, 0.0, 0.0), (1e3, 0.0, 0.0, 0.0)]), self.vehicle)
         goal, trajectory = self.parameter("goal", ""), self.parameter("trajectory", "")
         if goal or trajectory:
             self._follow(guide_of(goal or None, trajectory or None))

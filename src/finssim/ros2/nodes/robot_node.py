@@ -7,10 +7,11 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -74,6 +75,7 @@ class RobotNode(Node):
         simulated = self.get_parameter("use_sim_time").value
         self.base = 0 if simulated else self.get_clock().now().nanoseconds // 10**9 * 10**9
         """What the ROS clock shows when the robot's shows 0 [ns]."""
+        self.add_on_set_parameters_callback(partial(_keep_clock, bool(simulated)))
         self._out: dict[str, Any] = {}
         self._listen_for({self.get_name(), *others})
 
@@ -192,6 +194,9 @@ class RobotNode(Node):
             pass
         except (ValueError, ParameterException) as error:
             return _refused(error)
+        except Exception:
+            if rclpy.ok():  # else a signal shut the context down during a call, which real rclpy does at once
+                raise
         finally:
             if node is not None:
                 node.close()
@@ -213,6 +218,17 @@ def matched_callbacks(matched: Callable[[Any], None]) -> Any:
     except ImportError:
         return None
     return SubscriptionEventCallbacks(matched=matched)
+
+
+def _keep_clock(simulated: bool, parameters: Sequence[Any]) -> SetParametersResult:
+    """Refuse another clock than that of the start, from which the node counts its seconds."""
+    changed = any(p.name == "use_sim_time" and p.value != simulated for p in parameters)
+    return SetParametersResult(
+        successful=not changed,
+        reason="its clock counts from the start of the node: start it again with this value"
+        if changed
+        else "",
+    )
 
 
 def _refused(error: Exception) -> int:

@@ -11,6 +11,7 @@ from typing import Any
 
 from finssim.ros2.shim.context import (
     Context,
+    SignalHandlerOptions,
     get_default_context,
     ok,
     renew_default_context,
@@ -37,15 +38,20 @@ __all__ = [
 
 
 def init(
-    *, args: Sequence[str] | None = None, context: Context | None = None, domain_id: int | None = None
+    *,
+    args: Sequence[str] | None = None,
+    context: Context | None = None,
+    domain_id: int | None = None,
+    signal_handler_options: SignalHandlerOptions | None = None,
 ) -> None:
-    """Join the wire; before anything else."""
+    """Join the wire; before anything else. SIGTERM ends `spin` unless the options leave it to the program."""
     if context is None:
         context = get_default_context()
         if not context.ok():
             context = renew_default_context()
     context.init(args, domain_id=domain_id)
-    context.leave_on_sigterm()
+    if signal_handler_options in (None, SignalHandlerOptions.ALL, SignalHandlerOptions.SIGTERM):
+        context.leave_on_sigterm()
 
 
 def create_node(node_name: str, **arguments: Any) -> Node:

@@ -1,4 +1,4 @@
-"""`rclpy.context`, `rclpy.utilities`: what a process holds between `init` and `shutdown`: participant and nodes."""
+"""`rclpy.context`, `rclpy.signals`, `rclpy.utilities`: participant and nodes of a process from `init` to `shutdown`."""
 
 from __future__ import annotations
 
@@ -7,12 +7,22 @@ import sys
 import threading
 import weakref
 from collections.abc import Sequence
+from enum import Enum
 from typing import Any
 
 from finssim.ros2.shim.arguments import RosArguments, parse_arguments
 from finssim.ros2.shim.exceptions import NotInitializedException
 from finssim.ros2.shim.logging import set_logger_level
 from finssim.ros2.wire import Participant, wire_settings
+
+
+class SignalHandlerOptions(Enum):
+    """Signals that end `spin`; SIGINT always raises KeyboardInterrupt here."""
+
+    NO = 0
+    SIGINT = 1
+    SIGTERM = 2
+    ALL = 3
 
 
 class Context:
