@@ -6,11 +6,12 @@ import pytest
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from finssim.robot.messages import Telemetry
-from finssim.robot.record_messages import RecordError
-from finssim.robot.record_reader import open_record, repair_record, write_whole
+from finssim.robot.record_messages import RecordError, types
+from finssim.robot.record_reader import info, open_record, play_record, repair_record, write_whole
 from finssim.robot.recorder import Recorder
 from finssim.vehicles import load_vehicle
 
@@ -133,6 +134,36 @@ def test_damage_that_has_no_message_is_named_by_its_kind(run, tmp_path):
     write_whole(cut, tmp_path / "copy.mcap", notes)
     assert notes == ["cut.mcap is damaged and was read up to there: EndOfFile"]
     assert depths(tmp_path / "copy.mcap")
+
+
+@pytest.mark.parametrize("repeated", [True, False])
+def test_a_channel_without_a_schema_and_a_summary_without_schemas_are_read(tmp_path, capsys, repeated):
+    """A file of another program: JSON without a schema beside a topic of a known type, its schemas only in the data."""
+    path, text = tmp_path / "other.mcap", "builtin_interfaces/msg/Time"
+    with path.open("wb") as file:
+        writer = Writer(file, repeat_schemas=repeated)
+        writer.start()
+        clock = writer.register_schema(text, "ros2msg", b"int32 sec\nuint32 nanosec\n")
+        typed = writer.register_channel("/time", "cdr", clock)
+        untyped = writer.register_channel("/words", "json", 0)
+        for i in range(3):
+            writer.add_message(typed, i, types().serialize_cdr(types().types[text](i, 0), text), i)
+            writer.add_message(untyped, i, b'{"a": 1}', i)
+        writer.finish()
+    info(path)
+    shown = capsys.readouterr().out
+    assert "6 messages" in shown and text in shown and "no type" in shown
+    play_record(path)
+    shown = capsys.readouterr()
+    assert (
+        len(shown.out.splitlines()) == 3
+        and "/words has no type in the file (schema 0) and is left out" in shown.err
+    )
+    with pytest.raises(RecordError, match="/words has no type in the file"):
+        play_record(path, topics=["words"])
+    assert repair_record(path, tmp_path / "mended.mcap") == []
+    info(tmp_path / "mended.mcap")
+    assert "6 messages" in capsys.readouterr().out
 
 
 def test_a_record_is_not_repaired_into_itself(run):

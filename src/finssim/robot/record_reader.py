@@ -132,6 +132,10 @@ class Entry(NamedTuple):
     """With the type's fields."""
 
 
+NO_TYPE = "no type"
+"""Type of a topic whose channel has no schema."""
+
+
 class Record:
     """An open record; see `open_record`."""
 
@@ -150,7 +154,8 @@ class Record:
         }
         """Name -> text of the files kept in it."""
         self.topics: dict[str, str] = {
-            c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values()
+            c.topic: summary.schemas[c.schema_id].name if c.schema_id else NO_TYPE
+            for c in summary.channels.values()
         }
         """Topic -> type."""
         self._epoch = round(float(self.metadata.get("epoch", 0.0)) * 1e9)
@@ -173,13 +178,17 @@ class Record:
         """Messages in time order.
 
         Args:
-            topics: Names, or their last parts, such as `odom`; all topics if None.
+            topics: Names, or their last parts, such as `odom`; all that have a type if None.
             start: Earlier ones are passed over [s].
 
         Raises:
             RecordError: There is no such topic, or one of a type that cannot be decoded.
         """
-        selected = None if topics is None else [self._known(self.topic(topic)) for topic in topics]
+        if topics is None:
+            topics = [topic for topic, kind in self.topics.items() if kind != NO_TYPE]
+        selected = [self._known(self.topic(topic)) for topic in topics]
+        if untyped := [topic for topic in selected if self.topics[topic] == NO_TYPE]:
+            raise RecordError(f"{self.path}: {untyped[0]} has no type in the file (schema 0): omit it")
         for schema, channel, message in self._reader.iter_messages(topics=selected):
             time = self._seconds(message.log_time)
             if start is not None and time < start:
@@ -228,11 +237,14 @@ def open_record(path: Path | str) -> Iterator[Record]:
 
 
 def _indexed(file: Any) -> bool:
-    """Whether the file has a summary that can be read."""
+    """Whether the file has a summary that can be read, with the schemas of all its channels."""
     from mcap.reader import make_reader
 
     try:
-        return make_reader(file).get_summary() is not None
+        summary = make_reader(file).get_summary()
+        return summary is not None and all(
+            c.schema_id in (0, *summary.schemas) for c in summary.channels.values()
+        )
     except Exception:  # a damaged summary breaks in whatever layer reads it; the data are read without it
         return False
 
@@ -371,6 +383,9 @@ def play_record(
     with open_record(path) as record:
         for note in record.notes:
             print(note, file=sys.stderr)
+        for topic, kind in record.topics.items():
+            if kind == NO_TYPE and topics is None:
+                print(f"{topic} has no type in the file (schema 0) and is left out", file=sys.stderr)
         first = next((at for at, _, _ in record.sizes()), 0.0) + start if start else None
         for entry in record.messages(topics, first):
             print(json_line(entry), flush=True)
