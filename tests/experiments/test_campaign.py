@@ -3,14 +3,18 @@
 import json
 import math
 import os
+import socket
 import subprocess
 import sys
+import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from signal import SIGINT, SIGKILL, SIGTERM
 
 import pytest
 
+from finssim.experiments import campaign
 from finssim.experiments.campaign import ResultError, keep_result, load_result, run_jobs, write_json
 from finssim.experiments.robot_trials import Job
 from reference import played
@@ -147,3 +151,28 @@ def test_a_result_with_nan_is_refused_and_nothing_is_written(tmp_path):
     ):
         write_json(tmp_path / "result.json", {"e_p_m": math.nan})
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "says, reason", [(b"", "timed out"), (b"SSH-2.0-OpenSSH_9.6\r\n", "another program")]
+)
+def test_a_stranger_at_the_address_of_a_cluster_is_found_out(monkeypatch, says, reason):
+    """One that is silent is given up after the time for an answer, one that greets otherwise at once."""
+    monkeypatch.setattr(campaign, "PATIENCE", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+
+        def greet():
+            guest = listener.accept()[0]
+            with suppress(ConnectionResetError):
+                guest.sendall(says)
+                while guest.recv(1 << 10):  # until the other end has gone
+                    pass
+            guest.close()
+
+        stranger = threading.Thread(target=greet)
+        stranger.start()
+        with pytest.raises(campaign.ClusterError, match=f"no Ray cluster answers at {address}: .*{reason}"):
+            campaign._knock(address)
+        stranger.join(10.0)
+    assert not stranger.is_alive()

@@ -6,6 +6,7 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -195,8 +196,6 @@ def test_lockstep_gives_what_the_pool_gives():
 
 def test_lockstep_lets_in_one_robot_alone_and_outlives_no_garbage():
     """A second robot finds nobody; one that speaks something else is told so, and the server ends."""
-    import threading
-
     server, pool, ended = LockstepServer((HERE, 0)), world(), []
     thread = threading.Thread(target=lambda: ended.append(server.serve(pool)), daemon=True)
     thread.start()
@@ -350,13 +349,27 @@ def test_a_pool_that_finds_its_port_taken_leaves_the_files_of_the_other_alone(tm
     assert [file.read_text() for file in files] == ["of the pool that is running"] * 2
 
 
-def test_a_robot_that_sends_garbage_and_leaves_ends_lockstep_without_an_error():
-    """The refusal finds nobody."""
-    server = LockstepServer((HERE, 0))
+def test_guests_that_are_no_robot_do_not_end_lockstep():
+    """One connects and leaves, one sends garbage and breaks off, one asks for a page, ten are silent: then a robot."""
+    server, ended = LockstepServer((HERE, 0)), []
+    thread = threading.Thread(target=lambda: ended.append(server.serve(world())), daemon=True)
+    thread.start()
+    socket.create_connection(server.address).close()
     with socket.create_connection(server.address) as rude:
         rude.sendall(b"garbage of some length")
         rude.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-    assert server.serve(VirtualPool(FINSROV, draw_plant(FINSROV, 1, "nominal"))) != ""
+    with socket.create_connection(server.address, timeout=10.0) as browser:
+        browser.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        assert b"no lock-step message" in browser.recv(4096)
+    silent = [socket.create_connection(server.address) for _ in range(10)]
+    with LockstepClient(f"{HERE}:{server.address[1]}", timeout=10.0) as robot:
+        assert robot.exchange(0.1, []).time == pytest.approx(0.1)
+    thread.join(10.0)
+    assert ended == ["the robot has left"]
+    for guest in silent:
+        guest.settimeout(10.0)
+        assert guest.recv(1) == b""
+        guest.close()
 
 
 def test_a_port_that_is_taken_is_named():

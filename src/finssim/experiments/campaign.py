@@ -39,6 +39,8 @@ Progress = Callable[..., None]
 
 WATCH = 1.0
 """Time between two looks of a worker at its parent [s]."""
+SETTINGS = 4
+"""Type of a frame of HTTP/2."""
 PATIENCE = 10.0
 """For a cluster's answer to a first knock [s]."""
 RETRIES = 3
@@ -339,14 +341,23 @@ def _call(work: Callable[[Any], Any], item: Any) -> Any:
 
 
 def _knock(address: str) -> None:
-    """Refuse an address where nothing listens at once: Ray itself tries for minutes."""
+    """Refuse an address where nothing answers as Ray does: Ray itself tries for minutes, or for ever.
+
+    Ray speaks gRPC, so its first frame is one of HTTP/2 settings.
+    """
     if address == "auto":
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdigit():
         raise ClusterError(f"address is '{address}', expected HOST:PORT or auto")
     try:
-        socket.create_connection((host, int(port)), timeout=PATIENCE).close()
+        with socket.create_connection((host, int(port)), timeout=PATIENCE) as connection:
+            if os.environ.get("RAY_USE_TLS", "0") in ("0", ""):
+                connection.sendall(
+                    b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, SETTINGS, 0, 0, 0, 0, 0))
+                )
+                if connection.recv(9)[3:4] != bytes((SETTINGS,)):
+                    raise OSError("it is another program")
     except (OSError, OverflowError) as error:
         raise ClusterError(f"no Ray cluster answers at {address}: {error}") from error
 

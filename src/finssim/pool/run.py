@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import select
 import signal
 import socket
 import sys
@@ -64,6 +65,12 @@ MOST_BEHIND = 0.2
 """A pool that is further behind gives up that time [s]: its clock stands still instead, as on a stopped computer."""
 
 
+MOST_CALLERS = 8
+"""Ground stations that are answered over UDP, and guests of a pool in lock-step: those that called last."""
+GUEST_PATIENCE = 2.0
+"""Within which a robot's first request must arrive whole [s]."""
+
+
 class Clocked(Protocol):
     """A camera that must know when the pool's clock began."""
 
@@ -114,7 +121,10 @@ class LockstepServer:
         self.address: tuple[str, int] = self._listener.getsockname()
 
     def serve(self, world: VirtualPool, *, duration: float = math.inf) -> str:
-        """Wait for a robot and serve it; nobody else is let in.
+        """Wait for a robot and serve it; no one else is let in.
+
+        The robot is the first that sends a request. Whoever connects and leaves again, is silent or sends something
+        else is not, and the pool continues to listen.
 
         Args:
             world: The pool.
@@ -123,17 +133,20 @@ class LockstepServer:
         Returns:
             Why it ended, in a few words.
         """
-        connection, robot = self._listener.accept()
+        connection, request = self._first_request()
         self.close()
         with connection:
+            robot = connection.getpeername()
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             try:
-                while (message := receive(connection)) is not None:
+                message: tuple[int, bytes] | None = request
+                while message is not None:
                     until, sent = decode_request(*message)
                     if until > duration + 1e-9:
                         connection.sendall(encode_refusal(f"the pool ends at {duration:g} s, as it was told"))
                         return "the time is over"
                     connection.sendall(encode_delivery(world.exchange(until, sent)))
+                    message = receive(connection)
             except (LockstepError, PoolClockError) as problem:
                 with suppress(OSError):  # it may not wait for the answer
                     connection.sendall(encode_refusal(str(problem)))
@@ -142,13 +155,42 @@ class LockstepServer:
                 return f"the robot has gone: {problem.strerror or problem}"
         return "the robot has left"
 
+    def _first_request(self) -> tuple[socket.socket, tuple[int, bytes]]:
+        """Wait for a request among all that connect; the others are closed."""
+        guests: list[socket.socket] = []
+        robot: socket.socket | None = None
+        try:
+            while True:
+                ready, _, _ = select.select([self._listener, *guests], [], [])
+                if self._listener in ready:
+                    guests.append(self._listener.accept()[0])
+                    guests[-1].settimeout(GUEST_PATIENCE)
+                    if len(guests) > MOST_CALLERS:
+                        guests.pop(0).close()
+                for guest in [guest for guest in guests if guest in ready]:
+                    try:
+                        if (message := receive(guest)) is not None:
+                            decode_request(*message)
+                            robot = guest
+                            robot.settimeout(None)
+                            return robot, message
+                    except LockstepError as problem:
+                        with suppress(OSError):  # it may not wait for the answer
+                            guest.sendall(encode_refusal(str(problem)))
+                    except OSError:
+                        pass
+                    guests.remove(guest)
+                    guest.close()
+        finally:
+            for guest in guests:
+                if guest is not robot:
+                    guest.close()
+
     def close(self) -> None:
         """Stop listening."""
         self._listener.close()
 
 
-MOST_CALLERS = 8
-"""Ground stations that are answered over UDP: those that called last."""
 LARGEST = 2048
 """Bytes taken of a datagram."""
 MOST_FRAMES = 1024

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import http
+import ipaddress
 import math
+import re
 import socket
+import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from itertools import groupby
 from typing import Any
@@ -14,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import viser
+import websockets.asyncio.server
 
 from finssim.localization.pool import Pool
 from finssim.viewer.frame import Curve, Frame, Picture, Pose, Source, Stage, ViewError
@@ -513,6 +518,61 @@ def _check_address(bind: str) -> None:
         raise ViewError(f"--bind {bind}: {reason}: give an address of this machine") from None
 
 
+def _own_guests(bind: str) -> Callable[[Any, Any], Any]:
+    """Answer requests of other pages with 403.
+
+    A page of another site may open a WebSocket to any address, and its name may be made to lead here. So the host that
+    a browser asks for must be an address, `localhost` or this machine's name, and a WebSocket's origin the page there.
+
+    Args:
+        bind: Where the page is served.
+    """
+    own = socket.gethostname().lower()
+    names = {"localhost", own, f"{own}.local", bind.lower()}
+
+    def check(connection: Any, request: Any) -> Any:
+        host, upgrade = request.headers.get("Host", ""), request.headers.get("Upgrade", "")
+        name = re.sub(r":\d*$", "", host).strip("[]").lower()
+        if name not in names and not _is_address(name):
+            return connection.respond(http.HTTPStatus.FORBIDDEN, f"{host[:80]} is no name of this page\n")
+        if upgrade and request.headers.get("Origin", "").lower() != f"http://{host}".lower():
+            return connection.respond(http.HTTPStatus.FORBIDDEN, "only the page itself may connect\n")
+        return None
+
+    return check
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+@contextmanager
+def _only_own_pages(bind: str) -> Iterator[None]:
+    """Have the server that viser starts meanwhile check who connects: viser has no setting for it."""
+    serve, check = websockets.asyncio.server.serve, _own_guests(bind)
+
+    def checked(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            refusal = check(connection, request)
+            return process_request(connection, request) if refusal is None and process_request else refusal
+
+        return serve(*arguments, process_request=answer, **options)
+
+    with _STARTING:
+        websockets.asyncio.server.serve = checked  # type: ignore[assignment, misc]
+        try:
+            yield
+        finally:
+            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+_STARTING = threading.Lock()
+
+
 class View:
     """A page that shows a source. `run` is its loop; `turn` one pass of it."""
 
@@ -536,7 +596,10 @@ class View:
         """
         self.source, self.playback = source, Playback(source.duration, speed=speed, playing=playing)
         _check_address(bind)
-        with redirect_stdout(StringIO()):  # viser greets and says goodbye even where it is told not to
+        with (
+            redirect_stdout(StringIO()),
+            _only_own_pages(bind),
+        ):  # viser greets and says goodbye even where it is told not to
             self.server = viser.ViserServer(host=bind, port=port, label="FinsSim", verbose=False)
         self.scene = Scene(self.server, source.stage)
         self.panel = Panel(self.server, source.stage, self.playback)
