@@ -66,6 +66,34 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line(f"{seconds:7.2f}s {name}")
 
 
+# ---- real time: processes of a test share a clock that is as slow as the machine
+
+
+SPIN = 0.7e-3
+"""Processor time of one turn of `_turn` on the machine on which the tests were written [s]."""
+
+
+def _turn() -> None:
+    sum(range(50_000))
+
+
+def measured_rate() -> float:
+    """Return how fast a session's clock may run now: the machine's speed, and this process's share of it, at most 1."""
+    began, turns = time.monotonic(), 0
+    while time.monotonic() - began < 0.3:
+        _turn()
+        turns += 1
+    return min(max(turns * SPIN / (time.monotonic() - began), 0.1), 1.0)
+
+
+@pytest.fixture
+def slow_clock(monkeypatch) -> float:
+    """Let the processes that a test starts live on a clock that this machine keeps up with; its rate."""
+    rate = measured_rate()
+    monkeypatch.setenv("FINSSIM_CLOCK_RATE", f"{rate:.3f}")
+    return rate
+
+
 # ---- `make quick`: no test starts a process
 
 LOOK_UPS = {"git", "gcc", "ld", "ldconfig", "uname"}

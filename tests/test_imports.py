@@ -39,6 +39,7 @@ FOUNDATION = {
     "page",
     "provenance",
     "quiet",
+    "realtime",
     "text_table",
     "yaml_file",
 }

@@ -100,11 +100,8 @@ def free_port():
 
 
 @pytest.mark.slow
-def test_one_command_runs_a_team_and_who_is_lost_stops_alone(tmp_path):
-    """Three processes of robots, told of each other by the site; one is killed, and the others end in their time.
-
-    On a machine that does much else a robot may have been kept waiting, which is the only fault that may be.
-    """
+def test_one_command_runs_a_team_and_who_is_lost_stops_alone(tmp_path, slow_clock):
+    """Three processes of robots, told of each other by the site; one is killed, and the others end in their time."""
     port = free_port()
     finssim, ends = [sys.executable, "-m", "finssim"], ["--robot", f"127.0.0.1:{port + 100}"]
     words = "--team finsrov,finsrov,finsrov --task formation --plant 0 --severity nominal --seed 3"
@@ -128,8 +125,8 @@ def test_one_command_runs_a_team_and_who_is_lost_stops_alone(tmp_path):
         site.wait(30)
     assert told["corner_2"] is None and team.returncode == 9
     for name in ("corner_1", "corner_3"):
-        assert all("the clock jumped" in fault for fault in told[name]["faults"]), told[name]
-        assert told[name]["faults"] or (told[name]["decisions"] > 80 and told[name]["duration_s"] > 11.9)
+        assert told[name]["faults"] == [] and told[name]["duration_s"] > 11.9
+        assert told[name]["decisions"] > 80
         with open_record(tmp_path / f"{name}.mcap") as record:
             fixes = sum(1 for _ in record.messages(("positioning/pose",)))
         assert fixes > 50
@@ -150,7 +147,7 @@ def process_of(team, name, record):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "policy"), [("pursuit", "lead"), ("t3", "pid")])
-def test_who_pursues_in_another_process_is_told_of_the_prey_and_follows_it(task, policy):
+def test_who_pursues_in_another_process_is_told_of_the_prey_and_follows_it(task, policy, slow_clock):
     """Of the prey or the goal that moves; located by motion capture on its wire, it decides ten times a second."""
     port = free_port()
     finssim = [sys.executable, "-m", "finssim"]

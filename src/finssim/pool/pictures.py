@@ -9,7 +9,6 @@ import queue
 import signal
 import socket
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from finssim import realtime
 from finssim.localization.pool import Pool
 from finssim.pool.camera import CameraSettings, PoolCamera
 from finssim.pool.plant_spec import Basin
@@ -67,8 +67,8 @@ class UdpSender:
         """Send a picture; one that cannot leave is counted and forgotten.
 
         Args:
-            picture: With its time on `time.monotonic` [s].
-            now: `time.monotonic` [s].
+            picture: With its time on the clock of `finssim.realtime` [s].
+            now: the clock of `finssim.realtime` [s].
         """
         # Small pictures of the vehicle's own sensors, which policies see, go as they are.
         compress = not picture.source or (
@@ -146,7 +146,7 @@ class PictureProcess:
         """
         self.dropped = 0
         self.start = 0.0
-        """When the pool's clock was 0, on `time.monotonic` [s]."""
+        """When the pool's clock was 0, on the clock of `finssim.realtime` [s]."""
         self._shutters = [plan.shutter() for plan in plans]
         context = multiprocessing.get_context("spawn")
         self._undrawn: Any = context.Queue(UNDRAWN)
@@ -232,7 +232,7 @@ def _draw(plans: Sequence[Plan], bind: Address, peer: Address, undrawn: Any, rea
     drawn: list[tuple[float, int, Picture]] = []
     try:
         for order in count():
-            rest = drawn[0][0] - time.monotonic() if drawn else ORPHANED
+            rest = drawn[0][0] - realtime.now() if drawn else ORPHANED
             try:
                 item = undrawn.get(timeout=min(max(rest, 0.0), ORPHANED))
             except queue.Empty:
@@ -244,8 +244,8 @@ def _draw(plans: Sequence[Plan], bind: Address, peer: Address, undrawn: Any, rea
                 i, exposure, arrival = item
                 picture = replace(cameras[i].develop(exposure), time=arrival)
                 heapq.heappush(drawn, (arrival, order, picture))
-            while drawn and drawn[0][0] <= time.monotonic():
-                sink.send(heapq.heappop(drawn)[2], time.monotonic())
+            while drawn and drawn[0][0] <= realtime.now():
+                sink.send(heapq.heappop(drawn)[2], realtime.now())
     finally:
         sink.close()
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import select
-import signal
 import socket
 import sys
-import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
@@ -19,6 +17,7 @@ from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 
+from finssim import realtime
 from finssim.control.guidance import Station
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.localization.pool import Pool, write_pool
@@ -31,7 +30,7 @@ from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, 
 from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
 from finssim.robot.goals import station_of
-from finssim.robot.interrupt import interruptible
+from finssim.robot.interrupt import interruptible, interrupting
 from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import (
     Address,
@@ -348,8 +347,8 @@ def serve_realtime(
     duration: float = math.inf,
     until: Callable[[], bool] = lambda: False,
     over: Callable[[], None] = lambda: None,
-    clock: Callable[[], float] = time.monotonic,
-    wait: Callable[[float], None] = time.sleep,
+    clock: Callable[[], float] = realtime.now,
+    wait: Callable[[float], None] = realtime.wait,
 ) -> Pace:
     """Let a site live in real time until the time is over or `until` says so.
 
@@ -829,11 +828,8 @@ def _lockstep(
         world = make_world(plan.eye())
         stack.callback(world.close)
         reason = "stopped"
-        _say(f"lock-step: {_name(server.address)}")
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
-                stack.callback(signal.signal, number, signal.signal(number, signal.default_int_handler))
-        with suppress(KeyboardInterrupt):
+        with suppress(KeyboardInterrupt), interrupting():
+            _say(f"lock-step: {_name(server.address)}")
             reason = server.serve(world, duration=duration)
     _say(f"{reason} at {world.time:.1f} s")
 

@@ -30,17 +30,33 @@ def follow_parent() -> None:
     threading.Thread(target=watch, name="launcher", daemon=True).start()
 
 
-@contextmanager
-def interruptible() -> Iterator[Callable[[], bool]]:
-    """Gives what tells whether Ctrl-C, SIGTERM or SIGHUP has come; a second one interrupts at once.
+def _stopping() -> list[int]:
+    """Return the signals that end a command: Ctrl-C, SIGTERM and, where the system has it, SIGHUP.
 
     SIGHUP stays ignored where it is, as under nohup.
     """
+    hangup = getattr(signal, "SIGHUP", None)
+    heard = hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN
+    return [signal.SIGINT, signal.SIGTERM, *([hangup] if heard else [])]
+
+
+@contextmanager
+def _handled(handler: Any) -> Iterator[None]:
+    before = {number: signal.signal(number, handler) for number in _stopping()}
+    try:
+        yield
+    finally:
+        for number, previous in before.items():
+            signal.signal(number, previous)
+
+
+@contextmanager
+def interruptible() -> Iterator[Callable[[], bool]]:
+    """Give a function that answers whether Ctrl-C, SIGTERM or SIGHUP has come; a second one interrupts at once."""
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
     requested = False
-    before: dict[int, Any] = {}
 
     def end(number: int, frame: object) -> None:
         nonlocal requested
@@ -48,11 +64,12 @@ def interruptible() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         requested = True
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
-            before[number] = signal.signal(number, end)
-    try:
+    with _handled(end):
         yield lambda: requested
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+
+
+@contextmanager
+def interrupting() -> Iterator[None]:
+    """Raise KeyboardInterrupt for Ctrl-C, SIGTERM and SIGHUP, also where Ctrl-C was ignored at the start."""
+    with _handled(signal.default_int_handler):
+        yield

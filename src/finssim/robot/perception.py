@@ -390,7 +390,7 @@ class Perception:
         """
         imu = self._aboard.imu(telemetry, time, now)
         if isinstance(imu, ImuSample):
-            if self.estimator.add(imu) == "accepted" and not _older(imu.time, self._omega_time):
+            if self.estimator.put(imu) is None and not _older(imu.time, self._omega_time):
                 self._omega, self._omega_time = imu.omega, imu.time
         else:
             self.estimator.refuse("imu", imu)
@@ -398,7 +398,7 @@ class Perception:
             self.unfused.heading(self._aboard.yaw(telemetry))
         depth = self._aboard.depth(telemetry, time, now)
         if isinstance(depth, DepthSample):
-            self.estimator.add(depth)
+            self.estimator.put(depth)
             if self.unfused is not None:
                 self.unfused.height(self._height(telemetry), depth.time)
         elif depth:
@@ -431,20 +431,18 @@ class Perception:
             self.unfused.fix(fix.position, fix.yaw, fix.time)
         return self.estimator.add(fix)
 
-    def aid(self, arrival: float, aid: NavigationAid) -> str:
+    def aid(self, arrival: float, aid: NavigationAid) -> None:
         """Take in what a navigation instrument sent.
 
         Args:
             arrival: When it came [s].
             aid: As it was decoded.
-
-        Returns:
-            `accepted`, or why it was refused.
         """
         sample = self._aboard.aid(aid, arrival)
         if isinstance(sample, str):
-            return self.estimator.refuse("aid", sample)
-        return self.estimator.add(self._frame.in_pool(sample))
+            self.estimator.refuse("aid", sample)
+        else:
+            self.estimator.put(self._frame.in_pool(sample))
 
     def reading(self, now: float) -> Reading:
         """The state at a time [s], in world and body axes."""

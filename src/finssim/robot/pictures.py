@@ -7,7 +7,6 @@ import math
 import re
 import struct
 import threading
-import time
 import zlib
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Sequence
@@ -17,6 +16,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from finssim import realtime
 from finssim.budget import decoded_picture
 from finssim.localization.detection.detector import RegionTracker, detector
 from finssim.robot.link.frames import LinkError
@@ -314,7 +314,7 @@ class UdpPictures:
 
     def receive(self, now: float) -> list[Picture]:
         """Pictures since the last call, oldest first, with times on the clock of `now` [s]."""
-        received, later = [], time.monotonic() - now
+        received, later = [], realtime.now() - now
         while self._waiting:
             came, picture = self._waiting.popleft()
             received.append(replace(picture, time=came - later))
@@ -338,7 +338,7 @@ class UdpPictures:
             for data in self._wire.receive(wait=0.2):
                 complete = self.assembler.add(data)
                 if complete is not None:
-                    self._take(time.monotonic(), complete)
+                    self._take(realtime.now(), complete)
 
     def _take(self, came: float, data: bytes) -> None:
         posted = decode_picture(data)
@@ -425,7 +425,7 @@ class TagFinder:
         vehicle: Vehicle,
         *,
         size: tuple[int, int],
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = realtime.now,
     ) -> None:
         """Start looking.
 

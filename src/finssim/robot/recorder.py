@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from finssim import realtime
 from finssim.files import OutputError, atomic_write, refuse_unwritable
 from finssim.mcap_files import END
 from finssim.provenance import provenance
@@ -453,7 +454,7 @@ def recording(
     if path is None:
         yield None
         return
-    epoch = 0.0 if lockstep else time.time() - time.monotonic()
+    epoch = 0.0 if lockstep else time.time() - realtime.now()
     files = {"pool.yaml": pool_file} if pool_file else {}
     with Recorder(path, vehicle, meta, pictures=pictures, epoch=epoch, files=files) as recorder:
         yield recorder

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import gc
 import math
+import re
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from finssim import realtime
 from finssim.localization.pool import Pool
 from finssim.robot.interrupt import interruptible
 from finssim.robot.link.frames import LinkError, McuLink
@@ -53,8 +54,8 @@ def run_realtime(
     duration: float = math.inf,
     until: Callable[[Runtime], bool] = lambda runtime: False,
     show: Callable[[Runtime], None] = lambda runtime: None,
-    clock: Callable[[], float] = time.monotonic,
-    wait: Callable[[float], None] = time.sleep,
+    clock: Callable[[], float] = realtime.now,
+    wait: Callable[[float], None] = realtime.wait,
 ) -> float:
     """Run a robot on its wires until the time is over, `until` says so, or Ctrl-C; then stop its thrusters.
 
@@ -198,6 +199,8 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[D
             raise LinkError(
                 "a team runs in lock-step within one process: use finssim experiment stack, or omit --lockstep"
             )
+        if not wiring.lockstep:
+            _check_clock(wiring.robot)
         link = link_of(wiring.robot, vehicle)
         if wiring.lockstep:
             world = stack.enter_context(LockstepClient(_lockstep_address(wiring)))
@@ -223,11 +226,23 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[D
         def run(runtime: Runtime, **options: Any) -> float:
             while transport.receive():
                 pass
-            camera.receive(time.monotonic())
+            camera.receive(realtime.now())
             runtime.attach(link)
             return run_realtime(runtime, transport, camera, mates=mates, **options)
 
         yield run
+
+
+def _check_clock(robot: str) -> None:
+    """Refuse a slowed clock for anything but a virtual pool on this machine, whose process reads the same clock."""
+    rate = realtime.clock_rate()
+    hosts = re.findall(r"(?:udp://|udpin:|udpout:|tcp:|dvl=)([^:?&]+)", robot)
+    remote = [host for host in hosts if host != "localhost" and not host.startswith("127.")]
+    if rate != 1.0 and (remote or "serial:" in robot):
+        raise LinkError(
+            f"--robot {robot}: {realtime.RATE}={rate:g} slows the clock, and only a virtual pool on this machine "
+            f"shares it: unset {realtime.RATE} for a vehicle"
+        )
 
 
 def open_camera(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> PictureSource:

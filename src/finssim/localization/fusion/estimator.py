@@ -54,7 +54,11 @@ class Surroundings:
 
 
 class Timeline(Generic[S]):
-    """Samples of the last `horizon` seconds with the state after each; `S` is any immutable state."""
+    """Samples of the last `horizon` seconds with the state after each; `S` is any immutable state.
+
+    An inserted sample and those after it are applied when `settle` is called, so that many samples that arrive together
+    cost one pass over them, however far a robot's loop has fallen behind.
+    """
 
     def __init__(self, start: S, horizon: float) -> None:
         """
@@ -70,7 +74,9 @@ class Timeline(Generic[S]):
         self._keys: list[tuple[float, int]] = []
         self._samples: list[Sample] = []
         self._states: list[S] = []
-        self._outcomes: list[tuple[Outcome, ...]] = []
+        """State after each of the first samples: those before the earliest that is not yet applied."""
+        self._outcomes: list[tuple[Outcome, ...] | None] = []
+        """Outcome of each sample when it was last applied; None before."""
 
     @property
     def head(self) -> float:
@@ -98,32 +104,34 @@ class Timeline(Generic[S]):
             k += 1
         return None
 
-    def insert(
-        self, sample: Sample, apply: Callable[[S, Sample], tuple[S, tuple[Outcome, ...]]]
-    ) -> tuple[list[tuple[Outcome, ...]], list[tuple[Outcome, ...]]]:
-        """Put a sample in its place and run everything after it again.
-
-        Args:
-            sample: One that `refusal` lets pass.
-            apply: State and sample -> state after it and what became of it.
-
-        Returns:
-            Outcomes that no longer hold, and those that hold instead.
-        """
+    def insert(self, sample: Sample) -> None:
+        """Put a sample that `refusal` lets pass in its place; states are out of date until `settle`."""
         key = (sample.time, _RANK[sample.stream])
         k = bisect.bisect_right(self._keys, key)
         self._keys.insert(k, key)
         self._samples.insert(k, sample)
-        replaced = self._outcomes[k:]
-        state = self._states[k - 1] if k else self._before
-        states, outcomes = [], []
-        for item in self._samples[k:]:
-            state, outcome = apply(state, item)
-            states.append(state)
-            outcomes.append(outcome)
-        self._states[k:], self._outcomes[k:] = states, outcomes
+        self._outcomes.insert(k, None)
+        del self._states[k:]
+
+    def settle(
+        self, apply: Callable[[S, Sample], tuple[S, tuple[Outcome, ...]]]
+    ) -> list[tuple[Sample, tuple[Outcome, ...] | None, tuple[Outcome, ...]]]:
+        """Apply the samples that were inserted since the last call, and those after them again.
+
+        Args:
+            apply: State and sample -> state after it and what became of it.
+
+        Returns:
+            Samples in the order of their times, each with its former outcome and the one that holds instead.
+        """
+        state, settled = self.state, []
+        for k in range(len(self._states), len(self._samples)):
+            state, outcome = apply(state, self._samples[k])
+            self._states.append(state)
+            settled.append((self._samples[k], self._outcomes[k], outcome))
+            self._outcomes[k] = outcome
         self._forget()
-        return replaced, outcomes
+        return settled
 
     def _forget(self) -> None:
         """Drop what is older than the horizon; the state after it stays."""
@@ -331,26 +339,43 @@ class Estimator:
         self._timeline: Timeline[Any] = Timeline(self._model.start(), self.settings.horizon)
 
     def add(self, sample: Sample) -> str:
-        """Take in a sample.
+        """Take in a sample and apply it.
 
         Returns:
             `accepted`, or why it was refused; a fix's is that of its position.
         """
+        reason = self.put(sample)
+        return reason or next(new for item, _, new in self._settle() if item is sample)[0].verdict
+
+    def put(self, sample: Sample) -> str | None:
+        """Take in a sample, which is applied when the state is needed.
+
+        Returns:
+            Why it was refused without a look at the state; None if it has its place.
+        """
         reason = refusal(sample) or self._clock(sample) or self._timeline.refusal(sample)
         if reason is not None:
             return self.refuse(sample.stream, reason)
-        replaced, now = self._timeline.insert(sample, self._apply)
-        # An outcome that is the same object as before stands: those of the IMU's samples, which are most.
-        other = [pair for pair in zip(replaced, now[1:], strict=True) if pair[0] is not pair[1]]
-        self._tally([old for old, _ in other], -1)
-        self._tally([now[0], *(new for _, new in other)], +1)
+        self._timeline.insert(sample)
         self._arrived = max(self._arrived, sample.time if sample.arrival is None else sample.arrival)
-        for outcome in now[0]:
-            if math.isfinite(outcome.mahalanobis):
-                self._latest[outcome.stream] = outcome.mahalanobis
-            if not outcome.used:
-                self._reason = f"{outcome.stream}: {outcome.verdict}"
-        return now[0][0].verdict
+        return None
+
+    def _settle(self) -> list[tuple[Sample, tuple[Outcome, ...] | None, tuple[Outcome, ...]]]:
+        """Apply what was put, and count what became of it."""
+        settled = self._timeline.settle(self._apply)
+        for _, old, new in settled:
+            # An outcome that is the same object as before stands: those of the IMU's samples, which are most.
+            if old is new:
+                continue
+            if old is not None:
+                self._tally(old, -1)
+            self._tally(new, +1)
+            for outcome in new if old is None else ():
+                if math.isfinite(outcome.mahalanobis):
+                    self._latest[outcome.stream] = outcome.mahalanobis
+                if not outcome.used:
+                    self._reason = f"{outcome.stream}: {outcome.verdict}"
+        return settled
 
     def refuse(self, stream: str, reason: str) -> str:
         """Count what never became a sample, such as a picture without tags; returns the reason."""
@@ -363,6 +388,7 @@ class Estimator:
 
         For a time within the horizon it is the state after the samples up to then, as far as they have come.
         """
+        self._settle()
         if time is None:
             time = self._timeline.head if math.isfinite(self._timeline.head) else 0.0
         track = self._timeline.state_at(time) if time < self._timeline.head else self._timeline.state
@@ -371,12 +397,14 @@ class Estimator:
 
     def health(self, estimate: Estimate) -> Health:
         """The condition that goes with an estimate."""
+        self._settle()
         return health_of(estimate, self.settings, self.site, self._latest, self._reason, self._counts)
 
     def at(self, time: float) -> Surroundings:
         """Roll, pitch and depth at the time of an exposure [s], for the fit of its pose: between samples in a straight
         line, else from one within the freshness of its stream.
         """
+        self._settle()
         s = self.settings
         roll, pitch = self._timeline.tilt_at(time, s.imu_fresh, self._model.tilt)
         return Surroundings(roll, pitch, self._timeline.depth_at(time, s.depth_fresh))
@@ -384,9 +412,11 @@ class Estimator:
     @property
     def counts(self) -> dict[str, dict[str, int]]:
         """Stream -> verdict -> samples."""
+        self._settle()
         return {stream: dict(verdicts) for stream, verdicts in self._counts.items()}
 
     def _restart(self) -> None:
+        self._settle()
         self._timeline = Timeline(self._model.start(), self.settings.horizon)
         self._arrived = -math.inf
 
@@ -420,16 +450,15 @@ class Estimator:
         self._other = []
         return None
 
-    def _tally(self, outcomes: list[tuple[Outcome, ...]], sign: int) -> None:
-        for group in outcomes:
-            for outcome in group:
-                self._count(outcome.stream, outcome.verdict, sign)
-                if outcome.verdict == "accepted" and outcome.stream in self.nis:
-                    total, numbers = self.nis[outcome.stream]
-                    self.nis[outcome.stream] = (
-                        total + sign * outcome.mahalanobis,
-                        numbers + sign * outcome.dimension,
-                    )
+    def _tally(self, outcomes: tuple[Outcome, ...], sign: int) -> None:
+        for outcome in outcomes:
+            self._count(outcome.stream, outcome.verdict, sign)
+            if outcome.verdict == "accepted" and outcome.stream in self.nis:
+                total, numbers = self.nis[outcome.stream]
+                self.nis[outcome.stream] = (
+                    total + sign * outcome.mahalanobis,
+                    numbers + sign * outcome.dimension,
+                )
 
     def _count(self, stream: str, verdict: str, step: int) -> None:
         verdicts = self._counts.setdefault(stream, {})
