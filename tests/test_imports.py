@@ -40,6 +40,7 @@ FOUNDATION = {
     "provenance",
     "quiet",
     "realtime",
+    "system",
     "text_table",
     "yaml_file",
 }

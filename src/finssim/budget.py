@@ -223,7 +223,7 @@ def limited_memory(extra: int = MEMORY) -> Iterator[None]:
     try:
         import resource
 
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
         before = resource.getrlimit(resource.RLIMIT_AS)
         limit = used + extra if before[0] == resource.RLIM_INFINITY else min(before[0], used + extra)
         resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))

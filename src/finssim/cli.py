@@ -10,6 +10,7 @@ import typer
 
 from finssim import __version__, boundary
 from finssim.command_line import Experiment, command_app
+from finssim.system import replace_unwritable
 
 COMMANDS: dict[str, str | Experiment] = {
     "demo": "finssim.experiments.demo:demo",
@@ -97,6 +98,7 @@ def main() -> None:
 
     Statuses: 0 well, 1 a fault of FinsSim, 2 a refused input, 3 a result that is negative, 130 interrupted.
     """
+    replace_unwritable(sys.stdout, sys.stderr)
     sys.exit(boundary.run(app, sys.argv[1:]))
 
 

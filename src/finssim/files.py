@@ -48,7 +48,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     parent directories are made. A place that cannot be written is refused on entry, before any work is done.
 
         with atomic_write("run/report.html") as temporary:
-            temporary.write_text(html)
+            temporary.write_text(html, encoding="utf-8")
 
     Args:
         path: File to write. A symbolic link is followed.

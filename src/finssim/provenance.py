@@ -74,7 +74,7 @@ def package_versions(names: tuple[str, ...]) -> dict[str, str]:
 def _git(directory: Path, *arguments: str) -> str | None:
     try:
         answer = subprocess.run(
-            ["git", "-C", directory, *arguments], capture_output=True, text=True, timeout=10
+            ["git", "-C", directory, *arguments], capture_output=True, encoding="utf-8", timeout=10
         )
     except (OSError, subprocess.TimeoutExpired):
         return None

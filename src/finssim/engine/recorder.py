@@ -72,7 +72,7 @@ class Recorder:
         self.columns = ["world", "vehicle", "t", *(c for group in STATE_COLUMNS.values() for c in group)]
         self.columns += [f"command_{name}" for name in names] + [f"thrust_{name}" for name in names]
         with atomic_write(self.folder / ABOUT) as temporary:
-            temporary.write_text(json.dumps(self._about(), indent=2) + "\n")
+            temporary.write_text(json.dumps(self._about(), indent=2) + "\n", encoding="utf-8")
 
     def _about(self) -> dict[str, Any]:
         s = self.simulator

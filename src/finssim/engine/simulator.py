@@ -479,7 +479,7 @@ def write_post_mortem(simulator: "Simulator", world: int, directory: Path) -> Pa
     while path.exists():  # an earlier run's
         path = directory / f"frozen-world{world}-episode{episode}-{again}.csv"
         again += 1
-    with atomic_write(path) as temporary, open(temporary, "w") as file:
+    with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(",".join(COLUMNS) + "\n")
         for v in range(history.shape[1]):
             for step in range(max(0, last - HISTORY), last):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import resource
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from finssim.engine.launch import default_threads
 from finssim.experiments.campaign import Progress
 from finssim.experiments.tables import Table
 from finssim.provenance import provenance
+from finssim.system import peak_memory
 from finssim.tasks import Environment, StationKeeping
 
 SECONDS = 1.0
@@ -116,7 +116,7 @@ def mujoco_rate() -> float | None:
 def memory_mb(worlds: int) -> float:
     """Peak resident memory of a process that runs T1 in `worlds` worlds [MB], the interpreter included."""
     program = f"from finssim.experiments.bench import _use_memory; _use_memory({worlds})"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, encoding="utf-8", check=True)
     return float(done.stdout.split()[-1])
 
 
@@ -125,14 +125,14 @@ def _use_memory(worlds: int) -> None:
     action = np.zeros((worlds, environment.action_size), dtype=np.float32)
     for _ in range(3):
         environment.step(action)
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
+    print(peak_memory())
 
 
 def machine() -> dict[str, Any]:
     """What the figures were measured on."""
     model = platform.processor() or platform.machine()
     try:
-        with open("/proc/cpuinfo") as file:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
             model = next(line.split(":")[1].strip() for line in file if line.startswith("model name"))
     except (OSError, StopIteration):
         pass

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import subprocess
 import sys
 import time
@@ -15,6 +14,7 @@ from finssim.engine import Simulator
 from finssim.experiments.bench import machine
 from finssim.experiments.campaign import Progress
 from finssim.experiments.tables import Table
+from finssim.system import peak_memory
 from finssim.worlds import CameraBatch, SonarBatch, WorldBatch, load_device, load_world, poses_of
 from finssim.worlds.description import CameraDevice, SonarDevice
 
@@ -113,7 +113,7 @@ def _rates(
 def memory_mb(site: str, worlds: int) -> float:
     """Peak resident memory of a process with vehicles and a 64x64 camera in so many worlds, all included [MB]."""
     program = f"from finssim.experiments.bench_cameras import _use_memory; _use_memory({site!r}, {worlds})"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, encoding="utf-8", check=True)
     return float(done.stdout.split()[-1])
 
 
@@ -124,7 +124,7 @@ def _use_memory(site: str, worlds: int) -> None:
     for _ in range(2):
         simulator.step()
         camera.update(poses_of(simulator.state), seed=1)
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
+    print(peak_memory())
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:

@@ -31,6 +31,7 @@ from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
 from finssim.experiments.tables import Table, markdown_of, print_tables
 from finssim.files import atomic_write, plain_name
 from finssim.quiet import start_warp
+from finssim.system import parent_runs
 from finssim.vehicles import load_vehicle
 from finssim.yaml_file import json_value, read_json
 
@@ -371,7 +372,7 @@ def _prepare(parent: int) -> None:
 
 def _end_with(parent: int) -> None:
     """End this process when its parent has gone, however that ended."""
-    while os.getppid() == parent:
+    while parent_runs(parent):
         time.sleep(WATCH)
     os._exit(1)
 

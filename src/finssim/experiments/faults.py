@@ -9,8 +9,6 @@ import json
 import math
 import os
 import re
-import resource
-import signal
 import socket
 import subprocess
 import sys
@@ -45,6 +43,7 @@ from finssim.robot.record_reader import Record, open_record
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import link_of
+from finssim.system import SEPARATE, interrupt
 from finssim.vehicles import load_vehicle
 
 __all__ = ["SCENARIOS", "Bench", "Fault", "Scenario", "fault_job", "faults_experiment", "tables_of"]
@@ -259,6 +258,8 @@ def jump_mcu_clock(step: float) -> Touch:
 
 def full_disk(bench: Bench) -> None:
     """The system takes no more bytes of any file that is as long as the record is now."""
+    import resource
+
     time.sleep(RECORDER_TURN)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     bench.undo.append(lambda: resource.setrlimit(resource.RLIMIT_FSIZE, before))
@@ -704,7 +705,11 @@ class Process:
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "finssim", *arguments], stdout=out, stderr=err, env=environment
+                [sys.executable, "-m", "finssim", *arguments],
+                stdout=out,
+                stderr=err,
+                env=environment,
+                **SEPARATE,
             )
 
     @property
@@ -730,7 +735,7 @@ class Process:
     def end(self) -> int:
         """As Ctrl-C, and not as gently where that is not heard; returns the exit status."""
         if self.running:
-            self._process.send_signal(signal.SIGINT)
+            interrupt(self._process)
         try:
             return self._process.wait(20.0)
         except subprocess.TimeoutExpired:

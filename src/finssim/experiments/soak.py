@@ -20,6 +20,7 @@ from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
+from finssim.system import peak_memory
 from finssim.vehicles import load_vehicle
 
 Array = NDArray[np.float64]
@@ -133,9 +134,7 @@ def memory_mib() -> float:
         rollup = Path("/proc/self/smaps_rollup").read_text(encoding="ascii")
         return int(re.search(r"^Rss:\s+(\d+) kB", rollup, re.MULTILINE)[1]) / 1024.0  # type: ignore[index]
     except OSError:
-        import resource
-
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        return peak_memory()
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:

@@ -31,6 +31,7 @@ from finssim.robot.pictures import (
     encode_picture,
     fragments,
 )
+from finssim.system import parent_runs
 from finssim.vehicles import Vehicle
 
 Address = tuple[str, int]
@@ -236,7 +237,7 @@ def _draw(plans: Sequence[Plan], bind: Address, peer: Address, undrawn: Any, rea
             try:
                 item = undrawn.get(timeout=min(max(rest, 0.0), ORPHANED))
             except queue.Empty:
-                if os.getppid() != parent:
+                if not parent_runs(parent):
                     return
             else:
                 if item is None:

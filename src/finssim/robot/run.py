@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -27,7 +26,7 @@ from finssim.control.policy import read_description
 from finssim.geometry.rotations import quat_yaw, wrap_angle
 from finssim.localization.pool import load_pool
 from finssim.robot.goals import HeardGoal, check_reachable, guide_of, place_of
-from finssim.robot.interrupt import PARENT, follow_parent, interruptible
+from finssim.robot.interrupt import interruptible
 from finssim.robot.link.transports import host_port
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, make_pilot
@@ -35,6 +34,7 @@ from finssim.robot.recorder import Recorder, recording
 from finssim.robot.runtime import USED, Runtime
 from finssim.robot.team import Team
 from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
+from finssim.system import PARENT, SEPARATE, follow_parent, interrupt
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
@@ -262,16 +262,16 @@ def run_team(
                 children[agent] = subprocess.Popen(
                     [sys.executable, "-m", "finssim", "run", "--agent", agent, *ends, *context, *alike],
                     env=environment,
-                    start_new_session=True,  # Ctrl-C reaches us alone, and we tell them once
                     stdout=subprocess.PIPE,
-                    text=True,
+                    encoding="utf-8",
+                    **SEPARATE,  # Ctrl-C reaches us alone, and we tell them once
                 )
             while not interrupted() and any(child.poll() is None for child in children.values()):
                 time.sleep(POLL)
         finally:
             for child in children.values():
                 if child.poll() is None:
-                    child.send_signal(signal.SIGINT)
+                    interrupt(child)
             outcome = {agent: child.communicate()[0] for agent, child in children.items()}
     _tell({agent: json.loads(text) if text.strip() else None for agent, text in outcome.items()}, as_json)
     return max(abs(child.returncode) for child in children.values())

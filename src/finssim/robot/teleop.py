@@ -284,9 +284,12 @@ class Keyboard:
         self._open = True
 
     def __enter__(self) -> Keyboard:
-        import termios
-        import tty
-
+        try:
+            import termios
+            import tty
+        except ImportError:
+            _windows_keyboard()  # nothing to set up: its console gives keys as they are pressed
+            return self
         self._before = termios.tcgetattr(self._descriptor)
         tty.setcbreak(self._descriptor)  # Ctrl-C still interrupts
         return self
@@ -294,6 +297,8 @@ class Keyboard:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if not self._before:
+            return
         import termios
 
         try:
@@ -303,6 +308,8 @@ class Keyboard:
 
     def pressed(self) -> list[str]:
         """Keys since the last call, arrows as their sequence of three characters; never waits."""
+        if not self._before:
+            return _windows_keys(_windows_keyboard())
         keys: list[str] = []
         while self._open and select.select([self._descriptor], [], [], 0.0)[0]:
             try:
@@ -322,6 +329,36 @@ class Keyboard:
         for key in self.pressed():
             self.keys.press(now, key)
         return self.keys.hands(now) if self._open else Hands(present=False)
+
+
+WINDOWS_ARROWS = {"H": "\x1b[A", "P": "\x1b[B", "M": "\x1b[C", "K": "\x1b[D"}
+"""Second character of an arrow key in Windows' console -> its sequence in a terminal."""
+
+
+def _windows_keyboard() -> Any:
+    """Return Windows' module of its console.
+
+    Raises:
+        TeleopError: This system has neither that nor termios.
+    """
+    try:
+        import msvcrt
+    except ImportError:
+        raise TeleopError(
+            "this Python reads no keyboard (it has neither termios nor msvcrt): use a gamepad"
+        ) from None
+    return msvcrt
+
+
+def _windows_keys(console: Any) -> list[str]:
+    """Return the keys pressed since the last call; the console announces a special key by a character of its own."""
+    keys = []
+    while console.kbhit():
+        key = console.getwch()
+        if key == "\x03":
+            raise KeyboardInterrupt
+        keys.append(WINDOWS_ARROWS.get(console.getwch(), "") if key in "\x00\xe0" else key)
+    return keys
 
 
 # A gamepad through pygame; no window is opened.

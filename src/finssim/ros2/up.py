@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import yaml
 
 from finssim.robot.goals import check_reachable, guide_of, place_of
-from finssim.robot.interrupt import PARENT, interruptible
+from finssim.robot.interrupt import interruptible
 from finssim.ros2 import Ros2Error
 from finssim.ros2.backend import activate
 from finssim.ros2.topics import TOPICS, Topic
+from finssim.system import PARENT, SEPARATE, interrupt
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 
@@ -82,8 +83,8 @@ class Supervisor:
         process = subprocess.Popen(
             command,
             env=environment,
-            start_new_session=True,
             stdin=subprocess.DEVNULL if name != "teleop" else None,
+            **SEPARATE,
         )
         child = Child(name, process)
         self.children.append(child)
@@ -104,7 +105,7 @@ class Supervisor:
         """End all, those first that were started last."""
         for child in reversed(self.children):
             if child.process.poll() is None:
-                child.process.send_signal(signal.SIGINT)
+                interrupt(child.process)
         limit = time.monotonic() + PATIENCE
         for child in reversed(self.children):
             try:

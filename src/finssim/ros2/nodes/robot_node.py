@@ -16,9 +16,9 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
-from finssim.robot.interrupt import follow_parent
 from finssim.ros2.nodes.conversions import RosMessages, nanoseconds, ros_type
 from finssim.ros2.topics import TOPICS, own_topics, quality_profile
+from finssim.system import follow_parent
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 

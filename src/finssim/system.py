@@ -1,0 +1,110 @@
+"""What Linux, macOS and Windows do differently: signals between processes, their parents, peak memory, text streams.
+
+The branches for Windows and macOS are written from their documentation and run in tests only where these take away what
+the other systems lack; no one has run them on such a machine.
+"""
+
+from __future__ import annotations
+
+import _thread
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO
+
+PARENT = "FINSSIM_PARENT"
+"""Environment variable: the process without which this one ends too."""
+ORPHANED = 0.5
+"""Time between two checks whether the parent is running [s]."""
+SEPARATE: dict[str, Any] = (
+    {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+    if os.name == "nt"
+    else {"start_new_session": True}
+)
+"""Options of `subprocess.Popen` for a child that the terminal's Ctrl-C does not reach; see `interrupt`."""
+
+
+def stop_signals() -> list[int]:
+    """Return the signals that end a command: Ctrl-C, SIGTERM, and SIGHUP or Windows' SIGBREAK where there is one.
+
+    SIGHUP stays ignored where it is, as under nohup.
+    """
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    for name in ("SIGHUP", "SIGBREAK"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            numbers.append(number)
+    return numbers
+
+
+@contextmanager
+def handled(handler: Any) -> Iterator[None]:
+    """Give all stop signals a handler for a while; only the main thread may call this."""
+    before = {number: signal.signal(number, handler) for number in stop_signals()}
+    try:
+        yield
+    finally:
+        for number, previous in before.items():
+            signal.signal(number, previous)
+
+
+def interrupt(process: subprocess.Popen[Any]) -> None:
+    """Ask a child that was started with `SEPARATE` to end, as Ctrl-C does."""
+    process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
+
+
+def follow_parent() -> None:
+    """End with the process that started this one, even if that was killed."""
+    parent = os.environ.get(PARENT, "")
+    if parent.isdecimal():
+        threading.Thread(target=_follow, args=(int(parent),), name="launcher", daemon=True).start()
+
+
+def _follow(parent: int) -> None:
+    while parent_runs(parent):
+        time.sleep(ORPHANED)
+    if os.name == "nt":  # where os.kill ends the process at once
+        _thread.interrupt_main(signal.SIGTERM)
+    else:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def parent_runs(pid: int) -> bool:
+    """Return whether the process that started this one, `pid`, is still running."""
+    if os.name != "nt":
+        return os.getppid() == pid
+    import ctypes
+
+    synchronize, timeout = 0x00100000, 0x102
+    kernel: Any = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
+    handle = kernel.OpenProcess(synchronize, False, pid)
+    if not handle:
+        return False
+    try:
+        return bool(kernel.WaitForSingleObject(handle, 0) == timeout)
+    finally:
+        kernel.CloseHandle(handle)
+
+
+def peak_memory() -> float:
+    """Return the most memory that this process has had [MiB]; NaN where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return float("nan")
+    # Linux counts kibibytes, macOS bytes.
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / (
+        2**20 if sys.platform == "darwin" else 2**10
+    )
+
+
+def replace_unwritable(*streams: TextIO) -> None:
+    """Write `?` for characters that a stream's encoding lacks, such as an arrow in a file of code page 1252."""
+    for stream in streams:
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
