@@ -9,6 +9,7 @@ import pytest
 
 from finssim.vehicles import AXES, catalogue, load_vehicle
 from finssim.vehicles.capability import (
+    largest,
     restoring,
     terminal_speed,
     terminal_speeds,
@@ -129,3 +130,29 @@ def test_trim_holds_an_offset_centre_of_buoyancy():
 
 def test_trim_beyond_the_thrusters_is_said():
     assert trim(load_vehicle("finsrov").replace({"body.mass": 16.0})).forces is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_largest_thrust_is_that_of_a_linear_program(seed):
+    """Against SciPy's HiGHS, for random thrusters: dependent rows, idle and one-way thrusters, equal limits."""
+    from scipy.optimize import linprog
+
+    rng = np.random.default_rng(seed)
+    for _ in range(40):
+        n, m = rng.integers(1, 13), rng.integers(0, 6)
+        gain, zero = rng.normal(size=n), rng.normal(size=(m, n))
+        lower, upper = -50.0 * rng.random(n), 50.0 * rng.random(n)
+        if rng.random() < 0.4:
+            idle = rng.random(n) < 0.4
+            zero[:, idle] = gain[idle] = 0.0
+        if rng.random() < 0.4 and m > 1:
+            zero[-1] = 2.0 * zero[0]
+        if rng.random() < 0.4:
+            gain, zero, lower, upper = np.round(gain), np.round(zero), np.full(n, -40.0), np.full(n, 50.0)
+        if rng.random() < 0.4:
+            lower[rng.random(n) < 0.4] = 0.0
+        f = largest(gain, zero, lower, upper)
+        best = -linprog(-gain, A_eq=zero, b_eq=np.zeros(m), bounds=np.column_stack([lower, upper])).fun
+        assert (f >= lower).all() and (f <= upper).all()
+        assert np.abs(zero @ f).max(initial=0.0) < 1e-8  # 1e-10 of 12 thrusts of 50 N
+        assert gain @ f == pytest.approx(best, rel=1e-8, abs=1e-8)

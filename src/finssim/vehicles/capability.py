@@ -53,26 +53,58 @@ def wrench_capability(vehicle: Vehicle) -> WrenchCapability:
     Returns:
         Limits about `wrench_reference`, body frame.
     """
-    from scipy.optimize import linprog
-
     B = vehicle.control_matrix
     lower, upper = vehicle.force_limits
     controlled = [AXES.index(axis) for axis in vehicle.controlled_axes]
     limits = np.zeros((2, 6))
     for i in controlled:
-        others = [j for j in controlled if j != i]
+        others = B[[j for j in controlled if j != i]]
         for row, sign in enumerate((1.0, -1.0)):
-            result = linprog(
-                -sign * B[i],
-                A_eq=B[others] if others else None,
-                b_eq=np.zeros(len(others)) if others else None,
-                bounds=np.column_stack([lower, upper]),
-                method="highs",
-            )
-            if not result.success:
-                raise VehicleError(f"{vehicle.name}: no thrust gives pure {AXES[i]}: {result.message}")
-            limits[row, i] = max(0.0, -result.fun)
+            limits[row, i] = max(0.0, sign * B[i] @ largest(sign * B[i], others, lower, upper))
     return WrenchCapability(positive=limits[0], negative=limits[1])
+
+
+def largest(gain: Array, zero: Array, lower: Array, upper: Array) -> Array:
+    """Return f that maximises gain · f subject to zero f = 0 and lower <= f <= upper, by an active set from f = 0.
+
+    A step follows the gain, projected onto what the constraints and the bounds that hold leave free, to the next bound.
+    Where nothing is left to gain, a bound whose multiplier has the wrong sign is released; without one, f is optimal
+    (Karush, Kuhn and Tucker). The lowest index goes first, so that it cannot cycle (Bland).
+
+    Args:
+        gain: Wrench component per thrust, (n,).
+        zero: Rows that have to stay zero, (m, n).
+        lower: Least thrusts, at most 0, (n,).
+        upper: Greatest thrusts, at least 0, (n,).
+
+    Raises:
+        VehicleError: Numbers so unlike each other that rounding hides the optimum.
+    """
+    n, f = len(gain), np.zeros(len(gain))
+    side = np.zeros(n, int)  # -1 at the lower bound, 1 at the upper one, 0 free
+    tiny = 1e-10 * max(float(np.abs(gain).max()), 1e-300)
+    for _ in range(100 * n):
+        held = np.flatnonzero(side)
+        rows = np.vstack([zero, np.eye(n)[held]])
+        multipliers = np.linalg.lstsq(rows.T, gain, rcond=None)[0] if len(rows) else np.zeros(0)
+        direction = gain - rows.T @ multipliers
+        direction[held] = 0.0
+        if np.abs(direction).max() <= tiny:
+            wrong = held[multipliers[len(zero) :] * side[held] < -tiny]
+            if not len(wrong):
+                return f
+            side[wrong[0]] = 0
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(direction > 0.0, upper - f, f - lower) / np.abs(direction)
+        room[np.abs(direction) <= tiny] = math.inf
+        step = float(room.min())
+        k = int(np.flatnonzero(room <= step * (1.0 + 1e-12))[0])
+        side[k] = 1 if direction[k] > 0.0 else -1
+        f = np.clip(f + step * direction, lower, upper)
+    raise VehicleError(
+        f"the largest wrench of {n} thrusters was not found: check their positions, axes and limits"
+    )
 
 
 def terminal_speed(d1: float, d2: float, tau: float) -> float:

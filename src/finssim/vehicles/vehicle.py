@@ -277,7 +277,7 @@ class Vehicle(Part):
 
         See `finssim.vehicles.capability.wrench_capability`; zero on axes that are not controlled.
         """
-        from finssim.vehicles.capability import wrench_capability  # SciPy is slow to import
+        from finssim.vehicles.capability import wrench_capability
 
         return np.asarray(wrench_capability(self).symmetric)
 
