@@ -28,6 +28,7 @@ CASES = (
 def seeds(tmp_path_factory):
     folder = tmp_path_factory.mktemp("seeds")
     for name, text in hostile.MADE.items():
+        (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(text)
     shutil.copyfile(hostile.FINSROV, folder / "vehicle.yaml")
     return folder
