@@ -31,9 +31,9 @@ class Sea:
         self.end.close()
         self.end = UdpTransport(self.end.address, robot)
 
-    def turn(self):
-        """Let the world go on to this moment."""
-        self.now = max(time.monotonic() - self.began, self.now)
+    def turn(self, now=None):
+        """Let the world go on to this moment, or to a time since its begin [s]."""
+        self.now = max(time.monotonic() - self.began, self.now) if now is None else now
         for _, frame in self.world.exchange(self.now, self.end.receive()).frames:
             self.end.send(frame)
 
