@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from finssim import budget
 from finssim.calibration.findings import CalibrationError
+from finssim.calibration.importers import dispatch
 from finssim.calibration.importers.dispatch import read_trials
 
 pytest.importorskip("rosbags")
@@ -259,3 +261,18 @@ def test_what_is_no_bag_is_refused(tmp_path, name):
     (tmp_path / "table.csv").write_text("t,u\n0,1\n")
     with pytest.raises(CalibrationError, match="cannot be opened as a bag"):
         read_trials([tmp_path / "table.csv"], format="rosbag")
+
+
+def test_a_small_bag_that_unpacks_to_much_is_refused(tmp_path, monkeypatch):
+    """A message of 300 MB that is 30 kB in the bag, where 128 MiB may be taken."""
+    pytest.importorskip("resource")
+    writer = Writer(tmp_path / "bomb", version=8, storage_plugin=StoragePlugin.SQLITE3)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        writer.write(
+            writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=STORE), START, bytes(300 << 20)
+        )
+    assert sum(file.stat().st_size for file in (tmp_path / "bomb").iterdir()) < 1 << 20
+    monkeypatch.setattr(dispatch, "limited_memory", lambda: budget.limited_memory(128 << 20))
+    with pytest.raises(CalibrationError, match="Unable to allocate|MemoryError"):
+        read_trials([tmp_path / "bomb"])

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
+from finssim.budget import limited_memory
 from finssim.calibration.findings import CalibrationError, Finding, finding, listed
 from finssim.calibration.importers.assemble import (
     ColumnMap,
@@ -452,6 +453,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[Finding]]]:
         findings = [finding("as_read", remark=repair) for repair in repairs]
         if parts != [path] and path.is_dir():
             findings.append(finding("no_metadata", bag=path.name, files=len(parts)))
+        stack.enter_context(limited_memory())  # whatever a small bag may unpack to
         try:
             reader = AnyReader(parts, default_typestore=get_typestore(Stores.LATEST))
             reader.open()
