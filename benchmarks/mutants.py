@@ -1,18 +1,21 @@
-"""Do the tests notice a wrong sign, bound or condition? Changes the source in 40 places, one at a time, and tests it.
+"""Do the tests notice a wrong sign, bound or condition? Changes the source in 80 places, one at a time, and tests it.
 
-    python benchmarks/mutants.py [--count 40] [--seed 1] [--checkout FOLDER] [--list]
+    python benchmarks/mutants.py [--count 80] [--seed 2] [--packages a,b] [--out FILE] [--checkout FOLDER] [--list]
 
 A place is a sum, difference, product, comparison, boolean operator or number in a function of `src/finssim`, drawn in
 turn from the packages. It is changed in a copy of the package, on which the tests of the same name run and, where these
-pass, those of the same folder (`physics/damping.py`: `tests/physics/test_damping.py`, then `tests/physics`). A function
-that none of them calls is not counted: another place is drawn. `--checkout` takes the tests of another revision, to
-compare the two on the same changes.
+pass, those of the same folder (`physics/damping.py`: `tests/physics/test_damping.py`, then the quick tests of
+`tests/physics`, then its slow ones). A function that none of them calls is not counted: another place is drawn.
+`--checkout` takes the tests of another revision, to compare the two on the same changes. Results go to `--out` one by
+one, and a run with the same seed continues after those in the file; `--again` tests the survivors in it once more.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import itertools
+import json
 import os
 import random
 import shutil
@@ -22,13 +25,12 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "finssim"
-PACKAGES = (
-    "geometry", "vehicles", "physics", "sensors", "engine", "control", "localization",
-    "tasks", "learning", "calibration", "robot", "ros2", "pool", "experiments",
-)  # fmt: skip
+PACKAGES = "physics,control,localization,calibration,learning,robot"
+"""Where changes are drawn, in turn."""
 SWAPS: dict[type[ast.AST], tuple[str, str]] = {
     ast.Add: ("+", "-"),
     ast.Sub: ("-", "+"),
@@ -104,26 +106,28 @@ def is_text(node: ast.AST) -> bool:
     return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
 
 
-def drawn(seed: int) -> Iterator[Mutant]:
+def drawn(seed: int, packages: list[str]) -> Iterator[Mutant]:
     """Changes in turn from every package."""
     rng = random.Random(seed)
     pools = {}
-    for package in PACKAGES:
+    for package in packages:
         pools[package] = [m for path in sorted((SOURCE / package).rglob("*.py")) for m in mutants(path)]
         rng.shuffle(pools[package])
     while any(pools.values()):
-        for package in PACKAGES:
+        for package in packages:
             if pools[package]:
                 yield pools[package].pop()
 
 
-def tests_of(path: str, checkout: Path) -> list[Path]:
+def tests_of(path: str, checkout: Path) -> list[tuple[str, ...]]:
     """The tests beside a module: of its name if there are any, then of its folder or the nearest above."""
     folder = (checkout / "tests" / path).parent
     while not folder.is_dir():
         folder = folder.parent
     named = sorted(folder.rglob(f"test_{Path(path).stem}.py"))
-    return [*named, folder]
+    tests = [(file.relative_to(checkout).as_posix(),) for file in named]
+    whole = folder.relative_to(checkout).as_posix()
+    return [*tests, (whole, "-m", "not slow"), (whole, "-m", "slow")]
 
 
 class Copy:
@@ -131,10 +135,10 @@ class Copy:
 
     def __init__(self, folder: Path, checkout: Path) -> None:
         self.source, self.kernels, self.checkout = folder / "src", folder / "kernels", checkout
-        self.sound: dict[Path, bool] = {}
+        self.sound: dict[tuple[str, ...], bool] = {}
         shutil.copytree(SOURCE, self.source / "finssim", ignore=shutil.ignore_patterns("__pycache__"))
 
-    def failing(self, mutant: Mutant, text: str) -> Path | None:
+    def failing(self, mutant: Mutant, text: str) -> tuple[str, ...] | None:
         """The tests that fail where a file has another text, of those that pass on the original."""
         file = self.source / "finssim" / mutant.path
         original = file.read_text(encoding="utf-8")
@@ -150,13 +154,13 @@ class Copy:
                 return tests
         return None
 
-    def _passes(self, tests: Path) -> bool:
+    def _passes(self, tests: tuple[str, ...]) -> bool:
         environment = os.environ | {
             "PYTHONPATH": str(self.source),
             "PYTHONDONTWRITEBYTECODE": "1",  # a change within a second would be taken for the original
             "WARP_CACHE_PATH": str(self.kernels),
         }
-        words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", str(tests)]
+        words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
         try:
             done = subprocess.run(
                 words, cwd=self.checkout, env=environment, capture_output=True, timeout=LONGEST, check=False
@@ -193,31 +197,54 @@ def refusing(mutant: Mutant) -> str:
 def main() -> None:
     """Print each change with what became of it, and the sum."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--count", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--count", type=int, default=80)
+    parser.add_argument("--seed", type=int, default=2)
+    parser.add_argument("--packages", default=PACKAGES)
+    parser.add_argument("--out", type=Path, help="JSON lines of results, continued where it exists")
+    parser.add_argument("--again", action="store_true", help="test the survivors in --out again")
     parser.add_argument("--checkout", type=Path, default=ROOT, help="where the tests are")
     parser.add_argument("--list", action="store_true", help="only print the places")
     given = parser.parse_args()
-    caught = counted = 0
+    packages = given.packages.split(",")
+    if given.list:
+        for mutant in itertools.islice(drawn(given.seed, packages), given.count):
+            print(name_of(mutant))
+        return
+    before: dict[str, Any] = {}
+    if given.out is not None and given.out.exists():
+        rows = [json.loads(line) for line in given.out.read_text(encoding="utf-8").splitlines()]
+        before = {row["change"]: row for row in rows}
+    counted = caught = 0
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(Path(folder), given.checkout.resolve())
-        for mutant in drawn(given.seed):
+        for mutant in drawn(given.seed, packages):
             if counted == given.count:
                 break
-            name = f"{mutant.path}:{mutant.line}: {mutant.before} -> {mutant.after}"
-            if given.list:
-                counted += 1
-                print(name)
-                continue
-            tests = copy.failing(mutant, changed(mutant))
-            if tests is None and copy.failing(mutant, refusing(mutant)) is None:
-                print(f"not called {name}", flush=True)
-                continue
-            counted, caught = counted + 1, caught + (tests is not None)
-            by = f" by {tests.relative_to(copy.checkout)}" if tests else ""
-            print(f"{'caught' if tests else 'SURVIVED':10} {name}{by}", flush=True)
-    if not given.list:
-        print(f"{caught} of {counted} caught")
+            row = before.get(name_of(mutant))
+            if row is None or (given.again and row["result"] == "survived"):
+                row = {"change": name_of(mutant), **tried(copy, mutant)}
+                if given.out is not None:
+                    with given.out.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(row) + "\n")
+            print(f"{row['result']:10} {row['change']} {row['by']}", flush=True)
+            counted += row["result"] != "not called"
+            caught += row["result"] == "caught"
+    print(f"{caught} of {counted} caught")
+
+
+def name_of(mutant: Mutant) -> str:
+    """Where a change is, what it is, and the line that it is in."""
+    line = (SOURCE / mutant.path).read_text(encoding="utf-8").splitlines()[mutant.line - 1].strip()
+    return f"{mutant.path}:{mutant.line}: {mutant.before} -> {mutant.after} in `{line}`"
+
+
+def tried(copy: Copy, mutant: Mutant) -> dict[str, str]:
+    """Test a change: caught, survived or not called, and by which tests it was caught."""
+    tests = copy.failing(mutant, changed(mutant))
+    if tests is not None:
+        return {"result": "caught", "by": " ".join(tests)}
+    called = copy.failing(mutant, refusing(mutant)) is not None
+    return {"result": "survived" if called else "not called", "by": ""}
 
 
 if __name__ == "__main__":
