@@ -21,7 +21,7 @@ LATCHED = QoSProfile(
 )
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def nodes():
     """Two nodes: the first publishes, the second listens, serves and asks."""
     rclpy.init(args=[])

@@ -34,6 +34,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64, String
+from std_srvs.srv import Trigger
 
 PATIENCE = 10.0
 
@@ -354,7 +355,17 @@ def test_another_thread_can_publish_and_wake(context):
     assert got[0].data == "x"
 
 
-@pytest.mark.parametrize("module", ["rclpy.action", "rclpy.lifecycle", "rclpy.nonsense"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "rclpy.action",
+        "rclpy.lifecycle",
+        "rclpy.nonsense",
+        "message_filters",
+        "cv_bridge",
+        "tf2_ros.buffer_client",
+    ],
+)
 def test_what_is_missing_says_what_it_needs(module):
     """One sentence instead of a riddle."""
     with pytest.raises(ImportError, match="needs a sourced ROS 2"):
@@ -365,6 +376,76 @@ def test_several_threads_of_callbacks_need_ros():
     """The name exists in rclpy, so the refusal names it."""
     with pytest.raises(ImportError, match="use SingleThreadedExecutor"):
         from rclpy.executors import MultiThreadedExecutor  # noqa: F401
+
+
+LACKING = [
+    (lambda node: node, "create_rate", "Node.create_rate needs a sourced ROS 2: use create_timer"),
+    (lambda node: node, "get_parameters_by_prefix", "use list_parameters"),
+    (lambda node: node.create_client(Trigger, "go"), "call", "Client.call needs .*: use call_async"),
+    (lambda node: node.create_publisher(String, "a", 1), "wait_for_all_acked", "let the other side answer"),
+    (lambda node: node.create_timer(1.0, print), "time_since_last_call", "take the time in the callback"),
+    (lambda node: node.context, "on_shutdown", "in a finally clause"),
+    (lambda node: node.get_clock(), "sleep_until", "Clock.sleep_until .*: use create_timer"),
+    (lambda node: SingleThreadedExecutor(), "create_task", "use a timer"),
+]
+
+
+def test_what_a_class_lacks_says_what_to_do(context):
+    """A sentence where rclpy has more; `getattr` with a default still gives the default."""
+    node = Node("a")
+    for made, name, hint in LACKING:
+        thing = made(node)
+        with pytest.raises(AttributeError, match=hint):
+            getattr(thing, name)
+        assert getattr(thing, name, None) is None
+
+
+def test_a_misspelt_name_is_none_of_rclpy(context):
+    """The ordinary words of Python."""
+
+    class Mine(Node):
+        """A node of one's own."""
+
+    with pytest.raises(AttributeError, match="'Mine' object has no attribute 'create_publishr'"):
+        Mine("a").create_publishr  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "hint"),
+    [
+        ("rclpy", "get_rmw_implementation_identifier", "rmw_cyclonedds_cpp"),
+        ("rclpy.timer", "Rate", "use Node.create_timer"),
+        ("rclpy.event_handler", "PublisherEventCallbacks", "leave event_callbacks out"),
+        ("rclpy.node", "HIDDEN_NODE_PREFIX", "built-in rclpy has no such name"),
+        ("tf2_ros", "BufferClient", "use Buffer and TransformListener"),
+    ],
+)
+def test_what_a_module_lacks_says_what_to_do(module, name, hint):
+    """With `from module import name`."""
+    with pytest.raises(ImportError, match=f"{name} needs a sourced ROS 2: .*{hint}"):
+        exec(f"from {module} import {name}")
+
+
+def test_parts_of_rclpy_come_with_it():
+    """As in the real one: `import rclpy` alone."""
+    assert rclpy.duration.Duration is Duration and rclpy.qos.QoSProfile is QoSProfile
+    assert rclpy.time.Time is Time and rclpy.utilities.remove_ros_args(["a"]) == ["a"]
+
+
+def test_every_name_that_is_refused_is_one_the_class_lacks():
+    """A list that is kept by hand."""
+    import tf2_ros  # noqa: F401 - its classes are among them
+
+    from finssim.ros2.limits import MISSING, Limited
+
+    classes = {kind.__name__: kind for kind in _below(Limited)}
+    for name, lacking in MISSING.items():
+        assert not [word for word in lacking if hasattr(classes[name], word)], name
+
+
+def _below(kind):
+    for one in kind.__subclasses__():
+        yield from (one, *_below(one))
 
 
 def test_coroutines_need_ros(context):

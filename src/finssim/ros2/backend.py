@@ -9,12 +9,14 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from finssim.ros2 import Ros2Error
 from finssim.ros2.codec import Codec, codec_of
+from finssim.ros2.limits import PACKAGES, refuse
 
 __all__ = ["activate", "install"]
 
@@ -117,6 +119,14 @@ PARTS = {
     "time": ("clock", "clock_type", "duration", "time"),
 }  # fmt: skip
 """Modules of the shim, and the submodules of rclpy that each is."""
+TF2 = (
+    "buffer",
+    "buffer_interface",
+    "static_transform_broadcaster",
+    "transform_broadcaster",
+    "transform_listener",
+)
+"""Submodules of tf2_ros, which are all one module of the shim."""
 
 
 def install(interfaces: Sequence[Path] = ()) -> None:
@@ -132,11 +142,17 @@ def install(interfaces: Sequence[Path] = ()) -> None:
     for folder in interfaces:
         codec.definitions.add_package(folder)
     shim = "finssim.ros2.shim"
-    sys.modules["rclpy"] = importlib.import_module(shim)
-    for module, parts in PARTS.items():
-        for part in parts:
-            sys.modules[f"rclpy.{part}"] = importlib.import_module(f"{shim}.{module}")
+    modules = {"rclpy": shim, "tf2_ros": f"{shim}.tf2", **{f"tf2_ros.{part}": f"{shim}.tf2" for part in TF2}}
+    modules |= {f"rclpy.{part}": f"{shim}.{module}" for module, parts in PARTS.items() for part in parts}
+    for name, source in modules.items():
+        sys.modules[name] = module = importlib.import_module(source)
+        module.__dict__.setdefault("__getattr__", partial(refuse, name))
+        package, dot, part = name.partition(".")
+        if dot:
+            setattr(sys.modules[package], part, module)  # `import rclpy` gives rclpy.duration too
+    sys.modules["tf2_ros"].__path__ = []
     sys.meta_path.insert(0, _Finder(codec))
+    sys.meta_path.append(_Absent())
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -147,9 +163,9 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def find_spec(self, name: str, path: Any, target: Any = None) -> importlib.machinery.ModuleSpec | None:
         package, _, kind = name.partition(".")
-        if package == "rclpy":
+        if package in ("rclpy", "tf2_ros"):
             raise ImportError(
-                f"{name} needs a sourced ROS 2: FinsSim's built-in rclpy has no {kind}", name=name
+                f"{name} needs a sourced ROS 2: FinsSim's built-in {package} has no {kind}", name=name
             )
         if package not in self._packages or kind not in ("", "msg", "srv"):
             return None
@@ -163,6 +179,15 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         """Nothing to run: classes are made when first asked for."""
+
+
+class _Absent(importlib.abc.MetaPathFinder):
+    """Asked last: says of packages of ROS 2 that are nowhere what to do without them."""
+
+    def find_spec(self, name: str, path: Any, target: Any = None) -> None:
+        hint = PACKAGES.get(name.partition(".")[0])
+        if hint is not None:
+            raise ModuleNotFoundError(f"{name} needs a sourced ROS 2: {hint}", name=name)
 
 
 class _Types(ModuleType):

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import Any
 
+from finssim.ros2.limits import Limited
 from finssim.ros2.shim.arguments import RosArguments, parse_arguments
 from finssim.ros2.shim.exceptions import NotInitializedException
 from finssim.ros2.shim.logging import set_logger_level
@@ -25,7 +26,7 @@ class SignalHandlerOptions(Enum):
     ALL = 3
 
 
-class Context:
+class Context(Limited):
     """One presence on the wire. Nodes of one process share it."""
 
     def __init__(self) -> None:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from finssim.ros2 import Ros2Error
 from finssim.ros2.codec import HEADER, Message, codec_of
+from finssim.ros2.limits import Limited
 from finssim.ros2.shim.exceptions import InvalidHandle
 from finssim.ros2.shim.qos import quality_of
 from finssim.ros2.wire import ClientEnd, Quality, ServerEnd
@@ -70,7 +71,7 @@ def deserialize_message(data: bytes, message_type: type[Message]) -> Any:
 # `rclpy.task`: answers that have yet to come.
 
 
-class Future:
+class Future(Limited):
     """An answer that comes while some executor spins. Not to be awaited: coroutines need a sourced ROS 2."""
 
     def __init__(self, *, executor: Any = None) -> None:
@@ -131,7 +132,7 @@ class Future:
 # What publishers, subscriptions, services and clients share.
 
 
-class Endpoint:
+class Endpoint(Limited):
     """One end of a topic."""
 
     node: Any

@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from finssim.ros2.limits import Limited
 from finssim.ros2.shim.context import Context
 from finssim.ros2.shim.endpoint import Future, check_callback
 from finssim.ros2.shim.time import Clock
 from finssim.ros2.wire import Waiter
 
 
-class Timer:
+class Timer(Limited):
     """Calls back at a fixed period of a clock. Made by `Node.create_timer`.
 
     Calls that were missed are left out, and the rhythm is kept.
@@ -89,7 +90,7 @@ class ExternalShutdownException(Exception):
     """The context was shut down by somebody else while an executor spun."""
 
 
-class SingleThreadedExecutor:
+class SingleThreadedExecutor(Limited):
     """Runs callbacks one at a time.
 
     Args:
@@ -229,11 +230,3 @@ class SingleThreadedExecutor:
             for node in self._nodes:
                 for end in node.endpoints():
                     end.tell_mismatches()
-
-
-def __getattr__(name: str) -> Any:
-    if name in ("MultiThreadedExecutor", "Executor", "EventsExecutor"):
-        raise ImportError(f"rclpy.executors.{name} needs a sourced ROS 2: use SingleThreadedExecutor")
-    if name in ("ShutdownException", "TimeoutException"):
-        raise ImportError(f"rclpy.executors.{name} needs a sourced ROS 2: nothing raises it here")
-    raise AttributeError(f"rclpy.executors has no '{name}'")

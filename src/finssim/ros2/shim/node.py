@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from finssim.ros2.codec import codec_of
+from finssim.ros2.limits import Limited
 from finssim.ros2.shim.arguments import (
     check_node,
     full_node_name,
@@ -74,7 +75,7 @@ class TimeSource:
 Made = TypeVar("Made", bound=Endpoint)
 
 
-class Node(NodeParameters, NodeGraph):
+class Node(NodeParameters, NodeGraph, Limited):
     """A node.
 
     Args:

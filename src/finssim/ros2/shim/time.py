@@ -8,6 +8,7 @@ from functools import total_ordering
 from typing import Any
 
 from finssim.ros2.codec import codec_of
+from finssim.ros2.limits import Limited
 
 
 class ClockType(IntEnum):
@@ -128,7 +129,7 @@ class Time:
 # `rclpy.clock`: what time it is, by the system or by the topic /clock.
 
 
-class Clock:
+class Clock(Limited):
     """A clock.
 
     Args:
