@@ -96,8 +96,8 @@ def slow_clock(monkeypatch) -> float:
 
 # ---- `make quick`: no test starts a process
 
-LOOK_UPS = {"git", "gcc", "ld", "ldconfig", "uname"}
-"""What Python and FinsSim ask about this machine and this checkout, once a process."""
+LOOK_UPS = {"fc-list", "git", "gcc", "ld", "ldconfig", "uname"}
+"""What Python, matplotlib (for fonts, without its cache) and FinsSim ask about this machine and this checkout."""
 
 _guarded = False
 
