@@ -11,7 +11,9 @@ from typing import Any
 
 from finssim.files import atomic_directory
 
-__all__ = ["RECORD_FILE", "REPORT_FILE", "Page", "Pictures", "html_page", "html_picture", "html_table"]
+__all__ = [
+    "RECORD_FILE", "REPORT_FILE", "Page", "Pictures", "html_page", "html_picture", "html_table", "notebook_html",
+]  # fmt: skip
 
 REPORT_FILE, MARKDOWN_FILE, RECORD_FILE = "report.html", "report.md", "fit.json"
 
@@ -56,6 +58,12 @@ def html_table(heads: Sequence[str], rows: Sequence[str]) -> str:
     """A table of rows that are HTML already."""
     cells = "".join(f"<th>{escape(head)}</th>" for head in heads)
     return f"<table><thead><tr>{cells}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def notebook_html(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a title and a table as a notebook displays them (`_repr_html_`); plain text in, HTML out."""
+    cells = ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
+    return f"<b>{escape(title)}</b>{html_table(heads, cells)}"
 
 
 class Page:

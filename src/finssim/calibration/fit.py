@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.findings import Finding, plain
+from finssim.page import notebook_html
 from finssim.vehicles import Vehicle
 
 __all__ = ["Correlation", "Curve", "Estimate", "Fit"]
@@ -114,3 +115,17 @@ class Fit:
     """Method options, seed."""
     interrupted: bool = False
     """Whether Ctrl-C ended it before it converged; the estimates are the best until then."""
+
+    def __repr__(self) -> str:
+        counts = (
+            f"{len(self.estimates)} estimates, {len(self.changes)} changes, {len(self.findings)} findings"
+        )
+        return f"<Fit {self.kind} ({self.method}) of {self.vehicle.name}: {counts}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (e.name, f"{e.estimate:.4g}", f"{e.ci95[0]:.4g} to {e.ci95[1]:.4g}", e.unit, e.note)
+            for e in self.estimates.values()
+        ]
+        title = f"{self.kind} of {self.vehicle.name} ({self.method})"
+        return notebook_html(title, ("", "estimate", "95 % interval", "unit", "note"), rows)

@@ -236,6 +236,13 @@ class Simulator:
         h = self.control_step / self.substeps
         pipeline.add(refresh_plant, [self.plant.array, h, mask], vehicles=len(self.vehicles))
 
+    def __repr__(self) -> str:
+        names = ", ".join(vehicle.name for vehicle in self.vehicles)
+        return (
+            f"<Simulator: {self.worlds} worlds of {names} ({self.hydrodynamics}), {self.control_step:g} s in "
+            f"{self.substeps} substeps, {self.device}>"
+        )
+
     def step(self) -> None:
         """Advance every world by one control step under `command`."""
         self._step.run()

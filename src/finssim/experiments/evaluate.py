@@ -21,7 +21,7 @@ from finssim.experiments.metrics import (
     summarize_tracking,
 )
 from finssim.experiments.plants import Plant, load_plant
-from finssim.experiments.tables import Columns, Table, cells, figure_text
+from finssim.experiments.tables import Columns, Table, cells, figure_text, html_of
 from finssim.experiments.trials import (
     EPISODES,
     T2_TRAJECTORIES,
@@ -181,6 +181,13 @@ class Evaluation:
     """What `--json` prints: who, where, the measures over all trials, `per_trial`, provenance."""
     trials: Sequence[Trial] = ()
     """Of T1 and T2, for figures."""
+
+    def __repr__(self) -> str:
+        count = len(self.result.get("per_trial", ()))
+        return f"<Evaluation of {self.label} in {self.result['task']}: {count} trials>"
+
+    def _repr_html_(self) -> str:
+        return "".join(html_of(tables_of(self.result), Path()))
 
     @property
     def label(self) -> str:

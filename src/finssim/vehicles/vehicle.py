@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from finssim.page import notebook_html
 from finssim.vehicles.autopilot import Autopilot, refuse_misfit
 from finssim.vehicles.defaults import (
     DEFAULTS,
@@ -343,6 +344,24 @@ class Vehicle(Part):
         except mesh.MeshError as error:
             raise VehicleError(f"file {hull.file.name}: {error}") from None
         return hull.scale * vertices, faces
+
+    # -- display ----------------------------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        return f"<Vehicle {self.name}: {', '.join(text for _, text in self._summary())}>"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        return notebook_html(f"{self.name}: {self.title}", ("", ""), self._summary())
+
+    def _summary(self) -> list[tuple[str, str]]:
+        return [
+            ("mass", f"{self.body.mass:g} kg"),
+            ("actuators", f"{len(self.thrusters)} thrusters"),
+            ("controlled axes", " ".join(self.controlled_axes)),
+            ("hydrodynamics", f"hydrodynamics {' '.join(self.hydrodynamics)}"),
+        ]
 
     # -- identity ---------------------------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from finssim.calibration.findings import CalibrationError, Finding
+from finssim.page import notebook_html
 from finssim.vehicles.part import Part, refuse_section, refuse_value
 from finssim.vehicles.vehicle import Axis
 
@@ -242,6 +243,19 @@ class Trial:
     def duration(self) -> float:
         """From the first row to the last [s]."""
         return float(self.t[-1] - self.t[0])
+
+    def __repr__(self) -> str:
+        columns = " ".join(self.channels) or "no columns"
+        return f"<Trial {self.name}: {self.duration:.1f} s, {len(self.t)} rows, {columns}>"
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for name in self.channels:
+            values, column = self.series(name)[1], column_of(name)
+            ends = [f"{f(values):.4g}" for f in (np.min, np.max)] if len(values) else ["–", "–"]
+            rows.append((name, column.unit if column else "", str(len(values)), *ends))
+        title = f"{self.name}: {self.duration:.1f} s, {len(self.t)} rows"
+        return notebook_html(title, ("column", "unit", "samples", "least", "greatest"), rows)
 
     @cached_property
     def sha256(self) -> str:

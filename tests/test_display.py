@@ -1,0 +1,104 @@
+"""Objects that a user meets in a terminal or a notebook: one line each, and a table in HTML."""
+
+from html.parser import HTMLParser
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from finssim.calibration.fit import Estimate, Fit
+from finssim.calibration.trials.trial import Trial
+from finssim.engine import Simulator
+from finssim.experiments.evaluate import evaluation
+from finssim.vehicles import catalogue, load_vehicle
+
+FINSROV = load_vehicle("finsrov")
+
+
+def cells(html):
+    """Texts of the cells of a table, once every tag is closed."""
+    texts, depth = [], []
+
+    class Reader(HTMLParser):
+        def handle_starttag(self, tag, attributes):
+            depth.append(tag)
+
+        def handle_endtag(self, tag):
+            assert depth.pop() == tag
+
+        def handle_data(self, data):
+            if depth and depth[-1] in ("td", "th"):
+                texts.append(data)
+
+    reader = Reader()
+    reader.feed(html)
+    reader.close()
+    assert not depth
+    return texts
+
+
+def trial():
+    t = np.linspace(0.0, 2.0, 21)
+    return Trial(name="surge_050", t=t, channels={"u": 0.1 * t, "depth": np.where(t < 1.0, np.nan, 0.5)})
+
+
+def fit():
+    estimate = Estimate.within("surge.d1", 12.0, 1.5, "N s/m", True)
+    return Fit(
+        kind="hydrodynamics",
+        method="regression",
+        vehicle=FINSROV,
+        estimates={"surge.d1": estimate},
+        changes={},
+    )
+
+
+@pytest.mark.parametrize("name", catalogue())
+def test_a_vehicle_is_one_line(name):
+    """With its name, mass, thrusters and hydrodynamic sets; of the catalogue none is longer than two terminal lines."""
+    vehicle = load_vehicle(name)
+    assert repr(vehicle) == str(vehicle)
+    assert (
+        repr(vehicle).startswith(f"<Vehicle {name}: {vehicle.body.mass:g} kg, ") and len(repr(vehicle)) < 160
+    )
+
+
+def test_every_object_is_one_line():
+    """Without an address and without its arrays."""
+    simulator = Simulator("finsrov", worlds=3)
+    assert repr(simulator) == "<Simulator: 3 worlds of finsrov (calibrated), 0.1 s in 4 substeps, cpu>"
+    assert repr(trial()) == "<Trial surge_050: 2.0 s, 21 rows, u depth>"
+    assert repr(fit()) == "<Fit hydrodynamics (regression) of finsrov: 1 estimates, 0 changes, 0 findings>"
+
+
+def test_notebooks_show_tables():
+    """Vehicle, trial and fit: well-formed HTML that holds their numbers, escaped."""
+    assert "11.2 kg" in cells(FINSROV.replace({"body.mass": 11.2})._repr_html_())
+    assert cells(trial()._repr_html_())[5:] == [
+        "u",
+        "m/s",
+        "21",
+        "0",
+        "0.2",
+        "depth",
+        "m",
+        "11",
+        "0.5",
+        "0.5",
+    ]
+    assert "10.5 to 13.5" in cells(fit()._repr_html_())
+    assert "<script>" not in FINSROV.replace({"title": "<script>"})._repr_html_()
+
+
+def test_an_evaluation_shows_its_table():
+    """The table that `finssim evaluate` prints."""
+    measures = [{"episode": 0, "success": 1.0, "return": 2.0, "time": 3.0, "energy": 4.0}]
+    plant = {"name": "nominal", "title": ""}
+    shown = evaluation({"name": "pid"}, "docking", FINSROV, plant, measures)
+    assert repr(shown) == "<Evaluation of pid in docking: 1 trials>"
+    assert any("pid" in cell or "nominal" in cell for cell in cells(shown._repr_html_()))
+
+
+def test_type_checkers_read_the_package():
+    """PEP 561."""
+    assert files("finssim").joinpath("py.typed").is_file()
