@@ -25,8 +25,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
 
-from finssim.ros2.nodes.robot_node import FORGOTTEN
-
 pytestmark = pytest.mark.slow
 
 PEER = Path(__file__).with_name("peer.py")
@@ -185,28 +183,3 @@ def test_a_killed_peer_does_not_hold_up_the_others(node):
         longest = max(longest, time.monotonic() - began)
     assert longest < PATIENCE / 4  # a writer that waits for ever would not be here
     node.destroy_publisher(publisher), node.destroy_subscription(subscription)
-
-
-def test_a_node_that_is_there_already_is_not_started_again(node):
-    """A second one of its name and namespace ends with a sentence; with another namespace it lives."""
-    first = Node("camera", namespace="twins")
-    started = time.monotonic()
-    words = [sys.executable, "-m", "finssim", "ros2", "node", "camera", "--ros-args", "-r", "__ns:=/twins"]
-    run = subprocess.run([*words, "-p", "vehicle:=finsrov"], capture_output=True, text=True, timeout=90.0)
-    assert run.returncode == 2 and "another node /twins/camera is on ROS domain" in run.stderr
-    assert "waiting until it has gone" in run.stderr and time.monotonic() - started > FORGOTTEN
-    first.destroy_node()
-    run = subprocess.run(
-        [*words, "-p", "pool_file:=/none.yaml"], capture_output=True, text=True, timeout=90.0
-    )
-    assert run.returncode == 2 and "/none.yaml" in run.stderr and "another" not in run.stderr
-
-
-def test_a_graph_is_not_started_where_one_of_its_nodes_lives(node):
-    """Before any process of it."""
-    first = Node("controller", namespace="finsrov")
-    words = [sys.executable, "-m", "finssim", "ros2", "up", "sim", "--duration", "0.1"]
-    run = subprocess.run(words, capture_output=True, text=True, timeout=90.0)
-    assert run.returncode == 2 and "another node /finsrov/controller" in run.stderr
-    assert "process" not in run.stdout
-    first.destroy_node()
