@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.pool.virtual_pool import read_truth
+from finssim.pool.virtual_pool import TruthError, read_truth
 from finssim.robot.record_reader import open_record
 from finssim.vehicles import VehicleError
 from finssim.viewer.frame import ViewError
@@ -62,6 +62,17 @@ def test_clocks_are_laid_over_each_other_by_the_motion(trial, source):
     assert found == pytest.approx(123.4, abs=0.1)
     with pytest.raises(ViewError, match="less than half"):
         offset_between(source._odom, truth.time[:50], truth.position[:50])
+    with pytest.raises(ViewError, match="expected at most 86400 s with the record: give times in s"):
+        offset_between(source._odom, 1e5 * truth.time, truth.position)
+
+
+def test_a_damaged_truth_is_refused(trial, tmp_path):
+    """Ten bytes of the table come twice, so that all rows behind them are made of parts of two."""
+    damaged, data = tmp_path / "truth.fst", trial.truth.read_bytes()
+    middle = len(data) // 2
+    damaged.write_bytes(data[:middle] + data[middle - 10 :])
+    with pytest.raises(TruthError, match="is damaged: its times do not increase"):
+        read_truth(damaged)
 
 
 def test_an_offset_that_is_given_is_used(trial):

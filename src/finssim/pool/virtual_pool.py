@@ -162,7 +162,10 @@ def read_truth(path: str | Path) -> Truth:
     table = np.frombuffer(body, dtype=layout, count=len(body) // layout.itemsize)
     columns = {name: table[name].astype(float) for name in fields}
     columns["voltage"] = columns["voltage"][:, 0]
-    return Truth(header=header, time=table["time"].astype(float), **columns)
+    time = table["time"].astype(float)
+    if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
+        raise TruthError(f"{path}: is damaged: its times do not increase: give the file as the pool wrote it")
+    return Truth(header=header, time=time, **columns)
 
 
 # Faults of the wire and of the instruments, switched on by experiments: what a robot must survive.

@@ -143,6 +143,8 @@ COARSE, FINE = 0.2, 0.01
 """Steps of the search [s]."""
 SAMPLES = 400
 """Of the estimate, that are compared."""
+LONGEST = 86_400.0
+"""Of truth and estimate together [s]: the search takes 0.1 ms for each step."""
 OVERLAP = 0.5
 """Part of the estimate that the truth must cover."""
 
@@ -158,13 +160,17 @@ def offset_between(estimate: PoseSeries, time: Array, position: Array) -> float:
         position: Of the truth [m], (k, 3).
 
     Raises:
-        ViewError: The truth is too short.
+        ViewError: The truth is too short, or too long to be searched.
     """
     chosen = np.unique(np.linspace(0, len(estimate) - 1, SAMPLES).round().astype(int))
     t, x = estimate.time[chosen], estimate.position[chosen]
     finite = np.isfinite(x).all(axis=1)
     t, x = t[finite], x[finite]
     first, last = t[0] - time[-1], t[-1] - time[0]
+    if last - first > LONGEST:
+        raise ViewError(
+            f"it lasts {last - first:g} s, expected at most {LONGEST:g} s with the record: give times in s"
+        )
 
     def error(offset: float) -> float:
         inside = (t - offset >= time[0]) & (t - offset <= time[-1])
