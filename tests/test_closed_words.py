@@ -166,7 +166,12 @@ def refusal(read, path, tree):
     return None
 
 
-@pytest.fixture(params=READERS)
+LONG = {"site", "site with models", "vehicle", "plant of the pool"}
+
+
+@pytest.fixture(
+    params=[pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in READERS]
+)
 def reader(request, tmp_path):
     read, source, name = READERS[request.param]
     path = tmp_path / name
