@@ -109,7 +109,7 @@ def test_version(capsys):
 def test_no_command_shows_the_help(capsys):
     """`finssim` alone shows what there is."""
     assert finssim() == 0
-    assert "Commands:" in capsys.readouterr().out
+    assert "Identify a vehicle:" in capsys.readouterr().out
 
 
 def test_vehicles_lists_the_catalogue(capsys):
@@ -296,3 +296,15 @@ def test_validate_takes_the_model_it_is_given(capfd):
     assert [result["hydrodynamics"] for result in results] == ["calibrated", "simplified"]
     speeds = [[response["simulated"] for response in result["responses"]] for result in results]
     assert speeds[0] != speeds[1]
+
+
+@pytest.mark.parametrize("words", ["vehicles", "tasks", "worlds"])
+def test_lists_fit_into_80_columns(words, monkeypatch, capsys):
+    """No heading is cut or broken, and descriptions keep several words on a line."""
+    monkeypatch.setenv("COLUMNS", "80")
+    assert boundary.run(app, [words]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert all(len(line) <= 80 and "…" not in line for line in lines)
+    headings = {"vehicles": "thrusters  axes  description", "tasks": "observed  actions", "worlds": ""}[words]
+    assert any(headings in " ".join(line.split()) or headings in line for line in lines)
+    assert sum(len(line.split()) == 1 for line in lines) < 0.3 * len(lines)

@@ -462,7 +462,7 @@ def test_fuse_writes_at_the_rate(files, tmp_path, rate):
 @pytest.mark.parametrize(
     "words",
     [
-        ["--mode", "error-state"],
+        ["--estimator", "constant-velocity"],
         ["--method", "refractive-6dof"],
         ["--method", "pinhole"],
         ["--pixel-std", "8"],
@@ -502,7 +502,7 @@ def test_fuse_doubts_corners_that_are_said_to_be_poor(files, tmp_path):
         ),
         (["fuse", "log", *FUSE, "--out", "OUT", "--rate", "0"], "rate is 0 Hz"),
         (["fuse", "log", *FUSE, "--out", "OUT", "--rate", "5000"], "rate is 5000 Hz"),
-        (["fuse", "log", *FUSE, "--out", "OUT", "--mode", "guess"], "unknown mode 'guess'"),
+        (["fuse", "log", *FUSE, "--out", "OUT", "--estimator", "guess"], "unknown estimator 'guess'"),
         (["fuse", "log", *FUSE, "--out", "OUT", "--method", "snell"], "unknown method 'snell'; available"),
         (["fuse", "log", *FUSE, "--out", "OUT", "--pixel-std", "-1"], "pixel_std is -1"),
         (["fuse", "log", *FUSE, "--out", "OUT", "--vehicle", "bluerov2"], "no tags"),

@@ -1,6 +1,7 @@
 """A command is a function: its signature is the options, its docstring the help."""
 
 import inspect
+import re
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -10,7 +11,7 @@ import typer
 from typer.main import get_command
 
 from finssim import boundary, command_line
-from finssim.cli import COMMANDS, app
+from finssim.cli import COMMANDS, SECTIONS, app
 from finssim.command_line import Experiment, command_app, read
 
 SOURCE = '''
@@ -55,7 +56,7 @@ def work(tmp_path, monkeypatch):
     (tmp_path / "thing.py").write_text(SOURCE)
     monkeypatch.setattr(command_line, "ROOT", tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    app = command_app({"work": "thing:work", "other": "thing:work"}, {})
+    app = command_app({"Commands": {"work": "thing:work", "other": "thing:work"}}, {})
     import thing
 
     yield lambda *words: boundary.run(app, ["work", *words]), thing.CALLS
@@ -153,3 +154,35 @@ def test_a_number_without_bounds_is_a_quantity(capsys, tmp_path, number):
     assert boundary.run(app, [*words, "--duration", number]) == 2
     assert f"'--duration': {float(number):g} is not a number from -1e+09 to 1e+09" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+SERVING = {"pool", "teleop", "view", "play", "report", "ros2 up", "ros2 node", "ardusub-sitl"}
+"""Commands that serve, print lines of JSON already, or edit pages."""
+
+
+@pytest.mark.parametrize("words", COMMANDS.keys() - SERVING)
+def test_every_command_with_a_result_prints_json(words, capsys):
+    """--json is an option of all."""
+    assert boundary.run(app, [*words.split(), "--help"]) == 0
+    assert "--json" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_an_option_means_the_same_in_every_command(words, capsys):
+    """--seed is 1 where it has a default; the estimator is never called a mode."""
+    assert boundary.run(app, [*words.split(), "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    seed = re.search(r"--seed INTEGER RANGE (?:(?! --).)*", text)
+    assert seed is None or "[default: 1;" in seed[0] or words == "worlds show"
+    assert "--mode" not in text.replace("--model", "")
+
+
+def test_the_help_lists_commands_by_section_in_the_order_of_use(capsys):
+    """Every command once, below its section, and no line wider than 80 columns."""
+    assert boundary.run(app, ["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    first = dict.fromkeys(words.partition(" ")[0] for words in COMMANDS)
+    headings = [line.rstrip(":") for line in lines if line.rstrip(":") in SECTIONS]
+    assert headings == list(SECTIONS)
+    listed = [line.split()[0] for line in lines if line.startswith("  ") and line.split()[0] in first]
+    assert listed == list(first)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -12,63 +13,79 @@ from finssim import __version__, boundary
 from finssim.command_line import Experiment, command_app
 from finssim.system import replace_unwritable
 
-COMMANDS: dict[str, str | Experiment] = {
-    "demo": "finssim.experiments.demo:demo",
-    "simulate": "finssim.experiments.simulate:simulate",
-    "vehicles": "finssim.cli:vehicles",
-    "vehicles show": "finssim.cli:show_vehicle",
-    "validate": Experiment("finssim.experiments.validate:validate"),
-    "bench": Experiment("finssim.experiments.bench:bench"),
-    "bench cameras": Experiment("finssim.experiments.bench_cameras:bench_cameras"),
-    "worlds": Experiment("finssim.experiments.worlds_show:worlds_list"),
-    "worlds show": Experiment("finssim.experiments.worlds_show:worlds_show"),
-    "doctor": "finssim.doctor:doctor",
-    "train": "finssim.learning.train:train",
-    "evaluate": Experiment("finssim.experiments.evaluate:evaluate"),
-    "tasks": Experiment("finssim.experiments.tasks_show:tasks_list"),
-    "tasks show": Experiment("finssim.experiments.tasks_show:tasks_show"),
-    "collect": Experiment("finssim.experiments.records:collect"),
-    "datasets": Experiment("finssim.experiments.records:datasets"),
-    "compare": Experiment("finssim.experiments.compare:compare"),
-    "sweep": Experiment("finssim.experiments.sweep:sweep"),
-    "trials check": "finssim.calibration.check:check",
-    "trials import": "finssim.calibration.importers.dispatch:import_trials",
-    "excite": "finssim.experiments.excitation:excite",
-    "calibrate thruster": "finssim.calibration.thruster:calibrate_thruster",
-    "calibrate motor": "finssim.calibration.motor:calibrate_motor",
-    "calibrate hydrodynamics": "finssim.calibration.hydrodynamics:calibrate_hydrodynamics",
-    "calibrate camera": "finssim.calibration.vision.camera:run",
-    "calibrate pool": "finssim.calibration.vision.pool_fit:run",
-    "calibrate mounts": "finssim.calibration.vision.mounts:run",
-    "replay": "finssim.calibration.replay:run_replay",
-    "experiment replay": Experiment("finssim.experiments.replay_experiment:replay_experiment"),
-    "experiment localization": Experiment(
-        "finssim.experiments.localization_experiment:localization_experiment"
-    ),
-    "experiment t1": Experiment("finssim.experiments.transfer:t1"),
-    "experiment t2": Experiment("finssim.experiments.transfer:t2"),
-    "experiment anatomy": Experiment("finssim.experiments.anatomy:anatomy"),
-    "experiment open-water": Experiment("finssim.experiments.open_water:open_water"),
-    "experiment faults": Experiment("finssim.experiments.faults:faults_experiment"),
-    "experiment soak": Experiment("finssim.experiments.soak:soak"),
-    "experiment stack": Experiment("finssim.experiments.stack:play"),
-    "report": "finssim.experiments.report:report",
-    "localize": "finssim.localization.localize:run",
-    "fuse": "finssim.localization.fusion.fuse:run",
-    "project": "finssim.localization.points:run_project",
-    "backproject": "finssim.localization.points:run_backproject",
-    "record info": "finssim.robot.record_reader:info",
-    "record repair": "finssim.robot.record_reader:repair",
-    "play": "finssim.experiments.playback:play",
-    "teleop": "finssim.robot.teleop:run",
-    "run": "finssim.robot.run:run",
-    "pool": "finssim.pool.run:run",
-    "ardusub-sitl": "finssim.pool.ardusub_sitl:run",
-    "view": "finssim.viewer.run:run",
-    "ros2 node": "finssim.ros2.up:run_node",
-    "ros2 up": "finssim.ros2.up:up",
+SECTIONS: dict[str, dict[str, str | Experiment]] = {
+    "Start": {
+        "demo": "finssim.experiments.demo:demo",
+        "doctor": "finssim.doctor:doctor",
+    },
+    "Describe and simulate": {
+        "vehicles": "finssim.cli:vehicles",
+        "vehicles show": "finssim.cli:show_vehicle",
+        "worlds": Experiment("finssim.experiments.worlds_show:worlds_list"),
+        "worlds show": Experiment("finssim.experiments.worlds_show:worlds_show"),
+        "simulate": "finssim.experiments.simulate:simulate",
+        "view": "finssim.viewer.run:run",
+    },
+    "Identify a vehicle": {
+        "excite": "finssim.experiments.excitation:excite",
+        "trials import": "finssim.calibration.importers.dispatch:import_trials",
+        "trials check": "finssim.calibration.check:check",
+        "calibrate hydrodynamics": "finssim.calibration.hydrodynamics:calibrate_hydrodynamics",
+        "calibrate thruster": "finssim.calibration.thruster:calibrate_thruster",
+        "calibrate motor": "finssim.calibration.motor:calibrate_motor",
+        "calibrate camera": "finssim.calibration.vision.camera:run",
+        "calibrate pool": "finssim.calibration.vision.pool_fit:run",
+        "calibrate mounts": "finssim.calibration.vision.mounts:run",
+        "replay": "finssim.calibration.replay:run_replay",
+    },
+    "Locate it": {
+        "localize": "finssim.localization.localize:run",
+        "fuse": "finssim.localization.fusion.fuse:run",
+        "project": "finssim.localization.points:run_project",
+        "backproject": "finssim.localization.points:run_backproject",
+    },
+    "Train and evaluate": {
+        "tasks": Experiment("finssim.experiments.tasks_show:tasks_list"),
+        "tasks show": Experiment("finssim.experiments.tasks_show:tasks_show"),
+        "train": "finssim.learning.train:train",
+        "evaluate": Experiment("finssim.experiments.evaluate:evaluate"),
+        "sweep": Experiment("finssim.experiments.sweep:sweep"),
+        "compare": Experiment("finssim.experiments.compare:compare"),
+        "collect": Experiment("finssim.experiments.records:collect"),
+        "datasets": Experiment("finssim.experiments.records:datasets"),
+    },
+    "Deploy": {
+        "pool": "finssim.pool.run:run",
+        "run": "finssim.robot.run:run",
+        "teleop": "finssim.robot.teleop:run",
+        "record info": "finssim.robot.record_reader:info",
+        "record repair": "finssim.robot.record_reader:repair",
+        "play": "finssim.experiments.playback:play",
+        "ros2 up": "finssim.ros2.up:up",
+        "ros2 node": "finssim.ros2.up:run_node",
+        "ardusub-sitl": "finssim.pool.ardusub_sitl:run",
+    },
+    "Prove": {
+        "experiment t1": Experiment("finssim.experiments.transfer:t1"),
+        "experiment t2": Experiment("finssim.experiments.transfer:t2"),
+        "experiment localization": Experiment(
+            "finssim.experiments.localization_experiment:localization_experiment"
+        ),
+        "experiment replay": Experiment("finssim.experiments.replay_experiment:replay_experiment"),
+        "experiment anatomy": Experiment("finssim.experiments.anatomy:anatomy"),
+        "experiment open-water": Experiment("finssim.experiments.open_water:open_water"),
+        "experiment faults": Experiment("finssim.experiments.faults:faults_experiment"),
+        "experiment soak": Experiment("finssim.experiments.soak:soak"),
+        "experiment stack": Experiment("finssim.experiments.stack:play"),
+        "validate": Experiment("finssim.experiments.validate:validate"),
+        "bench": Experiment("finssim.experiments.bench:bench"),
+        "bench cameras": Experiment("finssim.experiments.bench_cameras:bench_cameras"),
+        "report": "finssim.experiments.report:report",
+    },
 }
-"""Words -> what they do."""
+"""Section of the help -> words of a command -> what it does, in the order of a user's path."""
+COMMANDS = {words: work for section in SECTIONS.values() for words, work in section.items()}
+"""Words of every command -> what it does."""
 
 GROUPS = {
     "trials": "Check trials, and import foreign logs as trials.\n\nExample: finssim trials check trials",
@@ -84,7 +101,7 @@ GROUPS = {
 PICTURES = (".png", ".svg", ".pdf")
 
 app = command_app(
-    COMMANDS,
+    SECTIONS,
     GROUPS,
     name="finssim",
     help="Identify, locate and simulate underwater vehicles, train controllers, and deploy them.",
@@ -117,22 +134,30 @@ def _finssim(
     """Units are SI and radians unless an option's name says otherwise; z is up, and 0 on the still water surface."""
 
 
-def vehicles() -> None:
+def vehicles(*, as_json: bool = False) -> None:
     """List the vehicles in the catalogue; `show NAME` prints one in full.
 
     Example: finssim vehicles
+
+    Args:
+        as_json: Print one JSON object instead of a table.
     """
     from rich.console import Console
 
-    from finssim.vehicles.show import print_catalogue
+    from finssim.vehicles import catalogue, load_vehicle
+    from finssim.vehicles.show import print_catalogue, vehicle_data
 
-    print_catalogue(Console())
+    if as_json:
+        print(json.dumps({name: vehicle_data(load_vehicle(name)) for name in catalogue()}))
+    else:
+        print_catalogue(Console())
 
 
 def show_vehicle(
     name: str,
     *,
     picture: Path | None = None,
+    as_json: bool = False,
 ) -> None:
     """Print mass [kg], trim, terminal speeds, wrench capability [N, N m], time constants [s] and thrusters.
 
@@ -141,11 +166,12 @@ def show_vehicle(
     Args:
         name (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         picture: Also draw the thruster layout into this file (.png, .svg).
+        as_json: Print one JSON object instead of tables.
     """
     from rich.console import Console
 
     from finssim.vehicles import load_vehicle
-    from finssim.vehicles.show import print_vehicle
+    from finssim.vehicles.show import print_vehicle, vehicle_data
 
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"{picture} ends in '{picture.suffix}', expected one of {' '.join(PICTURES)}")
@@ -155,11 +181,14 @@ def show_vehicle(
 
         for sensor in vehicle.perception:
             device_of(vehicle, sensor)
-    print_vehicle(vehicle, Console())
+    if as_json:
+        print(json.dumps(vehicle_data(vehicle)))
+    else:
+        print_vehicle(vehicle, Console())
     if picture is not None:
         from finssim.files import atomic_write
         from finssim.vehicles.show import draw_vehicle
 
         with atomic_write(picture) as temporary:
             draw_vehicle(vehicle, temporary)
-        typer.echo(f"thruster layout: {picture}")
+        typer.echo(f"thruster layout: {picture}", err=as_json)

@@ -38,6 +38,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+import typer.core
 
 from finssim.files import sole_writer
 
@@ -271,16 +272,32 @@ def _literal(default: ast.expr, source: str) -> Any:
     return ast.literal_eval(default)
 
 
-def command_app(commands: Mapping[str, Work], groups: Mapping[str, str], **settings: Any) -> typer.Typer:
-    """The whole command line.
+def command_app(
+    sections: Mapping[str, Mapping[str, Work]], groups: Mapping[str, str], **settings: Any
+) -> typer.Typer:
+    """Return the whole command line.
 
     Args:
-        commands: Words after the program's name -> what is done. One of a group's own name is what the group does when
-            nothing follows it; other groups then print their help.
+        sections: Heading of the help -> words after the program's name -> what is done. One of a group's own name is
+            what the group does when nothing follows it; other groups then print their help.
         groups: Word -> help of a group that does nothing itself.
         settings: Of the outermost `typer.Typer`.
     """
-    app = typer.Typer(**SETTINGS, **settings)
+    commands = {name: work for section in sections.values() for name, work in section.items()}
+
+    class Sections(typer.core.TyperGroup):
+        """Lists commands by section, in the order in which they are given."""
+
+        def format_commands(self, context: Any, formatter: Any) -> None:
+            width = max(len(word) for word in self.commands)
+            for heading, section in sections.items():
+                words = dict.fromkeys(name.partition(" ")[0] for name in section)
+                room = formatter.width - width - 6
+                rows = [(f"{word:{width}}", self.commands[word].get_short_help_str(room)) for word in words]
+                with formatter.section(heading):
+                    formatter.write_dl(rows)
+
+    app = typer.Typer(**SETTINGS, **settings, cls=Sections)
     apps: dict[str, typer.Typer] = {}
     for name, work in commands.items():
         first, _, last = name.partition(" ")

@@ -280,3 +280,18 @@ def test_the_papers_rows_are_the_published_table():
     """Table of T1: eight trials each, the best at 7 of 8."""
     assert {row[4] for row in PAPER_T1.values()} == {8} and max(row[3] for row in PAPER_T1.values()) == 7
     assert PAPER_T1["calibrated + DR"][:3] == [0.092, 0.043, 5.42]
+
+
+def test_a_policys_own_task_and_vehicle_are_the_defaults(tmp_path, monkeypatch):
+    """Trained for a BlueROV2, it flies one; trained for a file of one's own, it asks for the file."""
+    monkeypatch.setattr(trials_module, "DURATION", 1.0)
+    bluerov2 = load_vehicle("bluerov2_heavy")
+    policy = proportional(tmp_path / "policy", bluerov2)
+    result = evaluate(policy, trials=1)
+    assert (result["task"], result["vehicle"]["name"]) == ("t1", "bluerov2_heavy")
+    changed = proportional(tmp_path / "changed", bluerov2.replace({"body.mass": 14.0}))
+    with pytest.raises(
+        EvaluationError, match="trained for a vehicle 'bluerov2_heavy' .* give its file with --vehicle"
+    ):
+        evaluate(changed, trials=1)
+    assert evaluate("pid", trials=1)["vehicle"]["name"] == "finsrov"

@@ -250,7 +250,7 @@ def test_what_cannot_be_is_refused():
     pool = overhead()
     with pytest.raises(LocalizationError, match="unknown method 'x'"):
         Perception(VEHICLE, pool, method="x")
-    with pytest.raises(LocalizationError, match="unknown mode 'x'"):
+    with pytest.raises(LocalizationError, match="unknown estimator 'x'"):
         Perception(VEHICLE, pool, mode="x")
     with pytest.raises(LocalizationError, match="no tags"):
         Perception(VEHICLE.model_copy(update={"tags": None}), pool)

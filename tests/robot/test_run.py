@@ -116,10 +116,12 @@ def test_the_error_state_estimator_can_be_chosen(capsys, pool_file):
     """And an unknown one is refused before anything starts."""
     world = Served()
     words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--lockstep")
-    status, summary = told(capsys, *words, "--robot", world.address, "--duration", 1, "--mode", "error-state")
+    status, summary = told(
+        capsys, *words, "--robot", world.address, "--duration", 1, "--estimator", "error-state"
+    )
     assert status == 0 and summary["fixes"] > 20
-    assert finssim(*words, "--robot", world.address, "--mode", "psychic") == 2
-    assert "unknown mode 'psychic'" in capsys.readouterr().err
+    assert finssim(*words, "--robot", world.address, "--estimator", "psychic") == 2
+    assert "unknown estimator 'psychic'" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -662,7 +662,7 @@ def calibrate_motor(
     vehicle: str,
     out: Path,
     report: Path | None = None,
-    seed: int = 0,
+    seed: int = 1,
     as_json: bool = False,
 ) -> Vehicle:
     """Fit the motors' response to steps: delay and lag [s], dead zone.

@@ -808,7 +808,7 @@ def run_replay(
     hydrodynamics: str | Sequence[str] = "calibrated",
     horizon: float | None = None,
     out: Path | None = None,
-    seed: int = 20260903,
+    seed: int = 1,
     as_json: bool = False,
     console: Console | None = None,
 ) -> Replay:

@@ -427,6 +427,7 @@ def demo(
     firmware: str = "mcu",
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
+    as_json: bool = False,
 ) -> Path:
     """Identify a vehicle in the virtual pool or on a robot, train and deploy a policy, write a report.
 
@@ -454,6 +455,7 @@ def demo(
             its camera, with setpoints three times as far).
         robot: Where trials are made and setpoints held, in place of the virtual pool.
         attendant: The person beside that robot, instead of the terminal's keyboard.
+        as_json: Print one JSON object instead of tables.
 
     Returns:
         Path of the report.
@@ -474,8 +476,14 @@ def demo(
         out=Path(out), name=vehicle, standing=standing, seed=seed, steps=steps, scope=scope or FULL, console=console,
         processes=processes, robot=robot, attendant=attendant, firmware=firmware,
     )  # fmt: skip
-    print_tables(demonstration.run(), Console())
-    report = Path(out) / REPORT_FILE
+    tables, report = demonstration.run(), Path(out) / REPORT_FILE
+    if as_json:
+        rows = [
+            {"title": t.title, "heads": list(t.heads), "rows": [list(r) for r in t.rows if r]} for t in tables
+        ]
+        print(json.dumps({"report": str(report), "tables": rows}))
+        return report
+    print_tables(tables, Console())
     print(f"report: {report}")
     display = environ.get("DISPLAY") or environ.get("WAYLAND_DISPLAY") or sys.platform in ("darwin", "win32")
     if sys.stdout.isatty() and display:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+from finssim.control.policy import read_description
 from finssim.experiments import campaign
 from finssim.experiments.campaign import progress_bar, write_json
 from finssim.experiments.figures import draw_envelopes, draw_tracking, save_figure
@@ -34,9 +35,10 @@ from finssim.experiments.trials import (
 from finssim.files import atomic_directory, plain_name
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
+from finssim.robot.record_reader import open_record
 from finssim.tasks import task_named
 from finssim.tasks.agents import agent_for
-from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles import Vehicle, catalogue, catalogue_vehicle, load_vehicle
 
 EVALUATION_FILE = "evaluation.json"
 TRAJECTORIES = "trajectories"
@@ -240,15 +242,15 @@ def evaluation(
 def evaluate(
     controller: Sequence[str | Path] | str | Path,
     *,
-    task: str = "t1",
-    vehicle: str | Vehicle = "finsrov",
+    task: str | None = None,
+    vehicle: str | Vehicle | None = None,
     hydrodynamics: str = "calibrated",
     plant: Sequence[str | Path] | str | Path = ("nominal",),
     observe: str | None = None,
     trajectories: Annotated[Sequence[str | Path], "--trajectory"] = (),
     trials: Annotated[int | None, (1, 100_000)] = None,
     truth: Path | None = None,
-    seed: int = 42,
+    seed: int = 1,
     out: Path | None = None,
 ) -> dict[str, Any]:
     """Evaluate a controller: success, errors [m, deg], settling time [s]; or errors along trajectories [m].
@@ -264,8 +266,10 @@ def evaluate(
     Args:
         controller (DIR|pid|pid-paper|RECORD): A policy's directory, or pid, or pid-paper; or records of one controller
             on a robot (.mcap).
-        task (TASK): Task; finssim tasks lists them. Your own: FILE.py:CLASS. For records, a task of one vehicle.
-        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        task (TASK): Task; finssim tasks lists them. Your own: FILE.py:CLASS. For records, a task of one vehicle. The
+            policy's own if not given, and t1 of a controller that has none.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file. That of the policy or of the record if
+            not given, and finsrov of a controller that has none.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), current, foreign, held_out, lag, mesh,
             noise, randomised, sensors, simplified, waves, or a file. May be repeated.
@@ -285,8 +289,9 @@ def evaluate(
     Raises:
         EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
     """
-    task_named(task)  # which refuses one that does not exist
     names = [controller] if isinstance(controller, str | Path) else controller
+    task, vehicle = _subject(Path(names[0]), task, vehicle)
+    task_named(task)  # which refuses one that does not exist
     records = [Path(name) for name in names if str(name).endswith(".mcap")]
     if len(names) > 1 and len(records) < len(names):
         raise EvaluationError(
@@ -322,6 +327,31 @@ def evaluate(
                 figure = form.draw({e.label: e.trials for e in evaluations}, title)
                 save_figure(figure, folder / form.figure)
     return document
+
+
+def _subject(controller: Path, task: str | None, vehicle: str | Vehicle | None) -> tuple[str, str | Vehicle]:
+    """Return the task and the vehicle of an evaluation: as given, else those of the policy or of the record.
+
+    Raises:
+        EvaluationError: The policy was trained for a vehicle that is not in the catalogue.
+        PolicyError, RecordError, VehicleError: The policy or the record cannot be read.
+    """
+    if controller.suffix == ".mcap" and vehicle is None:
+        with open_record(controller) as record:
+            name = record.metadata.get("vehicle")
+        vehicle = None if name is None else catalogue_vehicle(name, str(controller))
+    if controller.is_dir() and (task is None or vehicle is None):
+        trained = read_description(controller)
+        task = task or trained.task
+        if vehicle is None:
+            named = trained.vehicle
+            vehicle = catalogue_vehicle(named.name, str(controller)) if named.name in catalogue() else None
+            if vehicle is None or vehicle.sha256 != named.sha256:
+                raise EvaluationError(
+                    f"{controller} was trained for a vehicle '{named.name}' that is not the catalogue's: give its file "
+                    "with --vehicle"
+                )
+    return task or "t1", vehicle or "finsrov"
 
 
 def _recorded(
@@ -378,7 +408,7 @@ def evaluate_controller(
     hydrodynamics: str = "calibrated",
     trajectories: Sequence[str | Path] = (),
     trials: int | None = None,
-    seed: int = 42,
+    seed: int = 1,
     record: Path | None = None,
 ) -> Evaluation:
     """Run the trials in one plant and measure them; arguments as `evaluate`.

@@ -515,7 +515,7 @@ def excite(
     coast: float = 30.0,
     duration: float = 60.0,
     robot: OnRobot | None = None,
-    seed: int = 0,
+    seed: int = 1,
     as_json: bool = False,
 ) -> list[Path]:
     """Play excitation programmes on a robot or in simulation, or write them as tables (wrench [N, N m], 50 Hz).

@@ -36,7 +36,7 @@ def play(
     task: str | None = None,
     vehicle: str | None = None,
     plant: str = "nominal",
-    seed: int = 42,
+    seed: int = 1,
 ) -> None:
     """Print the messages of a record as JSON lines [SI units], or film an episode of a policy.
 

@@ -413,7 +413,7 @@ def collect(
     observe: str = "training",
     disturb: float = 0.0,
     goal: str | None = None,
-    seed: int = 42,
+    seed: int = 1,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
     """Store episodes of a task as a Minari data set, from an expert or from records of a driven vehicle.

@@ -76,6 +76,7 @@ def simulate(
     hydrodynamics: str = "calibrated",
     depth: float = 5.0,
     device: str = "cpu",
+    as_json: bool = False,
 ) -> None:
     """Simulate a vehicle from rest under a constant wrench and record its motion.
 
@@ -93,6 +94,7 @@ def simulate(
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         depth: Depth of the body origin at the start [m].
         device (DEVICE): Compute device: cpu or cuda.
+        as_json: Print one JSON object instead of a table.
 
     Raises:
         CommandError: The command, a time or the file's name cannot be used, or the motion did not stay finite.
@@ -124,6 +126,19 @@ def simulate(
         }
         origin.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     last, achieved = rows[-1], allocator.achieved(thrust)
+    if as_json:
+        state = dict(zip(columns, (float(x) for x in last), strict=True))
+        print(
+            json.dumps(
+                {
+                    "out": str(out),
+                    **about,
+                    "wrench": dict(zip(AXES, achieved.tolist(), strict=True)),
+                    "end": state,
+                }
+            )
+        )
+        return
     angles_deg = np.degrees(quat_to_euler(last[4:8]))
     cells = [
         ["requested wrench [N, N m]", *(f"{x:.4g}" for x in tau)],

@@ -183,12 +183,16 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         rows = [
             [
                 name, str(len(task["agents"])), str(task["observation"]["size"]), str(task["action"]["size"]),
-                f"{task['period_s']:g}", f"{task['time_limit_s']:g}", ", ".join(task["baselines"]), task["title"],
+                f"{task['period_s']:g}", f"{task['time_limit_s']:g}", ", ".join(task["baselines"]),
             ]
             for name, task in result.items()
         ]  # fmt: skip
-        heads = ("task", "agents", "sees", "does", "every [s]", "for [s]", "baseline", "what is to be done")
-        return [Table(title="", heads=heads, rows=rows, left=(0, 6, 7), whole=(0, 6))]
+        heads = ("task", "agents", "observed", "actions", "period [s]", "length [s]", "baseline")
+        goals = [[name, task["title"]] for name, task in result.items()]
+        return [  # two tables, which fit into 80 columns
+            Table(title="", heads=("task", "goal"), rows=goals, left=(0, 1), whole=(0,)),
+            Table(title="", heads=heads, rows=rows, left=(0, 6), whole=(0, 6)),
+        ]
     parts = {
         "Observation, of one agent: each over its scale, within ± clip": (result["observation"]["parts"], ""),
         "Action: limits at -1 and 1": (result["action"]["components"], ""),

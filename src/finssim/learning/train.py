@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -36,7 +37,7 @@ def train(
     action: str | None = None,
     randomize: str | Path | None = None,
     observe: str = "training",
-    seed: int = 42,
+    seed: int = 1,
     worlds: Annotated[int | None, (1, 10_000_000)] = None,
     steps: Annotated[int | None, (1, 1_000_000_000_000)] = None,
     until: float | None = None,
@@ -46,6 +47,7 @@ def train(
     wandb: str | None = None,
     device: str = "cpu",
     console: Console | None = None,
+    as_json: bool = False,
     shown: Annotated[Path | None, "python"] = None,
     interrupted: Annotated[Path | None, "python"] = None,
 ) -> Path:
@@ -91,6 +93,7 @@ def train(
             WANDB_MODE=offline they are stored beside the policy for 'wandb sync'.
         device (DEVICE): Compute device: cpu or cuda.
         console: Where progress is shown; standard error if None.
+        as_json: Print one JSON object about the policy, to standard output.
         shown: Name of the directory in messages, where `out` is a temporary one.
         interrupted: Where the policy so far goes after Ctrl-C; if None, `out`, or `OUT-training/interrupted` where
             `out` holds an earlier policy.
@@ -181,6 +184,8 @@ def train(
     _finish(
         loop, folder, stopped, console, folder if stopped else shown or folder, time.perf_counter() - began
     )
+    if as_json:
+        print(json.dumps({"policy": str(folder), "best_steps": loop.best.steps, **loop.curves[-1]}))
     return folder
 
 

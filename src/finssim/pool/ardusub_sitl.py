@@ -396,7 +396,7 @@ def run(
     resistance: Annotated[float, (0.0, 1.0)] = 0.02,
     dvl: str | None = None,
     duration: Annotated[float | None, (0.0, None)] = None,
-    seed: int = 0,
+    seed: int = 1,
 ) -> None:
     """Simulate the physics for ArduPilot's ArduSub SITL, started with `--model JSON:127.0.0.1`, until Ctrl-C.
 

@@ -545,7 +545,7 @@ def run(
     tcp: str = "127.0.0.1:5760",
     dvl: str = "127.0.0.1:16171",
     duration: Annotated[float | None, (0.0, None)] = None,
-    seed: int = 0,
+    seed: int = 1,
 ) -> None:
     """Simulate a vehicle and its pool for a robot on this machine, until Ctrl-C.
 

@@ -25,7 +25,7 @@ from finssim.yaml_file import json_value
 __all__ = ["Entry", "Record", "describe_record", "events_of", "open_record", "repair_record"]
 
 
-def repair(file: Path, *, out: Path | None = None) -> None:
+def repair(file: Path, *, out: Path | None = None, as_json: bool = False) -> None:
     """Write a complete record from the readable part of a truncated or damaged one; FILE is not changed.
 
     Example: finssim record repair run.mcap --out whole.mcap
@@ -33,9 +33,14 @@ def repair(file: Path, *, out: Path | None = None) -> None:
     Args:
         file (FILE): Record of a run (.mcap).
         out (FILE): File to write; FILE-repaired.mcap if not given.
+        as_json: Print one JSON object instead of sentences.
     """
     target = out or file.with_name(f"{file.stem}-repaired.mcap")
-    for note in repair_record(file, target) or ["nothing is damaged"]:
+    notes = repair_record(file, target)
+    if as_json:
+        print(json.dumps({"out": str(target), "damage": notes}))
+        return
+    for note in notes or ["nothing is damaged"]:
         print(note)
     print(f"wrote {target}")
 

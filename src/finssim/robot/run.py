@@ -316,7 +316,7 @@ def run(
     number: Annotated[int, (0, 1000)] = 0,
     vehicle: str = "finsrov",
     let_in: str | None = None,
-    mode: str | None = None,
+    estimator: str | None = None,
     record: Path | None = None,
     duration: Annotated[float | None, (0.0, None)] = None,
     lockstep: bool = False,
@@ -362,7 +362,7 @@ def run(
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         let_in (X,Y): Position at the start, world frame [m], known to 5 cm: for dead reckoning by DVL and compass,
             without camera and position fixes.
-        mode (MODE): Estimator: error-state, which uses the IMU's accelerations (default on a vehicle with an IMU),
+        estimator (NAME): Estimator: error-state, which uses the IMU's accelerations (default on a vehicle with an IMU),
             or constant-velocity.
         record (FILE): Record everything to this file (.mcap); with --team a folder with a file for each.
         duration: Duration [s]; until the end of the trajectory or Ctrl-C if not given.
@@ -390,7 +390,7 @@ def run(
             "--site": site or "open-water",
             "--pool-file": pool_file or "none",
             "--goal": goal,
-            "--mode": mode,
+            "--estimator": estimator,
             "--duration": duration,
         }
         tokens = [word for name, x in options.items() if x is not None for word in (name, str(x))]
@@ -423,7 +423,7 @@ def run(
             markup=False,
         )
     pool = None if file is None else load_pool(file)
-    perception = Perception(ours, pool, mode=mode, let_in=None if let_in is None else place_of(let_in))
+    perception = Perception(ours, pool, mode=estimator, let_in=None if let_in is None else place_of(let_in))
     team = _team(pilot, wiring)
     heard = HeardGoal(team.tracks) if team is not None and guide is _GO and _alone(pilot) else None
     guide = heard or guide

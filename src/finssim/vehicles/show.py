@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,26 +27,30 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from rich.console import Console
 
-__all__ = ["draw_vehicle", "print_catalogue", "print_vehicle"]
+__all__ = ["draw_vehicle", "print_catalogue", "print_vehicle", "vehicle_data"]
 
 
 _MARK = {"measured": "", "published": "", "derived": " ·", "guessed": " ?"}
 _LEGEND = "no mark: measured or published    · derived    ? guessed"
 
 
+WIDE = 110
+"""Columns of a terminal from which the hydrodynamic sets have a column of their own in the catalogue."""
+
+
 def print_catalogue(console: Console) -> None:
     """One line per vehicle that comes with FinsSim."""
     table = Table(title="Vehicles", title_justify="left", box=None, pad_edge=False)
-    for column in ("name", "mass [kg]", "thrusters", "axes"):
+    for column in ("name", "mass\n[kg]", "thrusters", "axes"):
         table.add_column(Text(column), justify="left" if column == "name" else "right", no_wrap=True)
-    table.add_column("hydrodynamics")
-    table.add_column("what it is", overflow="fold")
+    wide = console.width >= WIDE
+    for column in ("hydrodynamics", "description") if wide else ("description",):
+        table.add_column(column)
     for name in catalogue():
         vehicle = load_vehicle(name)
         numbers = (f"{vehicle.body.mass:g}", len(vehicle.thrusters), len(vehicle.controlled_axes))
-        table.add_row(
-            f"[bold]{name}[/bold]", *map(str, numbers), " ".join(vehicle.hydrodynamics), escape(vehicle.title)
-        )
+        words = (" ".join(vehicle.hydrodynamics), vehicle.title) if wide else (vehicle.title,)
+        table.add_row(f"[bold]{name}[/bold]", *map(str, numbers), *map(escape, words))
     console.print(table)
 
 
@@ -69,6 +74,30 @@ def print_vehicle(vehicle: Vehicle, console: Console) -> None:
         console.print(f"calibrated: {record.sentence()}", highlight=False, markup=False)
     for table in _tables(vehicle):
         console.print(table)
+
+
+def vehicle_data(vehicle: Vehicle) -> dict[str, Any]:
+    """Return a vehicle as plain data: its values and what each axis can do alone, in the order of `AXES`.
+
+    Wrenches are in N and N m, terminal speeds in m/s and rad/s, time constants in s; None where there is none.
+    """
+    capability = wrench_capability(vehicle)
+    sets = [name for name, chosen in vehicle.hydrodynamics.items() if isinstance(chosen, HydrodynamicSet)]
+
+    def by_set(function: Any) -> dict[str, list[float | None]]:
+        return {s: [x if math.isfinite(x) else None for x in function(vehicle, s).tolist()] for s in sets}
+
+    return {
+        "name": vehicle.name,
+        "file": None if vehicle.path is None else str(vehicle.path),
+        "sha256": vehicle.sha256,
+        "values": json.loads(json.dumps(vehicle.values(), default=str)),
+        "wrench_positive": capability.positive.tolist(),
+        "wrench_negative": capability.negative.tolist(),
+        "terminal_speeds": by_set(terminal_speeds),
+        "time_constants": by_set(time_constants),
+        "checks": [{"name": f.name, "passed": f.passed, "text": f.sentence} for f in check_vehicle(vehicle)],
+    }
 
 
 def _tables(vehicle: Vehicle) -> Iterator[Table]:

@@ -969,7 +969,7 @@ def run(
     vehicle: str,
     out: Path,
     report: Path | None = None,
-    seed: int = 0,
+    seed: int = 1,
     as_json: bool = False,
 ) -> Vehicle:
     """Estimate the mounts of tags on the vehicle from its motion, IMU and pressure port: poses [m, deg].

@@ -324,7 +324,7 @@ class Estimator:
             LocalizationError: Unknown mode.
         """
         if mode not in MODELS:
-            raise LocalizationError(f"unknown mode '{mode}'; available: {', '.join(MODELS)}")
+            raise LocalizationError(f"unknown estimator '{mode}'; available: {', '.join(MODELS)}")
         self.settings, self.site = settings or Settings(), site or Site()
         self._model = MODELS[mode](self.settings, self.site)
         self._counts: dict[str, dict[str, int]] = {stream: {} for stream in STREAMS}

@@ -207,7 +207,7 @@ def run(
     vehicle: str | Path,
     out: str | Path,
     rate: float = 60.0,
-    mode: str = "constant-velocity",
+    estimator: str | None = None,
     method: str = "refractive",
     pixel_std: float | None = None,
     as_json: bool = False,
@@ -222,7 +222,8 @@ def run(
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Table to write (.csv).
         rate: Rows per second [Hz].
-        mode (MODE): constant-velocity (paper, eq. 14-15) or error-state (uses IMU acceleration).
+        estimator (NAME): error-state, which uses the IMU's accelerations (default where the log has them), or
+            constant-velocity (paper, eq. 14-15).
         method (METHOD): Localization method: refractive, refractive-weighted, refractive-6dof, pinhole-depth or
             pinhole.
         pixel_std: Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
@@ -239,7 +240,8 @@ def run(
     site, body = load_pool(pool), load_vehicle(str(vehicle))
     read = load_log(log, body, latency=site.latency)
     pixel_std = site.pixel_std if pixel_std is None else pixel_std
-    fused = fuse(read, site, body, rate=rate, mode=mode, method=method, pixel_std=pixel_std)
+    estimator = estimator or ("error-state" if _has_accelerations(read) else "constant-velocity")
+    fused = fuse(read, site, body, rate=rate, mode=estimator, method=method, pixel_std=pixel_std)
     write_rows(fused.rows, out)
     if as_json:
         print(json.dumps({"out": str(out), "notes": read.notes, **fused.summary}, allow_nan=False))
@@ -273,9 +275,9 @@ def fuse(
         raise LocalizationError(f"rate is {rate:g} Hz, expected above 0 and up to {FASTEST:g}")
     check_method(method)
     estimator = Estimator(settings_of(vehicle), site_of(pool, vehicle), mode=mode)
-    if mode == "error-state" and not any(getattr(s, "force", None) for s in log.samples):
+    if mode == "error-state" and not _has_accelerations(log):
         raise LocalizationError(
-            "mode error-state needs accelerations with gravity (ax, ay, az beside p, q, r): use constant-velocity"
+            "estimator error-state needs accelerations with gravity (ax, ay, az beside p, q, r): use constant-velocity"
         )
     fixes = None
     if log.frames:  # default tags are for the virtual world
@@ -293,6 +295,11 @@ def fuse(
     final = estimator.health(estimator.estimate(result.rows[-1][0] if result.rows else None))
     result.summary = summary_of(result.rows, final, estimator.nis, log.truth)
     return result
+
+
+def _has_accelerations(log: Log) -> bool:
+    """Return whether the IMU of a log measured specific force."""
+    return any(getattr(sample, "force", None) for sample in log.samples)
 
 
 def _take(item: Delivery, estimator: Estimator, fixes: Fixes | None) -> None:
