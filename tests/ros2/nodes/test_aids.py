@@ -1,7 +1,6 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
 """Fixes by wire, Doppler log and compass: from the motor controller to topics and odometry, without a camera."""
 
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +17,7 @@ from finssim.ros2.nodes.conversions import nanoseconds, ros_type
 from finssim.ros2.nodes.hardware_bridge import HardwareBridge
 from finssim.ros2.nodes.state_estimation import StateEstimation
 from finssim.ros2.topics import TOPICS, quality_profile
+from reference.ros_time import RosTime
 from reference.sea import Sea
 
 PATIENCE = 40.0  # [s] on a busy machine
@@ -35,6 +35,7 @@ def sea():
         "pool_file:='none'",
         address,
         "bind:='127.0.0.1:0'",
+        "use_sim_time:=true",
     ]
     words = [word for option in options for word in ("-p", option)]
     rclpy.init(args=["--ros-args", "-r", "__ns:=/finsrov", *words])
@@ -47,15 +48,11 @@ def sea():
             ros_type(topic.type), topic.name, heard[key].append, quality_profile(topic.quality)
         )
 
+    ros_time = RosTime(peer, (bridge, estimator))
+    began = ros_time.now
+
     def until(condition):
-        end = time.monotonic() + PATIENCE
-        while not condition() and time.monotonic() < end:
-            made.turn()
-            for node in (bridge, estimator, peer):
-                for _ in range(8):
-                    rclpy.spin_once(node, timeout_sec=0.0)
-            time.sleep(0.002)
-        return condition()
+        return ros_time.until(condition, lambda: made.turn(ros_time.now - began))
 
     yield SimpleNamespace(heard=heard, until=until, world=made.world, estimator=estimator)
     bridge.close()
