@@ -1,14 +1,20 @@
 """The batch: seeds, independence of worlds, automatic reset, refusals, noise and worlds that break."""
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas
 import pytest
+import warp as wp
 
 from finssim.control.modes import action_mode
 from finssim.engine.randomize import Randomization
+from finssim.engine.state import State
+from finssim.engine.surroundings import Pool
 from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, StationKeeping
+from finssim.tasks.terms import place_at_rest
+from reference.guess import Steady
 
 TASK = StationKeeping(time_limit=1.0)
 NOISE = MeasurementNoise(position_std=0.05, yaw_std=0.17, velocity_std=0.02, rate_std=0.03)
@@ -211,3 +217,42 @@ def test_a_world_that_breaks_is_reported_and_starts_over(tmp_path, capsys, auto_
     assert len(table) == 4 and table.iloc[:-1].notna().all(axis=None) and table.iloc[-1].isna().any()
     again = broken.step(np.full((8, 6), 0.1))
     assert not again.terminated.any() and np.isfinite(again.observation).all()
+
+
+@wp.func
+def in_the_wall(state: State, w: int):
+    """The third world begins 0.1 m inside a wall."""
+    place_at_rest(state, w, 0, wp.vec3(wp.where(w == 2, 2.1, 1.0), 0.0, -0.5), 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walled(Steady):
+    """It begins where it cannot."""
+
+    name: str = "walled"
+    pool: Pool | None = Pool()
+
+    def terms(self):
+        return replace(super().terms(), start=in_the_wall)
+
+
+def test_a_start_outside_the_arena_is_refused_with_its_place():
+    """Its wall would throw the vehicle out at 46 m/s; in a wider arena it may begin there."""
+    with pytest.raises(
+        EnvironmentSetupError, match=r"'walled' starts .* in world 2 at \(2.1, 0, -0.5\) m, outside"
+    ):
+        Environment(Walled(), worlds=4)
+    assert Environment(replace(Walled(), pool=Pool(length=6.0)), worlds=4).worlds == 4
+
+
+def test_of_many_worlds_that_break_three_are_written(tmp_path, capsys):
+    """The others are counted, in one sentence, however many break and however often."""
+    env = Environment(StationKeeping(), worlds=8, crash_directory=tmp_path / "broken")
+    for _ in range(3):
+        velocity = env.simulator.state.velocity.numpy()
+        velocity[:] = np.nan
+        env.simulator.state.velocity.assign(velocity)
+        env.step(np.zeros((8, 6)))
+    assert len(list((tmp_path / "broken").iterdir())) == 3
+    said = capsys.readouterr().err
+    assert said.count("last states in") == 3 and said.count("are not written") == 1

@@ -355,11 +355,12 @@ class Simulator:
         """Worlds that stand still because a number stopped being finite."""
         return np.flatnonzero(self.state.frozen.numpy())
 
-    def report_frozen(self, directory: Path) -> list[Path]:
+    def report_frozen(self, directory: Path, most: int | None = None) -> list[Path]:
         """Write the last 50 states of every newly frozen world to a CSV file.
 
         Args:
             directory: Where; made if missing.
+            most: How many files are written at most; all if None.
 
         Returns:
             The files written.
@@ -367,7 +368,7 @@ class Simulator:
         episode = self.state.episode.numpy()
         new = [w for w in self.frozen_worlds() if (int(w), int(episode[w])) not in self._reported]
         self._reported |= {(int(w), int(episode[w])) for w in new}
-        return [write_post_mortem(self, int(w), directory) for w in new]
+        return [write_post_mortem(self, int(w), directory) for w in new[:most]]
 
 
 # What a simulator is given, checked: names, devices, vehicles that share a world.

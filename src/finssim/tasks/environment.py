@@ -31,6 +31,10 @@ GPU_FROZEN_CHECK = 100
 """Steps between looks for frozen worlds on a GPU."""
 
 
+MOST_REPORTS = 3
+"""Worlds that froze whose last states are written; the others are counted."""
+
+
 @dataclass(frozen=True)
 class Step:
     """What one step gave; NumPy views of the environment's own arrays, valid until the next step."""
@@ -166,7 +170,8 @@ class Environment:
         self.noise = noise or MeasurementNoise()
         self.randomization = randomization
         self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
-        self._steps = 0
+        self._steps = self._reported = 0
+        self._arena = pool or task.arena()
         drawn = bool(randomization and randomization.changes_sensors)
         sensed = isinstance(self.noise, Sensing)
         off_by = self.noise.fixes if isinstance(self.noise, Sensing) else self.noise
@@ -298,7 +303,29 @@ class Environment:
         starts = np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
         self._mask.assign(starts)
         self._begin(self._start, starts != 0)
+        self._check_starts(starts != 0)
         return self._observed("")
+
+    def _check_starts(self, mask: NDArray[np.bool_]) -> None:
+        """Refuse starts outside the arena, from which walls would throw a vehicle out.
+
+        Raises:
+            EnvironmentSetupError: With the coordinates of the first.
+        """
+        if self._arena is None:
+            return
+        half = np.array([0.5 * self._arena.length, 0.5 * self._arena.width, np.inf])
+        low, high = -half, half
+        low[2] = -self._arena.depth
+        positions = self.simulator.state.position.numpy()
+        outside = ~((positions >= low - 1e-6) & (positions <= high + 1e-6)).all(2) & mask[:, None]
+        if outside.any():
+            world, vehicle = np.argwhere(outside)[0]
+            place = ", ".join(f"{x:.3g}" for x in positions[world, vehicle])
+            raise EnvironmentSetupError(
+                f"task '{self.task.name}' starts {self.task.vehicles[vehicle]} in world {world} at ({place}) m, "
+                f"outside its arena: expected x within ±{half[0]:g}, y within ±{half[1]:g} and z above {low[2]:g} m"
+            )
 
     def _begin(self, pipeline: Pipeline, mask: NDArray[np.bool_]) -> None:
         """Start episodes in the worlds of the pipeline's mask."""
@@ -388,8 +415,12 @@ class Environment:
     def _revive(self) -> None:
         """Report the worlds that froze, then start new episodes there; their step counts as terminated."""
         frozen = self.simulator.state.frozen.numpy() != 0
+        before, self._reported = self._reported, self._reported + int(frozen.sum())
         try:
-            notes = [f"last states in {path}" for path in self.simulator.report_frozen(self.crash_directory)]
+            paths = self.simulator.report_frozen(self.crash_directory, most=max(0, MOST_REPORTS - before))
+            notes = [f"last states in {path}" for path in paths]
+            if before <= MOST_REPORTS < self._reported:
+                notes.append(f"more worlds than {MOST_REPORTS}: the states of the others are not written")
         except OSError as error:  # a report that cannot be written must not end a long training
             notes = [f"its last states could not be written: {error}"]
         for note in notes:
