@@ -643,7 +643,7 @@ WALK = 2.5
 LARGEST_TURN = 1.0
 """Turn between two samples of an attitude above which its rates may be aliases [rad]."""
 
-STEEP = 0.3
+STEEP = 0.6
 """Cosine of the pitch below which the heading means nothing."""
 
 LEVEL = 0.7
@@ -693,12 +693,13 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
     f, _ = on_grid(trial, ("ax", "ay", "az"), t)
     f = np.nan_to_num(f[np.isfinite(f[:, 2])])
     mean = np.linalg.norm(f.mean(axis=0))
+    usual = np.median(np.linalg.norm(f, axis=1))  # of a vehicle that turns over, too
     for size, unit, scale in (
         (1.0, "g", 9.80665),
         (1000.0, "milli-g", 9.80665e-3),
         (100.0 * g, "cm/s²", 0.01),
     ):
-        if abs(mean / size - 1.0) < 0.15:
+        if abs(mean / size - 1.0) < 0.15 and abs(usual / size - 1.0) < 0.3:
             return [finding("acceleration_unit", value=mean, unit=unit, factor=scale)]
     if not holds_gravity(trial, g):
         if abs(mean / g - 1.0) < 0.2:
@@ -720,7 +721,7 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
         # Without an attitude a vehicle that is level at any time shows that its accelerometer is.
         cosines = np.sum(f * up, axis=1) / np.linalg.norm(f, axis=1)
-        if attitude.tilt or np.percentile(cosines, 90.0) < np.cos(np.radians(15.0)):
+        if attitude.tilt or np.percentile(cosines, 98.0) < np.cos(np.radians(15.0)):
             findings.append(finding("accelerometer_turned", angle=angle, reference=against))
     for i, angle_name in ((0, "pitch"), (1, "roll")):
         swing = g * np.std(up[:, i])
@@ -732,10 +733,7 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
 def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     findings: list[Finding] = []
     _, q, _ = attitude_samples(trial)
-    if len(q) < FEWEST:
-        return []
-    turns = 2.0 * np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=1)), 0.0, 1.0))
-    if np.percentile(turns, 98.0) > LARGEST_TURN:
+    if len(q) < FEWEST or _too_slow(q):
         return []
     gyro, _ = on_grid(trial, ("p", "q", "r"), t)
     angles = quat_to_euler(q)
@@ -763,7 +761,7 @@ def _heading(trial: Trial) -> list[Finding]:
     """The heading against the integrated gyro, psi_dot = (q sin(roll) + r cos(roll)) / cos(pitch)."""
     t, r = trial.series("r")
     at, q, named = attitude_samples(trial)
-    if len(t) < FEWEST or "yaw" not in named or len(at) < FEWEST:
+    if len(t) < FEWEST or "yaw" not in named or len(at) < FEWEST or _too_slow(q):
         return []
     roll, pitch, yaw = quat_to_euler(q)
     inside = (t >= at[0]) & (t <= at[-1])
@@ -783,8 +781,7 @@ def _heading(trial: Trial) -> list[Finding]:
     wide = (step > longest_step(t)) | (np.cos(theta[1:]) < STEEP) | (np.cos(theta[:-1]) < STEEP)
     turns = np.where(wide, 0.0, 0.5 * (rate[1:] + rate[:-1]) * step)
     turned = np.concatenate([[0.0], np.cumsum(turns)])
-    # The gyro bridges a turn of more than half a circle between two samples of the heading.
-    difference = np.interp(t, at, np.unwrap(yaw - np.interp(at, t, turned)))
+    difference = np.interp(t, at, np.unwrap(yaw)) - turned
     for edge in np.flatnonzero(wide):
         difference[edge + 1 :] += difference[edge] - difference[edge + 1]
     bias, _ = np.polyfit(t - t[0], difference, 1) if t[-1] - t[0] > 5.0 else (0.0, 0.0)
@@ -803,11 +800,16 @@ def _heading(trial: Trial) -> list[Finding]:
 
 def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     _, up = on_grid(trial, ("z", "depth"), t, 3)
-    both = relation(-up[:, 1], up[:, 0], nuisances=np.ones((len(t), 1)))
-    if _against(both):
-        return [finding("z_down")]
-    if wrong_unit := _unit_ratio(-up[:, 1], up[:, 0], "z", "depth"):
-        return wrong_unit
+    moves = [
+        np.nanstd(rate) > 0.01 and _stands_out(rate, trial.series(name)[1])
+        for name, rate in zip(("z", "depth"), up.T, strict=True)
+        if np.isfinite(rate).sum() >= FEWEST
+    ]
+    if sum(moves) == 2:
+        if _against(relation(-up[:, 1], up[:, 0], nuisances=np.ones((len(t), 1)))):
+            return [finding("z_down")]
+        if wrong_unit := _unit_ratio(-up[:, 1], up[:, 0], "z", "depth"):
+            return wrong_unit
     vertical = "z" if trial.has("z") else "depth"
     rising = np.where(np.isfinite(up[:, 0]), up[:, 0], -up[:, 1])
     through = _through_world(trial, t, attitude)[:, 2]
@@ -873,6 +875,12 @@ def _through_world(trial: Trial, t: Array, attitude: AttitudeSignal) -> Array:
     through[~np.isfinite(nu[:, :2]).all(axis=1), :2] = np.nan
     through[~np.isfinite(nu[:, 2]), 2] = np.nan
     return np.asarray(through)
+
+
+def _too_slow(q: Array) -> bool:
+    """Return whether an attitude turns so far from sample to sample that its rates may be aliases."""
+    turns = 2.0 * np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=1)), 0.0, 1.0))
+    return bool(np.percentile(turns, 98.0) > LARGEST_TURN)
 
 
 def _stands_out(rates: Array, samples: Array) -> bool:
