@@ -141,8 +141,10 @@ def trial_covariance(evidence: Evidence) -> Covariance:
     index = np.arange(len(N_g))
     gram[:, index, index] += np.einsum("gpk,gpk->pg", a, Ba)
     trace = np.trace(gram, axis1=1, axis2=2)
-    square = np.einsum("pgh,pgh->p", gram, gram)
-    dof = np.where(square > 0.0, trace**2 / np.maximum(square, 1e-300), 1.0)
+    # In units of the largest entry: squares of the variance of a parameter that is hardly known would overflow.
+    unit = gram / np.maximum(np.abs(gram).max(axis=(1, 2), keepdims=True), 1e-300)
+    square = np.einsum("pgh,pgh->p", unit, unit)
+    dof = np.where(square > 0.0, np.trace(unit, axis1=1, axis2=2) ** 2 / np.maximum(square, 1e-300), 1.0)
     # A stated variance has infinitely many degrees of freedom; Satterthwaite's sum of both.
     mixed = (1.0 + np.diagonal(stated) / np.maximum(trace, 1e-300)) ** 2
 

@@ -327,6 +327,10 @@ CLOSE = 0.25
 DAMPINGS = np.array([1e-2, 1e-1, 1.0, 1e1, 1e2, 1e4])
 """Factors on the damping that are tried at once."""
 
+SHORTENED = (0.5, 0.2, 0.05)
+"""Parts of the undamped step that are tried at once too: damping acts on theta alone, and a linear model may be wrong
+about the initial states of the segments."""
+
 SMALL = 0.05
 """Fall of half the sum of losses that is not worth another iteration: an error of a third of a standard error."""
 
@@ -363,6 +367,9 @@ class Solution:
     linear: Linear
     iterations: int
     converged: bool
+    """Whether the last step is negligible beside the error that independent noise would leave."""
+    step: Array
+    """What an undamped step would still change in theta, (P,)."""
     interrupted: bool = False
 
 
@@ -443,9 +450,12 @@ def solve(
     point, damping, done = start, 1e-2, 0
     linear = problem.linearise(point)
     if not np.isfinite(linear.residual).all():
-        return Solution(point, np.ones(len(linear.residual)), np.inf, linear, 0, False)
+        return Solution(
+            point, np.ones(len(linear.residual)), np.inf, linear, 0, False, np.full(len(point.theta), np.inf)
+        )
     std = problem.noise(linear.residual) if std is None else std
     converged, interrupted, settled, cut = False, False, rough, np.inf if rough else CUT
+    step = np.full(len(point.theta), np.inf)
 
     def cost_at(std: Array) -> float:
         one = Point(point.theta[None], point.z[None])
@@ -457,21 +467,22 @@ def solve(
             if report:
                 report(done, float(np.sqrt(2.0 * cost / max(len(std), 1))))
             reduced = arrow_reduced(blocks_of(problem, linear, std, point, cut), 0.0)
-            step, _, error = step_of(problem, reduced, point, 0.0)
+            step, own, error = step_of(problem, reduced, point, 0.0)
             near = error + problem.grain(point.theta)
             remaining = float(np.max(np.abs(step / near)[: problem.judged], initial=0.0))
             if settled and remaining < CLOSE:
                 converged = True
                 break
-            steps = [step_of(problem, reduced, point, damping * factor) for factor in DAMPINGS]
+            steps = [step_of(problem, reduced, point, damping * factor)[:2] for factor in DAMPINGS]
+            steps += [(part * step, part * own) for part in SHORTENED]
             points = Point(
-                np.clip(point.theta + np.array([theta for theta, _, _ in steps]), problem.low, problem.high),
-                point.z + np.array([z for _, z, _ in steps]),
+                np.clip(point.theta + np.array([theta for theta, _ in steps]), problem.low, problem.high),
+                point.z + np.array([z for _, z in steps]),
             )
             costs = costs_of(problem, problem.residuals(points), std, points, cut)
             best = int(np.argmin(costs))
             if costs[best] < cost:
-                damping = float(np.clip(damping * DAMPINGS[best], 1e-9, 1e9))
+                damping = float(np.clip(damping * [*DAMPINGS, *(1.0 for _ in SHORTENED)][best], 1e-9, 1e9))
                 stuck = cost - costs[best] < (1e-2 * cost if rough else SMALL)
                 point = Point(points.theta[best], points.z[best])
                 linear = problem.linearise(point)
@@ -488,7 +499,7 @@ def solve(
             cost = cost_at(std)
     except KeyboardInterrupt:
         interrupted = True
-    return Solution(point, std, cost, linear, done, converged, interrupted)
+    return Solution(point, std, cost, linear, done, converged, step, interrupted)
 
 
 # What a simulation would have measured, against what was measured.
@@ -1316,7 +1327,7 @@ def fit_findings(
     out = []
     if solution.interrupted:
         out.append(finding("interrupted"))
-    elif not solution.converged:
+    elif not (solution.converged or _close(solution, found, problem.judged)):
         out.append(finding("not_converged", iterations=solution.iterations))
     P = len(problem.parameters.names)
     for stream, late, (low, high) in zip(
@@ -1328,6 +1339,18 @@ def fit_findings(
     if found.evidence.unit == "blocks":
         out.append(finding("block_intervals", trials=len(used)))
     return out
+
+
+def _close(solution: Solution, found: Confidence, judged: int) -> bool:
+    """Return whether the last step is a small part of each parameter's standard error, as its interval has it.
+
+    Trials differ by more than independent noise, so that steps far below what can be known may still exceed the error
+    of such noise.
+    """
+    errors = np.sqrt(
+        np.maximum(*(np.diagonal(one) for one in (found.covariance.local, found.covariance.trials)))
+    )
+    return bool(np.all(np.abs(solution.step[:judged]) <= CLOSE * errors[:judged]))
 
 
 class Clock:
