@@ -9,7 +9,7 @@ import pytest
 from finssim.calibration.check import check_trials
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.fit import Estimate
-from finssim.calibration.hydrodynamics import fit_hydrodynamics
+from finssim.calibration.hydrodynamics import _worse, fit_hydrodynamics
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.programmes import programmes
 from finssim.calibration.regression.axis_estimates import trim
@@ -83,6 +83,7 @@ def test_pulses_and_an_imu_without_any_velocity(tmp_path):
         )
     fit = fit_hydrodynamics(fitted, vehicle)
     assert fit.method == "simulation"
+    assert "not_converged" not in {one.code for one in fit.findings}
     result = replay(held, calibrated(fit), horizon=3.0)
     ahead = {axis: result.ahead[axis]["calibrated"].nrmse[-1] for axis in ("roll", "pitch", "yaw")}
     assert max(ahead.values()) < 0.15, ahead
@@ -104,9 +105,31 @@ def test_a_heading_that_decays(tmp_path):
     assert ratio.ci95[1] - ratio.ci95[0] < 0.05 * ratio.estimate
     assert fit.quality["yaw"]["rmse_quadratic"] < 0.2 * fit.quality["yaw"]["rmse_linear"]
     assert scores(calibrated(fit), trials)["yaw"] < 0.02
+    linear = fit_hydrodynamics(trials, vehicle, damping="linear").estimates
+    assert linear["yaw.d1/m_eff"].estimate > 0.1 and linear["yaw.d2/m_eff"].estimate == 0.0
     known = fit_hydrodynamics(trials, vehicle, known={"yaw": 0.5})
     assert known.estimates["yaw.d2"].estimate == pytest.approx(0.5 * ratio.estimate)
     assert calibrated(known).mass_matrix()[5, 5] == pytest.approx(0.5, rel=1e-6)
+
+
+def test_what_replays_worse_is_judged_by_trials_that_were_not_fitted(tmp_path):
+    """Held-out trials where there are any, else each trial by a fit of the others, and the finding says which."""
+    vehicle = load_vehicle("bluerov2")
+    slow = read(["spin_[1-3].csv"], "decay.yaml", "yaw_decay", tmp_path)
+    words = []
+    told = lambda part, text: words.append((part, text))  # noqa: E731
+    fit = fit_hydrodynamics(slow, vehicle, progress=told)
+    assert not {"replays_worse"} & {one.code for one in fit.findings}
+    assert words[0][0] <= words[-1][0] <= 1.0 and any("free motion of yaw" in text for _, text in words)
+    (drag,) = (path for path in fit.changes if "quadratic_damping" in path)
+    bad = replace(fit, changes={**fit.changes, drag: 5.0})
+    before = {"yaw": 1e-3}
+    held = _worse(bad, vehicle, slow, slow, {}, None)
+    assert [one.values["judged"] for one in held] == ["the held-out trials"]
+    wild = replace(fit, changes={**fit.changes, drag: 500.0})  # no replay stays finite
+    assert _worse(wild, vehicle, slow, slow, {}, None)
+    crossed = _worse(fit, vehicle, slow, (), before, lambda k: bad)
+    assert [one.values["judged"] for one in crossed] == ["trials left out of the fit in turn"]
 
 
 def test_options_belong_to_their_method(joystick):

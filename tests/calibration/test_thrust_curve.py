@@ -348,6 +348,24 @@ def test_force_and_pulse_without_speed_fit_the_speed_controller_alone(tmp_path):
     thruster = BLUEROV2.replace(fit.changes).thrusters["T1"]
     error = thruster.thrust(thruster.shaft_speed(table.pulse, 16.0)) - table.force
     assert np.sqrt(np.mean(error**2)) < 0.02 * 51.4
+    assert "another_thruster" not in {one.code for one in fit.findings}
+
+
+@pytest.mark.parametrize("times", [2.0, 0.5])
+def test_pulses_of_another_thruster_invent_no_shaft_speeds(tmp_path, times):
+    """Twice and half the forces at the same pulses: the thrust comes back, and no speed counts as determined."""
+    table = read_table(AT_16_V)
+    header = "PWM (µs),Thrust (N),Voltage (V)"
+    fit = fit_thruster(
+        [write(tmp_path / "a.csv", header, table.pulse, times * table.force, table.voltage)], BLUEROV2
+    )
+    (found,) = (one for one in fit.findings if one.code == "another_thruster")
+    assert found.severity == "care" and found.values["times"] == pytest.approx(times, rel=0.05)
+    speeds = [e for name, e in fit.estimates.items() if "rpm_" in name or "emf" in name or "load" in name]
+    assert len(speeds) >= 6 and not any(one.identifiable for one in speeds)
+    thruster = BLUEROV2.replace(fit.changes).thrusters["T1"]
+    error = thruster.thrust(thruster.shaft_speed(table.pulse, 16.0)) - times * table.force
+    assert np.sqrt(np.mean(error**2)) < 0.02 * 51.4 * times
 
 
 def test_a_limit_of_the_vehicle_file_stays_where_the_table_does_not_reach_it(tmp_path):

@@ -191,3 +191,18 @@ def test_numbers_that_overflow_are_refused():
     evidence = Evidence(names=("c",), normal=np.full((2, 1, 1), np.nan), score=np.zeros((2, 1)))
     with pytest.raises(CalibrationError, match="cannot be computed with: check the units"):
         trial_covariance(evidence)
+
+
+def test_a_parameter_that_is_hardly_known_overflows_nothing():
+    """Its variance has no square that a float holds; the degrees of freedom are those of the others all the same."""
+    noise = np.random.default_rng(0).standard_normal((5, 2))
+    for tiny in (1e-9, 1e-200):
+        scale = np.array([1.0, tiny])
+        evidence = Evidence(
+            names=("a", "b"),
+            normal=np.array([(1.0 + 0.1 * g) * np.diag(scale) for g in range(5)]),
+            score=noise * np.sqrt(scale),
+        )
+        with np.errstate(all="raise", under="ignore"):
+            found = trial_covariance(evidence)
+        assert found.dof == pytest.approx([3.9085, 3.9085], rel=1e-4)

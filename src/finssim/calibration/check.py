@@ -640,6 +640,9 @@ DRIFTS = 0.2
 WALK = 2.5
 """Range of a random walk without its trend, in standard deviations of its end, that chance hardly exceeds."""
 
+WIGGLES = 10.0
+"""Independent values that a smoother may leave of pure noise."""
+
 LARGEST_TURN = 1.0
 """Turn between two samples of an attitude above which its rates may be aliases [rad]."""
 
@@ -733,7 +736,7 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
 def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     findings: list[Finding] = []
     _, q, _ = attitude_samples(trial)
-    if len(q) < FEWEST or _too_slow(q):
+    if len(q) < FEWEST or _too_slow(trial, q):
         return []
     gyro, _ = on_grid(trial, ("p", "q", "r"), t)
     angles = quat_to_euler(q)
@@ -761,7 +764,7 @@ def _heading(trial: Trial) -> list[Finding]:
     """The heading against the integrated gyro, psi_dot = (q sin(roll) + r cos(roll)) / cos(pitch)."""
     t, r = trial.series("r")
     at, q, named = attitude_samples(trial)
-    if len(t) < FEWEST or "yaw" not in named or len(at) < FEWEST or _too_slow(q):
+    if len(t) < FEWEST or "yaw" not in named or len(at) < FEWEST or _too_slow(trial, q):
         return []
     roll, pitch, yaw = quat_to_euler(q)
     inside = (t >= at[0]) & (t <= at[-1])
@@ -877,16 +880,21 @@ def _through_world(trial: Trial, t: Array, attitude: AttitudeSignal) -> Array:
     return np.asarray(through)
 
 
-def _too_slow(q: Array) -> bool:
-    """Return whether an attitude turns so far from sample to sample that its rates may be aliases."""
+def _too_slow(trial: Trial, q: Array) -> bool:
+    """Return whether a vehicle turns so far between two samples of its attitude that their rates may be aliases.
+
+    The gyro has to say so too: an angle in degrees turns far by itself.
+    """
     turns = 2.0 * np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=1)), 0.0, 1.0))
-    return bool(np.percentile(turns, 98.0) > LARGEST_TURN)
+    step = trial.duration / max(len(q) - 1, 1)
+    gyro = [float(np.percentile(np.abs(trial.series(name)[1]), 98.0)) for name in "pqr" if trial.has(name)]
+    return bool(np.percentile(turns, 98.0) > LARGEST_TURN and max(gyro, default=0.0) * step > LARGEST_TURN)
 
 
 def _stands_out(rates: Array, samples: Array) -> bool:
-    """Return whether what changed at these rates on the grid moved by more than the noise of one sample."""
+    """Return whether what changed at these rates on the grid moved by more than a smoother makes of the noise."""
     moved = np.cumsum(np.nan_to_num(rates - np.nanmean(rates))) / RATE
-    return not float(np.std(moved)) < white_noise(samples)
+    return not float(np.std(moved)) < white_noise(samples) * np.sqrt(WIGGLES / len(samples))
 
 
 def _against(found: Relation) -> bool:
@@ -913,6 +921,9 @@ LONG_PUSH = 3.0
 
 HOLD = 0.5
 """[s]"""
+
+UNLIKELY = 0.01
+"""Chance below which a speed answers its wrench, where the work says the same."""
 
 ANSWERS = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Time constants of the speeds of vehicles [s]."""
@@ -989,7 +1000,7 @@ def work_findings(
         if effort == 0.0 or work > -0.4 * effort:
             continue
         answer = _answer(nu, tau, motion.rate)
-        if answer.sure and answer.correlation < AGAINST:
+        if answer.chance < UNLIKELY and answer.correlation < AGAINST:
             held = np.abs(tau[both]) > QUIET * report.strongest
             sure = report.axis in named or (not named and held.sum() / motion.rate > LONG_PUSH)
             findings.append(

@@ -38,6 +38,12 @@ further to speeds that no trial had."""
 WORSE = 1.05
 """Factor on the vehicle file's NRMSE above which the fit replays an axis worse than the file."""
 
+CLEARLY = 0.7
+"""Factor on the vehicle file's NRMSE of the fitted trials below which other trials are not replayed worse either."""
+
+FEWEST_LEFT, MOST_LEFT_OUT = 2, 8
+"""Trials that a fit without one needs, and trials up to which one fit for each is cheap."""
+
 LIKELY_SCALE, SCALE_STD = 0.88, 0.17
 """Thrust of a battery on its way from full to empty, to that at the voltage of the thruster's table, and the standard
 deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4.2 V a cell (0.14), and propellers of
@@ -68,6 +74,7 @@ def fit_hydrodynamics(
     damping: str = "auto",
     known: Mapping[str, float] | None = None,
     horizon: float | None = None,
+    held_out: Sequence[Trial] = (),
     progress: Progress | None = None,
 ) -> Fit:
     """Fit added mass, damping, buoyancy and stiffness.
@@ -85,6 +92,8 @@ def fit_hydrodynamics(
         damping: `auto`, `linear`, `quadratic` or `both`.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²]; regression only.
         horizon: Longest stretch that is simulated without a restart [s]; simulation only.
+        held_out: Further trials that show whether the calibrated vehicle replays worse than the file. Without any, a
+            regression that does not replay the fitted trials much better is judged by trials left out in turn.
         progress: Called with the part done and a few words.
 
     Raises:
@@ -102,9 +111,13 @@ def fit_hydrodynamics(
     if known and method == "simulation":
         raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")
 
-    def regression(body: Vehicle, **given: Any) -> Fit:
+    tell = progress or (lambda part, text: None)
+
+    def regression(
+        body: Vehicle, own: Sequence[Trial] = trials, span: tuple[float, float] = (0.1, 0.3), **given: Any
+    ) -> Fit:
         settings = {"known": known} | given
-        return regress(trials, body, axes=axes, damping=damping, **settings)
+        return regress(own, body, axes=axes, damping=damping, progress=_within(tell, *span), **settings)
 
     def simulation(body: Vehicle, begin: Fit | None = None) -> Fit:
         from finssim.calibration.simulation.fit import fit_by_simulation
@@ -112,14 +125,15 @@ def fit_hydrodynamics(
         begin = begin or _or_none(lambda body: regression(body, known={}, file_prior=False), body)
         return fit_by_simulation(
             trials, body, axes=axes, estimate=estimate, damping=damping, horizon=horizon, begin=begin,
-            progress=progress,
+            progress=_within(tell, 0.3, 0.95),
         )  # fmt: skip
 
     scale, std = 1.0, 0.0
     if "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle):
-        free = _or_none(lambda body: regression(body, known={}, file_prior=False), vehicle)
+        free = _or_none(lambda body: regression(body, span=(0.0, 0.1), known={}, file_prior=False), vehicle)
         scale, std = _thrust_scale(free, vehicle, known)
     body = vehicle.replace(scaled_thrust(vehicle, scale)) if std else vehicle
+    tell(0.1, "replay by the vehicle file")
     before = _scores(vehicle, trials)
     driven = [trial for trial in trials if not trial.header.passive]
     if method == "simulation" or asked:
@@ -130,7 +144,21 @@ def fit_hydrodynamics(
         fit = _better(regression, simulation, body, trials, before)
     if std:
         fit = _with_scale(fit, vehicle, scale, std, known)
-    return replace(fit, findings=(*fit.findings, *_worse(fit, trials, before)))
+    if fit.interrupted:
+        return fit
+    tell(0.95, "replay by the calibrated vehicle")
+
+    def without(k: int) -> Fit:
+        part = 0.95 + 0.05 * k / len(trials)
+        return regression(body, [*trials[:k], *trials[k + 1 :]], (part, part))
+
+    judge = without if fit.method == "regression" else None
+    return replace(fit, findings=(*fit.findings, *_worse(fit, vehicle, trials, held_out, before, judge)))
+
+
+def _within(progress: Progress, low: float, high: float) -> Progress:
+    """Return the progress of a part of the work."""
+    return lambda part, text: progress(low + (high - low) * part, text)
 
 
 def _or_none(fit: Callable[[Vehicle], Fit], vehicle: Vehicle) -> Fit | None:
@@ -172,6 +200,11 @@ def _mean(scores: Mapping[str, float], axes: set[str]) -> float:
 
 def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
     """NRMSE of the replay by axis, the median over the trials; none where nothing can be replayed."""
+    return {axis: float(np.median(found)) for axis, found in _values(vehicle, trials).items()}
+
+
+def _values(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, list[float]]:
+    """NRMSE of the replay of each trial by axis."""
     from finssim.calibration.replay import replay
 
     try:
@@ -185,20 +218,57 @@ def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
                 values.setdefault(str(axis), []).append(
                     score.value if math.isfinite(score.value) else math.inf
                 )
-    return {axis: float(np.median(found)) for axis, found in values.items()}
+    return values
 
 
-def _worse(fit: Fit, trials: Sequence[Trial], before: Mapping[str, float]) -> list[Finding]:
-    """A finding for each axis that the calibrated vehicle replays worse than the file it came from."""
+def _worse(
+    fit: Fit,
+    vehicle: Vehicle,
+    trials: Sequence[Trial],
+    held_out: Sequence[Trial],
+    before: Mapping[str, float],
+    without: Callable[[int], Fit] | None,
+) -> list[Finding]:
+    """A finding for each axis that the calibrated vehicle replays worse than the file it came from.
+
+    Args:
+        fit: The fit.
+        vehicle: The file.
+        trials: That were fitted.
+        held_out: That were not, which judge alone where there are any.
+        before: NRMSE of the fitted trials by the file.
+        without: The fit without one of the trials, where that is cheap.
+    """
     if not fit.changes:
         return []
-    after = _scores(calibrated(fit), trials)
+    if held_out:
+        judged, before = "the held-out trials", _scores(vehicle, held_out)
+        after = dict.fromkeys(before, math.inf) | _scores(calibrated(fit), held_out)
+    else:
+        judged, after = "the fitted trials", dict.fromkeys(before, math.inf)  # where it cannot be replayed
+        after |= _scores(calibrated(fit), trials)
+        doubtful = [axis for axis, value in after.items() if value > CLEARLY * before.get(axis, math.inf)]
+        if without is not None and doubtful and FEWEST_LEFT < len(trials) <= MOST_LEFT_OUT:
+            judged, after = "trials left out of the fit in turn", _left_out(without, trials)
     other = "simulation" if fit.method == "regression" else "regression"
     return [
-        finding("replays_worse", axis, after=value, before=before[axis], method=other)
+        finding("replays_worse", axis, judged=judged, after=value, before=before[axis], method=other)
         for axis, value in after.items()
         if axis in before and value > WORSE * before[axis] + 0.01
     ]
+
+
+def _left_out(without: Callable[[int], Fit], trials: Sequence[Trial]) -> dict[str, float]:
+    """NRMSE by axis, the median over the trials, each replayed by the fit of the others."""
+    values: dict[str, list[float]] = {}
+    for k, trial in enumerate(trials):
+        try:
+            fit = without(k)
+        except CalibrationError:
+            continue  # the others excite nothing
+        for axis, found in _values(calibrated(fit), [trial]).items():
+            values.setdefault(axis, []).extend(found)
+    return {axis: float(np.median(found)) for axis, found in values.items()}
 
 
 # -- the scale of thrust --------------------------------------------------------------------------------------------
@@ -331,8 +401,8 @@ def calibrate_hydrodynamics(
     if ranges is not None:
         refuse_places(ranges, None, "ranges")
     body = load_vehicle(vehicle)
-    used = usable_trials(trials)
-    with progress_bar() as progress:
+    used, held_out = usable_trials(trials)
+    with progress_bar("calibrate hydrodynamics") as progress:
         fit = fit_hydrodynamics(
             used,
             body,
@@ -342,6 +412,7 @@ def calibrate_hydrodynamics(
             damping=damping,
             known=known,
             horizon=horizon,
+            held_out=held_out,
             progress=progress,
         )
     return finish("hydrodynamics", fit, options)

@@ -680,5 +680,5 @@ def calibrate_motor(
     options = dict(locals())
     refuse_places(out, report, "vehicle")
     body = load_vehicle(vehicle)
-    fit = fit_motor(usable_trials(trials), body, seed=seed)
+    fit = fit_motor(usable_trials(trials)[0], body, seed=seed)
     return finish("motor", fit, options)

@@ -8,6 +8,7 @@ import math
 import os
 import shlex
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -82,16 +83,40 @@ def command_line(kind: str, inputs: Iterable[Path], options: Mapping[str, Any]) 
     return shlex.join(tokens)
 
 
+EVERY = 10.0
+"""Time between two lines of progress where there is no terminal [s]."""
+
+
 @contextmanager
-def progress_bar() -> Iterator[Callable[..., None]]:
-    """A bar on standard error, fed with the part done and a few words."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+def progress_bar(name: str) -> Iterator[Callable[..., None]]:
+    """Show a bar on standard error, fed with the part done and a few words; lines where that is no terminal."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     screen = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bars:
-        bar = bars.add_task("fit", total=1.0)
-        yield lambda part, text="fit": bars.update(bar, completed=part, description=text)
+    if not screen.is_terminal:
+        yield _lines(name, screen)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=screen, transient=True) as bars:
+        bar = bars.add_task(name, total=1.0)
+        yield lambda part, text=name: bars.update(bar, completed=part, description=text)
+
+
+def _lines(name: str, screen: Console) -> Callable[..., None]:
+    """Return a progress that prints a line at once and then every `EVERY` seconds."""
+    began = time.monotonic()
+    last = -EVERY
+
+    def tell(part: float, text: str = "") -> None:
+        nonlocal last
+        spent = time.monotonic() - began
+        if spent < last + EVERY:
+            return
+        last = spent
+        left = f", about {spent / part - spent:.0f} s left" if part > 0.02 and spent > EVERY else ""
+        screen.print(f"{name}: {text} ({part:.0%}{left})", highlight=False, markup=False, soft_wrap=True)
+
+    return tell
 
 
 BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
@@ -544,14 +569,15 @@ def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:
     return used, excluded
 
 
-def usable_trials(paths: Sequence[Path]) -> list[Trial]:
-    """Load, and say on standard error what is left out of each trial and why."""
-    used, excluded = usable(load_trials(paths))
+def usable_trials(paths: Sequence[Path]) -> tuple[list[Trial], list[Trial]]:
+    """Load trials for a fit and held-out ones; say on standard error what is left out and why."""
+    trials = load_trials(paths)
+    used, excluded = usable(trials)
     screen = Console(stderr=True)
     excluded += [item.about(trial.name) for trial in used for item in trial.findings]
     for sentence in sentences(excluded):
         screen.print(sentence, highlight=False, markup=False, soft_wrap=True)
-    return used
+    return used, [trial for trial in trials if trial.header.role == "held-out"]
 
 
 def finish(kind: str, fit: Fit, options: Mapping[str, Any]) -> Vehicle:

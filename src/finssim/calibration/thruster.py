@@ -789,6 +789,8 @@ def bench(tables: Sequence[ThrustTable], thruster: Thruster, label: str, voltage
             ends = [end for zone in zones for end in zone.interval]
             middle = float(np.median([zone.speed for zone in zones]))
             dead[name] = replace(zones[0], speed=middle, interval=(min(ends), max(ends)))
+    if not measured and (times := _times_the_file(fastest, thruster, chosen, pulse_range)):
+        findings.append(finding("another_thruster", label, times=times))
     rows, esc = _stack(at), None
     if any(np.isfinite(table.pulse).any() for table in tables):
         if math.isnan(chosen):
@@ -817,6 +819,32 @@ def bench(tables: Sequence[ThrustTable], thruster: Thruster, label: str, voltage
         sides=sides, dead=dead, fastest=fastest, esc=esc, speeds_measured=measured, before=thruster,
         findings=tuple(dict.fromkeys(findings)),
     )  # fmt: skip
+
+
+def _times_the_file(
+    fastest: Mapping[str, tuple[float, bool, float]],
+    thruster: Thruster,
+    voltage: float,
+    pulse_range: tuple[float, float, float],
+) -> float:
+    """Return forces over those of the vehicle file's thruster where they show another one, else 0.
+
+    Args:
+        fastest: As of a `Bench`, from the forces by the file's curve.
+        thruster: As the vehicle file has it.
+        voltage: Of these rows [V]; NaN where it is not known.
+        pulse_range: Reverse, neutral and forward [µs].
+    """
+    ratios = [1.0]
+    for (name, sign), pulse in zip(SIDES, (pulse_range[2], pulse_range[0]), strict=True):
+        speed, at_end, _ = fastest[name]
+        if at_end and thruster.esc is not None and math.isfinite(voltage):
+            ratios.append(speed / abs(float(thruster.shaft_speed(np.array([pulse]), voltage)[0])))
+        else:  # a table may end before the limit
+            limit = abs(thruster.rpm_max if sign > 0.0 else thruster.rpm_min) / TO_RPM
+            ratios.append(max(1.0, speed / limit))
+    worst = max(ratios, key=lambda ratio: abs(math.log(max(ratio, 1e-6))))
+    return worst**2 if abs(math.log(max(worst, 1e-6))) > math.log(ANOTHER) else 0.0
 
 
 def _turning(table: ThrustTable, sign: float) -> tuple[Array, Array]:
@@ -1070,8 +1098,10 @@ def estimates_of(name: str, path: str, result: Bench) -> list[Estimate]:
         moves = at_end or speed > old_speed
         note = "beyond the vehicle file's" if moves else "the table ends here; the vehicle file's stays"
         note = f"full pulse{volts and ' at '}{volts}" if at_end else note
+        note = note if result.speeds_measured else NOMINAL
         rpm = sign * speed * TO_RPM
-        add(f"rpm_{end}", rpm, _around(rpm, scatter * TO_RPM), "rpm", moves, note)
+        known = moves and result.speeds_measured
+        add(f"rpm_{end}", rpm, _around(rpm, scatter * TO_RPM), "rpm", known, note)
         force = c * (speed if moves else old_speed) ** 2
         half = force * side.half_width / side.c if side else 0.0
         sure, note = math.isfinite(half), f"c_{direction} at the speed limit"
@@ -1084,9 +1114,15 @@ def estimates_of(name: str, path: str, result: Bench) -> list[Estimate]:
         for key, ends in result.esc.intervals.items():
             note = result.esc.unsure.get(key, "" if key.startswith("dead") else caution)
             value, sure = float(getattr(result.esc.esc, key)), key not in result.esc.unsure
+            if not (result.speeds_measured or key.startswith("dead")):
+                note, sure = NOMINAL, False
             add(f"esc.{key}", value, ends, units[key.partition("_")[0]], sure, note)
     return rows
 
+
+NOMINAL = "nominal: no shaft speed was measured, the vehicle file's curve gives it from the force"
+ANOTHER = 1.15
+"""Factor on the vehicle file's fastest speed beyond which speeds from forces show another thruster."""
 
 WRITTEN = ("c_", "dead_rpm_", "rpm_", "force_")
 """Beginnings of the keys of a thruster that an estimate goes to."""
@@ -1142,7 +1178,8 @@ def fit_thruster(
         for estimate in estimates_of(target, path, result):
             estimates[estimate.name] = estimate
             key = estimate.name.rpartition(".")[2]
-            if estimate.identifiable and key.startswith(WRITTEN):
+            old = abs(getattr(result.before, key)) if key.startswith("rpm_") else math.inf
+            if key.startswith(WRITTEN) and (estimate.identifiable or _raised(result, estimate, old)):
                 changes |= {f"thrusters.{name}.{key}": estimate.estimate for name in thrusters}
         if result.esc is not None:
             changes |= {f"thrusters.{name}.esc": result.esc.esc.values() for name in thrusters}
@@ -1161,6 +1198,11 @@ def fit_thruster(
         trials={table.name: table.sha256 for table in read},
         settings={"voltage": voltage, "group": group, "seed": seed},
     )
+
+
+def _raised(result: Bench, estimate: Estimate, old: float) -> bool:
+    """Return whether a nominal speed limit has to rise, so that pulses give the forces that were measured."""
+    return not result.speeds_measured and abs(estimate.estimate) > old
 
 
 def _distinct_names(read: Sequence[tuple[Any, ThrustTable]]) -> list[ThrustTable]:

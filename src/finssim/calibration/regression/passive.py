@@ -48,6 +48,9 @@ FEWEST_TRIALS = 4
 LINEAR, QUADRATIC, BOTH = (True, False), (False, True), (True, True)
 """Which of c1, c2 are fitted."""
 
+KINDS = {"auto": None, "linear": LINEAR, "quadratic": QUADRATIC, "both": BOTH}
+"""Terms by word of the option."""
+
 SHAPES = {LINEAR: "linear", QUADRATIC: "quadratic", BOTH: "linear and quadratic"}
 
 USEFUL = 0.5
@@ -503,7 +506,7 @@ def free_motion(
     terms: tuple[bool, bool] | None = None,
     refused: list[CalibrationError] | None = None,
 ) -> list[FreeMotion]:
-    """The free motion of one axis over all trials that show one, with each kind of drag.
+    """Fit the free motion of one axis over all trials that show one, with each kind of drag.
 
     The drag is linear, quadratic or both by Schwarz' criterion, which also says where an equilibrium drifts.
 
@@ -511,7 +514,7 @@ def free_motion(
         trials: Passive ones.
         axis: One of six: a decay of roll and pitch, a coast of surge, sway and yaw, a rise in heave.
         vehicle: Gives the places of sensors.
-        terms: Whether to fit c1 and c2, in place of a choice.
+        terms: Whether c1 and c2 are fitted in the best, in place of a choice.
         refused: Takes why a trial shows nothing.
 
     Returns:
@@ -529,9 +532,10 @@ def free_motion(
     if not releases:
         raise errors[-1] if errors else CalibrationError("no trials were given")
     # A single rise cannot show both kinds of drag.
-    kinds = [terms] if terms else [LINEAR, QUADRATIC] if axis == "heave" else [LINEAR, QUADRATIC, BOTH]
+    kinds = [LINEAR, QUADRATIC] if axis == "heave" else [LINEAR, QUADRATIC, BOTH]
     fits = [FreeMotion(axis=axis, releases=tuple(releases), terms=kind) for kind in kinds]
-    best = min(fits, key=lambda fit: fit.criterion(fits[-1]))
+    wanted = [fit for fit in fits if fit.terms == terms] or fits
+    best = min(wanted, key=lambda fit: fit.criterion(fits[-1]))
     if best.r2 < EXPLAINED:
         errors += [CalibrationError(f"{axis} does not move as if left to itself", r.trial) for r in releases]
         raise errors[-1]
@@ -682,15 +686,20 @@ def passive(
     vehicle: Vehicle,
     *,
     axes: Sequence[str] | None = None,
+    damping: str = "auto",
     known: Mapping[str, float] | None = None,
+    progress: Callable[[float, str], None] | None = None,
 ) -> Fit:
-    """What trials without thrust tell.
+    """Estimate what trials without thrust show.
 
     Args:
         trials: Each with one release.
         vehicle: Gives what is taken as known: the stiffness k = B z_b - W z_g of roll and pitch, else M_RB + M_A.
         axes: All if None.
+        damping: `auto`, `linear`, `quadratic` or `both`; a rise takes one of the first two for `both`, since it cannot
+            show both.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²], in place of the file's numbers.
+        progress: Called with the part done and a few words.
 
     Raises:
         CalibrationError: No trial shows a decay, a coast or a rise.
@@ -700,9 +709,12 @@ def passive(
     changes: dict[str, Any] = {}
     quality: dict[str, dict[str, float]] = {}
     findings, curves, refused, used = list[Finding](), list[Curve](), list[CalibrationError](), set[str]()
-    for axis in (a for a in AXES if axes is None or a in axes):
+    wanted = [a for a in AXES if axes is None or a in axes]
+    for k, axis in enumerate(wanted):
+        if progress:
+            progress(k / len(wanted), f"free motion of {axis}")
         try:
-            chosen, *fits = free_motion(trials, axis, vehicle, refused=refused)
+            chosen, *fits = free_motion(trials, axis, vehicle, terms=KINDS[damping], refused=refused)
         except CalibrationError:
             continue
         result = _Result(chosen, fits[-1], plant, (known or {}).get(axis))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -297,6 +297,7 @@ def regress(
     damping: str = "auto",
     known: Mapping[str, float] | None = None,
     file_prior: bool = True,
+    progress: Callable[[float, str], None] | None = None,
 ) -> Fit:
     """Effective mass, damping, bias and, in roll and pitch, stiffness of every axis that the trials excite.
 
@@ -312,6 +313,7 @@ def regress(
         damping: `auto`, `linear`, `quadratic` or `both`.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
         file_prior: Whether the inertia and drag of the vehicle file count as a prior, within a factor of two or so.
+        progress: Called with the part done and a few words.
 
     Raises:
         CalibrationError: No trial can be used, one is held out, an axis or damping is unknown, or two share a
@@ -323,8 +325,12 @@ def regress(
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
     require_fittable(trials, vehicle)
     driven = [trial for trial in trials if not trial.header.passive]
+    tell = progress or (lambda part, text: None)
+    tell(0.0, "smoothing the trials")
     prepared, findings = prepare(driven, vehicle)
-    chosen, more = _fit_axes(prepared, vehicle, wanted, axes is not None, damping, known or {}, file_prior)
+    chosen, more = _fit_axes(
+        prepared, vehicle, wanted, axes is not None, damping, known or {}, file_prior, tell
+    )
     findings += more
     file = matrices(vehicle)
     estimates: dict[str, Estimate] = {}
@@ -354,7 +360,9 @@ def regress(
         [AXES[i] for i in wanted if i not in told],
     )
     if quiet_trials and open_axes:
-        quiet = passive(quiet_trials, vehicle, axes=open_axes, known=known)
+        quiet = passive(
+            quiet_trials, vehicle, axes=open_axes, damping=damping, known=known, progress=progress
+        )
         estimates |= quiet.estimates
         changes |= quiet.changes
         figures |= quiet.quality
@@ -394,6 +402,7 @@ def _fit_axes(
     damping: str,
     known: Mapping[str, float],
     file_prior: bool,
+    tell: Callable[[float, str], None],
 ) -> tuple[dict[int, tuple[AxisData, Selection]], list[Finding]]:
     """Data and model of every axis that can be fitted; couplings between axes use the estimates of the round before."""
     file = matrices(vehicle)
@@ -405,7 +414,8 @@ def _fit_axes(
     for round_ in range(PASSES):
         settled, former = True, chosen
         chosen, findings = {}, []
-        for i in wanted:
+        for k, i in enumerate(wanted):
+            tell((round_ + k / len(wanted)) / PASSES, f"regression of {AXES[i]}")
             those = np.flatnonzero(active[:, i])
             keep = TILTS_INTO.get(i, set()) <= fitted
             data, said = axis_data(

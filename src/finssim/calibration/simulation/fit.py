@@ -327,10 +327,6 @@ CLOSE = 0.25
 DAMPINGS = np.array([1e-2, 1e-1, 1.0, 1e1, 1e2, 1e4])
 """Factors on the damping that are tried at once."""
 
-SHORTENED = (0.5, 0.2, 0.05)
-"""Parts of the undamped step that are tried at once too: damping acts on theta alone, and a linear model may be wrong
-about the initial states of the segments."""
-
 SMALL = 0.05
 """Fall of half the sum of losses that is not worth another iteration: an error of a third of a standard error."""
 
@@ -467,22 +463,21 @@ def solve(
             if report:
                 report(done, float(np.sqrt(2.0 * cost / max(len(std), 1))))
             reduced = arrow_reduced(blocks_of(problem, linear, std, point, cut), 0.0)
-            step, own, error = step_of(problem, reduced, point, 0.0)
+            step, _, error = step_of(problem, reduced, point, 0.0)
             near = error + problem.grain(point.theta)
             remaining = float(np.max(np.abs(step / near)[: problem.judged], initial=0.0))
             if settled and remaining < CLOSE:
                 converged = True
                 break
-            steps = [step_of(problem, reduced, point, damping * factor)[:2] for factor in DAMPINGS]
-            steps += [(part * step, part * own) for part in SHORTENED]
+            steps = [step_of(problem, reduced, point, damping * factor) for factor in DAMPINGS]
             points = Point(
-                np.clip(point.theta + np.array([theta for theta, _ in steps]), problem.low, problem.high),
-                point.z + np.array([z for _, z in steps]),
+                np.clip(point.theta + np.array([theta for theta, _, _ in steps]), problem.low, problem.high),
+                point.z + np.array([z for _, z, _ in steps]),
             )
             costs = costs_of(problem, problem.residuals(points), std, points, cut)
             best = int(np.argmin(costs))
             if costs[best] < cost:
-                damping = float(np.clip(damping * [*DAMPINGS, *(1.0 for _ in SHORTENED)][best], 1e-9, 1e9))
+                damping = float(np.clip(damping * DAMPINGS[best], 1e-9, 1e9))
                 stuck = cost - costs[best] < (1e-2 * cost if rough else SMALL)
                 point = Point(points.theta[best], points.z[best])
                 linear = problem.linearise(point)
@@ -963,6 +958,9 @@ def confidence(problem: Shooting, solution: Solution) -> Confidence:
     ends = intervals(free, covariance)
     ends[:, 0], ends[:, 1] = np.minimum(ends[:, 0], theta), np.maximum(ends[:, 1], theta)
     ends = np.clip(ends, low[:, None], high[:, None])
+    if np.isfinite(solution.step).all():  # the truth may be where one step more would go
+        goes = np.clip(theta + solution.step, low, high)
+        ends[:, 0], ends[:, 1] = np.minimum(ends[:, 0], goes), np.maximum(ends[:, 1], goes)
     unknown = ~np.isfinite(np.diagonal(covariance.local))
     ends[unknown] = [-np.inf, np.inf]
     return Confidence(evidence, covariance, free, ends)
@@ -1342,15 +1340,13 @@ def fit_findings(
 
 
 def _close(solution: Solution, found: Confidence, judged: int) -> bool:
-    """Return whether the last step is a small part of each parameter's standard error, as its interval has it.
+    """Return whether one step more would keep every parameter within its 95 % interval.
 
-    Trials differ by more than independent noise, so that steps far below what can be known may still exceed the error
-    of such noise.
+    Trials differ by more than independent noise, so that a step far above the error that such noise leaves may still be
+    far below what can be known.
     """
-    errors = np.sqrt(
-        np.maximum(*(np.diagonal(one) for one in (found.covariance.local, found.covariance.trials)))
-    )
-    return bool(np.all(np.abs(solution.step[:judged]) <= CLOSE * errors[:judged]))
+    low, high = intervals(solution.point.theta, found.covariance).T
+    return bool(np.all(np.abs(solution.step[:judged]) <= 0.5 * (high - low)[:judged]))
 
 
 class Clock:
