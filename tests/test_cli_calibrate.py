@@ -98,7 +98,9 @@ def test_held_out_trials_are_left_out_and_it_is_said(capsys, tmp_path, trials):
         write_trial(type(trial)(**{**vars_of(trial), "header": header}), tmp_path / "t" / trial.name)
     words = ["calibrate", "hydrodynamics", tmp_path / "t", "--vehicle", "finsrov", "--axes", "surge"]
     assert finssim(*words, "--out", tmp_path / "v.yaml") == 0
-    assert "surge_plus_12: left out: it is marked as held out" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "surge_plus_12: left out: it is marked as held out" in told
+    assert "calibrate hydrodynamics: replay by the vehicle file (10%)" in told
     vehicle = load_vehicle(tmp_path / "v.yaml")
     assert len(vehicle.calibrations[0].trials) == 5
     assert not any(vehicle.fitted_on(t.sha256) for t in every if t.name == "surge_plus_12")
