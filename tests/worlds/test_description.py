@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from finssim.geometry.mesh import write_stl
 from finssim.geometry.rotations import quat_rotate
 from finssim.sensors.overhead_camera import Water
 from finssim.worlds.description import (
@@ -84,6 +85,24 @@ def test_what_cannot_be_is_refused_in_one_sentence(old, new, sentence, tmp_path)
     with pytest.raises(WorldError) as refused:
         load_world(written(tmp_path, WORLD.replace(old, new, 1)))
     assert sentence in str(refused.value) and "world.yaml" in str(refused.value)
+
+
+def test_places_that_come_of_files_are_within_reach(tmp_path):
+    """Heights of a table, a slope over a wide bed, and a mesh that is scaled up."""
+    (tmp_path / "bed.csv").write_text("0,1\n-1e300,0\n")
+    write_stl(tmp_path / "a.stl", 1e4 * np.eye(4, 3), [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+    for old, new, sentence in (
+        (
+            "spacing: 1.0",
+            "spacing: 1.0, heights: bed.csv",
+            "seabed: reaches 1e\\+300 m, expected up to 1e\\+09 m",
+        ),
+        ("slope: [0.1, 0.0]", "slope: [9.9e8, 0.0]", "seabed: reaches 9.9e\\+09 m"),
+        ("shape: sphere", "shape: mesh, file: a.stl, scale: 1e6", "objects.ball: reaches 1e\\+10 m"),
+    ):
+        text = WORLD.replace(", radius: 0.3", "") if "mesh" in new else WORLD
+        with pytest.raises(WorldError, match=sentence):
+            load_world(written(tmp_path, text.replace(old, new)))
 
 
 def test_a_sensor_of_no_kind_and_a_site_of_no_name_are_refused(tmp_path):

@@ -511,7 +511,7 @@ class World(Part):
             vertices, faces = load_stl(path)
         except (OSError, MeshError) as error:
             raise WorldError(f"{self.path}: objects.{name}: cannot read {path.name}: {error}") from None
-        return vertices * (item.scale or 1.0), faces
+        return self._reachable(vertices * (item.scale or 1.0), f"objects.{name}"), faces
 
     def model(self, name: str) -> list[ModelPart]:
         """The shapes of an object from a model file, unscaled, in the object's axes."""
@@ -524,6 +524,15 @@ class World(Part):
             raise WorldError(f"{self.path}: objects.{name}: no file {path.name} beside it")
         try:
             self._models[name] = parts_of(path)
+            for part in self._models[name]:
+                numbers = [
+                    part.position,
+                    part.size,
+                    np.ravel(0.0 if part.vertices is None else part.vertices),
+                ]
+                self._reachable(
+                    np.concatenate(numbers) * (self.objects[name].scale or 1.0), f"objects.{name}"
+                )
         except PartsError as error:
             raise WorldError(f"{self.path}: objects.{name}: {path.name} {error}") from None
         return self._models[name]
@@ -545,7 +554,15 @@ class World(Part):
                 z = z + a * np.sin(k * (np.cos(h) * x + np.sin(h) * y) + p)
         if bed.heights is not None:
             z = z + _stretched(self._table(bed.heights), z.shape)
-        return z
+        return self._reachable(z, "seabed")
+
+    def _reachable(self, places: Array, label: str) -> Array:
+        """The places themselves [m], unless one is farther than worlds are computed."""
+        if not np.abs(places).max() <= GREATEST:
+            raise WorldError(
+                f"{self.path}: {label}: reaches {np.abs(places).max():g} m, expected up to {GREATEST:g} m"
+            )
+        return places
 
     def _table(self, file: str) -> Array:
         path = self.beside(file, "seabed: heights")
