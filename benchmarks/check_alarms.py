@@ -1,6 +1,6 @@
 """False alarms of `trials check` on correct random logs, and how many logs with one known fault it notices.
 
-    python benchmarks/check_alarms.py [--logs 1000] [--faulty 250] [--out alarms.jsonl]
+    python benchmarks/check_alarms.py [--logs 1000] [--faulty 100] [--out alarms.jsonl]
 
 A log is a run of a random catalogue vehicle whose plant differs from its file, pushed along random axes at 0.5 to 60 %
 of its wrench limits or drifting without thrust. The simulator moves it, and sensors of random noise, rate and choice of
@@ -216,7 +216,7 @@ def main() -> None:
     )
     parser.add_argument("--logs", type=int, default=1000)
     parser.add_argument(
-        "--faulty", type=int, default=250, help="logs that are also spoilt by one fault at a time"
+        "--faulty", type=int, default=100, help="logs that are also spoilt by one fault at a time"
     )
     parser.add_argument("--out", type=Path, default=Path("alarms.jsonl"))
     args = parser.parse_args()

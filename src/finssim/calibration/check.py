@@ -623,7 +623,7 @@ RATE = 25.0
 AGAINST = -0.5
 """Correlation below which two columns that should agree run against each other."""
 
-NEGATIVE = 3.0
+NEGATIVE = 4.0
 """Factor by which noise, smoothing and errors of scale change a slope of -1 at most."""
 
 WITH = 0.7

@@ -10,7 +10,7 @@ from scipy.special import stdtr
 
 Array = NDArray[np.float64]
 
-CHANCE = 1e-6
+CHANCE = 1e-4
 """Probability below which a relation is not chance."""
 
 
