@@ -10,6 +10,7 @@ import pytest
 
 from finssim.geometry.mesh import parametric_hull, write_stl
 from finssim.vehicles import Vehicle, VehicleError, catalogue, load_vehicle
+from finssim.vehicles.part import sentence_of
 from vehicles.minnow import MINNOW
 
 
@@ -187,6 +188,12 @@ REFUSALS = {
     ),
     "hull file missing": ("hydrodynamics:\n", "hull: {file: hull.stl}\nhydrodynamics:\n", "hull: file "),
     "mass a truth": ("mass: 11.2", "mass: true", "body: mass is True, expected a number"),
+    "huge coordinate": (
+        "center_of_gravity: [0.0, 0.0, -0.02]",
+        "center_of_gravity: [0.0, 0.0, -1e300]",
+        "body.center_of_gravity: 2 is -1e+300, expected numbers up to 1e+12",
+    ),
+    "huge mass": ("mass: 11.2", "mass: 1e13", "body: mass is 1e+13, expected numbers up to 1e+12"),
     "name given": (
         "title: Minnow",
         "title: Minnow\nname: minnow",
@@ -201,6 +208,12 @@ def test_what_cannot_be_right_is_refused_in_one_sentence(case, tmp_path):
     first, *others = refusal(tmp_path, old, new).splitlines()
     assert expected in first
     assert all(expected in other for other in others)  # once per thruster where the group is at fault
+
+
+def test_what_a_library_refuses_of_the_whole_file_is_a_sentence():
+    """NumPy's error about eigenvalues names no key."""
+    detail = {"type": "value_error", "loc": (), "msg": "Value error, Eigenvalues did not converge", "ctx": {}}
+    assert sentence_of(detail, "own.yaml") == "own.yaml: Eigenvalues did not converge"
 
 
 def test_an_open_hull_is_refused(tmp_path):

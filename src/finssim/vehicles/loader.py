@@ -17,6 +17,9 @@ from finssim.vehicles.part import VehicleError, did_you_mean, sentence_of
 from finssim.vehicles.vehicle import ORIGINS, Provenance, Vehicle
 from finssim.yaml_file import read_mapping
 
+GREATEST = 1e12
+"""Magnitude of a number in a vehicle file; squares and products of greater ones leave double precision."""
+
 CATALOGUE = Path(__file__).parent / "catalogue"
 
 Tree = dict[str, Any]
@@ -304,6 +307,10 @@ def _plain(
             raise VehicleError(
                 f"{label}: {_where(path[:-1])}: {path[-1]} has no origin: write "
                 f"{{value: {node}, origin: measured, source: ...}} or give 'origin:' to its section or to the file"
+            )
+        if math.isfinite(node) and abs(node) > GREATEST:
+            raise VehicleError(
+                f"{label}: {_where(path[:-1])}: {path[-1]} is {node:g}, expected numbers up to {GREATEST:g}"
             )
         origins[".".join(path)] = inherited
     return node

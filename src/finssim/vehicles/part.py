@@ -199,6 +199,8 @@ def sentence_of(detail: Any, label: str, missing: str = "add it, with its origin
     kind, value, context = detail["type"], detail.get("input"), detail.get("ctx", {})
     if kind == "section":
         return ": ".join(filter(None, [label, ".".join(location), context["message"]]))
+    if not location:  # raised by a library about several sections
+        return f"{label}: {str(detail['msg']).removeprefix('Value error, ')}"
     bounds = {
         "greater_than": ("gt", ">"),
         "greater_than_equal": ("ge", ">="),
