@@ -1,10 +1,8 @@
 """A hydrodynamic term that the package does not know: one file with all of it, and one line."""
 # mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
 
-import importlib.util
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,12 +17,9 @@ from finssim.physics.types import vec6
 from finssim.vehicles import VehicleError, check_vehicle, load_vehicle
 from finssim.vehicles.terms import TERMS
 from reference.draws import column, draw
+from reference.examples import EXAMPLES, example
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-spec = importlib.util.spec_from_file_location("own_term", EXAMPLES / "own_term.py")
-own_term = importlib.util.module_from_spec(spec)
-sys.modules["own_term"] = own_term
-spec.loader.exec_module(own_term)
+own_term = example("own_term")
 WING, Wing, wing_wrench = own_term.WING, own_term.Wing, own_term.wing_wrench
 
 FILE = """

@@ -1,0 +1,131 @@
+"""Laws that every hydrodynamic term obeys: those of the package, of installed packages, and that of an example."""
+# mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
+
+import numpy as np
+import pytest
+import warp as wp
+
+from finssim.engine import Simulator
+from finssim.physics.terms.composed import composed, layout, parameter_row
+from finssim.physics.types import mat66, vec6
+from finssim.vehicles import load_vehicle
+from finssim.vehicles.terms import TERMS, find_term, term_names
+from reference.examples import example
+
+WING = example("own_term").WING
+EVERY = pytest.mark.parametrize("name", sorted({*term_names(), WING.name}))
+RNG = np.random.default_rng(7)
+NU = RNG.uniform(-2.0, 2.0, (64, 6))
+
+
+@pytest.fixture
+def term(name):
+    TERMS.setdefault(WING.name, WING)
+    return find_term(name)
+
+
+def drawn(term, diagonal=False):
+    """Path of each parameter -> positive numbers, or a matrix whose symmetric part is positive definite."""
+    numbers = {}
+    for slot in layout((term,)):
+        if slot.kind is mat66:
+            half = RNG.normal(size=(6, 6))
+            matrix = 5.0 * half @ half.T
+            numbers[slot.path] = np.diag(np.diag(matrix)) if diagonal else matrix
+        else:
+            numbers[slot.path] = (
+                RNG.uniform(20.0, 40.0, slot.size) if slot.size > 1 else RNG.uniform(20.0, 40.0)
+            )
+    return numbers
+
+
+def evaluated(term, role, numbers, nu):
+    """Wrench or slope at velocities, (n, 6)."""
+    function = composed((term,), role)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def sample(x: wp.array3d(dtype=float), nu_r: wp.array(dtype=vec6), out: wp.array(dtype=vec6)):
+        i = wp.tid()
+        out[i] = function(x, 0, 0, nu_r[i], wp.vec3(0.0, 0.0, 1.0), 5.0, 1000.0)
+
+    row = np.asarray(parameter_row((term,), numbers), np.float32)[None, None]
+    out = wp.zeros(len(nu), dtype=vec6, device="cpu")
+    inputs = [
+        wp.array(row, dtype=float, device="cpu"),
+        wp.array(np.asarray(nu, np.float32), dtype=vec6, device="cpu"),
+    ]
+    wp.launch(sample, dim=len(nu), inputs=[*inputs, out], device="cpu")
+    return out.numpy().astype(float)
+
+
+def value_of(term, numbers):
+    """What stands under the key of a vehicle file."""
+    plain = {path: np.asarray(number).tolist() for path, number in numbers.items()}
+    return plain[term.name] if term.name in plain else {p.partition(".")[2]: x for p, x in plain.items()}
+
+
+@EVERY
+def test_at_rest_it_gives_nothing(term):
+    """A velocity of zero, any parameters: no wrench."""
+    assert not evaluated(term, "wrench", drawn(term), np.zeros((1, 6))).any()
+
+
+@EVERY
+def test_a_damping_term_takes_energy_out(term):
+    """nu_r · tau <= 0, of a term that declares how fast its wrench falls with the velocity."""
+    if term.slope is None:
+        pytest.skip(f"{term.name} declares no slope: it is no damping")
+    for _ in range(4):
+        power = (NU * evaluated(term, "wrench", drawn(term), NU)).sum(1)
+        assert (power <= 1e-4).all() and (power < -1e-3).any()
+
+
+@EVERY
+def test_its_slope_is_its_derivative(term):
+    """-dtau_i/dnu_i by central differences: never more than the slope, and equal to it while going straight ahead.
+
+    Of a matrix its diagonal: the slope is that of each axis alone.
+    """
+    if term.slope is None:
+        pytest.skip(f"{term.name} declares no slope")
+    numbers, h = drawn(term, diagonal=True), 1e-2
+    ahead = NU * [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    for nu in (NU, ahead):
+        slope, derivative = evaluated(term, "slope", numbers, nu), np.zeros_like(nu)
+        for i in range(6):
+            step = h * np.eye(6)[i]
+            pair = [evaluated(term, "wrench", numbers, nu + sign * step)[:, i] for sign in (1.0, -1.0)]
+            derivative[:, i] = -(pair[0] - pair[1]) / (2.0 * h)
+        smooth = np.abs(nu) > h  # |u| has no derivative at 0
+        smooth[:, 1:] |= nu is ahead
+        atol = 2e-3 * np.abs(slope).max()  # float32 over 2 h
+        assert (slope >= -atol).all() and (slope >= derivative - atol)[smooth].all()
+    np.testing.assert_allclose(slope[smooth], derivative[smooth], rtol=0, atol=atol)
+
+
+@EVERY
+def test_its_declared_share_of_quadratic_drag_is_its_drag(term):
+    """Moving along one axis alone, either way: -tau_i = d2_i v|v|."""
+    numbers = drawn(term)
+    d2 = term.quadratic(term.read(value_of(term, numbers)))
+    for v in (-1.5, 0.5, 2.0):
+        alone = np.diag(np.full(6, v))
+        found = -np.diag(evaluated(term, "wrench", numbers, alone))
+        np.testing.assert_allclose(found, d2 * v * abs(v), rtol=1e-5, atol=1e-5)
+
+
+@EVERY
+def test_the_simulator_accelerates_by_its_wrench(term):
+    """M (nu' - nu0') = tau, where nu0' is that without the term; one step of 50 µs, short beside 1 / 160 s."""
+    base, numbers = "hydrodynamics.calibrated", drawn(term)
+    plain = load_vehicle("bluerov2").replace({f"{base}.reference_point": [0.0, 0.0, 0.0]})
+    vehicles = plain, plain.replace({f"{base}.{term.name}": value_of(term, numbers)})
+    nu, dt, after = np.array([0.8, -0.3, 0.4, 0.2, -0.5, 0.3]), 5e-5, []
+    for vehicle in vehicles:
+        sim = Simulator(vehicle, control_step=dt, substeps=1, threads=1)
+        sim.place(position=(0.0, 0.0, -5.0), velocity=nu)
+        sim.step()
+        after.append(sim.numpy("velocity")[0, 0].astype(float))
+    expected = evaluated(term, "wrench", numbers, nu[None])[0]
+    found = plain.mass_matrix("calibrated") @ (after[1] - after[0]) / dt
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=0.03 * np.abs(expected).max())
