@@ -48,3 +48,4 @@ def test_the_map_is_the_world_of_the_pool_file():
     assert position[:2] == pytest.approx([2.0, 0.0], abs=1e-12)
     assert np.abs(quaternion) == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=1e-12)
     assert covariance[0, 0] == pytest.approx(SPREAD[1, 1]) and covariance[1, 1] == pytest.approx(SPREAD[0, 0])
+    assert covariance[2, 2] > 1e5, "without a depth sensor's word the height is not known"

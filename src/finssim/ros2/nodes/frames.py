@@ -112,7 +112,7 @@ def _along(axis: Array) -> Array:
 KNOWN = [0, 1, 2, 5]
 """x, y, z and yaw among the six of a pose's covariance."""
 UNKNOWN = 1.0e6
-"""Variance of a heading that is not known [rad²]."""
+"""Variance of a heading [rad²] or a height [m²] that is not known."""
 TILT_VARIANCE = 0.02
 """Of roll and pitch, which are the attitude filter's [rad²]."""
 
@@ -137,10 +137,13 @@ class FixFrame:
         """
         near = estimator.at(fix.time)
         height = float(estimator.estimate(fix.time).x[2])
-        position = np.array([*fix.position, height if math.isfinite(height) else 0.0])
+        known = math.isfinite(height)
+        position = np.array([*fix.position, height if known else 0.0])
         roll, pitch = (a if math.isfinite(a) else 0.0 for a in (near.roll, near.pitch))
         level = quat_from_euler(roll, pitch, fix.yaw or 0.0)
-        P = np.diag([0.0, 0.0, self._height_variance, UNKNOWN if fix.yaw is None else 0.0])
+        P = np.diag(
+            [0.0, 0.0, self._height_variance if known else UNKNOWN, UNKNOWN if fix.yaw is None else 0.0]
+        )
         if fix.covariance is not None:
             P[np.ix_([0, 1, 3], [0, 1, 3])] += np.array(fix.covariance)
         full = np.diag([0.0, 0.0, 0.0, TILT_VARIANCE, TILT_VARIANCE, 0.0])
