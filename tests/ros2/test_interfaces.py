@@ -203,7 +203,7 @@ def parameters_of(lines, node, namespace="finsrov"):
         ("robot", {"vehicle": "warpauv"}, "camera", {"vehicle": "warpauv"}),
         ("robot", {}, "controller", {"policy": "pid", "vehicle": "finsrov"}),
         ("sim", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper", "use_sim_time": True}),
-        ("sim", {"vehicle": "bluerov2_heavy"}, "sim", {"vehicle": "bluerov2_heavy", "seed": 0}),
+        ("sim", {"vehicle": "bluerov2_heavy"}, "sim", {"vehicle": "bluerov2_heavy", "seed": 1}),
         ("pool", {"plant": "7"}, "virtual_pool", {"plant": "7", "severity": "realistic"}),
     ],
 )

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, NamedTuple
 
 from cyclonedds._clayer import ddspy_take
@@ -218,12 +217,6 @@ class DdsTypes:
         if kind == Nodetype.ARRAY:
             return idl.array[self._field(*inner), count]
         return idl.sequence[self._field(*inner), count] if count else idl.sequence[self._field(*inner)]
-
-
-@cache
-def types_of(codec: Codec) -> DdsTypes:
-    """Return the types of a codec, kept for the whole process: Cyclone may still need them when a context has left."""
-    return DdsTypes(codec)
 
 
 # Writers and readers of bytes on one DDS topic.
@@ -438,7 +431,9 @@ class Participant:
         self.entity = DomainParticipant(settings.domain, qos=user_data)
         self.gid: bytes = self.entity.guid.bytes
         self._publisher, self._subscriber = Publisher(self.entity), Subscriber(self.entity)
-        self._types = types_of(self.codec)
+        self._types = DdsTypes(
+            self.codec
+        )  # its own: Cyclone crashes on a type that an earlier participant registered
         self._topics: dict[tuple[str, str], Topic] = {}
         self._builtin: dict[str, Any] = {}
         self._lock = threading.Lock()

@@ -145,7 +145,7 @@ class Sim(RobotNode):
         super().__init__("sim")
         self.base, self.time = 0, 0.0
         self.sends("odometry", "estimator", "imu", "pressure", "event", "diagnostics")
-        hydrodynamics, seed = self.parameter("hydrodynamics", "calibrated"), self.parameter("seed", 0)
+        hydrodynamics, seed = self.parameter("hydrodynamics", "calibrated"), self.parameter("seed", 1)
         self.sim = Simulator(
             self.vehicle, hydrodynamics=hydrodynamics, control_step=STEP, substeps=SUBSTEPS, seed=seed
         )

@@ -28,7 +28,7 @@ class VirtualPoolNode(RobotNode):
             "truth": _path(self.parameter("truth", "")),
             "start": self.parameter("start", "") or None,
             "positioning": self.parameter("positioning", "none"),
-            "seed": self.parameter("seed", 0),
+            "seed": self.parameter("seed", 1),
             "world": self.parameter("world", "") or None,
         }
         self._vehicle_name = self.get_parameter("vehicle").value
