@@ -8,8 +8,11 @@ import pytest
 from finssim.tasks import TASKS, EnvironmentSetupError, make
 from finssim.tasks.fitting import coefficients_of, driven_axes
 from finssim.vehicles import catalogue, load_vehicle
+from reference.examples import example
 
-NAMES = list(TASKS)
+OWN = example("own_task").KeepDepth
+NAMES = [*TASKS, OWN().name]
+"""Those of the package, and one from outside."""
 SHORT = 1.0
 """Length of an episode [s]: several end in a test."""
 
@@ -17,7 +20,7 @@ SHORT = 1.0
 def environment(name, vehicle="finsrov", worlds=4, **options):
     model = coefficients_of(load_vehicle(vehicle))
     return make(
-        replace(TASKS[name](), time_limit=SHORT),
+        replace((TASKS.get(name) or OWN)(), time_limit=SHORT),
         worlds=worlds,
         vehicle=vehicle,
         hydrodynamics=model,
