@@ -37,6 +37,7 @@ FOUNDATION = {
     "files",
     "mcap_files",
     "page",
+    "progress",
     "provenance",
     "quiet",
     "realtime",

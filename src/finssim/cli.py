@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import typer
 
 from finssim import __version__, boundary
 from finssim.command_line import Experiment, command_app
-from finssim.system import replace_unwritable
+from finssim.system import announce, replace_unwritable
 
 SECTIONS: dict[str, dict[str, str | Experiment]] = {
     "Start": {
@@ -116,6 +117,8 @@ def main() -> None:
     Statuses: 0 well, 1 a fault of FinsSim, 2 a refused input, 3 a result that is negative, 130 interrupted.
     """
     replace_unwritable(sys.stdout, sys.stderr)
+    words = itertools.takewhile(lambda word: not word.startswith("-"), sys.argv[1:3])
+    announce(f"finssim {' '.join(words)}: starting")
     sys.exit(boundary.run(app, sys.argv[1:]))
 
 

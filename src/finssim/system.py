@@ -103,6 +103,29 @@ def peak_memory() -> float:
     )
 
 
+def announce(text: str, after: float = 1.5) -> threading.Timer:
+    """Print a line on standard error unless something else is printed before.
+
+    Args:
+        text: The line.
+        after: From now [s].
+
+    Returns:
+        The timer that prints it, already started.
+    """
+    timer = threading.Timer(after, lambda: print(text, file=sys.stderr, flush=True))
+    timer.daemon = True
+    for stream in (sys.stdout, sys.stderr):
+
+        def write(characters: str, write: Any = stream.write) -> Any:
+            timer.cancel()
+            return write(characters)
+
+        stream.write = write  # type: ignore[method-assign]
+    timer.start()
+    return timer
+
+
 def replace_unwritable(*streams: TextIO) -> None:
     """Write `?` for characters that a stream's encoding lacks, such as an arrow in a file of code page 1252."""
     for stream in streams:

@@ -20,10 +20,11 @@ from finssim.calibration.fit import Estimate, Fit
 from finssim.calibration.regression.axis_estimates import CERTAIN
 from finssim.calibration.regression.plant_terms import matrices
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.report import finish, progress_bar, refuse_places, usable_trials
+from finssim.calibration.report import finish, refuse_places, usable_trials
 from finssim.calibration.trials.inputs import drive, require_axes
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.vehicle_file import calibrated, scaled_thrust
+from finssim.progress import progress_bar
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 METHODS = ("auto", "regression", "simulation")

@@ -8,9 +8,7 @@ import math
 import os
 import shlex
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,42 +79,6 @@ def command_line(kind: str, inputs: Iterable[Path], options: Mapping[str, Any]) 
             elif item is not None and item is not False and item != "":
                 tokens += [option, str(item)]
     return shlex.join(tokens)
-
-
-EVERY = 10.0
-"""Time between two lines of progress where there is no terminal [s]."""
-
-
-@contextmanager
-def progress_bar(name: str) -> Iterator[Callable[..., None]]:
-    """Show a bar on standard error, fed with the part done and a few words; lines where that is no terminal."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    screen = Console(stderr=True)
-    if not screen.is_terminal:
-        yield _lines(name, screen)
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=screen, transient=True) as bars:
-        bar = bars.add_task(name, total=1.0)
-        yield lambda part, text=name: bars.update(bar, completed=part, description=text)
-
-
-def _lines(name: str, screen: Console) -> Callable[..., None]:
-    """Return a progress that prints a line at once and then every `EVERY` seconds."""
-    began = time.monotonic()
-    last = -EVERY
-
-    def tell(part: float, text: str = "") -> None:
-        nonlocal last
-        spent = time.monotonic() - began
-        if spent < last + EVERY:
-            return
-        last = spent
-        left = f", about {spent / part - spent:.0f} s left" if part > 0.02 and spent > EVERY else ""
-        screen.print(f"{name}: {text} ({part:.0%}{left})", highlight=False, markup=False, soft_wrap=True)
-
-    return tell
 
 
 BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"

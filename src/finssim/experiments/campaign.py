@@ -15,28 +15,25 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress as Bar
 
 from finssim.control.controllers import CONTROLLERS
 from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
 from finssim.experiments.tables import Table, markdown_of, print_tables
 from finssim.files import atomic_write, plain_name
+from finssim.progress import Progress, progress_bar
 from finssim.quiet import start_warp
 from finssim.system import parent_runs
 from finssim.vehicles import load_vehicle
 from finssim.yaml_file import json_value, read_json
-
-Progress = Callable[..., None]
-"""Told the share that is done, and what comes next as text."""
 
 WATCH = 1.0
 """Time between two looks of a worker at its parent [s]."""
@@ -90,15 +87,6 @@ def run_experiment(
     if options.get("out") is not None:
         console.print(f"written: {options['out']}", highlight=False, soft_wrap=True)
     return result
-
-
-@contextmanager
-def progress_bar(name: str, *, visible: bool = True) -> Iterator[Progress]:
-    """A bar on standard error where that is a terminal; told the share that is done and, perhaps, what comes next."""
-    screen = Console(stderr=True)
-    with Bar(console=screen, transient=True, disable=not visible or not screen.is_terminal) as bar:
-        task = bar.add_task(name, total=1.0)
-        yield lambda part, text=name: bar.update(task, completed=part, description=text)
 
 
 def check_choices(

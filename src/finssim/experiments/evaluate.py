@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 
 from finssim.control.policy import read_description
 from finssim.experiments import campaign
-from finssim.experiments.campaign import progress_bar, write_json
+from finssim.experiments.campaign import write_json
 from finssim.experiments.figures import draw_envelopes, draw_tracking, save_figure
 from finssim.experiments.metrics import (
     PAPER_T2,
@@ -33,6 +33,7 @@ from finssim.experiments.trials import (
     summarize_episodes,
 )
 from finssim.files import atomic_directory, plain_name
+from finssim.progress import progress_bar
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.record_reader import open_record

@@ -24,7 +24,7 @@ from finssim.control import ControlError
 from finssim.control.allocation import Allocator
 from finssim.control.controllers import controller
 from finssim.control.guidance import Goal, Guide, Measured, Station, goal_at
-from finssim.experiments.campaign import Progress, Show, progress_bar, run_jobs
+from finssim.experiments.campaign import Show, run_jobs
 from finssim.experiments.robot_trials import (
     Attendant,
     OnRobot,
@@ -42,6 +42,7 @@ from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import draw_plant
 from finssim.pool.draw_plant import site_of
 from finssim.pool.plant_spec import Basin
+from finssim.progress import Progress, progress_bar
 from finssim.quiet import start_warp
 from finssim.robot.perception import Perception
 from finssim.robot.recorder import Recorder

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.control.policy import read_description
-from finssim.experiments.campaign import progress_bar
 from finssim.experiments.plants import load_plant
 from finssim.files import atomic_write
+from finssim.progress import progress_bar
 from finssim.quiet import start_warp
 from finssim.robot.record_reader import play_record
 from finssim.tasks import Environment, task_named

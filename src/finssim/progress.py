@@ -1,0 +1,60 @@
+"""Progress of long work on standard error."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+
+Progress = Callable[..., None]
+"""Takes the share that is done, 0 to 1, and, perhaps, what comes next."""
+EVERY = 10.0
+"""Time between two lines of progress where there is no terminal [s]."""
+
+
+@contextmanager
+def progress_bar(name: str, *, visible: bool = True) -> Iterator[Progress]:
+    """Show progress on standard error: a bar where that is a terminal, else a line at once and every ten seconds.
+
+    Args:
+        name: Of the work.
+        visible: False: nothing is shown.
+
+    Yields:
+        A function of the share that is done and, perhaps, of what comes next.
+    """
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    screen = Console(stderr=True)
+    if not visible:
+        yield lambda part, text="": None
+        return
+    if not screen.is_terminal:
+        yield _lines(name, screen)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Bar(*columns, console=screen, transient=True) as bars:
+        bar = bars.add_task(name, total=1.0)
+        yield lambda part, text=name: bars.update(bar, completed=part, description=text)
+
+
+def _lines(name: str, screen: Console) -> Progress:
+    """Return a progress that prints a line at once and then every `EVERY` seconds."""
+    began = time.monotonic()
+    last = -EVERY
+
+    def tell(part: float, text: str = "") -> None:
+        nonlocal last
+        spent = time.monotonic() - began
+        if spent < last + EVERY:
+            return
+        last = spent
+        left = f", about {spent / part - spent:.0f} s left" if part > 0.02 and spent > EVERY else ""
+        words = f"{name}: {text}" if text else name
+        screen.print(f"{words} ({part:.0%}{left})", highlight=False, markup=False, soft_wrap=True)
+
+    tell(0.0)
+    return tell
