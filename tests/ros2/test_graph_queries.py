@@ -91,3 +91,18 @@ def test_names_come_with_their_types(nodes):
     assert talker.get_client_names_and_types_by_node("talker", "/ns") == [go]
     with pytest.raises(NodeNameNonExistentError, match="nobody"):
         talker.get_publisher_names_and_types_by_node("nobody", "/")
+
+
+def test_who_has_left_is_neither_found_nor_kept(nodes):
+    """However many come and go: each query reads what is new."""
+    talker, listener = nodes
+    for _ in range(20):
+        gone = listener.create_publisher(String, "fleeting", 1)
+        assert len(awaited(lambda: talker.get_publishers_info_by_topic("/fleeting"))) == 1
+        listener.destroy_publisher(gone)
+    end = time.monotonic() + 10.0
+    while talker.count_publishers("/fleeting") and time.monotonic() < end:
+        time.sleep(0.01)
+    assert talker.get_publishers_info_by_topic("/fleeting") == []
+    reader, known = talker.context.participant._builtin["publications"]
+    assert not reader.read(N=10_000) and len(known) < 20

@@ -488,15 +488,19 @@ class Participant:
             kind: "publications" or "subscriptions".
         """
         topics = {"publications": BuiltinTopicDcpsPublication, "subscriptions": BuiltinTopicDcpsSubscription}
-        if kind not in self._builtin:
-            self._builtin[kind] = BuiltinDataReader(self.entity, topics[kind])
-        samples = self._builtin[kind].read(N=10_000)
-        alive = [
-            s
-            for s in samples
-            if s.sample_info.instance_state == InstanceState.Alive and hasattr(s, "topic_name")
-        ]
-        return [EndpointRecord(s.topic_name, s.type_name, s.key.bytes, s.qos) for s in alive]
+        with self._lock:
+            if kind not in self._builtin:
+                self._builtin[kind] = BuiltinDataReader(self.entity, topics[kind]), {}
+            reader, known = self._builtin[kind]
+            for sample in reader.take(
+                N=10_000
+            ):  # news alone: those that have left would be read again for ever
+                if sample.sample_info.instance_state == InstanceState.Alive:
+                    record = EndpointRecord(sample.topic_name, sample.type_name, sample.key.bytes, sample.qos)
+                    known[sample.key.bytes] = record
+                else:
+                    known.pop(sample.key.bytes, None)
+            return list(known.values())
 
     def close(self) -> None:
         """Leave the wire at once: peers are told, and wait for nothing."""

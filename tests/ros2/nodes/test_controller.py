@@ -133,7 +133,8 @@ def pid_force(goal):
 
 def test_it_is_silent_until_the_bridge_is_armed(wire):
     """Then it asks for what the PID asks for, towards the goal of its parameter; disarmed, it is silent again."""
-    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'")
+    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'", "-p", "use_sim_time:=true")
+    stage.clock = 10 * 10**9  # one decision a turn at most, so that none is overwritten unheard
     assert stage.until(lambda: stage.node.state.reading(stage.node.now()).ready)
     stage.turns(20)
     assert not stage.heard["command"]
