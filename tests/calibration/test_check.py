@@ -186,6 +186,19 @@ def test_a_heading_that_samples_slowly_or_a_vehicle_on_its_nose_has_no_drift():
     assert not told(Trial(name="somersault", t=t, channels=flip | rates), "heading_drift")
 
 
+def test_a_vehicle_that_rolls_without_a_measured_tilt_is_not_taken_as_level():
+    """On its back it rises while w is negative; only the gyro shows that it turned over."""
+    t = np.arange(0.0, 20.0, 0.05)
+    rate = np.where((t > 2.0) & (t < 4.0), 0.5 * np.pi, 0.0)
+    roll = 0.05 * np.cumsum(rate)
+    rising = 0.2 * np.sin(1.5 * t)
+    channels = {"w": rising * np.cos(roll), "z": 0.05 * np.cumsum(rising) - 5.0, "yaw": 0.0 * t}
+    trial = Trial(name="over", t=t, channels=channels)
+    assert told(trial, "rate_sign")
+    turning = replace(trial, channels={**channels, "p": rate, "q": 0.0 * t})
+    assert not told(turning, "rate_sign")
+
+
 def test_five_hertz_with_wrench_and_velocity_only(simulated):
     """Every tenth row, two columns: the surge axis is still told, the lag is not, the rest has no velocity."""
     trial = simulated["surge"]

@@ -773,11 +773,8 @@ def _heading(trial: Trial) -> list[Finding]:
     t, r = t[inside], r[inside]
     phi, theta = np.interp(t, at, roll), np.interp(t, at, pitch)
     q_at = np.interp(t, *trial.series("q")) if trial.has("q") else np.zeros(len(t))
-    if not {"roll", "pitch"} & set(named):  # taken level, which a gyro may contradict
-        p_at = np.interp(t, *trial.series("p")) if trial.has("p") else q_at
-        for tilting in (p_at - np.median(p_at), q_at - np.median(q_at)):
-            if np.ptp(np.cumsum(tilting[1:] * np.diff(t))) > LARGEST_TURN:
-                return []
+    if not {"roll", "pitch"} & set(named) and _tilts_unseen(trial):
+        return []
     rate = (q_at * np.sin(phi) + r * np.cos(phi)) / np.maximum(np.cos(theta), STEEP)
     # A gap of the gyro hides a turn, and a vehicle on its nose has no heading: each stretch begins anew.
     step = np.diff(t)
@@ -813,6 +810,8 @@ def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]
             return [finding("z_down")]
         if wrong_unit := _unit_ratio(-up[:, 1], up[:, 0], "z", "depth"):
             return wrong_unit
+    if not attitude.tilt and _tilts_unseen(trial):
+        return []
     vertical = "z" if trial.has("z") else "depth"
     rising = np.where(np.isfinite(up[:, 0]), up[:, 0], -up[:, 1])
     through = _through_world(trial, t, attitude)[:, 2]
@@ -841,6 +840,8 @@ def _unit_ratio(x: Array, y: Array, of: str, over: str) -> list[Finding]:
 
 def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     if not (trial.has("x", "y", "u", "v") and attitude.heading):
+        return []
+    if not attitude.tilt and _tilts_unseen(trial):
         return []
     _, world = on_grid(trial, ("x", "y"), t, 3)
     through = _through_world(trial, t, attitude)[:, :2]
@@ -889,6 +890,14 @@ def _too_slow(trial: Trial, q: Array) -> bool:
     step = trial.duration / max(len(q) - 1, 1)
     gyro = [float(np.percentile(np.abs(trial.series(name)[1]), 98.0)) for name in "pqr" if trial.has(name)]
     return bool(np.percentile(turns, 98.0) > LARGEST_TURN and max(gyro, default=0.0) * step > LARGEST_TURN)
+
+
+def _tilts_unseen(trial: Trial) -> bool:
+    """Return whether the gyro shows tilts of a vehicle that is taken as level, since roll and pitch are not measured."""
+    for t, rate in (trial.series(name) for name in "pq" if trial.has(name)):
+        if np.ptp(np.cumsum((rate - np.median(rate))[1:] * np.diff(t))) > LARGEST_TURN:
+            return True
+    return False
 
 
 def _stands_out(rates: Array, samples: Array) -> bool:
