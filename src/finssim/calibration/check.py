@@ -893,7 +893,7 @@ def _too_slow(trial: Trial, q: Array) -> bool:
 
 
 def _tilts_unseen(trial: Trial) -> bool:
-    """Return whether the gyro shows tilts of a vehicle that is taken as level, since roll and pitch are not measured."""
+    """Return whether the gyro shows tilts of a vehicle that is taken as level for want of a measured tilt."""
     for t, rate in (trial.series(name) for name in "pq" if trial.has(name)):
         if np.ptp(np.cumsum((rate - np.median(rate))[1:] * np.diff(t))) > LARGEST_TURN:
             return True
