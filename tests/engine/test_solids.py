@@ -287,7 +287,7 @@ def test_what_is_not_solid_is_not_there(world):
 
 @pytest.mark.slow
 def test_the_step_with_solids_compiles_for_cuda(tmp_path):
-    """NVRTC, which needs no device, makes a binary for a compute capability of 7.5."""
+    """NVRTC, which needs no device, makes code (PTX) for a compute capability of 7.5."""
     wp.init()
     if wp.get_cuda_toolkit_version() is None:
         pytest.skip("this Warp has no CUDA compiler")
@@ -295,5 +295,5 @@ def test_the_step_with_solids_compiles_for_cuda(tmp_path):
 
     kernel = physics_kernel("calibrated", "midpoint", solids_present=True, funnel_present=True)
     for module in (kernel.module, wp.get_module(solids.__name__)):
-        wp.compile_aot_module(module, arch=75, module_dir=tmp_path)
-    assert len(list(tmp_path.glob("*.cubin"))) == 2
+        wp.compile_aot_module(module, arch=75, module_dir=tmp_path, use_ptx=True)
+    assert len(list(tmp_path.glob("*.ptx"))) == 2
