@@ -218,14 +218,18 @@ def main() -> None:
     parser.add_argument(
         "--faulty", type=int, default=100, help="logs that are also spoilt by one fault at a time"
     )
+    parser.add_argument(
+        "--first", type=int, default=0, help="number of the first log; thresholds were chosen on 0 to 999"
+    )
     parser.add_argument("--out", type=Path, default=Path("alarms.jsonl"))
     args = parser.parse_args()
     rows = [json.loads(line) for line in args.out.read_text().splitlines()] if args.out.is_file() else []
     done = {row["log"] // GROUP for row in rows}
-    left = [group for group in range(-(-args.logs // GROUP)) if group not in done]
+    last = args.first + args.logs
+    left = [group for group in range(args.first // GROUP, -(-last // GROUP)) if group not in done]
     start = time.monotonic()
     for number, group in enumerate(left, 1):
-        new = examine(group, args.logs, args.faulty)
+        new = examine(group, last, args.faulty)
         rows += new
         with args.out.open("a", encoding="utf-8") as file:
             file.writelines(json.dumps(row) + "\n" for row in new)
@@ -233,7 +237,7 @@ def main() -> None:
         bad = sum(bool(row["alarms"]) for row in rows)
         print(f"{len(rows)} of {args.logs} logs, {bad} with a false alarm, "
               f"{spent * (len(left) - number) / number:.0f} s left", flush=True)  # fmt: skip
-    report([row for row in rows if row["log"] < args.logs])
+    report([row for row in rows if args.first <= row["log"] < last])
 
 
 def report(rows: list[dict]) -> None:
