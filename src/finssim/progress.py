@@ -42,7 +42,7 @@ def progress_bar(name: str, *, visible: bool = True) -> Iterator[Progress]:
 
 
 def _lines(name: str, screen: Console) -> Progress:
-    """Return a progress that prints a line at once and then every `EVERY` seconds."""
+    """Return a progress that prints what it is first given, and then a line every `EVERY` seconds."""
     began = time.monotonic()
     last = -EVERY
 
@@ -56,5 +56,4 @@ def _lines(name: str, screen: Console) -> Progress:
         words = f"{name}: {text}" if text else name
         screen.print(f"{words} ({part:.0%}{left})", highlight=False, markup=False, soft_wrap=True)
 
-    tell(0.0)
     return tell

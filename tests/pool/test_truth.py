@@ -49,7 +49,7 @@ def test_a_killed_writer_leaves_all_but_the_last_records(tmp_path):
         "import sys, time, numpy as np\n"
         "from finssim.pool.virtual_pool import TruthWriter\n"
         "w = TruthWriter(sys.argv[1], ('a',), {})\n"
-        "for i in range(475): w.write(0.01 * i, [np.zeros(20, dtype=np.float32)])\n"
+        "for i in range(475): w.write(0.01 * i, [np.zeros(19, dtype=np.float32)])\n"
         "print('written', flush=True); time.sleep(60)\n"
     )
     path = tmp_path / "a.truth"

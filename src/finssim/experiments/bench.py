@@ -16,6 +16,7 @@ import warp as wp
 
 from finssim.engine import Simulator
 from finssim.engine.launch import default_threads
+from finssim.engine.simulator import find_device
 from finssim.experiments.campaign import Progress
 from finssim.experiments.tables import Table
 from finssim.provenance import provenance
@@ -149,6 +150,7 @@ def bench(*, device: str = "cpu", progress: Progress = lambda part, text: None) 
         device (DEVICE): Compute device: cpu or cuda.
         progress: Told the share that is done and what is measured next.
     """
+    find_device(device)  # refuses one that is not there before anything is measured
     plan: dict[tuple[str, str], Callable[[], float | None]] = {
         ("physics", f"{model}/{worlds}"): partial(physics_rate, model, worlds, device=device)
         for model in MODELS

@@ -291,8 +291,6 @@ def evaluate(
         EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
     """
     names = [controller] if isinstance(controller, str | Path) else controller
-    task, vehicle = _subject(Path(names[0]), task, vehicle)
-    task_named(task)  # which refuses one that does not exist
     records = [Path(name) for name in names if str(name).endswith(".mcap")]
     if len(names) > 1 and len(records) < len(names):
         raise EvaluationError(
@@ -306,6 +304,8 @@ def evaluate(
         raise EvaluationError(f"a record was made once and for all: leave {', '.join(unheeded)} out")
     if truth is not None and not records:
         raise EvaluationError("--truth is for records: a simulation has its own truth")
+    task, vehicle = _subject(Path(names[0]), task, vehicle)
+    task_named(task)  # which refuses one that does not exist
     plants = [] if records else _plants([plant] if isinstance(plant, str | Path) else plant)
     plants = plants if observe is None else [plant_file.with_view(observe) for plant_file in plants]
     with atomic_directory(out, replaces=EVALUATION_FILE) if out is not None else nullcontext() as folder:

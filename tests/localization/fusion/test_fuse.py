@@ -78,7 +78,7 @@ def read_out(path):
 def test_a_folder_of_tables_becomes_one_table(tmp_path, pool, mode, capsys):
     """60 rows a second with states, deviations and counts; errors against the truth file are centimetres."""
     log = write_log(tmp_path / "log", samples())
-    run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", mode=mode)
+    run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", estimator=mode)
     columns, states = read_out(tmp_path / "out.csv")
     assert np.diff(columns["t"]) == pytest.approx(1 / 60)
     assert set(states[60:]) == {"fresh"} and states[0] == "uninitialized"
@@ -330,7 +330,7 @@ def test_logs_that_cannot_be_used_are_refused_in_a_sentence(tmp_path, pool, writ
     ("options", "sentence"),
     [
         ({"rate": 0.0}, "rate is 0 Hz"),
-        ({"mode": "ekf"}, "available: constant-velocity, error-state"),
+        ({"estimator": "ekf"}, "available: constant-velocity, error-state"),
         ({"method": "best"}, "available: refractive"),
     ],
 )
