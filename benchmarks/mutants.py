@@ -44,8 +44,10 @@ SWAPS: dict[type[ast.AST], tuple[str, str]] = {
     ast.And: ("and", "or"),
     ast.Or: ("or", "and"),
 }
-LONGEST = 900
+LONGEST = 1800
 """Of one run of tests, after which they count as failed [s]."""
+LONGEST_TEST = 300
+"""Of one test, after which it counts as failed [s]."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,8 @@ class Copy:
             "PYTHONDONTWRITEBYTECODE": "1",  # a change within a second would be taken for the original
             "WARP_CACHE_PATH": str(self.kernels),
         }
-        words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+        words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
+        words += [f"--timeout={LONGEST_TEST}", *tests]
         try:
             done = subprocess.run(
                 words, cwd=self.checkout, env=environment, capture_output=True, timeout=LONGEST, check=False
