@@ -187,7 +187,7 @@ def kinds() -> list[Kind]:
         Kind("motion capture", "mocap.csv", ("evaluate SEEDS/run.mcap --task t1 --truth {}",)),
         Kind("policy", "policy/policy.yaml", (
             "evaluate {} --trials 1", "run --policy {} --goal 0,0,-0.5,0 --pool-file none --robot udp://127.0.0.1:9 "
-            "--bind 127.0.0.1:0 --duration 0", "compare {} --trials 1 --out OUT/compared",
+            "--bind 127.0.0.1:0 --duration 0",
         ), folder=1, weight=3),
         Kind("network", "policy/policy.onnx", ("evaluate {} --trials 1",), folder=1),
         Kind("task", "own.py", ("tasks show {}:KeepDepth",)),
@@ -222,7 +222,6 @@ def kinds() -> list[Kind]:
         ), folder=1, weight=2),
         Kind("camera of a world", "camera-device.yaml", ("worlds show pool --camera {} --out OUT/seen.png",)),
         Kind("sonar of a world", "sonar-device.yaml", ("worlds show pool --sonar {} --out OUT/seen.png",)),
-        Kind("result of a comparison", "compared/compare.json", ("compare SEEDS/policy --trials 1 --out {}",), folder=1, inside=True),  # noqa: E501
         Kind("number", "goal.yaml", (
             "simulate --vehicle finsrov --command surge=NUMBER --duration 0.2 --out OUT/run.csv",
             "simulate --vehicle finsrov --command surge=5 --duration NUMBER --out OUT/run.csv",
@@ -482,7 +481,6 @@ def make(folder: Path, run: Callable[..., None]) -> None:
     steps = folder / "steps" / "surge_plus_9" / "data.csv"
     steps.write_text("".join(steps.read_text().splitlines(keepends=True)[:700]))
     run("train", "t1", "--steps", "1024", "--worlds", "16", "--out", "policy")
-    run("compare", "policy", "--trials", "1", "--out", "compared")
     run("experiment", "stack", "t1", "--policy", "policy", "--episodes", "1", "--records", "--out", "stack")
     shutil.copyfile(next((folder / "stack").rglob("*.mcap")), folder / "run.mcap")
     shutil.copyfile(next((folder / "stack").rglob("*.truth")), folder / "truth.fst")

@@ -53,7 +53,6 @@ COMMANDS = [
     "tasks show",
     "collect",
     "datasets",
-    "compare",
     "sweep",
     "record",
     "record info",

@@ -51,7 +51,6 @@ SECTIONS: dict[str, dict[str, str | Experiment]] = {
         "train": "finssim.learning.train:train",
         "evaluate": Experiment("finssim.experiments.evaluate:evaluate"),
         "sweep": Experiment("finssim.experiments.sweep:sweep"),
-        "compare": Experiment("finssim.experiments.compare:compare"),
         "collect": Experiment("finssim.experiments.records:collect"),
         "datasets": Experiment("finssim.experiments.records:datasets"),
     },

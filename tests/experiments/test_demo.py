@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -180,3 +181,13 @@ def test_somebodys_files_are_not_replaced(tmp_path):
     (tmp_path / "thesis.tex").write_text("years", encoding="utf-8")
     with pytest.raises(RobotError, match="holds other files"):
         demo(tmp_path, steps=1)
+
+
+def test_a_training_curve_leaves_out_rows_without_a_number():
+    """Success and return of the evaluations come first; before the first episode ended a row has no return."""
+    kinds = [("steps", float), ("mean_return", float), ("held", float), ("evaluation_return", float)]
+    rows = [(100.0, np.nan, 0.1, np.nan), (200.0, 2.0, 0.2, np.nan), (300.0, 3.0, 0.3, np.nan)]
+    figure = demo_module._training(np.array(rows, dtype=kinds))
+    held, returns = (axes.lines[0].get_xydata() for axes in figure.axes)
+    np.testing.assert_allclose(held, [[1e-4, 0.1], [2e-4, 0.2], [3e-4, 0.3]])
+    np.testing.assert_allclose(returns, [[2e-4, 2.0], [3e-4, 3.0]])

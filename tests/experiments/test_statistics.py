@@ -1,60 +1,53 @@
-"""Aggregates over seeds: closed forms, and intervals that hold the truth as often as they say."""
-
-import math
+"""Intervals hold what they should as often as they say, and pairs cancel what both rows share."""
 
 import numpy as np
 import pytest
-from scipy.stats import mannwhitneyu
 
-from finssim.experiments.statistics import interquartile_mean, probability_of_improvement, with_bootstrap
-
-
-@pytest.mark.parametrize(
-    "scores, expected",
-    [
-        ([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0], 3.5),  # the middle four
-        ([1.0, 2.0, 3.0, 4.0, 10.0], (0.75 * 2.0 + 3.0 + 0.75 * 4.0) / 2.5),  # 1.25 off each end
-        ([5.0], 5.0),
-        ([1.0, 2.0, 3.0, math.inf], 2.5),  # one in four failed
-        ([1.0, 2.0, math.inf, math.inf], math.inf),
-    ],
-)
-def test_the_middle_half(scores, expected):
-    shuffled = np.random.default_rng(0).permutation(scores)
-    assert interquartile_mean(shuffled) == pytest.approx(expected)
+from finssim.experiments.statistics import paired_difference, with_interval
 
 
-def test_rows_and_columns_are_one_set():
-    scores = np.random.default_rng(1).normal(size=(6, 4))
-    assert interquartile_mean(scores) == interquartile_mean(scores.T)
+def test_the_value_is_the_statistic_of_all_values():
+    """Clusters decide the interval, not the value."""
+    values = {"a": [1.0, 2.0], "b": [9.0]}
+    assert with_interval(values)["value"] == pytest.approx(4.0)
+    assert with_interval(values, np.median)["value"] == pytest.approx(2.0)
+    assert with_interval({"a": []}) is None
 
 
-@pytest.mark.parametrize("less", [True, False])
-def test_probability_is_that_of_mann_and_whitney(less):
-    """Column by column, ties included."""
-    rng = np.random.default_rng(2)
-    a, b = rng.integers(0, 5, (7, 3)).astype(float), rng.integers(1, 6, (5, 3)).astype(float)
-    wins = [mannwhitneyu(a[:, k], b[:, k]).statistic / 35.0 for k in range(3)]
-    expected = np.mean(wins) if not less else 1.0 - np.mean(wins)
-    assert probability_of_improvement(a, b, less) == pytest.approx(expected)
+def test_shared_errors_widen_the_interval():
+    """Eight trials that share their plant are worth little more than one."""
+    random = np.random.default_rng(1)
+    clustered = {k: list(np.full(8, shared)) for k, shared in enumerate(random.normal(0.0, 1.0, 9))}
+    alone = {k: [x] for k, x in enumerate(random.normal(0.0, 1.0, 72))}
+    wide, narrow = (np.ptp(with_interval(values)["ci95"]) for values in (clustered, alone))
+    assert wide > 1.8 * narrow
 
 
 @pytest.mark.slow
-def test_intervals_hold_the_truth():
-    """Of a symmetric distribution it is the middle: 12 runs, 200 draws; 95 % less what twelve cost."""
-    rng = np.random.default_rng(3)
-    held = 0
-    for _ in range(200):
-        low, high = with_bootstrap([rng.normal(1.0, 0.3, (12, 3))], interquartile_mean, 300)["ci95"]
-        held += low <= 1.0 <= high
-    assert 0.85 * 200 <= held <= 200
+def test_an_interval_holds_the_mean_about_as_often_as_it_says():
+    """Nine clusters: a percentile bootstrap covers somewhat less than 95 %, never less than 80 %."""
+    random = np.random.default_rng(2)
+    inside = 0
+    for _ in range(60):
+        drawn = {k: list(x + random.normal(0.0, 0.3, 8)) for k, x in enumerate(random.normal(0.0, 1.0, 9))}
+        low, high = with_interval(drawn, np.mean)["ci95"]
+        inside += low <= 0.0 <= high
+    assert inside >= 48
 
 
-def test_what_never_varies_has_no_width():
-    same = with_bootstrap([np.full((4, 2), 3.0)], interquartile_mean)
-    assert same == {"value": 3.0, "ci95": [3.0, 3.0], "count": 4}
+def test_pairs_cancel_what_a_plant_does_to_both():
+    """A difference of 0.01 shows although plants differ by 1."""
+    random = np.random.default_rng(3)
+    plants = random.normal(0.0, 1.0, 9)
+    pairs = [(p, s, t) for p in range(9) for s in (1,) for t in ("P01", "P02")]
+    ours = {pair: plants[pair[0]] + random.normal(0.0, 0.002) for pair in pairs}
+    theirs = {pair: plants[pair[0]] + 0.01 + random.normal(0.0, 0.002) for pair in pairs}
+    d = paired_difference(ours, theirs)
+    assert d["ci95"][0] > 0.0 and d["value"] == pytest.approx(0.01, abs=0.002) and d["count"] == len(pairs)
 
 
-def test_a_failure_is_no_number_in_json():
-    failed = with_bootstrap([np.full((3, 2), math.inf)], interquartile_mean)
-    assert failed == {"value": None, "ci95": [None, None], "count": 3}
+def test_trials_without_a_partner_are_left_out():
+    """A pair needs both."""
+    d = paired_difference({(1, 1, "P01"): 1.0}, {(1, 1, "P01"): 2.0, (2, 1, "P01"): 50.0})
+    assert (d["value"], d["count"]) == (1.0, 1)
+    assert paired_difference({(1, 1, "P01"): 1.0}, {}) is None

@@ -33,7 +33,7 @@ def test_settings_times_grid_times_seeds(tmp_path):
         {"steps": 10, "worlds": 64, "action": "wrench4", "randomize": "pool"}
     ] * 2
     assert len({job.key for job in jobs}) == len(jobs)
-    settings = {job.key.removesuffix(str(job.seed)) for job in jobs}  # what finssim compare takes together
+    settings = {job.key.removesuffix(str(job.seed)) for job in jobs}
     assert len(settings) == len(jobs) // 2
 
 

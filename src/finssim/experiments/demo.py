@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.calibration.findings import Finding, sentences
@@ -32,10 +33,9 @@ from finssim.control.pid import axis_model
 from finssim.control.policy import Policy
 from finssim.engine import Pool
 from finssim.experiments.campaign import Progress
-from finssim.experiments.compare import draw_training, groups_of
 from finssim.experiments.evaluate import T1_COLUMNS
 from finssim.experiments.excitation import record_programmes
-from finssim.experiments.figures import COLORS, legend_below, new_figure, save_figure
+from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
 from finssim.experiments.metrics import T1_SETPOINTS
 from finssim.experiments.robot_trials import (
     FIRMWARES,
@@ -309,6 +309,30 @@ def _paths(trials: Sequence[Trial], site: str) -> Any:
     return figure
 
 
+CURVES = {
+    "evaluation_success": "success, evaluated",
+    "evaluation_return": "return, evaluated",
+    "held": "share that held at the end",
+    "mean_return": "return in training",
+}
+"""Columns of a training's `curves.csv` and their titles."""
+
+
+def _training(curves: NDArray[Any]) -> Any:
+    """Draw the first two of `CURVES` that a training measured, over its control steps."""
+    names = [
+        name for name in CURVES if name in (curves.dtype.names or ()) and np.isfinite(curves[name]).any()
+    ]
+    figure = new_figure(7.2, 3.0)
+    for axes, name in zip(figure.subplots(1, 2), names, strict=False):
+        measured = np.isfinite(curves[name])  # no value before the first episode ended
+        axes.plot(curves["steps"][measured] / 1e6, curves[name][measured], color=BLUE)
+        axes.set_xlabel("control steps [million]", fontsize=8)
+        axes.set_title(CURVES[name], fontsize=10)
+        clean(axes)
+    return figure
+
+
 def _identification(result: Identification, hardware: bool) -> list[Table]:
     """What the trials made identifiable, and how the result replays others."""
     score = result.replay.aggregate(result.replay.models[0]).value
@@ -341,7 +365,7 @@ def _identification(result: Identification, hardware: bool) -> list[Table]:
     ]
 
 
-def _lead(result: Mapping[str, Any], spec: Spec, seconds: float | None) -> str:
+def _lead(result: Mapping[str, Any], spec: Spec, seconds: float) -> str:
     rows = result["rows"]
     texts = {
         name: f"{row['success']} of {row['trials']}" for name, row in rows.items() if name != WITH_PICTURES
@@ -352,7 +376,7 @@ def _lead(result: Mapping[str, Any], spec: Spec, seconds: float | None) -> str:
         errors = f", with {100.0 * e_p:.1f} cm and {e_psi:.1f}° of error once settled"
     others = "; ".join(f"{spec.rows[name].title}: {text}" for name, text in texts.items() if name != POLICY)
     return (
-        f"A policy trained here in {math.nan if seconds is None else seconds:.0f} s, from nothing to a file that runs "
+        f"A policy trained here in {seconds:.0f} s, from nothing to a file that runs "
         f"on the vehicle, holds {texts.get(POLICY, 'none')} published setpoints "
         f"{'on hardware' if result['robot'] else 'in the virtual pool'}{errors}. On the same trials: {others}."
     )
@@ -524,8 +548,8 @@ class _Demonstration:
             )  # fmt: skip
         policy, tables = self.out / "policy", spec.tables(result)
         shutil.copytree(held / "policies" / f"{POLICY}-seed{self.seed}", policy, dirs_exist_ok=True)
-        training = groups_of([str(policy)])
-        draw_training(training, self.out / "training.png")
+        curves = np.genfromtxt(policy / "curves.csv", delimiter=",", names=True, ndmin=1)
+        save_figure(_training(curves), self.out / "training.png")
         trials = [played_trial(r, held / "trials") for r in result["trials"] if r["job"]["row"] == POLICY]
         learnt = {"training.png": "Mean return and share of episodes held while training"}
         drawn = [Table(title="Training", pictures=learnt), _setpoints(result, spec)]
@@ -534,11 +558,11 @@ class _Demonstration:
             paths = {"paths.png": "Paths of the trials from above and from the side"}
             drawn.insert(0, Table(title="Paths of the policy", pictures=paths))
         title = f"Station keeping of {self.standing.name}"
-        files = dict(training[0].runs[0].description.files)
+        files = dict(Policy.load(policy).description.files)
         origin = {"vehicle": result["vehicle"], "seed": self.seed, "policy": files, **result["provenance"]}
         sections = [
             f"<h1>{escape(title)}</h1>",
-            f'<p class="lead">{escape(_lead(result, spec, training[0].runs[0].seconds))}</p>',
+            f'<p class="lead">{escape(_lead(result, spec, float(curves["seconds"][-1])))}</p>',
             *html_of(_identification(identification, self.robot is not None), self.out),
             *html_of(tables, held),
             *html_of(drawn, self.out),

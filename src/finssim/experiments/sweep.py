@@ -23,7 +23,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from rich.console import Console
 
 from finssim.experiments.campaign import Progress, keep_result, load_result, spread, write_json
-from finssim.experiments.compare import MEASURES
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
 from finssim.experiments.tables import Table, cells
@@ -37,6 +36,11 @@ RESULT_FILE = "sweep.json"
 ROW_FILE = "sweep-row.json"
 SAME_FOR_ALL = ("task", "out", "seed", "console", "shown", "interrupted", "resume", "device", "vehicle")
 """Arguments of a training that a sweep sets itself."""
+MEASURES: dict[str, tuple[str, ...]] = {
+    "t1": ("success", "e_p_m", "e_psi_deg", "t_s_s"),
+    "t2": ("horizontal_rmse_m", "vertical_rmse_m", "p95_m"),
+}
+"""Task of the paper -> columns of its table; the table of another task has all its metrics."""
 FILES = ("vehicle", "plants", "randomize")
 """Keys whose values may name files."""
 
@@ -63,7 +67,7 @@ class Job:
     def key(self) -> str:
         """Name of its folder: with a digest of everything that decides what comes of it, files too, then the seed.
 
-        Those of a setting differ in the number at their end alone, so that `finssim compare` takes them together.
+        The folders of a setting differ in the number at their end alone.
         """
         about = [self.task, self.vehicle, dict(self.options), self.plants, self.trials]
         digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode())
