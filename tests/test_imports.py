@@ -106,8 +106,6 @@ HOMES = {
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
     "mujoco": {
-        "engine/scene_model.py",
-        "engine/scene_picture.py",
         "experiments/bench.py",
         "worlds/parts.py",
     },

@@ -69,7 +69,7 @@ EXTRAS = {
         {"matplotlib": "matplotlib", "viser": "viser"},
         "draw pictures of vehicles and figures of evaluations, show runs live in the browser",
     ),
-    "mujoco": Extra({"mujoco": "mujoco"}, "measure speed as a ratio to MuJoCo's"),
+    "mujoco": Extra({"mujoco": "mujoco"}, "place MJCF and URDF models in described worlds"),
     "usd": Extra({"usd-core": "pxr"}, "place USD models in described worlds"),
     "mpc": Extra({"casadi": "casadi"}, "control by nonlinear model prediction (nmpc)"),
     "perception": Extra({"newton": "newton"}, "simulate cameras, sonars and altimeters in finssim.worlds"),

@@ -67,6 +67,66 @@ def test_a_heavy_vehicle_rests_on_the_floor_at_weight_over_stiffness(world, floo
     assert simulator.solids.force.numpy()[:, 0] == pytest.approx(np.full(2, net * vehicle.weight), rel=1e-3)
 
 
+def thing(text):
+    """A world's only object."""
+    return f"objects: {{thing: {{{text}}}}}"
+
+
+FLOORS = {
+    "seabed": "seabed: {depth: 6, size: [12, 12], spacing: 2.0, roughness: {rms: 0.2, wavelength: 8.0}}",
+    "slope": "seabed: {depth: 6, slope: [0.1, -0.05]}",
+    "box": thing("shape: box, position: [0, 0, -6.2], size: [4, 4, 0.4], vary: {position: [0, 0, 0.3], yaw: 3}"),
+    "disc": thing("shape: cylinder, position: [0, 0, -6.2], radius: 2, length: 0.4"),
+    "rails": thing("shape: capsule, position: [0, -0.1, -6.2], radius: 0.2, length: 4, axis: [1, 0, 0],"
+                   "repeat: {count: 2, step: [0, 0.2, 0]}"),
+    "domes": thing("shape: sphere, position: [0, -0.15, -6.2], radius: 0.2, repeat: {count: 2, step: [0, 0.3, 0]}}, "
+                   "m: {shape: sphere, position: [-0.2, 0, -6.2], radius: 0.2, repeat: {count: 2, step: [0.4, 0, 0]}"),
+    "hollow": thing("shape: mesh, file: hollow.stl, position: [0, 0, -6], yaw: 0.3"),
+}  # fmt: skip
+
+
+def write_hollow(path):
+    """A closed block whose top falls by 0.3 m to its middle line, as an STL of text; its convex hull would be level."""
+    corners = {(a, y, b): np.array([2.0 * a, y, 0.6 * abs(a) * b - 0.3 * (1 - b)])
+               for a in (-1, 0, 1) for y in (-2, 2) for b in (0, 1)}  # fmt: skip
+    quads = [
+        [(a, -2, b), (a + 1, -2, b), (a + 1, 2, b), (a, 2, b)][:: 2 * b - 1] for a in (-1, 0) for b in (0, 1)
+    ]
+    for a in (-1, 0):
+        quads += [[(a, y, 0), (a + 1, y, 0), (a + 1, y, 1), (a, y, 1)][:: -y // 2] for y in (-2, 2)]
+    quads += [[(x, -2, 0), (x, 2, 0), (x, 2, 1), (x, -2, 1)][::x] for x in (-1, 1)]
+    lines = ["solid hollow"]
+    for quad in quads:
+        for triangle in ((0, 1, 2), (0, 2, 3)):
+            points = ["vertex {} {} {}".format(*corners[quad[k]]) for k in triangle]
+            lines += ["facet normal 0 0 0", "outer loop", *points, "endloop", "endfacet"]
+    path.write_text("\n".join([*lines, "endsolid hollow"]), encoding="utf-8")
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_a_vehicle_rests_where_a_rigid_body_rests(floor, world, tmp_path):
+    """Heavy by 5 %, let go above each solid of a drawn world: pose as MuJoCo's, whose contacts are hard.
+
+    The spheres of the hull lie a tenth of the least half extent inside the faces, and penalties are a few millimetres.
+    """
+    pytest.importorskip("mujoco")
+    from reference.rigid import rest_pose
+
+    write_hollow(tmp_path / "hollow.stl")
+    vehicle = FINSROV.replace({"body.displaced_volume": 0.95 * FINSROV.body.mass / FINSROV.water.density})
+    layout = WorldLayout(world(FLOORS[floor] + "\ncontact: {friction: 2.0}"))
+    layout.draw(5)
+    start = (1.4, 0.6, -5.6) if floor == "seabed" else (0.0, 0.0, -5.6)  # within one triangle
+    simulator = Simulator(vehicle, world=layout, threads=1)
+    simulator.place(start)
+    for _ in range(80):
+        simulator.step()
+    position, R = rest_pose(vehicle, layout, start)
+    near = 0.1 * HALF.min() + 0.006
+    assert np.abs(simulator.numpy("position")[0, 0] - position).max() < near
+    assert np.abs(rotation(simulator.numpy("quaternion")[0, 0]) - R).max() < near / HALF[1]
+
+
 SHAPES = {
     "box": "{shape: box, position: [1.2, 0, -5], size: [0.8, 0.8, 0.8], yaw: 0.4}",
     "plane": "{shape: plane, position: [0.9, 0, -5], axis: [-1, 0.2, 0.1]}",

@@ -11,16 +11,9 @@ from finssim.geometry.frames import (
     TO_CONTROLLER,
     TO_FOSSEN,
     TO_OPTICAL,
-    acceleration_from_mujoco,
     camera_from_optical,
-    mujoco_acceleration,
-    mujoco_inertia,
-    mujoco_velocity,
     optical_from_camera,
-    velocity_from_mujoco,
-    wrench_from_mujoco,
     wxyz_from_xyzw,
-    xyzw_from_wxyz,
 )
 from finssim.geometry.rotations import quat_from_euler, quat_rotate, quat_to_matrix
 
@@ -124,50 +117,5 @@ def test_a_camera_looks_along_its_optical_z():
     )
 
 
-def test_mujoco_puts_w_first():
+def test_wxyz_has_w_first():
     np.testing.assert_array_equal(wxyz_from_xyzw([1, 2, 3, 4]), [4, 1, 2, 3])
-    np.testing.assert_array_equal(xyzw_from_wxyz(wxyz_from_xyzw(Q)), Q)
-
-
-@pytest.mark.slow  # importing MuJoCo's viewer starts a process
-def test_mujoco_free_joint_moves_as_the_body_does():
-    """A free joint with our velocity advances its position along our body's motion, and turns about its axes."""
-    mujoco = pytest.importorskip("mujoco")
-    joint = "<mujoco><worldbody><body><freejoint/><geom size='0.1'/></body></worldbody></mujoco>"
-    model = mujoco.MjModel.from_xml_string(joint)
-    model.opt.gravity[:] = 0.0
-    q, nu, dt = Q[0], TWIST[0], 1e-6
-    end = np.concatenate([np.zeros(3), wxyz_from_xyzw(q)])
-    mujoco.mj_integratePos(model, end, mujoco_velocity(nu, q), dt)
-    np.testing.assert_allclose(end[:3] / dt, quat_rotate(q, nu[:3]))
-    turned = (Rotation.from_quat(q).inv() * Rotation.from_quat(xyzw_from_wxyz(end[3:]))).as_rotvec()
-    np.testing.assert_allclose(turned / dt, nu[3:], atol=1e-8)
-    np.testing.assert_allclose(velocity_from_mujoco(mujoco_velocity(TWIST, Q), Q), TWIST, atol=1e-14)
-
-
-@pytest.mark.slow  # importing MuJoCo's viewer starts a process
-def test_mujoco_free_joint_accelerates_as_the_body_does():
-    """A lopsided rigid body under a wrench: Kirchhoff's equations in our coordinates give MuJoCo's qacc and inertia."""
-    mujoco = pytest.importorskip("mujoco")
-    mass, r_g, inertia = 3.0, np.array([0.1, -0.2, 0.3]), np.diag([0.3, 0.4, 0.5])
-    body = f"<freejoint/><inertial pos='0.1 -0.2 0.3' mass='{mass}' diaginertia='0.3 0.4 0.5'/>"
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody><body>{body}</body></worldbody></mujoco>")
-    model.opt.gravity[:] = 0.0
-    data = mujoco.MjData(model)
-    q, nu, tau = Q[0], TWIST[0], TWIST[1]
-    S = np.array([np.cross(r_g, e) for e in np.eye(3)]).T
-    M = np.block([[mass * np.eye(3), -mass * S], [mass * S, inertia - mass * S @ S]])
-    p, h = (M @ nu)[:3], (M @ nu)[3:]
-    coriolis = np.concatenate([np.cross(nu[3:], p), np.cross(nu[:3], p) + np.cross(nu[3:], h)])
-    nu_dot = np.linalg.solve(M, tau - coriolis)
-
-    data.qpos[3:] = wxyz_from_xyzw(q)
-    data.qvel[:] = mujoco_velocity(nu, q)
-    data.qfrc_applied[:3], data.qfrc_applied[3:] = quat_rotate(q, tau[:3]), tau[3:]
-    mujoco.mj_forward(model, data)
-    np.testing.assert_allclose(data.qacc, mujoco_acceleration(nu_dot, nu, q), atol=1e-12)
-    np.testing.assert_allclose(acceleration_from_mujoco(data.qacc, nu, q), nu_dot, atol=1e-12)
-    np.testing.assert_allclose(wrench_from_mujoco(data.qfrc_applied, q), tau, atol=1e-14)
-    momentum = np.zeros(6)
-    mujoco.mj_mulM(model, data, momentum, data.qvel)
-    np.testing.assert_allclose(mujoco_inertia(M, q) @ data.qvel, momentum, atol=1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.engine import Scene, Simulator, SimulatorError
+from finssim.engine import Simulator
 from finssim.worlds import CameraBatch, RangeBatch, WorldBatch, WorldLayout, load_device, load_world
 
 WATER = "water: {attenuation: [0, 0, 0], veil: [0, 0, 0], daylight_attenuation: [0, 0, 0]}\n"
@@ -56,18 +56,6 @@ def test_a_vehicle_rests_on_a_ball_of_its_world(site):
         simulator.step()
         force = simulator.solids.force.numpy()[:, 0]
         assert np.all(force > 0.0) if touches else np.all(force == 0.0), force
-
-
-def test_a_scene_refuses_sizes_that_change(site):
-    """MuJoCo keeps sizes: those of the draw before it was made."""
-    pytest.importorskip("mujoco")
-    layout = WorldLayout(site(BALL))
-    layout.draw(5)
-    scene = Scene("finsrov", world=layout)
-    scene.step()
-    layout.draw(6)
-    with pytest.raises(SimulatorError, match="draw first, then make the scene"):
-        scene.step()
 
 
 @pytest.mark.slow

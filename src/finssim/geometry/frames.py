@@ -6,7 +6,7 @@
 | Fossen | x forward, y right, z down | z down (x shared with ours) | right-handed |
 | paper's controller | x forward, y up, z left | y up, y = 0 on the water surface | LEFT-handed |
 | camera optical | x right, y down, z along the view | - | right-handed |
-| MuJoCo | ours | ours | wxyz; free joints mix world and body |
+| ArduSub's JSON, MuJoCo | - | - | wxyz |
 
 `TO_X.vector(v)` writes our vector in X's axes, `FROM_X.vector(v)` brings it back. Every function takes a leading
 `...` batch.
@@ -21,10 +21,7 @@ import numpy.typing as npt
 
 from finssim.geometry.rotations import (
     matrix_to_quat,
-    quat_inverse_rotate,
     quat_multiply,
-    quat_rotate,
-    quat_to_matrix,
 )
 
 Array = npt.NDArray[np.float64]
@@ -121,77 +118,5 @@ def camera_from_optical(q_wo: npt.ArrayLike) -> Array:
 
 
 def wxyz_from_xyzw(q: npt.ArrayLike) -> Array:
-    """Quaternion as MuJoCo orders it, (..., 4)."""
+    """Return a quaternion (xyzw) in the order wxyz, of ArduSub's JSON and of MuJoCo, (..., 4)."""
     return np.roll(np.asarray(q, float), 1, axis=-1)
-
-
-def xyzw_from_wxyz(q: npt.ArrayLike) -> Array:
-    """Quaternion as we order it, (..., 4)."""
-    return np.roll(np.asarray(q, float), -1, axis=-1)
-
-
-def mujoco_velocity(nu: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
-    """A free joint's qvel: linear velocity in the world, angular in the body, from `nu` in the body.
-
-    Args:
-        nu: Twist, body frame [m/s, rad/s], (..., 6).
-        quaternion: Body to world, xyzw, (..., 4).
-
-    Returns:
-        qvel [m/s, rad/s], (..., 6).
-    """
-    nu = np.asarray(nu, float)
-    return np.concatenate([quat_rotate(quaternion, nu[..., :3]), nu[..., 3:]], axis=-1)
-
-
-def velocity_from_mujoco(qvel: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
-    """`nu` in the body frame from a free joint's qvel, (..., 6)."""
-    qvel = np.asarray(qvel, float)
-    return np.concatenate([quat_inverse_rotate(quaternion, qvel[..., :3]), qvel[..., 3:]], axis=-1)
-
-
-def mujoco_acceleration(nu_dot: npt.ArrayLike, nu: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
-    """A free joint's qacc from `nu_dot`: d(R v)/dt = R (v_dot + omega x v), and omega_dot as it is.
-
-    Args:
-        nu_dot: Derivative of `nu`, body frame [m/s², rad/s²], (..., 6).
-        nu: Twist, body frame [m/s, rad/s], (..., 6).
-        quaternion: Body to world, xyzw, (..., 4).
-
-    Returns:
-        qacc, linear in the world, angular in the body [m/s², rad/s²], (..., 6).
-    """
-    return mujoco_velocity(np.asarray(nu_dot, float) + _turning(nu), quaternion)
-
-
-def acceleration_from_mujoco(qacc: npt.ArrayLike, nu: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
-    """`nu_dot` from a free joint's qacc: the inverse of `mujoco_acceleration`.
-
-    Args:
-        qacc: Linear in the world, angular in the body [m/s², rad/s²], (..., 6).
-        nu: Twist, body frame [m/s, rad/s], (..., 6).
-        quaternion: Body to world, xyzw, (..., 4).
-
-    Returns:
-        Derivative of `nu`, body frame [m/s², rad/s²], (..., 6).
-    """
-    return np.asarray(velocity_from_mujoco(qacc, quaternion) - _turning(nu))
-
-
-def _turning(nu: npt.ArrayLike) -> Array:
-    """[omega x v; 0]: what the linear acceleration has in the world and `nu_dot` has not, body axes, (..., 6)."""
-    v, omega = np.split(np.asarray(nu, float), 2, axis=-1)
-    return np.concatenate([np.cross(omega, v), np.zeros_like(v)], axis=-1)
-
-
-def mujoco_inertia(M: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
-    """A 6x6 inertia about the body origin in a free joint's coordinates, (..., 6, 6): the same energy for its qvel."""
-    T = np.zeros((*np.shape(quaternion)[:-1], 6, 6))
-    T[..., :3, :3] = quat_to_matrix(quaternion)
-    T[..., 3:, 3:] = np.eye(3)
-    return np.asarray(T @ np.asarray(M, float) @ np.swapaxes(T, -1, -2))
-
-
-def wrench_from_mujoco(qfrc: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
-    """Wrench about the body origin, body frame, from the generalised force of a free joint, (..., 6)."""
-    return velocity_from_mujoco(qfrc, quaternion)
