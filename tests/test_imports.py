@@ -64,7 +64,6 @@ HOMES = {
         "learning/layers.py",
         "learning/learners/catalogue.py",
         "learning/learners/distill.py",
-        "learning/learners/gail.py",
         "learning/learners/imitation.py",
         "learning/learners/rsl_rl_ppo.py",
         "learning/learners/sb3.py",

@@ -68,7 +68,7 @@ def train(
             your own, FILE.py:CLASS.
         out (DIR): Directory of the policy; an earlier policy there is replaced at the end.
         learner (NAME): Learner: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; one agent also torchrl-ppo,
-            several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; tasks with images
+            several torchrl-ippo or torchrl-mappo; from demonstrations bc or dagger; tasks with images
             distill, their default; or your own, FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.

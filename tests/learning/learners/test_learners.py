@@ -15,7 +15,7 @@ from finssim.learning.resume import read_state, write_state
 from finssim.tasks import TASKS, task_named
 from reference.guess import BEST, Guess, GuessTogether
 
-IMITATING = ("bc", "dagger", "gail", "distill")
+IMITATING = ("bc", "dagger", "distill")
 """Tested where demonstrations and pictures are."""
 REINFORCED = [name for name in LEARNERS if name not in IMITATING]
 ONE = [name for name in REINFORCED if LEARNERS[name].agents != "several"]

@@ -166,12 +166,11 @@ LEARNERS: dict[str, LearnerKind] = {
         agents="one",
         sees=True,
     ),
-    "gail": LearnerKind("gail", "Gail", "GAIL: PPO judged against demonstrations", extra="imitation,torchrl"),
 }
 """Learner by the name that commands take."""
 
 
-MAY_BE_ZERO = ("warm_up", "clone_passes", "expert_rounds", "history", "memory")
+MAY_BE_ZERO = ("warm_up", "expert_rounds", "history", "memory")
 """Settings that count what may be left out; of all others there is at least one."""
 LARGEST = 10**9
 """Of anything that is counted."""
