@@ -36,8 +36,10 @@ format: $(STAMP)  ## put the source into the common form
 	$(BIN)/ruff check --fix-only .
 	$(BIN)/ruff format .
 
-bench: $(STAMP)  ## measure speed on this machine
-	$(BIN)/finssim bench
+bench: $(STAMP)  ## measure speed on this machine, and compare speeds with published ones
+	$(BIN)/python benchmarks/engine.py
+	$(BIN)/python benchmarks/cameras.py
+	$(BIN)/python benchmarks/published_responses.py
 
 docs: $(STAMP)  ## build the pages into site/
 	$(BIN)/mkdocs build --strict

@@ -124,7 +124,7 @@ def kinds() -> list[Kind]:
     fitted = "--camera SEEDS/camera.yaml --interface surface --folds 2 --out OUT/pool.yaml"
     return [
         Kind("vehicle", "vehicle.yaml", (
-            "vehicles show {}", "validate {}", "tasks show t1 --vehicle {}",
+            "vehicles show {}", "tasks show t1 --vehicle {}",
             "simulate --vehicle {} --command surge=5 --duration 0.2 --out OUT/run.csv",
             "excite surge --vehicle {} --levels 5 --out OUT/programmes",
             "run --policy pid --goal 0,0,-0.5,0 --vehicle {} --pool-file none --robot udp://127.0.0.1:9 "

@@ -17,8 +17,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from engine import MUJOCO_BODY
 from finssim.engine import Simulator
-from finssim.experiments.bench import _MUJOCO_BODY
 from finssim.tasks import Environment, StationKeeping
 
 VEHICLES = ("finsrov", "bluerov2_heavy", "bluerov2")
@@ -69,7 +69,7 @@ def processor_time(step: Callable[[], object]) -> float:
 
 def speed() -> None:
     """Print nanoseconds of a step of one vehicle, and how many fit into a step of MuJoCo's body."""
-    model = mujoco.MjModel.from_xml_string(_MUJOCO_BODY)
+    model = mujoco.MjModel.from_xml_string(MUJOCO_BODY)
     data = mujoco.MjData(model)
     body = processor_time(lambda: [mujoco.mj_step(model, data) for _ in range(1000)]) / 1000.0
     print(f"MuJoCo, one free body: {1e9 * body:.0f} ns a step")

@@ -21,9 +21,6 @@ COMMANDS = [
     "simulate",
     "vehicles",
     "vehicles show",
-    "validate",
-    "bench",
-    "bench cameras",
     "doctor",
     "trials",
     "trials check",
@@ -56,7 +53,6 @@ COMMANDS = [
     "sweep",
     "record",
     "record info",
-    "report",
     "record repair",
     "play",
     "view",
@@ -266,35 +262,12 @@ def test_pids_are_controllers_like_any(capfd, controller):
         (["evaluate", "pid", "--plant", "currant"], "current"),
         (["evaluate", "pid", "--trials", "0"], "Invalid value for '--trials'"),
         (["evaluate", "pid", "--out", "/proc/x/result"], "write elsewhere"),
-        (["validate", "rexrov"], "available: finsrov"),
-        (["validate", "finsrov", "--hydrodynamics", "fosen"], "unknown hydrodynamic model 'fosen'"),
         (["demo", "--out", "/proc/x/demo"], "write elsewhere"),
-        (["bench", "--device", "tpu"], "device 'tpu' is not available"),
     ],
 )
 def test_experiments_refuse_in_a_sentence(capsys, words, sentence):
-    """What cannot be evaluated, validated, shown or measured is refused before the work."""
+    """What cannot be evaluated or shown is refused before the work."""
     assert sentence in refusal(capsys, *words)
-
-
-def test_validate_as_json(capfd):
-    """Each published response stands beside the simulated one, with a verdict."""
-    assert finssim("validate", "finsrov", "--json") == 0
-    result = json.loads(capfd.readouterr().out)
-    assert result["vehicle"]["name"] == "finsrov"
-    assert {"yaw", "surge", "sway", "heave"} == {response["axis"] for response in result["responses"]}
-    assert all({"simulated", "measured", "agrees"} <= response.keys() for response in result["responses"])
-
-
-def test_validate_takes_the_model_it_is_given(capfd):
-    """Another model is another water: it is named, and the speeds differ."""
-    results = []
-    for model in ("calibrated", "simplified"):
-        assert finssim("validate", "finsrov", "--hydrodynamics", model, "--json") == 0
-        results.append(json.loads(capfd.readouterr().out))
-    assert [result["hydrodynamics"] for result in results] == ["calibrated", "simplified"]
-    speeds = [[response["simulated"] for response in result["responses"]] for result in results]
-    assert speeds[0] != speeds[1]
 
 
 @pytest.mark.parametrize("words", ["vehicles", "tasks", "worlds"])

@@ -12,7 +12,7 @@ from typer.main import get_command
 
 from finssim import boundary, command_line
 from finssim.cli import COMMANDS, SECTIONS, app
-from finssim.command_line import Experiment, command_app, read
+from finssim.command_line import Experiment, command_app, read, run_script
 
 SOURCE = '''
 from __future__ import annotations
@@ -115,6 +115,18 @@ def test_help_is_the_docstring(work, capsys):
     assert "TABLE" in text and "--axes AXES Which. [default: surge,yaw]" in text
 
 
+@pytest.mark.parametrize(
+    ("words", "status"), [(["a.csv", "--deep"], 0), (["a.csv"], 3), ([], 2), (["a.csv", "--rate", "10"], 2)]
+)
+def test_a_script_is_a_command_of_its_own(work, monkeypatch, words, status):
+    """The same words, exit statuses and refusals as a command of `finssim`; words that are missing are refused."""
+    _, calls = work
+    monkeypatch.setattr(sys, "argv", ["thing.py", *words])
+    with pytest.raises(SystemExit) as end:
+        run_script("thing:work")
+    assert end.value.code == status and len(calls) == (status != 2)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("words", COMMANDS)
 def test_what_the_source_says_is_what_python_has(words):
@@ -156,8 +168,8 @@ def test_a_number_without_bounds_is_a_quantity(capsys, tmp_path, number):
     assert list(tmp_path.iterdir()) == []
 
 
-SERVING = {"pool", "teleop", "view", "play", "report", "ros2 up", "ros2 node", "ardusub-sitl"}
-"""Commands that serve, print lines of JSON already, or edit pages."""
+SERVING = {"pool", "teleop", "view", "play", "ros2 up", "ros2 node", "ardusub-sitl"}
+"""Commands that serve, or print lines of JSON already."""
 
 
 @pytest.mark.parametrize("words", [words for words in COMMANDS if words not in SERVING])

@@ -104,10 +104,7 @@ HOMES = {
     "newton": {"worlds/model.py"},
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
-    "mujoco": {
-        "experiments/bench.py",
-        "worlds/parts.py",
-    },
+    "mujoco": {"worlds/parts.py"},
     "pxr": {"worlds/parts.py"},
     "pandas": {"engine/recorder.py", "learning/lerobot.py"},
     "pyarrow": {"calibration/trials/trial_files.py", "engine/recorder.py", "learning/lerobot.py"},

@@ -15,7 +15,7 @@ REFUSED = 2
 INTERRUPTED = 130
 
 
-def run(app: typer.Typer, arguments: Sequence[str]) -> int:
+def run(app: typer.Typer, arguments: Sequence[str], *, script: str | None = None) -> int:
     """Run a command and turn what it refuses into one sentence on standard error.
 
     A refusal is a usage error, an error of the system (OSError), too little memory, an extra that is not installed, or
@@ -25,13 +25,17 @@ def run(app: typer.Typer, arguments: Sequence[str]) -> int:
 
     Args:
         app: The commands.
-        arguments: The words after the program's name; none asks for help.
+        arguments: The words after the program's name; without any, `finssim` prints its help.
+        script: Module of a program other than `finssim`, whose ValueErrors are refusals too.
 
     Returns:
         The exit status: 0 well, 2 refused, 130 interrupted, or what the command itself gave.
     """
     try:
-        status = app(list(arguments) or ["--help"], prog_name="finssim", standalone_mode=False)
+        if script is None:
+            status = app(list(arguments) or ["--help"], prog_name="finssim", standalone_mode=False)
+        else:
+            status = app(list(arguments), standalone_mode=False)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -39,7 +43,7 @@ def run(app: typer.Typer, arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         status = INTERRUPTED
     except Exception as error:
-        sentence = refusal(error)
+        sentence = refusal(error, script or "finssim")
         if sentence is None or os.environ.get("FINSSIM_DEBUG") == "1":
             raise
         _say(sentence)
@@ -49,8 +53,13 @@ def run(app: typer.Typer, arguments: Sequence[str]) -> int:
     return status if isinstance(status, int) else 0
 
 
-def refusal(error: Exception) -> str | None:
-    """The sentence for an error that is the input's or the system's, or None for a fault of FinsSim."""
+def refusal(error: Exception, script: str = "finssim") -> str | None:
+    """Return the sentence for an error of the input or the system, or None for a fault of FinsSim.
+
+    Args:
+        error: The error.
+        script: Module of the program that runs.
+    """
     if hasattr(error, "format_message"):  # a usage error of the command line
         return str(error.format_message())
     if isinstance(error, ModuleNotFoundError):
@@ -60,7 +69,7 @@ def refusal(error: Exception) -> str | None:
     if isinstance(error, MemoryError):
         return f"not enough memory: {error or 'a requested size is too large'}: ask for less"
     if isinstance(error, ValueError) and (
-        _is_ours(type(error).__module__) or _raised_by_us(error.__traceback__)
+        _is_ours(type(error).__module__, script) or _raised_by_us(error.__traceback__, script)
     ):
         return str(error)
     return None
@@ -78,15 +87,15 @@ def _system_error(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-def _raised_by_us(traceback: TracebackType | None) -> bool:
-    """Whether the innermost frame is FinsSim's: a `raise` of ours, and not a fault deep in a library that we called."""
+def _raised_by_us(traceback: TracebackType | None, script: str) -> bool:
+    """Return whether the innermost frame is a `raise` of FinsSim or the script, and not a fault deep in a library."""
     while traceback is not None and traceback.tb_next is not None:
         traceback = traceback.tb_next
-    return traceback is not None and _is_ours(traceback.tb_frame.f_globals.get("__name__", ""))
+    return traceback is not None and _is_ours(traceback.tb_frame.f_globals.get("__name__", ""), script)
 
 
-def _is_ours(module: str) -> bool:
-    return module.partition(".")[0] == "finssim"
+def _is_ours(module: str, script: str) -> bool:
+    return module.partition(".")[0] in ("finssim", script.partition(".")[0])
 
 
 def _say(sentence: str) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from finssim import __version__, boundary
-from finssim.command_line import Experiment, command_app
+from finssim.command_line import CONTEXT, Experiment, command_app
 from finssim.system import announce, replace_unwritable
 
 SECTIONS: dict[str, dict[str, str | Experiment]] = {
@@ -77,10 +77,6 @@ SECTIONS: dict[str, dict[str, str | Experiment]] = {
         "experiment faults": Experiment("finssim.experiments.faults:faults_experiment"),
         "experiment soak": Experiment("finssim.experiments.soak:soak"),
         "experiment stack": Experiment("finssim.experiments.stack:play"),
-        "validate": Experiment("finssim.experiments.validate:validate"),
-        "bench": Experiment("finssim.experiments.bench:bench"),
-        "bench cameras": Experiment("finssim.experiments.bench_cameras:bench_cameras"),
-        "report": "finssim.experiments.report:report",
     },
 }
 """Section of the help -> words of a command -> what it does, in the order of a user's path."""
@@ -106,7 +102,7 @@ app = command_app(
     name="finssim",
     help="Identify, locate and simulate underwater vehicles, train controllers, and deploy them.",
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    context_settings=CONTEXT,
 )
 
 

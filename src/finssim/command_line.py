@@ -35,12 +35,14 @@ from functools import cache
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 import typer.core
 
+from finssim import boundary
 from finssim.files import sole_writer
+from finssim.system import replace_unwritable
 
 ROOT = Path(__file__).parents[1]
 KINDS: Mapping[str, Any] = {
@@ -56,6 +58,7 @@ MAKERS = {
 SEEDS = (0, 2**31 - 1)
 LARGEST = 1e9
 """Of a number on the command line, whatever its unit."""
+CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 SETTINGS: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
 WRITTEN = ("out", "lerobot")
 """Options whose directories are written."""
@@ -171,7 +174,10 @@ def loaded(path: str) -> Callable[..., Any]:
 def read(path: str) -> Definition:
     """Read a function, or a dataclass of settings, from its source."""
     module, _, name = path.partition(":")
-    source = (ROOT / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8")
+    file = ROOT / (module.replace(".", "/") + ".py")
+    if not file.is_file():  # a module outside the package, such as __main__
+        file = Path(str(import_module(module).__file__))
+    source = file.read_text(encoding="utf-8")
     start = re.search(rf"^(def {name}\(|class {name}[(:])", source, re.MULTILINE)
     assert start is not None, path
     text = re.split(r"\n(?=[^\s)#])", source[start.start() :], maxsplit=1)[0]
@@ -313,6 +319,19 @@ def command_app(
             options = {"allow_extra_args": True, "ignore_unknown_options": True} if extra else None
             (apps[first] if last else app).command(last or first, context_settings=options)(handler)
     return app
+
+
+def run_script(work: Work) -> NoReturn:
+    """Run a function as a program of its own, whose options are those of its signature, and exit.
+
+    Args:
+        work: The function, module:function, or an experiment; the module may be `__main__`.
+    """
+    path = work.work if isinstance(work, Experiment) else work
+    app = typer.Typer(**SETTINGS, pretty_exceptions_enable=False, context_settings=CONTEXT)
+    app.command()(_handler(path.rpartition(":")[2], work))
+    replace_unwritable(sys.stdout, sys.stderr)
+    sys.exit(boundary.run(app, sys.argv[1:], script=path.partition(":")[0]))
 
 
 def _group(title: str) -> Callable[..., None]:

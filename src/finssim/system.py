@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import _thread
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -89,6 +90,15 @@ def parent_runs(pid: int) -> bool:
         return bool(kernel.WaitForSingleObject(handle, 0) == timeout)
     finally:
         kernel.CloseHandle(handle)
+
+
+def processor_name() -> str:
+    """Return the model of this machine's processor, or its architecture where the system names none."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            return next(line.split(":")[1].strip() for line in file if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
 
 
 def peak_memory() -> float:

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.reference.observed import published_t1
 
 from finssim.control.guidance import Station
 from finssim.experiments.records import collect_records
@@ -22,6 +21,7 @@ from finssim.robot.runtime import Runtime
 from finssim.tasks import make
 from finssim.tasks.agents import PidAgent
 from finssim.vehicles import load_vehicle
+from tests.reference.observed import published_t1
 
 pytestmark = pytest.mark.slow
 

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.reference.observed import published_t2
 
 from finssim.control.trajectories import TRAJECTORIES, load_trajectory
 from finssim.engine import Pool
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping, TrajectoryTracking, follow
 from finssim.tasks.trajectory_tracking import LEVELS
+from tests.reference.observed import published_t2
 
 TASK = TrajectoryTracking()
 GUIDES = tuple(TRAJECTORIES.values())

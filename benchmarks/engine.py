@@ -1,30 +1,34 @@
-"""`finssim bench`: how fast this machine simulates, as rates and as ratios to MuJoCo stepping one free body."""
+"""Speed of the simulation on this machine: `python benchmarks/engine.py [--json] [--device cuda]`.
+
+Rates of physics, of the environment of T1 and of hull triangles, and the ratio to MuJoCo stepping one free body.
+"""
 
 from __future__ import annotations
 
 import os
-import platform
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from finssim.command_line import Experiment, run_script
 from finssim.engine import Simulator
 from finssim.engine.launch import default_threads
 from finssim.engine.simulator import find_device
-from finssim.experiments.campaign import Progress
 from finssim.experiments.tables import Table
+from finssim.progress import Progress
 from finssim.provenance import provenance
-from finssim.system import peak_memory
+from finssim.system import peak_memory, processor_name
 from finssim.tasks import Environment, StationKeeping
 
 SECONDS = 1.0
-"""Time each figure is measured for; the best of its rounds counts, since other load only ever slows one down."""
+"""Time for which each figure is measured [s]; the best round counts, since other load only slows a round down."""
 ROUNDS = 10
 PHYSICS_SUBSTEPS = 4
 PHYSICS_STEP = 0.04
@@ -33,20 +37,17 @@ ACTIONS = ("thruster8", "wrench6")
 WORLDS = (1, 4096)
 MEMORY_WORLDS = 16384
 
-_MUJOCO_BODY = """<mujoco><option timestep="0.01" integrator="Euler"/><worldbody><body><freejoint/>
+MUJOCO_BODY = """<mujoco><option timestep="0.01" integrator="Euler"/><worldbody><body><freejoint/>
 <inertial pos="0 0 0" mass="12" diaginertia="0.13 0.23 0.25"/></body></worldbody></mujoco>"""
 
 
 def best_rate(step: Callable[[], object], work: float, finish: Callable[[], object] = lambda: None) -> float:
-    """Work done per second in the best of several rounds, which take `SECONDS` in all.
+    """Return the work done per second of wall time in the best of several rounds, which take `SECONDS` in total.
 
     Args:
-        step: What is timed; called often enough to fill the time.
-        work: Done by one call.
-        finish: Waits for what steps have started; a GPU works on after a step returns.
-
-    Returns:
-        Work per second of wall time.
+        step: Function that is timed; called often enough to fill the time.
+        work: Work that one call does.
+        finish: Waits for the work that steps have started: a GPU continues after a step returns.
     """
     step()
     finish()
@@ -65,7 +66,7 @@ def best_rate(step: Callable[[], object], work: float, finish: Callable[[], obje
 
 
 def physics_rate(model: str, worlds: int, threads: int | None = None, device: str = "cpu") -> float:
-    """Control steps per second: FinsROV, full 6x6 matrices, thrusters with lag and delay, 4 substeps, random thrust."""
+    """Measure control steps per second: FinsROV, 6x6 matrices, thruster lag and delay, 4 substeps, random thrust."""
     simulator = Simulator(
         "finsrov",
         worlds=worlds,
@@ -81,7 +82,7 @@ def physics_rate(model: str, worlds: int, threads: int | None = None, device: st
 
 
 def environment_rate(action: str, worlds: int, threads: int | None = None, device: str = "cpu") -> float:
-    """T1 environment steps per second at 10 Hz with 10 substeps: allocation, observation, reward and reset included."""
+    """Measure T1 steps per second at 10 Hz: physics, allocation, observation, reward and reset included."""
     environment = Environment(StationKeeping(), worlds=worlds, action=action, threads=threads, device=device)
     random = np.random.default_rng(0)
     actions = [
@@ -92,19 +93,19 @@ def environment_rate(action: str, worlds: int, threads: int | None = None, devic
 
 
 def faces_rate(worlds: int = 1024) -> float:
-    """Hull triangles per second and core in the whole mesh model: one thread, wholly submerged."""
+    """Measure hull triangles per second and core with the mesh model: one thread, fully submerged."""
     simulator = Simulator("finsrov", hydrodynamics="mesh")
     faces = len(simulator.vehicles[0].hull_mesh()[1])
     return physics_rate("mesh", worlds, threads=1) * PHYSICS_SUBSTEPS * faces
 
 
 def mujoco_rate() -> float | None:
-    """Steps per second of MuJoCo with one free body; None where it is not installed."""
+    """Measure steps per second of MuJoCo with one free body; None where it is not installed."""
     try:
         import mujoco
     except ImportError:
         return None
-    model = mujoco.MjModel.from_xml_string(_MUJOCO_BODY)
+    model = mujoco.MjModel.from_xml_string(MUJOCO_BODY)
     data = mujoco.MjData(model)
 
     def thousand() -> None:
@@ -115,13 +116,16 @@ def mujoco_rate() -> float | None:
 
 
 def memory_mb(worlds: int) -> float:
-    """Peak resident memory of a process that runs T1 in `worlds` worlds [MB], the interpreter included."""
-    program = f"from finssim.experiments.bench import _use_memory; _use_memory({worlds})"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, encoding="utf-8", check=True)
+    """Measure the peak resident memory of a process that runs T1 in `worlds` worlds [MB], interpreter included."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"from engine import use_memory; use_memory({worlds})"],
+        cwd=Path(__file__).parent, capture_output=True, encoding="utf-8", check=True,
+    )  # fmt: skip
     return float(done.stdout.split()[-1])
 
 
-def _use_memory(worlds: int) -> None:
+def use_memory(worlds: int) -> None:
+    """Step T1 in `worlds` worlds, and print the peak memory of this process [MB]."""
     environment = Environment(StationKeeping(), worlds=worlds)
     action = np.zeros((worlds, environment.action_size), dtype=np.float32)
     for _ in range(3):
@@ -130,25 +134,19 @@ def _use_memory(worlds: int) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    model = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            model = next(line.split(":")[1].strip() for line in file if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass
+    """Describe the machine: processor, threads, load and versions."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    return {"processor": model, "threads": default_threads(), "load_1min": load, **provenance()}
+    return {"processor": processor_name(), "threads": default_threads(), "load_1min": load, **provenance()}
 
 
 def bench(*, device: str = "cpu", progress: Progress = lambda part, text: None) -> dict[str, Any]:
     """Measure this machine's speed: physics steps/s, environment steps/s, mesh faces/s.
 
-    Example: finssim bench --json > bench.json
+    Example: python benchmarks/engine.py --json > engine.json
 
     Args:
         device (DEVICE): Compute device: cpu or cuda.
-        progress: Told the share that is done and what is measured next.
+        progress: Receives the completed fraction and the next figure.
     """
     find_device(device)  # refuses one that is not there before anything is measured
     plan: dict[tuple[str, str], Callable[[], float | None]] = {
@@ -182,7 +180,7 @@ def bench(*, device: str = "cpu", progress: Progress = lambda part, text: None) 
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """Rates of this machine."""
+    """Return the rates of this machine as a table."""
     rates = {
         **{f"physics, {name}": rate for name, rate in result["physics_steps_per_s"].items()},
         **{f"T1, {name}": rate for name, rate in result["env_steps_per_s"].items()},
@@ -200,3 +198,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         + f"; on {on['processor']}, {on['threads']} threads, load {on['load_1min']}",
     )
     return [table]
+
+
+if __name__ == "__main__":
+    run_script(Experiment("__main__:bench"))

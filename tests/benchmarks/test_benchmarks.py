@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 ASK_EACH = """
 import contextlib, io, runpy, sys, traceback
@@ -18,7 +18,7 @@ for path in sys.argv[1:]:
         with contextlib.redirect_stdout(text):
             runpy.run_path(path, run_name="__main__")
     except SystemExit as stop:
-        status = "" if stop.code == 0 and "usage:" in text.getvalue() else f"--help ends with {stop.code}"
+        status = "" if stop.code == 0 and "usage:" in text.getvalue().lower() else f"--help ends with {stop.code}"
     except BaseException:
         status = traceback.format_exc()
     if status:
@@ -32,6 +32,6 @@ def test_every_benchmark_loads_and_answers_help():
     paths = sorted(map(str, BENCHMARKS.glob("*.py")))
     assert len(paths) > 20
     done = subprocess.run(
-        [sys.executable, "-c", ASK_EACH, *paths], capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", ASK_EACH, *paths], capture_output=True, text=True, timeout=300, cwd=BENCHMARKS
     )
     assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr

@@ -1,4 +1,4 @@
-"""`finssim report`: what a page is filled with, what it asks for in vain, and the pages that ship."""
+"""`tools/report.py`: tables in pages, requests that are refused, and the pages of this repository."""
 
 import json
 import shutil
@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from finssim.experiments.report import ReportError, filled, report
+from tools.report import ReportError, filled, report
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 RESULTS = sorted((ROOT / "results").glob("*.json"))
 PAGES = [
     ROOT / "README.md",
@@ -42,7 +42,7 @@ ANATOMY = {
 def test_the_pages_that_ship_say_what_the_results_do():
     """Every figure of their tables comes out of `results/`."""
     assert RESULTS and report(RESULTS, into=PAGES, check=True) == 0
-    assert all("<!-- finssim report: " in page.read_text(encoding="utf-8") for page in PAGES)
+    assert all("<!-- report: " in page.read_text(encoding="utf-8") for page in PAGES)
 
 
 def test_a_block_is_filled_and_the_rest_stays(tmp_path):
@@ -50,15 +50,15 @@ def test_a_block_is_filled_and_the_rest_stays(tmp_path):
     page, result = tmp_path / "page.md", tmp_path / "anatomy.json"
     result.write_text(json.dumps(ANATOMY))
     page.write_text(
-        "before\n<!-- finssim report: anatomy -->\nold\n<!-- end -->\nbetween\n"
-        "<!-- finssim report: anatomy table=2 columns=0,1 rows=Row B;Row A -->\n<!-- end -->\nafter\n"
+        "before\n<!-- report: anatomy -->\nold\n<!-- end -->\nbetween\n"
+        "<!-- report: anatomy table=2 columns=0,1 rows=Row B;Row A -->\n<!-- end -->\nafter\n"
     )
     assert report([result], into=[page], check=True) == 1 and "old" in page.read_text()
     assert report([result], into=[page]) == 0
     assert page.read_text() == (
-        "before\n<!-- finssim report: anatomy -->\n| wrong | a | b |\n| --- | --: | --: |\n"
+        "before\n<!-- report: anatomy -->\n| wrong | a | b |\n| --- | --: | --: |\n"
         "| slower by [s] | 0 | 0.1+ |\n<!-- end -->\nbetween\n"
-        "<!-- finssim report: anatomy table=2 columns=0,1 rows=Row B;Row A -->\n|  | held |\n| --- | --: |\n"
+        "<!-- report: anatomy table=2 columns=0,1 rows=Row B;Row A -->\n|  | held |\n| --- | --: |\n"
         "| Row B | 1.000 [1.000, 1.000] |\n| Row A | 0.500 [0.500, 0.500] |\n<!-- end -->\nafter\n"
     )
     assert report([result], into=[page], check=True) == 0
@@ -80,7 +80,7 @@ def test_a_result_in_sentences_is_a_list():
         "missed_decisions": 0,
         "decisions": 1440000,
     }
-    page = filled("<!-- finssim report: soak -->\n<!-- end -->", {"soak": soaked}, "page")
+    page = filled("<!-- report: soak -->\n<!-- end -->", {"soak": soaked}, "page")
     assert page.splitlines()[1:4] == [
         "- 20.00 h of vehicle time in 120.0 min, 10.0 times real time",
         "- memory: flat, +0.01 MiB per hour of vehicle time; 340.0 MiB at the start, 341.0 at the end",
@@ -99,17 +99,17 @@ def test_a_result_in_sentences_is_a_list():
 )
 def test_what_there_is_not_is_refused(what, message):
     """With the page and what it asks for."""
-    with pytest.raises(ReportError, match=f"^page: <!-- finssim report: {what} -->: {message}"):
-        filled(f"<!-- finssim report: {what} -->\n<!-- end -->", {"anatomy": ANATOMY}, "page")
+    with pytest.raises(ReportError, match=f"^page: <!-- report: {what} -->: {message}"):
+        filled(f"<!-- report: {what} -->\n<!-- end -->", {"anatomy": ANATOMY}, "page")
 
 
 def test_a_file_that_is_no_result_is_refused(tmp_path):
     """And what it is instead."""
     page = shutil.copy(ROOT / "README.md", tmp_path / "page.md")
     for text, message in (
-        ("no", "is no result"),
-        ("[]", "is no result"),
-        ('{"experiment": "stack"}', "'stack', expected"),
+        ("no", "not the result of"),
+        ("[]", "not the result of"),
+        ('{"experiment": "stack"}', "'stack', expected one of"),
     ):
         (tmp_path / "x.json").write_text(text)
         with pytest.raises(ReportError, match=message):

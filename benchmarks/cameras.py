@@ -1,29 +1,36 @@
-"""`finssim bench cameras`: pictures per second of one core, beside the ray caster that they are made with."""
+"""Images per processor-second: `python benchmarks/cameras.py [--json] [--site SITE] [--device cuda]`.
+
+Cameras and a sonar of vehicles in many worlds, compared with the ray caster that renders them.
+"""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 
+from finssim.command_line import Experiment, run_script
 from finssim.engine import Simulator
-from finssim.experiments.bench import machine
-from finssim.experiments.campaign import Progress
+from finssim.engine.launch import default_threads
 from finssim.experiments.tables import Table
-from finssim.system import peak_memory
+from finssim.progress import Progress
+from finssim.provenance import provenance
+from finssim.system import peak_memory, processor_name
 from finssim.worlds import CameraBatch, SonarBatch, WorldBatch, load_device, load_world, poses_of
 from finssim.worlds.description import CameraDevice, SonarDevice
 
 SIZES = (16, 32, 64, 128)
-"""Edges of the pictures [px]."""
+"""Edge lengths of the images [px]."""
 WORLDS = 256
 MEMORY_WORLDS = 1024
 ROUNDS = 5
-"""In turn with the bare sensor; the best of each counts, since other load only ever slows one down."""
+"""Rounds, alternating with the bare sensor; the best of each counts, since other load only slows a round down."""
 VEHICLE = "finsrov"
 
 
@@ -35,12 +42,12 @@ def bench_cameras(
     Each of 256 worlds has a vehicle with a square camera of 90°, and different objects and water. The bare rate is
     that of Newton's SensorCamera alone with depth, shape and normal, measured alternately.
 
-    Example: finssim bench cameras --json
+    Example: python benchmarks/cameras.py --json
 
     Args:
         site (SITE|FILE): Site of the measurement.
         device (DEVICE): Compute device: cpu or cuda.
-        progress: Told the share that is done and what is measured next.
+        progress: Receives the completed fraction and the next figure.
     """
     batch = WorldBatch(load_world(site), worlds=WORLDS, device=device)
     batch.draw(seed=1)
@@ -75,18 +82,27 @@ def bench_cameras(
         "site": batch.world.name,
         "shapes": batch.model.shape_count // WORLDS,
         "device": device,
-        "machine": machine(),
+        "machine": {
+            "processor": processor_name(),
+            "threads": default_threads(),
+            "load_1min": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+            **provenance(),
+        },
     }
 
 
 def square_camera(size: int) -> CameraDevice:
-    """A camera of 90° both ways, `size` pixels wide and high, with the catalogue camera's electronics."""
+    """Return a camera of 90° in both directions, `size` pixels wide and high, with the catalogue camera's electronics.
+
+    Args:
+        size: Width and height [px].
+    """
     camera = load_device("low_light_camera")
     return camera.model_copy(update={"width": size, "height": size, "focal_length": 0.5 * size})
 
 
 def _simulator(batch: WorldBatch) -> Simulator:
-    """Vehicles at the site's viewpoint."""
+    """Place vehicles at the site's viewpoint."""
     simulator = Simulator(VEHICLE, worlds=batch.worlds, threads=1, device=str(batch.device))
     pose = batch.world.viewpoint.pose
     simulator.place(position=pose[:3], quaternion=pose[3:])
@@ -96,7 +112,7 @@ def _simulator(batch: WorldBatch) -> Simulator:
 def _rates(
     clock: Callable[[], float], batch: WorldBatch, full: Callable[[], object], bare: Callable[[], object]
 ) -> tuple[float, float]:
-    """Views per second of two ways to the same rays, the best of rounds in turn."""
+    """Measure views per second of two functions that cast the same rays, the best of alternating rounds."""
     best = [0.0, 0.0]
     for work in (full, bare):
         work()
@@ -111,13 +127,16 @@ def _rates(
 
 
 def memory_mb(site: str, worlds: int) -> float:
-    """Peak resident memory of a process with vehicles and a 64x64 camera in so many worlds, all included [MB]."""
-    program = f"from finssim.experiments.bench_cameras import _use_memory; _use_memory({site!r}, {worlds})"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, encoding="utf-8", check=True)
+    """Measure the peak resident memory of a process with vehicles and a 64x64 camera in `worlds` worlds [MB]."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"from cameras import use_memory; use_memory({site!r}, {worlds})"],
+        cwd=Path(__file__).parent, capture_output=True, encoding="utf-8", check=True,
+    )  # fmt: skip
     return float(done.stdout.split()[-1])
 
 
-def _use_memory(site: str, worlds: int) -> None:
+def use_memory(site: str, worlds: int) -> None:
+    """Step vehicles and cameras in `worlds` worlds, and print the peak memory of this process [MB]."""
     batch = WorldBatch(load_world(site), worlds=worlds)
     simulator = _simulator(batch)
     camera = CameraBatch(batch, square_camera(64))
@@ -128,7 +147,7 @@ def _use_memory(site: str, worlds: int) -> None:
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """Rates of this machine."""
+    """Return the rates of this machine as a table."""
     frames, bare = result["frames_per_s"], result["bare_frames_per_s"]
     rows = [
         [f"camera {s}", f"{frames[s]:,.0f}", f"{bare[s]:,.0f}", f"{result['ratio'][s]:.2f}"] for s in frames
@@ -146,3 +165,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
             f"load {result['machine']['load_1min']}",
         )
     ]
+
+
+if __name__ == "__main__":
+    run_script(Experiment("__main__:bench_cameras"))

@@ -1,4 +1,4 @@
-"""`finssim report`: the tables of pages, made of the results of experiments, so that nobody types a figure."""
+"""Fill the tables of pages from results: `python tools/report.py results/*.json --into docs/experiments.md`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from finssim.command_line import run_script
 from finssim.experiments import anatomy, faults, soak, transfer
 from finssim.experiments.tables import Table, figure_text, markdown_table
 from finssim.files import atomic_write
-
-# The tables of `results/seeing.json`: of tasks that see, what `train`, `evaluate` and `experiment stack` gave.
 
 SEEING_HEADS = (
     "task",
@@ -27,11 +26,11 @@ SEEING_HEADS = (
 
 
 def seeing_tables(result: Mapping[str, Any]) -> list[Table]:
-    """Controllers on the looks that are held out, all seeds together; each seed; and through the stack.
+    """Return the tables of `results/seeing.json`: tasks with images in held-out appearances, and through the stack.
 
     Args:
-        result: `rows` by task, controller and seed, `pooled` over the seeds, `stack` by task: each with `metrics` as
-            `finssim evaluate` has them.
+        result: Results of `train`, `evaluate` and the stack: `rows` by task, controller and seed, `pooled` over the
+            seeds, `stack` by task, each with `metrics` as those of `finssim evaluate`.
     """
 
     def cells(row: Mapping[str, Any]) -> list[str]:
@@ -67,7 +66,7 @@ def seeing_tables(result: Mapping[str, Any]) -> list[Table]:
 
 
 SEEING_KEYS = ("stack", "batch")
-"""Where the same policy was played: through the deployed software, and in the batch."""
+"""Keys of a policy's success through the deployed software, and in the batch."""
 
 
 TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Table]]] = {
@@ -77,23 +76,23 @@ TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Table]]] = {
     "seeing": seeing_tables,
     "soak": soak.tables_of,
 }
-"""Experiment -> the tables of its result."""
+"""Experiment -> function that returns the tables of its result."""
 
-BLOCK = re.compile(r"<!-- finssim report: (?P<what>.*?) -->\n(?P<old>.*?)<!-- end -->", re.DOTALL)
+BLOCK = re.compile(r"<!-- report: (?P<what>.*?) -->\n(?P<old>.*?)<!-- end -->", re.DOTALL)
 
 
 class ReportError(ValueError):
-    """A page asks for a table that the results do not hold."""
+    """A page asks for a table that the results do not contain."""
 
 
 def report(results: Sequence[Path], *, into: Annotated[Sequence[Path], "--into"], check: bool = False) -> int:
     """Fill the tables of Markdown pages from results of experiments.
 
-    A page marks a table with <!-- finssim report: t1 --> and <!-- end -->, for the result in t1.json; options after
+    A page marks a table with <!-- report: t1 --> and <!-- end -->, for the result in t1.json; options after
     the name are table=2 (the second table of the result), columns=0,1,3, rows=calibrated;paper: calibrated (names
     as in the table), and headline=yes. A result in sentences, such as soak, becomes a list.
 
-    Example: finssim report results/t1.json results/anatomy.json --into docs/experiments.md --into README.md
+    Example: python tools/report.py results/t1.json results/anatomy.json --into docs/experiments.md --into README.md
 
     Args:
         results (FILE.json...): Results of experiments t1, t2, anatomy, faults and soak, and `seeing.json`.
@@ -101,7 +100,7 @@ def report(results: Sequence[Path], *, into: Annotated[Sequence[Path], "--into"]
         check: Change nothing; exit status 1 if a page differs from the results.
 
     Raises:
-        ReportError: A file is no result of such an experiment, or a page asks for what there is not.
+        ReportError: A file is no result of such an experiment, or a page asks for a table that does not exist.
     """
     by_name = {path.stem: _read(path) for path in results}
     stale = []
@@ -115,32 +114,32 @@ def report(results: Sequence[Path], *, into: Annotated[Sequence[Path], "--into"]
             with atomic_write(page) as temporary:
                 temporary.write_text(new, encoding="utf-8")
     for page in stale:
-        print(f"{page}: {'does not say what the results do' if check else 'filled'}")
+        print(f"{page}: {'differs from the results' if check else 'filled'}")
     return int(check and bool(stale))
 
 
 def _read(path: Path) -> Mapping[str, Any]:
-    """The result of an experiment."""
+    """Read the result of an experiment."""
     try:
         result: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         name = result["experiment"]
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise ReportError(f"{path}: is no result of an experiment ({error})") from None
+        raise ReportError(f"{path}: not the result of an experiment ({error})") from None
     if name not in TABLES:
-        raise ReportError(f"{path}: is of experiment '{name}', expected one of {', '.join(TABLES)}")
+        raise ReportError(f"{path}: result of experiment '{name}', expected one of {', '.join(TABLES)}")
     return result
 
 
 def filled(page: str, results: Mapping[str, Mapping[str, Any]], name: str) -> str:
-    """A page with its tables made anew.
+    """Return a page with its tables filled from results.
 
     Args:
-        page: Its text.
-        results: Name of its file, without the ending -> result.
-        name: Of the page, for what is refused.
+        page: Text of the page.
+        results: Name of a file without its suffix -> result.
+        name: Name of the page, for refusals.
 
     Raises:
-        ReportError: It asks for what there is not.
+        ReportError: The page asks for a table, row or column that does not exist.
     """
 
     def made(match: re.Match[str]) -> str:
@@ -151,8 +150,8 @@ def filled(page: str, results: Mapping[str, Mapping[str, Any]], name: str) -> st
             result = results[name_of_result]
             text = _table(TABLES[result["experiment"]](result), options[0] if options else "")
         except ReportError as error:
-            raise ReportError(f"{name}: <!-- finssim report: {match['what']} -->: {error}") from None
-        return f"<!-- finssim report: {match['what']} -->\n{text}\n<!-- end -->"
+            raise ReportError(f"{name}: <!-- report: {match['what']} -->: {error}") from None
+        return f"<!-- report: {match['what']} -->\n{text}\n<!-- end -->"
 
     return BLOCK.sub(made, page)
 
@@ -186,3 +185,7 @@ def _table(tables: Sequence[Table], options: str) -> str:
         else "\n".join(f"- {text}" for text in selected.sentences)
     )
     return f"{selected.headline}:\n\n{table}" if chosen.get("headline") == "yes" else table
+
+
+if __name__ == "__main__":
+    run_script("__main__:report")

@@ -1,17 +1,19 @@
-"""Simulated steady speeds beside the published pool speeds."""
+"""Simulated and published steady speeds."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from finssim import boundary
-from finssim.cli import app
-from finssim.experiments.validate import ValidationError, simulate_responses, validate
+from benchmarks.published_responses import ValidationError, simulate_responses, validate
 from finssim.vehicles import load_vehicle
 
+ROOT = Path(__file__).resolve().parents[2]
 FINSROV = load_vehicle("finsrov")
 
 
@@ -50,12 +52,43 @@ def test_applied_is_what_the_thrusters_give(responses: dict[str, dict]) -> None:
     assert responses["surge +18 N"]["applied"] == pytest.approx(18.0, rel=1e-3)
 
 
-def test_the_command_prints_one_object(capsys: pytest.CaptureFixture[str]) -> None:
-    """--json is one JSON object with every response and the vehicle's hash."""
-    assert boundary.run(app, ["validate", "finsrov", "--json"]) == 0
-    out = json.loads(capsys.readouterr().out)
+def test_another_model_gives_other_speeds(responses: dict[str, dict]) -> None:
+    """The result names the model."""
+    result = validate("finsrov", hydrodynamics="simplified")
+    assert result["hydrodynamics"] == "simplified"
+    assert [r["simulated"] for r in result["responses"]] != [r["simulated"] for r in responses.values()]
+
+
+def script(*words: str) -> subprocess.CompletedProcess[str]:
+    """Run the script in a process of its own."""
+    command = [sys.executable, "benchmarks/published_responses.py", *words]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+@pytest.mark.slow
+def test_the_script_prints_one_object() -> None:
+    """--json is one JSON object with every response, its verdict and the vehicle's hash."""
+    out = json.loads(script("--json").stdout)
     assert out["vehicle"]["sha256"] == FINSROV.sha256
     assert len(out["responses"]) == 6 and all(np.isfinite(r["simulated"]) for r in out["responses"])
+    assert {"yaw", "surge", "sway", "heave"} == {response["axis"] for response in out["responses"]}
+    assert all({"simulated", "measured", "agrees"} <= response.keys() for response in out["responses"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("rexrov",), "no published responses of 'rexrov' to compare with; available: finsrov"),
+        (("finsrov", "--hydrodynamics", "fosen"), "unknown hydrodynamic model 'fosen'"),
+    ],
+)
+def test_the_script_refuses_in_a_sentence(words: tuple[str, ...], sentence: str) -> None:
+    """Exit status 2, and one line on standard error."""
+    done = script(*words)
+    assert done.returncode == 2 and done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"finssim: {sentence}")
 
 
 def test_a_vehicle_without_published_responses_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""`finssim validate`: simulated steady speeds beside those that the vehicle's authors measured in their pool."""
+"""Simulated steady speeds and those that the vehicle's authors measured: `python benchmarks/published_responses.py`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from finssim.command_line import Experiment, run_script
 from finssim.control.allocation import Allocator
 from finssim.engine import Simulator
 from finssim.experiments.tables import Table
@@ -17,31 +18,31 @@ from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 PUBLISHED = Path(__file__).parent / "published"
 DURATION = 6.0
-"""Of each run [s]: eight of the slowest time constants, but too short for added mass to turn a straight run."""
+"""Length of each run [s]: eight of the slowest time constants, but too short for added mass to turn a straight run."""
 AGREES = 0.15
-"""Relative difference up to which a simulated speed is said to agree with the measured one."""
+"""Largest relative difference at which a simulated speed agrees with the measured one."""
 
 
 class ValidationError(ValueError):
-    """There is nothing published to compare with."""
+    """No published responses to compare with."""
 
 
 def simulate_responses(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> dict[str, Any]:
-    """Apply every published command to the vehicle at rest in deep water, all as worlds of one batch.
+    """Simulate every published command from rest in deep water, each in its own world of one batch.
 
     Args:
         vehicle: The vehicle.
         hydrodynamics: The model.
 
     Returns:
-        `source` of what is published, and `responses`, each with `name`, `axis`, `command` about the centre of gravity
+        `source` of the measurements, and `responses`, each with `name`, `axis`, `command` about the centre of gravity
         and `applied`, the same axis of the wrench that the thrusters can give [N or N m]; `simulated`, mean speed over
         the last quarter of the run, and `measured`, the least and greatest published [m/s or rad/s]; `difference`,
-        relative and from the nearer end of the measured range, 0 inside it; `agrees`; `why`, what is known of a
+        relative to the nearer end of the measured range, 0 inside it; `agrees`; `why`, the known reason of a
         disagreement.
 
     Raises:
-        ValidationError: Nothing is published of this vehicle, and it says for which vehicles something is.
+        ValidationError: No responses of this vehicle are published; the message lists the vehicles that have some.
     """
     path = PUBLISHED / f"{vehicle.name}.yaml"
     if not path.is_file():
@@ -82,17 +83,17 @@ def simulate_responses(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> d
     }
 
 
-def validate(name: str, *, hydrodynamics: str = "calibrated") -> dict[str, Any]:
+def validate(name: str = "finsrov", *, hydrodynamics: str = "calibrated") -> dict[str, Any]:
     """Compare simulated with published pool responses, and report where they disagree.
 
-    Example: finssim validate finsrov
+    Example: python benchmarks/published_responses.py --hydrodynamics simplified
 
     Args:
         name (NAME): Vehicle with published responses: finsrov.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
 
     Raises:
-        ValidationError: nothing is published of this vehicle.
+        ValidationError: No responses of this vehicle are published.
     """
     vehicle = load_vehicle(name)
     return {
@@ -104,7 +105,7 @@ def validate(name: str, *, hydrodynamics: str = "calibrated") -> dict[str, Any]:
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """A row for each response, and what is known of those that disagree."""
+    """Return a table with a row for each response, and the known reasons of disagreements."""
     rows = []
     for r in result["responses"]:
         unit, speed = ("N m", "rad/s") if r["axis"] in AXES[3:] else ("N", "m/s")
@@ -124,3 +125,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         ],
     )
     return [table]
+
+
+if __name__ == "__main__":
+    run_script(Experiment("__main__:validate"))
