@@ -831,7 +831,7 @@ def run_replay(
     """
     from finssim.calibration.trials.trial_files import load_trials
 
-    body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    body = load_vehicle(vehicle)
     trials = load_trials(paths)
     start_warp()
     screen = Console(stderr=True)

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from finssim.control.allocation import Allocator
 from finssim.engine.lanes import LANES
 from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
@@ -99,7 +100,7 @@ class Simulator:
             SimulatorError: a name or number is out of its range; it says which.
         """
         crew = [vehicles] if isinstance(vehicles, Vehicle | str) else list(vehicles)
-        self.vehicles = [v if isinstance(v, Vehicle) else load_vehicle(v) for v in crew]
+        self.vehicles = [load_vehicle(v) for v in crew]
         self.hydrodynamics = checked_choice(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
         self.integrator = checked_choice(integrator, INTEGRATORS, "integrator")
         if worlds < 1 or substeps < 1 or not self.vehicles:
@@ -148,6 +149,7 @@ class Simulator:
         self._step = self.pipeline()
         self.add_step(self._step)
         self._reported: set[tuple[int, int]] = set()
+        self._allocators: list[Allocator] = []
         self.refresh()
         start: Any = (0.0, 0.0, -0.5 * (pool.depth if pool else 1.0))
         self.place(position=start if self.world is None else self.world.world.viewpoint.position)
@@ -340,6 +342,54 @@ class Simulator:
             SimulatorError: the shape is wrong or a number is not finite.
         """
         self.command.thrust.assign(thrust_table(force, self.vehicles, self.worlds))
+
+    def set_wrench(self, wrench: ArrayLike) -> None:
+        """Command thruster forces that come nearest to a wrench within the thrusters' limits (paper, eq. 18).
+
+        Args:
+            wrench: Body frame, about each vehicle's `wrench_reference` [N, N m], shape broadcastable to
+                (worlds, vehicles, 6).
+
+        Raises:
+            SimulatorError: The shape is wrong or a number is not finite.
+        """
+        wanted = self._by_vehicle(wrench, 6, "wrench command")
+        forces = np.zeros((*wanted.shape[:2], self._most_thrusters), dtype=np.float32)
+        if not self._allocators:
+            self._allocators = [Allocator.from_vehicle(vehicle) for vehicle in self.vehicles]
+        for i, allocator in enumerate(self._allocators):
+            forces[:, i, : allocator.thrusters] = allocator.allocate(wanted[:, i])
+        self.set_thrust(forces)
+
+    def set_pwm(self, pulse: ArrayLike, voltage: float | None = None) -> None:
+        """Command the thruster forces that pulse widths give in the steady state, by the law of the speed controllers.
+
+        Args:
+            pulse: Pulse widths [µs], shape broadcastable to (worlds, vehicles, n), n thrusters in the vehicle's order;
+                0 is no signal and stops a motor. Vehicles with fewer thrusters leave the last numbers unused.
+            voltage: Voltage of the battery [V]; that of the speed controller's numbers if None.
+
+        Raises:
+            SimulatorError: The shape is wrong or a number is not finite.
+            VehicleError: The vehicle file gives a thruster no speed controller (`esc`).
+        """
+        pulses = self._by_vehicle(pulse, self._most_thrusters, "pulse command")
+        forces = np.zeros(pulses.shape, dtype=np.float32)
+        for i, vehicle in enumerate(self.vehicles):
+            for k, thruster in enumerate(vehicle.thrusters.values()):
+                forces[:, i, k] = thruster.thrust(thruster.shaft_speed(pulses[:, i, k], voltage))
+        self.set_thrust(forces)
+
+    @property
+    def _most_thrusters(self) -> int:
+        return max(len(vehicle.thrusters) for vehicle in self.vehicles)
+
+    def _by_vehicle(self, values: ArrayLike, n: int, label: str) -> NDArray[np.float64]:
+        """Return n finite numbers for every world and vehicle."""
+        array = np.asarray(values, dtype=np.float64)
+        if not np.isfinite(array).all():
+            raise SimulatorError(f"{label} has a number that is not finite")
+        return np.array(broadcast(array, (self.worlds, len(self.vehicles), n), label))
 
     def restart_episodes(self, mask: ArrayLike | None = None) -> None:
         """Count episodes from zero again, so that the random streams repeat: where mask is true, everywhere if None."""

@@ -154,48 +154,25 @@ class Course:
 
 
 @cache
-def physics_kernel(
+def motion_function(
     model: str,
-    integrator: str,
-    water_moving: bool = True,
-    walls_present: bool = True,
-    tether_present: bool = True,
-    speed_lag: bool = True,
+    runge_kutta: bool,
+    water_moving: bool = False,
+    tether_present: bool = False,
     terms: tuple[Term, ...] = (),
-    funnel_present: bool = False,
-    solids_present: bool = False,
-    lanes: bool = False,
-) -> wp.Kernel:
-    """The kernel for one hydrodynamic model and one integrator, without the code that a simulation does not need.
+) -> Any:
+    """Return the Warp function of the equation of motion, without the terms that a simulation does not need.
 
     Args:
         model: A key of `HYDRODYNAMICS`.
-        integrator: `midpoint` (see `finssim.engine.midpoint`) or `rk4`.
+        runge_kutta: Whether the integrator is `rk4`, which needs no relaxation.
         water_moving: Whether there are currents or waves.
-        walls_present: Whether there is a pool to bump into.
         tether_present: Whether there is a tether.
-        speed_lag: Whether some vehicle's motors lag in speed rather than in force.
         terms: Those that some vehicle has, in the order of the rows of their parameters.
-        funnel_present: Whether there is a dock to enter.
-        solids_present: Whether there is a world with solids to bump into.
-        lanes: Whether worlds go in blocks of `LANES`, on a processor; see `finssim.engine.lanes`.
-
-    Returns:
-        A kernel over (worlds of the slice, vehicles); with lanes over (blocks of the slice, vehicles), which takes the
-        number of the slice's worlds before its offset.
     """
     hydrodynamic_wrench = HYDRODYNAMICS[model]
     term_wrench, term_slope = composed(terms, "wrench"), composed(terms, "slope")
-    runge_kutta = integrator == "rk4"
     added_mass = model != "simplified"
-    contacts = walls_present or funnel_present or solids_present
-    contact_step = DOCK_STEP if funnel_present else WALL_STEP
-
-    @wp.func
-    def thrust_of(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, actuator: vec8) -> vec8:
-        if wp.static(speed_lag):
-            return delivered_thrust(plant, w, v, actuator)
-        return wp.cw_mul(plant[w, v].gain, actuator)
 
     @wp.func
     def motion_at(
@@ -296,6 +273,51 @@ def physics_kernel(
                     falls = term_slope(extra, w, v, nu_m, up, -position[2], water.density)
                     out.relaxation += wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, wp.max(falls, vec6())))
         return out
+
+    return motion_at
+
+
+@cache
+def physics_kernel(
+    model: str,
+    integrator: str,
+    water_moving: bool = True,
+    walls_present: bool = True,
+    tether_present: bool = True,
+    speed_lag: bool = True,
+    terms: tuple[Term, ...] = (),
+    funnel_present: bool = False,
+    solids_present: bool = False,
+    lanes: bool = False,
+) -> wp.Kernel:
+    """The kernel for one hydrodynamic model and one integrator, without the code that a simulation does not need.
+
+    Args:
+        model: A key of `HYDRODYNAMICS`.
+        integrator: `midpoint` (see `finssim.engine.midpoint`) or `rk4`.
+        water_moving: Whether there are currents or waves.
+        walls_present: Whether there is a pool to bump into.
+        tether_present: Whether there is a tether.
+        speed_lag: Whether some vehicle's motors lag in speed rather than in force.
+        terms: Those that some vehicle has, in the order of the rows of their parameters.
+        funnel_present: Whether there is a dock to enter.
+        solids_present: Whether there is a world with solids to bump into.
+        lanes: Whether worlds go in blocks of `LANES`, on a processor; see `finssim.engine.lanes`.
+
+    Returns:
+        A kernel over (worlds of the slice, vehicles); with lanes over (blocks of the slice, vehicles), which takes the
+        number of the slice's worlds before its offset.
+    """
+    runge_kutta = integrator == "rk4"
+    motion_at = motion_function(model, runge_kutta, water_moving, tether_present, terms)
+    contacts = walls_present or funnel_present or solids_present
+    contact_step = DOCK_STEP if funnel_present else WALL_STEP
+
+    @wp.func
+    def thrust_of(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, actuator: vec8) -> vec8:
+        if wp.static(speed_lag):
+            return delivered_thrust(plant, w, v, actuator)
+        return wp.cw_mul(plant[w, v].gain, actuator)
 
     @wp.func
     def contact_at(

@@ -120,7 +120,7 @@ def train(
     learner = learner or ("distill" if the_task.pictures else "ppo")
     kind = learner_named(learner)
     kind.check(the_task)
-    chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    chosen = load_vehicle(vehicle)
     randomization = Randomization(randomize) if randomize is not None else None
     refuse_unwritable(atomic_directory(out, replaces=DESCRIPTION_FILE))
     start_warp()

@@ -495,7 +495,7 @@ def make_plan(
     Raises:
         PlantSpecError: The plant cannot be made, or there is no such severity or camera.
     """
-    ours = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    ours = load_vehicle(vehicle)
     spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
     world_is_site = world is not None and site is None
     spec = (

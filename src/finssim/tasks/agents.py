@@ -974,7 +974,7 @@ def baseline(task: str, name: str, vehicle: Vehicle | str = "finsrov") -> Baseli
         raise BaselineError(
             f"unknown baseline '{name}' of task '{task}'; available: {', '.join(have) or 'none'}"
         )
-    return have[name](vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle))
+    return have[name](load_vehicle(vehicle))
 
 
 def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:

@@ -26,10 +26,7 @@ def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: s
         raise EnvironmentSetupError(
             f"{len(stated)} vehicles are given, expected {len(task.vehicles)} for task '{task.name}': {names}"
         )
-    vehicles = [
-        vehicle_or_name if isinstance(vehicle_or_name, Vehicle) else load_vehicle(vehicle_or_name)
-        for vehicle_or_name in stated
-    ]
+    vehicles = [load_vehicle(vehicle_or_name) for vehicle_or_name in stated]
     for vehicle_or_name in vehicles:
         missing = [axis for axis in task.needs if axis not in vehicle_or_name.controlled_axes]
         if missing:

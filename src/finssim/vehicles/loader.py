@@ -31,15 +31,17 @@ def catalogue() -> list[str]:
     return sorted(path.stem for path in CATALOGUE.glob("*.yaml"))
 
 
-def load_vehicle(name_or_path: str | os.PathLike[str]) -> Vehicle:
+def load_vehicle(name_or_path: Vehicle | str | os.PathLike[str]) -> Vehicle:
     """Read and check a vehicle.
 
     Args:
-        name_or_path: A catalogue name such as `finsrov`, or the path of a YAML file.
+        name_or_path: A catalogue name such as `finsrov`, or the path of a YAML file; a `Vehicle` is returned as it is.
 
     Raises:
         VehicleError: Unknown name, or a file that is refused; the message says where, what and what to do.
     """
+    if isinstance(name_or_path, Vehicle):
+        return name_or_path
     path, label = _locate(name_or_path)
     values, origins = _with_parents(path, label, ())
     values, origins = _expand_groups(values, origins, label)
