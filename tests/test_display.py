@@ -47,7 +47,7 @@ def fit():
     return Fit(
         kind="hydrodynamics",
         method="regression",
-        vehicle=FINSROV,
+        before=FINSROV,
         estimates={"surge.d1": estimate},
         changes={},
     )

@@ -1,23 +1,79 @@
-"""FinsSim: calibrate, simulate, train and deploy underwater robots through one set of interfaces.
+"""FinsSim: describe, identify, simulate, train and deploy underwater vehicles.
 
-The parts are imported by name, so that each costs only what it needs:
+    import finssim as fs
 
-    from finssim.vehicles import load_vehicle
-    from finssim.engine import Simulator
+    vehicle = fs.load_vehicle("bluerov2_heavy")
+    fit = fs.identify(vehicle, [fs.Trial.from_frame(frame)])
+    policy = fs.train("t1", vehicle=fit.vehicle)
+    result = fs.evaluate(policy, "t1")
+
+Names are imported when they are first used, so that each costs only what it needs.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from finssim.calibration.fit import Fit
+    from finssim.calibration.trials.trial import Trial
+    from finssim.control.policy import Policy
+    from finssim.engine.model import acceleration
+    from finssim.engine.simulator import Simulator
     from finssim.tasks.environment import Environment
-
-__all__ = ["__version__", "make"]
+    from finssim.vehicles.loader import catalogue, load_vehicle
+    from finssim.vehicles.vehicle import Vehicle
+    from finssim.workflow import evaluate, identify, run_in_pool, train
 
 __version__ = "0.1.0"
 
+_HOMES = {
+    "Fit": "finssim.calibration.fit",
+    "Policy": "finssim.control.policy",
+    "Simulator": "finssim.engine.simulator",
+    "Trial": "finssim.calibration.trials.trial",
+    "Vehicle": "finssim.vehicles.vehicle",
+    "acceleration": "finssim.engine.model",
+    "catalogue": "finssim.vehicles.loader",
+    "evaluate": "finssim.workflow",
+    "identify": "finssim.workflow",
+    "load_vehicle": "finssim.vehicles.loader",
+    "run_in_pool": "finssim.workflow",
+    "train": "finssim.workflow",
+}
+"""Name -> the module that it is imported from."""
+
+__all__ = [
+    "Fit",
+    "Policy",
+    "Simulator",
+    "Trial",
+    "Vehicle",
+    "__version__",
+    "acceleration",
+    "catalogue",
+    "evaluate",
+    "identify",
+    "load_vehicle",
+    "make",
+    "run_in_pool",
+    "train",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'finssim' has no attribute '{name}'")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 def make(task: Any = "t1", **options: Any) -> "Environment":
-    """The batched environment of a task: see `finssim.tasks.make`, which is imported only now."""
+    """Return the batched environment of a task; see `finssim.tasks.make`, which is imported only now."""
     from finssim.tasks import make as made
 
     return made(task, **options)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 from rich.console import Console
 
@@ -12,6 +13,19 @@ Progress = Callable[..., None]
 """Takes the share that is done, 0 to 1, and, perhaps, what comes next."""
 EVERY = 10.0
 """Time between two lines of progress where there is no terminal [s]."""
+
+
+_SHOWN: ContextVar[bool] = ContextVar("progress_shown", default=True)
+
+
+@contextmanager
+def silent(silenced: bool = True) -> Iterator[None]:
+    """Show no progress while the block runs, for functions that a script or a notebook calls."""
+    token = _SHOWN.set(_SHOWN.get() and not silenced)
+    try:
+        yield
+    finally:
+        _SHOWN.reset(token)
 
 
 @contextmanager
@@ -29,7 +43,7 @@ def progress_bar(name: str, *, visible: bool = True) -> Iterator[Progress]:
     from rich.progress import Progress as Bar
 
     screen = Console(stderr=True)
-    if not visible:
+    if not (visible and _SHOWN.get()):
         yield lambda part, text="": None
         return
     if not screen.is_terminal:

@@ -38,7 +38,7 @@ def made_fit(vehicle: Vehicle | None = None, **changes: Any) -> Fit:
         **{
             "kind": "hydrodynamics",
             "method": "regression",
-            "vehicle": vehicle or load_vehicle("finsrov"),
+            "before": vehicle or load_vehicle("finsrov"),
             "estimates": {
                 n: Estimate(name=n, estimate=e, ci95=ci, unit=u, identifiable=i, note=note, path=path)
                 for n, e, ci, u, i, note, path in estimates

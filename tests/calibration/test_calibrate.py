@@ -26,7 +26,7 @@ from finssim.vehicles import load_vehicle
 def test_only_what_the_data_determine_is_written():
     """Numbers and origins of everything else stay, those that could not be identified included."""
     fit = made_fit()
-    before, after = fit.vehicle, calibrated(fit)
+    before, after = fit.before, calibrated(fit)
     assert after.hydrodynamic_set("calibrated").linear_damping[0, 0] == 39.1
     assert after.hydrodynamic_set("calibrated").quadratic_damping[5, 5] == 0.47763214
     assert retained_values(fit, after) == {"yaw.d2": 0.47763214, "heave.d1": 80.09677}
@@ -69,7 +69,7 @@ def test_groups_may_name_their_thrusters():
         ci95=(9.4e-5, 9.6e-5),
         path="thruster_groups.CC.c_plus",
     )
-    thrusters = [name for name, t in fit.vehicle.thrusters.items() if t.group == "CC"]
+    thrusters = [name for name, t in fit.before.thrusters.items() if t.group == "CC"]
     fit = dataclasses.replace(
         fit,
         kind="thruster",
@@ -176,7 +176,7 @@ def test_a_coupling_of_a_diagonal_matrix_was_zero(tmp_path):
     """The file had nothing there, which is zero; its row is readable however long the notes are."""
     fit = made_fit(changes={f"{SET}.linear_damping.1.5": 0.5})
     after = calibrated(fit)
-    assert number_in(fit.vehicle, f"{SET}.linear_damping.1.5") == 0.0
+    assert number_in(fit.before, f"{SET}.linear_damping.1.5") == 0.0
     assert number_in(after, f"{SET}.linear_damping.1.5") == 0.5
     write_vehicle(after, tmp_path / "v.yaml")
     assert max(map(len, (tmp_path / "v.yaml").read_text("utf-8").splitlines())) < 250

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.findings import Finding, plain
+from finssim.calibration.findings import CalibrationError, Finding, plain
 from finssim.page import notebook_html
 from finssim.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Correlation", "Curve", "Estimate", "Fit"]
 
@@ -97,8 +101,8 @@ class Fit:
     kind: str
     """thruster, motor or hydrodynamics"""
     method: str
-    vehicle: Vehicle
-    """As it was before."""
+    before: Vehicle
+    """The vehicle that the fit started from."""
     estimates: dict[str, Estimate]
     """By name, in the order of a report."""
     changes: dict[str, Any]
@@ -116,16 +120,45 @@ class Fit:
     interrupted: bool = False
     """Whether Ctrl-C ended it before it converged; the estimates are the best until then."""
 
+    @cached_property
+    def vehicle(self) -> Vehicle:
+        """The calibrated vehicle: everything that the fit did not determine keeps its number and its origin.
+
+        Raises:
+            CalibrationError: The estimates make no vehicle that can be simulated.
+        """
+        from finssim.calibration.vehicle_file import calibrated
+
+        return calibrated(self)
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % interval of each estimate by its name, in the estimate's unit; infinite ends where it is unknown."""
+        return {name: estimate.ci95 for name, estimate in self.estimates.items()}
+
+    def plot(self) -> Figure:
+        """Return a Matplotlib figure of measured and fitted values and their differences, of up to six curves.
+
+        Raises:
+            CalibrationError: The fit holds no curves.
+        """
+        from finssim.calibration.report import draw_curves
+
+        figure = next(draw_curves(self.curves), None)
+        if figure is None:
+            raise CalibrationError("the fit holds no curves to draw")
+        return figure
+
     def __repr__(self) -> str:
         counts = (
             f"{len(self.estimates)} estimates, {len(self.changes)} changes, {len(self.findings)} findings"
         )
-        return f"<Fit {self.kind} ({self.method}) of {self.vehicle.name}: {counts}>"
+        return f"<Fit {self.kind} ({self.method}) of {self.before.name}: {counts}>"
 
     def _repr_html_(self) -> str:
         rows = [
             (e.name, f"{e.estimate:.4g}", f"{e.ci95[0]:.4g} to {e.ci95[1]:.4g}", e.unit, e.note)
             for e in self.estimates.values()
         ]
-        title = f"{self.kind} of {self.vehicle.name} ({self.method})"
+        title = f"{self.kind} of {self.before.name} ({self.method})"
         return notebook_html(title, ("", "estimate", "95 % interval", "unit", "note"), rows)

@@ -330,7 +330,7 @@ def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float, known: Map
     )  # fmt: skip
     return replace(
         fit,
-        vehicle=vehicle,
+        before=vehicle,
         estimates=found,
         changes={**scaled_thrust(vehicle, scale), **fit.changes},
         findings=(finding("voltage_unknown", percent=100.0 * (high - 1.0)), *fit.findings),

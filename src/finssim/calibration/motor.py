@@ -599,7 +599,7 @@ def fit_motor(
     return Fit(
         kind="motor",
         method="first order plus dead time",
-        vehicle=vehicle,
+        before=vehicle,
         estimates={e.name: e for e in estimates},
         changes=changes,
         quality={result.name: quality_of(result) for result in studies},

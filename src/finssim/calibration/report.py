@@ -263,7 +263,7 @@ def fit_json(
     return {
         "kind": fit.kind,
         "method": fit.method,
-        "vehicle": {"name": fit.vehicle.name, "sha256": fit.vehicle.sha256},
+        "vehicle": {"name": fit.before.name, "sha256": fit.before.sha256},
         "parameters": {name: estimate.as_json() for name, estimate in fit.estimates.items()},
         "kept": retained_values(fit, vehicle),
         "quality": plain(fit.quality),
@@ -280,7 +280,7 @@ def fit_json(
 
 def _cells(e: Estimate, fit: Fit, vehicle: Vehicle) -> tuple[str, ...]:
     """Texts of an estimate, in the order of the heads."""
-    before = number_text(file_number(e, fit.vehicle))
+    before = number_text(file_number(e, fit.before))
     return e.name, number_text(e.estimate), interval_text(e), e.unit, before, state_text(e, fit, vehicle)
 
 
@@ -318,7 +318,7 @@ def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
         return "written"
     if estimate.path is None:
         return "" if estimate.identifiable else "not told"
-    before, after = number_in(fit.vehicle, estimate.path), number_in(vehicle, estimate.path)
+    before, after = number_in(fit.before, estimate.path), number_in(vehicle, estimate.path)
     if after != before or (after is not None and estimate.identifiable and after == estimate.estimate):
         return "written" if estimate.identifiable else "unsure"
     return "file kept"
@@ -457,8 +457,8 @@ def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> 
     sentence = vehicle.calibrations[-1].sentence()
     undrawn = len(fit.curves) - MAX_CURVES
     return Report(
-        title=f"Calibration of {fit.vehicle.name}: {sentence}",
-        headline=f"{fit.vehicle.name}: {sentence}",
+        title=f"Calibration of {fit.before.name}: {sentence}",
+        headline=f"{fit.before.name}: {sentence}",
         heads=(*HEADS, "file had", "state"),
         estimates=list(fit.estimates.values()),
         cells=lambda e: _cells(e, fit, vehicle),
@@ -508,7 +508,7 @@ def write_report(
         *([command] if command else []),
         f"FinsSim {record.finssim}, revision {record.revision or 'not from a checkout'}",
         f"settings: {json.dumps(record.settings)}",
-        f"vehicle before: {fit.vehicle.name}, sha256 {fit.vehicle.sha256}",
+        f"vehicle before: {fit.before.name}, sha256 {fit.before.sha256}",
         f"vehicle after: sha256 {vehicle.sha256}",
     ]
     as_object = fit_json(fit, vehicle, out=out, findings=findings)

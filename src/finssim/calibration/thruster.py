@@ -1189,7 +1189,7 @@ def fit_thruster(
     return Fit(
         kind="thruster",
         method="least squares of T = c± ω|ω|",
-        vehicle=vehicle,
+        before=vehicle,
         estimates=estimates,
         changes=changes,
         quality=quality,

@@ -458,7 +458,7 @@ def calibrated(fit: Fit) -> Vehicle:
     Raises:
         CalibrationError: The estimates make no vehicle that can be simulated.
     """
-    before = fit.vehicle
+    before = fit.before
     number = len(before.calibrations) + 1
     record = _calibration_record(fit)
     source = f"calibration {number}: {record.sentence()}"
@@ -501,7 +501,7 @@ def retained_values(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
     for name, estimate in fit.estimates.items():
         if estimate.path is None:
             continue
-        before, after = number_in(fit.vehicle, estimate.path), number_in(vehicle, estimate.path)
+        before, after = number_in(fit.before, estimate.path), number_in(vehicle, estimate.path)
         if before is not None and before == after and not estimate.identifiable:
             retained[name] = before
     return retained
@@ -515,7 +515,7 @@ def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
         fit: The fit.
         vehicle: `calibrated(fit)`.
     """
-    passed = {check.name for check in check_vehicle(fit.vehicle) if check.passed}
+    passed = {check.name for check in check_vehicle(fit.before) if check.passed}
     findings = [*fit.findings]
     findings += [
         finding("check_failed", check=check.name, sentence=check.sentence)
@@ -553,7 +553,7 @@ def _calibration_record(fit: Fit) -> CalibrationRecord:
         method=fit.method,
         trials=dict(fit.trials),
         settings=json.loads(json.dumps(dict(fit.settings), default=_plain_value)),
-        start=fit.vehicle.sha256,
+        start=fit.before.sha256,
         finssim=origin["finssim"],
         revision=origin["revision"],
         interrupted=fit.interrupted,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import shutil
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from finssim.budget import SECONDS, limited_memory, read_bytes
+from finssim.files import atomic_directory
+from finssim.page import notebook_html
 from finssim.yaml_file import first_problem, read_mapping
 
 # What a policy directory says of itself: `policy.yaml`, its schema and how two of them are compared.
@@ -205,10 +208,20 @@ class Identified(Protocol):
 
 
 class Policy:
-    """A trained policy: observation in, action in [-1, 1] out. Make one with `Policy.load`."""
+    """A trained policy: observation in, action in [-1, 1] out. Make one with `Policy.load`.
 
-    def __init__(self, description: PolicyDescription, session: Any) -> None:
+    Attributes:
+        description: What `policy.yaml` says.
+        folder: The policy directory that it was read from.
+        vehicle: The vehicle that it was loaded for; None where that was not checked.
+    """
+
+    def __init__(
+        self, description: PolicyDescription, session: Any, folder: Path, vehicle: Identified | None = None
+    ) -> None:
         self.description = description
+        self.folder = folder
+        self.vehicle = vehicle
         self._session = session
         self._size = description.observation.size
 
@@ -246,7 +259,34 @@ class Policy:
                 f"{folder}: trained for vehicle {trained.name} {trained.sha256[:12]}, but this is {vehicle.name} "
                 f"{vehicle.sha256[:12]}: train again, or give the vehicle file it was trained with"
             )
-        return cls(description, _open_network(folder, description))
+        return cls(description, _open_network(folder, description), folder, vehicle)
+
+    def save(self, directory: str | Path) -> Path:
+        """Copy the policy directory, and return the copy's path.
+
+        Raises:
+            OutputError: The directory holds something other than a policy, or cannot be written.
+        """
+        with atomic_directory(directory, replaces=DESCRIPTION_FILE) as folder:
+            shutil.copytree(self.folder, folder, dirs_exist_ok=True)
+        return Path(directory)
+
+    def __repr__(self) -> str:
+        about = self.description
+        return f"<Policy for {about.task} of {about.vehicle.name}: {self._size} observations to {about.action_size}>"
+
+    def _repr_html_(self) -> str:
+        about = self.description
+        rows = [
+            ("task", about.task),
+            ("vehicle", f"{about.vehicle.name} ({about.hydrodynamics})"),
+            ("action mode", str(about.action["mode"])),
+            ("observations", ", ".join(entry.name for entry in about.observation.entries)),
+            ("control period", f"{about.control_period:g} s"),
+            ("learner", str(about.training.get("learner", "–"))),
+            ("seed", str(about.seed)),
+        ]
+        return notebook_html("Policy", ("", ""), rows)
 
     def act(self, observation: ArrayLike) -> NDArray[np.float32]:
         """Action for each observation, of a policy without memory.

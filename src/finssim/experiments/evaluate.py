@@ -147,11 +147,15 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 def _remarks(trials: Sequence[Mapping[str, Any]]) -> list[str]:
     """What is to be known of records: why one is not complete, and how far its estimate was from the truth."""
-    faults = [f"{trial['record']}: {trial['fault']}" for trial in trials if trial.get("fault")]
-    located = [(trial["record"], trial["localization"]) for trial in trials if trial.get("localization")]
+
+    def name(trial: Mapping[str, Any]) -> str:
+        return str(next(trial[key] for key in ("record", "setpoint", "trajectory", "trial") if key in trial))
+
+    faults = [f"{name(trial)}: {trial['fault']}" for trial in trials if trial.get("fault")]
+    located = [(name(trial), trial["localization"]) for trial in trials if trial.get("localization")]
     return faults + [
-        f"{record}: the robot's estimate was {off['position_m']:.3g} m, {off['heading_deg']:.2g}° off the truth (rms)"
-        for record, off in located
+        f"{label}: the robot's estimate was {off['position_m']:.3g} m, {off['heading_deg']:.2g}° off the truth (rms)"
+        for label, off in located
     ]
 
 
@@ -198,6 +202,49 @@ class Evaluation:
         plant = self.result["plant"]["name"]
         name: str = self.result["controller"]["name"]
         return name if plant == "nominal" else f"{name}, {plant}"
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """One controller in one plant or several."""
+
+    each: tuple[Evaluation, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the result as plain data; of several plants `plants`, one for each, in their order."""
+        results = [evaluation.result for evaluation in self.each]
+        return results[0] if len(results) == 1 else {"plants": results}
+
+    @property
+    def table(self) -> Table:
+        """Measures by target and plant, with the paper's rows where the task is the paper's."""
+        return tables_of(self.as_json())[0]
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """Measures over all trials of the first plant: keys as in `evaluation.json`, errors in m, rad or as named."""
+        result = self.each[0].result
+        skipped = ("controller", "task", "vehicle", "hydrodynamics", "plant", "provenance", "per_trial")
+        return {key: value for key, value in result.items() if key not in skipped}
+
+    def plot(self) -> Any:
+        """Return a Matplotlib figure: errors against time (t1), or trajectories from above (t2).
+
+        Raises:
+            EvaluationError: The task is measured in episodes, whose motion is not kept.
+        """
+        first = self.each[0].result
+        if first["task"] not in FORMS:
+            names = ", ".join(FORMS)
+            raise EvaluationError(f"task '{first['task']}' has no figure; tasks with one: {names}")
+        title = "" if self.each[1:] else first["plant"].get("title", "")
+        return FORMS[first["task"]].draw({e.label: e.trials for e in self.each}, title)
+
+    def __repr__(self) -> str:
+        return f"<Evaluations: {', '.join(map(repr, self.each))}>"
+
+    def _repr_html_(self) -> str:
+        return "".join(html_of(tables_of(self.as_json()), Path()))
 
 
 def evaluation(
@@ -290,6 +337,27 @@ def evaluate(
     Raises:
         EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
     """
+    return evaluate_in_plants(
+        controller, task=task, vehicle=vehicle, hydrodynamics=hydrodynamics, plant=plant, observe=observe,
+        trajectories=trajectories, trials=trials, truth=truth, seed=seed, out=out,
+    ).as_json()  # fmt: skip
+
+
+def evaluate_in_plants(
+    controller: Sequence[str | Path] | str | Path,
+    *,
+    task: str | None = None,
+    vehicle: str | Vehicle | None = None,
+    hydrodynamics: str = "calibrated",
+    plant: Sequence[str | Path] | str | Path = ("nominal",),
+    observe: str | None = None,
+    trajectories: Sequence[str | Path] = (),
+    trials: int | None = None,
+    truth: Path | None = None,
+    seed: int = 1,
+    out: Path | None = None,
+) -> Evaluations:
+    """Evaluate a controller in every plant; arguments and errors as `evaluate`."""
     names = [controller] if isinstance(controller, str | Path) else controller
     records = [Path(name) for name in names if str(name).endswith(".mcap")]
     if len(names) > 1 and len(records) < len(names):
@@ -318,16 +386,12 @@ def evaluate(
                     names[0], plant_file, task=task, vehicle=vehicle, trajectories=trajectories, **options
                 )
             )
-        results = [evaluation.result for evaluation in evaluations]
-        document = results[0] if len(results) == 1 else {"plants": results}
+        scored = Evaluations(tuple(evaluations))
         if folder is not None:
-            write_json(folder / EVALUATION_FILE, document)
-            title = "" if results[1:] else results[0]["plant"].get("title", "")
+            write_json(folder / EVALUATION_FILE, scored.as_json())
             if task in FORMS:
-                form = FORMS[task]
-                figure = form.draw({e.label: e.trials for e in evaluations}, title)
-                save_figure(figure, folder / form.figure)
-    return document
+                save_figure(scored.plot(), folder / FORMS[task].figure)
+    return scored
 
 
 def _subject(controller: Path, task: str | None, vehicle: str | Vehicle | None) -> tuple[str, str | Vehicle]:
@@ -367,7 +431,7 @@ def _recorded(
 
     if len(trajectories) > 1:
         raise EvaluationError("records follow one trajectory each: give at most one --trajectory")
-    body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    body = load_vehicle(vehicle)
     guide = guide_of(trajectories[0], body) if trajectories else None
     trials = [read_record(path, task, body, guide=guide, truth=truth) for path in records]
     pilots = [trial.pilot for trial in trials]
@@ -428,7 +492,7 @@ def evaluate_controller(
     if trials < 1:
         raise EvaluationError(f"trials is {trials}, expected 1 or more")
     start_warp()
-    body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    body = load_vehicle(vehicle)
     agent = agent_for(controller, body, the_task)
     played: list[Trial] = []
     with progress_bar(f"{trials} trials") as show:

@@ -580,7 +580,7 @@ def check_starts(starts: Mapping[str, Station], vehicle: str | Vehicle) -> None:
     Raises:
         GoalError: One is; says which.
     """
-    body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    body = load_vehicle(vehicle)
     for name, start in starts.items():
         check_reachable(Station(start.position, start.yaw, name=f"the start of {name}"), body)
 
@@ -625,10 +625,10 @@ def firmware_of(name: str, vehicle: Vehicle, robot: OnRobot | None = None) -> st
 class PoolJob(campaign.Job):
     """What the robot's whole software does in a pool, whose vehicle it knows only so well."""
 
-    vehicle: str = "finsrov"
-    """Name or file of the vehicle as controller and localization know it."""
-    pool_vehicle: str = "finsrov"
-    """Name or file of the vehicle around which the pool's own is drawn."""
+    vehicle: str | Vehicle = "finsrov"
+    """The vehicle, its name or file, as controller and localization know it."""
+    pool_vehicle: str | Vehicle = "finsrov"
+    """The vehicle, its name or file, around which the pool's own is drawn."""
     severity: str = "realistic"
     """nominal, realistic or hard."""
     camera: str = "pictures"
@@ -778,8 +778,22 @@ def play(job: Job, path: Path) -> dict[str, Any]:
         path: PATH.npz takes the true motion.
 
     Returns:
+        The measures as of `play_trial`.
+    """
+    result, trial = play_trial(job)
+    trial.motion.write(path)
+    return result
+
+
+def play_trial(job: Job) -> tuple[dict[str, Any], Trial]:
+    """Play a job in its pool and measure it by the true motion.
+
+    Args:
+        job: Who, where and what.
+
+    Returns:
         The measures of its task, `fault` (why the bridge stopped it, or empty), `localization` (errors of the estimate
-        against the truth, rms) and how the robot's loop did.
+        against the truth, rms) and how the robot's loop did; and the trial with its motion.
     """
     start_warp()
     began, seed = time.perf_counter(), noise_seed(job.seed, job.target)
@@ -804,15 +818,15 @@ def play(job: Job, path: Path) -> dict[str, Any]:
     motion = Motion(t=t, **states).between(rows)
     assert isinstance(trial.watch, _Estimates)
     localization = localization_errors(motion, trial.watch.motion())
-    return _result(job, path, motion, outcome, began) | {"localization": localization}
+    result, played = _measured(job, motion, outcome, began)
+    return result | {"localization": localization}, played
 
 
-def _result(job: Job, path: Path, motion: Motion, outcome: Outcome, began: float) -> dict[str, Any]:
-    """Write the motion of a trial to PATH.npz, and measure it."""
-    motion.write(path)
+def _measured(job: Job, motion: Motion, outcome: Outcome, began: float) -> tuple[dict[str, Any], Trial]:
+    """Return the measures of a trial and the trial with its motion."""
     trial = Trial(name=job.target, guide=outcome.trial.guide, motion=motion)
     limits = load_vehicle(job.vehicle).force_limits
-    return {
+    result = {
         **trial.measures(job.task, limits, stopped=bool(outcome.fault)),
         "fault": outcome.fault,
         "room": room(load_vehicle(job.pool_vehicle).body.size) * SITE_SIZES[job.site],
@@ -821,6 +835,7 @@ def _result(job: Job, path: Path, motion: Motion, outcome: Outcome, began: float
         "seconds": time.perf_counter() - began,
         "provenance": provenance(),
     }
+    return result, trial
 
 
 def played_trial(result: Mapping[str, Any], folder: Path) -> Trial:
@@ -918,4 +933,6 @@ def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | No
         nowhere = np.full((2, 4), np.nan)
         motion = Motion(t=np.array([0.0, 0.1]), position=nowhere[:, :3], quaternion=nowhere)
     origin = {"robot": opened.robot.title, "record": record.name}
-    return _result(job, path, motion, outcome, began) | origin
+    result, played = _measured(job, motion, outcome, began)
+    played.motion.write(path)
+    return result | origin

@@ -63,7 +63,8 @@ def console_table(
 def markdown_table(heads: Sequence[str], rows: Rows, *, left: Sequence[int] = (0,)) -> str:
     """The same on a page."""
     rule = ["---" if k in left else "--:" for k in range(len(heads))]
-    return "\n".join("| " + " | ".join(line) + " |" for line in (heads, rule, *rows) if line is not None)
+    lines = ([head.replace("\n", " ") for head in heads], rule, *rows)
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines if line is not None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +86,12 @@ class Table:
     """Whether a narrow screen shows the intervals of cells too."""
     pictures: Mapping[str, str] = field(default_factory=dict)
     """File beside the page -> what it shows."""
+
+    def __str__(self) -> str:
+        return markdown_of([self])
+
+    def _repr_html_(self) -> str:
+        return "".join(html_of([self], Path()))
 
 
 def print_tables(tables: Sequence[Table], console: Console) -> None:

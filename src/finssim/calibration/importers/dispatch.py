@@ -54,9 +54,22 @@ def read_stream(path: Path, source: SourceMap | None) -> Stream:
     Raises:
         CalibrationError: Unreadable, or a column that it has not.
     """
-    label = path.name
     mapping = source or SourceMap()
     table = read_table(path, skip=mapping.skip_rows, names=mapping.names, spaces=mapping.spaces)
+    return table_stream(table, source, path.name)
+
+
+def table_stream(table: Table, source: SourceMap | None, label: str) -> Stream:
+    """Return the columns of a table as a stream.
+
+    Args:
+        table: As read.
+        source: How it is read; without it the columns with canonical names are taken.
+        label: Name of the table in messages.
+
+    Raises:
+        CalibrationError: The table lacks a column.
+    """
     findings = tuple(item.about(label) for item in table.findings)
     if source is None:
         source = _by_names(table, label)

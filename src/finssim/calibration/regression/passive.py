@@ -739,7 +739,7 @@ def passive(
     return Fit(
         kind="hydrodynamics",
         method="passive",
-        vehicle=vehicle,
+        before=vehicle,
         estimates=estimates,
         changes=changes,
         quality=quality,

@@ -378,7 +378,7 @@ def regress(
     return Fit(
         kind="hydrodynamics",
         method="regression",
-        vehicle=vehicle,
+        before=vehicle,
         estimates=estimates,
         changes=changes,
         quality=figures,

@@ -1642,7 +1642,7 @@ class Stages:
         return Fit(
             kind="hydrodynamics",
             method="simulation",
-            vehicle=self.vehicle,
+            before=self.vehicle,
             estimates=found,
             changes=new,
             quality=quality(stage.problem, stage.solution, self.axes, self.used),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -226,6 +227,52 @@ class Trial:
             raise CalibrationError(
                 f"{self.name}: phase must hold {len(t)} words of {', '.join(PHASES)}, or empty ones"
             )
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: Any,
+        *,
+        columns: Mapping[str, str] | None = None,
+        units: Mapping[str, str] | None = None,
+        time: str = "t",
+        axes: str = "FLU",
+        name: str = "trial",
+        surface_pressure: float | None = None,
+        **header: Any,
+    ) -> Trial:
+        """Return the trial that a table in memory holds; columns that are not used are named in its findings.
+
+        Args:
+            frame: A pandas DataFrame, or a mapping of names to columns of one length. A DataFrame whose index holds the
+                times needs no time column.
+            columns: Column of a trial -> name of the column in `frame`; the columns that have the names of a trial's
+                columns if None.
+            units: Column of a trial, or `t` for the times -> its unit in `frame`, where that is not the trial's own
+                unit; `date` for written dates and for pandas timestamps.
+            time: Name of the column of times.
+            axes: Axes of the table: FLU (x forward, y left, z up) or FRD (x forward, y right, z down, and a world with
+                z down).
+            name: Name of the trial.
+            surface_pressure: What the sensor of a column `pressure` reads at the surface [Pa], 0 for a gauge; a
+                standard atmosphere if None, which is noted in the findings.
+            header: Further keys of `trial.yaml`, such as `vehicle`, `voltage` or `role`.
+
+        Raises:
+            CalibrationError: A column, unit or key that is not known, no times, or no usable column.
+        """
+        from finssim.calibration.importers.frame import trial_from_frame
+
+        return trial_from_frame(
+            frame,
+            columns=columns,
+            units=units,
+            time=time,
+            axes=axes,
+            name=name,
+            surface_pressure=surface_pressure,
+            header=header,
+        )
 
     def has(self, *columns: str) -> bool:
         """Whether every one of these columns holds at least two finite samples."""

@@ -872,7 +872,7 @@ def calibrate_mounts(log: MountLog, pool: Pool, vehicle: Vehicle, *, name: str, 
     return Fit(
         kind="mounts",
         method="vision",
-        vehicle=vehicle,
+        before=vehicle,
         estimates={row.name: row for row in rows},
         changes=changes,
         quality={"corners [px]": figures},

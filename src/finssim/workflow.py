@@ -1,0 +1,276 @@
+"""The steps of a study as functions: identify a vehicle, train a policy, evaluate it, and run it in the virtual pool.
+
+They return objects, print nothing, and are what `finssim` exports. Each does what the command of its name does.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from finssim.progress import progress_bar, silent
+from finssim.vehicles import Vehicle, load_vehicle
+
+if TYPE_CHECKING:
+    from finssim.calibration.fit import Fit
+    from finssim.calibration.trials.trial import Trial
+    from finssim.control.policy import Policy
+    from finssim.experiments.evaluate import Evaluations
+    from finssim.tasks import Task
+
+__all__ = ["evaluate", "identify", "run_in_pool", "train"]
+
+
+def identify(
+    vehicle: Vehicle | str | Path,
+    trials: Sequence[Trial | str | Path] | Trial | str | Path,
+    *,
+    axes: Sequence[str] | None = None,
+    estimate: Sequence[str] = (),
+    damping: str = "auto",
+    method: str = "auto",
+    progress: bool = False,
+) -> Fit:
+    """Fit a vehicle's added mass, damping, buoyancy and stiffness to trials.
+
+    Args:
+        vehicle: The vehicle to start from, the name of one in the catalogue, or the path of a vehicle file. It gives
+            the rigid body, the thrusters and what is not fitted.
+        trials: Trials, or paths of trial folders, of folders of them, or of tables with a trial's columns. Trials whose
+            `role` is held-out are not fitted; the fit is judged by them.
+        axes: Axes to fit, of surge, sway, heave, roll, pitch and yaw; those that the trials excite if None.
+        estimate: Further parameters to fit by simulation: thrust_scale, thrust_lag, thrust_delay, buoyancy_excess, k,
+            or a parameter of one of the vehicle's terms.
+        damping: Drag: linear, quadratic, both, or auto, which chooses.
+        method: auto, regression or simulation.
+        progress: Whether progress is shown on standard error.
+
+    Returns:
+        The fit: `vehicle`, `estimates` and their 95 % `intervals`, `findings`, `quality` and `plot()`.
+
+    Raises:
+        CalibrationError: No trial can be used, or an argument is not known.
+        VehicleError: There is no such vehicle.
+    """
+    from finssim.calibration.hydrodynamics import fit_hydrodynamics
+    from finssim.calibration.report import usable
+    from finssim.calibration.trials.trial import Trial
+    from finssim.calibration.trials.trial_files import load_trials
+
+    body = load_vehicle(vehicle)
+    given = [trials] if isinstance(trials, Trial | str | Path) else list(trials)
+    read = [t for item in given for t in ([item] if isinstance(item, Trial) else load_trials([item]))]
+    used, remarks = usable(read)
+    remarks += [item.about(trial.name) for trial in used for item in trial.findings]
+    with silent(not progress), progress_bar("identify") as show:
+        fit = fit_hydrodynamics(
+            used,
+            body,
+            axes=axes,
+            estimate=estimate,
+            damping=damping,
+            method=method,
+            held_out=[trial for trial in read if trial.header.role == "held-out"],
+            progress=show,
+        )
+    return replace(fit, findings=(*remarks, *fit.findings))
+
+
+def train(
+    task: str | Task = "t1",
+    *,
+    vehicle: Vehicle | str | Path = "finsrov",
+    seed: int = 1,
+    out: str | Path | None = None,
+    learner: str | None = None,
+    steps: int | None = None,
+    worlds: int | None = None,
+    randomize: str | Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+    progress: bool = False,
+    **options: Any,
+) -> Policy:
+    """Train a policy.
+
+    Args:
+        task: Task to learn: its name, FILE.py:CLASS, or a `Task`.
+        vehicle: A vehicle, the name of one in the catalogue, or the path of a vehicle file.
+        seed: Seed of every random number; equal seeds give equal results.
+        out: Directory of the policy; if None, the policy is kept until the object is gone (see `Policy.save`).
+        learner: Learner; ppo if None, and distill for tasks with images.
+        steps: Control steps of the training, summed over all worlds; the task's default if None.
+        worlds: Worlds simulated at once; the learner's default if None.
+        randomize: Ranges of vehicle and water parameters: a name or a file.
+        settings: Settings of the learner, such as {"learning_rate": 1e-3}.
+        progress: Whether progress is shown on standard error.
+        options: Further arguments of `finssim.learning.train.train`.
+
+    Returns:
+        The policy, which `evaluate` and `run_in_pool` take.
+
+    Raises:
+        TrainingError, LearningError, EnvironmentSetupError, VehicleError, OutputError: As they say.
+    """
+    from rich.console import Console
+
+    from finssim.control.policy import Policy
+    from finssim.learning.train import train as train_into
+
+    body = load_vehicle(vehicle)
+    folder = None if out is not None else tempfile.TemporaryDirectory(prefix="finssim-policy-")
+    target = Path(out) if folder is None else Path(folder.name) / "policy"
+    train_into(
+        task,
+        out=target,
+        learner=learner,
+        vehicle=body,
+        seed=seed,
+        worlds=worlds,
+        steps=steps,
+        randomize=randomize,
+        settings=settings or {},
+        console=Console(stderr=True, quiet=not progress),
+        **options,
+    )
+    policy = Policy.load(target, vehicle=body)
+    if folder is not None:
+        weakref.finalize(policy, folder.cleanup)
+    return policy
+
+
+def evaluate(
+    controller: Policy | str | Path,
+    task: str | None = None,
+    *,
+    vehicle: Vehicle | str | Path | None = None,
+    plant: str | Path | Sequence[str | Path] = "nominal",
+    trials: int | None = None,
+    seed: int = 1,
+    progress: bool = False,
+    **options: Any,
+) -> Evaluations:
+    """Evaluate a controller in simulated trials of a task.
+
+    Args:
+        controller: A policy, the path of its directory, the name of a baseline of the task such as pid, or the path of
+            a record of one on a robot (.mcap).
+        task: Name of the task, or FILE.py:CLASS; the policy's own if None, and t1 of a controller that has none.
+        vehicle: A vehicle, the name of one in the catalogue, or the path of a vehicle file; the policy's own if None.
+        plant: How the simulated vehicle and water differ from the vehicle file: a name, a file, or several.
+        trials: Trials in each plant; if None the eight setpoints of t1, the four trajectories of t2, or the task's own
+            number of episodes.
+        seed: Seed of every random number.
+        progress: Whether progress is shown on standard error.
+        options: Further arguments of `finssim.experiments.evaluate.evaluate`.
+
+    Returns:
+        The result: `table`, `metrics`, `plot()`, and `each` with the trials of every plant.
+
+    Raises:
+        EvaluationError, PolicyError, ControlError, PlantError, VehicleError: As they say.
+    """
+    from finssim.control.policy import Policy
+    from finssim.experiments.evaluate import evaluate_in_plants
+
+    named: Any = vehicle
+    if isinstance(controller, Policy) and vehicle is None:
+        named = _vehicle_of(controller)
+    with silent(not progress):
+        return evaluate_in_plants(
+            controller.folder if isinstance(controller, Policy) else controller,
+            task=task,
+            vehicle=named,
+            plant=plant,
+            trials=trials,
+            seed=seed,
+            **options,
+        )
+
+
+def run_in_pool(
+    controller: Policy | str | Path,
+    task: Literal["t1", "t2"] = "t1",
+    *,
+    plant: int = 1,
+    vehicle: Vehicle | str | Path | None = None,
+    targets: Sequence[str] | None = None,
+    severity: str = "realistic",
+    camera: str = "corners",
+    duration: float = 60.0,
+    seed: int = 1,
+    progress: bool = False,
+) -> Evaluations:
+    """Run the robot's whole software against the virtual pool in lock-step, as fast as both compute.
+
+    The pool holds a vehicle that the controller does not know: mass, drag, thrusters, sensors and delays are drawn
+    around the vehicle file. The controller sees only what localization and the fusion filter give it.
+
+    Args:
+        controller: A policy, the path of its directory, or pid or pid-paper.
+        task: t1 (station keeping) or t2 (trajectory tracking).
+        plant: Seed from which the pool's vehicle is drawn.
+        vehicle: The vehicle as the robot's software knows it: a vehicle, a name or a file; the policy's own if None.
+        targets: Names of setpoints (t1) or of trajectories (t2); all of the paper's if None.
+        severity: How far the drawn vehicle is from the vehicle file: nominal, realistic or hard.
+        camera: What the overhead camera gives: corners of the tags with noise, or pictures that are drawn and searched.
+        duration: Length of a trial of t1 [s].
+        seed: Seed of all noise.
+        progress: Whether progress is shown on standard error.
+
+    Returns:
+        The result by the true motion: `table`, `metrics`, `plot()`.
+
+    Raises:
+        EvaluationError: Another task.
+        PolicyError, ControlError, PlantSpecError, VehicleError: As they say.
+    """
+    from finssim.control.policy import Policy
+    from finssim.experiments.evaluate import FORMS, EvaluationError, Evaluations, evaluation
+    from finssim.experiments.robot_trials import Job, play_trial
+    from finssim.robot.pilots import make_pilot
+
+    if task not in FORMS:
+        raise EvaluationError(f"run_in_pool plays {', '.join(FORMS)}, but the task is '{task}'")
+    if vehicle is None:
+        vehicle = _vehicle_of(controller) if isinstance(controller, Policy) else "finsrov"
+    body = load_vehicle(vehicle)
+    name = str(controller.folder if isinstance(controller, Policy) else controller)
+    about = make_pilot(name, body, task=task).describe()
+    names = FORMS[task].targets if targets is None else targets
+    measures, trials = [], []
+    with silent(not progress), progress_bar(f"virtual pool, plant {plant}") as show:
+        for k, target in enumerate(names):
+            show(k / len(names), target)
+            job = Job(
+                row=name, target=target, plant=plant, seed=seed, controller=name, vehicle=body, pool_vehicle=body,
+                severity=severity, camera=camera, duration=duration,
+            )  # fmt: skip
+            result, trial = play_trial(job)
+            measures.append(result)
+            trials.append(trial)
+    where = {"name": f"pool {plant}", "title": f"virtual pool, plant {plant}, {severity}, seen by {camera}"}
+    return Evaluations((evaluation(about, task, body, where, measures, trials, seed=seed),))
+
+
+def _vehicle_of(policy: Policy) -> Vehicle:
+    """Return the vehicle that a policy was trained for, if it is known or in the catalogue.
+
+    Raises:
+        EvaluationError: The policy was trained for another vehicle.
+    """
+    from finssim.experiments.evaluate import EvaluationError
+    from finssim.vehicles import catalogue
+
+    if isinstance(policy.vehicle, Vehicle):
+        return policy.vehicle
+    trained = policy.description.vehicle
+    vehicle = load_vehicle(trained.name) if trained.name in catalogue() else None
+    if vehicle is None or vehicle.sha256 != trained.sha256:
+        raise EvaluationError(
+            f"the policy was trained for a vehicle '{trained.name}' that is not the catalogue's: give it with vehicle="
+        )
+    return vehicle
