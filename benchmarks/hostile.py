@@ -121,7 +121,7 @@ def kinds() -> list[Kind]:
     """All of them."""
     camera = "--pool SEEDS/pool.yaml"
     located = f"{camera} --vehicle finsrov --out OUT/rows.csv"
-    fitted = "--camera SEEDS/camera.yaml --interface surface --folds 2 --out OUT/pool.yaml"
+    fitted = "--survey SEEDS/pool-survey.yaml --camera SEEDS/camera.yaml --out OUT/pool.yaml"
     return [
         Kind("vehicle", "vehicle.yaml", (
             "vehicles show {}", "tasks show t1 --vehicle {}",
@@ -139,14 +139,15 @@ def kinds() -> list[Kind]:
             "localize SEEDS/log/detections.csv --vehicle finsrov --out OUT/rows.csv --depth 0.5 --pool {}",
         ), weight=2),
         Kind("camera file", "camera.yaml", (
-            "calibrate pool SEEDS/survey.csv --camera {} --interface surface --folds 2 --out OUT/pool.yaml",
+            "calibrate pool SEEDS/survey.csv --survey SEEDS/pool-survey.yaml --camera {} --out OUT/pool.yaml",
         )),
         Kind("camera file of OpenCV", "left_intrinsics.yml", (
-            "calibrate pool SEEDS/survey.csv --camera {} --interface surface --folds 2 --out OUT/pool.yaml",
+            "calibrate pool SEEDS/survey.csv --survey SEEDS/pool-survey.yaml --camera {} --out OUT/pool.yaml",
         )),
-        Kind("survey", "survey.csv", (
-            "calibrate pool {} --camera SEEDS/camera.yaml --interface surface --folds 2 --out OUT/pool.yaml",
-        ), weight=2),
+        Kind("survey", "survey.csv", (f"calibrate pool {{}} {fitted}",), weight=2),
+        Kind("survey file", "pool-survey.yaml", (
+            "calibrate pool SEEDS/survey.csv --survey {} --camera SEEDS/camera.yaml --out OUT/pool.yaml",
+        )),
         Kind("points", "points.csv", (f"project {{}} {camera}",)),
         Kind("pixels", "pixels.csv", (f"backproject {{}} {camera} --z 0",)),
         Kind("detections", "log/detections.csv", (
@@ -237,8 +238,6 @@ def kinds() -> list[Kind]:
             f"localize SEEDS/log/detections.csv {located} --depth 0.5 --tilt-std-deg NUMBER",
             f"fuse SEEDS/log {located} --rate NUMBER", f"fuse SEEDS/log {located} --pixel-std NUMBER",
             f"backproject SEEDS/pixels.csv {camera} --z NUMBER", f"backproject SEEDS/pixels.csv {camera} --plane 0,0,1,NUMBER",  # noqa: E501
-            f"calibrate pool SEEDS/survey.csv {fitted} --index NUMBER", f"calibrate pool SEEDS/survey.csv {fitted} --z NUMBER",  # noqa: E501
-            f"calibrate pool SEEDS/survey.csv {fitted} --water-height NUMBER --survey-sigma NUMBER",
             "play SEEDS/run.mcap --start NUMBER", "view SEEDS/run.mcap --no-browser --duration 0 --basin 4,2,NUMBER",
             "evaluate pid --trials NUMBER", "collect pid --task t1 --episodes NUMBER --disturb NUMBER --out OUT/set",
             "run --policy pid --goal 0,0,NUMBER,NUMBER --pool-file none --robot udp://127.0.0.1:9 --bind 127.0.0.1:0 "
@@ -541,6 +540,10 @@ def _what_a_camera_saw(folder: Path) -> None:
     points = rng.uniform((-0.8, -0.5, 0.0), (0.8, 0.5, 0.5), (16, 3))
     pixels = project(pool.camera, Interface.water(1.0), points).pixels + 0.2 * rng.standard_normal((16, 2))
     rows = np.column_stack([np.arange(16), pixels, points])
+    (folder / "pool-survey.yaml").write_text(
+        "sigma: 0.002\nsurface: {height: 1.0, sigma: 0.005}\nfit: [pose, height, tilt]\nfolds: 2\n",
+        encoding="utf-8",
+    )
     np.savetxt(folder / "survey.csv", rows, "%.9g", ",", header="id,u,v,x,y,z", comments="")
     tags = load_vehicle("finsrov").tags
     t = np.arange(0.0, 3.0, 0.02)

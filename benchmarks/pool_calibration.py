@@ -36,7 +36,8 @@ class Case:
     reach: tuple[float, float] = (1.9, 0.95)
     tape: bool = False
     focal: bool = False
-    wall: float | None = None
+    window: float | None = None
+    """Angle of the camera to a window [deg]; None: the water surface."""
     plane: bool = False
 
 
@@ -49,17 +50,17 @@ CASES = {
     "two depths, tape": Case(heights=(0.0, 0.5), tape=True),
     "near the axis": Case(reach=(0.2, 0.2), locations=40),
     "near the axis, tape": Case(reach=(0.2, 0.2), locations=40, tape=True),
-    "wall 0": Case(wall=0.0, locations=60),
-    "wall 40": Case(wall=40.0, locations=60),
-    "wall 0, plane": Case(wall=0.0, locations=60, plane=True),
-    "wall 40, plane": Case(wall=40.0, locations=60, plane=True),
+    "window 0": Case(window=0.0, locations=60),
+    "window 40": Case(window=40.0, locations=60),
+    "window 0, plane": Case(window=0.0, locations=60, plane=True),
+    "window 40, plane": Case(window=40.0, locations=60, plane=True),
 }
 
 
 def draw(case: Case, rng: np.random.Generator) -> tuple[Camera, Interface, Observations, Settings]:
     """One pool with its survey, and what its owner knows."""
     index = 1.333 + 0.003 * rng.standard_normal()
-    if case.wall is not None:
+    if case.window is not None:
         return _tank(case, rng, index)
     view = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
     lean = quat_to_matrix(quat_from_rotvec(0.05 * rng.standard_normal(3)))
@@ -69,9 +70,8 @@ def draw(case: Case, rng: np.random.Generator) -> tuple[Camera, Interface, Obser
     seen = _tags(case, rng, camera, water)
     height = float(water.height(*seen.points[:, :2].mean(axis=0)))
     settings = Settings(
-        interface="surface",
         water_height=height + TAPE * rng.standard_normal() if case.tape else None,
-        water_height_sigma=TAPE,
+        place_sigma=TAPE,
         fit=FIT + (("focal",) if case.focal else ()),
         focal_sigma=0.0,
     )
@@ -81,25 +81,25 @@ def draw(case: Case, rng: np.random.Generator) -> tuple[Camera, Interface, Obser
 def _tank(
     case: Case, rng: np.random.Generator, index: float
 ) -> tuple[Camera, Interface, Observations, Settings]:
-    """Points in a tank seen through 10 mm of glass, at z up and the wall at y = 0."""
-    angle = np.radians(case.wall or 0.0)
+    """Return points in a tank seen through 10 mm of glass, with z up and the window at y = 0."""
+    angle = np.radians(case.window or 0.0)
     position = np.array([0.6 * np.sin(angle), -0.6 * np.cos(angle), 0.2])
     ahead = np.array([0.0, 0.15, 0.2]) - position
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right = right / np.linalg.norm(right)
     camera = Camera(TANK_LENS, position, matrix_to_quat(np.stack([right, np.cross(ahead, right), ahead], 1)))
-    glass = (Layer(0.010, 1.52),)
-    wall = Interface(np.array([0.0, -1.0, 0.0]), 0.0, index_far=index, window=glass)
+    glass = Layer(0.010, 1.52)
+    window = Interface(np.array([0.0, -1.0, 0.0]), 0.0, index_far=index, window=(glass,))
     points = rng.uniform((-0.3, 0.03, 0.0), (0.3, 0.35, 0.4), (4000, 3))
-    seen = _seen(points[:, None, :], 0.0005, 0.0, rng, camera, wall, case.locations)
+    seen = _seen(points[:, None, :], 0.0005, 0.0, rng, camera, window, case.locations)
     lean = 1e-3 * rng.standard_normal(2)
     known = (float(lean[0]), -1.0, float(lean[1]), TAPE * rng.standard_normal()) if case.plane else None
     settings = Settings(
-        interface="wall", plane=known, water_height_sigma=TAPE, tilt_sigma=1e-3 if case.plane else None,
-        window=glass, survey_sigma=0.0005, fit=FIT,
+        window=glass, plane=known, place_sigma=TAPE, tilt_sigma=1e-3 if case.plane else None,
+        survey_sigma=0.0005, fit=FIT,
     )  # fmt: skip
-    return camera, wall, seen, settings
+    return camera, window, seen, settings
 
 
 def _tags(case: Case, rng: np.random.Generator, camera: Camera, water: Interface) -> Observations:
@@ -143,7 +143,7 @@ def _seen(
 
 def errors(fit: PoolFit, camera: Camera, plane: Interface) -> dict[str, tuple[float, float]]:
     """Estimate minus truth, and half the interval, of each parameter that the truth has."""
-    surface = fit.surface
+    surface = fit.settings.surface
     truth = {f"camera_{axis}": float(camera.position[k]) for k, axis in enumerate("xyz")}
     clearance = float(plane.normal @ camera.position + plane.offset)
     truth["camera_height" if surface else "camera_distance"] = clearance

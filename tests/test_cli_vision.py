@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 
 from calibration.vision.board_views import PHOTOGRAPHS
 from calibration.vision.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
@@ -254,26 +255,34 @@ def surveyed(pool_files, tmp_path, monkeypatch):
 
 
 WITH = ["--camera", "camera.yaml"]
-SURFACE = ["--interface", "surface", "--fit", "pose,height,tilt,index", "--folds", "2"]
-TAPE = ["--water-height", "1.0"]
+TAPE = "surface: {height: 1.0}"
 
 
-def pool_by(capsys, out, *words, inputs=("points.csv",), surface=SURFACE):
+def surveyed_as(folder, tape=TAPE, **values):
+    """A survey file of the folder: a surface with a tape and two folds, unless given otherwise; its path."""
+    tree = {"fit": ["pose", "height", "tilt", "index"], "folds": 2, **yaml.safe_load(tape), **values}
+    (folder / "survey.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
+    return folder / "survey.yaml"
+
+
+def pool_by(capsys, out, *words, tape=TAPE, inputs=("points.csv",), **values):
     """What `finssim calibrate pool` finds, and the pool that it writes."""
-    found = found_by(capsys, "calibrate", "pool", *inputs, *WITH, *surface, "--out", out / "p.yaml", *words)
+    survey = ["--survey", surveyed_as(out, tape, **values)]
+    found = found_by(capsys, "calibrate", "pool", *inputs, *survey, *WITH, "--out", out / "p.yaml", *words)
     return found, load_pool(out / "p.yaml")
 
 
 @pytest.fixture(scope="session")
-def plain(pool_files):
-    """The same without any option, for comparison."""
+def plain(pool_files, tmp_path_factory):
+    """The same with a tape alone, for comparison."""
     import contextlib
     import io
 
-    text = io.StringIO()
+    text, out = io.StringIO(), tmp_path_factory.mktemp("plain")
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(text):
         patch.chdir(pool_files)
-        words = ["calibrate", "pool", "points.csv", *WITH, *SURFACE, *TAPE, "--out", "plain.yaml", "--json"]
+        survey = ["--survey", surveyed_as(out)]
+        words = ["calibrate", "pool", "points.csv", *survey, *WITH, "--out", "plain.yaml", "--json"]
         assert finssim(*words) == 0
     return json.loads(text.getvalue()), load_pool(pool_files / "plain.yaml")
 
@@ -295,12 +304,13 @@ def test_pool_as_json_and_as_a_file(surveyed, plain):
 
 @pytest.mark.slow
 def test_pool_as_a_table_with_a_report(surveyed, capsys):
-    """Without any option but those that it needs: what was found, where it was written, and a command to do it again
-    that does it again."""
+    """With the shortest survey file: what was found, where it was written, and a command that does it again."""
     import shlex
 
-    words = ["calibrate", "pool", "points.csv", *WITH, "--out", surveyed / "p.yaml", "--seed", "4"]
-    assert finssim(*words, "--report", surveyed / "report", "--latency", "0.05") == 0
+    (surveyed / "s.yaml").write_text("surface: {}\ncamera: {latency: 0.05}\n")
+    words = ["calibrate", "pool", "points.csv", "--survey", surveyed / "s.yaml", *WITH]
+    words += ["--out", surveyed / "p.yaml", "--seed", "4", "--report", surveyed / "report"]
+    assert finssim(*words) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "camera before a water surface, from 24 surveyed places" in out and "camera_height" in out
     assert "held out (5 parts)" in out and f"written: {surveyed / 'report'}" in out
@@ -313,141 +323,129 @@ def test_pool_as_a_table_with_a_report(surveyed, capsys):
 
 
 @pytest.mark.slow
-def test_pool_matches_a_survey_with_pixels(surveyed, plain, capsys):
-    """Two tables with --surveyed give what one gives."""
-    _, pool = pool_by(capsys, surveyed, *TAPE, "--surveyed", "survey.csv", inputs=("pixels.csv",))
+def test_pool_matches_a_survey_with_pixels(surveyed, pool_files, plain, capsys):
+    """Two tables give what one gives; `points` is beside the survey file."""
+    points = str(pool_files / "survey.csv")
+    _, pool = pool_by(capsys, surveyed, points=points, inputs=("pixels.csv",))
     assert pool.sha256 == plain[1].sha256
 
 
 @pytest.mark.slow
 def test_pool_reads_lengths_in_the_unit(surveyed, plain, capsys):
-    """Millimetres without a word of it spread over kilometres and are refused; with --unit they are the same survey."""
-    words = ["calibrate", "pool", "millimetres.csv", *WITH, *SURFACE, *TAPE, "--out", surveyed / "p.yaml"]
-    refused(capsys, surveyed, words, "give --unit")
-    _, pool = pool_by(capsys, surveyed, *TAPE, "--unit", "mm", inputs=("millimetres.csv",))
+    """Millimetres that are not named spread over kilometres and are refused; with `unit` they are the same survey."""
+    survey = ["--survey", surveyed_as(surveyed)]
+    words = ["calibrate", "pool", "millimetres.csv", *survey, *WITH, "--out", surveyed / "p.yaml"]
+    refused(capsys, surveyed, words, "unit: mm into the survey file")
+    _, pool = pool_by(capsys, surveyed, unit="mm", inputs=("millimetres.csv",))
     np.testing.assert_allclose(pool.camera.position, plain[1].camera.position, atol=1e-6)
 
 
 def test_pool_takes_the_height_of_a_floor(surveyed, capsys):
-    """A table without z: refused without --z; another height of the floor moves the camera with it."""
-    words = ["calibrate", "pool", "floor.csv", *WITH, *SURFACE, "--out", surveyed / "p.yaml"]
+    """A table without z: refused without `z`; another height of the floor moves the camera with it."""
+    survey = ["--survey", surveyed_as(surveyed, "surface: {}")]
+    words = ["calibrate", "pool", "floor.csv", *survey, *WITH, "--out", surveyed / "p.yaml"]
     refused(capsys, surveyed, words, "no column 'z'")
     heights = []
     for z in (0.0, 0.5):
-        _, pool = pool_by(capsys, surveyed, "--z", z, "--water-height", 1.0 + z, inputs=("floor.csv",))
+        _, pool = pool_by(
+            capsys, surveyed, tape=f"surface: {{height: {1.0 + z}}}", z=z, inputs=("floor.csv",)
+        )
         heights.append(pool.camera.position[2])
     assert heights[1] - heights[0] == pytest.approx(0.5, abs=1e-4)
 
 
-OPTIONS = {
-    "interface": (["--interface", "wall"], lambda a, b, p: a["interface"] == "wall"),
-    "plane": (["--plane", "0,0,1,-1.02"], lambda a, b, p: abs(p.interface.height(0, 0) - 1.02) < 0.01),
-    "window": (["--window", "0.02:1.49"], lambda a, b, p: p.interface.window == (Layer(0.02, 1.49),)),
-    "two windows": (
-        ["--window", "0.02:1.49", "--window", "0.01:1.52"],
-        lambda a, b, p: p.interface.window == (Layer(0.02, 1.49), Layer(0.01, 1.52)),
+KEYS = {
+    "window": (
+        {"tape": "window: {thickness: 0.02, index: 1.49}"},
+        lambda a, b, p: a["interface"] == "window" and p.interface.window == (Layer(0.02, 1.49),),
     ),
-    "water-height": (
-        ["--water-height", "1.03", "--water-height-sigma", "0.0005"],
+    "plane": (
+        {"tape": "window: {thickness: 0.02, index: 1.49, plane: [0, 0, 1, -1.02], sigma: 0.0005}"},
+        lambda a, b, p: abs(p.interface.height(0, 0) - 1.02) < 0.01,
+    ),
+    "height": (
+        {"tape": "surface: {height: 1.03, sigma: 0.0005}"},
         lambda a, b, p: abs(a["parameters"]["water_height"]["estimate"] - 1.03) < 0.005,
     ),
-    "water-depth": (
-        ["--water-depth", "0.5", "--water-height-sigma", "0.0005"],
+    "depth": (
+        {"tape": "surface: {depth: 0.5, sigma: 0.0005}"},
         lambda a, b, p: a["settings"]["water_depth"] == 0.5
         and abs(a["parameters"]["water_height"]["estimate"] - b["parameters"]["water_height"]["estimate"]) > 0.1,
     ),
-    "water-height-sigma": (
-        [*TAPE, "--water-height-sigma", "0.0005"],
+    "sigma of the height": (
+        {"tape": "surface: {height: 1.0, sigma: 0.0005}"},
         lambda a, b, p: 3.0 * width(a, "water_height") < width(b, "water_height"),
     ),
     "index": (
-        [*TAPE, "--index", "1.34", "--fit", "pose,height,tilt"],
-        lambda a, b, p: p.interface.index_far == 1.34 and a["settings"]["index_sigma"] == 0.0,
+        {"water": {"index": 1.34}, "fit": ["pose", "height", "tilt"]},
+        lambda a, b, p: p.interface.index_far == 1.34,
     ),
-    "index-sigma": ([*TAPE, "--index-sigma", "0.03"], lambda a, b, p: width(a, "index") > 1.5 * width(b, "index")),
-    "tilt-sigma": ([*TAPE, "--tilt-sigma", "0.01"], lambda a, b, p: width(a, "tilt_x") < 0.5 * width(b, "tilt_x")),
-    "fit": ([*TAPE, "--fit", "pose,height"], lambda a, b, p: a["parameters"]["tilt_x"]["note"] == "as given"),
-    "focal-sigma": ([*TAPE, "--focal-sigma", "0.01"], lambda a, b, p: width(a, "focal") > width(b, "focal") == 0.0),
-    "center-sigma": (
-        [*TAPE, "--center-sigma", "5"],
+    "index_sigma": ({"water": {"index_sigma": 0.03}}, lambda a, b, p: width(a, "index") > 1.5 * width(b, "index")),
+    "tilt_sigma_deg": (
+        {"tape": "surface: {height: 1.0, tilt_sigma_deg: 0.01}"},
+        lambda a, b, p: width(a, "tilt_x") < 0.5 * width(b, "tilt_x"),
+    ),
+    "fit": ({"fit": ["pose", "height"]}, lambda a, b, p: a["parameters"]["tilt_x"]["note"] == "as given"),
+    "focal_sigma": ({"camera": {"focal_sigma": 0.01}}, lambda a, b, p: width(a, "focal") > width(b, "focal") == 0.0),
+    "center_sigma_px": (
+        {"camera": {"center_sigma_px": 5}},
         lambda a, b, p: width(a, "center_x") > width(b, "center_x") == 0.0,
     ),
-    "pixel-sigma": ([*TAPE, "--pixel-sigma", "1.5"], lambda a, b, p: a["residual"]["pixel_sigma"] == 1.5),
-    "survey-sigma": (
-        [*TAPE, "--survey-sigma", "0.0002"],
-        lambda a, b, p: a["residual"]["survey_sigma_mm"] < 0.5,
-    ),
-    "latency": ([*TAPE, "--latency", "0.04"], lambda a, b, p: p.latency == 0.04),
-    "folds": ([*TAPE, "--folds", "4"], lambda a, b, p: a["held_out"]["folds"] == 4 != b["held_out"]["folds"]),
-    "seed": ([*TAPE, "--seed", "7"], lambda a, b, p: a["held_out"]["rms_px"] != b["held_out"]["rms_px"]),
+    "pixel_sigma_px": ({"camera": {"pixel_sigma_px": 1.5}}, lambda a, b, p: a["residual"]["pixel_sigma"] == 1.5),
+    "sigma": ({"sigma": 0.0002}, lambda a, b, p: a["residual"]["survey_sigma_mm"] < 0.5),
+    "latency": ({"camera": {"latency": 0.04}}, lambda a, b, p: p.latency == 0.04),
+    "folds": ({"folds": 4}, lambda a, b, p: a["held_out"]["folds"] == 4 != b["held_out"]["folds"]),
 }  # fmt: skip
-"""Option -> words, and what is then otherwise than without: JSON now, JSON without, pool now."""
+"""Key of the survey file -> what is given, and what then differs: JSON now, JSON without, pool now."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", OPTIONS)
-def test_pool_does_what_each_option_says(surveyed, plain, capsys, name):
-    """The result is otherwise in the way that the option names."""
-    words, told = OPTIONS[name]
-    found, pool = pool_by(capsys, surveyed, *words)
+@pytest.mark.parametrize("name", KEYS)
+def test_pool_does_what_each_key_says(surveyed, plain, capsys, name):
+    """The result is otherwise in the way that the key names."""
+    values, told = KEYS[name]
+    found, pool = pool_by(capsys, surveyed, **values)
     assert told(found, plain[0], pool)
     assert not told(plain[0], plain[0], plain[1])
 
 
 @pytest.mark.slow
+def test_pool_draws_by_its_seed(surveyed, plain, capsys):
+    found, _ = pool_by(capsys, surveyed, "--seed", "7")
+    assert found["held_out"]["rms_px"] != plain[0]["held_out"]["rms_px"]
+
+
+@pytest.mark.slow
 def test_pool_finds_the_tags_of_a_picture(surveyed, tag_files, capsys):
-    """Of the family that --family says, with the edge that --edge says: camera and water within 1.5 cm."""
-    words = ["--surveyed", "tags.csv", *TAPE]
-    given = {"inputs": ("tags.png",)}
-    found, pool = pool_by(capsys, surveyed, *words, "--family", "tag36h11", "--edge", TAG_EDGE, **given)
+    """Of the given family, with the given edge: camera and water within 1.5 cm."""
+    given = {"inputs": ("tags.png",), "points": str(tag_files / "tags.csv")}
+    tags = {"family": "tag36h11", "edge": TAG_EDGE}
+    found, pool = pool_by(capsys, surveyed, tags=tags, **given)
     assert found["residual"]["points"] == 48 and found["residual"]["locations"] == 12
     assert np.linalg.norm(pool.camera.position - overhead().position) < 0.02
-    yaw = ["--survey-yaw-sigma", "4", "--family", "tag36h11", "--edge", TAG_EDGE]
-    other, _ = pool_by(capsys, surveyed, *words, *yaw, **given)
+    other, _ = pool_by(capsys, surveyed, tags={**tags, "yaw_sigma_deg": 4}, **given)
     assert other["parameters"]["camera_x"] != found["parameters"]["camera_x"]
     assert other["settings"]["survey_yaw_sigma"] == pytest.approx(np.radians(4.0))
-    command = ["calibrate", "pool", "tags.png", *words, *WITH, "--out", surveyed / "q.yaml"]
-    refused(capsys, surveyed, [*command, "--family", "tag36h11"], "a tag without its edge")
-    refused(capsys, surveyed, [*command, "--family", "16h5", "--edge", TAG_EDGE], "tags.png")
-    refused(capsys, surveyed, [*command, "--family", "99h9", "--edge", TAG_EDGE], "unknown tag family '99h9'")
+    for changes, sentence in (
+        ({"family": "tag36h11"}, "a tag without its edge"),
+        ({"family": "16h5", "edge": TAG_EDGE}, "tags.png"),
+        ({"edge": TAG_EDGE}, "give tags: {family: tag25h9}"),
+    ):
+        survey = ["--survey", surveyed_as(surveyed, tags=changes, points=given["points"])]
+        command = ["calibrate", "pool", "tags.png", *survey, *WITH, "--out", surveyed / "q.yaml"]
+        refused(capsys, surveyed, command, sentence)
 
 
-POOL_WORDS = ["calibrate", "pool", "points.csv", *WITH, "--out", "OUT"]
+POOL_WORDS = ["calibrate", "pool", "points.csv", "--survey", "SURVEY", *WITH, "--out", "OUT"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ([*POOL_WORDS, "--interface", "glass"], "unknown interface 'glass'; available: auto, surface, wall"),
-        ([*POOL_WORDS, "--plane", "0,1"], "plane is '0,1', expected n_x,n_y,n_z,b"),
-        ([*POOL_WORDS, "--plane", "0,0,0,1"], "expected a direction"),
-        ([*POOL_WORDS, "--window", "thick"], "window is 'thick', expected THICKNESS:INDEX"),
-        ([*POOL_WORDS, "--window", "-1:1.5"], "window is '-1:1.5'"),
-        ([*POOL_WORDS, "--water-height", "-1"], "other side"),
-        ([*POOL_WORDS, "--water-height", "1", "--water-depth", "1"], "given twice"),
-        ([*POOL_WORDS, "--index", "5"], "index is 5, expected a number from 1 to 2.5"),
-        ([*POOL_WORDS, "--fit", "pose,colour"], "unknown 'colour' to fit; available: pose"),
-        ([*POOL_WORDS, "--fit", "height"], "fit leaves the pose out"),
-        ([*POOL_WORDS, "--fit", "pose"], "give --water-height"),
-        ([*POOL_WORDS, "--pixel-sigma", "0"], "pixel sigma is 0"),
-        ([*POOL_WORDS, "--survey-sigma", "-1"], "survey sigma is -1"),
-        ([*POOL_WORDS, "--focal-sigma", "-1"], "focal sigma is -1"),
-        ([*POOL_WORDS, "--center-sigma", "-1"], "center sigma is -1"),
-        ([*POOL_WORDS, "--index-sigma", "-1"], "index sigma is -1"),
-        ([*POOL_WORDS, "--tilt-sigma", "-1"], "tilt sigma [deg] is -1"),
-        ([*POOL_WORDS, "--water-height", "1", "--water-height-sigma", "-1"], "water height sigma is -1"),
-        ([*POOL_WORDS, "--survey-yaw-sigma", "-1"], "survey yaw sigma [deg] is -1"),
-        ([*POOL_WORDS, "--water-height", "nan"], "'--water-height': nan is not a number"),
-        ([*POOL_WORDS, "--water-depth", "nan"], "'--water-depth': nan is not a number"),
-        ([*POOL_WORDS, "--plane", "0,nan,1,0"], "plane"),
-        ([*POOL_WORDS, "--latency", "nan"], "'--latency': nan is not a number"),
-        ([*POOL_WORDS, "--z", "nan"], "'--z': nan is not a number"),
-        ([*POOL_WORDS, "--edge", "nan"], "'--edge': nan is not a number"),
-        ([*POOL_WORDS, "--unit", "mile"], "mile"),
-        ([*POOL_WORDS, "--folds", "1"], "Invalid value for '--folds'"),
         ([*POOL_WORDS, "--seed", "-1"], "Invalid value for '--seed'"),
-        ([*POOL_WORDS, "--surveyed", "nowhere.csv"], "nowhere.csv"),
+        ([*POOL_WORDS, "--survey", "nowhere.yaml"], "nowhere.yaml"),
+        ([*POOL_WORDS, "--survey", "camera.yaml"], "camera.yaml: neither surface nor window is given"),
         ([*POOL_WORDS, "--camera", "nowhere.yaml"], "nowhere.yaml"),
         ([*POOL_WORDS, "--camera", "points.csv"], "points.csv"),
         ([*POOL_WORDS[:-1], "p.txt"], "p.txt ends in '.txt', expected .yaml"),
@@ -457,14 +455,17 @@ POOL_WORDS = ["calibrate", "pool", "points.csv", *WITH, "--out", "OUT"]
         (["calibrate", "pool", "nowhere.csv", *POOL_WORDS[3:]], "nowhere.csv: no such file"),
         (["calibrate", "pool", "pixels.csv", *POOL_WORDS[3:]], "no column 'x'"),
         (["calibrate", "pool", "bad.csv", *POOL_WORDS[3:]], "bad.csv"),
-        (["calibrate", "pool", "points.csv", "--out", "OUT"], "Missing option '--camera'"),
-        (["calibrate", "pool", "points.csv", *WITH], "Missing option '--out'"),
+        (["calibrate", "pool", "points.csv", "--survey", "SURVEY", "--out", "OUT"], "Missing option '--camera'"),
+        (["calibrate", "pool", "points.csv", *WITH, "--out", "OUT"], "Missing option '--survey'"),
+        (["calibrate", "pool", "points.csv", "--survey", "SURVEY", *WITH], "Missing option '--out'"),
         (["calibrate", "pool", *POOL_WORDS[3:]], "Missing argument 'INPUT"),
+        ([*POOL_WORDS, "--water-height", "1"], "--water-height"),
     ],
 )  # fmt: skip
 def test_pool_refuses_in_a_sentence(surveyed, pool_files, capsys, words, sentence):
     """And nothing is written, neither where the inputs are."""
-    given = [surveyed / "p.yaml" if word == "OUT" else word for word in words]
+    files = {"OUT": surveyed / "p.yaml", "SURVEY": surveyed_as(surveyed)}
+    given = [files.get(word, word) for word in words]
     before = sorted(pool_files.rglob("*"))
     refused(capsys, surveyed, given, sentence)
     assert sorted(pool_files.rglob("*")) == before

@@ -9,7 +9,7 @@ import yaml
 from finssim import experiments, vehicles, worlds
 from finssim.calibration.importers.assemble import read_map
 from finssim.calibration.trials.trial_files import read_header
-from finssim.calibration.vision.survey import grid_points
+from finssim.calibration.vision.survey_file import load_survey_file
 from finssim.control.modes import action_mode, mode_from_dict
 from finssim.control.policy import read_description
 from finssim.control.trajectories import read_trajectory
@@ -49,6 +49,7 @@ LATER = {
     "trial": {"vehicle"},
     "plant of the pool": {"vehicle"},
     "vehicle": {"family"},
+    "survey through a window": {"points"},
     "policy": {"task", "unit", "mode", "sha256", "hydrodynamics"},
 }
 """Words that are names of something outside the file, which whoever uses it compares or looks up."""
@@ -94,10 +95,17 @@ READERS = {
         "water: {density: 1000.0}\n",
         "trial.yaml",
     ),
-    "board of tags": (
-        grid_points,
-        "grid: {first: 0, columns: 3, rows: 2, spacing: [0.1, 0.1], edge: 0.08, position: [0, 0, 0]}\n",
-        "grid.yaml",
+    "survey": (
+        load_survey_file,
+        "grid: {first: 0, columns: 3, rows: 2, spacing: [0.1, 0.1], edge: 0.08, position: [0, 0, 0]}\nunit: mm\n"
+        "tags: {family: tag36h11}\nsurface: {height: 1.0}\nwater: {index: 1.34}\ncamera: {latency: 0.1}\n"
+        "fit: [pose, height]\n",
+        "survey.yaml",
+    ),
+    "survey through a window": (
+        load_survey_file,
+        "points: survey.csv\nwindow: {thickness: 0.01, index: 1.52, plane: [0, 1, 0, 0]}\n",
+        "survey.yaml",
     ),
     "points": (
         read_trajectory,

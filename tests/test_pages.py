@@ -7,12 +7,16 @@ import sys
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import pytest
 
 from finssim.calibration.importers.dispatch import read_trials
+from finssim.calibration.vision.pool_fit import run
 from finssim.engine.ranges_file import load_ranges
 from finssim.experiments.plants import load_plant
 from finssim.experiments.sweep import load_sweep
+from finssim.geometry.optics import Interface
+from finssim.localization.camera_file import write_camera
 from finssim.localization.pool import load_pool
 from finssim.tasks import TASKS
 from finssim.tasks.sensing import load_sensing
@@ -73,6 +77,28 @@ def test_the_pools_on_the_page_load(tmp_path):
     for example, height in ((full, 0.96), (shortest, 1.0)):
         (tmp_path / "pool.yaml").write_text(example, encoding="utf-8")
         assert load_pool(tmp_path / "pool.yaml").interface.height(0.0, 0.0) == pytest.approx(height)
+
+
+@pytest.mark.slow
+def test_the_survey_on_the_page_calibrates_a_pool(tmp_path, monkeypatch):
+    """The survey file of the page, with a survey of the published pool in millimetres: the camera to 15 mm."""
+    from calibration.vision.surveyed_pools import FLOOR, PLUMB_BOB, overhead, survey
+
+    monkeypatch.chdir(tmp_path)
+    (example,) = blocks(ROOT / "docs" / "pool_calibration.md", "yaml")
+    Path("survey.yaml").write_text(example, encoding="utf-8")
+    write_camera("camera.yaml", PLUMB_BOB, {})
+    seen = survey(overhead(), Interface.water(1.02), FLOOR, 30)
+    for name, header, rows in (
+        ("points.csv", "id,x,y", 1000.0 * seen.points[:, :2]), ("pixels.csv", "id,u,v", seen.pixels),
+    ):  # fmt: skip
+        lines = [f"{label},{a},{b}" for label, (a, b) in zip(seen.names, rows, strict=True)]
+        Path(name).write_text("\n".join([header, *lines]), encoding="utf-8")
+    fit = run(
+        [Path("pixels.csv")], survey=Path("survey.yaml"), camera=Path("camera.yaml"), out=Path("pool.yaml")
+    )
+    assert np.linalg.norm(fit.model.camera.position - overhead().position) < 0.015
+    assert load_pool("pool.yaml").latency == 0.045
 
 
 def test_the_rov_on_the_page_is_sound_and_its_log_is_read(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Camera files say the same lens in every dialect, and what is missing in one sentence."""
+"""Camera files of every format give the same lens, and what is missing is refused in one sentence."""
 
 import json
 
@@ -55,43 +55,49 @@ KALIBR = f"""cam0:
   resolution: [640, 480]
 """
 EIGHT = (*FIVE, 0.01, 0.02, 0.03)
+MESSAGE = f"width: 640\nheight: 480\ndistortion_model: plumb_bob\nD: {list(FIVE)}\nK: {FLAT}\nP: {[*FLAT, 0, 0, 0]}\n"
+"""A ROS message, as `rostopic echo` prints it."""
+
+
+def matlab(matrix=None, **changes):
+    """Return what `jsonencode(toStruct(cameraParams))` writes: the first pixel is 1, the older matrix is transposed."""
+    older = [[535.9, 0.0, 0.0], [0.0, 536.2, 0.0], [343.3, 236.6, 1.0]]
+    tree = {
+        "RadialDistortion": [FIVE[0], FIVE[1], FIVE[4]],
+        "TangentialDistortion": FIVE[2:4],
+        "ImageSize": [480, 640],
+        "EstimateSkew": False,
+        "NumRadialDistortionCoefficients": 3,
+        "WorldPoints": [[0, 0], [25, 0]],
+        "WorldUnits": "mm",
+        "Version": {"major": 1},
+        **(matrix or {"IntrinsicMatrix": older}),
+        **changes,
+    }
+    return json.dumps(tree)
+
+
 DIALECTS = {
     "opencv": (OPENCV, Lens(**NUMBERS, distortion=FIVE)),
-    "ros": (ros("plumb_bob", FIVE), Lens(**NUMBERS, distortion=FIVE)),
-    "ros rational": (ros("rational_polynomial", EIGHT), Lens(**NUMBERS, model="rational", distortion=EIGHT)),
-    "ros fisheye": (ros("equidistant", FOUR), Lens(**NUMBERS, model="fisheye", distortion=FOUR)),
-    "kalibr": (KALIBR, Lens(**NUMBERS, model="fisheye", distortion=FOUR)),
-    "nested json": (
-        json.dumps({"camera_matrix": K, "dist_coeffs": [list(FIVE)], "image_size": [640, 480]}),
-        Lens(**NUMBERS, distortion=FIVE),
-    ),
-    "plain numbers": (
-        "width: 640\nheight: 480\nfx: 535.9\nfy: 536.2\ncx: 342.3\ncy: 235.6\nk1: 0.1\nk2: -0.2\n",
-        Lens(**NUMBERS, distortion=(0.1, -0.2, 0.0, 0.0, 0.0)),
-    ),
-    "named coefficients of a fisheye": (
-        "width: 640\nheight: 480\nfx: 535.9\nfy: 536.2\ncx: 342.3\ncy: 235.6\nmodel: fisheye\nk1: 0.1\nk3: 0.02\n",
-        Lens(**NUMBERS, model="fisheye", distortion=(0.1, 0.0, 0.02, 0.0)),
-    ),
-    "named coefficients with k3": (
-        "width: 640\nheight: 480\nfx: 535.9\nfy: 536.2\ncx: 342.3\ncy: 235.6\nk1: 0.1\nk3: 0.02\n",
-        Lens(**NUMBERS, distortion=(0.1, 0.0, 0.0, 0.0, 0.02)),
-    ),
     "opencv's fisheye": (
         OPENCV.replace("flags: 2", "fisheye_model: 1").replace(str(list(FIVE)), str(list(FOUR))),
         Lens(**NUMBERS, model="fisheye", distortion=FOUR),
     ),
-    **{
-        word: (ros(word, FOUR), Lens(**NUMBERS, model="fisheye", distortion=FOUR))
-        for word in ("kannala_brandt", "KannalaBrandt8", "opencv_fisheye", "OPENCV_FISHEYE", "kb4", "fisheye")
-    },
-    "colmap": (ros("FULL_OPENCV", EIGHT), Lens(**NUMBERS, model="rational", distortion=EIGHT)),
-    "ours with another's word": (
-        "lens: {model: kannala_brandt, width: 640, height: 480, fx: 535.9, fy: 536.2, cx: 342.3, cy: 235.6, "
-        "distortion: [0.01, -0.02, 0.003, -0.004]}\n",
-        Lens(**NUMBERS, model="fisheye", distortion=FOUR),
+    "ros": (ros("plumb_bob", FIVE), Lens(**NUMBERS, distortion=FIVE)),
+    "ros rational": (ros("rational_polynomial", EIGHT), Lens(**NUMBERS, model="rational", distortion=EIGHT)),
+    "ros fisheye": (ros("equidistant", FOUR), Lens(**NUMBERS, model="fisheye", distortion=FOUR)),
+    "ros message": (MESSAGE, Lens(**NUMBERS, distortion=FIVE)),
+    "kalibr": (KALIBR, Lens(**NUMBERS, model="fisheye", distortion=FOUR)),
+    "kalibr radtan": (KALIBR.replace("equidistant", "radtan"), Lens(**NUMBERS, distortion=FOUR)),
+    "matlab": (matlab(), Lens(**NUMBERS, distortion=FIVE)),
+    "matlab of 2022": (
+        matlab({"K": [[535.9, 0.0, 343.3], [0.0, 536.2, 236.6], [0.0, 0.0, 1.0]]}),
+        Lens(**NUMBERS, distortion=FIVE),
     ),
-    "no distortion": ("image_width: 640\nimage_height: 480\nK: " + str(FLAT) + "\n", Lens(**NUMBERS)),
+    "matlab, two radial coefficients": (
+        matlab(RadialDistortion=FIVE[:2]),
+        Lens(**NUMBERS, distortion=(*FIVE[:4], 0.0)),
+    ),
     "ours": (
         "lens: {model: fisheye, width: 640, height: 480, fx: 535.9, fy: 536.2, cx: 342.3, cy: 235.6, "
         "distortion: [0.01, -0.02, 0.003, -0.004]}\n",
@@ -124,9 +130,13 @@ def test_a_written_camera_reads_back(model, coefficients, tmp_path):
 
 
 REFUSED = {
-    "no size": (f"K: {FLAT}\n", "image_width"),
-    "no matrix": ("image_width: 640\nimage_height: 480\n", "camera matrix"),
-    "skew": (f"image_width: 9\nimage_height: 9\nK: {[500.0, 3.0, *FLAT[2:]]}\n", "skew"),
+    "no size": (
+        ros("plumb_bob", FIVE).replace("image_height: 480\n", ""),
+        "add image_width and image_height",
+    ),
+    "one size": (KALIBR.replace("[640, 480]", "[640]"), "size of the image is missing: add resolution"),
+    "no distortion": (MESSAGE.replace(f"D: {list(FIVE)}\n", ""), "D is missing; zeros mean no distortion"),
+    "skew": (MESSAGE.replace(str(FLAT), str([535.9, 3.0, *FLAT[2:]])), "skew"),
     "not a number": ("lens: {width: 640, height: 480, fx: wide, cx: 1, cy: 1}\n", "fx holds 'wide'"),
     "negative focal length": (
         "lens: {width: 640, height: 480, fx: -5, cx: 1, cy: 1}\n",
@@ -135,37 +145,42 @@ REFUSED = {
     "unknown key": ("lens: {width: 640, height: 480, fx: 5, cx: 1, cy: 1, k1: 0.1}\n", "unknown key 'k1'"),
     "empty": ("", "found nothing"),
     "unknown model": (ros("eucm", FOUR), "unknown lens model 'eucm'"),
-    "unknown projection": (KALIBR.replace("pinhole", "omni"), "unknown lens model 'omni'"),
-    "two models": (ros("plumb_bob", FOUR) + "fisheye: true\n", "two lens models, fisheye and plumb_bob"),
+    "unknown projection": (KALIBR.replace("pinhole", "omni"), "unknown camera_model 'omni'"),
     "unknown model of ours": (
         "lens: {width: 640, height: 480, fx: 5, cx: 1, cy: 1, model: eucm}\n",
         "unknown lens model 'eucm'",
     ),
     "unknown key with numbers": (ros("plumb_bob", FIVE) + "xi: 1.2\n", "unknown key 'xi' holds numbers"),
-    "distortion under another name": (
-        f"width: 640\nheight: 480\nK: {FLAT}\nRadialDistortion: [0.1, 0.2]\n",
-        "unknown key 'RadialDistortion' holds numbers",
-    ),
     "two cameras": (KALIBR + KALIBR.replace("cam0", "cam1"), "unknown key 'cam1' holds numbers"),
     "binned": (ros("plumb_bob", FIVE) + "binning_x: 2\n", "binning_x is 2"),
     "part of the picture": (ros("plumb_bob", FIVE) + "roi: {x_offset: 8, width: 9}\n", "roi is {"),
     "transposed": (
-        f"width: 640\nheight: 480\nK: {[list(row) for row in zip(*K, strict=True)]}\n",
-        "the camera matrix is transposed",
-    ),
-    "no camera matrix": (
-        f"width: 640\nheight: 480\nK: {[1.0, *FLAT[1:8], 2.0]}\n",
+        MESSAGE.replace(str(FLAT), str([x for row in zip(*K, strict=True) for x in row])),
         "expected rows [fx, 0, cx]",
     ),
-    "k4 of plumb_bob": (
-        f"width: 640\nheight: 480\nK: {FLAT}\nmodel: plumb_bob\nk1: 0.1\nk4: 0.1\n",
-        "a plumb_bob lens has no k4",
+    "no camera matrix": (
+        MESSAGE.replace(str(FLAT), str([1.0, *FLAT[1:8], 2.0])),
+        "expected rows [fx, 0, cx]",
     ),
-    "one size": (f"image_size: [640]\nK: {FLAT}\n", "size of the image is missing"),
+    "eight numbers": (MESSAGE.replace(str(FLAT), str(FLAT[:8])), "K holds 8 numbers, expected 9"),
     "key beside our lens": (
         "lens: {width: 640, height: 480, fx: 5, cx: 1, cy: 1}\nlense: {fx: 6}\n",
         "unknown key 'lense'",
     ),
+    "radial coefficients of MATLAB": (matlab(RadialDistortion=[0.1]), "RadialDistortion of 2 or 3 numbers"),
+    "tangential coefficients of MATLAB": (matlab(TangentialDistortion=[0.1]), "TangentialDistortion of 2"),
+    **{
+        name: (
+            text,
+            "expected a camera file of FinsSim (lens), ROS (camera_info), OpenCV (FileStorage), Kalibr",
+        )
+        for name, text in {
+            "plain numbers": "width: 640\nheight: 480\nfx: 535.9\nfy: 536.2\ncx: 342.3\ncy: 235.6\nk1: 0.1\n",
+            "own json": json.dumps({"mtx": K, "dist": FIVE, "image_size": [640, 480]}),
+            "orb-slam": "Camera.fx: 535.9\nCamera.fy: 536.2\nCamera.cx: 342.3\nCamera.cy: 235.6\n",
+            "no camera at all": "image_width: 640\nimage_height: 480\n",
+        }.items()
+    },
 }
 
 

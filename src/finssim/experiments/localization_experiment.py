@@ -34,6 +34,7 @@ from finssim.provenance import provenance
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
 from finssim.text_table import write_csv
 from finssim.vehicles import Mount, Tags
+from finssim.yaml_file import yaml_text
 
 Array = NDArray[np.float64]
 
@@ -320,9 +321,8 @@ def calibrate(campaign: Campaign, observed: Sequence[Picture]) -> Calibrated:
     frames = [Frame(np.nan, p.name, (p.detection,)) for p in chosen if p.detection is not None]
     rows = survey_rows(campaign, chosen)
     settings = Settings(
-        interface="surface",
         water_height=campaign.water_read,
-        water_height_sigma=max(campaign.conditions.tape, 5e-4),
+        place_sigma=max(campaign.conditions.tape, 5e-4),
         survey_sigma=max(campaign.conditions.survey, 1e-4),
         focal_sigma=campaign.conditions.lens / campaign.lens.fx,
         center_sigma=campaign.conditions.lens,
@@ -352,7 +352,7 @@ def survey_rows(campaign: Campaign, chosen: Sequence[Picture]) -> list[Row]:
 
 
 def write_survey(rows: Sequence[Row], path: Path) -> None:
-    """Write the table as `finssim calibrate pool --surveyed` reads it."""
+    """Write the table of the surveyed tags."""
     write_csv(path, list(rows[0]), [list(row.values()) for row in rows])
 
 
@@ -678,6 +678,14 @@ def _write(result: Mapping[str, Any], out: Path, first: SeedResult) -> None:
         write_pool(calibration.pinhole, folder / "pool_pinhole.yaml")
         write_detections(calibration.frames, folder / "detections.csv")
         write_survey(calibration.survey, folder / "survey.csv")
+        told = calibration.fit.settings
+        survey = {
+            "points": "survey.csv",
+            "sigma": told.survey_sigma,
+            "surface": {"height": told.water_height, "sigma": told.place_sigma},
+            "camera": {"focal_sigma": told.focal_sigma, "center_sigma_px": told.center_sigma},
+        }
+        (folder / "survey.yaml").write_text(yaml_text(survey), encoding="utf-8")
         write_json(folder / RESULT_FILE, result, tables_of(result))
 
 

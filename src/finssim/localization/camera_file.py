@@ -1,4 +1,4 @@
-"""Camera files: a lens with its record, ours or as OpenCV, ROS, Kalibr and plain lists of numbers write it."""
+"""Camera files: a lens with its record, in our format or in that of ROS, OpenCV, Kalibr or MATLAB."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from finssim.files import atomic_write
-from finssim.geometry.optics import COEFFICIENTS, Lens, OpticsError, lens_model
+from finssim.geometry.optics import Lens, OpticsError, lens_model
 from finssim.localization import LocalizationError
 from finssim.yaml_file import read_mapping, yaml_text
 
@@ -33,6 +33,10 @@ class Fields:
     def has(self, key: str) -> bool:
         """Whether the key is given, and not null."""
         return self._values.get(key) is not None
+
+    def given(self, key: str) -> bool:
+        """Return whether the key is there, with a value or without."""
+        return key in self._values
 
     def take(self, key: str, default: Any = None) -> Any:
         """The value as it stands, or the default."""
@@ -106,47 +110,51 @@ class Fields:
         return float(value)
 
 
-_SECTIONS = ("lens", "camera", "intrinsics", "cam0")
-"""Where foreign files keep a camera, if not at the top."""
-_WIDTH = ("image_width", "width", "img_width")
-_HEIGHT = ("image_height", "height", "img_height")
-_SIZE = ("image_size", "resolution", "img_size", "size")
-_MATRIX = ("camera_matrix", "K", "mtx", "intrinsic_matrix", "cameraMatrix", "intrinsics", "camera_intrinsics")
-_DISTORTION = (
-    "distortion_coefficients",
-    "distortion_coeffs",
-    "dist_coeffs",
-    "distCoeffs",
-    "dist_coefs",
-    "distortion",
-    "dist",
-    "D",
-)
-_MODEL = (
-    "distortion_model",
-    "model",
-    "lens_model",
-    "camera_model",
-    "projection_model",
-    "camera_type",
-    "distortion_type",
-)
-_ANY_MODEL = ("pinhole", "perspective", "none")
-"""Words that leave the distortion open."""
-_FISHEYE = ("fisheye", "is_fisheye", "fisheye_model")
-"""Keys of a truth value."""
+@dataclass(frozen=True)
+class _Format:
+    """Words of another program's camera file."""
+
+    name: str
+    width: str = ""
+    height: str = ""
+    matrix: str = ""
+    """Key of the camera matrix: 9 numbers, or fx, fy, cx, cy."""
+    distortion: str = ""
+    model: str = ""
+    """Key of the lens model's word; empty: the file names none."""
+    ignored: str = ""
+    """Keys whose numbers are no part of the lens, separated by spaces."""
+
+
+_ROS = "camera_name rectification_matrix projection_matrix header R P"
+_FORMATS = (
+    _Format(
+        "ROS", "image_width", "image_height", "camera_matrix", "distortion_coefficients", "distortion_model", _ROS
+    ),
+    _Format("ROS", "width", "height", "K", "D", "distortion_model", _ROS),
+    _Format(
+        "OpenCV", "image_width", "image_height", "camera_matrix", "distortion_coefficients", "",
+        "nframes nr_of_frames board_width board_height square_size marker_size aspectRatio fix_aspect_ratio flags "
+        "calibration_time avg_reprojection_error per_view_reprojection_errors extrinsic_parameters image_points "
+        "grid_points",
+    ),
+    _Format(
+        "Kalibr", "resolution", "resolution", "intrinsics", "distortion_coeffs", "distortion_model",
+        "rostopic cam_overlaps T_cam_imu T_cn_cnm1 timeshift_cam_imu",
+    ),
+    _Format(
+        "MATLAB", "ImageSize", "ImageSize", "IntrinsicMatrix", "RadialDistortion", "",
+        "WorldPoints EstimateSkew NumRadialDistortionCoefficients EstimateTangentialDistortion RotationVectors "
+        "TranslationVectors ReprojectionErrors DetectedKeypoints Version FocalLength PrincipalPoint Skew",
+    ),
+)  # fmt: skip
+"""Formats of other programs that are read."""
+
+READ = "FinsSim (lens), ROS (camera_info), OpenCV (FileStorage), Kalibr (cam0) and MATLAB (toStruct as JSON)"
+"""Formats of camera files, as refusals name them."""
+
 _PART_OF_PICTURE = ("binning_x", "binning_y", "roi")
-"""Keys that change what a pixel is, unless their numbers are 0 or 1."""
-_NAMES = ("fx", "fy", "cx", "cy", *COEFFICIENTS["rational"], "p1", "p2")
-_NO_LENS = set(
-    "nframes nrofframes boardwidth boardheight squaresize markersize aspectratio fixaspectratio flags calibrationtime "
-    "avgreprojectionerror perviewreprojectionerrors reprojectionerror meanreprojectionerror extrinsicparameters "
-    "imagepoints gridpoints rms rmserror meanerror error ret rvecs tvecs rectificationmatrix projectionmatrix r p seq "
-    "ratehz "
-    "header stamp timestamp date time tcamimu timucam tcncnm1 tbs timeshiftcamimu camoverlaps fps framerate rate "
-    "version format id cameraid serial serialnumber numimages nimages calibration".split()
-)
-"""Keys, in small letters and digits alone, whose numbers are no part of a lens."""
+"""Keys of ROS that change what a pixel is, unless their numbers are 0 or 1."""
 
 
 @dataclass(frozen=True)
@@ -161,11 +169,11 @@ class CameraFile:
 def load_camera(path: str | Path) -> CameraFile:
     """Read a camera file.
 
-    Ours (`lens:`), OpenCV's FileStorage YAML, ROS's `camera_info` YAML, Kalibr's camchain, JSON or YAML with
-    `camera_matrix` (or K) and distortion under one of their usual names, and our pool files.
+    Formats: ours (`lens:`) and our pool files, OpenCV's FileStorage YAML, ROS's `camera_info` (file or message),
+    Kalibr's camchain of one camera, and MATLAB's `jsonencode(toStruct(cameraParams))`.
 
     Raises:
-        LocalizationError: Unreadable, or without image size or focal length; names the file and what to write.
+        LocalizationError: The file is unreadable, in another format, or lacks image size, camera matrix or distortion.
     """
     path = Path(path)
     tree = read_mapping(
@@ -269,51 +277,71 @@ def _standard(text: str) -> str:
 
 
 def _foreign(tree: Mapping[str, Any], label: str) -> Lens:
-    """The lens in other people's words."""
-    for key in _SECTIONS:
-        inner = tree.get(key)
-        if isinstance(inner, Mapping) and _first(inner, (*_MATRIX, "fx")) is not None:
-            return _foreign({**{k: v for k, v in tree.items() if k != key}, **inner}, f"{label}: {key}")
-    _refuse_strange(tree, label)
-    width, height = _size(tree, label)
-    fx, fy, cx, cy = _focal(tree, label)
-    value = _first(tree, _DISTORTION)
-    given = None if value is None else _flat(value, label)
-    model = _model(tree, given, label)
-    return _lens(
-        {
-            "width": width,
-            "height": height,
-            "fx": fx,
-            "fy": fy,
-            "cx": cx,
-            "cy": cy,
-            "model": model,
-            "distortion": _named(tree, model, label) if given is None else given,
-        },
-        label,
-    )
+    """Return the lens of another program's file."""
+    if isinstance(tree.get("cam0"), Mapping):
+        rest = {key: value for key, value in tree.items() if key != "cam0"}
+        return _foreign({**rest, **tree["cam0"]}, f"{label}: cam0")
+    fields = Fields(tree, label)
+    if tree.get("IntrinsicMatrix") is None and "RadialDistortion" in tree and "K" in tree:
+        tree = {
+            **{k: v for k, v in tree.items() if k != "K"},
+            "IntrinsicMatrix": _transposed(tree["K"], label),
+        }
+    for words in _FORMATS:
+        if tree.get(words.matrix) is not None and (not words.model or tree.get(words.model) is not None):
+            break
+    else:
+        raise fields.error(f"no camera in a known format; expected a camera file of {READ}")
+    extra = {"Kalibr": ("camera_model",), "OpenCV": ("fisheye_model",), "MATLAB": ("TangentialDistortion",)}
+    known = {
+        words.width,
+        words.height,
+        words.matrix,
+        words.distortion,
+        words.model,
+        *extra.get(words.name, ()),
+    }
+    _refuse_strange(tree, {*known, *words.ignored.split()}, label)
+    width, height = _size(tree, words, label)
+    fx, fy, cx, cy = _focal(tree, words, label)
+    if tree.get(words.distortion) is None:
+        raise fields.error(f"{words.distortion} is missing; zeros mean no distortion")
+    given = _flat(tree[words.distortion], label)
+    model = _model_of(fields.word(words.model), label) if words.model else "plumb_bob"
+    if words.name == "Kalibr" and fields.word("camera_model") != "pinhole":
+        raise fields.error(f"unknown camera_model '{tree['camera_model']}', expected pinhole")
+    if words.name == "OpenCV" and tree.get("fisheye_model") in (True, 1):
+        model = "fisheye"
+    if words.name == "MATLAB":  # its first pixel is 1
+        tangential = _flat(tree.get("TangentialDistortion") or [0.0, 0.0], label)
+        if len(given) not in (2, 3) or len(tangential) != 2:
+            raise fields.error(
+                "expected a RadialDistortion of 2 or 3 numbers, and a TangentialDistortion of 2"
+            )
+        given = (*given[:2], *tangential, *(given[2:] or (0.0,)))
+        cx, cy = cx - 1.0, cy - 1.0
+    if model == "plumb_bob" and len(given) == 8:
+        model = "rational"  # OpenCV's superset
+    arguments = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    return _lens({**arguments, "model": model, "distortion": given}, label)
 
 
-def _refuse_strange(tree: Mapping[Any, Any], label: str) -> None:
+def _refuse_strange(tree: Mapping[Any, Any], known: set[str], label: str) -> None:
     """Refuse numbers that would be ignored although they may belong to the lens."""
-    known = {*_WIDTH, *_HEIGHT, *_SIZE, *_MATRIX, *_DISTORTION, *_MODEL, *_FISHEYE, *_NAMES}
     for key, value in tree.items():
         if key in _PART_OF_PICTURE:
             if any(x not in (0, 1) for x in _numbers_in(value)):
                 raise LocalizationError(
                     f"{label}: {key} is {value!r}, expected the whole picture, every pixel: calibrate without it"
                 )
-        elif key not in known and re.sub("[^a-z0-9]", "", str(key).lower()) not in _NO_LENS:
-            if any(_numbers_in(value)):
-                raise LocalizationError(
-                    f"{label}: unknown key '{key}' holds numbers: remove it, or rename it, if it belongs to the lens, "
-                    f"to one of {', '.join(sorted(known))}"
-                )
+        elif key not in known and any(_numbers_in(value)):
+            raise LocalizationError(
+                f"{label}: unknown key '{key}' holds numbers: remove it if it is no part of the lens"
+            )
 
 
 def _numbers_in(value: Any) -> Iterator[float]:
-    """All numbers in lists and mappings of any depth."""
+    """Yield all numbers in lists and mappings of any depth."""
     if isinstance(value, (Mapping, list, tuple)):
         for item in value.values() if isinstance(value, Mapping) else value:
             yield from _numbers_in(item)
@@ -321,99 +349,55 @@ def _numbers_in(value: Any) -> Iterator[float]:
         yield value
 
 
-def _first(tree: Mapping[str, Any], names: tuple[str, ...]) -> Any:
-    return next((tree[name] for name in names if tree.get(name) is not None), None)
-
-
 def _flat(value: Any, label: str) -> tuple[float, ...]:
-    """Numbers of a list, of nested lists, or of OpenCV's and ROS's {rows, cols, data}."""
+    """Return the numbers of a list, of nested lists, or of OpenCV's and ROS's {rows, cols, data}."""
     if isinstance(value, Mapping):
         _only(value, ("type_id", "rows", "cols", "dt", "data"), label)
         value = value.get("data")
     if isinstance(value, (list, tuple)):
         return tuple(x for item in value for x in _flat(item, label))
-    return Fields({"it": value}, label).numbers("it", None, ()) if value is None else (_number(value, label),)
+    return (_number(value, label),)
 
 
 def _number(value: Any, label: str) -> float:
     return Fields({"a coefficient": value}, label).number("a coefficient")
 
 
-def _size(tree: Mapping[str, Any], label: str) -> tuple[int, int]:
-    size = _first(tree, _SIZE)
-    width, height = _first(tree, _WIDTH), _first(tree, _HEIGHT)
-    if width is None and size is not None:
-        width, height = (*_flat(size, label), None, None)[:2]
+def _transposed(value: Any, label: str) -> list[float]:
+    numbers = _flat(value, label)
+    return [numbers[3 * column + row] for row in range(3) for column in range(3)] if len(numbers) == 9 else []
+
+
+def _size(tree: Mapping[str, Any], words: _Format, label: str) -> tuple[int, int]:
+    """Return width and height of the image [px]."""
+    if words.width == words.height:  # one list: [width, height] of Kalibr, [rows, columns] of MATLAB
+        size = _flat(tree.get(words.width) or [], label)
+        width, height = size[:: -1 if words.name == "MATLAB" else 1] if len(size) == 2 else (None, None)
+    else:
+        width, height = tree.get(words.width), tree.get(words.height)
     if width is None or height is None:
-        raise LocalizationError(
-            f"{label}: the size of the image is missing: add image_width and image_height"
-        )
+        names = " and ".join(dict.fromkeys((words.width, words.height)))
+        raise LocalizationError(f"{label}: the size of the image is missing: add {names}")
     return int(_number(width, label)), int(_number(height, label))
 
 
-def _focal(tree: Mapping[str, Any], label: str) -> tuple[float, float, float, float]:
-    value = _first(tree, _MATRIX)
-    if value is None and tree.get("fx") is not None:
-        fields = Fields(tree, label)
-        fx = fields.number("fx")
-        return fx, fields.number("fy", fx), fields.number("cx"), fields.number("cy")
-    numbers = _flat(value, label)
-    if len(numbers) == 4:
+def _focal(tree: Mapping[str, Any], words: _Format, label: str) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy as the file has them [px]."""
+    numbers = _flat(tree[words.matrix], label)
+    if words.name == "Kalibr" and len(numbers) == 4:
         return numbers[0], numbers[1], numbers[2], numbers[3]
-    if len(numbers) == 9:
-        if (numbers[2], numbers[5]) == (0.0, 0.0) and (numbers[6], numbers[7]) != (0.0, 0.0):
-            raise LocalizationError(
-                f"{label}: the camera matrix is transposed, as MATLAB writes it: write its columns as rows, and "
-                "subtract 1 from cx and cy if MATLAB computed them (its first pixel is 1, here it is 0)"
-            )
-        if abs(numbers[1]) > 1e-6 * abs(numbers[0]):
-            raise LocalizationError(
-                f"{label}: the camera matrix has a skew of {numbers[1]:.4g} px, expected 0: calibrate without skew"
-            )
-        if (numbers[3], *numbers[6:]) != (0.0, 0.0, 0.0, 1.0):
-            raise LocalizationError(
-                f"{label}: the camera matrix is {list(numbers)}, expected rows [fx, 0, cx], [0, fy, cy], [0, 0, 1]"
-            )
-        return numbers[0], numbers[4], numbers[2], numbers[5]
-    raise LocalizationError(
-        f"{label}: no camera matrix found: give fx, fy, cx, cy [px], or camera_matrix with 9 numbers"
-    )
-
-
-def _model(tree: Mapping[str, Any], given: tuple[float, ...] | None, label: str) -> str:
-    """The model that the file names, or else that its coefficients mean.
-
-    Args:
-        tree: The file.
-        given: Its list of coefficients; None where it names each, or none.
-        label: What messages call it.
-
-    Raises:
-        LocalizationError: An unknown word, or two words that differ.
-    """
-    words = {key: Fields(tree, label).word(key) for key in _MODEL if tree.get(key) is not None}
-    models = {_model_of(word, label) for word in words.values() if word.lower() not in _ANY_MODEL}
-    models |= {"fisheye" for key in _FISHEYE if tree.get(key) in (True, 1)}
-    if len(models) > 1:
+    if words.name == "MATLAB":
+        numbers = tuple(_transposed(numbers, label))
+    if len(numbers) != 9 or words.name == "Kalibr":
         raise LocalizationError(
-            f"{label}: the file names two lens models, {' and '.join(sorted(models))}: keep one"
+            f"{label}: {words.matrix} holds {len(numbers)} numbers, expected {4 if words.name == 'Kalibr' else 9}"
         )
-    if models == {"plumb_bob"} and len(given or ()) == 8:
-        return "rational"  # OpenCV's superset
-    if models:
-        return models.pop()
-    names = {name for name in _NAMES if tree.get(name) is not None}
-    if given is None and "k4" in names and not names & {"p1", "p2", "k5", "k6"}:
-        return "fisheye"
-    return "rational" if len(given or ()) >= 8 or names & {"k4", "k5", "k6"} else "plumb_bob"
-
-
-def _named(tree: Mapping[str, Any], model: str, label: str) -> tuple[float, ...]:
-    """Coefficients that stand alone, each under its name; none where there are none."""
-    names = [name for name in COEFFICIENTS["rational"] if tree.get(name) is not None]
-    for name in names:
-        if name not in COEFFICIENTS[model]:
-            raise LocalizationError(
-                f"{label}: a {model} lens has no {name}: remove it, or name another model"
-            )
-    return tuple(_number(tree.get(name) or 0.0, label) for name in COEFFICIENTS[model]) if names else ()
+    if abs(numbers[1]) > 1e-6 * abs(numbers[0]):
+        raise LocalizationError(
+            f"{label}: the camera matrix has a skew of {numbers[1]:.4g} px, expected 0: calibrate without skew"
+        )
+    if (numbers[3], *numbers[6:]) != (0.0, 0.0, 0.0, 1.0):
+        raise LocalizationError(
+            f"{label}: the camera matrix is {list(numbers)}, expected rows [fx, 0, cx], [0, fy, cy], [0, 0, 1]"
+        )
+    return numbers[0], numbers[4], numbers[2], numbers[5]

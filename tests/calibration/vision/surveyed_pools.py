@@ -18,7 +18,7 @@ RATIONAL = Lens(
     1280, 720, 620.0, 615.0, 640.0, 350.0, "rational", (0.1, -0.05, 1e-3, 1e-3, 0.01, 0.12, -0.03, 0.0)
 )
 TANK_LENS = Lens(1280, 720, 900.0, 900.0, 640.0, 360.0, "plumb_bob", (-0.1, 0.05, 0.0, 0.0))
-GLASS = (Layer(0.010, 1.52),)
+GLASS = Layer(0.010, 1.52)
 FLOOR = ((-1.9, -0.95, 0.0), (1.9, 0.95, 1e-12))
 SOLID = ((-1.9, -0.95, 0.0), (1.9, 0.95, 0.6))
 TANK = ((-0.3, 0.03, 0.0), (0.3, 0.35, 0.4))
@@ -39,15 +39,15 @@ def overhead(lens=PLUMB_BOB) -> Camera:
 
 
 def before_tank(degrees: float) -> Camera:
-    """A camera 0.6 m from the middle of a tank's wall at y = 0, seen from the side."""
+    """Return a camera 0.6 m from the middle of a tank's window at y = 0, seen from the side."""
     a = np.radians(degrees)
     position = (0.6 * np.sin(a), -0.6 * np.cos(a), 0.2)
     return looking(position, (0.0, 0.15, 0.2), TANK_LENS, (0.0, 0.0, 1.0))
 
 
-def wall(**options) -> Interface:
-    """The wall at y = 0, the water beyond it."""
-    return Interface(np.array([0.0, -1.0, 0.0]), 0.0, **options)
+def window() -> Interface:
+    """Return the window of a tank: 10 mm of glass at y = 0, the water beyond it."""
+    return Interface(np.array([0.0, -1.0, 0.0]), 0.0, window=(GLASS,))
 
 
 def survey(camera, plane, box, count, seed=0, *, pixel=0.25, error=0.002) -> Observations:

@@ -80,14 +80,14 @@ def test_pixel_and_point_in_one_row(tmp_path, text):
 
 def test_a_floor_needs_no_column_of_heights(tmp_path):
     path = written(tmp_path, "c.csv", "u,v,x,y\n5,6,1,2\n")
-    with pytest.raises(CalibrationError, match="no column 'z'.*--z"):
+    with pytest.raises(CalibrationError, match="no column 'z'.*survey file gives it"):
         observe_combined([path])
     assert observe_combined([path], z=0.0).points[0].tolist() == [1.0, 2.0, 0.0]
 
 
 def test_numbers_that_cannot_be_metres_are_refused(tmp_path):
     path = written(tmp_path, "c.csv", "u,v,x,y,z\n5,6,1500,200,0\n")
-    with pytest.raises(CalibrationError, match="spread over 1500 m.*--unit mm"):
+    with pytest.raises(CalibrationError, match="spread over 1500 m.*unit: mm into the survey file"):
         observe_combined([path])
     assert observe_combined([path], unit="mm").points[0, 0] == pytest.approx(1.5)
 

@@ -12,6 +12,7 @@ from finssim.geometry.optics import Interface, Lens
 
 from .surveyed_pools import (
     FLOOR,
+    GLASS,
     PLUMB_BOB,
     SOLID,
     TANK,
@@ -21,7 +22,7 @@ from .surveyed_pools import (
     observations,
     overhead,
     survey,
-    wall,
+    window,
 )
 
 WATER = Interface.water(1.0)
@@ -71,10 +72,10 @@ def test_a_good_camera_file_is_left_alone():
 def test_points_near_the_axis_tell_no_height():
     """Seen from above, water only brings the floor nearer: the height is said to be unknown, and the map is right."""
     seen = survey(overhead(), WATER, ((-0.2, -0.4, 0.0), (0.2, 0.0, 1e-12)), 40)
-    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, interface="surface"))
+    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT))
     assert not fit.estimates["camera_height"].identifiable
     assert any(
-        one.code == "points_narrow" and "--water-height" in one.values["remedy"] for one in fit.findings
+        one.code == "points_narrow" and "surface: height" in one.values["remedy"] for one in fit.findings
     )
     assert fit.held_out.as_json()["rms_cm"] < 0.5
     low, high = fit.estimates["camera_height"].ci95
@@ -87,7 +88,7 @@ def test_a_sloping_floor_taken_for_level_is_noticed():
     water = Interface.water(1.0, tilt_x=0.02)
     camera = looking((-2.5, 0.0, 2.5), (0.0, 0.0, 0.0), PLUMB_BOB, (0.0, 0.0, 1.0))
     seen = survey(camera, water, ((-2.0, -1.5, 0.0), (2.0, 1.5, 0.5)), 80, error=0.001)
-    told = Settings(fit=FIT, water_height=1.0, water_height_sigma=0.02, survey_sigma=0.001)
+    told = Settings(fit=FIT, water_height=1.0, place_sigma=0.02, survey_sigma=0.001)
     fit = calibrate_pool(seen, PLUMB_BOB, told)
     assert "plane_tilted" in codes(fit)
     assert tilt_error(fit, water) < 0.5
@@ -96,7 +97,7 @@ def test_a_sloping_floor_taken_for_level_is_noticed():
 @pytest.mark.slow
 def test_a_wrong_tape_is_contradicted():
     seen = survey(overhead(), WATER, SOLID, 80)
-    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=1.3, water_height_sigma=0.005))
+    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=1.3, place_sigma=0.005))
     assert "plane_contradicted" in codes(fit)
 
 
@@ -120,7 +121,7 @@ def test_dry_points_help():
         arm=np.zeros((52, 3)),
         dry=np.arange(52) >= 40,
     )
-    told = Settings(fit=FIT, interface="surface")
+    told = Settings(fit=FIT)
     half = [np.ptp(calibrate_pool(s, PLUMB_BOB, told).estimates["water_height"].ci95) for s in (wet, both)]
     assert half[1] < half[0] / 1.5
 
@@ -165,10 +166,10 @@ def test_marks_above_the_water_are_told_from_wrong_rows():
 def test_points_without_water_are_noticed():
     """Pixels of points in air, calibrated as a tank: straight lines foretell them better, and that comes first."""
     camera = before_tank(30.0)
-    points = survey(camera, wall(), TANK, 60, error=0.0).points
+    points = survey(camera, window(), TANK, 60, error=0.0).points
     pixels, _ = camera.lens.project((points - camera.position) @ camera.R_pc)
     pixels = pixels + 0.25 * np.random.default_rng(1).standard_normal(pixels.shape)
-    told = Settings(fit=FIT, plane=(0.0, 1.0, 0.0, 0.0), index_sigma=0.0, survey_sigma=0.0005)
+    told = Settings(fit=FIT, window=GLASS, plane=(0.0, 1.0, 0.0, 0.0), index_sigma=0.0, survey_sigma=0.0005)
     fit = doubted(calibrate_pool(observations(points, pixels), TANK_LENS, told))
     assert codes(fit)[0] == "straight_better"
 
@@ -186,7 +187,7 @@ def test_centimetres_for_metres_are_refused(option, value):
     seen = survey(overhead(), WATER, FLOOR, 40)
     fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, **{option: value}))
     with pytest.raises(
-        CalibrationError, match=f"--{option.replace('_', '-')} 100 puts the plane 100 m.*unit"
+        CalibrationError, match=f"surface: {option.removeprefix('water_')} 100 puts the plane 100 m.*unit"
     ):
         doubted(fit)
 
@@ -215,7 +216,7 @@ def test_a_flat_left_handed_survey_is_warned_of():
     turn = np.array([1.0, -1.0, 1.0])
     left = survey(overhead(), WATER, FLOOR, 40)
     left = replace(left, points=left.points * turn)
-    told = Settings(fit=FIT, interface="surface")
+    told = Settings(fit=FIT)
     assert codes(doubted(calibrate_pool(left, PLUMB_BOB, told)))[0] == "handedness_open"
     with pytest.raises(CalibrationError, match="other side"):
         calibrate_pool(left, PLUMB_BOB, replace(told, water_height=1.0))
@@ -228,26 +229,26 @@ def test_a_flat_left_handed_survey_is_warned_of():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.94, 0.96])
-def test_a_lens_that_misfits_before_a_known_wall_may_be_fitted(factor):
-    """Wall and index known, the lens not: index or wall gives way, and the advice says how to free the lens."""
+def test_a_lens_that_misfits_before_a_known_window_may_be_fitted(factor):
+    """Window and index known, the lens not: index or window gives way, and the advice says how to free the lens."""
     rough = replace(TANK_LENS, fx=TANK_LENS.fx * factor, fy=TANK_LENS.fy * factor)
-    seen = survey(before_tank(30.0), wall(), TANK, 60, error=0.0005)
-    told = Settings(fit=FIT, plane=(0.0, 1.0, 0.0, 0.0), survey_sigma=0.0005)
+    seen = survey(before_tank(30.0), window(), TANK, 60, error=0.0005)
+    told = Settings(fit=FIT, window=GLASS, plane=(0.0, 1.0, 0.0, 0.0), survey_sigma=0.0005)
     fit = calibrate_pool(seen, rough, told)
     assert any(
-        one.code in ("index_pulled", "tilt_pulled") and "index,focal,center" in one.values["remedy"]
+        one.code in ("index_pulled", "tilt_pulled") and "index, focal, center" in one.values["remedy"]
         for one in fit.findings
     )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plane", [None, (0.0, 1.0, 0.0, 0.0)], ids=["surface", "wall"])
+@pytest.mark.parametrize("plane", [None, (0.0, 1.0, 0.0, 0.0)], ids=["surface", "window"])
 def test_correlations_bear_the_names_of_the_table(plane):
     if plane is None:
         seen, lens = survey(overhead(), WATER, SOLID, 40), PLUMB_BOB
     else:
-        seen, lens = survey(before_tank(30.0), wall(), TANK, 40, error=0.0005), TANK_LENS
-    fit = calibrate_pool(seen, lens, Settings(fit=FIT, plane=plane))
+        seen, lens = survey(before_tank(30.0), window(), TANK, 40, error=0.0005), TANK_LENS
+    fit = calibrate_pool(seen, lens, Settings(fit=FIT, window=GLASS if plane else None, plane=plane))
     fitted = [name for name, estimate in fit.estimates.items() if estimate.note != "as given"]
     assert list(fit.correlation.names) == fitted
     np.testing.assert_allclose(np.diagonal(fit.correlation.matrix), 1.0)

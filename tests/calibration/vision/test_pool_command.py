@@ -13,9 +13,10 @@ from finssim.geometry.optics import Interface, back_project
 from finssim.localization.camera_file import write_camera
 from finssim.localization.pool import load_pool
 
-from .surveyed_pools import FLOOR, GLASS, PLUMB_BOB, TANK, TANK_LENS, before_tank, overhead, survey, wall
+from .surveyed_pools import FLOOR, GLASS, PLUMB_BOB, TANK, TANK_LENS, before_tank, overhead, survey, window
 
 WATER = Interface.water(1.0)
+SURE = "surface: {{height: 1.0}}\ncamera: {{{}}}"
 
 
 @pytest.fixture
@@ -31,22 +32,31 @@ def table(path, seen):
     path.write_text("\n".join(["id,u,v,x,y,z", *rows]) + "\n", encoding="utf-8")
 
 
+def calibrated(folder, text="surface: {height: 1.0}", points="points.csv", out="pool.yaml", **options):
+    """Run the command with a survey file of that text on the files of a folder."""
+    (folder / "survey.yaml").write_text(text, encoding="utf-8")
+    files = {"survey": folder / "survey.yaml", "camera": folder / "camera.yaml", "out": folder / out}
+    return run([folder / points], **{**files, **options})
+
+
 def test_a_pool_file_gives_held_out_points_back(pool):
     """Points that the calibration never saw, back-projected to the floor: 3 mm, of which the survey is 3."""
-    run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", water_height=1.0)
+    calibrated(pool)
     found, fresh = (
         load_pool(pool / "pool.yaml"),
         survey(overhead(), WATER, FLOOR, 200, seed=9, pixel=0.0, error=0.0),
     )
     points, _ = back_project(found.camera, found.interface, fresh.pixels).at_z(0.0)
     assert np.sqrt(np.mean(np.sum((points - fresh.points) ** 2, axis=1))) < 0.003
-    assert found.record["inputs"].keys() == {str(pool / "points.csv"), str(pool / "camera.yaml")}
+    assert found.record["inputs"].keys() == {
+        str(pool / f"{x}") for x in ("points.csv", "survey.yaml", "camera.yaml")
+    }
     assert found.record["parameters"]["camera_height"]["ci95"][0] < 1.2
 
 
 @pytest.mark.slow
 def test_the_lens_is_as_sure_as_its_file_remembers(pool):
-    """The intervals of `calibrate camera` become standard errors of focal length and centre; options go before them."""
+    """Intervals of `calibrate camera` become standard errors of focal length and centre; the survey file goes first."""
     fx, cx = PLUMB_BOB.fx, PLUMB_BOB.cx
     ends = {"fx": [fx - 1.96, fx + 1.96], "cx": [cx - 3.92, cx + 3.92], "cy": [0.0, 0.0]}
     record = {
@@ -55,16 +65,15 @@ def test_the_lens_is_as_sure_as_its_file_remembers(pool):
         }
     }
     write_camera(pool / "camera.yaml", PLUMB_BOB, record)
-    files = {"camera": pool / "camera.yaml", "out": pool / "pool.yaml", "water_height": 1.0}
-    told = run([pool / "points.csv"], **files).settings
+    told = calibrated(pool).settings
     assert told.focal_sigma == pytest.approx(1.0 / fx) and told.center_sigma == pytest.approx(2.0)
-    said = run([pool / "points.csv"], **files, focal_sigma=0.01, center_sigma=5.0).settings
+    said = calibrated(pool, SURE.format("focal_sigma: 0.01, center_sigma_px: 5.0")).settings
     assert (said.focal_sigma, said.center_sigma) == (0.01, 5.0)
 
 
 @pytest.mark.slow
 def test_json_holds_what_was_promised(pool, capsys):
-    run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", as_json=True)
+    calibrated(pool, "surface: {}", as_json=True)
     said = json.loads(capsys.readouterr().out)
     assert said["kind"] == "pool" and said["out"] == str(pool / "pool.yaml")
     assert said.keys() >= {
@@ -82,7 +91,7 @@ def test_json_holds_what_was_promised(pool, capsys):
 
 @pytest.mark.slow
 def test_a_report_has_its_pictures(pool):
-    run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", report=pool / "report")
+    calibrated(pool, "surface: {}", report=pool / "report")
     names = {path.name for path in (pool / "report").iterdir()}
     assert names >= {
         "report.html",
@@ -96,16 +105,14 @@ def test_a_report_has_its_pictures(pool):
 
 
 @pytest.mark.slow
-def test_a_tank_with_its_wall_surveyed(tmp_path, capsys):
-    camera, plane = before_tank(30.0), wall(window=GLASS)
+def test_a_tank_with_its_window_surveyed(tmp_path, capsys):
+    camera, plane = before_tank(30.0), window()
     write_camera(tmp_path / "camera.yaml", TANK_LENS, {})
     table(tmp_path / "points.csv", survey(camera, plane, TANK, 50, error=0.0005))
-    run(
-        [tmp_path / "points.csv"], camera=tmp_path / "camera.yaml", out=tmp_path / "pool.yaml",
-        plane="0,1,0,0", window=["0.010:1.52"], survey_sigma=0.0005,
-    )  # fmt: skip
+    text = "window: {thickness: 0.010, index: 1.52, plane: [0, 1, 0, 0]}\nsigma: 0.0005"
+    calibrated(tmp_path, text)
     found = load_pool(tmp_path / "pool.yaml")
-    assert found.interface.window == GLASS
+    assert found.interface.window == (GLASS,)
     assert found.interface.normal[1] < -0.999
     assert np.linalg.norm(found.camera.position - camera.position) < 0.01
     assert "camera_distance" in capsys.readouterr().out
@@ -114,7 +121,7 @@ def test_a_tank_with_its_wall_surveyed(tmp_path, capsys):
 @pytest.mark.slow
 def test_equal_inputs_write_equal_files(pool):
     for name in ("a.yaml", "b.yaml"):
-        run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / name, water_height=1.0)
+        calibrated(pool, out=name)
     assert (pool / "a.yaml").read_bytes() == (pool / "b.yaml").read_bytes()
 
 
@@ -122,59 +129,59 @@ def test_equal_inputs_write_equal_files(pool):
     ("options", "words"),
     [
         ({"out": "pool.txt"}, "expected .yaml"),
-        ({"plane": "0,1"}, "expected n_x,n_y,n_z,b"),
-        ({"window": ["thick"]}, "expected THICKNESS:INDEX"),
-        ({"inputs": "nowhere.csv"}, "no such file"),
-        ({"window": ["10:1.52"]}, "window is 10 m thick.*metres"),
-        ({"water_height": -1.0}, "other side"),
-        ({"water_height": 100.0}, "--water-height 100 puts the plane 100 m from the points.*unit"),
-        ({"fit": "pose,colour"}, "unknown 'colour'"),
+        ({"points": "nowhere.csv"}, "no such file"),
+        ({"text": "surface: {height: -1.0}"}, "other side"),
+        (
+            {"text": "surface: {height: 100.0}"},
+            "surface: height 100 puts the plane 100 m from the points.*unit",
+        ),
+        ({"text": "surface: {}\npoints: nowhere.csv"}, "nowhere.csv"),
+        ({"text": "fit: [pose, colour]\nsurface: {}"}, "survey.yaml: unknown 'colour'"),
     ],
 )
 def test_refusals_write_nothing(pool, options, words):
-    options = dict(options)
-    inputs, out = [pool / options.pop("inputs", "points.csv")], pool / options.pop("out", "pool.yaml")
     with pytest.raises(CalibrationError, match=words):
-        run(inputs, camera=pool / "camera.yaml", out=out, **options)
-    assert not out.exists()
+        calibrated(pool, **options)
+    assert not (pool / options.get("out", "pool.yaml")).exists()
 
 
 def test_pixels_of_another_resolution_are_refused(pool):
     write_camera(pool / "half.yaml", type(PLUMB_BOB)(640, 360, 270.0, 270.0, 341.0, 174.0), {})
     with pytest.raises(CalibrationError, match="another resolution"):
-        run([pool / "points.csv"], camera=pool / "half.yaml", out=pool / "pool.yaml")
+        calibrated(pool, camera=pool / "half.yaml")
 
 
 def test_a_folder_of_other_things_is_no_report(pool):
     with pytest.raises(OutputError, match="already holds files"):
-        run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", report=pool)
+        calibrated(pool, report=pool)
 
 
 def test_parts_of_the_picture_are_no_pixels(pool):
     seen = survey(overhead(), WATER, FLOOR, 40)
     table(pool / "parts.csv", replace(seen, pixels=seen.pixels / [PLUMB_BOB.width, PLUMB_BOB.height]))
     with pytest.raises(CalibrationError, match="spread over 0.* px in all.*multiply"):
-        run([pool / "parts.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml")
+        calibrated(pool, points="parts.csv")
     assert not (pool / "pool.yaml").exists()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "options", [{}, {"focal_sigma": 0.003}, {"focal_sigma": 0.0}, {"fit": "pose,height,focal"}]
+    "lens",
+    ["", "camera: {focal_sigma: 0.003}", "camera: {focal_sigma: 0.0}", "fit: [pose, height, focal]"],
 )
-def test_a_lens_taken_as_exact_is_said(pool, capsys, options):
-    """As a note in the table and a finding in JSON, unless somebody told its errors or it is fitted."""
-    files = {"camera": pool / "camera.yaml", "out": pool / "pool.yaml", "water_height": 1.0}
-    run([pool / "points.csv"], **files, **options)
-    assert ("· the lens is taken as exact" in capsys.readouterr().out) == (not options)
-    run([pool / "points.csv"], **files, **options, as_json=True)
+def test_a_lens_taken_as_exact_is_said(pool, capsys, lens):
+    """As a note in the table and a finding in JSON, unless the survey file gives its errors or fits it."""
+    text = f"surface: {{height: 1.0}}\n{lens}"
+    calibrated(pool, text)
+    assert ("· the lens is taken as exact" in capsys.readouterr().out) == (not lens)
+    calibrated(pool, text, as_json=True)
     said = json.loads(capsys.readouterr().out)
-    assert ("lens_exact" in {one["code"] for one in said["findings"]}) == (not options)
+    assert ("lens_exact" in {one["code"] for one in said["findings"]}) == (not lens)
 
 
 def test_the_surveys_part_of_the_held_out_error_is_said(pool, capsys):
     """2 mm for each of two coordinates make 2.8 mm, times how much worse than said the survey seems."""
-    fit = run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", water_height=1.0)
+    fit = calibrated(pool)
     told = 0.2 * np.sqrt(2.0) * fit.noise.scale
     assert load_pool(pool / "pool.yaml").record["held_out"]["survey_cm"] == pytest.approx(told)
     assert f"survey's own error {told:.2f} cm" in " ".join(capsys.readouterr().out.split())

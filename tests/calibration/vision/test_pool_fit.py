@@ -8,11 +8,12 @@ import pytest
 from finssim.calibration.findings import CalibrationError
 from finssim.calibration.vision.pool_fit import calibrate_pool
 from finssim.calibration.vision.pool_model import Settings
-from finssim.geometry.optics import Camera, Interface, project
+from finssim.geometry.optics import Camera, Interface, Layer, project
 
 from .surveyed_pools import (
     FISHEYE,
     FLOOR,
+    GLASS,
     PLUMB_BOB,
     RATIONAL,
     SOLID,
@@ -53,7 +54,7 @@ def test_published_geometry_with_a_tape():
     for seed in range(6):
         seen = survey(camera, WATER, FLOOR, 160, seed, pixel=0.25, error=0.002)
         tape = 1.0 + 0.002 * np.random.default_rng(seed).standard_normal()
-        told = Settings(fit=FIT, water_height=tape, water_height_sigma=0.002, interface="surface")
+        told = Settings(fit=FIT, water_height=tape, place_sigma=0.002)
         fit = calibrate_pool(seen, PLUMB_BOB, told)
         normal = fit.model.interface.normal
         errors.append([fit.model.camera.position[2] - camera.position[2], *np.degrees(normal[:2])])
@@ -74,7 +75,7 @@ def test_intervals_hold_the_truth():
         camera = overhead()
         water = Interface.water(1.0, tilt_x=tilts[0], tilt_y=tilts[1], n_water=index)
         seen = survey(camera, water, SOLID, 30, seed)
-        table = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, interface="surface", seed=seed)).estimates
+        table = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, seed=seed)).estimates
         truth = {"camera_x": 0.03, "camera_z": 2.2, "index": index, "camera_height": clearance(camera, water)}
         inside += sum(table[n].ci95[0] < value < table[n].ci95[1] for n, value in truth.items())
     assert inside >= 20
@@ -132,10 +133,13 @@ def test_equal_seeds_give_equal_fits():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"interface": "ceiling"}, "unknown interface 'ceiling'"),
         ({"fit": ("pose", "colour")}, "unknown 'colour' to fit"),
         ({"fit": ("pose", "tilt")}, "leaves the height out"),
         ({"water_height": 1.0, "water_depth": 1.0}, "given twice"),
+        ({"plane": (0.0, 1.0, 0.0, 0.0)}, "a plane without a window"),
+        ({"window": GLASS, "water_height": 1.0}, "the height or depth of a window"),
+        ({"window": GLASS, "plane": (0.0, 0.0, 0.0, 1.0)}, "expected a direction"),
+        ({"window": Layer(10.0, 1.52)}, "window is 10 m thick.*metres"),
         ({"folds": 1}, "at least 2"),
         ({"index": 0.7}, "index is 0.7"),
     ],
@@ -165,8 +169,7 @@ def test_intervals_allow_for_a_lens_that_is_not_sure():
             told = Settings(
                 fit=FIT,
                 water_height=1.0,
-                water_height_sigma=0.002,
-                interface="surface",
+                place_sigma=0.002,
                 focal_sigma=sigma[0],
                 center_sigma=sigma[1],
             )

@@ -9,14 +9,13 @@ from finssim.geometry.optics import Interface
 from .surveyed_pools import (
     FISHEYE,
     FLOOR,
-    GLASS,
     PLUMB_BOB,
     RATIONAL,
     TANK,
     before_tank,
     overhead,
     survey,
-    wall,
+    window,
 )
 
 STEPS = np.array([1e-5] * 9 + [1e-6, 1e-6, 1e-3, 1e-3] + [1e-6] * 5)
@@ -25,7 +24,7 @@ STEPS = np.array([1e-5] * 9 + [1e-6, 1e-6, 1e-3, 1e-3] + [1e-6] * 5)
 def scenes():
     for lens in (PLUMB_BOB, FISHEYE, RATIONAL):
         yield pytest.param(overhead(lens), Interface.water(1.0, tilt_x=0.02), FLOOR, id=lens.model)
-    yield pytest.param(before_tank(30.0), wall(window=GLASS), TANK, id="window")
+    yield pytest.param(before_tank(30.0), window(), TANK, id="window")
 
 
 @pytest.mark.parametrize("dry", [False, True], ids=["wet", "dry"])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +47,9 @@ from finssim.calibration.vision.pool_model import (
     residuals,
     solve,
 )
-from finssim.calibration.vision.survey import Observations, observe, observe_combined, read_survey
-from finssim.geometry.optics import Camera, Interface, Layer, Lens, back_project
+from finssim.calibration.vision.survey import Observations
+from finssim.calibration.vision.survey_file import load_survey_file
+from finssim.geometry.optics import Camera, Interface, Lens, back_project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_euler, quat_to_matrix
 from finssim.localization.camera_file import CameraFile, load_camera
 from finssim.localization.pool import Pool, write_pool
@@ -90,9 +91,6 @@ weak that it only decides where the pixels say nothing."""
 
 MIRRORED = 0.6
 """Residual of the mirror image over that of the best model, below which the survey's frame is left-handed."""
-
-SAME = 1.15
-"""A surface that fits within this factor of a wall is taken for a surface."""
 
 
 class RobustPixels:
@@ -257,8 +255,6 @@ class BestStart:
 
     model: PoolModel
     pinhole: PoolModel
-    surface: bool
-    """The plane's normal is along the survey's z."""
 
 
 def search(observed: Observations, lens: Lens, settings: Settings) -> BestStart:
@@ -272,9 +268,7 @@ def search(observed: Observations, lens: Lens, settings: Settings) -> BestStart:
         observed = observed.subset(np.sort(sample))
     poses = pinhole_poses(observed, lens, settings.seed)
     near = [p.model for p in poses[:3] if p.cost < 3.0 * poses[0].cost + 0.5]
-    runs: list[tuple[float, PoolModel, bool]] = []
-    for surface, normals in _families(near[0], observed, settings):
-        runs += _family(near, normals, observed, settings, surface)
+    runs = _descents(near, _normals(near[0], observed, settings), observed, settings)
     # Bent rays come first: straight ones may fit the mirror image of a good survey better than the survey.
     _refuse_mirrored(observed, lens, min([_score(near[0], observed), *(run[0] for run in runs)]))
     if not runs:
@@ -282,27 +276,25 @@ def search(observed: Observations, lens: Lens, settings: Settings) -> BestStart:
             "no place of the plane between camera and points explains the pixels: check the water height, its sign and "
             "the interface"
         )
-    chosen = _choose(runs, len(observed))
-    return BestStart(chosen[1], near[0], chosen[2])
+    return BestStart(runs[0][1], near[0])
 
 
-def prior_of(
-    model: PoolModel, start: PoolModel, settings: Settings, surface: bool, stds: tuple[float, ...]
-) -> Prior:
-    """What is known of the plane before the pictures, as the fit wants it.
+def prior_of(model: PoolModel, start: PoolModel, settings: Settings, stds: tuple[float, ...]) -> Prior:
+    """Return the prior of plane, index and lens.
 
     Args:
-        model: On whose side of the points the camera is.
-        start: Holds the index and the lens as given.
+        model: Model whose camera gives the side of the points.
+        start: Model with the index and the lens as given.
         settings: Options.
-        surface: The normal is along the survey's z.
-        stds: Of the lens's parameters.
+        stds: Standard deviations of the lens's parameters, in the order of `LENS_NAMES`.
     """
-    normal, depth = stated_plane(model, settings, surface)
+    normal, depth = stated_plane(model, settings)
     tilt = settings.tilt_sigma
     if tilt is None:
-        tilt = float(PLANE_TILT if settings.plane is not None else SURFACE_TILT if surface else np.inf)
-    depth_std = max(settings.water_height_sigma, 1e-6)
+        tilt = float(
+            PLANE_TILT if settings.plane is not None else SURFACE_TILT if settings.surface else np.inf
+        )
+    depth_std = max(settings.place_sigma, 1e-6)
     if not np.isfinite(depth):
         apparent = float(np.linalg.norm(start.camera.position - start.reference))
         depth, depth_std = ANYWHERE * apparent, ANYWHERE * apparent
@@ -317,29 +309,28 @@ def prior_of(
     )
 
 
-def stated_plane(model: PoolModel, settings: Settings, surface: bool) -> tuple[Array | None, float]:
-    """Normal towards the camera, and distance of the plane from the reference point; None and NaN where unknown."""
+def stated_plane(model: PoolModel, settings: Settings) -> tuple[Array | None, float]:
+    """Return the normal towards the camera, pool frame (3,), and the distance of the plane from the reference point
+    [m]; None and NaN where unknown."""
     towards, depth = model.camera.position - model.reference, settings.water_depth
     if settings.plane is not None:
         normal, offset = settings.unit_plane
         sign = 1.0 if normal @ towards > 0.0 else -1.0
         return sign * normal, float(-sign * (normal @ model.reference + offset))
+    if not settings.surface:
+        return None, np.nan
     normal = UP if towards[2] > 0.0 else -UP
-    if surface and settings.water_height is not None:
+    if settings.water_height is not None:
         return normal, float(normal[2] * (settings.water_height - model.reference[2]))
-    return normal if surface else None, np.nan if depth is None else depth
+    return normal, np.nan if depth is None else depth
 
 
-def _families(
-    pinhole: PoolModel, observed: Observations, settings: Settings
-) -> list[tuple[bool, list[Array]]]:
-    """(surface?, normals to try)."""
+def _normals(pinhole: PoolModel, observed: Observations, settings: Settings) -> list[Array]:
+    """Return the normals to try, pool frame, each (3,): z for a surface, the measured one or several for a window."""
+    if settings.surface:
+        return [UP]
     if settings.plane is not None:
-        normal, _ = settings.unit_plane
-        return [(bool(abs(normal[2]) > 0.9), [normal])]
-    surface = [(True, [UP])]
-    if settings.interface == "surface" or settings.interface == "auto" and settings.water_height is not None:
-        return surface
+        return [settings.unit_plane[0]]
     towards = pinhole.camera.position - pinhole.reference
     towards = towards / np.linalg.norm(towards)
     axes = np.linalg.svd(observed.points - observed.points.mean(axis=0), full_matrices=True)[2]
@@ -348,39 +339,35 @@ def _families(
         n = n if n @ towards > 0.0 else -n
         if n @ towards > 0.35 and all(n @ other < 0.995 for other in facing):
             facing.append(n)
-    return [*(surface if settings.interface == "auto" else []), (False, facing)]
+    return facing
 
 
-def _family(
-    poses: Sequence[PoolModel],
-    normals: Sequence[Array],
-    observed: Observations,
-    settings: Settings,
-    surface: bool,
-) -> list[tuple[float, PoolModel, bool]]:
-    """Ends of the search from all starts of one family: residual [px], model, surface?; the best first."""
-    plane = Interface(UP, 0.0, settings.index_near, settings.index, settings.window)
+def _descents(
+    poses: Sequence[PoolModel], normals: Sequence[Array], observed: Observations, settings: Settings
+) -> list[tuple[float, PoolModel]]:
+    """Return the ends of the search from all starts: residual [px] and model, the best first."""
+    plane = Interface(UP, 0.0, settings.index_near, settings.index, settings.layers)
     starts: list[PoolModel] = []
     for pinhole in poses:
-        _refuse_wrong_side(pinhole, settings, surface)
-        _, depth = stated_plane(pinhole, settings, surface)
+        _refuse_wrong_side(pinhole, settings)
+        _, depth = stated_plane(pinhole, settings)
         starts += plane_starts(pinhole, normals, plane, observed, depth)
     ends: list[tuple[float, PoolModel]] = []
     for counts, count in (((6, 4), len(starts)), ((30, 40), 4)):
-        models = [_descend(model, observed, settings, surface, counts) for model in starts[:count]]
+        models = [_descend(model, observed, settings, counts) for model in starts[:count]]
         ends = [(_score(model, observed), model) for model in models if model is not None]
         ends.sort(key=lambda pair: pair[0])
         starts = [model for _, model in ends]
-    return [(value, model, surface) for value, model in ends]
+    return ends
 
 
 def _descend(
-    model: PoolModel, observed: Observations, settings: Settings, surface: bool, counts: tuple[int, int]
+    model: PoolModel, observed: Observations, settings: Settings, counts: tuple[int, int]
 ) -> PoolModel | None:
-    """Pose alone, then pose and plane."""
+    """Fit the pose alone, then pose and plane; return None where the search is lost."""
     start = model
     for count, names in zip(counts, (NAMES[:6], NAMES[:9]), strict=True):
-        prior = prior_of(model, start, settings, surface, (np.inf,) * 8)
+        prior = prior_of(model, start, settings, (np.inf,) * 8)
         active = np.array([name in names for name in NAMES])
         whiten = RobustPixels(model, observed)
         model, cost = solve(model, observed, whiten, active, prior, iterations=count, tolerance=1e-7)
@@ -406,32 +393,18 @@ def _refuse_mirrored(observed: Observations, lens: Lens, best: float) -> None:
         )
 
 
-def _refuse_wrong_side(pinhole: PoolModel, settings: Settings, surface: bool) -> None:
-    _, depth = stated_plane(pinhole, settings, surface)
+def _refuse_wrong_side(pinhole: PoolModel, settings: Settings) -> None:
+    """Refuse a plane on the other side of the points than the camera."""
+    _, depth = stated_plane(pinhole, settings)
     if np.isfinite(depth) and depth <= 0.0:
         sense = "below" if pinhole.camera.position[2] < pinhole.reference[2] else "above"
-        plane_name = "the plane given" if settings.water_height is None else "the water's height given"
+        plane_name = "the window's plane" if settings.window else "the surface's height or depth"
         raise CalibrationError(
             f"the pixels put the camera at z {sense} the points, and {plane_name} is {-depth:.3g} m on the other side "
-            "of "
-            f"them: the survey's z points {'down' if sense == 'below' else 'up'}, or its x and y make it left-handed "
-            "(seen from the camera, y must lie to the left of x where z is up); give the water's height with the other "
-            "sign, or negate y in the survey"
+            f"of them: the survey's z points {'down' if sense == 'below' else 'up'}, or its x and y make it "
+            "left-handed (seen from the camera, y must lie to the left of x where z is up); give the surface's height "
+            "with the other sign, or negate y in the survey"
         )
-
-
-def _choose(runs: list[tuple[float, PoolModel, bool]], count: int) -> tuple[float, PoolModel, bool]:
-    """The best run; a level surface wherever it does as well as a wall, or the points are too few to tell."""
-    best = min(runs, key=lambda run: run[0])
-    surfaces = [run for run in runs if run[2]]
-    if surfaces and not best[2]:
-        level = min(surfaces, key=lambda run: run[0])
-        upright = abs(float(best[1].interface.normal[2])) > np.cos(np.radians(5.0))
-        spare = 2.0 * count - 9.0  # a wall's parameters are nine, two more than a surface's
-        freedom = np.sqrt((spare + 2.0) / spare) if spare > 0.0 else 1.0
-        if spare <= 0.0 or level[0] <= SAME * freedom * best[0] + 0.02 or upright:
-            return level
-    return best
 
 
 # The fit proper: full weights, the size of the errors, wrong rows left out, errors at points not seen.
@@ -828,14 +801,14 @@ STEPS = np.array([1e-5] * 3 + [1e-6] * 5 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-6, 
 """Of the derivatives by the parameters."""
 
 
-def estimates(fit: Refined, surface: bool, settings: Settings) -> tuple[dict[str, Estimate], Correlation]:
-    """Table of estimates, and the correlation of their errors, without what was not fitted.
+def estimates(fit: Refined, settings: Settings) -> tuple[dict[str, Estimate], Correlation]:
+    """Return the table of estimates and the correlation of their errors; the latter without what was not fitted.
 
     Args:
         fit: The fit.
-        surface: The plane is a water surface.
         settings: Options.
     """
+    surface = settings.surface
     table, quantile = _quantities(fit.model, surface), float(student.ppf(0.975, fit.dof))
     G = np.zeros((len(table), len(NAMES)))
     for k in np.flatnonzero(fit.active):
@@ -905,13 +878,12 @@ COMMON_DEPTH = 0.02
 CERTAIN = 0.999
 """Share of the marks above the water that are taken for such."""
 
-FULL_LENS = "--fit pose,height,tilt,index,focal,center,distortion"
+FULL_LENS = "fit: [pose, height, tilt, index, focal, center, distortion]"
 
 
 def advice(
     fit: Refined,
     observed: Observations,
-    surface: bool,
     settings: Settings,
     table: Mapping[str, Estimate],
     touching: Sequence[str],
@@ -922,7 +894,6 @@ def advice(
     Args:
         fit: The fit.
         observed: All rows.
-        surface: The plane is a water surface.
         settings: Options.
         table: Estimates.
         touching: What the plane came to rest against.
@@ -931,17 +902,18 @@ def advice(
     if touching:
         yield finding("plane_touches", places=tuple(touching))
     yield from contradicted
-    yield from _separability(fit, observed, surface, settings, table)
-    yield from _conflicts(fit, surface, settings)
+    yield from _separability(fit, observed, settings, table)
+    yield from _conflicts(fit, settings)
     yield from _numbers(fit, observed)
-    yield from _excluded_rows(fit, observed, surface)
+    yield from _excluded_rows(fit, observed, settings.surface)
 
 
 def _separability(
-    fit: Refined, observed: Observations, surface: bool, settings: Settings, table: Mapping[str, Estimate]
+    fit: Refined, observed: Observations, settings: Settings, table: Mapping[str, Estimate]
 ) -> Iterator[Finding]:
     """On camera height, water height and index, which few points cannot separate."""
     model, wet = fit.model, observed.subset(fit.used & ~observed.dry)
+    surface = settings.surface
     height = table["camera_height" if surface else "camera_distance"]
     half = 0.5 * (height.ci95[1] - height.ci95[0])
     n = model.interface.normal
@@ -950,12 +922,14 @@ def _separability(
     distance = model.clearance + model.depth
     steepest = float(np.arctan2(radius, distance))
     levels = float(np.ptp(wet.points @ n))
-    quantities = "camera height, water height" if surface else "distances of camera and points from the wall"
-    tape = "measure the water's height with a tape and give --water-height"
+    quantities = (
+        "camera height, water height" if surface else "distances of camera and points from the window"
+    )
+    tape = "measure the water's height with a tape and give surface: height"
     tape = (
         ""
         if settings.stated_depth
-        else f": {tape if surface else 'measure where the wall is and give --plane'}"
+        else f": {tape if surface else 'measure where the window is and give window: plane'}"
     )
     if steepest < NARROW:
         angle = float(np.degrees(steepest))
@@ -971,11 +945,11 @@ def _separability(
         yield finding("focal_of_one_depth")
 
 
-def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[Finding]:
+def _conflicts(fit: Refined, settings: Settings) -> Iterator[Finding]:
     """Where the pixels pull an estimate far from what was known."""
     prior, model = fit.prior, fit.model
     focal = NAMES.index("focal")
-    plane_name = "water's height" if surface else "plane's place"
+    plane_name = "water's height" if settings.surface else "window's place"
     lens = "" if fit.active[focal] else f"; or let the lens be fitted ({FULL_LENS})"
     if np.isfinite(prior.index_std):
         pull = (model.interface.index_far - settings.index) / prior.index_std
@@ -1036,9 +1010,6 @@ def _above(fit: Refined, observed: Observations) -> NDArray[np.bool_]:
 DOUBT = 20.0
 """Fall of chi² above which a prior counts as contradicted: by chance once in 20000 surveys, more in very poor ones."""
 
-LEVEL = np.radians(3.0)
-"""A plane of any direction that is found this near to level is a water surface [rad]."""
-
 MAX_LEAN = np.radians(5.0)
 """A surface tilted further from the survey's z than this is none [rad]."""
 
@@ -1053,8 +1024,6 @@ BETTER = 0.9
 class PoolFit(Refined):
     """The result, in the survey's frame."""
 
-    surface: bool
-    """The plane was taken for a water surface, its normal along the survey's z."""
     settings: Settings
     estimates: dict[str, Estimate]
     correlation: Correlation
@@ -1113,22 +1082,17 @@ def calibrate_pool(observed: Observations, lens: Lens, settings: Settings | None
     best_start = search(observed, extended_lens(lens), settings)
     notes = list(observed.findings)
     fit = _best_lens(observed, best_start, settings, notes)
-    level = abs(float(fit.model.interface.normal[2])) > np.cos(LEVEL)
-    if level and not best_start.surface and settings.interface == "auto" and settings.plane is None:
-        best_start, notes = replace(best_start, surface=True), list(observed.findings)
-        fit = _best_lens(observed, best_start, settings, notes)
     fit = _released(observed, settings, fit, notes)
-    if best_start.surface and fit.model.interface.normal[2] < 0.0:
+    if settings.surface and fit.model.interface.normal[2] < 0.0:
         notes.append(finding("camera_below"))
     pinhole = _pinhole(observed, best_start, settings, fit)
-    normal = UP if best_start.surface else fit.model.interface.normal
+    normal = UP if settings.surface else fit.model.interface.normal
     parts = [held_out(f, observed, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
-    table, errors = estimates(fit, best_start.surface, settings)
+    table, errors = estimates(fit, settings)
     touching = touched(fit, observed)
     contradicted = _contradicted(observed, settings, fit)
     return PoolFit(
         **vars(fit),
-        surface=best_start.surface,
         settings=settings,
         estimates=table,
         correlation=errors,
@@ -1141,7 +1105,7 @@ def calibrate_pool(observed: Observations, lens: Lens, settings: Settings | None
         pinhole_held_out=parts[1],
         lens_fitted=_lens_groups(fit.active),
         findings=(
-            *advice(fit, observed, best_start.surface, settings, table, touching, contradicted),
+            *advice(fit, observed, settings, table, touching, contradicted),
             *notes,
         ),
         touching=touching,
@@ -1164,14 +1128,12 @@ def _best_lens(
 
     def fitted(model: PoolModel, active: NDArray[np.bool_]) -> Refined:
         stds = lens_std(settings, model.camera.lens.width)
-        return _refined(
-            observed, model, settings, active, prior_of(model, start, settings, best_start.surface, stds)
-        )
+        return _refined(observed, model, settings, active, prior_of(model, start, settings, stds))
 
     best = fitted(best_start.model, active_names(settings))
     if settings.fit is not None:
         return best
-    normal = UP if best_start.surface else best.model.interface.normal
+    normal = UP if settings.surface else best.model.interface.normal
     error = _generalisation(best, observed, settings, normal)
     for extra in LENS_STEPS:
         active = active_names(settings, extra)
@@ -1312,15 +1274,16 @@ def _refuse_depth(fit: PoolFit) -> None:
 
 
 def _measured_depth(fit: PoolFit) -> tuple[float, str]:
-    """Distance of the plane from the middle of the points under water as it was measured [m], and by which option."""
+    """Return the measured distance of the plane from the middle of the points under water [m], and the key that gave
+    it."""
     settings, middle = fit.settings, fit.observed.points[~fit.observed.dry].mean(axis=0)
     if settings.water_height is not None:
-        return abs(settings.water_height - float(middle[2])), f"--water-height {settings.water_height:g}"
+        return abs(settings.water_height - float(middle[2])), f"surface: height {settings.water_height:g}"
     if settings.water_depth is not None:
-        return abs(settings.water_depth), f"--water-depth {settings.water_depth:g}"
+        return abs(settings.water_depth), f"surface: depth {settings.water_depth:g}"
     if settings.plane is not None:
         normal, offset = settings.unit_plane
-        return abs(float(normal @ middle) + offset), "--plane"
+        return abs(float(normal @ middle) + offset), "window: plane"
     return 0.0, ""
 
 
@@ -1353,9 +1316,7 @@ def _straight(fit: PoolFit) -> list[Finding]:
 def _handed(fit: PoolFit) -> list[Finding]:
     """A flat survey whose z points down, or is left-handed: the same pixels, unless the water's height is told."""
     settings = fit.settings
-    if not fit.surface or fit.model.interface.normal[2] > 0.0:
-        return []
-    if settings.water_height is not None or settings.plane is not None:
+    if not settings.surface or fit.model.interface.normal[2] > 0.0 or settings.water_height is not None:
         return []
     values = np.linalg.svd(fit.observed.points - fit.observed.points.mean(axis=0), compute_uv=False)
     if values[2] >= LEAST_THICKNESS * values[1]:
@@ -1402,7 +1363,7 @@ def pool_json(
     }
     return {
         "kind": "pool",
-        "interface": "surface" if fit.surface else "wall",
+        "interface": "surface" if fit.settings.surface else "window",
         "parameters": {name: estimate.as_json() for name, estimate in fit.estimates.items()},
         **plain(figures),
         "lens_fitted": list(fit.lens_fitted),
@@ -1442,7 +1403,7 @@ def pool_report(fit: PoolFit) -> Report:
     if fit.outliers:
         more = ", ..." if len(fit.outliers) > MAX_NAMES else ""
         summary.append(f"left out as wrong: {', '.join(fit.outliers[:MAX_NAMES])}{more}")
-    kind = "water surface" if fit.surface else "wall"
+    kind = "water surface" if fit.settings.surface else "window"
     return Report(
         title=f"Camera and {kind} from {figures['locations']} surveyed places",
         heads=(*HEADS, "note"),
@@ -1501,8 +1462,8 @@ def _map(fit: PoolFit) -> Figure:
     figure = new_figure(7.4, 5.6)
     axes = figure.subplots()
     across, names = np.eye(3)[:2], ("x [m]", "y [m]")
-    if not fit.surface:
-        across, names = fit.model.tangents, ("along the wall [m]", "along the wall, across [m]")
+    if not fit.settings.surface:
+        across, names = fit.model.tangents, ("along the window [m]", "along the window, across [m]")
     axes.plot(*(across @ fit.model.camera.position), "^", color="black", markersize=8, label="camera")
     draw_arrows(axes, fit.observed.points @ across.T, 1000.0 * fit.error @ across.T, fit.used, "mm", 1000.0)
     axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
@@ -1521,69 +1482,24 @@ def _picture(fit: PoolFit) -> Figure:
 def run(
     inputs: Sequence[Path],
     *,
+    survey: Path,
     camera: Path,
     out: Path,
-    surveyed: Path | None = None,
     report: Path | None = None,
-    interface: str = "auto",
-    plane: str | None = None,
-    window: Sequence[str] = (),
-    water_height: float | None = None,
-    water_depth: float | None = None,
-    water_height_sigma: float | None = None,
-    index: float = 1.333,
-    index_sigma: float | None = None,
-    tilt_sigma: float | None = None,
-    fit: str | None = None,
-    focal_sigma: float | None = None,
-    center_sigma: float | None = None,
-    pixel_sigma: float | None = None,
-    survey_sigma: float = 0.002,
-    survey_yaw_sigma: float = 0.5,
-    unit: str | None = None,
-    z: float | None = None,
-    edge: float | None = None,
-    family: str | None = None,
-    latency: float = 0.0,
-    folds: Annotated[int, (2, 1000)] = 5,
     seed: int = 1,
     as_json: bool = False,
 ) -> PoolFit:
     """Estimate camera pose [m, deg] and water plane (height [m], tilt [deg], index) from surveyed points in the
     water.
 
-    Example: finssim calibrate pool points.csv --surveyed survey.csv --camera camera.yaml --out pool.yaml
+    Example: finssim calibrate pool pixels.csv --survey survey.yaml --camera camera.yaml --out pool.yaml
 
     Args:
         inputs (INPUT): Detections (.csv), pixels (id,u,v), pixels with points (u,v,x,y,z), or images of tags.
-        camera (FILE): Camera file: ours, or one of OpenCV, ROS or Kalibr.
+        survey (FILE): Survey file (.yaml): the points, what the camera looks through, and what is known of it.
+        camera (FILE): Camera file: ours, or one of OpenCV, ROS, Kalibr or MATLAB.
         out (FILE): Pool file to write (.yaml).
-        surveyed (FILE): Survey (.csv): id,x,y,z of points, or tag,x,y,z,yaw_deg,edge of tags, or
-            image,x,y,z,yaw_deg,edge of one moved tag; not needed if the inputs contain the points.
         report (DIR): Directory for the report and its figures.
-        interface (KIND): Interface between camera and water: surface, wall, or auto.
-        plane (PLANE): Surveyed interface plane n_x,n_y,n_z,b with n . X + b = 0 [m].
-        window (LAYER): Solid layer THICKNESS:INDEX, such as 0.010:1.52 for 10 mm of glass; several in order from
-            the camera.
-        water_height: z of the surface in the survey's frame, from a tape measure [m].
-        water_depth: Depth of the surveyed points below the surface [m], instead of --water-height.
-        water_height_sigma: Standard deviation of either, or of the plane's position [m]; 0.005 if not given.
-        index: Refractive index of the water.
-        index_sigma: Standard deviation of the index; 0.003 if neither is given, 0 (fixed) if only --index is.
-        tilt_sigma: Standard deviation of the plane's tilt [deg]; 0.2 for a surface, 0.5 for --plane, free for a
-            wall.
-        fit (NAMES): Parameters to fit, of pose,height,tilt,index,focal,center,distortion; automatic if not given.
-        focal_sigma: Relative standard deviation of the camera file's focal length; from the file if not given.
-        center_sigma: Standard deviation of its optical centre [px]; from the file if not given.
-        pixel_sigma: Standard deviation of a pixel [px]; from the residuals if not given.
-        survey_sigma: Standard deviation of a surveyed coordinate [m].
-        survey_yaw_sigma: Standard deviation of a tag's heading [deg].
-        unit (UNIT): Unit of lengths in tables without one: m, cm, mm, in, ft.
-        z: Height of points in tables without z [m].
-        edge: Edge of tags in surveys without that column [m].
-        family (NAME): Family of the tags in images.
-        latency: Time stamps of images minus their exposure [s], written to the file.
-        folds: Folds of the cross-validation.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 
@@ -1593,31 +1509,31 @@ def run(
     Raises:
         CalibrationError, LocalizationError, OutputError: As they say; nothing is written then.
     """
-    arguments = {
-        k: v for k, v in locals().items() if k not in ("inputs", "out", "as_json", "report", "camera")
-    }
-    for name, value in arguments.items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise CalibrationError(f"--{name.replace('_', '-')} is {value}, expected a finite number")
     refuse_places(out, report, "pool")
-    file = load_camera(camera)
-    settings = _settings(arguments, file)
-    observed = _observations(list(map(Path, inputs)), surveyed, unit, z, edge, family)
-    _refuse_pixels(observed, file)
-    lens_stated = focal_sigma is not None or center_sigma is not None or any(_lens_sigma(file))
-    pool_fit = doubted(calibrate_pool(observed, file.lens, settings), lens_stated=lens_stated)
+    camera_file, survey_file = load_camera(camera), load_survey_file(survey)
+    focal_sigma, center_sigma = _lens_sigma(camera_file)
+    settings = survey_file.fit_settings(focal_sigma=focal_sigma, center_sigma=center_sigma, seed=seed)
+    for path in inputs:
+        if not Path(path).exists():
+            raise CalibrationError(f"{path}: no such file")
+    observed = survey_file.observe(list(map(Path, inputs)))
+    _refuse_pixels(observed, camera_file)
+    lens_stated = bool({"focal_sigma", "center_sigma"} & survey_file.settings.keys()) or any(
+        (focal_sigma, center_sigma)
+    )
+    pool_fit = doubted(calibrate_pool(observed, camera_file.lens, settings), lens_stated=lens_stated)
     hashes = {
         str(path): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in map(Path, [*inputs, *filter(None, [surveyed]), camera])
+        for path in map(Path, [*inputs, *survey_file.sources, camera])
         if path.is_file()
     }
     record = pool_record(pool_fit, hashes)
-    write_pool(Pool(pool_fit.model.camera, pool_fit.model.interface, latency, record=record), out)
+    pool = Pool(pool_fit.model.camera, pool_fit.model.interface, survey_file.latency, record=record)
+    write_pool(pool, out)
     summary = pool_report(pool_fit)
     if report is not None:
-        defaults = run.__kwdefaults__ or {}
-        options = {k: v for k, v in arguments.items() if v != defaults.get(k)}
-        repeat = [command_line("pool", inputs, {"camera": camera, "out": out, **options})]
+        options = {"survey": survey, "camera": camera, "out": out, "seed": seed}
+        repeat = [command_line("pool", inputs, options)]
         repeat += [f"{path}  sha256 {digest}" for path, digest in hashes.items()]
         summary.write(
             report, pool_json(pool_fit, out=Path(out), inputs=hashes), pool_pictures(pool_fit), repeat
@@ -1625,39 +1541,6 @@ def run(
     as_object = pool_json(pool_fit, out=Path(out), inputs=hashes) if as_json else None
     publish(as_object, summary.show, (out, report))
     return pool_fit
-
-
-def _settings(arguments: Mapping[str, Any], file: CameraFile) -> Settings:
-    """The options as `Settings`: texts read, degrees as radians, what is not given from the camera file."""
-    options = {f.name: arguments[f.name] for f in fields(Settings) if arguments.get(f.name) is not None}
-    options["plane"] = _plane(arguments["plane"])
-    options["window"] = tuple(_layer(text) for text in arguments["window"])
-    fit = arguments["fit"]
-    options["fit"] = None if fit in (None, "auto") else tuple(filter(None, map(str.strip, fit.split(","))))
-    for name in {"tilt_sigma", "survey_yaw_sigma"} & options.keys():
-        options[name] = math.radians(options[name])
-    focal, center = _lens_sigma(file)
-    held = arguments["index"] != Settings.index and "index" not in (options["fit"] or ())
-    defaults = {"focal_sigma": focal, "center_sigma": center}
-    return Settings(**{**defaults, **({"index_sigma": 0.0} if held else {}), **options})
-
-
-def _observations(
-    paths: Sequence[Path],
-    surveyed: Path | None,
-    unit: str | None,
-    z: float | None,
-    edge: float | None,
-    family: str | None,
-) -> Observations:
-    if not paths:
-        raise CalibrationError("no input: give detections, pixels or pictures")
-    for path in paths:
-        if not path.exists():
-            raise CalibrationError(f"{path}: no such file")
-    if surveyed is None or all(path.resolve() == Path(surveyed).resolve() for path in paths):
-        return observe_combined(paths, unit=unit, z=z)
-    return observe(paths, read_survey(surveyed, unit=unit, edge=edge, z=z), family=family)
 
 
 def _refuse_pixels(observed: Observations, file: CameraFile) -> None:
@@ -1691,25 +1574,3 @@ def _remembered(file: CameraFile, name: str) -> float:
     except (KeyError, TypeError, ValueError):
         return 0.0
     return max(0.0, (high - low) / 3.92)
-
-
-def _plane(text: str | None) -> tuple[float, float, float, float] | None:
-    if text is None:
-        return None
-    try:
-        x, y, z, b = (float(word) for word in text.split(","))
-    except ValueError:
-        raise CalibrationError(
-            f"plane is '{text}', expected n_x,n_y,n_z,b with n . X + b = 0, such as 0,1,0,0 for a wall at y = 0"
-        ) from None
-    return x, y, z, b
-
-
-def _layer(text: str) -> Layer:
-    thickness, mark, index = text.partition(":")
-    try:
-        return Layer(float(thickness), float(index) if mark else 1.52)
-    except ValueError as error:
-        raise CalibrationError(
-            f"window is '{text}', expected THICKNESS:INDEX in metres, such as 0.010:1.52 ({error})"
-        ) from None

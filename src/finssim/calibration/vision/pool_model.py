@@ -158,8 +158,6 @@ def _lens_moved(lens: Lens, step: Array) -> Lens:
     )
 
 
-INTERFACES = ("auto", "surface", "wall")
-
 FITTED = {
     "pose": NAMES[:6],
     "height": ("depth",),
@@ -179,86 +177,83 @@ RANGES = {
     "index": ("index", 1.0, 1.0, 2.5),
     "index_sigma": ("index sigma", 1.0, 0.0, 1.0),
     "tilt_sigma": ("tilt sigma [deg]", np.degrees(1.0), 0.0, 180.0),
-    "water_height_sigma": ("water height sigma", 1.0, 0.0, 10.0),
+    "place_sigma": ("sigma of the surface or window [m]", 1.0, 0.0, 10.0),
     "survey_sigma": ("survey sigma", 1.0, 0.0, 1.0),
     "survey_yaw_sigma": ("survey yaw sigma [deg]", np.degrees(1.0), 0.0, 180.0),
     "focal_sigma": ("focal sigma", 1.0, 0.0, 10.0),
     "center_sigma": ("center sigma", 1.0, 0.0, 1e4),
     "pixel_sigma": ("pixel sigma", 1.0, 1e-3, 100.0),
 }
-"""Setting -> what it is called, units that one of its own makes, least and most in those."""
+"""Setting -> its name in messages, units of the message in one unit of the setting, least and greatest value."""
 
 THICKEST = 0.5
-"""Thickness of a window beyond which another unit than metres is meant [m]."""
+"""Greatest plausible thickness of a window [m]; a greater one is in another unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Options; standard deviations are of what is known before the pictures."""
+    """Priors and options of the fit: standard deviations describe what is known before the pictures.
 
-    interface: str = "auto"
-    """`surface` (normal along the survey's z), `wall` (any direction) or `auto`."""
+    The interface is the water surface, with its normal along the survey's z, unless a window is given.
+    """
+
+    window: Layer | None = None
+    """Flat window between camera and water, in any direction; None: the camera looks through the water surface."""
     plane: tuple[float, float, float, float] | None = None
-    """Surveyed plane n . X + b = 0 as n_x, n_y, n_z, b [m]; the sense of n does not matter."""
-    window: tuple[Layer, ...] = ()
-    """Layers between, the first one next to the camera."""
+    """Surveyed face of the window towards the camera, n . X + b = 0 as n_x, n_y, n_z, b [m]; either sense of n."""
     water_height: float | None = None
     """z of the surface in the survey's frame [m]."""
     water_depth: float | None = None
     """Distance from the middle of the surveyed points to the surface [m], for a survey of one plane."""
-    water_height_sigma: float = 0.005
-    """Of either, or of the surveyed plane's position [m]."""
+    place_sigma: float = 0.005
+    """Standard deviation of the measured height or depth of the surface, or of the window's place [m]."""
     index: float = 1.333
-    """Of the water."""
+    """Refractive index of the water."""
     index_sigma: float = 0.003
-    """Of that; 0 holds it."""
+    """Standard deviation of the index; 0 holds it."""
     index_near: float = 1.0003
-    """On the camera's side."""
+    """Refractive index on the camera's side."""
     tilt_sigma: float | None = None
-    """Of the plane's direction [rad]; None: 0.2 degrees for a surface, 0.5 for a surveyed plane, free for a wall."""
+    """Standard deviation of the plane's direction [rad]; None: 0.2 degrees for a surface, 0.5 for a surveyed window."""
     fit: tuple[str, ...] | None = None
-    """Of `FITTED`; None: pose, height, tilt and index, and the lens where held-out points get better by it."""
+    """Groups of `FITTED`; None: pose, height, tilt and index, and the lens where held-out points get better by it."""
     focal_sigma: float = 0.0
-    """Of the camera file's focal length, relative; 0 holds it unless `fit` names it."""
+    """Relative standard deviation of the camera file's focal length; 0 holds it unless `fit` names it."""
     center_sigma: float = 0.0
-    """Of the camera file's optical centre along each axis [px]; 0 holds it unless `fit` names it."""
+    """Standard deviation of the camera file's optical centre along each axis [px]; 0 holds it unless `fit` names it."""
     pixel_sigma: float | None = None
-    """Of a pixel [px]; None: from the residuals."""
+    """Standard deviation of a pixel [px]; None: from the residuals."""
     survey_sigma: float = 0.002
-    """Of a surveyed coordinate [m]."""
+    """Standard deviation of a surveyed coordinate [m]."""
     survey_yaw_sigma: float = math.radians(0.5)
-    """Of a tag's direction [rad]."""
+    """Standard deviation of a tag's direction [rad]."""
     folds: int = 5
     """Folds of the cross-validation."""
     seed: int = 0
-    """Of the parts and of samples."""
+    """Seed of the folds and of samples."""
 
     def __post_init__(self) -> None:
-        if self.interface not in INTERFACES:
-            raise CalibrationError(
-                f"unknown interface '{self.interface}'; available: {', '.join(INTERFACES)} (a window or wall of known "
-                "place is --plane)"
-            )
         for name in self.fit or ():
             if name not in FITTED:
                 raise CalibrationError(f"unknown '{name}' to fit; available: {', '.join(FITTED)}")
         if self.fit is not None and "pose" not in self.fit:
             raise CalibrationError("fit leaves the pose out: the camera's pose is always fitted, add pose")
-        stated = [self.water_height is not None, self.water_depth is not None, self.plane is not None]
-        if sum(stated) > 1:
+        if self.window is None and self.plane is not None:
+            raise CalibrationError("a plane without a window: the plane of a surface is its height or depth")
+        if self.window is not None and not (self.water_height is self.water_depth is None):
+            raise CalibrationError("the height or depth of a window: its place is a plane")
+        if self.water_height is not None and self.water_depth is not None:
+            raise CalibrationError("the place of the surface is given twice: give its height or its depth")
+        if self.fit is not None and "height" not in self.fit and not self.stated_depth:
             raise CalibrationError(
-                "the place of the water is given twice: give one of its height, depth and plane"
+                "fit leaves the height out and none is given: add height to fit, or give the height of the surface or "
+                "the plane of the window"
             )
-        if self.fit is not None and "height" not in self.fit and not any(stated):
+        if self.window is not None and self.window.thickness > THICKEST:
             raise CalibrationError(
-                "fit leaves the height out and none is given: add height, or give --water-height"
+                f"window is {self.window.thickness:g} m thick, expected at most {THICKEST:g}: thickness is in metres, "
+                "10 mm of glass are 0.010"
             )
-        for layer in self.window:
-            if layer.thickness > THICKEST:
-                raise CalibrationError(
-                    f"window is {layer.thickness:g} m thick, expected at most {THICKEST:g}: thickness is in metres, "
-                    "10 mm of glass are 0.010:1.52"
-                )
         for field, (name, per, least, greatest) in RANGES.items():
             value = getattr(self, field)
             if value is not None and not least <= per * value <= greatest:
@@ -269,6 +264,16 @@ class Settings:
             raise CalibrationError(f"folds is {self.folds}, expected at least 2")
         if self.plane is not None and not np.linalg.norm(self.plane[:3]) > 0.0:
             raise CalibrationError(f"plane has normal {self.plane[:3]}, expected a direction")
+
+    @property
+    def surface(self) -> bool:
+        """Whether the interface is the water surface."""
+        return self.window is None
+
+    @property
+    def layers(self) -> tuple[Layer, ...]:
+        """Solid layers between camera and water, as `Interface` takes them."""
+        return () if self.window is None else (self.window,)
 
     @property
     def stated_depth(self) -> bool:
@@ -288,7 +293,7 @@ def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.
     held = {
         "index": settings.index_sigma <= 0.0,
         "tilt": settings.tilt_sigma is not None and settings.tilt_sigma <= 0.0,
-        "height": settings.stated_depth and settings.water_height_sigma <= 0.0,
+        "height": settings.stated_depth and settings.place_sigma <= 0.0,
     }
     groups = {*(settings.fit or ("pose", "height", "tilt", "index")), *extra}
     groups |= {name for name in ("focal", "center") if getattr(settings, f"{name}_sigma") > 0.0}

@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.trials.conversion import UNITS
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
-from finssim.localization import LocalizationError
-from finssim.localization.camera_file import Fields
 from finssim.localization.detection.detections import Frame, best_detections, read_detections
 from finssim.localization.detection.families import corners
 from finssim.text_table import TextTable, read_text, read_text_table, text_table
 from finssim.text_table import number as _number
-from finssim.yaml_file import read_mapping
 
 Array = NDArray[np.float64]
 
@@ -117,7 +114,7 @@ class Table:
         if spread > WIDEST and not self.united:
             raise CalibrationError(
                 f"{self.path}: the points spread over {spread:.0f} m: if they are not in metres, write the unit into "
-                "the header (x_mm) or give --unit mm"
+                "the header (x_mm) or unit: mm into the survey file"
             )
 
     def refuse(self, row: Row, sentence: str) -> CalibrationError:
@@ -230,57 +227,6 @@ def _recognised(names: Sequence[str]) -> int:
     return sum(bool(_column(word)[0]) for word in names)
 
 
-# Tags on one board, surveyed as a whole: a YAML file that says where the first lies and how the others follow.
-
-PRINTED = 0.0005
-"""Standard error of a tag on a board where the file gives none [m]: printers and glue do no better."""
-
-
-def grid_points(path: str | Path) -> tuple[dict[int, np.ndarray], float]:
-    """Corners of the tags of a grid.
-
-        grid: {first: 0, columns: 6, rows: 4, spacing: [0.13, 0.13], edge: 0.1, position: [0.2, 0.3, 0], yaw_deg: 90}
-
-    Ids run along a column's x, then from row to row; `spacing` is from centre to centre along the printed x and y (a
-    negative second number counts rows downwards); `position` is the centre of the first tag; `yaw_deg`, `pitch_deg`,
-    `roll_deg` turn the board.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Tag id -> corners in the survey's frame [m], (4, 3); and their standard error within the board (`sigma`) [m].
-
-    Raises:
-        CalibrationError: A key is missing, unknown or senseless.
-    """
-    try:
-        tree = read_mapping(Path(path), LocalizationError, such_as="grid: {first: 0, columns: 6, rows: 4}")
-        top = Fields(tree, str(path))
-        fields = top.section("grid")
-        top.finish()
-        first, columns, rows = (int(fields.number(key)) for key in ("first", "columns", "rows"))
-        dx, dy = fields.numbers("spacing", 2)
-        edge, position = fields.number("edge"), fields.numbers("position", 3)
-        angles = [fields.number(f"{name}_deg", 0.0) for name in ("roll", "pitch", "yaw")]
-        sigma = fields.number("sigma", PRINTED)
-        fields.finish()
-    except LocalizationError as error:
-        raise CalibrationError(str(error)) from None
-    if columns < 1 or rows < 1 or edge <= 0.0 or min(abs(dx), abs(dy)) < edge:
-        raise CalibrationError(
-            f"{path}: grid of {columns} x {rows} tags of {edge:g} m every {dx:g}, {dy:g} m: expected at least one tag, "
-            "an edge above 0 and a spacing above the edge"
-        )
-    turn = quat_from_euler(*np.radians(angles))
-    points = {}
-    for row in range(rows):
-        for column in range(columns):
-            flat = corners(edge) + np.array([column * dx, row * dy, 0.0])
-            points[first + row * columns + column] = np.asarray(position) + quat_rotate(turn, flat)
-    return points, sigma
-
-
 @dataclass(frozen=True, eq=False)
 class Placed:
     """Points that were surveyed together, so that one error moves them all: a tag's corners, or a single point."""
@@ -325,7 +271,7 @@ def read_survey(
     gives a row its own standard error, `dry` marks what is above the water, `group` ties points to one target.
 
     Args:
-        path: CSV file, or YAML of a grid of tags (`survey_grid.grid_points`).
+        path: CSV file.
         unit: Of lengths where the file says none.
         edge: Of all tags [m] where the table has no such column.
         z: Height of all points [m] where the table has no such column.
@@ -333,10 +279,6 @@ def read_survey(
     Raises:
         CalibrationError: A column or number is missing, or an id has two positions; names the line.
     """
-    if Path(path).suffix.lower() in (".yaml", ".yml"):
-        tags, sigma = grid_points(path)
-        placed = {tag: Placed(f"tag {tag}", at, sigma) for tag, at in tags.items()}
-        return Survey(str(path), tags=placed)
     table = read_table(path, unit=unit)
     for name in ("x", "y"):
         if name not in table.columns:
@@ -344,7 +286,9 @@ def read_survey(
                 f"{table.path}: no column '{name}': a survey has id,x,y,z or tag,x,y,z,yaw_deg,edge"
             )
     if "z" not in table.columns and z is None:
-        raise CalibrationError(f"{table.path}: no column 'z': add it, or give the height of all points (--z)")
+        raise CalibrationError(
+            f"{table.path}: no column 'z': add it, or give the height of all points as z in the survey file"
+        )
     if not {"id", "tag", "image"} & set(table.columns):
         raise CalibrationError(f"{table.path}: no column names the points: add id, tag or image")
     findings: list[Finding] = []
@@ -385,7 +329,9 @@ def _surveyed(table: Table, row: Row, edge: float | None, z: float | None) -> tu
             raise table.refuse(row, "no id")
         return name, None, row.placed(name, row.position(z)[None])
     if edge is None or edge <= 0.0:
-        raise table.refuse(row, "a tag without its edge: add a column edge [m], or give --edge")
+        raise table.refuse(
+            row, "a tag without its edge: add a column edge [m], or edge to tags of the survey file"
+        )
     if word is not None and _number(word) is None:
         raise table.refuse(row, f"tag is '{word}', expected its number")
     tag = None if word is None else int(float(word))
@@ -473,8 +419,12 @@ def observe_combined(
         missing = [name for name in needed if name not in table.columns]
         if missing:
             raise CalibrationError(
-                f"{path}: no column '{missing[0]}': name the columns u,v,x,y,z, or give a survey (--surveyed)"
-                + ("; points of one height may leave z out and give --z" if missing == ["z"] else "")
+                f"{path}: no column '{missing[0]}': name the columns u,v,x,y,z, or give the points of the survey file"
+                + (
+                    "; points of one height may leave z out if the survey file gives it"
+                    if missing == ["z"]
+                    else ""
+                )
             )
         complete = [row for row in table.rows if not row.missing(*needed)]
         table.refuse_other_units(max((np.abs(row.position(z)).max() for row in complete), default=0.0))
@@ -608,6 +558,8 @@ def _detect(paths: Sequence[Path], family: str | None) -> list[Frame]:
     from finssim.localization.detection.pictures import pictures
 
     if family is None:
-        raise CalibrationError("pictures need the family of the tags in them: give --family, such as tag25h9")
+        raise CalibrationError(
+            "images need the family of their tags: give tags: {family: tag25h9} in the survey file"
+        )
     find = detector(family)
     return [Frame(time, name, tuple(find.detect(image))) for time, name, image in pictures(paths)]

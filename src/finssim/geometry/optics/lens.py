@@ -7,7 +7,6 @@ OpenCV. All functions take a leading `...` batch.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -321,23 +320,21 @@ COEFFICIENTS = {
 }
 """Model -> names of its coefficients, in OpenCV's order."""
 _WORDS = {
-    word: model
-    for model, words in {
-        "plumb_bob": "plumbbob radtan radialtangential brown brownconrady opencv pinholeradtan",
-        "rational": "rational rationalpolynomial fullopencv",
-        "fisheye": "fisheye equidistant equi kannalabrandt kannalabrandt4 kannalabrandt8 kb kb4 kb8 opencvfisheye "
-        "pinholeequi",
-    }.items()
-    for word in words.split()
+    "plumb_bob": "plumb_bob",
+    "radtan": "plumb_bob",
+    "rational": "rational",
+    "rational_polynomial": "rational",
+    "fisheye": "fisheye",
+    "equidistant": "fisheye",
 }
-"""Word of another program, in small letters alone -> model."""
+"""Words of our files, of ROS and of Kalibr -> model."""
 
 
 def lens_model(word: str) -> str:
-    """Translate the word of another program for a lens model.
+    """Return the lens model of a word in a camera file: ours, or one of ROS or Kalibr.
 
     Args:
-        word: Such as `kannala_brandt`, `opencv_fisheye` or `equidistant`, which are `fisheye`.
+        word: Word such as `plumb_bob`, `radtan` or `equidistant`, which is `fisheye`.
 
     Returns:
         Key of `LENS_MODELS`.
@@ -346,12 +343,9 @@ def lens_model(word: str) -> str:
         OpticsError: The word is unknown.
     """
     try:
-        return _WORDS[re.sub(r"[^a-z0-9]", "", word.lower())]
+        return _WORDS[word]
     except KeyError:
-        raise OpticsError(
-            f"unknown lens model '{word[:40]}'; available: {', '.join(LENS_MODELS)} (also radtan, "
-            "rational_polynomial, equidistant, kannala_brandt, opencv_fisheye)"
-        ) from None
+        raise OpticsError(f"unknown lens model '{word[:40]}'; available: {', '.join(_WORDS)}") from None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Tanks seen through a wall of any direction, with glass or without."""
+"""Tanks seen through a window of any direction."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from .surveyed_pools import (
     carried,
     observations,
     survey,
-    wall,
+    window,
 )
 
 FIT = ("pose", "height", "tilt", "index")
@@ -26,7 +26,7 @@ BOARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).T
 """Axes of boards that hang in the tank, z into the water: columns, in the tank's frame."""
 
 TURNS = [(0, 0), (8, 0), (-8, 0), (0, 8), (0, -8), (12, -9), (-12, 9), (12, 9), (20, 0), (0, -20), (-14, -14)]
-"""Of the wall against the boards, about the boards' two axes [degrees]."""
+"""Turns of the window against the boards, about the boards' two axes [degrees]."""
 
 PIXEL, SURVEY = 0.1, 0.0002
 
@@ -40,15 +40,13 @@ def tilt_error(fit, plane):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("window", [(), GLASS], ids=["bare", "glass"])
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 40.0])
-def test_points_behind_a_wall(degrees, window):
-    """A vertical wall at any angle to the camera, its plane unknown: held-out points to about a millimetre."""
-    camera, plane = before_tank(degrees), wall(window=window)
+def test_points_behind_a_window(degrees):
+    """A vertical window at any angle to the camera, its plane unknown: held-out points to about a millimetre."""
+    camera, plane = before_tank(degrees), window()
     seen = survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005)
-    fit = calibrate_pool(seen, camera.lens, Settings(fit=FIT, window=window, survey_sigma=0.0005))
+    fit = calibrate_pool(seen, camera.lens, Settings(fit=FIT, window=GLASS, survey_sigma=0.0005))
     table = fit.estimates
-    assert not fit.surface
     assert table["camera_distance"].ci95[0] < clearance(camera, plane) < table["camera_distance"].ci95[1]
     assert tilt_error(fit, plane) < 2.5
     assert fit.held_out.as_json()["rms_cm"] < 0.12
@@ -56,33 +54,31 @@ def test_points_behind_a_wall(degrees, window):
 
 
 @pytest.mark.slow
-def test_a_wall_in_the_frame_of_a_target():
+def test_a_window_in_the_frame_of_a_target():
     """Any frame will do: that of a target that lies askew in the water."""
-    camera, plane = before_tank(30.0), wall(window=GLASS)
+    camera, plane = before_tank(30.0), window()
     camera, plane, seen = carried(camera, plane, survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005))
-    told = Settings(fit=FIT, window=GLASS, survey_sigma=0.0005, interface="wall")
+    told = Settings(fit=FIT, window=GLASS, survey_sigma=0.0005)
     fit = calibrate_pool(seen, camera.lens, told)
     assert tilt_error(fit, plane) < 2.5
     assert np.linalg.norm(fit.model.camera.position - camera.position) < 0.03
 
 
 @pytest.mark.slow
-def test_a_surveyed_plane_makes_a_wall_exact():
-    camera, plane = before_tank(20.0), wall(window=GLASS)
+def test_a_surveyed_plane_makes_a_window_exact():
+    camera, plane = before_tank(20.0), window()
     seen = survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005)
-    told = Settings(
-        fit=FIT, window=GLASS, survey_sigma=0.0005, plane=(0.0, 1.0, 0.0, 0.0), water_height_sigma=0.001
-    )
+    told = Settings(fit=FIT, window=GLASS, survey_sigma=0.0005, plane=(0.0, 1.0, 0.0, 0.0), place_sigma=0.001)
     fit = calibrate_pool(seen, camera.lens, told)
     assert np.linalg.norm(fit.model.camera.position - camera.position) < 0.004
     assert tilt_error(fit, plane) < 0.5
 
 
-def turned(turn, window=()):
-    """A wall turned away from the boards by angles about x and z [degrees], through the middle of their edge."""
+def turned(turn):
+    """Return a window turned from the boards about x and z [degrees], through the middle of their edge."""
     R = quat_to_matrix(quat_from_rotvec(np.radians([turn[0], 0.0, turn[1]])))
     normal = R @ np.array([0.0, -1.0, 0.0])
-    plane = Interface(normal / np.linalg.norm(normal), 0.0, window=window)
+    plane = Interface(normal / np.linalg.norm(normal), 0.0, window=(GLASS,))
     return replace(plane, offset=-float(plane.normal @ np.array([0.0, 0.0, 0.2])))
 
 
@@ -115,16 +111,12 @@ def noise():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("turn", "window"),
-    [*((turn, GLASS) for turn in TURNS), *((turn, ()) for turn in TURNS[::5])],
-    ids=lambda value: str(value) if value and value != GLASS else "glass" if value else "bare",
-)
-def test_a_wall_turned_against_the_boards(turn, window):
+@pytest.mark.parametrize("turn", TURNS, ids=str)
+def test_a_window_turned_against_the_boards(turn):
     """Which plane comes out does not hang on how near the first one tried comes to the nearest point."""
-    camera, plane = before_tank(10.0), turned(turn, window)
+    camera, plane = before_tank(10.0), turned(turn)
     seen = boards(camera, plane)
-    fit = calibrate_pool(seen, camera.lens, told(window=window, interface="wall"))
+    fit = calibrate_pool(seen, camera.lens, told(window=GLASS))
     normal = plane.normal @ BOARD
     error = float(np.degrees(np.arccos(min(1.0, fit.model.interface.normal @ normal))))
     assert error < max(0.5, 3.0 * tilt_sigma(fit))
@@ -135,25 +127,15 @@ def test_a_wall_turned_against_the_boards(turn, window):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("turn", [(12, -9), (-12, 9), (0, 20)], ids=str)
-def test_a_turned_wall_is_no_level_surface(turn):
-    """The boards' z points into the tank, and a level plane does not explain the pixels."""
-    camera, plane = before_tank(10.0), turned(turn)
-    fit = calibrate_pool(boards(camera, plane), camera.lens, told(interface="auto"))
-    assert not fit.surface
-    assert fit.residual_json()["rms_px"] < 1.2 * noise()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("turn", [(8, -6), (-8, 6)], ids=str)
-def test_rows_before_the_wall_do_not_hold_it(turn):
-    """Three points surveyed 15 cm before the wall are named, and the plane passes them."""
-    camera, plane = before_tank(10.0), turned(turn, GLASS)
+def test_rows_before_the_window_do_not_hold_it(turn):
+    """Three points surveyed 15 cm before the window are named, and the plane passes them."""
+    camera, plane = before_tank(10.0), turned(turn)
     seen = boards(camera, plane)
     points = seen.points.copy()
     wrong = [3, 40, 77]
     points[wrong] += 0.2 * plane.normal @ BOARD
-    fit = calibrate_pool(replace(seen, points=points), camera.lens, told(window=GLASS, interface="wall"))
+    fit = calibrate_pool(replace(seen, points=points), camera.lens, told(window=GLASS))
     assert set(fit.outliers) == {f"p{i}" for i in wrong}
     assert fit.residual_json()["rms_px"] < 1.2 * noise()
 
@@ -161,17 +143,8 @@ def test_rows_before_the_wall_do_not_hold_it(turn):
 @pytest.mark.slow
 def test_a_plane_at_its_bound_is_told():
     """A window told far too thick leaves the plane no room before the nearest board."""
-    camera, plane = before_tank(10.0), turned((12, -9), GLASS)
+    camera, plane = before_tank(10.0), turned((12, -9))
     seen = boards(camera, plane, nearest=0.001)
-    thick = (replace(GLASS[0], thickness=0.12),)
-    fit = calibrate_pool(seen, camera.lens, told(window=thick, interface="wall"))
+    fit = calibrate_pool(seen, camera.lens, told(window=replace(GLASS, thickness=0.12)))
     assert fit.touching and CAMERA not in fit.touching
     assert fit.touching in [one.values["places"] for one in fit.findings if one.code == "plane_touches"]
-
-
-@pytest.mark.slow
-def test_four_points_tell_a_surface_only():
-    """Eight numbers cannot tell a wall's nine parameters from a surface's seven."""
-    camera, plane = before_tank(10.0), turned((0, 0))
-    seen = boards(camera, plane).subset(np.array([0, 34, 65, 139]))
-    assert calibrate_pool(seen, camera.lens, told(interface="auto")).surface
