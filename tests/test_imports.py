@@ -24,6 +24,7 @@ ARROWS = {
     "tasks": {"engine", "localization"},
     "learning": {"tasks"},
     "calibration": {"engine", "localization"},
+    "bench": {"calibration"},
     "robot": {"tasks"},
     "ros2": {"robot"},
     "pool": {"engine", "sensors", "robot"},

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from calibration.made_steps import RPM, held, lagged, sampled, step_log
+from bench.made_steps import RPM, held, lagged, sampled, step_log
+from finssim.bench.levels import find_steps, levels
+from finssim.bench.motor import cut_steps, fit_motor, fit_response
 from finssim.calibration.findings import CalibrationError
-from finssim.calibration.motor import cut_steps, fit_motor, fit_response
 from finssim.calibration.programmes import programmes
 from finssim.calibration.synthetic import simulate_programme
-from finssim.calibration.thruster import find_steps, levels
 from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 

@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from finssim.bench.curves import dead_zone, fit_side
+from finssim.bench.tables import read_table
+from finssim.bench.thruster import fit_thruster
 from finssim.calibration.findings import CalibrationError
-from finssim.calibration.thruster import dead_zone, fit_side, fit_thruster, read_table
 from finssim.vehicles import check_vehicle, load_vehicle
 
 T200 = Path(__file__).parents[1] / "data" / "t200"

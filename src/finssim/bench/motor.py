@@ -14,24 +14,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.bench.levels import find_steps
+from finssim.bench.solve import Solution, solve
 from finssim.calibration.findings import CalibrationError, Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion import without_spikes
 from finssim.calibration.report import finish, refuse_places, usable_trials
-from finssim.calibration.thruster import find_steps, jackknife
 from finssim.calibration.trials.trial import Trial
-from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.thruster import Thruster
 
 __all__ = ["cut_steps", "fit_motor", "fit_response"]
 
-
 Array = NDArray[np.float64]
 
 RPM = math.pi / 30.0
-
-# Command and response of a thruster in a trial.
 
 DOMAINS = ("force", "speed")
 """Thrust [N] and shaft speed [rad/s]."""
@@ -39,13 +36,13 @@ DOMAINS = ("force", "speed")
 UNIT = {"force": "N", "speed": "rad/s"}
 
 BEFORE = 0.3
-"""Longest part of the level before a step that is fitted with it [s]."""
+"""Longest part of the level before a step that is fitted together with the step [s]."""
 
 FEWEST = 5
-"""Samples after a step that it needs."""
+"""Samples that a step needs after it."""
 
 SETTLED = 0.4
-"""Part of a level, at its end, that counts as settled."""
+"""Share of a level, at its end, that counts as settled."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,16 +51,16 @@ class StepRecord:
 
     trial: str
     t: Array
-    """Since the step [s], (n,)."""
+    """Times since the step [s], (n,)."""
     y: Array
     """Response, (n,)."""
     sample: float
-    """Time in which the command's change is not told apart [s]."""
+    """Sampling period of the command [s], to which the time of its change is known."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Log:
-    """One thruster of one trial, thrust [N] or shaft speed [rad/s]."""
+    """Steps and levels of one thruster in one trial, in thrust [N] or shaft speed [rad/s]."""
 
     records: list[StepRecord]
     levels: list[tuple[float, float]]
@@ -76,14 +73,12 @@ class Log:
 
 
 def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Log | None:
-    """Command and response of a thruster.
+    """Return command and response of a thruster; None if the trial lacks one of them.
 
-    Commands, the first that is there: `rpm_command_NAME` [rpm], `command_NAME` [N], `pwm_NAME` [µs], and `force_NAME`
-    where the header says that inputs are commanded and speeds are measured. Responses: `rpm_NAME`, else `force_NAME`.
-    Thrust and speed turn into each other by the thruster's curve. A response without sign gets the command's.
-
-    Returns:
-        None where the trial has not both.
+    The command is the first of `rpm_command_NAME` [rpm], `command_NAME` [N] and `pwm_NAME` [µs] in the trial, or
+    `force_NAME` if the header says that inputs are commanded and speeds are measured. The response is `rpm_NAME`,
+    otherwise `force_NAME`. The thruster's curve converts between thrust and speed. A response without sign takes the
+    command's.
     """
     columns = _columns(trial, name)
     if columns is None:
@@ -101,7 +96,7 @@ def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Log | No
     elif column.startswith("rpm_"):
         command = _as(domain, raw * RPM, thruster, "speed")
     else:
-        # Small steps of a force are as plain as large ones in the speed.
+        # In the speed, small steps of a force are as visible as large ones.
         command, held = _as(domain, raw, thruster, "force"), thruster.speed(raw)
     t, raw = trial.series(measured)
     good = without_spikes(t, raw[:, None])
@@ -130,12 +125,12 @@ def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Log | No
 def cut_steps(
     trial: str, t: Array, y: Array, command_times: Array, steps: Sequence[tuple[float, float, float]]
 ) -> list[StepRecord]:
-    """Samples of the response around every step; steps with fewer than `FEWEST` samples after them are left out.
+    """Return the samples of the response around every step with at least `FEWEST` samples after it.
 
-    The level before a step is taken along where it has settled.
+    The level before a step is included if it has settled.
 
     Args:
-        trial: Its name.
+        trial: Name of the trial.
         t: Times of the response's samples [s], (n,).
         y: Response, (n,).
         command_times: Times of the command's samples [s], (m,).
@@ -159,7 +154,7 @@ def cut_steps(
 
 
 def _columns(trial: Trial, name: str) -> tuple[str, str] | None:
-    """Columns of command and response, or None."""
+    """Return the columns of command and response, or None."""
     responses = [column for column in (f"rpm_{name}", f"force_{name}") if trial.has(column)]
     commands = [c for c in (f"rpm_command_{name}", f"command_{name}", f"pwm_{name}") if trial.has(c)]
     if not commands and trial.header.inputs == "commanded" and len(responses) == 2:
@@ -174,17 +169,15 @@ def _as(domain: str, values: Array, thruster: Thruster, unit: str) -> Array:
 
 
 def _last_sign(command: Array) -> Array:
-    """Sign of the last command that was not zero, at every sample; until the first one, the first's."""
+    """Return the sign of the latest command that was not zero, at every sample; before it, that of the first."""
     sign = np.sign(command)
     nonzero = np.flatnonzero(sign)
     index = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), nonzero[0]))
     return np.asarray(sign[index])
 
 
-# One dead time and time constant for all steps of a thruster.
-
 GRID = 21
-"""Dead times and time constants of the coarse search, each way."""
+"""Dead times, and time constants, of the coarse search."""
 
 LONGEST_DELAY, DELAY_SHARE = 0.8, 0.45
 """T_d <= min(0.8 s, 0.45 of the step's duration) (facts, §5)."""
@@ -193,56 +186,56 @@ OVERSHOOT, NRMSE = 0.10, 0.10
 """A step is accepted up to this overshoot and this error over its height (facts, §5)."""
 
 FEWEST_TRIALS = 4
-"""With fewer, intervals are over steps."""
+"""Trials from which intervals are over trials; with fewer they are over steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Response:
-    """What all steps have in common."""
+    """The response that all steps have in common."""
 
     delay: float
-    """T_d [s]."""
+    """Dead time T_d [s]."""
     time_constant: float
-    """τ [s]."""
+    """Time constant τ [s]."""
     delay_interval: tuple[float, float]
     time_constant_interval: tuple[float, float]
     sample: float
-    """Of the measurement, median [s]."""
+    """Median sampling period of the response [s]."""
     nrmse: Array
     """Error of every step over its height, (n,)."""
     overshoot: Array
-    """Of every step beyond its final level, over its height; noise taken off, (n,)."""
+    """Overshoot of every step beyond its final level over its height, without noise, (n,)."""
     moved: NDArray[np.bool_]
-    """Which steps the response follows at all; it does not inside a dead zone, (n,)."""
+    """Whether the response follows a step at all, which it does not inside a dead zone, (n,)."""
     accepted: NDArray[np.bool_]
-    """Which steps follow first order plus dead time, (n,)."""
+    """Whether a step follows first order plus dead time, (n,)."""
     used: NDArray[np.bool_]
-    """Steps that the numbers rest on: the accepted ones, or all that moved where none is accepted, (n,)."""
+    """Whether a step was fitted: the accepted steps, or all that moved if none is accepted, (n,)."""
 
     @property
     def hidden(self) -> bool:
-        """Whether the time constant is below half a sample, where the log cannot tell it from 0."""
+        """Whether the time constant is below half a sample, where the log does not distinguish it from 0."""
         return self.time_constant < 0.5 * self.sample
 
     @property
     def error(self) -> float:
-        """Median over the steps used."""
+        """Median error of the steps used, over their height."""
         return float(np.median(self.nrmse[self.used]))
 
 
 def fit_response(records: Sequence[StepRecord]) -> Response:
-    """One dead time and time constant for all steps; every step has levels of its own.
+    """Fit one dead time and one time constant to all steps, with separate levels for every step.
 
     y = a + b (1 - e^(-(t - T_d) / τ)) from t = T_d on, with a and b of each step by least squares (variable
-    projection), so that static nonlinearity (dead zone, thrust curve) stays out of the dynamics. A coarse grid of T_d
-    and τ starts SciPy's least squares.
+    projection), so that static nonlinearity (dead zone, thrust curve) does not affect the dynamics. A coarse grid of
+    T_d and τ gives the first guess.
 
     Args:
-        records: At least one step in which the response moves.
+        records: Steps, at least one of which the response follows.
 
     Returns:
-        Estimates with 95 % intervals, over the steps (over the trials where there are four or more), with the time in
-        which samples cannot tell apart added to T_d's.
+        Estimates with 95 % intervals over the steps, or over the trials if there are four or more; the interval of T_d
+        includes half the sampling period of the command.
     """
     sample = float(np.median(np.concatenate([np.diff(record.t) for record in records])))
     duration = float(np.median([record.t[-1] for record in records]))
@@ -255,21 +248,20 @@ def fit_response(records: Sequence[StepRecord]) -> Response:
     moved = (explained > 0.5) & (power > 0.0)
     first = moved if moved.any() else np.arange(len(records)) == np.argmax(explained)
     spread = (remainder / np.maximum(power, 1e-300))[:, first].sum(axis=1)
-    x = _solved(records, first, corners[np.argmin(spread)], low, high)
+    x = _solved(records, first, corners[np.argmin(spread)], low, high).x
     nrmse, overshoot = np.array([_figures(record, x) for record in records]).T
     accepted = moved & (nrmse <= NRMSE) & (overshoot <= OVERSHOOT)
     used = accepted if accepted.any() else first
-    x = _solved(records, used, x, low, high)
-    nrmse, overshoot = np.array([_figures(record, x) for record in records]).T
-    chosen = [record for record, on in zip(records, used, strict=True) if on]
-    ends = intervals(x, trial_covariance(_evidence(chosen, x)))
-    blur = 0.5 * float(np.median([record.sample for record in chosen]))
-    slow = np.exp(np.clip(ends[1], -50.0, 50.0))
+    found = _solved(records, used, x, low, high)
+    nrmse, overshoot = np.array([_figures(record, found.x) for record in records]).T
+    blur = 0.5 * float(np.median([record.sample for record, on in zip(records, used, strict=True) if on]))
+    (delay, log_tau), (late, slow) = found.x, found.half
+    ends = np.exp(np.clip([log_tau - slow, log_tau + slow], -50.0, 50.0))
     return Response(
-        delay=float(x[0]),
-        time_constant=float(np.exp(x[1])),
-        delay_interval=(max(float(ends[0, 0]) - blur, 0.0), float(ends[0, 1]) + blur),
-        time_constant_interval=(float(slow[0]), float(slow[1])),
+        delay=float(delay),
+        time_constant=math.exp(log_tau),
+        delay_interval=(max(float(delay - late) - blur, 0.0), float(delay + late) + blur),
+        time_constant_interval=(float(ends[0]), float(ends[1])),
         sample=sample,
         nrmse=nrmse,
         overshoot=overshoot,
@@ -280,7 +272,7 @@ def fit_response(records: Sequence[StepRecord]) -> Response:
 
 
 def unit_response(t: Array, x: Array) -> Array:
-    """1 - e^(-(t - T_d) / τ) from T_d on, (n,).
+    """Return 1 - e^(-(t - T_d) / τ) from T_d on, and 0 before, (n,).
 
     Args:
         t: Time since the step [s], (n,).
@@ -290,13 +282,13 @@ def unit_response(t: Array, x: Array) -> Array:
 
 
 def _levels(record: StepRecord, x: Array) -> tuple[Array, Array]:
-    """Level before a step and height that fit best, and the basis that they multiply, (2,) and (n, 2)."""
+    """Return the best level before a step and its height, (2,), and the columns that they multiply, (n, 2)."""
     rows = np.column_stack([np.ones(len(record.t)), unit_response(record.t, x)])
     return np.linalg.lstsq(rows, record.y, rcond=None)[0], rows
 
 
 def _misfit(record: StepRecord, x: Array) -> Array:
-    """What the best levels leave, (n,): the response and the samples without their means and what they share."""
+    """Return the residual of a step with its best levels, (n,)."""
     r = unit_response(record.t, x)
     r, y = r - r.mean(), record.y - record.y.mean()
     power = float(r @ r)
@@ -305,53 +297,31 @@ def _misfit(record: StepRecord, x: Array) -> Array:
 
 def _solved(
     records: Sequence[StepRecord], which: NDArray[np.bool_], x: Array, low: Array, high: Array
-) -> Array:
-    from scipy.optimize import least_squares
-
+) -> Solution:
+    """Fit T_d and ln τ to some of the steps; intervals are over steps, or over trials if there are four or more."""
     chosen = [record for record, on in zip(records, which, strict=True) if on]
     scale = [max(float(np.std(record.y)), 1e-300) for record in chosen]
+    trials = np.unique([record.trial for record in chosen], return_inverse=True)[1]
+    group = trials if trials.max() + 1 >= FEWEST_TRIALS else np.arange(len(chosen))
+    sizes = [len(record.y) for record in chosen]
 
     def residual(x: Array) -> Array:
         return np.concatenate([_misfit(record, x) / s for record, s in zip(chosen, scale, strict=True)])
 
-    start = np.clip(x, low + 1e-6, high - 1e-6)
-    return np.asarray(
-        least_squares(residual, start, bounds=(low, high), x_scale=(0.01, 0.1), diff_step=1e-5).x
-    )
-
-
-def _evidence(records: Sequence[StepRecord], x: Array) -> Evidence:
-    """What each step, or each trial, says of T_d and ln τ."""
-    h = np.array([1e-4, 1e-3])
-    normal, score = [], []
-    for record in records:
-        r = _misfit(record, x)
-        J = (
-            np.stack(
-                [(_misfit(record, x + step) - _misfit(record, x - step)) / 2.0 for step in np.diag(h)], axis=1
-            )
-            / h
-        )
-        variance = (
-            float(np.mean(r**2)) * len(r) / max(len(r) - 4, 1) + 1e-12 * float(np.var(record.y)) + 1e-300
-        )
-        variance *= correlated_samples(r)
-        normal.append(J.T @ J / variance)
-        score.append(-J.T @ r / variance)
-    trials = [record.trial for record in records]
-    labels = trials if len(set(trials)) >= FEWEST_TRIALS else [str(i) for i in range(len(records))]
-    groups = [[i for i, label in enumerate(labels) if label == name] for name in dict.fromkeys(labels)]
-    return Evidence(
-        names=("delay", "ln_time_constant"),
-        normal=np.array([np.sum([normal[i] for i in rows], axis=0) for rows in groups]),
-        score=np.array([np.sum([score[i] for i in rows], axis=0) for rows in groups]),
-        unit="trials",
+    return solve(
+        residual,
+        np.clip(x, low + 1e-6, high - 1e-6),
+        [np.repeat(group, sizes)],
+        breaks=np.cumsum(sizes)[:-1].tolist(),
+        bounds=(low, high),
+        x_scale=(0.01, 0.1),
+        diff_step=1e-5,
     )
 
 
 def _figures(record: StepRecord, x: Array) -> tuple[float, float]:
-    """Error of one step over its height, and its largest excursion beyond the final level, of means of three samples,
-    less twice their noise."""
+    """Return the error of one step over its height, and its greatest overshoot of means of three samples minus twice
+    their noise."""
     (start, _), rows = _levels(record, x)
     settled = record.y[record.t >= 0.75 * record.t[-1]]
     height = float(np.mean(settled)) - float(start)
@@ -364,13 +334,11 @@ def _figures(record: StepRecord, x: Array) -> tuple[float, float]:
     return error, max(float(np.max(smooth)) - noise, 0.0) / abs(height)
 
 
-# What the logs say of one thruster.
-
 STANDING = 0.02
-"""Share of the largest response below which a held level counts as standing."""
+"""Share of the greatest response below which a held level counts as standing."""
 
 NARROW_DEAD_ZONE = 2.0
-"""A dead zone is told where the smallest command that turns is at most this times the largest that does not."""
+"""Greatest ratio of the smallest command that turns the shaft to the largest that does not, for a known dead zone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -382,11 +350,11 @@ class Study:
     logs: tuple[Log, ...]
     response: Response
     other_error: float
-    """Error of the same fit in the other domain, over the steps' height; NaN where it could not be made."""
+    """Error of the same fit in the other domain, over the steps' height; NaN if it could not be made."""
 
     @property
     def records(self) -> list[StepRecord]:
-        """All steps."""
+        """Steps of all logs."""
         return [record for log in self.logs for record in log.records]
 
     @property
@@ -396,37 +364,36 @@ class Study:
 
     @property
     def sure(self) -> bool:
-        """Whether a step follows first order plus dead time well enough for the numbers to be written."""
+        """Whether a step follows first order plus dead time, so that the numbers are written."""
         return bool(self.response.accepted.any())
 
     @property
     def levels(self) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-        """Commands and responses of all levels, and of those that move."""
+        """Commands and responses of all levels, and of the levels at which the shaft turns."""
         pairs = [pair for log in self.logs for pair in log.levels]
         largest = max((abs(y) for _, y in pairs), default=0.0)
         return pairs, [(u, y) for u, y in pairs if u != 0.0 and abs(y) > STANDING * largest]
 
     @property
     def gain(self) -> tuple[float, float]:
-        """Steady response over command by least squares through zero, and the half-width of its interval."""
+        """Steady response over command by least squares, and the half-width of its interval."""
         _, moving = self.levels
         if not moving:
             return math.nan, math.inf
         u, y = np.array(moving).T
         if len(u) < 3:
             return float(u @ y / (u @ u)), math.inf
-        others = [np.arange(len(u)) != i for i in range(len(u))]
-        jackknifed = np.array([[u[rows] @ y[rows] / (u[rows] @ u[rows])] for rows in others])
-        return float(u @ y / (u @ u)), float(jackknife(jackknifed)[0])
+        found = solve(lambda x: y - x[0] * u, [float(u @ y / (u @ u))], [np.arange(len(u))])
+        return float(found.x[0]), float(found.half[0])
 
 
 def study(name: str, trials: Sequence[Trial], thruster: Thruster) -> Study | None:
-    """Fit one thruster over all trials that hold it; None where no command of it holds and changes.
+    """Fit one thruster over all trials that hold it; return None if its command has no steps.
 
     Args:
-        name: Of the thruster.
-        trials: All of them.
-        thruster: As the vehicle file has it; its curve turns thrust and speed into each other.
+        name: Name of the thruster.
+        trials: All trials.
+        thruster: The thruster of the vehicle file, whose curve converts between thrust and speed.
     """
     chosen = thruster.domain
     logs = {
@@ -446,7 +413,7 @@ def study(name: str, trials: Sequence[Trial], thruster: Thruster) -> Study | Non
 
 
 def estimates_of(result: Study, thruster: Thruster) -> list[Estimate]:
-    """K, T_d, τ and the dead zone of one thruster."""
+    """Return the estimates of K, T_d, τ and the dead zone of one thruster."""
     response, name = result.response, result.name
     count = int(response.used.sum())
     rests = f"{count} step{'s' if count != 1 else ''} sampled every {response.sample:.3g} s"
@@ -479,7 +446,7 @@ def estimates_of(result: Study, thruster: Thruster) -> list[Estimate]:
 
 
 def _dead_zones(result: Study, thruster: Thruster) -> list[Estimate]:
-    """The slowest speed that turns the shaft either way, between two commands that were tried."""
+    """Return the slowest speed of each direction, between the last command at rest and the first that turns."""
     pairs, moving = result.levels
     estimates = []
     for side, sign in (("plus", 1.0), ("minus", -1.0)):
@@ -508,7 +475,7 @@ def _dead_zones(result: Study, thruster: Thruster) -> list[Estimate]:
 
 
 def quality_of(result: Study) -> dict[str, float]:
-    """Figures of the fit: overshoot and steady error of the steps, error over their height."""
+    """Return figures of the fit: overshoot and steady error of the steps, and their error over the height."""
     response, (_, moving) = result.response, result.levels
     errors = [abs(y - u) / abs(u) for u, y in moving]
     return {
@@ -523,7 +490,7 @@ def quality_of(result: Study) -> dict[str, float]:
 
 
 def findings_of(result: Study) -> list[Finding]:
-    """What a reader of the numbers must know."""
+    """Return the findings about one thruster."""
     response, (gain, half) = result.response, result.gain
     out = [item.about(log.records[0].trial) for log in result.logs for item in log.findings if log.records]
     accepted, moved = int(response.accepted.sum()), int(response.moved.sum())
@@ -544,7 +511,7 @@ def findings_of(result: Study) -> list[Finding]:
 
 
 def curve_of(result: Study) -> Curve:
-    """Steps used, one after the other, with the common response at each step's own levels."""
+    """Return the used steps, one after the other, with the common response at each step's own levels."""
     parameters, parts = np.array([result.response.delay, math.log(result.response.time_constant)]), []
     for record in np.array(result.records, dtype=object)[result.response.used]:
         level, rows = _levels(record, parameters)
@@ -556,18 +523,15 @@ def curve_of(result: Study) -> Curve:
 def fit_motor(
     trials: Iterable[Trial],
     vehicle: Vehicle,
-    *,
-    seed: int = 0,
 ) -> Fit:
     """Fit first order plus dead time to the steps of each thruster, in the vehicle file's domain.
 
-    Thrusters that no trial steps get the mean of their propeller group's. All thrusters share one link, so the vehicle
-    file gets one delay, the median of theirs.
+    Thrusters without steps get the mean of their propeller group. All thrusters share one link, so the vehicle file
+    gets one delay, the median over the thrusters.
 
     Args:
-        trials: With a held and changed command and its response per thruster; see `log_of` for the columns.
-        vehicle: Whose thrusters they are; its curves turn thrust into speed.
-        seed: For the record; the intervals need no random numbers.
+        trials: Trials with steps of a command and its response per thruster; see `log_of` for the columns.
+        vehicle: Vehicle of the thrusters, whose curves convert thrust to speed.
 
     Returns:
         Estimates `THRUSTER.time_constant`, `.delay`, `.gain`, `.dead_rpm_plus`, ...; `delay` of all.
@@ -606,7 +570,6 @@ def fit_motor(
         curves=tuple(curve_of(result) for result in studies),
         findings=tuple(dict.fromkeys(findings)),
         trials={trial.name: trial.sha256 for trial in trials},
-        settings={"seed": seed},
     )
 
 
@@ -622,7 +585,7 @@ def _names(trials: Sequence[Trial], vehicle: Vehicle) -> list[str]:
 
 
 def _common_delay(studies: Sequence[Study]) -> Estimate:
-    """The delay of the link that all thrusters share."""
+    """Return the delay of the link that all thrusters share."""
     delays = [result.response.delay for result in studies]
     ends = [result.response.delay_interval for result in studies]
     middle = float(np.median(delays))
@@ -639,7 +602,7 @@ def _common_delay(studies: Sequence[Study]) -> Estimate:
 def _untested(
     studies: Sequence[Study], vehicle: Vehicle, changes: dict[str, Any], findings: list[Finding]
 ) -> dict[str, float]:
-    """Time constants of the thrusters that no trial steps, from those of their group."""
+    """Return time constants of the thrusters without steps, from those of their group."""
     groups: dict[str, list[float]] = {}
     for result in studies:
         if f"thrusters.{result.name}.time_constant" in changes:
@@ -662,7 +625,6 @@ def calibrate_motor(
     vehicle: str,
     out: Path,
     report: Path | None = None,
-    seed: int = 1,
     as_json: bool = False,
 ) -> Vehicle:
     """Fit the motors' response to steps: delay and lag [s], dead zone.
@@ -674,11 +636,10 @@ def calibrate_motor(
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
         report (DIR): Directory for report.html, report.md, figures and fit.json.
-        seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
     """
     options = dict(locals())
     refuse_places(out, report, "vehicle")
     body = load_vehicle(vehicle)
-    fit = fit_motor(usable_trials(trials)[0], body, seed=seed)
+    fit = fit_motor(usable_trials(trials)[0], body)
     return finish("motor", fit, options)

@@ -1,0 +1,1 @@
+"""Bench measurements: thrust curves, speed controllers and the response of motors."""
