@@ -26,7 +26,7 @@ from finssim.calibration.trials.trial import (
     column_of,
 )
 from finssim.files import OutputError, atomic_directory
-from finssim.text_table import TextTable, number, read_text_table, write_csv
+from finssim.text_table import number, read_text_table, write_csv
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean, sentence_of
 from finssim.yaml_file import read_mapping, yaml_text
@@ -37,9 +37,6 @@ Array = NDArray[np.float64]
 
 MAX_RAGGED = 0.1
 """Part of the rows that may have a wrong number of cells; a file with more of them is no table."""
-
-CHUNK = 20_000
-"""Rows that are held as text at a time."""
 
 
 @dataclass
@@ -111,9 +108,8 @@ def _read_csv(path: Path, **options: Any) -> Table:
     if text.zeros:
         table.findings.append(finding("zero_bytes"))
     _check_names(names, path)
-    columns: list[list[Any]] = [[] for _ in names]
+    columns: list[list[float | str]] = [[] for _ in names]
     ragged: list[int] = []
-    rows: list[list[str]] = []
     for count, line in enumerate(text.texts, start=1):
         row = text.split(line)
         if len(row) < len(names) or any(row[len(names) :]):
@@ -122,11 +118,12 @@ def _read_csv(path: Path, **options: Any) -> Table:
         if text.unfinished and count == len(text.texts) and row[-1]:
             row[-1] = ""
             table.findings.append(finding("last_cell_cut"))
-        rows.append(row)
-        if len(rows) == CHUNK:
-            _append(columns, rows, text)
-            rows = []
-    _append(columns, rows, text)
+        for column, cell in zip(columns, row, strict=False):
+            try:
+                column.append(float(cell) if cell else math.nan)
+            except ValueError:
+                value = text.number(cell)
+                column.append(cell if value is None else value)
     _report_ragged(ragged, len(text.texts), len(names), text.unfinished, table, path)
     for name, column in zip(names, columns, strict=True):
         _keep(table, name, column)
@@ -144,16 +141,6 @@ def _check_names(names: list[str], path: Path) -> None:
     except ValueError:
         return
     raise CalibrationError(f"{path}: begins with numbers, expected a line of column names such as t,tau_x,u")
-
-
-def _append(columns: list[list[Any]], rows: list[list[str]], text: TextTable) -> None:
-    """Add rows of text to the columns, as numbers where every cell of the chunk is one."""
-    for column, cells in zip(columns, zip(*rows, strict=False), strict=False):
-        try:
-            column.extend([float(cell) if cell else math.nan for cell in cells])
-        except ValueError:
-            numbers = [text.number(cell) for cell in cells]
-            column.extend([cell if x is None else x for cell, x in zip(cells, numbers, strict=True)])
 
 
 def _report_ragged(ragged: list[int], count: int, width: int, cut: bool, table: Table, path: Path) -> None:
