@@ -1,4 +1,4 @@
-"""Where errors end: what a person at the command line reads in place of a traceback."""
+"""The boundary where errors end: the sentence that a person at the command line reads in place of a traceback."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ SECONDS = 60
 
 
 def read_bytes(path: Path, refuse: type[Exception], name: str | None = None, limit: int = FILE) -> bytes:
-    """Read a whole file of bounded size.
+    """Read a file of bounded size.
 
     Args:
         path: The file.

@@ -54,10 +54,10 @@ MAKERS = {
     "Choice": "finssim.viewer.run:Choice",
     "Options": "finssim.ros2.up:Options",
 }
-"""Name of an annotation -> function or dataclass that makes it; its options stand in place of the parameter."""
+"""Name of an annotation -> function or dataclass that makes it, whose options replace the parameter."""
 SEEDS = (0, 2**31 - 1)
 LARGEST = 1e9
-"""Of a number on the command line, whatever its unit."""
+"""Greatest magnitude of a number on the command line, in any unit."""
 CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 SETTINGS: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
 WRITTEN = ("out", "lerobot")
@@ -74,12 +74,12 @@ class Experiment:
 
 
 Work = str | Experiment
-"""What a command does: module:function, or an experiment."""
+"""Work of a command: module:function, or an experiment."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """A parameter of a function as the command line takes it."""
+    """Option of a command, made from a parameter of a function."""
 
     name: str
     kind: Any
@@ -89,12 +89,12 @@ class Option:
     default: Any
     """`inspect.Parameter.empty` where it must be given."""
     notes: tuple[Any, ...]
-    """Of `Annotated`: bounds, names, or ","."""
+    """Notes of `Annotated`: bounds, names, or ","."""
     metavar: str | None
     help: str
 
     def parameter(self) -> inspect.Parameter:
-        """As Typer reads it."""
+        """Return the option as Typer reads it."""
         low, high = next((n for n in self.notes if isinstance(n, tuple)), (None, None))
         if self.name == "seed" and self.kind is int:
             low, high = SEEDS
@@ -116,7 +116,7 @@ class Option:
         )
 
     def value(self, typed: Any) -> Any:
-        """What the function is called with.
+        """Return the value that the function is called with.
 
         Raises:
             BadParameter: A number without bounds that is not finite, or beyond any quantity.
@@ -131,7 +131,7 @@ class Option:
 
 @dataclass(frozen=True)
 class Definition:
-    """A function as its source tells it."""
+    """Definition of a function, read from its source."""
 
     path: str
     help: str
@@ -142,7 +142,7 @@ class Definition:
     """Takes whatever words follow, as `*words`."""
 
     def all_options(self) -> Iterator[Option]:
-        """Those of the makers too, in the order of the help."""
+        """Yield all options, those of the makers included, in the order of the help."""
         yield from self.options
         for maker in self.makers.values():
             yield from maker.options
@@ -249,7 +249,7 @@ def _helps(about: str) -> dict[str, Help]:
 
 
 def _kind(annotation: ast.expr | None) -> tuple[Any, bool, tuple[Any, ...]]:
-    """What is made of a word, whether of several, and the notes of `Annotated`; None where it is no option."""
+    """Return a word's type, whether there may be several, and the notes of `Annotated`; None if it is no option."""
     if isinstance(annotation, ast.BinOp):
         sides = (_kind(annotation.left), _kind(annotation.right))
         return next((side for side in sides if side[0] is not None), sides[0])
@@ -268,7 +268,7 @@ def _kind(annotation: ast.expr | None) -> tuple[Any, bool, tuple[Any, ...]]:
 
 
 def _literal(default: ast.expr, source: str) -> Any:
-    """A default; a name stands for a constant of the module."""
+    """Return a default value; a name means a constant of the module."""
     if isinstance(default, ast.Call) and ast.unparse(default.func) == "Path":
         return Path(ast.literal_eval(default.args[0]))
     if isinstance(default, ast.Name):
@@ -281,7 +281,7 @@ def _literal(default: ast.expr, source: str) -> Any:
 def command_app(
     sections: Mapping[str, Mapping[str, Work]], groups: Mapping[str, str], **settings: Any
 ) -> typer.Typer:
-    """Return the whole command line.
+    """Return the command line with all commands.
 
     Args:
         sections: Heading of the help -> words after the program's name -> what is done. One of a group's own name is
@@ -322,7 +322,7 @@ def command_app(
 
 
 def run_script(work: Work) -> NoReturn:
-    """Run a function as a program of its own, whose options are those of its signature, and exit.
+    """Run a function as a program whose options are those of its signature, and exit.
 
     Args:
         work: The function, module:function, or an experiment; the module may be `__main__`.

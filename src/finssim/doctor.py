@@ -20,7 +20,7 @@ class Extra:
     distributions: dict[str, str]
     """Distribution that pip installs -> module that Python imports."""
     enables: str
-    """What a user can do once it is installed."""
+    """Task that the package enables once it is installed."""
 
 
 EXTRAS = {
@@ -117,7 +117,7 @@ def doctor(*, as_json: bool = False) -> int:
 
 
 def examine() -> dict[str, Any]:
-    """What is installed and works, as plain values.
+    """Return what is installed and works, as plain values.
 
     Returns:
         `healthy`; `machine`; `core` (name -> version or None); `devices`, each with `name`, `works`, `detail`; `extras`

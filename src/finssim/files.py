@@ -1,4 +1,4 @@
-"""Output that is either whole or absent: written beside its target under another name, then renamed into place.
+"""Output that is either complete or absent: written beside its target under another name, then renamed into place.
 
 And names that may become part of a path: one that came from data is never a path itself.
 """
@@ -18,7 +18,8 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 LONGEST_NAME = 200
-"""Of a file or folder that data names [bytes]: 255 are possible, and suffixes, seeds and digests are added."""
+"""Longest name of a file or folder that data gives [bytes]: 255 are possible, and suffixes, seeds and digests are
+added."""
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space or write elsewhere",
@@ -40,7 +41,7 @@ class OutputError(OSError):
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Write one file so that a reader sees the old file or the whole new one, never a part.
+    """Write one file so that a reader sees either the old or the new file, never a part.
 
     Yields the path of an empty temporary file beside the target, with the target's suffix (libraries that choose a
     format by suffix work). When the block ends well, the file is flushed to disk and renamed over the target; when it
@@ -77,7 +78,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = None) -> Iterator[Path]:
-    """Fill a directory so that it appears whole or not at all.
+    """Fill a directory so that it appears complete or not at all.
 
     Yields an empty temporary directory beside the target. When the block ends well its files are flushed to disk and it
     takes the target's name; when it raises or is interrupted it is removed with all it holds.
@@ -186,7 +187,7 @@ def _remove_stale(lock: Path, label: str | os.PathLike[str]) -> None:
         except PermissionError:
             pass  # Windows: it is open
         else:
-            if aside.read_text(encoding="utf-8") != text:  # it was made anew in between
+            if aside.read_text(encoding="utf-8") != text:  # another process made it in between
                 os.rename(aside, lock)
             else:
                 aside.unlink()
@@ -214,7 +215,7 @@ def _runs(pid: int) -> bool:
 
 
 def plain_name(name: str, subject: str, error: type[Exception]) -> str:
-    """A name that came from data, where it becomes part of a path: it stands for one file or folder in one place.
+    """Return a name from data that becomes part of a path, if it names one file or folder in one place.
 
         file = folder / f"{plain_name(name, 'run.mcap: vehicle', ViewError)}.yaml"
 
@@ -240,7 +241,7 @@ def plain_name(name: str, subject: str, error: type[Exception]) -> str:
 
 
 def _no_plain_name(name: str) -> str:
-    """Why a name is none; empty if it is."""
+    """Return why a name is refused; empty if it is accepted."""
     if not name.strip():
         return "is empty"
     if name in (".", ".."):
@@ -341,7 +342,8 @@ def _as_output_error(target: Path, *, label: str | os.PathLike[str]) -> Iterator
 
 
 def _about_output(error: OSError, target: Path) -> bool:
-    """Whether the error is of the output: its file is under the target's directory or above it, or is not named."""
+    """Return whether the error concerns the output: its file is under the target's directory or above it, or has no
+    name."""
     if error.filename is None:
         return True
     named = Path(os.path.abspath(os.fsdecode(error.filename)))

@@ -22,15 +22,15 @@ LAYOUTS = {
 }  # fmt: skip
 """Kind -> its parts: so many bytes; text (s), bytes (m) or a table (t) after 4 bytes of length, bytes (b) after 8."""
 END = struct.pack("<BQI", DATA_END, 4, 0) + struct.pack("<BQQQI", FOOTER, 20, 0, 0, 0) + MAGIC
-"""What closes a file without a summary: end of data without a checksum, an empty footer, the magic."""
+"""Bytes that close a file without a summary: end of data without a checksum, an empty footer, the magic."""
 TAIL = 29 + len(MAGIC)
-"""Of a footer and the magic [bytes]."""
+"""Length of a footer and the magic [bytes]."""
 CHUNK_BEGINS = re.compile(rb"\x06.{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)", re.DOTALL)
 
 
 @contextmanager
 def intact_mcap(path: Path, notes: list[str]) -> Iterator[Path]:
-    """The file itself; or, of an MCAP that is cut or damaged, a temporary copy of its whole records.
+    """Yield the file; or, if an MCAP file is cut or damaged, a temporary copy of its intact records.
 
     Args:
         path: Any bag; only `.mcap` files are looked at.
@@ -49,7 +49,7 @@ def intact_mcap(path: Path, notes: list[str]) -> Iterator[Path]:
 
 
 def _copied(data: mmap.mmap, copy: Path) -> str | None:
-    """Copy the whole records of a file of which others are broken, and say which; nothing of a file that is well."""
+    """Copy the intact records of a damaged file, and return what is damaged; copy nothing of an intact file."""
     spans, lost = _intact_records(data)
     summary, ends = _summary(data), data[-len(MAGIC) :] == MAGIC
     if not lost and ends and summary is not None:
@@ -70,7 +70,7 @@ def _copied(data: mmap.mmap, copy: Path) -> str | None:
 
 
 def _intact_records(data: mmap.mmap) -> tuple[list[tuple[int, int]], list[int]]:
-    """Begin and end of each whole record up to the end of the data, and the lengths of what is broken between them."""
+    """Return begin and end of each intact record up to the end of the data, and the lengths of the gaps."""
     spans, lost, at = [], [], len(MAGIC)
     while at < len(data) and data[at] not in (DATA_END, FOOTER):
         if (end := _record_end(data, at)) is None:
@@ -84,7 +84,7 @@ def _intact_records(data: mmap.mmap) -> tuple[list[tuple[int, int]], list[int]]:
 
 
 def _resumed(data: mmap.mmap, at: int) -> int | None:
-    """Where the next whole record begins after a broken one: where that says that it ends, or else the next chunk."""
+    """Return where the next intact record begins after a damaged one: at its stated end, or else at the next chunk."""
     end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
     if end < len(data) and _record_end(data, end) is not None:
         return end
@@ -110,7 +110,7 @@ def _record_end(data: bytes | mmap.mmap, at: int) -> int | None:
 
 
 def _fits(body: bytes, layout: str) -> bool:
-    """Whether the parts of a record lie within it, and its texts are texts."""
+    """Return whether the parts of a record lie within it, and its texts are valid."""
     at = 0
     for part in layout:
         if part.isdigit():
@@ -135,7 +135,7 @@ def _fits(body: bytes, layout: str) -> bool:
 
 
 def _sound_chunk(body: bytes) -> bool:
-    """Whether a chunk can be unpacked, to what its checksum says, or to whole records where it has none."""
+    """Return whether a chunk can be unpacked to match its checksum, or to intact records if it has none."""
     if len(body) < 40:
         return False
     size, crc, length = struct.unpack_from("<QII", body, 16)
@@ -144,7 +144,7 @@ def _sound_chunk(body: bytes) -> bool:
         return False
     try:
         records = _unpacked(compression.decode("ascii"), body[begin:])
-    except Exception:  # each compression has errors of its own
+    except Exception:  # each compression raises different errors
         return False
     return len(records) == size and (zlib.crc32(records) == crc if crc else _last_record_end(records) == size)
 
@@ -170,7 +170,7 @@ def _announced(summary: bytes) -> Iterator[bytes]:
 
 
 def _last_record_end(records: bytes) -> int:
-    """Where the last whole record ends."""
+    """Return where the last intact record ends."""
     at = 0
     while (end := _record_end(records, at)) is not None:
         at = end
@@ -178,7 +178,7 @@ def _last_record_end(records: bytes) -> int:
 
 
 def _of_cut_chunk(data: bytes) -> bytes:
-    """The whole records inside a chunk that is cut; they may also stand outside of one."""
+    """Return the intact records inside a chunk that is cut; records may also occur outside of a chunk."""
     if len(data) < 49 or data[0] != CHUNK:
         return b""
     # Kind, length; first and last time, size, checksum; then the compression's name and the length of what follows.
@@ -192,7 +192,7 @@ def _of_cut_chunk(data: bytes) -> bytes:
 
 
 def _unpacked(compression: str, packed: bytes) -> bytes:
-    """As much as can be unpacked of the beginning of a chunk."""
+    """Return as much as can be unpacked of the beginning of a chunk."""
     if compression == "":
         return packed
     if compression == "zstd":
@@ -242,5 +242,5 @@ def _strings(data: bytes) -> list[str]:
         strings.append(data[at : at + length].decode("utf-8", errors="replace"))
         at += length
         if len(strings) == 1:
-            at += 4  # the length of the whole table
+            at += 4  # the length of the complete table
     return strings

@@ -38,7 +38,7 @@ pre { background: #f3f6f9; padding: .8rem; overflow-x: auto; font-size: .85rem; 
 
 
 def html_page(title: str, sections: Sequence[str]) -> str:
-    """A whole page.
+    """Return a complete page.
 
     Args:
         title: Plain text.
@@ -49,7 +49,7 @@ def html_page(title: str, sections: Sequence[str]) -> str:
 
 
 def html_picture(png: bytes, text: str) -> str:
-    """A picture inside the page, with the words that stand for it."""
+    """Return a picture inside the page, with its alternative text."""
     data = base64.b64encode(png).decode("ascii")
     return f'<img alt="{escape(text)}" src="data:image/png;base64,{data}">'
 
@@ -80,11 +80,11 @@ class Page:
         self._markdown.append(markdown)
 
     def heading(self, text: str) -> None:
-        """Of a section."""
+        """Add the heading of a section."""
         self._add(f"<h2>{escape(text)}</h2>", f"## {text}")
 
     def lead(self, text: str) -> None:
-        """A paragraph that says what came out."""
+        """Add a paragraph that states the result."""
         self._add(f'<p class="lead">{escape(text)}</p>', text)
 
     def note(self, text: str) -> None:

@@ -30,7 +30,7 @@ def silent(silenced: bool = True) -> Iterator[None]:
 
 @contextmanager
 def progress_bar(name: str, *, visible: bool = True) -> Iterator[Progress]:
-    """Show progress on standard error: a bar where that is a terminal, else a line at once and every ten seconds.
+    """Show progress on standard error: a bar on a terminal, otherwise a line immediately and one every ten seconds.
 
     Args:
         name: Of the work.

@@ -1,4 +1,4 @@
-"""What produced an artefact: source revision, package versions, machine. Stored in every policy, report and result."""
+"""Origin of an artefact: source revision, package versions, machine. Stored in every policy, report and result."""
 
 from __future__ import annotations
 

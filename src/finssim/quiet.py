@@ -1,4 +1,4 @@
-"""Start Warp without what it prints to every user's terminal, but tell of kernels that are being compiled."""
+"""Start Warp without its usual output, and report kernels that are being compiled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What Linux, macOS and Windows do differently: signals between processes, their parents, peak memory, text streams.
+"""Differences between Linux, macOS and Windows: signals between processes, their parents, peak memory, text streams.
 
 The branches for Windows and macOS are written from their documentation and run in tests only where these take away what
 the other systems lack; no one has run them on such a machine.
@@ -69,7 +69,7 @@ def follow_parent() -> None:
 def _follow(parent: int) -> None:
     while parent_runs(parent):
         time.sleep(ORPHANED)
-    if os.name == "nt":  # where os.kill ends the process at once
+    if os.name == "nt":  # where os.kill ends the process immediately
         _thread.interrupt_main(signal.SIGTERM)
     else:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -102,7 +102,7 @@ def processor_name() -> str:
 
 
 def peak_memory() -> float:
-    """Return the most memory that this process has had [MiB]; NaN where the system does not tell (Windows)."""
+    """Return the peak memory of this process [MiB]; NaN if the system does not report it (Windows)."""
     try:
         import resource
     except ImportError:

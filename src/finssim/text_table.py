@@ -1,4 +1,4 @@
-"""Tables in text files as people and programs write them: one reader for all layers that knows where a cell stands."""
+"""Tables in text files as people and programs write them: one reader for all layers, with the line of each cell."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ class TextTable:
     """One table as text."""
 
     names: list[str]
-    """Of the columns."""
+    """Names of the columns."""
     texts: list[str]
     """Lines below the names."""
     lines: list[int]
-    """Where each of them stands in the file, from 1."""
+    """Line number of each of them in the file, from 1."""
     split: Callable[[str], list[str]]
     """The cells of a line, without the blanks around them; there may be fewer or more than names."""
     decimal_comma: bool
-    """Whether a comma in a number stands for its point, because something else separates the cells."""
+    """True if a comma in a number is its decimal point, because something else separates the cells."""
     comments: list[str] = field(default_factory=list)
     """Lines that are no rows."""
     zeros: bool = False
-    """Whether the file ends in zero bytes, as after a crash; it was read up to them."""
+    """True if the file ends in zero bytes, as after a crash; it was read up to them."""
     unfinished: bool = False
-    """Whether the last line has no end, so that its last cell may be cut."""
+    """True if the last line has no end, so that its last cell may be cut."""
 
     @property
     def rows(self) -> list[list[str]]:

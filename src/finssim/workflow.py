@@ -204,7 +204,7 @@ def run_in_pool(
     seed: int = 1,
     progress: bool = False,
 ) -> Evaluations:
-    """Run the robot's whole software against the virtual pool in lock-step, as fast as both compute.
+    """Run the robot's complete software against the virtual pool in lock-step, as fast as both compute.
 
     The pool holds a vehicle that the controller does not know: mass, drag, thrusters, sensors and delays are drawn
     around the vehicle file. The controller sees only what localization and the fusion filter give it.

@@ -1,5 +1,5 @@
-"""The one reader of YAML and JSON from outside: values of bounded size, or one sentence that says what is wrong; and
-the one writer of YAML."""
+"""Reader of YAML and JSON from outside, which returns values of bounded size or one sentence that names the error; and
+writer of YAML."""
 
 import json
 import re
@@ -12,7 +12,7 @@ import yaml
 from finssim.budget import read_bytes
 
 LONGEST = 32 << 20
-"""Of a YAML file [bytes]."""
+"""Greatest size of a YAML file [bytes]."""
 LARGEST = 200_000
 """Values in a YAML file, those that its aliases repeat among them."""
 DEEPEST = 100
@@ -94,7 +94,7 @@ for _kind in ("bool", "int", "float"):
 
 
 def whole_number(text: str) -> int | float:
-    """The number that digits stand for; a float where 64 bits do not hold it."""
+    """Return the number of some digits; a float if 64 bits do not hold it."""
     value = int(text) if len(text) < 30 else 2**64
     return value if -(2**63) <= value < 2**63 else float(text)
 
@@ -133,7 +133,7 @@ def _refuse_bombs(text: str) -> None:
 
 
 def json_value(text: str | bytes, refuse: type[Exception], name: str) -> Any:
-    """The value that JSON stands for.
+    """Return the value of a JSON text.
 
     Args:
         text: The JSON.
@@ -155,7 +155,7 @@ def json_value(text: str | bytes, refuse: type[Exception], name: str) -> Any:
 
 
 def _deeper(value: Any, depth: int) -> bool:
-    """Whether lists and mappings are inside one another more often than so."""
+    """Return whether lists and mappings are nested more deeply than a limit."""
     if not isinstance(value, dict | list):
         return False
     return not depth or any(
@@ -225,7 +225,7 @@ def read_mapping(
 
 
 def first_problem(error: Any) -> str:
-    """What Pydantic found wrong first in data from a file, as `where: what`.
+    """Return the first error that Pydantic found in data from a file, as `place: error`.
 
     Args:
         error: A `pydantic.ValidationError`.

@@ -104,7 +104,7 @@ class DeadZone:
     """[rad/s], at least 0."""
     interval: tuple[float, float]
     measured: bool
-    """Whether the table shows a gap; otherwise `speed` is 0 and the interval ends at the slowest speed of the table."""
+    """True if the table shows a gap; otherwise `speed` is 0 and the interval ends at the slowest speed of the table."""
     note: str = ""
 
 
@@ -160,7 +160,7 @@ def fit_esc(
     weight: Array | None = None,
     at: float | None = None,
 ) -> EscFit:
-    """Fit `finssim.vehicles.Esc` by least squares of the shaft speed, each direction by itself.
+    """Fit `finssim.vehicles.Esc` by least squares of the shaft speed, each direction separately.
 
     Args:
         pulse: Pulse widths [µs], (n,).

@@ -1,4 +1,4 @@
-"""From step logs to the response of a vehicle's motors.
+"""Response of a vehicle's motors, fitted to step logs.
 
 First order plus dead time, K e^(-T_d s) / (τ s + 1), in the quantity on which the vehicle file lets the lag act.
 """
@@ -68,7 +68,7 @@ class Log:
     measured: str
     """Column of the response."""
     same_unit: bool
-    """Whether command and response are the same quantity; pulses without an ESC's law are not."""
+    """True if command and response are the same quantity; pulses without the law of a speed controller are not."""
     findings: tuple[Finding, ...]
 
 
@@ -206,15 +206,15 @@ class Response:
     overshoot: Array
     """Overshoot of every step beyond its final level over its height, without noise, (n,)."""
     moved: NDArray[np.bool_]
-    """Whether the response follows a step at all, which it does not inside a dead zone, (n,)."""
+    """True if the response follows a step at all, which it does not inside a dead zone, (n,)."""
     accepted: NDArray[np.bool_]
-    """Whether a step follows first order plus dead time, (n,)."""
+    """True if a step follows first order plus dead time, (n,)."""
     used: NDArray[np.bool_]
-    """Whether a step was fitted: the accepted steps, or all that moved if none is accepted, (n,)."""
+    """True if a step was fitted: the accepted steps, or all that moved if none is accepted, (n,)."""
 
     @property
     def hidden(self) -> bool:
-        """Whether the time constant is below half a sample, where the log does not distinguish it from 0."""
+        """True if the time constant is below half a sample, where the log does not distinguish it from 0."""
         return self.time_constant < 0.5 * self.sample
 
     @property
@@ -359,12 +359,12 @@ class Study:
 
     @property
     def same_unit(self) -> bool:
-        """Whether gains and dead zone compare equal quantities."""
+        """True if gains and dead zone compare equal quantities."""
         return all(log.same_unit for log in self.logs)
 
     @property
     def sure(self) -> bool:
-        """Whether a step follows first order plus dead time, so that the numbers are written."""
+        """True if a step follows first order plus dead time, so that the numbers are written."""
         return bool(self.response.accepted.any())
 
     @property

@@ -1,4 +1,4 @@
-"""From tables of a bench to the thrust curve, dead zone, limits and speed controller of a vehicle's thrusters."""
+"""Thrust curve, dead zone, limits and speed controller of a vehicle's thrusters, fitted to tables of a bench."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Bench:
     lower speed [rad/s]."""
     esc: EscFit | None
     speeds_measured: bool
-    """Whether speeds were measured; otherwise they follow from the forces by the vehicle file's curve."""
+    """True if speeds were measured; otherwise they follow from the forces by the vehicle file's curve."""
     before: Thruster
     """The thruster of the vehicle file."""
     findings: tuple[Finding, ...]
@@ -78,7 +78,7 @@ class Bench:
 
 
 def bench(tables: Sequence[ThrustTable], thruster: Thruster, label: str, voltage: float | None) -> Bench:
-    """Analyse tables of one thruster or of several alike.
+    """Analyse tables of one thruster or of several equal ones.
 
     Args:
         tables: At least one.

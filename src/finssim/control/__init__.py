@@ -4,4 +4,4 @@ __all__ = ["ControlError"]
 
 
 class ControlError(ValueError):
-    """A controller, an action mode or an allocation was given something it refuses: the message says what to change."""
+    """A controller, an action mode or an allocation refuses its arguments; the message states what to change."""

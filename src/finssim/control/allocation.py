@@ -129,7 +129,7 @@ The multipliers need none: a thruster clamped for exceeding its limit by this mu
 
 @wp.struct
 class AllocationData:
-    """What `allocate` needs to know of each vehicle type; built by `allocation_data`, first index the type."""
+    """Tables of each vehicle type that `allocate` uses; built by `allocation_data`, with the type as first index."""
 
     gain: wp.array2d(dtype=vec8)
     """Columns of H^-1 B' W^2: thrust per unit of wanted wrench [N/N, N/(N m)], (vehicles, 6)."""

@@ -29,7 +29,7 @@ NEUTRAL, FULL = 1500.0, 400.0
 PULSES = np.arange(NEUTRAL - FULL, NEUTRAL + FULL + 1.0)
 """Pulse widths of the tables of thrust [µs], (801,)."""
 RULES = {"VECTORED": 1, "VECTORED_6DOF": 2}
-"""How a frame limits the outputs of its motors: those of others, rule 0, are clipped one by one."""
+"""Frame -> the rule that limits the outputs of its motors; other frames, rule 0, clip each output separately."""
 CORRECTIONS, NEAR = 20, 1e-4
 """Most rounds of `Mixer.demands`, and how near the outputs have to come [-]."""
 
@@ -41,14 +41,15 @@ for _row, (_axis, _sign) in enumerate([(3, 1.0), (4, -1.0), (5, -1.0), (2, 1.0),
 
 @wp.struct
 class MixerData:
-    """What `mix` and `mixed_thrusts` need to know of each vehicle; built by `mixer_data`, first index the vehicle."""
+    """Numbers of each vehicle that `mix` and `mixed_thrusts` use; built by `mixer_data`, with the vehicle as first
+    index."""
 
     factors: wp.array2d(dtype=vec8)
-    """Of the demands, by motor, (vehicles, motors)."""
+    """Factors of the demands by motor, (vehicles, motors)."""
     rule: wp.array(dtype=int)
-    """Of `RULES`, (vehicles,)."""
+    """Rule of `RULES`, (vehicles,)."""
     motor: wp.array2d(dtype=int)
-    """Of each thruster, canonical order, (vehicles, motors)."""
+    """Motor of each thruster, canonical order, (vehicles, motors)."""
     direction: wp.array2d(dtype=float)
     """MOT_n_DIRECTION, by motor, (vehicles, motors)."""
     thrust: wp.array3d(dtype=float)
@@ -171,7 +172,7 @@ def motors_of(vehicle: Any) -> npt.NDArray[np.int64]:
 
 
 def mixer_data(vehicles: Sequence[Any], device: Any = "cpu") -> MixerData:
-    """The numbers of `mix` and `mixed_thrusts` for vehicles alike in their number of thrusters.
+    """Return the numbers of `mix` and `mixed_thrusts` for vehicles with equal numbers of thrusters.
 
     Raises:
         ControlError: One has no `autopilot`, or thrusters without `esc`.

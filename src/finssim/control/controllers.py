@@ -26,7 +26,7 @@ CONTROLLERS: dict[str, Callable[..., Controller]] = {
 }
 """Makers `(vehicle, hydrodynamics="calibrated", period=...) -> Controller` by name."""
 COSTLY = ("nmpc",)
-"""Of these, what takes an extra and a second to make: nobody makes it without being asked for it by name."""
+"""Controllers that need an extra and a second to start, which are made only when they are requested by name."""
 
 
 def controller(name: str, vehicle: Vehicle, **options: Any) -> Controller:
@@ -41,7 +41,7 @@ def controller(name: str, vehicle: Vehicle, **options: Any) -> Controller:
 
 
 def controller_for(task: str, name: str, vehicle: Vehicle, **options: Any) -> Controller:
-    """The controller of that name as a task's baseline: `pid-paper` has a published profile of its own for t2.
+    """Return the controller of a name as a baseline of a task; `pid-paper` has a separate published profile for t2.
 
     Raises:
         ControlError: As `controller`.

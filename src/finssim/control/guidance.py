@@ -1,4 +1,4 @@
-"""Where a vehicle should be as a function of time, what a controller is given, and how far it is from its goal."""
+"""References over time, the readings that a controller receives, and errors to the goal."""
 
 from __future__ import annotations
 
@@ -53,19 +53,19 @@ class Track:
     nu: Array
     """Body frame [m/s, rad/s], (..., 6)."""
     time: float = math.nan
-    """When that was measured [s]; NaN where it is not told."""
+    """Time of the measurement [s]; NaN if it is not known."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """Readings as plain arrays; what nobody looks at may be left out."""
+    """Readings as plain arrays; fields that are not needed may be left out."""
 
     observation: Any
     position: Any = None
     quaternion: Any = None
     nu: Any = None
     pictures: Any = None
-    """What is seen, by name: uint8 (n, height, width, 3)."""
+    """Pictures by name: uint8 (n, height, width, 3)."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Goal:
     """The pose to hold, and how it moves."""
 
     position: Any
-    """Where the body origin should be, world frame [m], (..., 3)."""
+    """Position of the body origin, world frame [m], (..., 3)."""
     quaternion: Any
     """Attitude the body should have, body to world, xyzw, (..., 4)."""
     velocity: Any = (0.0, 0.0, 0.0)
@@ -83,7 +83,7 @@ class Goal:
 
 
 class Controller(Protocol):
-    """A controller keeps no state of its own: its memory goes in with every call and comes back."""
+    """A controller without internal state: its memory is an argument and a result of every call."""
 
     @property
     def period(self) -> float:
@@ -165,7 +165,7 @@ class Guide(Protocol):
 
     @property
     def name(self) -> str:
-        """Of the station or trajectory."""
+        """Name of the station or trajectory."""
 
     @property
     def duration(self) -> float:
@@ -187,7 +187,7 @@ class Station:
     duration: float = math.inf
 
     def at(self, t: npt.ArrayLike) -> Reference:
-        """The same at all times."""
+        """Return the same reference at all times."""
         shape = np.shape(t)
         position = np.broadcast_to(np.asarray(self.position, float), (*shape, 3))
         return Reference(position, np.zeros((*shape, 3)), np.full(shape, self.yaw), np.zeros(shape))

@@ -18,7 +18,7 @@ from finssim.vehicles import Vehicle
 Array = npt.NDArray[np.float64]
 
 POSITION_SCALE, ANGLE_SCALE = 0.25, math.radians(25.0)
-"""Errors that cost as much as the whole wrench limit of their axis [m, rad]."""
+"""Errors whose cost equals that of the full wrench limit of their axis [m, rad]."""
 OBSERVER_TIME = 1.0
 """Time constant with which the observer takes over an unknown wrench [s]."""
 SLOWEST_LAG = 0.02
@@ -26,7 +26,7 @@ SLOWEST_LAG = 0.02
 
 
 class LqrMemory(NamedTuple):
-    """What the controller remembers between two commands; n vehicles where they are a batch."""
+    """Memory of the controller between two commands; n vehicles if they are a batch."""
 
     force: Array
     """Observed force, WORLD frame [N], (..., 3): a current pushes the same way whatever the heading."""
@@ -35,7 +35,7 @@ class LqrMemory(NamedTuple):
     nu: Array
     """Velocity of the reference at the last command, body frame [m/s, rad/s], (..., 6); NaN before the first."""
     modelled: Array
-    """What acts since then by the model, thrusters included, body frame [N, N m], (..., 6)."""
+    """Wrench since then by the model, thrusters included, body frame [N, N m], (..., 6)."""
     delivered: Array
     """Wrench that the thrusters' lag lets through, body frame [N, N m], (..., 6)."""
     queue: Array
@@ -59,7 +59,7 @@ class Lqr:
     body: Pid = field(repr=False)
     """Model, limits, allocation and feed-forward."""
     gains: Array
-    """Of e, e', f and the commands under way, per axis, (6, 3 + delays)."""
+    """Gains of e, e', f and the delayed commands, per axis, (6, 3 + delays)."""
     error_limit: Array
     """Largest error that is acted on, (6,) [m, rad]."""
     lag: float
@@ -136,7 +136,7 @@ class Lqr:
         arriving = memory.queue[..., 0, :]
         through = 1.0 - math.exp(-self.period / self.lag)
         mean = arriving + (memory.delivered - arriving) * self.lag / self.period * through
-        # What the model says acts until the next command; the thrusters' part is its mean over the period.
+        # Wrench until the next command by the model; the thrusters' part is its mean over the period.
         modelled = mean - model_wrench - body.holding_wrench(q, q)
         delivered = memory.delivered + through * (arriving - memory.delivered)
         return tau, LqrMemory(

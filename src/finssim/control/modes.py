@@ -30,21 +30,22 @@ AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 QUIET = 0.01
 """Axes of `pilot6` up to this turn no motor [-]."""
 TOLERANCE = 1e-6
-"""Relative difference between limits that are computed anew and those that a policy's directory holds."""
+"""Relative difference between computed limits and those of a policy's directory that counts as none."""
 
 
 class ModeKind(NamedTuple):
     """One action mode, for any vehicle."""
 
     wrench: bool
-    """Whether the components are mixed to a wrench, which is allocated to the thrusters, or to the thrusters."""
+    """True if the components are mixed to a wrench, which is allocated to the thrusters; False: directly to the
+    thrusters."""
     labels: Callable[[Any], tuple[str, ...]]
     """Names of the components of an action for a vehicle, m of them."""
     mix: Callable[[Any], Array]
-    """What each component asks for at 1: parts of the wrench limits (m, 6), of the limits of n thrusters (m, n), or of
-    the autopilot's demands (m, 6)."""
+    """Function that gives the effect of each component at 1: shares of the wrench limits (m, 6), of the limits of n
+    thrusters (m, n), or of the autopilot's demands (m, 6)."""
     pilot: bool = False
-    """Whether the components are the axes of the vehicle's autopilot."""
+    """True if the components are the axes of the vehicle's autopilot."""
 
 
 def _axes(*axes: int) -> ModeKind:
@@ -73,25 +74,25 @@ MODES: dict[str, ModeKind] = {
 
 @wp.struct
 class ModeData:
-    """What `thrusts_of` needs to know of each vehicle; built by `mode_data`, first index the vehicle."""
+    """Numbers of each vehicle that `thrusts_of` uses; built by `mode_data`, with the vehicle as first index."""
 
     columns: wp.array2d(dtype=vec8)
-    """What each component asks for at 1: a wrench [N, N m] or demands [-] and two zeros, or parts of the thrusters'
+    """Effect of each component at 1: a wrench [N, N m] or demands [-] and two zeros, or shares of the thrusters'
     limits, (vehicles, m)."""
     lower: wp.array(dtype=vec8)
     """Least thrust [N], (vehicles,)."""
     upper: wp.array(dtype=vec8)
     """Greatest thrust [N], (vehicles,)."""
     wrench: wp.bool
-    """Whether the columns are wrenches."""
+    """True if the columns are wrenches."""
     allocation: AllocationData
-    """Of wrenches to the thrusters; empty where the columns are no wrenches."""
+    """Allocation of wrenches to the thrusters; empty if the columns are not wrenches."""
     pilot: wp.bool
-    """Whether the columns are demands."""
+    """True if the columns are demands."""
     dead_band: wp.array(dtype=vec8)
     """Part of each axis up to which no motor turns [-], (vehicles,); of demands."""
     mixer: MixerData
-    """Of demands to the thrusters; empty where the columns are no demands."""
+    """Mixer from demands to the thrusters; empty if the columns are not demands."""
 
 
 @wp.func
@@ -211,8 +212,8 @@ def before_dead_band(part: npt.ArrayLike, dead_band: npt.ArrayLike) -> Array:
 
 
 def _columns(kind: ModeKind, vehicle: Any, scale: Any) -> Array:
-    """What each component asks for at 1: a wrench [N, N m] or demands [-], (m, 6), or parts of the thrusters' limits,
-    (m, n)."""
+    """Return the effect of each component at 1: a wrench [N, N m] or demands [-], (m, 6), or shares of the thrusters'
+    limits, (m, n)."""
     if kind.pilot:
         return np.asarray(kind.mix(vehicle) * np.reshape(scale, (-1, 1)))
     full = np.asarray(scale, float) * (np.asarray(vehicle.wrench_limits, float) if kind.wrench else 1.0)
@@ -241,10 +242,10 @@ class ActionMode:
     `reference` [N, N m, m], or with `lower` and `upper` of the thrusters [N], and of an autopilot its `factors`, row by
     row, `gain` and `dead_band` by axis [-]."""
     columns: Array = field(repr=False, compare=False)
-    """What each component asks for at 1: a wrench about `reference` [N, N m] or demands of the autopilot [-], (m, 6),
-    or parts of the thrusters' limits, (m, n)."""
+    """Effect of each component at 1: a wrench about `reference` [N, N m] or demands of the autopilot [-], (m, 6), or
+    shares of the thrusters' limits, (m, n)."""
     thrusters: int
-    """Of the vehicle, n."""
+    """Number of the vehicle's thrusters n."""
     launch: RowLaunch = field(repr=False, compare=False)
     """Actions to thrusts, by `thrusts_of`."""
 
@@ -255,23 +256,23 @@ class ActionMode:
 
     @property
     def scale(self) -> tuple[float, ...]:
-        """Part of the limits that action 1 stands for."""
+        """Share of the limits that action 1 means."""
         return self.definition["scale"]
 
     @property
     def wrench(self) -> bool:
-        """Whether the components ask for a wrench."""
+        """True if the components are mixed to a wrench."""
         return MODES[self.name].wrench
 
     @property
     def pilot(self) -> bool:
-        """Whether the components are the axes of the vehicle's autopilot."""
+        """True if the components are the axes of the vehicle's autopilot."""
         return MODES[self.name].pilot
 
     @property
     def ends(self) -> tuple[Array, Array]:
-        """What each component alone asks for at -1 and at 1, (m,): of its axis [N, N m] or of its thruster [N], or of
-        full output [-]."""
+        """Effect of each component at -1 and at 1, (m,): on its axis [N, N m], of its thruster [N], or of full output
+        [-]."""
         if self.pilot:
             return -np.abs(self.columns).sum(axis=1), np.abs(self.columns).sum(axis=1)
         if self.wrench:

@@ -1,4 +1,4 @@
-"""From thrusts to what a motor controller is told, and back: curve, order, sign, and pulses for small thrusts."""
+"""Conversion between thrusts and commands of a motor controller: curve, order, sign, and pulses for small thrusts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["AT_REST", "Motor", "MotorMap", "MotorMemory", "PulseMemory", "Side"]
 # One motor: the shaft speed to command for a thrust, small thrusts as pulses that are right on average.
 #
 # A motor does not turn below a slowest speed, so the thrust of that speed is the least one that can be held. Anything
-# smaller is delivered on average: the motor runs at its slowest speed in pulses, begun and ended by what is owed.
+# smaller thrusts are delivered on average: the motor runs at its slowest speed in pulses, set by the owed impulse.
 #
 #     owed_dot = f - T(ω),      a pulse begins at owed = +h and ends at owed = -h,      h = T_slow t_pulse / 2
 #
@@ -28,7 +28,7 @@ __all__ = ["AT_REST", "Motor", "MotorMap", "MotorMemory", "PulseMemory", "Side"]
 
 
 class PulseMemory(NamedTuple):
-    """What one motor's pulses carry from one call to the next."""
+    """State of one motor's pulses from one call to the next."""
 
     owed: float
     """Impulse that was asked for and not delivered [N s]."""
@@ -39,7 +39,7 @@ class PulseMemory(NamedTuple):
 
 
 AT_REST = PulseMemory(0.0, 0.0, 0.0)
-"""A motor that stands and owes nothing."""
+"""State of a motor at rest that owes no impulse."""
 
 
 class Side(NamedTuple):
@@ -106,12 +106,12 @@ class Motor:
 
 Array = npt.NDArray[np.float64]
 MotorMemory = tuple[PulseMemory, ...]
-"""What the map carries from one call to the next, one entry per thruster in canonical order."""
+"""State of the map from one call to the next, one entry per thruster in canonical order."""
 
 RPM = 2.0 * math.pi / 60.0
 """One rpm in rad/s."""
 SLOWEST_MARGIN = 1.1
-"""Speed of a pulse over the slowest speed in the vehicle file: right at its edge a motor might stand still."""
+"""Ratio of the speed of a pulse to the slowest speed in the vehicle file, at which a motor might not turn."""
 SHORTEST_PULSE = 0.05
 """[s]; three periods of a loop at 60 Hz, for motors faster than that."""
 
@@ -216,7 +216,7 @@ class MotorMap:
     def normalised(
         self, force: npt.ArrayLike, memory: MotorMemory, dt: float
     ) -> tuple[Array, Array, MotorMemory]:
-        """What to tell the controller until the next call.
+        """Return the command to send to the controller until the next call.
 
         Args:
             force: Thrusts asked for, along the thrusters' axes, canonical order [N], (n,); finite.

@@ -29,11 +29,11 @@ SPEED_SCALE = 4.0
 FINAL = 5.0
 """Cost of the state at the end of the horizon, in those of a step."""
 ITERATIONS = 30
-"""Of the solver, at most: a solution is good enough to act on long before."""
+"""Greatest number of iterations; a solution is good enough to act on long before."""
 
 
 class NmpcMemory(NamedTuple):
-    """What the controller remembers between two commands; n vehicles where they are a batch."""
+    """Memory of the controller between two commands; n vehicles if they are a batch."""
 
     force: Array
     """Observed force, WORLD frame [N], (..., 3)."""
@@ -42,7 +42,7 @@ class NmpcMemory(NamedTuple):
     predicted: Array
     """Velocity of the body origin that the model expected by now, body frame [m/s, rad/s], (..., 6); NaN at first."""
     thrust: Array
-    """What the thrusters give, by their lag [N], (..., n)."""
+    """Thrust by the thrusters' lag [N], (..., n)."""
     queue: Array
     """Thrusts commanded and not yet at the thrusters, oldest first [N], (..., delays, n)."""
     plan: Array
@@ -51,7 +51,8 @@ class NmpcMemory(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Nmpc:
-    """The thrusts of the next two seconds that cost least, of which the first is commanded; solved anew every period.
+    """Nonlinear model-predictive control: the cheapest thrusts of the next two seconds, of which the first is
+    commanded.
 
         M nu_dot + C(nu) nu + D(nu) nu + g(q) = B f + w,    lag f_dot + f = u(t - delay),    lower <= u <= upper
 
@@ -70,7 +71,7 @@ class Nmpc:
     mass: Array
     """M about the body origin [kg, kg m, kg m²], (6, 6)."""
     bounds: tuple[Array, Array]
-    """Of the constraints, (constraints,) each."""
+    """Bounds of the constraints, (constraints,) each."""
     delays: int
     """Commands under way."""
     period: float
@@ -143,7 +144,7 @@ class Nmpc:
         self, memory: NmpcMemory, p: Array, q: Array, nu: Array, p_goal: Array, q_goal: Array, v_goal: Array,
         a_goal: Array,
     ) -> tuple[Array, NmpcMemory]:  # fmt: skip
-        """The same for one vehicle; the goal moves on with its velocity and acceleration."""
+        """Return thrusts and memory for one vehicle; the goal moves with its velocity and acceleration."""
         # q and -q are one attitude, but of the other sign no step of the last plan would fit.
         if memory.plan[3:7] @ q < 0.0:
             q = -q
@@ -175,7 +176,7 @@ class Nmpc:
         plan = np.asarray(answer["x"]).ravel()
         lower, upper = self.allocator.lower, self.allocator.upper
         thrust = np.clip(plan[state.size : state.size + steady.size], lower, upper)
-        # A solver that fails does not stop the vehicle: hold it and begin anew.
+        # A solver that fails does not stop the vehicle: keep the last thrust and start the plan again.
         if not np.isfinite(plan).all():
             thrust, plan = steady, np.full_like(plan, np.nan)
         queue = np.concatenate([memory.queue, thrust[None]])
@@ -256,7 +257,7 @@ def _problem(vehicle: Vehicle, advance: Any, limits: Array, period: float) -> tu
              (("x", 13 + n), ("w", 6), ("p", 3), ("q", 4), ("v", 3), ("a", 3), ("steady", n))]  # fmt: skip
     start, w, position, attitude, velocity, acceleration, steady = symbols
     reach = np.maximum(upper, -lower)
-    # An axis that the thrusters do not command is nobody's to hold.
+    # An axis that the thrusters do not command is not controlled.
     driven = (limits > 0.0).astype(float)
     turning = np.array([driven[3], driven[4], driven[5]]) / ANGLE_SCALE**2
 

@@ -78,7 +78,8 @@ class AxisModel:
 
 @dataclass(frozen=True)
 class Gains:
-    """tau = kp e + integral - kd x', with integral' = rate (the force that the model says is left over), per axis."""
+    """Gains of tau = kp e + integral - kd x', with integral' = rate (the force that the model leaves unexplained), per
+    axis."""
 
     kp: Array
     """[N/m, N m/rad], (6,)."""
@@ -167,14 +168,14 @@ CRUISE = 0.7
 """Speed at which a far goal is approached, as a part of the terminal speed at the wrench limit."""
 
 LEAST_LAG = 0.15
-"""Of a loop of place or heading, however quick the thrusters [s]: what is seen lags by exposure, wire and filter."""
+"""Shortest lag of a position or heading loop [s]: exposure, wire and filter delay the measurement."""
 
 INTEGRAL_SHARE = 0.5
 """Largest integral, as a part of the wrench limit."""
 
 
 class PidMemory(NamedTuple):
-    """What the controller remembers between two commands."""
+    """Memory of the controller between two commands."""
 
     force: Array
     """Integral part of the force, WORLD frame [N], (..., 3): a current pushes the same way whatever the heading."""
@@ -213,7 +214,7 @@ class Pid:
     center_of_buoyancy: Array
     """Body frame [m], (3,)."""
     allocator: Allocator = field(repr=False)
-    """Tells what the thrusters can deliver."""
+    """Allocator that gives what the thrusters can deliver."""
     period: float
     """Time between two commands [s]."""
 
@@ -346,11 +347,11 @@ class PaperProfile(NamedTuple):
     axis_range: tuple[float, float, float, float]
     """Divisor that turns each output into an effort in [-1, 1]: smaller is stronger."""
     integral_decay: float = 0.95
-    """What a period leaves of the integral."""
+    """Factor on the integral per period."""
     integral_limit: float = 100.0
     """Bound of the integral of the error."""
     derivative_memory: float = math.exp(-4.0)
-    """What a period leaves of the filtered derivative."""
+    """Factor on the filtered derivative per period."""
     yaw_dead_band: float = 5.0
     """Heading error that is ignored [deg]."""
     unit: float = 7.0
@@ -383,7 +384,7 @@ are then 0.12 to 0.19 m, near the published 0.17 to 0.21 m; with 7 N they would 
 
 
 class PaperMemory(NamedTuple):
-    """What the controller remembers, order depth, surge, sway, yaw [m, deg]."""
+    """Memory of the controller, in the order depth, surge, sway, yaw [m, deg]."""
 
     integral: Array
     """Decaying integral of the error, (..., 4)."""

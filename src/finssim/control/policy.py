@@ -1,4 +1,4 @@
-"""A trained policy as a directory: `policy.yaml` says what goes in and out, `policy.onnx` is the network.
+"""Trained policies as directories: `policy.yaml` describes inputs and outputs, `policy.onnx` is the network.
 
 The same directory is run by the evaluation, by the robot and by the virtual pool, with onnxruntime and without torch.
 What a policy was trained with is part of it, and `Policy.load` refuses to run it with anything else: a network fed in
@@ -24,7 +24,7 @@ from finssim.files import atomic_directory
 from finssim.page import notebook_html
 from finssim.yaml_file import first_problem, read_mapping
 
-# What a policy directory says of itself: `policy.yaml`, its schema and how two of them are compared.
+# `policy.yaml`: its schema, and how two descriptions are compared.
 
 
 FORMAT = 1
@@ -48,9 +48,9 @@ class ObservationEntry(_Record):
     """A run of observation elements holding one quantity, as clip(quantity / scale)."""
 
     name: str
-    """What it is, with its frame, such as `position_error_body`."""
+    """Name of the quantity with its frame, such as `position_error_body`."""
     indices: tuple[int, ...]
-    """Where its components lie in the observation, in order."""
+    """Indices of its components in the observation, in order."""
     unit: str
     """Unit of the quantity before division; "1" when it has none."""
     scale: float = Field(default=1.0, gt=0.0)
@@ -60,7 +60,7 @@ class ObservationEntry(_Record):
 
 
 class ObservationSchema(_Record):
-    """The observation's layout: which quantity stands where, in which unit and scale."""
+    """Layout of the observation: the index, unit and scale of each quantity."""
 
     size: int = Field(gt=0, le=LARGEST)
     entries: tuple[ObservationEntry, ...]
@@ -86,14 +86,14 @@ class VehicleIdentity(_Record):
 
 
 class PolicyDescription(_Record):
-    """Everything `policy.yaml` says. Mappings are plain data: numbers, strings, lists and dictionaries."""
+    """Content of `policy.yaml`. Mappings are plain data: numbers, strings, lists and dictionaries."""
 
     format: int = FORMAT
     task: str
     observation: ObservationSchema
     pictures: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """What it sees beside the observation, by the name of the entry of the vehicle's `perception`: device, shape
-    (height, width, 3), rate [Hz] and latency [s]."""
+    """Pictures besides the observation, by the name of the entry of the vehicle's `perception`: device, shape (height,
+    width, 3), rate [Hz] and latency [s]."""
     action: dict[str, Any]
     """The action mode, as its `describe()` gives it: at least `mode` (name), `size`, and its limits and scale."""
     control_period: float = Field(ge=1e-3, le=10.0)
@@ -167,7 +167,7 @@ def plain_data(value: Any) -> Any:
 
 
 def first_difference(trained: Any, actual: Any, path: str, tolerance: float = 1e-9) -> str | None:
-    """Where two pieces of plain data first differ, as "PATH is A in the policy and B here", or None.
+    """Return where two pieces of plain data first differ, as "PATH is A in the policy and B here", or None.
 
     Args:
         trained: What the policy has.
@@ -194,11 +194,11 @@ def first_difference(trained: Any, actual: Any, path: str, tolerance: float = 1e
 
 
 OUTPUTS = ["action", "memory_after"]
-"""Of the network; the second only of one with memory."""
+"""Outputs of the network; the second only of a network with memory."""
 
 
 class Identified(Protocol):
-    """What a policy compares of a vehicle: its name and the SHA-256 of its file. A `Vehicle` has both."""
+    """Name of a vehicle and the SHA-256 of its file, which a policy compares. A `Vehicle` has both."""
 
     @property
     def name(self) -> str: ...
@@ -304,7 +304,7 @@ class Policy:
         return self.step(None, observation)[0]
 
     def reset(self, n: int) -> NDArray[np.float32] | None:
-        """What it remembers at the start of n episodes, (n, k); None of a policy without memory."""
+        """Return the memory at the start of n episodes, (n, k); None for a policy without memory."""
         k = self.description.memory
         return np.zeros((n, k), dtype=np.float32) if k else None
 

@@ -22,7 +22,7 @@ from finssim.yaml_file import read_mapping
 
 # Shapes that a trajectory can follow: position and its exact derivative as functions of time.
 #
-# A shape lies in the horizontal plane z = `depth` (negative under water) unless it says otherwise. In the paper's
+# A shape lies in the horizontal plane z = `depth` (negative under water) unless stated otherwise. In the paper's
 # controller frame that is the x-z plane: its x is ours, its z is our y, both at y = depth.
 
 
@@ -41,7 +41,7 @@ TABLE_SIZE = 2048
 
 
 def polyline(points: Sequence[Sequence[float]], durations: Sequence[float]) -> Timed:
-    """Straight segments from point to point, each begun and ended at rest: s = 3u² - 2u³.
+    """Return straight segments from point to point, each from rest to rest: s = 3u² - 2u³.
 
     Args:
         points: Corners, world frame [m], (n + 1, 3).
@@ -115,7 +115,7 @@ def gerono(a: float, b: float, duration: float, depth: float = DEPTH) -> Timed:
 
 
 def ellipse(a: float, b: float, duration: float, depth: float = DEPTH) -> Timed:
-    """One turn of an ellipse, slower at its four vertices, begun and ended at rest.
+    """Return one turn of an ellipse from rest to rest, slower at its four vertices.
 
     The speed along the arc follows 0.5 + 0.5 sin² 2θ, and time itself runs by s = 3u² - 2u³. That reading of what is
     published gives the published peak: 0.1031 m/s for half axes of 1.0 and 0.4 m in 92.70 s.
@@ -182,7 +182,7 @@ TANGENT_SPAN = 0.1
 """The tangent is taken across this much time on either side [s], so that it is known at rests and corners too."""
 
 CHECK_STEP = 0.02
-"""Limits are checked at times this far apart [s]."""
+"""Interval at which limits are checked [s]."""
 
 LONGEST = 86400.0
 """A day, of any trajectory [s]."""
@@ -202,7 +202,7 @@ class Trajectory:
     yaw: float = 0.0
     """[rad]"""
     turning: Callable[[Array], Array] | None = field(default=None, repr=False)
-    """A heading of its own at times within the duration [rad], in place of a fixed one; `yaw` is added."""
+    """Heading at times within the duration [rad], in place of a fixed one; `yaw` is added."""
     knots: Array | None = field(default=None, repr=False, compare=False)
     """Times of the points that it goes through [s], (n,); None without points."""
 
@@ -229,7 +229,7 @@ class Trajectory:
         return Reference(position, velocity, self._yaw(inside), inside / self.duration)
 
     def scaled(self, factor: float) -> Trajectory:
-        """The same way in the same time, with lengths, depth and speeds times a factor."""
+        """Return the same trajectory in the same time, with lengths, depth and speeds times a factor."""
 
         def motion(t: Array) -> tuple[Array, Array]:
             position, velocity = self.motion(t)
@@ -267,7 +267,7 @@ TRAJECTORIES = _catalogue()
 """The published trajectories, and a helix of ours, by name. Heading 0 throughout: the paper states none."""
 
 PUBLISHED_NAMES = {"straight_pro": "broken"}
-"""What the published configuration calls ours."""
+"""Name in the published configuration -> our name."""
 
 
 def load_trajectory(
@@ -368,7 +368,7 @@ def _too_fast(
 
 
 COLUMNS = ("t", "x", "y", "z", "yaw")
-"""Of a table of points: time [s], world position [m], and if wanted the heading [rad]."""
+"""Columns of a table of points: time [s], world position [m], and optionally the heading [rad]."""
 
 KEYS = {"name", "heading", "yaw", "points", "shape"}
 

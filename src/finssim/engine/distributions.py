@@ -22,7 +22,7 @@ KINDS = ("uniform", "log_uniform", "normal", "choice")
 MAX_CHOICES = 32
 
 CUT = 4.0
-"""A normal distribution is cut at so many standard deviations, unless `within` says where."""
+"""Number of standard deviations at which a normal distribution is cut, unless `within` is given."""
 
 EXAMPLE = "{normal: [1.0, 0.1]}"
 
@@ -90,7 +90,7 @@ class Distribution(Part):
     choice: tuple[float, ...] | None = Field(default=None, min_length=1, max_length=MAX_CHOICES)
     """One of these."""
     weights: tuple[float, ...] | None = None
-    """Of the choices, in any unit; equal if None."""
+    """Probabilities of the choices, in any unit; equal if None."""
     probability: float = Field(default=1.0, ge=0.0, le=1.0)
 
     @model_validator(mode="after")
@@ -125,7 +125,7 @@ class Distribution(Part):
 
     @property
     def kind(self) -> str:
-        """Which of `KINDS`."""
+        """Kind of the distribution, one of `KINDS`."""
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     def bounds(self) -> Pair:

@@ -25,7 +25,7 @@ LANES = 8
 
 
 class LaneError(TypeError):
-    """A function does what cannot be done for several worlds at once."""
+    """A function uses an operation that is not available for several worlds together."""
 
 
 class Lane:
@@ -245,7 +245,7 @@ def _each(form: str, function: Callable[..., Any], kind: str = "F") -> Callable[
 
 
 class _Library:
-    """What the functions use of Warp, on lane numbers; formulas as in Warp's own."""
+    """Functions of Warp that the traced code uses, on lane numbers, with Warp's formulas."""
 
     abs = staticmethod(_each("absolute({})", abs))
     sqrt = staticmethod(_each("root({})", lambda x: math.sqrt(max(x, 0.0))))
@@ -468,7 +468,7 @@ class StructArray:
             self._assigned[offset // 4 + i] = _word(number)
 
     def stores(self) -> list[str]:
-        """C++ that writes what was assigned, eight neighbours at once where there are so many."""
+        """Return the C++ that stores assigned numbers, eight neighbours together where possible."""
         lines, assigned = [], dict(sorted(self._assigned.items()))
         while assigned:
             first = next(iter(assigned))
@@ -555,7 +555,7 @@ class UniformStruct:
 
 
 class Loop:
-    """What a loop of C++ carries from one pass to the next: a struct of lane numbers, in variables."""
+    """Variables that a C++ loop carries from one pass to the next: a struct of lane numbers."""
 
     def __init__(self, trace: Trace, name: str, start: SimpleNamespace) -> None:
         """Begin with what section 0 has computed."""
@@ -683,7 +683,7 @@ const auto gather = [&](const At& a, I slot, F* y) {
 };
 M ok = all_i(-1);
 """
-"""Types and functions of the traced lines; a lambda may stand inside a function, as a native function's text does."""
+"""Types and functions of the traced lines; a lambda may occur within a function, as in a native function's text."""
 
 STORES = """
 const auto put_at = [&](const At& a, I slot, int offset, const Eight& eight) {

@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 MIN_SLICE = 64
-"""Worlds below which a slice is not worth waking a thread for."""
+"""Number of worlds below which a slice is not given to another thread."""
 
 
 class _Job:
@@ -54,7 +54,7 @@ _pool_lock = threading.Lock()
 
 
 def _forget_workers() -> None:
-    """In a forked child: threads do not survive a fork, so the child makes its own when it needs them."""
+    """Forget the workers in a forked child: threads do not survive a fork, so the child starts its own when needed."""
     global _pool_lock
     _workers.clear()
     _pool_lock = threading.Lock()

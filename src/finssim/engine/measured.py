@@ -1,4 +1,4 @@
-"""How what a controller sees differs from the truth, for every vehicle of every world."""
+"""Noise, delay and dropouts of what a controller observes, for every vehicle of every world."""
 
 import warp as wp
 
@@ -7,7 +7,7 @@ import warp as wp
 class Measurement:
     """Errors of what is seen of one vehicle; all 0 is the truth."""
 
-    position_std: float  # of noise drawn anew every control step, per axis [m]
+    position_std: float  # noise drawn every control step, per axis [m]
     yaw_std: float  # [rad]
     velocity_std: float  # per axis of the linear velocity [m/s]
     rate_std: float  # per axis of the angular velocity [rad/s]
@@ -15,7 +15,7 @@ class Measurement:
     yaw_bias: float  # [rad]
     velocity_bias: float  # [m/s]
     rate_bias: float  # [rad/s]
-    dropout: float  # probability that a control step brings nothing new
+    dropout: float  # probability that a control step has no new sample
     delay: float  # age of what is seen [s], taken to the nearest control step
 
 

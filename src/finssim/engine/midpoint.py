@@ -44,12 +44,12 @@ from finssim.physics.types import angular, symmetric_times, vec6
 WALL_STEP = 0.0125
 """Longest step in which contacts with walls are integrated [s]; a substep near one is cut into as many as it takes."""
 DOCK_STEP = 0.005
-"""The same where there is a dock, whose springs are stiffer."""
+"""Longest step in which contacts are integrated if there is a dock, whose springs are stiffer [s]."""
 
 
 @wp.struct
 class Motion:
-    """What the equation of motion gives in one state."""
+    """Result of the equation of motion in one state."""
 
     nu_dot: vec6  # body frame [m/s², rad/s²]
     relaxation: vec6  # θ of each axis
@@ -58,7 +58,7 @@ class Motion:
 
 @wp.struct
 class Touch:
-    """What walls, a dock and the solids of a world do to a vehicle."""
+    """Wrench and forces of walls, a dock and the solids of a world on a vehicle."""
 
     tau: vec6  # wrench about the body origin, body frame [N, N m]
     push: float  # size of the dock's force [N]

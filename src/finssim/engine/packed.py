@@ -1,4 +1,4 @@
-"""Per-vehicle structs in one Warp array, and a view of each field as an array of its own.
+"""Per-vehicle structs in one Warp array, with a view of each field as a separate array.
 
 The physics kernel reads one struct per vehicle: one address instead of forty. Everybody else sees plain arrays by
 (world, vehicle), which share that memory.

@@ -1,4 +1,4 @@
-"""From vehicle files to the parameter arrays of the physics kernel."""
+"""Parameter arrays of the physics kernel, made from vehicle files."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -57,7 +57,7 @@ def vehicle_parameters(vehicle: "Vehicle", model: str) -> dict[str, Any]:
     zeros = np.zeros((6, 6))
     r_h = np.asarray(hydro.reference_point, dtype=float)
     H = twist_shift(r_h)
-    # The simplified model has no added mass by definition (paper, eq. 5), whatever the file says.
+    # The simplified model has no added mass by definition (paper, eq. 5), even if the file gives one.
     added = zeros if model == "simplified" else np.asarray(hydro.added_mass, dtype=float)
     r_g = np.asarray(body.center_of_gravity, dtype=float)
     inertia = np.asarray(body.inertia, dtype=float)

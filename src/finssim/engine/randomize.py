@@ -46,7 +46,7 @@ class DrawTable:
     choice: wp.array(dtype=float)
     cumulative: wp.array(dtype=float)
     first_tie: wp.array(dtype=int)
-    ties: wp.array(dtype=int)  # how many normal numbers its own is a sum of; 0: it stands alone
+    ties: wp.array(dtype=int)  # number of normal numbers that its own is a sum of; 0: it is independent
     tied: wp.array(dtype=int)  # entries of these
     tie_weight: wp.array(dtype=float)
 
@@ -83,7 +83,7 @@ def quantile(t: DrawTable, k: int, u: float) -> float:
 
 @wp.func
 def draw_entry(t: DrawTable, k: int, key: int) -> float:
-    """Entry k from the stream of its own that a key gives it: other entries do not change it."""
+    """Return entry k from its own stream of a key, which does not depend on other entries."""
     rng = wp.rand_init(key, 2 * t.stream[k])
     u = wp.randf(rng)
     gate = wp.randf(rng)
@@ -218,7 +218,7 @@ def scaled_matrix(M: mat66, factor: vec6) -> mat66:
 
 @wp.func
 def factors(x: wp.array3d(dtype=float), w: int, v: int, column: int) -> vec6:
-    """The common factor, which stands in `column`, times those of the axes, which follow."""
+    """Return the common factor in `column` times the factors of the axes, which follow it."""
     out = vec6()
     for i in range(6):
         out[i] = x[w, v, column] * x[w, v, column + 1 + i]
@@ -347,7 +347,7 @@ def write_tether(tether: wp.array2d(dtype=Tether), x: wp.array3d(dtype=float), w
 
 @wp.func
 def write_sensors(measurement: wp.array2d(dtype=Measurement), x: wp.array3d(dtype=float), w: int, v: int):
-    """What a controller sees of a vehicle."""
+    """Write noise, delay and dropouts of what a controller observes of a vehicle."""
     measurement[w, v].position_std = x[w, v, wp.static(COLUMN["sensors.position_std"])]
     measurement[w, v].yaw_std = x[w, v, wp.static(COLUMN["sensors.yaw_std"])]
     measurement[w, v].velocity_std = x[w, v, wp.static(COLUMN["sensors.velocity_std"])]
@@ -367,12 +367,12 @@ if TYPE_CHECKING:
 # The kernels that draw: an episode's vehicle, water and sensors, and when each command arrives.
 
 VEHICLE = wp.constant(122949823)
-"""Between the streams of two vehicles of a world: no seeds that people give are so far apart, so none meet there."""
+"""Distance between the streams of two vehicles of a world, larger than the distance of any two seeds in use."""
 
 
 @wp.struct
 class DrawnArrays:
-    """What was drawn, and where it goes."""
+    """Drawn numbers, and the arrays that they are written to."""
 
     values: wp.array3d(dtype=float)  # (worlds, vehicles, entries)
     volume_with_mass: int
@@ -380,11 +380,11 @@ class DrawnArrays:
     drift: int
     tether: int
     sensors: int
-    agents: int  # vehicles whose privileged numbers are told
+    agents: int  # vehicles whose privileged numbers are observed
     told: wp.array(dtype=int)  # columns of these numbers
     told_nominal: wp.array(dtype=float)
     told_scale: wp.array(dtype=float)
-    privileged: wp.array2d(dtype=float)  # (worlds, agents * told), (value - nominal) * scale
+    privileged: wp.array2d(dtype=float)  # (worlds, agents * observed), (value - nominal) * scale
     final_privileged: wp.array2d(dtype=float)  # the same of the episode before
 
 
@@ -408,7 +408,8 @@ def draw_values(t: DrawTable, d: DrawnArrays, w: int, v: int, vehicle_key: int, 
 
 @wp.func
 def finish_values(d: DrawnArrays, w: int, v: int):
-    """What follows from other entries: a volume that keeps the trim, the current's parts, waves beyond the count."""
+    """Compute what follows from other entries: a volume that keeps the trim, the parts of the current, the waves in
+    use."""
     x = d.values
     if d.volume_with_mass != 0:
         x[w, v, wp.static(COLUMN["volume"])] = x[w, v, wp.static(COLUMN["mass"])]
@@ -510,7 +511,7 @@ class Randomization:
         """Entry of the table -> its distribution, of those that vary."""
 
     def at_full_width(self) -> "Randomization":
-        """The same ranges without a schedule, for an evaluation: from the whole width at once."""
+        """Return the same ranges without a schedule, at their full width, for an evaluation."""
         return Randomization(self.ranges.model_copy(update={"curriculum": None}))
 
     def _draws(self, *beginnings: str) -> bool:
@@ -518,21 +519,21 @@ class Randomization:
 
     @property
     def moves_water(self) -> bool:
-        """Whether currents or waves are drawn."""
+        """True if currents or waves are drawn."""
         return self._draws("current", "vertical_current", "waves.")
 
     @property
     def changes_sensors(self) -> bool:
-        """Whether what the controller sees is drawn."""
+        """True if the noise of what the controller observes is drawn."""
         return self._draws("sensors.")
 
     @property
     def changes_velocities(self) -> bool:
-        """Whether errors of the velocities that the controller sees are drawn."""
+        """True if errors of the velocities that the controller observes are drawn."""
         return self._draws("sensors.velocity_", "sensors.rate_")
 
     def simulator_arguments(self, vehicle_delay: float, tether: TetherLine | None = None) -> dict[str, Any]:
-        """What a simulator must make room for.
+        """Return the arguments that make room in a simulator for what is drawn.
 
         Args:
             vehicle_delay: Longest command delay of the vehicles [s].
@@ -556,7 +557,7 @@ class Randomization:
         agents: int = 0,
         privileged: tuple[wp.array, wp.array] | None = None,
     ) -> "Draws":
-        """What is drawn in the worlds of one simulator, which was made with `simulator_arguments`.
+        """Return the draws in the worlds of one simulator, which was made with `simulator_arguments`.
 
         Args:
             simulator: The worlds.
@@ -579,7 +580,7 @@ class Randomization:
 
 
 class Draws:
-    """What a randomisation draws in the worlds of one simulator.
+    """Draws of a randomisation in the worlds of one simulator.
 
     Attributes:
         names: Entries that vary, in the order of the table.
@@ -664,7 +665,7 @@ class Draws:
             pipeline.add(jitter_commands, inputs, vehicles=len(s.vehicles))
 
     def numpy(self, names: Sequence[str] | None = None) -> NDArray[np.float32]:
-        """What the running episodes have of some entries, of those that vary if None: (worlds, vehicles, n), a copy."""
+        """Return a copy of some entries of the running episodes, or of all that vary if None: (worlds, vehicles, n)."""
         columns = [INDEX[name] for name in (self.names if names is None else names)]
         return np.asarray(self.values.numpy()[..., columns])
 

@@ -119,7 +119,7 @@ class ThrustScales(EachScales):
     """Factors on the thrust; and thrusters that fail."""
 
     failure: Scale = ONE
-    """What is left of a thruster's thrust; give it a probability, by which each thruster fails on its own."""
+    """Remaining share of a thruster's thrust; give it a probability, with which each thruster fails independently."""
 
 
 class WaveRanges(Part):
@@ -160,14 +160,14 @@ class TetherRanges(Part):
     """[m]"""
     drag_coefficient: Scale | None = None
     wet_weight: Interval | None = None
-    """In water, per length [N/m]; negative floats."""
+    """Weight in water per length [N/m]; negative floats."""
 
 
 class SensorRanges(Part):
-    """What the controller sees, in place of the environment's own noise; what is not named keeps that."""
+    """Noise, delay and dropouts of what the controller observes; omitted keys keep the environment's values."""
 
     position_std: Scale | None = None
-    """Of the noise, per axis [m]."""
+    """Standard deviation of the noise, per axis [m]."""
     yaw_std: Scale | None = None
     """[rad]"""
     velocity_std: Scale | None = None
@@ -183,18 +183,19 @@ class SensorRanges(Part):
     rate_bias: Scale | None = None
     """[rad/s]"""
     dropout: Share | None = None
-    """Probability that a control step brings nothing new."""
+    """Probability that a control step has no new sample."""
     delay: Time | None = None
     """Age of what is seen [s]."""
 
 
 class Correlated(Part):
-    """Entries whose draws go together: by rank, so that each keeps the distribution of its own."""
+    """Entries whose draws are correlated by rank, so that each keeps its distribution."""
 
     entries: tuple[str, ...] = Field(min_length=2)
     """Names as in the table of entries, such as linear_damping.surge."""
     correlation: tuple[tuple[float, ...], ...]
-    """Of the normal numbers behind them, (n, n); of the draws themselves where these are normal and hardly cut."""
+    """Correlation of the normal numbers behind them, (n, n); of the draws themselves if these are normal and hardly
+    cut."""
 
     @model_validator(mode="after")
     def _positive(self) -> "Correlated":
@@ -229,14 +230,14 @@ class Success(Part):
 
 
 class Curriculum(Part):
-    """All ranges grow together from a part of their width to the whole."""
+    """Schedule by which all ranges grow together from a part of their width to the full width."""
 
     by: Literal["progress", "steps", "success"] = "progress"
     """The share of the training done, the environment's own control steps, or the share of successes."""
     start: float = Field(default=0.0, ge=0.0, le=1.0)
     """Part of the width at the start; 0 is the vehicle of the file."""
     over: tuple[float, float] = (0.0, 1.0)
-    """From where to where they grow: shares of the training, or control steps of all worlds together."""
+    """Start and end of the growth, as shares of the training or as control steps of all worlds together."""
     success: Success | None = None
     """The task's own hold time if None."""
     episodes: int = Field(default=400, ge=1)
@@ -246,7 +247,7 @@ class Curriculum(Part):
     narrow_at: float = Field(default=0.4, ge=0.0, le=1.0)
     """A share below this narrows."""
     step: float = Field(default=0.1, gt=0.0, le=1.0)
-    """By this part of the full width."""
+    """Growth of each step, as a share of the full width."""
 
     @model_validator(mode="after")
     def _possible(self) -> "Curriculum":
@@ -268,7 +269,7 @@ class Curriculum(Part):
 
 
 class Ranges(Part):
-    """What is drawn for every episode: factors on the vehicle file's numbers unless a unit is given."""
+    """Distributions drawn for every episode: factors on the vehicle file's numbers, unless a unit is given."""
 
     name: str
     source: str = ""
@@ -286,7 +287,7 @@ class Ranges(Part):
     linear_damping: AxisScales = AxisScales()
     quadratic_damping: AxisScales = AxisScales()
     terms: dict[str, Interval] = Field(default_factory=dict)
-    """Of the vehicle's terms by entry, see `term_entries`; in a file each term's stand under its name."""
+    """Distributions of the vehicle's terms by entry (see `term_entries`); in a file under the term's name."""
     mesh_drag: Scale = ONE
     """Factor on form and skin drag of the mesh model."""
     thrust: ThrustScales = ThrustScales()
@@ -297,7 +298,7 @@ class Ranges(Part):
     added_delay: Time = NONE
     """[s]"""
     command_jitter: Time = NONE
-    """A command comes later by up to this, drawn anew every control step [s]."""
+    """Longest additional delay of a command, drawn every control step [s]."""
     slew: Scale = ONE
     dead_zone: Scale = ONE
     added_dead_zone: Scale = NONE
@@ -330,19 +331,19 @@ class Ranges(Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Ranges":
-        from finssim.engine.ranges_table import check_correlated  # the table is made of this file's parts
+        from finssim.engine.ranges_table import check_correlated  # the table imports this module
 
         check_correlated(self)
         return self
 
 
 def _of_term(term: Term, stated: Any) -> dict[str, Any]:
-    """What is drawn of a term, by entry.
+    """Return the distributions of a term by entry.
 
     Raises:
         ValueError: An entry that it does not have, or a range that cannot be; one sentence.
     """
-    from finssim.engine.ranges_table import term_entries  # the table is made of this file's parts
+    from finssim.engine.ranges_table import term_entries  # the table imports this module
 
     entries = {entry.name: entry for entry in term_entries(term)}
     if term.name in entries:

@@ -14,7 +14,7 @@ from finssim.vehicles.terms import Term
 
 TURN = Distribution(uniform=(0.0, 6.2831853))
 ALWAYS_FIRST = 0.999
-"""A count is the whole part of a number that reaches this far beyond the largest."""
+"""Offset below the next whole number, so that rounding a uniform number down gives equal probabilities."""
 TETHER = ("diameter", "drag_coefficient", "wet_weight")
 
 
@@ -23,19 +23,19 @@ class Entry:
     """One number that is drawn for every episode."""
 
     name: str
-    """As in a ranges file, with dots; `thrust.each.2` is that of the third thruster."""
+    """Name as in a ranges file, with dots; `thrust.each.2` is that of the third thruster."""
     unit: str = "1"
     """`1` is a factor on the vehicle file's number."""
     nominal: float = 1.0
-    """Where nothing is drawn."""
+    """Value if nothing is drawn."""
     world: bool = False
     """Drawn once for a world and not for each vehicle in it."""
     angle: bool = False
-    """A direction or phase: always from the whole circle."""
+    """True for a direction or phase, which is always drawn from the full circle."""
     told: bool = True
     """Among the privileged numbers where it varies."""
     stream: int = -1
-    """Of its random numbers, by which no other entry changes them."""
+    """Stream of its random numbers, which other entries do not change."""
 
 
 def _table() -> Iterator[Entry]:
@@ -111,12 +111,12 @@ def added_entry(path: str) -> str:
 
 
 def varies(distribution: Distribution, nominal: float) -> bool:
-    """Whether a distribution gives anything but the nominal number."""
+    """True if a distribution gives numbers other than the nominal one."""
     return distribution.probability > 0.0 and distribution.bounds() != (nominal, nominal)
 
 
 def drawn_entries(ranges: Ranges, thrusters: int = MAX_THRUSTERS) -> dict[str, Distribution]:
-    """What a ranges file draws: entry -> distribution, in the order of the table; without those that never vary.
+    """Return the entries that a ranges file draws, with their distributions, in the order of the table.
 
     Args:
         ranges: The ranges.

@@ -28,7 +28,8 @@ STATE_COLUMNS = {
 """Field of the simulator's state -> its columns, SI; world frame for the first two, body frame for the others."""
 
 ABOUT = "_run.json"
-"""What the run was: vehicles with their hashes, model, times, seed, revision. Parquet readers skip names with a `_`."""
+"""Description of the run: vehicles with their hashes, model, times, seed, revision. Parquet readers skip names with a
+`_`."""
 
 
 class Recorder:
@@ -131,7 +132,7 @@ class Recorder:
 
 
 def read_run(folder: str | Path) -> "pandas.DataFrame":
-    """A recorded run, up to its last whole part.
+    """Read a recorded run up to its last complete part.
 
     Args:
         folder: What `Recorder` was given.

@@ -220,7 +220,7 @@ class Simulator:
 
     @property
     def in_lanes(self) -> bool:
-        """Whether blocks of worlds go together: on a processor, where a trace can follow what they do."""
+        """True if blocks of worlds are stepped together: on a processor, for what the traced code supports."""
         traceable = self.integrator == "midpoint" and self.hydrodynamics != "mesh"
         return self.device.is_cpu and traceable and not self.water.moving and self.dock is None
 
@@ -250,7 +250,7 @@ class Simulator:
         self._step.run()
 
     def set_control_step(self, control_step: float, substeps: int, elapsed: float) -> None:
-        """Change the time between commands on the way; poses and motors go on.
+        """Change the time between commands during a run; poses and motors are kept.
 
         Args:
             control_step: From now on [s].
@@ -402,7 +402,7 @@ class Simulator:
         self._reported.clear()
 
     def frozen_worlds(self) -> NDArray[np.int64]:
-        """Worlds that stand still because a number stopped being finite."""
+        """Return the worlds that are frozen because a number stopped being finite."""
         return np.flatnonzero(self.state.frozen.numpy())
 
     def report_frozen(self, directory: Path, most: int | None = None) -> list[Path]:
@@ -434,7 +434,7 @@ def checked_choice(value: str, available: Sequence[str], kind: str) -> str:
 
 
 def find_device(name: str) -> wp.Device:
-    """The Warp device of that name, or a sentence that says which there are."""
+    """Return the Warp device of a name."""
     start_warp()
     if name.startswith("cuda") and not wp.is_cuda_available():
         raise SimulatorError(f"device '{name}' is not available here; available: cpu")

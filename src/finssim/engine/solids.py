@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from finssim.worlds import World, WorldLayout
 
 KINDS = ("box", "sphere", "capsule", "cylinder", "plane", "mesh", "heightfield")
-"""In the order of the constants of `finssim.physics.solids`."""
+"""Shapes in the order of the constants of `finssim.physics.solids`."""
 
 
 def layout_of(world: Any, worlds: int, device: wp.Device) -> WorldLayout:
@@ -54,7 +54,7 @@ def pool_of(world: World) -> Pool | None:
 
 
 def solid_shapes(layout: WorldLayout) -> list[int]:
-    """Which shapes of a layout vehicles run into, beside the basin."""
+    """Return the shapes of a layout, other than the basin, that vehicles collide with."""
     return [
         k
         for k, shape in enumerate(layout.shapes)
@@ -63,7 +63,7 @@ def solid_shapes(layout: WorldLayout) -> list[int]:
 
 
 class WorldSolids:
-    """What a vehicle can run into beside the basin: the struct that kernels take, and what it points to."""
+    """Shapes that a vehicle can collide with, other than the basin: the struct that kernels take, and its arrays."""
 
     def __init__(self, layout: WorldLayout, vehicles: int, lightest: float) -> None:
         """Take the shapes of a layout whose objects are solid.
@@ -144,7 +144,7 @@ def refresh_clearing(
     control_step: float,
     world_offset: int,
 ):
-    """Look around anew where vehicles may leave their ball of free water, or their neighbours, in this control step."""
+    """Search again for the nearest solids of vehicles that may leave their ball of free water in this control step."""
     i, v = wp.tid()
     w = world_offset + i
     solids.force[w, v] = 0.0

@@ -46,12 +46,12 @@ class State:
     steps: wp.array(dtype=int)  # control steps since the world's reset
     episode: wp.array(dtype=int)  # resets so far
     broken: wp.array(dtype=int)  # 1: a number stopped being finite in this control step
-    frozen: wp.array(dtype=int)  # 1: the world stands still since that happened
+    frozen: wp.array(dtype=int)  # 1: the world has been frozen since that happened
     history: wp.array3d(dtype=vec13)  # (slot, world, vehicle): position, quaternion, velocity
 
 
 def new_state(vehicles: Packed, slots: int) -> State:
-    """State of vehicles that stand upright at the origin.
+    """Return the state of upright vehicles at the origin.
 
     Args:
         vehicles: Memory of their `VehicleState`s, by (world, vehicle).
@@ -93,7 +93,7 @@ def clear_actuators(state: State, mask: wp.array(dtype=int), world_offset: int):
 
 @wp.func
 def is_finite(position: wp.vec3, q: wp.quat, nu: vec6) -> bool:
-    """Whether every number of a state is finite.
+    """True if every number of a state is finite.
 
     Args:
         position: Body origin, world frame [m].

@@ -66,7 +66,7 @@ def delivered_thrust(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int,
 
 @wp.func
 def lag_target(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, force: vec8) -> vec8:
-    """What the lag tends to for a force command: the force itself, or the propeller speed that gives it.
+    """Return the value that the lag approaches for a force command: the force, or the propeller speed that gives it.
 
     Args:
         plant: Parameters.
@@ -356,7 +356,7 @@ def physics_kernel(
         v: int,
         head: int,
     ) -> Course:
-        """Where the vehicle is, with its newest command in the delay line."""
+        """Start the course of a control step, with the newest command in the delay line."""
         out = Course()
         newest = admissible(
             command[w, v].thrust,

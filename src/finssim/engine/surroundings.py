@@ -1,4 +1,4 @@
-"""What surrounds the vehicles: water that moves, a pool with walls, a tether. Plain data, checked when made."""
+"""Surroundings of the vehicles: moving water, a pool with walls, a tether. Plain data, checked on construction."""
 
 import math
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ class Water:
     """Moving water, the same in every world until it is randomised."""
 
     current: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """At the still surface, world frame [m/s]."""
+    """Velocity at the still surface, world frame [m/s]."""
     shear: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Change of the current with height, d(current)/dz [1/s]."""
     drift_std: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -68,18 +68,18 @@ class Water:
 
     @property
     def drifting(self) -> bool:
-        """Whether the current has a random part that must be advanced every step."""
+        """True if the current has a random part that must be advanced every step."""
         return any(x > 0.0 for x in self.drift_std) and self.drift_time > 0.0
 
     @property
     def moving(self) -> bool:
-        """Whether the water does anything but stand still."""
+        """True if there are currents or waves."""
         return self.drifting or bool(self.waves) or any((*self.current, *self.shear))
 
     def arrays(
         self, worlds: int, density: float, gravity: float, device: wp.Device, max_waves: int = 0
     ) -> WaterArrays:
-        """The same water for every world, as Warp arrays; and room for max_waves more waves.
+        """Return the same water for every world, as Warp arrays with room for `max_waves` more waves.
 
         Args:
             worlds: How many.
@@ -129,7 +129,7 @@ class Pool:
     depth: float = 1.0
     """[m]"""
     stiffness: float = 4000.0
-    """Of a wall, per corner of the vehicle [N/m]."""
+    """Stiffness of a wall, per corner of the vehicle [N/m]."""
     damping: float = 100.0
     """Against approach, per corner [N s/m]."""
     friction: float = 0.2
@@ -159,14 +159,14 @@ class TetherLine:
     """A taut tether from an anchor to the vehicle."""
 
     anchor: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where it enters the water, world frame [m]."""
+    """Point where it enters the water, world frame [m]."""
     attachment: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """On the vehicle, body frame [m]."""
+    """Point on the vehicle, body frame [m]."""
     diameter: float = 0.0076
     """[m]; the default is Blue Robotics' Fathom tether."""
     drag_coefficient: float = 1.2
     wet_weight: float = 0.0
-    """In water, per length [N/m]; 0 is neutral."""
+    """Weight in water per length [N/m]; 0 is neutral."""
 
     def __post_init__(self) -> None:
         numbers = (*self.anchor, *self.attachment, self.diameter, self.drag_coefficient, self.wet_weight)
@@ -185,15 +185,15 @@ class TetherLine:
 
 @dataclass(frozen=True, kw_only=True)
 class Dock:
-    """A block with a cone and a tube bored into it, one in every world; where they stand is set by world.
+    """A block with a bored cone and tube in every world, placed by world.
 
     Dock axes: the origin is the middle of the throat, where cone and tube meet; x points into the tube.
     """
 
     mouth_radius: float
-    """Of the cone's wide end [m]."""
+    """Radius of the cone's wide end [m]."""
     throat_radius: float
-    """Of its narrow end and of the tube [m]."""
+    """Radius of the cone's narrow end and of the tube [m]."""
     cone_length: float
     """[m]"""
     tube_length: float
@@ -221,7 +221,7 @@ class Dock:
             )
 
     def struct(self, worlds: int, vehicles: int, device: wp.Device) -> Funnel:
-        """The struct that kernels take; every dock stands at the origin, pointing along world x."""
+        """Return the struct that kernels take, with every dock at the origin, pointing along world x."""
         funnel = Funnel()
         for name in ("mouth_radius", "throat_radius", "cone_length", "tube_length"):
             setattr(funnel, name, getattr(self, name))

@@ -1,4 +1,4 @@
-"""Rotations in float64 NumPy over a leading `...` batch; quaternions are xyzw, body to world unless said otherwise.
+"""Rotations in float64 NumPy over a leading `...` batch; quaternions are xyzw, body to world unless stated otherwise.
 
 Euler angles are ZYX (yaw, then pitch, then roll). With y left and z up, a positive pitch is nose DOWN and a positive
 yaw is a LEFT turn.
@@ -37,7 +37,7 @@ def _vector(*components: Any) -> Array:
 
 
 def wrap_angle(angle: npt.ArrayLike) -> Array:
-    """The same angle in [-pi, pi) [rad], (...,)."""
+    """Return an angle in [-pi, pi) [rad], (...,)."""
     return np.asarray(np.remainder(np.asarray(angle, float) + np.pi, 2.0 * np.pi) - np.pi)
 
 

@@ -64,7 +64,7 @@ def wall_force(penetration: float, v: wp.vec3, n: wp.vec3, walls: PoolWalls) -> 
 
 @wp.func
 def walls_within(walls: PoolWalls, position: wp.vec3, q: wp.quat, half_size: wp.vec3, reach: float) -> bool:
-    """Whether a wall or the floor is nearer to the vehicle's envelope box than `reach`.
+    """Return whether a wall or the floor is nearer to the vehicle's envelope box than `reach`.
 
     Args:
         walls: The pool.

@@ -93,7 +93,7 @@ def hull_point(i: int, half_size: wp.vec3) -> wp.vec3:
 
 @wp.func
 def funnel_within(funnel: Funnel, w: int, position: wp.vec3, half_size: wp.vec3, reach: float) -> bool:
-    """Whether the ball around the funnel of a world and the one around the vehicle are nearer than `reach` [m].
+    """Return whether the ball around the funnel of a world and the one around the vehicle are nearer than `reach` [m].
 
     Args:
         funnel: Shapes, and poses by world.

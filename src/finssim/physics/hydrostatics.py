@@ -9,7 +9,7 @@ from finssim.physics.types import join, vec6
 
 @wp.struct
 class WaterWrench:
-    """What a hydrodynamic model gives: its wrench, and how far the vehicle is in the water."""
+    """Result of a hydrodynamic model: its wrench, and how far the vehicle is in the water."""
 
     tau: vec6  # about the body origin, body frame [N, N m]
     displaced: float  # mass of water [kg]

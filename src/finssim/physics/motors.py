@@ -23,7 +23,7 @@ def speed_of_thrust(thrust: float, c_plus: float, c_minus: float) -> float:
 
 @wp.func
 def admissible(command: vec8, lower: vec8, upper: vec8, dead_minus: vec8, dead_plus: vec8) -> vec8:
-    """A force command as the motors take it: inside [lower, upper], and zero inside (dead_minus, dead_plus) [N]."""
+    """Limit a force command to [lower, upper], and set it to zero inside (dead_minus, dead_plus) [N]."""
     f = wp.min(wp.max(command, lower), upper)
     for i in range(MAX_THRUSTERS):
         f[i] = wp.where(f[i] > dead_minus[i], wp.where(f[i] < dead_plus[i], 0.0, f[i]), f[i])
@@ -32,7 +32,7 @@ def admissible(command: vec8, lower: vec8, upper: vec8, dead_minus: vec8, dead_p
 
 @wp.func
 def steps_ago(age: float, rate: float) -> int:
-    """How many control steps ago, at `rate` [1/s], the command that is `age` [s] old was issued."""
+    """Return the number of control steps at `rate` [1/s] since the command that is `age` [s] old was issued."""
     return wp.max(int(wp.ceil(age * rate - 1.0e-4)), 0)
 
 

@@ -52,7 +52,7 @@ class VehicleParameters:
 
 @wp.struct
 class VehicleCommand:
-    """What acts on one vehicle from outside."""
+    """Thruster commands and external wrench of one vehicle."""
 
     thrust: vec8  # commanded thruster force [N]
     disturbance: vec6  # extra wrench about the body origin, body frame [N, N m]
@@ -94,7 +94,7 @@ DERIVED = ("M_inv", "G", "r_m", "relax", "relax_1", "relax_2", "relax_v", "alpha
 def refresh_plant(
     plant: wp.array2d(dtype=VehicleParameters), substep: float, mask: wp.array(dtype=int), world_offset: int
 ):
-    """Bring the derived parameters up to date in the worlds where mask is not 0.
+    """Update the derived parameters in the worlds where mask is not 0.
 
     The lag makes alpha = 1 - exp(-h/T) of its way in a substep; its mean has made beta = 1 - alpha T/h of it.
     Without a lag, T = 0, forces are samples of what is linear between them: alpha = 1, beta = 1/2.

@@ -1,4 +1,4 @@
-"""Solids that stand in the water, as a penalty on points and spheres of the vehicle's hull.
+"""Solids in the water, as a penalty on points and spheres of the vehicle's hull.
 
 The hull is the eight corners of its envelope box, as a pool's walls meet them, and spheres within it, a tenth of the
 least half extent inside its faces: flat solids meet the corners alone, and thin ones do not pass between them.
@@ -117,7 +117,7 @@ def heightfield_depth(solids: Solids, size: wp.vec3, x: wp.vec3, radius: float) 
     columns = solids.heights.shape[1]
     rows = solids.heights.shape[0]
     if wp.abs(x[0]) > size[0] or wp.abs(x[1]) > size[1]:
-        # Nobody touches it from the side; it begins at its edge.
+        # The ground is not touched from the side; contact begins at its edge.
         beyond = wp.max(wp.abs(x[0]) - size[0], wp.abs(x[1]) - size[1])
         return wp.vec4(0.0, 0.0, 1.0, -wp.max(beyond, 1.0e-6))
     per_x = float(columns - 1) / (2.0 * size[0])
@@ -207,7 +207,7 @@ def scaled_depth(solids: Solids, k: int, scale: float, x: wp.vec3, radius: float
 
 @wp.func
 def spheres_along(half: float, least: float) -> int:
-    """Spheres of a row within the hull, at most 1.4 radii apart.
+    """Return the number of spheres in a row within the hull, at most 1.4 radii apart.
 
     Args:
         half: Half extent of the envelope along the row [m].
@@ -243,7 +243,7 @@ def hull_sphere(i: int, half_size: wp.vec3) -> wp.vec4:
 
 @wp.func
 def solids_within(clearing: wp.vec4, position: wp.vec3, half_size: wp.vec3, reach: float) -> bool:
-    """Whether a solid may be nearer to the vehicle's envelope than `reach`.
+    """Return whether a solid may be nearer to the vehicle's envelope than `reach`.
 
     Args:
         clearing: A ball of free water: its centre, world frame, and its radius [m].

@@ -1,4 +1,4 @@
-"""Sensors: what a vehicle measures of its own motion, with the noise, delays and losses of real instruments."""
+"""Sensors of a vehicle's own motion, with the noise, delays and losses of real instruments."""
 
 from finssim.sensors.batch import SensorError
 from finssim.sensors.suite import SensorSuite, add_sensor

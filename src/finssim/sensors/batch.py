@@ -1,4 +1,4 @@
-"""What the sensors of all vehicles of all worlds have in common on the Python side."""
+"""Common Python part of the sensors of all vehicles of all worlds."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from finssim.sensors.sampling import SensedState, new_sampling
 
 
 class SensorError(ValueError):
-    """A sensor was asked for something it cannot do; the message says what to do instead."""
+    """A sensor refuses its arguments; the message states what to change."""
 
 
 class Surroundings(NamedTuple):
-    """What a sensor's parameters may depend on beside the vehicle's file."""
+    """Surroundings that a sensor's parameters may depend on, besides the vehicle's file."""
 
     gravity: float
     """[m/s²]"""
     density: float
-    """Of the water [kg/m³]."""
+    """Density of the water [kg/m³]."""
     floor_depth: float
     """Depth of the flat floor [m]; infinite if not known."""
 
@@ -36,11 +36,11 @@ class SensorBatch:
     kind: ClassVar[str]
     """Its key under `sensors` in a vehicle file."""
     schema: ClassVar[Any] = None
-    """What a vehicle file says of it, a `vehicles.equipment.Sensor`; for `add_sensor`."""
+    """Schema of its section in a vehicle file, a `vehicles.equipment.Sensor`; for `add_sensor`."""
     kernel: ClassVar[Any]
-    """From `sampling.sampling_kernel`."""
+    """Kernel made by `sampling.sampling_kernel`."""
     parameter_struct: ClassVar[Any]
-    """From `sampling.parameters_of`."""
+    """Struct made by `sampling.parameters_of`."""
     array_struct: ClassVar[Any]
     """Warp struct of readings, by (world, vehicle), and of rings, which have one more index."""
     readings: ClassVar[tuple[str, ...]]

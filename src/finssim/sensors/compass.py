@@ -61,6 +61,6 @@ class CompassBatch(SensorBatch):
     readings = ("heading",)
 
     heading: "wp.array[Any]"
-    """Of the body's x axis from world x, left positive [rad]; float (W, V)."""
+    """Heading of the body's x axis from world x, left positive [rad]; float (W, V)."""
     bias: "wp.array[Any]"
     """Truth: the offset in it [rad]; float (W, V)."""

@@ -37,7 +37,7 @@ class DepthArrays:
 
 @wp.func
 def depth_of_point(position: wp.vec3, q_wb: wp.quat, r: wp.vec3) -> float:
-    """What an ideal gauge reads: depth of its point in still water, max(0, -(p + R_wb r)_z) [m].
+    """Return the reading of an ideal gauge: depth of its point in still water, max(0, -(p + R_wb r)_z) [m].
 
     Args:
         position: Body origin, world frame [m].
@@ -85,7 +85,7 @@ class DepthBatch(SensorBatch):
     readings = ("depth", "pressure")
 
     depth: "wp.array[Any]"
-    """Of the gauge below the still surface [m]; float (W, V)."""
+    """Depth of the gauge below the still surface [m]; float (W, V)."""
     pressure: "wp.array[Any]"
     """Absolute [Pa]; float (W, V)."""
     bias: "wp.array[Any]"

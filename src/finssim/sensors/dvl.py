@@ -39,7 +39,7 @@ class DvlArrays:
 
 @wp.func
 def sensed_velocity(nu: vec6, q_wb: wp.quat, water: wp.vec3, r: wp.vec3, q_bs: wp.quat) -> wp.vec3:
-    """What an ideal DVL reads: velocity of its point relative to the floor or to the water.
+    """Return the reading of an ideal DVL: velocity of its point relative to the floor or to the water.
 
     v = R_bsᵀ [ v + ω × r - R_wbᵀ v_w ]
 
@@ -59,7 +59,7 @@ def sensed_velocity(nu: vec6, q_wb: wp.quat, water: wp.vec3, r: wp.vec3, q_bs: w
 
 @wp.func
 def has_echo(position: wp.vec3, q_wb: wp.quat, p: DvlParameters) -> bool:
-    """Whether the beams find the floor: the vehicle is not tilted too far, nor too close, nor too high.
+    """Return whether the beams find the floor: the vehicle is not tilted too far, nor too close, nor too high.
 
     Args:
         position: Body origin, world frame [m].
@@ -111,7 +111,7 @@ class DvlBatch(SensorBatch):
     scale_error: "wp.array[Any]"
     """Truth: the scale error in it; float (W, V)."""
     lock: "wp.array[Any]"
-    """Whether the beams find the bottom, int (W, V): 1, where no `finssim.worlds.DopplerBatch` writes it."""
+    """Flag of the beams finding the bottom, int (W, V): 1, unless a `finssim.worlds.DopplerBatch` writes it."""
 
     def _new_arrays(self) -> Any:
         arrays = super()._new_arrays()

@@ -43,7 +43,7 @@ class ImuArrays:
 def specific_force(
     nu: vec6, nu_dot: vec6, q_wb: wp.quat, r: wp.vec3, q_bs: wp.quat, gravity: float
 ) -> wp.vec3:
-    """What an ideal accelerometer reads: acceleration of its point without gravity.
+    """Return the reading of an ideal accelerometer: acceleration of its point without gravity.
 
     f = R_bsᵀ [ v_dot + ω × v + ω_dot × r + ω × (ω × r) - R_wbᵀ g ],  g = (0, 0, -gravity)
 
@@ -69,7 +69,7 @@ def specific_force(
 
 @wp.func
 def angular_rate(nu: vec6, q_bs: wp.quat) -> wp.vec3:
-    """What an ideal gyroscope reads: R_bsᵀ ω, sensor frame [rad/s]."""
+    """Return the reading of an ideal gyroscope: R_bsᵀ ω, sensor frame [rad/s]."""
     return wp.quat_rotate_inv(q_bs, angular(nu))
 
 

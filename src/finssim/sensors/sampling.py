@@ -61,7 +61,7 @@ def normal3(key: wp.uint32, stream: int) -> wp.vec3:
 
 @wp.func
 def lost(key: wp.uint32, dropout: float) -> bool:
-    """Whether a sample is lost on its way, which happens with probability `dropout`."""
+    """Return whether a sample is lost on its way, with probability `dropout`."""
     return wp.randf(wp.rand_init(int(key), DROPOUT)) < dropout
 
 
@@ -115,7 +115,7 @@ class Timing:
 
 @wp.struct
 class Sampling:
-    """What one kind of sensor knows about its samples, by (world, vehicle)."""
+    """State of the samples of one kind of sensor, by (world, vehicle)."""
 
     timing: wp.array(dtype=Timing)  # by vehicle
     control_step: float  # [s]
@@ -135,7 +135,7 @@ def samples_until(samples_per_step: wp.float64, step: int) -> int:
 
 @wp.func
 def sample_due(sampling: Sampling, w: int, v: int, step: int) -> bool:
-    """Whether at least one sample fell due since the last one taken."""
+    """Return whether at least one sample fell due since the last one was taken."""
     n = sampling.timing[v].samples_per_step
     return samples_until(n, step) > samples_until(n, sampling.last[w, v])
 
@@ -148,13 +148,13 @@ def root_of_wait(sampling: Sampling, w: int, v: int, step: int) -> float:
 
 @wp.func
 def slot_of(sampling: Sampling, step: int) -> int:
-    """Where the ring keeps the sample of a step."""
+    """Return the slot of the ring for the sample of a step."""
     return step % sampling.sent.shape[2]
 
 
 @wp.func
 def begin_update(sampling: Sampling, w: int, v: int, step: int) -> bool:
-    """Mark the old sample as no longer fresh; tell whether there is anything to do in this step."""
+    """Mark the old sample as no longer fresh, and return whether there is anything to do in this step."""
     sampling.fresh[w, v] = False
     if sampling.timing[v].samples_per_step == wp.float64(0.0) or step == sampling.seen[w, v]:
         return False
@@ -173,7 +173,7 @@ def restart(sampling: Sampling, w: int, v: int, step: int):
 
 @wp.func
 def arrival(sampling: Sampling, w: int, v: int, step: int, restarting: bool) -> int:
-    """Slot of the sample that arrives in this step, or -1; its stamp goes on display.
+    """Return the slot of the sample that arrives in this step, or -1, and show its stamp.
 
     Args:
         sampling: Of this kind of sensor.
@@ -228,7 +228,7 @@ def new_sampling(
 
 @wp.struct
 class Truth:
-    """What is true of one vehicle at the end of a control step."""
+    """True state of one vehicle at the end of a control step."""
 
     position: wp.vec3  # body origin, world frame [m]
     quaternion: wp.quat  # attitude, body to world, xyzw
@@ -255,7 +255,7 @@ def parameters_of(schema: type[Sensor], **derived: Any) -> Any:
 
 
 def sampling_kernel(number: int, parameters: Any, arrays: Any, measure: Any, display: Any) -> Any:
-    """The kernel that brings all sensors of one kind up to date after a control step, or at a reset.
+    """Return the kernel that updates all sensors of one kind after a control step, or at a reset.
 
     Args:
         number: Of the kind, in the key of its random numbers; no other kind may have it.

@@ -124,7 +124,7 @@ class SensorSuite:
         return tuple(self.by_kind.values())
 
     def update_stages(self, state: SensedState, water_velocity: Any = None) -> list[Stage]:
-        """What `update` launches, for a program that records its launches.
+        """Return the launches of `update`, for a program that records its launches.
 
         Each stage is a kernel over (worlds of a slice, vehicles) and all its arguments but the last, `world_offset`.
         Slices share nothing that is written, so threads may each run their own.
@@ -138,7 +138,7 @@ class SensorSuite:
         return [(b.kernel, b.inputs(state, water_velocity, self._everywhere, False)) for b in self.batches]
 
     def reset_stages(self, state: SensedState, mask: Any = None, water_velocity: Any = None) -> list[Stage]:
-        """What `reset` launches, in the same form.
+        """Return the launches of `reset`, in the same form.
 
         Args:
             state: The state that the episode starts from, with `episode` already counted up.

@@ -1,4 +1,4 @@
-"""The autopilot of a vehicle that is steered by axes: ArduSub, its frame, and what full stick stands for."""
+"""The autopilot of a vehicle that is steered by axes: ArduSub, its frame, and the demands of full sticks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["DEMANDS", "FRAMES", "Autopilot"]
 Array = NDArray[np.float64]
 
 DEMANDS = ("roll", "pitch", "yaw", "throttle", "forward", "lateral")
-"""What ArduSub's mixer takes, in the order of a motor's factors: right side down, nose up, clockwise from above, up,
+"""Demands of ArduSub's mixer, in the order of a motor's factors: right side down, nose up, clockwise from above, up,
 ahead, right."""
 
 _HORIZONTAL: list[list[float]] = [
@@ -76,10 +76,10 @@ class Autopilot(Part):
     directions: tuple[Literal[-1, 1], ...] = ()
     """MOT_n_DIRECTION of each motor; 1 where the file gives none."""
     gain: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
-    """Part of an axis's full output that action 1 of `pilot6` stands for [-]; the vehicle's own pilot gain
-    (JS_GAIN_DEFAULT) has to be as large at least."""
+    """Share of an axis's full output that action 1 of `pilot6` means [-]; the vehicle's own pilot gain
+    (JS_GAIN_DEFAULT) must be at least as large."""
     voltage: Positive | None = None
-    """Of the battery under load, at which pulses become thrusts [V]; that of the thrusters' `esc` where not given."""
+    """Voltage of the battery under load, at which pulses become thrusts [V]; the thrusters' `esc.voltage` if None."""
 
     @field_validator("frame")
     @classmethod
@@ -99,12 +99,12 @@ class Autopilot(Part):
 
     @property
     def name(self) -> str:
-        """Of the frame; `table` where the file gives factors."""
+        """Name of the frame; `table` if the file gives factors."""
         return self.frame if isinstance(self.frame, str) else "table"
 
     @property
     def factors(self) -> Array:
-        """Of the `DEMANDS`, by motor, before directions [-], (motors, 6)."""
+        """Factors of the `DEMANDS`, by motor, before directions [-], (motors, 6)."""
         named = dict(FRAMES.values())
         return np.array(named[self.frame] if isinstance(self.frame, str) else self.frame, float)
 
@@ -114,7 +114,7 @@ class Autopilot(Part):
 
 
 def refuse_misfit(autopilot: Autopilot, thrusters: dict[str, Any], control_matrix: Array) -> None:
-    """Refuse an autopilot whose motors do not push the way that its frame says.
+    """Refuse an autopilot whose motors do not push in the direction of its frame.
 
     Args:
         autopilot: Its frame and directions.

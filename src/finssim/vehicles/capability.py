@@ -1,4 +1,4 @@
-"""What a vehicle can do with its thrusters: wrenches, terminal speeds, time constants, natural frequencies, trim."""
+"""Capability of a vehicle with its thrusters: wrenches, terminal speeds, time constants, natural frequencies, trim."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class WrenchCapability:
     """Largest pure wrenches about `wrench_reference`, order surge sway heave roll pitch yaw [N, N m]."""
 
     positive: Array
-    """In the positive direction, (6,)."""
+    """Greatest value in the positive direction, (6,)."""
     negative: Array
-    """In the negative direction, as magnitudes, (6,)."""
+    """Greatest value in the negative direction, as magnitudes, (6,)."""
 
     @property
     def symmetric(self) -> Array:
@@ -157,7 +157,8 @@ def time_constants(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array
 
 
 def level_speed(vehicle: Vehicle, hydrodynamics: str = "calibrated", axis: int = 0) -> float:
-    """Speed along surge (or sway) at which a small pitch (or roll) angle θ begins to grow by itself [m/s]; inf if none.
+    """Return the speed along surge (or sway) at which a small pitch (or roll) angle θ begins to grow [m/s]; inf if
+    none.
 
     Stiffness k θ against the Munk moment (m_z - m_x) u² θ, masses with added mass: u² = k / (m_z - m_x). Damping in
     heave and pitch lets a vehicle go somewhat faster; it is left out.

@@ -1,4 +1,4 @@
-"""Whether a vehicle's numbers make physical sense together: one sentence per finding."""
+"""Checks of a vehicle's numbers for physical consistency: one sentence per finding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands for the sections `sensors`, `perception`, `tags`, `mcu` and `safety` that a vehicle file leaves out.
+"""Defaults of the sections `sensors`, `perception`, `tags`, `mcu` and `safety` that a vehicle file omits.
 
 They make every vehicle fit for the virtual world. None of them is known of the real one: `finssim vehicles show` lists
 them as defaults, and what reads records of real water refuses tags that the file does not give.
@@ -52,11 +52,11 @@ SITES: Mapping[str, tuple[float, float, float] | None] = {
     "tank": (10.0, 6.0, 5.0),
     "open-water": (2000.0, 2000.0, 20.0),
 }
-"""Where a vehicle may swim: length, width and depth [m]; of the pool as the vehicle's file has its workspace."""
+"""Size of the water of each site: length, width and depth [m]; None: the workspace of the vehicle's file."""
 EDGE = (0.2, 0.4)
 """Largest edge of a tag, part of the vehicle's length and of its width: two with their margins fit on the top."""
 APART = 0.15
-"""Of a tag from the middle of the top, part of the vehicle's length."""
+"""Offset of a tag from the middle of the top, as a share of the vehicle's length."""
 QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 
 DEFAULTS: Mapping[str, str] = {
@@ -68,7 +68,7 @@ DEFAULTS: Mapping[str, str] = {
     "safety": "silences of 0.5 s; 45 degrees of tilt, 60 for a vehicle that does not control its heave; the published "
     "pool, scaled to the vehicle's length",
 }
-"""Section -> what stands for it where a file leaves it out."""
+"""Section -> description of its default."""
 
 
 def room(size: Any) -> float:
@@ -180,7 +180,7 @@ def vehicle_at(site: str, vehicle: Vehicle, *, navigation: bool = False) -> Vehi
 
 
 def numbered(vehicle: Vehicle, number: int) -> Vehicle:
-    """The vehicle as one of several under one camera, from 0: its tags' ids go on after those of the one before."""
+    """Return the vehicle as one of several under one camera, from 0: its tags' ids follow those of the one before."""
     tags = vehicle.tags
     if number == 0 or tags is None:
         return vehicle

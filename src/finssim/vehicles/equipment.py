@@ -26,13 +26,13 @@ class Mount(Part):
     """Pose of something fixed to the vehicle."""
 
     position: Vector3
-    """From the body origin, body frame [m], (3,)."""
+    """Position from the body origin, body frame [m], (3,)."""
     orientation: Quaternion = identity_quaternion()
     """Mounted frame to body frame, xyzw, (4,)."""
 
 
 class Sensor(Mount):
-    """What every sensor has."""
+    """Common fields of every sensor."""
 
     rate: Positive
     """[Hz]"""
@@ -119,7 +119,7 @@ OWN_SENSORS: dict[str, type[Sensor]] = {}
 
 
 class Sensors(Part):
-    """The sensors aboard; None where there is none. One's own (`OWN_SENSORS`) stand beside them under their kind."""
+    """Sensors aboard; None for those that are absent. Additional kinds (`OWN_SENSORS`) are listed under their names."""
 
     model_config = ConfigDict(frozen=True, extra="allow", arbitrary_types_allowed=True)
 
@@ -144,7 +144,7 @@ class Sensors(Part):
 
 
 SENSOR_NAME = "[a-z][a-z0-9_]{0,31}"
-"""Of a `RaySensor`, as a regular expression."""
+"""Regular expression of the name of a `RaySensor`."""
 
 
 RESERVED = (*Sensors.model_fields, "pressure", "base", "camera")
@@ -152,7 +152,7 @@ RESERVED = (*Sensors.model_fields, "pressure", "base", "camera")
 
 
 class RaySensor(Sensor):
-    """A camera, imaging sonar, altimeter, rangefinder or DVL's beams: what sees or hears the things at a site."""
+    """A camera, imaging sonar, altimeter, rangefinder or a DVL's beams, which sense the objects of a site."""
 
     device: str
     """A sensor of `finssim worlds`, or a file (`.yaml`) beside the vehicle file."""

@@ -1,4 +1,4 @@
-"""From a name or a file to a checked `Vehicle`."""
+"""Reader of vehicle files: a name or a path becomes a checked `Vehicle`."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def with_changes(vehicle: Vehicle, changes: Mapping[str, Any], provenance: Prove
     values, origins = vehicle.values(), dict(vehicle.provenance)
     for path, value in changes.items():
         section, inner, _ = path.partition(".")
-        if inner and section in vehicle.defaults:  # what is changed in a part is kept as a whole
+        if inner and section in vehicle.defaults:  # a section that is changed in part is kept completely
             part = getattr(vehicle, section)
             plain = (
                 {name: entry.values() for name, entry in part.items()}
@@ -212,7 +212,7 @@ def _expand_groups(values: Tree, origins: Origins, label: str) -> tuple[Tree, Or
 
 
 def _checked(values: Tree, origins: Origins, name: str, path: Path | None, label: str) -> Vehicle:
-    """The vehicle, with every refusal told as one sentence."""
+    """Return the vehicle, with every refusal as one sentence."""
     for key in ("name", "path", "provenance"):
         if key in values:
             raise VehicleError(f"{label}: unknown key '{key}': the name is that of the file")

@@ -25,7 +25,7 @@ def refuse_value(message: str) -> PydanticCustomError:
 
 
 def refuse_section(message: str) -> PydanticCustomError:
-    """Error about a whole section; `message` stands alone."""
+    """Return an error about a section; `message` is the complete sentence."""
     return PydanticCustomError("section", "{message}", {"message": message})
 
 
@@ -228,4 +228,4 @@ def sentence_of(detail: Any, label: str, missing: str = "add it, with its origin
 
 
 class VehicleError(ValueError):
-    """A vehicle file or a value given for a vehicle is refused; the message says where, what and what to do."""
+    """A vehicle file or a value given for a vehicle is refused; the message states where, what and what to do."""

@@ -43,9 +43,9 @@ class Term:
     name: str
     """Its key in a hydrodynamic set of a vehicle file."""
     schema: Any
-    """What stands under that key: a `Part` whose fields are the parameters, or the type of its only parameter."""
+    """Content of that key: a `Part` whose fields are the parameters, or the type of its only parameter."""
     units: Mapping[str, str]
-    """Of each parameter by its name; an only parameter has the name of the term."""
+    """Unit of each parameter by its name; an only parameter has the name of the term."""
     wrench: Any
     """`wp.func` -> vec6 [N, N m], body frame, about the reference point of the set; see `finssim.physics.terms`."""
     slope: Any = None
@@ -55,9 +55,9 @@ class Term:
     absent: Any = None
     """Value of the key where the file does not have it."""
     quadratic: Callable[[Any], Array] = field(default=lambda value: np.zeros(6))
-    """From what stands under the key to its share in the drag d2 v|v| of motion along each axis alone, (6,)."""
+    """Function from the content of the key to its share in the drag d2 v|v| of motion along each axis alone, (6,)."""
     check: Callable[[Any], tuple[bool, str]] | None = None
-    """From what stands under the key to whether it makes sense, and a sentence that says so."""
+    """Function from the content of the key to whether it is plausible, and a sentence about it."""
 
     @cached_property
     def section(self) -> type[BaseModel]:

@@ -43,7 +43,7 @@ class Esc(Part):
     pulse_max: Positive
     """Full forward [µs]."""
     voltage: Positive
-    """Of the battery under load, at which the numbers were found [V]."""
+    """Voltage of the battery under load, at which the numbers were determined [V]."""
     dead_minus: Positive
     """Largest pulse that turns the shaft in reverse, at `voltage` [µs]."""
     dead_plus: Positive
@@ -177,10 +177,10 @@ def _root(emf: float, load: float, volts: Array) -> Array:
 
 
 class Thruster(Part):
-    """Where a thruster sits, its steady thrust T = c± ω|ω| (paper, eq. 16) and how it follows commands."""
+    """A thruster: its position, its steady thrust T = c± ω|ω| (paper, eq. 16) and its response to commands."""
 
     position: Vector3
-    """Of the propeller disc, from the body origin, body frame [m], (3,)."""
+    """Position of the propeller disc, from the body origin, body frame [m], (3,)."""
     axis: Axis
     """Direction of the force on the vehicle for positive thrust, body frame, unit length, (3,)."""
     force_min: Negative
@@ -202,7 +202,7 @@ class Thruster(Part):
     domain: Literal["force", "speed"]
     """The quantity on which lag and slew limit act: thrust [N] or shaft speed [rad/s]."""
     time_constant: Positive
-    """Of the first-order lag [s]."""
+    """Time constant of the first-order lag [s]."""
     delay: NonNegative = 0.0
     """Pure delay of the command [s]."""
     slew: Positive = math.inf

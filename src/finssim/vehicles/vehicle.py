@@ -1,4 +1,4 @@
-"""The vehicle: everything a file says about it, and the matrices that follow directly."""
+"""The vehicle: the content of its file, and the matrices that follow directly."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class CalibrationRecord(Part):
     """One entry of `calibrations` in a vehicle file; no clock time is in it, so that equal fits write equal files."""
 
     kind: Literal["thruster", "motor", "hydrodynamics", "mounts"]
-    """What was calibrated."""
+    """Kind of the calibration."""
     method: str
     """Estimator, such as `regression` or `simulation`."""
     trials: dict[str, str]
@@ -120,7 +120,7 @@ class CalibrationRecord(Part):
     revision: str | None = None
     """Git commit of FinsSim, where it ran from a checkout."""
     interrupted: bool = False
-    """Whether it was stopped before it converged."""
+    """True if it was stopped before it converged."""
 
     def sentence(self) -> str:
         """`hydrodynamics by regression on 24 trials`, for lists and notes."""
@@ -138,7 +138,7 @@ ORIGINS: tuple[Origin, ...] = ("measured", "published", "derived", "guessed")
 
 
 class Provenance(NamedTuple):
-    """Where a number comes from."""
+    """Origin of a number."""
 
     origin: Origin
     source: str = ""
@@ -151,29 +151,29 @@ class Vehicle(Part):
     title: str
     """One line naming the vehicle and the set of numbers."""
     description: str
-    """What it is, and what to know before using the numbers."""
+    """Description of the vehicle, and what to know before using the numbers."""
     water: Water
     body: Body
     hull: Hull | None = None
     hydrodynamics: dict[str, AnyHydrodynamicSet]
     """Sets by name: `calibrated`, `simplified`, `mesh`; only what the sources give."""
     thrusters: dict[str, Thruster]
-    """By name, in the canonical order of every thruster vector."""
+    """Thrusters by name, in the canonical order of every thruster vector."""
     controlled_axes: tuple[Axis, ...] = AXES
     """Axes the thrusters are there to control; the others are left to the water (an underactuated vehicle)."""
     wrench_reference: Vector3 = Field(default_factory=lambda given: given["body"].center_of_gravity)
     """Body point about which wrenches are commanded [m], (3,); the centre of gravity where the file gives none."""
     sensors: Sensors = Field(default_factory=default_sensors)
     perception: dict[str, RaySensor] = Field(default_factory=default_perception)
-    """What sees and hears the site, by name; see `finssim.worlds.device_of`."""
+    """Sensors of the site by name, such as cameras and sonars; see `finssim.worlds.device_of`."""
     tags: Tags | None = Field(default_factory=default_tags)
     """None only where a file takes them off: `tags: null`."""
     mcu: Mcu = Field(default_factory=default_mcu)
     autopilot: Autopilot | None = None
-    """Of a vehicle that is steered by axes in place of shaft speeds."""
+    """Autopilot of a vehicle that is steered by axes instead of shaft speeds."""
     safety: Safety = Field(default_factory=default_safety)
     calibrations: tuple[CalibrationRecord, ...] = ()
-    """How its numbers were fitted to trials, oldest first; not part of `sha256`."""
+    """Calibrations of its numbers, oldest first; not part of `sha256`."""
     name: str = Field(exclude=True)
     """Name of the file without its suffix."""
     path: Path | None = Field(default=None, exclude=True)
@@ -381,7 +381,7 @@ class Vehicle(Part):
         return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 
     def fitted_on(self, sha256: str) -> bool:
-        """Whether one of its calibrations used the trial or table of that digest."""
+        """Return whether one of its calibrations used the trial or table of a digest."""
         return any(sha256 in record.trials.values() for record in self.calibrations)
 
     def origin_of(self, path: str) -> Provenance:

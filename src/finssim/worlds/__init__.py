@@ -1,4 +1,4 @@
-"""Worlds as data, and the sensors that see and hear them: cameras, imaging sonars, altimeters, DVL beams.
+"""Worlds as data, and the sensors that observe them: cameras, imaging sonars, altimeters, DVL beams.
 
 `WorldLayout`, `finssim.worlds.description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
 (`pip install 'finssim[perception]'`). What computes is imported when it is first named: a robot that

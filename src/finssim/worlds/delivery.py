@@ -26,7 +26,7 @@ from finssim.worlds.sensors import RayBatch
 wp.set_module_options({"enable_backward": False})
 
 STREAM = wp.constant(1000)
-"""Of the keys of what is lost, apart from those of the sensors of `finssim.sensors`."""
+"""Stream of the keys of lost readings, separate from those of the sensors of `finssim.sensors`."""
 
 
 @wp.kernel(enable_backward=False)
@@ -42,7 +42,8 @@ def _schedule(
     arrived: wp.array(dtype=int),
     age: wp.array2d(dtype=float),
 ):
-    """Which sensors measure in this step, into which slot of their ring, and which slot's reading arrives; -1: none."""
+    """Write which sensors measure in this step, into which slot of their ring, and which slot's reading arrives; -1:
+    none."""
     w, v = wp.tid()
     step = steps[w]
     view = w * age.shape[1] + v
@@ -110,7 +111,7 @@ class Delivery:
     """
 
     reading: wp.array
-    """What arrived last; zero before the first. Of the type and shape of the sensor's own."""
+    """Reading that arrived last; zero before the first. Its type and shape are the sensor's."""
     age: wp.array
     """Time since that was measured [s], infinite before the first; float (worlds, vehicles)."""
 

@@ -51,13 +51,13 @@ LARGEST = 4096
 FINEST = 1 << 20
 """Heights of a seabed."""
 PIXELS = 1 << 23
-"""Of a sensor that is computed: pixels, rays, or cells of range and beam."""
+"""Greatest number of computed values of a sensor: pixels, rays, or cells of range and beam."""
 SMALLEST, GREATEST = 1e-9, 1e9
 """Magnitude of a number in a world or a sensor that is not 0."""
 
 
 class WorldError(ValueError):
-    """A world or a sensor that cannot be: one sentence that says where, what and what to do."""
+    """A world or a sensor that is not possible: one sentence that states where, what and what to do."""
 
 
 def _within(low: float, high: float) -> AfterValidator:
@@ -104,17 +104,17 @@ class Texture(Part):
     """Squares of two colours; bands along z; tiles with joints; patches of random brightness, as sand has; a picture or
     a printed tag in the middle of each face, upright along z, on faces across z along y."""
     size: Annotated[float, Field(strict=True, ge=1e-4, le=1e6)]
-    """Of a square, a pair of bands, a tile, a patch; width of a picture; edge of a tag's black border [m]."""
+    """Size of a square, a pair of bands, a tile, a patch; width of a picture; edge of a tag's black border [m]."""
     file: str | None = None
-    """Of a picture: PNG or JPEG beside the world file."""
+    """File of a picture: PNG or JPEG beside the world file."""
     tag: Annotated[int, Field(strict=True, ge=0)] | None = None
     """Number of a tag in its family."""
     family: str = "apriltag_36h11"
-    """Of a tag: one of OpenCV's dictionaries, such as `apriltag_36h11` or `4x4_50`."""
+    """Family of a tag: one of OpenCV's dictionaries, such as `apriltag_36h11` or `4x4_50`."""
     colour: Colour = Field(default_factory=lambda: zeros(3))
-    """Of every other square or band, and of joints, which are 6 % of a tile wide."""
+    """Colour of every other square or band, and of joints, which are 6 % of a tile wide."""
     contrast: Probability = 0.3
-    """Of patches: largest change of brightness as a share of it; of tiles: from tile to tile."""
+    """Contrast of patches: greatest change of brightness as a share of it; of tiles: from tile to tile."""
 
     @model_validator(mode="after")
     def _complete(self) -> Texture:
@@ -125,20 +125,20 @@ class Texture(Part):
 
 
 class Finish(Part):
-    """What light and sound find on a surface."""
+    """Optical and acoustic properties of a surface."""
 
     colour: Colour = Field(default_factory=lambda: zeros(3) + 0.5)
     """Diffuse reflectance."""
     texture: Texture | None = None
     glow: NonNegative3 = Field(default_factory=lambda: zeros(3))
-    """Radiance of its own, as a beacon has."""
+    """Emitted radiance, as of a beacon."""
     backscatter_strength_db: Annotated[float, Field(strict=True, ge=-200.0, le=100.0)] = -27.0
     """10 log10 of Lambert's parameter mu [dB]: echo strength of 1 m² seen head-on. The default is that of sea floors
     (Mackenzie 1961); hard and rough walls have -15 to -5."""
 
 
 class Variation(Part):
-    """How far an object's pose and size are drawn from those of the file, by world; poses uniformly."""
+    """Ranges by which an object's pose and size differ from the file, by world; poses are drawn uniformly."""
 
     position: NonNegative3 = Field(default_factory=lambda: zeros(3))
     """Largest shift along x, y, z of its frame [m]."""
@@ -153,7 +153,7 @@ class Repeat(Part):
 
     count: Count
     step: Vector3
-    """From each copy to the next, in the frame of the shape's position [m]."""
+    """Offset from each copy to the next, in the frame of the shape's position [m]."""
 
 
 SIZES = {
@@ -170,25 +170,25 @@ SIZES = {
 
 
 class Object(Finish):
-    """A shape with its place, or a group that others stand in."""
+    """A shape with its pose, or a group that is the frame of others."""
 
     shape: Literal["box", "sphere", "capsule", "cylinder", "plane", "mesh", "model", "group"]
     position: Vector3
-    """Of the shape's middle, in the world or in `frame` [m]."""
+    """Position of the shape's middle, in the world or in `frame` [m]."""
     orientation: Quaternion | None = None
     """q_world<shape> (or q_frame<shape>), xyzw; at most one of orientation, axis and yaw."""
     axis: Vector3 | None = None
-    """Where the shape's z axis points: along a cylinder or capsule, out of a plane; any length but 0."""
+    """Direction of the shape's z axis: along a cylinder or capsule, out of a plane; any length but 0."""
     yaw: Number | None = None
     """Turn about z [rad]."""
     frame: str | None = None
     """An object before this one: this one's position is in its axes, and it moves with it."""
     size: Positive3 | None = None
-    """Of a box, along its axes [m]."""
+    """Size of a box, along its axes [m]."""
     radius: Positive | None = None
     """[m]"""
     length: Positive | None = None
-    """Of the cylinder, or of the straight part of a capsule [m]."""
+    """Length of the cylinder, or of the straight part of a capsule [m]."""
     file: str | None = None
     """Beside the world file: STL of a mesh [m]; of a model MJCF (.xml), URDF (.urdf) or USD (.usd, .usda, .usdc)."""
     scale: Positive | None = None
@@ -196,7 +196,7 @@ class Object(Finish):
     vary: Variation | None = None
     repeat: Repeat | None = None
     solid: bool = True
-    """Whether vehicles collide with it; of a group, nothing."""
+    """True if vehicles collide with it; no meaning for a group."""
 
     @model_validator(mode="after")
     def _complete(self) -> Object:
@@ -230,7 +230,7 @@ class Object(Finish):
 
     @property
     def positions(self) -> Array:
-        """Of the shape and its copies, in its frame [m], (count, 3)."""
+        """Return the positions of the shape and its copies, in its frame [m], (count, 3)."""
         if self.repeat is None:
             return self.position[None]
         return self.position + np.arange(self.repeat.count)[:, None] * self.repeat.step
@@ -242,7 +242,7 @@ class Basin(Finish):
     size: Positive3
     """Inner length along x, width along y, depth of the water [m]."""
     freeboard: NonNegative = 0.3
-    """How far the walls reach above the water [m]."""
+    """Height of the walls above the water [m]."""
 
 
 class Roughness(Part):
@@ -297,12 +297,12 @@ JERLOV = {
 """Attenuation of downward daylight K_d at 600, 550 and 475 nm [1/m] (Jerlov, Marine Optics, 1976, table XXVII, as two
 public programs have it, which agree), for red, green and blue."""
 BEAM_OVER_DAYLIGHT = 1.5
-"""What stands for the beam attenuation over K_d where only a water type is given. A choice: the table has none, and
-most light that scatters forwards still arrives near its pixel, so a picture fades by less than a + b."""
+"""Beam attenuation over K_d if only a water type is given. A choice: the table has none, and most light that scatters
+forwards still arrives near its pixel, so a picture fades by less than a + b."""
 
 
 class Snow(Part):
-    """Marine snow: particles that stand in the water, lit by daylight and lamps; cameras see those near them."""
+    """Marine snow: particles in the water, lit by daylight and lamps; cameras see those near them."""
 
     density: Annotated[float, Field(strict=True, gt=0.0, le=1e5)]
     """[1/m³]"""
@@ -348,14 +348,14 @@ class WorldWater(Part):
 
     @property
     def optical(self) -> Water:
-        """As the overhead camera has it."""
+        """Return the water in the form of the overhead camera."""
         from finssim.sensors.overhead_camera import Water  # which imports Warp
 
         return Water(attenuation=_triple(self.attenuation), veil=_triple(self.veil))
 
     @property
     def sound_speed(self) -> float:
-        """At the surface [m/s] (Medwin 1975; 0 to 35 °C, 0 to 45 g/kg).
+        """Return the speed of sound at the surface [m/s] (Medwin 1975; 0 to 35 °C, 0 to 45 g/kg).
 
         c = 1449.2 + 4.6 T - 0.055 T² + 0.00029 T³ + (1.34 - 0.010 T)(S - 35)
         """
@@ -384,7 +384,7 @@ class WorldWater(Part):
 
 
 class LightVariation(Part):
-    """How daylight is drawn by world."""
+    """Ranges of daylight, drawn by world."""
 
     brightness: Annotated[float, Field(strict=True, ge=1.0, le=10.0)] = 1.0
     """Largest factor by which daylight, veil and sky are drawn brighter or darker, log-uniformly."""
@@ -413,7 +413,7 @@ class Light(Part):
 
 
 class Contact(Part):
-    """How hard basin, seabed and objects are where a hull touches them: spring, damper and friction at each point."""
+    """Stiffness of basin, seabed and objects at a hull's points of contact: spring, damper and friction."""
 
     stiffness: Positive = 4000.0
     """Per corner, or sphere, of the hull [N/m]."""
@@ -424,7 +424,7 @@ class Contact(Part):
 
 
 class Viewpoint(Part):
-    """Where a vehicle looks from: what `finssim worlds show` draws, and where one may start."""
+    """Pose from which `finssim worlds show` draws, and where a vehicle may start."""
 
     position: Vector3
     """[m]"""
@@ -445,7 +445,7 @@ class Look(Part):
     water: WorldWater | None = None
     """For light alone: sound keeps the file's temperature and salinity."""
     surfaces: dict[str, Finish] = Field(default_factory=dict)
-    """By the name of an object, or `seabed` or `basin`; echoes are those of these finishes too."""
+    """Finish by the name of an object, or `seabed` or `basin`, for light and echoes."""
     held_out: Annotated[bool, Field(strict=True)] = False
     """Never drawn in training: what is learnt can be tried there."""
 
@@ -463,7 +463,7 @@ class World(Part):
     contact: Contact = Field(default_factory=lambda: Contact())
     viewpoint: Viewpoint
     looks: dict[str, Look] = Field(default_factory=dict)
-    """By name; a draw takes the file's own look or one of these, each as often."""
+    """Looks by name; a draw takes the file's own look or one of these, with equal probability."""
     colour_vary: Annotated[float, Field(strict=True, ge=1.0, le=4.0)] = 1.0
     """Largest factor by which colour and glow of each object are drawn darker or brighter, log-uniformly."""
     name: str = Field(exclude=True)
@@ -595,10 +595,10 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 
 class Mount(Part):
-    """Where a sensor sits on its vehicle."""
+    """Pose of a sensor on its vehicle."""
 
     position: Vector3 = Field(default_factory=lambda: zeros(3))
-    """From the body origin, body axes [m]."""
+    """Position from the body origin, body axes [m]."""
     pitch: Number = 0.0
     """Its x axis, along which it looks, turned down from the body's [rad]."""
     yaw: Number = 0.0
@@ -618,7 +618,7 @@ class Port(Part):
     """A flat window between a lens in air and the water, square to the view."""
 
     distance: Positive
-    """From the centre of the lens to the window's inner face [m]."""
+    """Distance from the centre of the lens to the window's inner face [m]."""
     thickness: Positive
     """[m]"""
     index: Annotated[float, Field(strict=True, ge=1.0, le=3.0)] = 1.49
@@ -630,7 +630,7 @@ class CameraDevice(Part):
 
     about: str
     source: str
-    """Where the figures are from."""
+    """Source of the figures."""
     width: Pixels
     height: Pixels
     focal_length: Positive
@@ -679,7 +679,7 @@ class CameraDevice(Part):
 
     @property
     def sensor(self) -> Sensor:
-        """From light to numbers, as the overhead camera has it."""
+        """Return the conversion of light to numbers in the form of the overhead camera."""
         from finssim.sensors.overhead_camera import Sensor
 
         gain = 1.0 if self.exposure == "auto" else self.exposure
@@ -697,7 +697,7 @@ class SonarDevice(Part):
 
     about: str
     source: str
-    """Where the figures are from."""
+    """Source of the figures."""
     mode: Literal["imaging", "profiling", "side_scan"] = "imaging"
     """Profiling: ranges of the first strong returns too. Side-scan: two beams square to the sensor's x axis."""
     frequency: Positive
@@ -707,11 +707,11 @@ class SonarDevice(Part):
     sector: Annotated[float, Field(strict=True, gt=0.0, le=math.pi)]
     """Horizontal field of view [rad]."""
     beam_width: Positive
-    """Of one beam across, between its half-power points on reception [rad]."""
+    """Width of one beam across, between its half-power points on reception [rad]."""
     vertical_beam_width: Annotated[float, Field(strict=True, gt=0.0, le=math.pi)]
     """Between half-power points, one way [rad]."""
     depression: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
-    """How far the middles of the beams point below the sensor's x-y plane [rad]."""
+    """Angle of the beams' middles below the sensor's x-y plane [rad]."""
     range: Positive
     """[m]"""
     minimum_range: NonNegative = 0.0
@@ -760,15 +760,15 @@ class RangeDevice(Part):
 
     about: str
     source: str
-    """Where the figures are from."""
+    """Source of the figures."""
     beams: Annotated[int, Field(strict=True, ge=1, le=16)] = 1
     """One along the sensor's x axis, or several evenly around it."""
     beam_angle: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
-    """Of each beam from the x axis [rad]."""
+    """Angle of each beam from the x axis [rad]."""
     beam_width: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
     """Between half-power points, one way [rad]; 0 for a single ray."""
     rays: Count = 37
-    """In a beam: what is computed, not a figure of the device."""
+    """Number of rays in a beam: a setting of the computation, not a figure of the device."""
     quantile: Probability = 0.1
     """Share of a beam's echo that has come when the range is taken; 0 for the first."""
     minimum_range: NonNegative
@@ -914,7 +914,7 @@ def _refuse_unphysical(value: Any, label: str) -> None:
             if key != "seed":
                 _refuse_unphysical(item, f"{label}: {key}" if isinstance(value, dict) else label)
     elif type(value) in (int, float) and value and not SMALLEST <= abs(value) <= GREATEST:
-        if math.isfinite(value):  # others are refused where they stand
+        if math.isfinite(value):  # other references are refused where they occur
             raise WorldError(
                 f"{label} holds {value:g}, expected 0 or a number from {SMALLEST:g} to {GREATEST:g}"
             )

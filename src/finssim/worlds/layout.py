@@ -1,4 +1,4 @@
-"""The shapes of a world and where they stand in each of its copies. Needs no Newton: collisions read it alone."""
+"""Shapes of a world and their poses in each of its copies. It does not need Newton, since collisions read it alone."""
 # mypy: ignore-errors
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ class Shape:
     rest: np.ndarray
     """Its pose, in the axes of the object that it moves with or of the world, (7,)."""
     anchor: int = -1
-    """Which of the objects that draws move it moves with; -1: none."""
+    """Index of the drawn object that it moves with; -1: none."""
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Half extents of a box or a heightfield; radius and half length of the round ones [m]."""
     vertices: np.ndarray | None = None
-    """Of a mesh, shape axes [m], (n, 3)."""
+    """Vertices of a mesh, shape axes [m], (n, 3)."""
     faces: np.ndarray | None = None
     """(m, 3)"""
     heights: np.ndarray | None = None
-    """Of a heightfield: z [m], (ny, nx), row 0 at the least y."""
+    """Heights of a heightfield: z [m], (ny, nx), row 0 at the least y."""
 
 
 class WorldLayout:
-    """N copies of a world, apart from each other: what stands where in each, and how it looks.
+    """Poses and looks of all shapes in N separate copies of a world.
 
     Args:
         world: A site of the catalogue, a path, or a world.
@@ -54,7 +54,7 @@ class WorldLayout:
     scales: wp.array
     """Factor on the size of every shape [-]; float (worlds, shapes)."""
     draws: wp.array
-    """How often each world was drawn; int (worlds,)."""
+    """Number of draws of each world; int (worlds,)."""
 
     def __init__(self, world: World | str, worlds: int = 1, device: str = "cpu") -> None:
         self.world = world if isinstance(world, World) else load_world(world)
@@ -82,7 +82,7 @@ class WorldLayout:
         WorldLayout._place(self, np.arange(worlds))
 
     def draw(self, seed: ArrayLike, mask: ArrayLike | None = None, held_out: bool = False) -> None:
-        """Draw poses of objects, water, look and colours of worlds anew; world w depends on its seed and w alone.
+        """Draw poses of objects, water, look and colours of worlds; world w depends on its seed and w alone.
 
         Args:
             seed: Of the draw, one for all worlds or one for each.
@@ -105,12 +105,12 @@ class WorldLayout:
 
     @property
     def looks(self) -> list[Look | None]:
-        """Those that a world may have; None is the file's own."""
+        """Return the looks that a world may have; None is the file's own."""
         return [None, *self.world.looks.values()]
 
     @property
     def drawn(self) -> np.ndarray:
-        """What the worlds are made of, to be assigned to another batch of the same world, (worlds, numbers)."""
+        """Return the drawn numbers of the worlds, for another batch of the same world, (worlds, numbers)."""
         return np.column_stack([self._drawn, self._look])
 
     @drawn.setter
@@ -127,7 +127,7 @@ class WorldLayout:
         self._place(np.arange(self.worlds))
 
     def move(self, name: str, poses: ArrayLike) -> None:
-        """Put an object that varies elsewhere, with all that stands in its frame, whatever is drawn.
+        """Move an object that varies, with everything in its frame, to given poses.
 
         Args:
             name: Of the object.

@@ -76,7 +76,7 @@ TEXTURES = {None: 0, "checker": 1, "stripes": 2, "tiles": 3, "mottled": 4, "pict
 
 @wp.struct
 class Surface:
-    """What light and sound find on a shape."""
+    """Optical and acoustic properties of a shape."""
 
     colour: wp.vec3  # diffuse reflectance
     second: wp.vec3  # of every other square or band, and of joints
@@ -85,7 +85,7 @@ class Surface:
     contrast: float  # of a picture: its height over its width
     picture: int  # which
     backscatter: float  # Lambert's parameter mu
-    glow: wp.vec3  # radiance of its own
+    glow: wp.vec3  # emitted radiance
     inverse: wp.transform  # from world axes to the shape's
 
 
@@ -105,7 +105,7 @@ class Optics:
 
 
 class WorldBatch(WorldLayout):
-    """N copies of a world, apart from each other, for ray sensors.
+    """N separate copies of a world for ray sensors.
 
         batch = WorldBatch("dock", worlds=256)
         batch.draw(seed=1)

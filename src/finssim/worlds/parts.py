@@ -19,7 +19,7 @@ from finssim.geometry.rotations import matrix_to_quat, quat_multiply, quat_rotat
 
 SUFFIXES = (".xml", ".mjcf", ".urdf", ".usd", ".usda", ".usdc", ".usdz")
 Y_UP = np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
-"""From axes with y up to axes with z up, xyzw."""
+"""Rotation from axes with y up to axes with z up, xyzw."""
 
 
 USD_KINDS = {"Cube": "box", "Sphere": "sphere", "Capsule": "capsule", "Cylinder": "cylinder", "Mesh": "mesh"}
@@ -48,7 +48,7 @@ class ModelPart:
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Half extents of a box; radius and half length of the round ones [m]."""
     vertices: np.ndarray | None = None
-    """Of a mesh, shape axes [m], (n, 3)."""
+    """Vertices of a mesh, shape axes [m], (n, 3)."""
     faces: np.ndarray | None = None
     """(m, 3)"""
     colour: np.ndarray | None = None
@@ -183,7 +183,7 @@ def _files_of(path: Path) -> dict[str, bytes]:
 
 
 def _is_model(data: bytes) -> bool:
-    """Whether a file may be XML: meshes and pictures are not."""
+    """Return whether a file may be XML: meshes and pictures are not."""
     return data[:64].lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
 
 

@@ -102,7 +102,7 @@ def _fan_cells(beams: int, bins: int, sector: float, side: int) -> tuple[NDArray
 
 
 def ray_elevations(device: SonarDevice) -> Array:
-    """Of the rays of a beam above the sonar's x-y plane [rad], (elevations,)."""
+    """Return the elevations of a beam's rays above the sonar's x-y plane [rad], (elevations,)."""
     return -device.depression + ELEVATION_SPAN * device.vertical_beam_width * (
         (np.arange(device.elevations) + 0.5) / device.elevations - 0.5
     )

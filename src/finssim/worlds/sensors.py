@@ -1,4 +1,4 @@
-"""Ray sensors of many vehicles at once: cameras, imaging sonars, altimeters and the beams of a DVL.
+"""Ray sensors of many vehicles: cameras, imaging sonars, altimeters and the beams of a DVL.
 
 Each takes the poses of N vehicles, and leaves arrays on the device:
 
@@ -40,13 +40,13 @@ wp.set_module_options({"enable_backward": False})
 
 MISS = wp.constant(wp.uint32(0xFFFFFFFF))
 SKIPPED = wp.constant(-101)
-"""In place of a view's world: Newton leaves its outputs as they are (`WorldRenderFlag.DISABLE_PRESERVE`)."""
+"""World of a view whose outputs Newton leaves unchanged (`WorldRenderFlag.DISABLE_PRESERVE`)."""
 LEVELS = 4096
-"""Of the converter behind a camera's pixels (12 bits), before the numbers are encoded to 8."""
+"""Levels of the converter behind a camera's pixels (12 bits), before the numbers are encoded to 8."""
 LAMP_STEPS = wp.constant(8)
 SNOW_STEPS = wp.constant(40)
 SNOW_SHARE = wp.constant(0.7)
-"""Of the cells of the lattice that marine snow stands in, twenty of which a ray is followed through."""
+"""Share of the cells of marine snow's lattice that hold a particle; a ray is followed through twenty cells."""
 BLUR = 5
 """Moments of an exposure that a blurred picture is the mean of."""
 AUTO_MEAN = 0.42
@@ -113,7 +113,7 @@ class RayBatch:
     """
 
     reading: wp.array
-    """What `update` returns; one row for each vehicle."""
+    """Result of `update`; one row for each vehicle."""
 
     def __init__(self, batch: WorldBatch, rays: np.ndarray, mount: Mount, vehicles: int = 1) -> None:
         self.batch, self.device, self.count = batch, batch.device, batch.worlds * vehicles
@@ -193,11 +193,11 @@ class Headlight:
     position: tuple[float, float, float]
     """Body axes [m]."""
     axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    """Of its beam, body axes, unit length."""
+    """Axis of its beam, body axes, unit length."""
     intensity: float = 0.5
     """Irradiance at 1 m on its axis, without water, relative to daylight just below the surface [-]."""
     half_angle: float = 1.0
-    """At which it has faded to half of what it has on its axis [rad]."""
+    """Angle at which it has half of its intensity on the axis [rad]."""
 
 
 @wp.func
@@ -346,7 +346,7 @@ def lamps_seen(
     origin: wp.vec3, ray: wp.vec3, path: float, normal: wp.vec3, reflectance: wp.vec3, c: wp.vec3, veil: wp.vec3,
     lamps: wp.array(dtype=Lamp), pose: wp.transform,
 ) -> wp.vec3:  # fmt: skip
-    """What the vehicle's lamps add to a ray: rho E e^(-c s) of the surface, and the veil between.
+    """Return the light that the vehicle's lamps add to a ray: rho E e^(-c s) of the surface, and the veil between.
 
     The veil is the integral of c B E e^(-c s) along the ray, by the midpoint rule over equal shares of its logarithm:
     the water scatters lamplight back as it does daylight.
@@ -390,7 +390,7 @@ def snow_seen(
     origin: wp.vec3, ray: wp.vec3, path: float, c: wp.vec3, daylight: wp.vec3, density: float, size: float,
     pixel: float, lamps: wp.array(dtype=Lamp), pose: wp.transform,
 ) -> wp.vec4:  # fmt: skip
-    """What particles in the water add to a ray, and in the fourth number how much of it they cover.
+    """Return the light that particles in the water add to a ray, and as fourth number the share that they cover.
 
     Each cell of a lattice holds a particle or none, by a hash of the cell; it covers a²/s² e^(-(x/s)²) of a pixel that
     it passes at x, a its radius and s² = a² + w² with the pixel's half width w there. Snow reflects 0.4 of its light.
@@ -575,7 +575,7 @@ def _take_picture(
         for k in range(3):
             charge = wp.max(gains[k] * colour[k], 0.0)
             if key >= 0:
-                # Shot noise, of variance `charge`, is normal in place of Poisson: alike above 20 electrons.
+                # Shot noise, of variance `charge`, is normal instead of Poisson; above 20 electrons they hardly differ.
                 drawn = normal_quantiles[int(bits & wp.uint32(1023))]
                 bits = bits >> wp.uint32(11)
                 charge += drawn * wp.sqrt(charge + noise_floor)
@@ -1057,8 +1057,8 @@ class SonarBatch(RayBatch):
     picture: wp.array
     """Its level between the device's `display` levels; uint8 (N, beams, bins)."""
     ranges: wp.array
-    """Of a profiling sonar: first range with a level of `detection_db` and within 6 dB of the beam's loudest [m],
-    infinite where there is none; float (N, beams)."""
+    """Range of a profiling sonar: first range with a level of `detection_db` and within 6 dB of the beam's loudest [m],
+    infinite if there is none; float (N, beams)."""
 
     def __init__(
         self,
@@ -1197,7 +1197,8 @@ class SonarBatch(RayBatch):
 
 
 def beam_pattern(width: float, spacing: float, beams: int) -> np.ndarray:
-    """How a receiving beam weighs the directions of its neighbours: sinc² of an even line array, sum 1, (odd,).
+    """Return the weights of a receiving beam in the directions of its neighbours: sinc² of an even line array, sum 1,
+    (odd,).
 
     Args:
         width: Between half-power points [rad]: sinc²(0.443) = 1/2.
@@ -1384,11 +1385,11 @@ class DopplerBatch(RangeBatch):
     """
 
     speeds: wp.array
-    """Of the sensor along each beam, positive away from it [m/s], NaN without an echo; float (N, beams)."""
+    """Velocity of the sensor along each beam, positive away from it [m/s], NaN without an echo; float (N, beams)."""
     velocity: wp.array
-    """Of the sensor, in its own axes [m/s], NaN without lock; float (N, 3)."""
+    """Velocity of the sensor, in its own axes [m/s], NaN without lock; float (N, 3)."""
     lock: wp.array
-    """Whether at least three beams find the bottom; int (worlds, vehicles)."""
+    """Flag of at least three beams finding the bottom; int (worlds, vehicles)."""
 
     def __init__(
         self, batch: WorldBatch, device: RangeDevice, twists: wp.array, *, lock: wp.array | None = None

@@ -19,7 +19,7 @@ from finssim.geometry.rotations import quat_to_matrix
 
 
 class OpticsError(ValueError):
-    """A lens, camera or interface that cannot be; the message is one sentence that says what was expected."""
+    """A lens, camera or interface that is not possible; the message is one sentence that states what was expected."""
 
 
 # OpenCV's radial and tangential distortion (plumb bob and rational), in complex image coordinates.
@@ -142,7 +142,7 @@ class RadialTangential:
             return image, np.isfinite(image)
         radius, ratio, reach = self._table
         length = np.abs(image)
-        if reach < np.inf:  # what no ray can reach is NaN from the start, so that nobody waits for it
+        if reach < np.inf:  # the iteration does not wait for pixels that no ray reaches
             image = np.where(length <= reach, image, np.nan)
         shrink = np.interp(length, radius, ratio)
         z = image * shrink
@@ -257,7 +257,7 @@ class Fisheye:
         """Unit rays (..., 3) of distorted coordinates (..., 2), and which of them have one, (...)."""
         angles, distances = self._table
         d = np.hypot(image[..., 0], image[..., 1])
-        # Past the fold there is no angle: NaN from the start, so that nobody waits for it.
+        # Beyond the fold there is no angle: NaN from the start, so that the iteration does not wait for it.
         d = np.where(d < distances[-1], d, np.nan)
         theta = np.interp(d, distances, angles)
         for _ in range(40):
@@ -448,7 +448,7 @@ class Lens:
         return rays, ok
 
     def inside(self, pixels: npt.ArrayLike) -> Flags:
-        """Whether pixels lie within the image, half a pixel around its outer pixel centres included, (...)."""
+        """Return whether pixels lie within the image, including half a pixel around its outer pixel centres, (...)."""
         scaled = np.abs((np.asarray(pixels, float) - self._middle) / self._half)
         return np.asarray((scaled[..., 0] <= 1.0) & (scaled[..., 1] <= 1.0))
 
@@ -479,7 +479,7 @@ class Lens:
         return np.array([0.5 * self.width, 0.5 * self.height])
 
 
-# A camera: a lens and where it stands.
+# A camera: a lens and its pose.
 
 
 @dataclass(frozen=True, eq=False)

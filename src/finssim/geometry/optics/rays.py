@@ -20,7 +20,7 @@ StatusArray = npt.NDArray[np.int8]
 
 
 class Status(IntEnum):
-    """What became of a pixel or a point; numbers come with OK and OUTSIDE_IMAGE only, NaN with the others."""
+    """Result of a pixel or a point; numbers are given with OK and OUTSIDE_IMAGE only, and NaN with the others."""
 
     OK = 0
     NO_RAY = 1
@@ -40,7 +40,7 @@ class Status(IntEnum):
 
 
 def count_rejections(status: npt.ArrayLike) -> dict[str, int]:
-    """How often each reason but OK occurs, by name; reasons that do not occur are left out."""
+    """Count the reasons other than OK by name; reasons that do not occur are left out."""
     counts = np.bincount(np.ravel(np.asarray(status, int)), minlength=len(Status))
     return {Status(i).name: int(n) for i, n in enumerate(counts) if n and i != Status.OK}
 
@@ -85,7 +85,7 @@ class Stack:
         return np.asarray(np.sqrt(a2 + (a2 - 1.0) * self.r2 * self.g**2))
 
     def derivatives(self) -> StackDerivatives:
-        """How k_0, the slope next to the camera, changes (implicit function theorem).
+        """Return the derivatives of k_0, the slope next to the camera (implicit function theorem).
 
         With P = sin(theta_i) n_i/r, the same in all layers, c_i = n_i cos(theta_i): k_i = P/c_i and
         sum t_i k_i = 1.
@@ -114,9 +114,9 @@ class StackDerivatives:
     k: Array
     by_r2: Array
     by_near: Array
-    """With respect to the camera's distance from the interface."""
+    """Derivative with respect to the camera's distance from the interface."""
     by_far: Array
-    """With respect to the point's distance from the far face."""
+    """Derivative with respect to the point's distance from the far face."""
     by_far_index: Array
 
 
@@ -159,14 +159,14 @@ _ON_THE_FACE = -1e-9
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Where points appear."""
+    """Image points of points under water."""
 
     pixels: Array
     """(..., 2), NaN where the status is neither OK nor OUTSIDE_IMAGE."""
     status: StatusArray
     """(...)"""
     surface_p: Array
-    """Where the ray crosses the near face, pool frame [m], (..., 3); NaN for WRONG_SIDE."""
+    """Point where the ray crosses the near face, pool frame [m], (..., 3); NaN for WRONG_SIDE."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,9 +181,9 @@ class Refraction:
     slope: Array
     """k: tangent of the incidence angle over |across| [1/m], (...)."""
     direction: Array
-    """From the camera to the surface, pool frame, (..., 3); its part along the normal is -1."""
+    """Direction from the camera to the surface, pool frame, (..., 3); its part along the normal is -1."""
     right_side: npt.NDArray[np.bool_]
-    """Whether camera and point lie on their sides, (...)."""
+    """True if camera and point are on their sides of the interface, (...)."""
 
 
 def refract(camera: Camera, interface: Interface, points_p: Array) -> Refraction:
@@ -258,7 +258,7 @@ class WaterRays:
     """(...)"""
 
     def at_z(self, z: npt.ArrayLike) -> tuple[Array, StatusArray]:
-        """Where the rays meet a horizontal plane (paper, eq. 12).
+        """Return the points where the rays meet a horizontal plane (paper, eq. 12).
 
         Args:
             z: Height of the plane, pool frame [m], one for all or (...).
@@ -274,7 +274,7 @@ class WaterRays:
         return points, status
 
     def at_plane(self, normal: npt.ArrayLike, offset: npt.ArrayLike) -> tuple[Array, StatusArray]:
-        """Where the rays meet a plane normal . X + offset = 0.
+        """Return the points where the rays meet a plane normal . X + offset = 0.
 
         Args:
             normal: Of any length [-], pool frame, (3,) or (..., 3).
@@ -383,20 +383,20 @@ class Jacobians:
 
     @cached_property
     def projection(self) -> Projection:
-        """What `project` returns, from the rays that are found already."""
+        """Return the result of `project`, from the rays that are known already."""
         return refracted_pixels(self._camera, self._found)
 
     @cached_property
     def point(self) -> Array:
-        """With respect to the point, pool frame [px/m], (..., 2, 3)."""
+        """Return the derivative with respect to the point, pool frame [px/m], (..., 2, 3)."""
         with np.errstate(all="ignore"):
             aside = self._outward - self._change.by_far[..., None] * self._interface.normal
             return self._by_k[..., None] * aside[..., None, :] + self._flat
 
     @cached_property
     def pose(self) -> Array:
-        """With respect to C_p [px/m] and a turn delta of the camera about pool axes, R_pc <- exp([delta]x) R_pc
-        [px/rad], (..., 2, 6)."""
+        """Return the derivative with respect to C_p [px/m] and a turn delta of the camera about pool axes, R_pc <-
+        exp([delta]x) R_pc [px/rad], (..., 2, 6)."""
         with np.errstate(all="ignore"):
             out = np.empty((*self._by_v.shape[:-1], 6))
             aside = self._change.by_near[..., None] * self._interface.normal - self._outward
@@ -406,8 +406,8 @@ class Jacobians:
 
     @cached_property
     def interface(self) -> Array:
-        """With respect to tilt_x, tilt_y (n <- n + tilt_x e1 + tilt_y e2, with `Interface.tangents`) [px/rad] and the
-        offset b [px/m], (..., 2, 3)."""
+        """Return the derivative with respect to tilt_x, tilt_y (n <- n + tilt_x e1 + tilt_y e2, with
+        `Interface.tangents`) [px/rad] and the offset b [px/m], (..., 2, 3)."""
         n, rho, change, by_v = self._interface.normal, self._rho, self._change, self._by_v
         centre = self._camera.position
         with np.errstate(all="ignore"):
@@ -427,13 +427,13 @@ class Jacobians:
 
     @cached_property
     def index(self) -> Array:
-        """With respect to index_far [px], (..., 2)."""
+        """Return the derivative with respect to index_far [px], (..., 2)."""
         with np.errstate(all="ignore"):
             return np.asarray(self._by_k * self._change.by_far_index[..., None])
 
     @cached_property
     def lens(self) -> Array:
-        """With respect to fx, fy, cx, cy and the distortion coefficients, (..., 2, 4 + k)."""
+        """Return the derivative with respect to fx, fy, cx, cy and the distortion coefficients, (..., 2, 4 + k)."""
         return self._camera.lens.parameter_jacobian(self._direction_c)
 
     @cached_property
@@ -451,7 +451,7 @@ class Jacobians:
 def plane_jacobian(
     camera: Camera, interface: Interface, points_p: npt.ArrayLike, normal: npt.ArrayLike
 ) -> Array:
-    """How the point that a pixel sees on a plane moves with the pixel and with the plane.
+    """Return the derivatives of the point that a pixel sees on a plane, by the pixel and by the plane.
 
     Pixel and plane fix the point, so this is the inverse of the three derivatives that a point's move has on them.
 

@@ -35,9 +35,9 @@ class HullMesh:
     face: wp.array(dtype=vec8)
     """Centroid [m], outward unit normal and area [m²] of each face (faces,), side by side for one read; then 0."""
     slope_form: wp.array(dtype=mat66)
-    """How fast form drag grows on each axis, by the columns of `drag_slope` (kinds,)."""
+    """Slope of the form drag on each axis, by the columns of `drag_slope` (kinds,)."""
     slope_skin: wp.array(dtype=mat66)
-    """The same for skin drag."""
+    """Slope of the skin drag on each axis, by the columns of `drag_slope` (kinds,)."""
     corners: wp.array(dtype=wp.mat33)
     """Corners of each face, a row each (faces,) [m]; only read near the surface."""
 
@@ -302,7 +302,7 @@ def mesh_displacement(hull: HullMesh, kind: int, surface_normal: wp.vec3, surfac
             pyramid = wet[3] * f[6] * wp.dot(wp.vec3(f[3], f[4], f[5]), arm) / 3.0
             volume += pyramid
             moment += pyramid * arm
-    # Below float32's resolution of the whole, the quotient of two rounding errors is no centroid.
+    # Below float32's resolution of the total volume, the quotient of two rounding errors is no centroid.
     if volume <= 1.0e-7 * hull.volume[kind]:
         return wp.vec4(0.0)
     c = apex + 0.75 * moment / volume

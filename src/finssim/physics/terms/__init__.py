@@ -1,4 +1,4 @@
-"""Hydrodynamic terms, a file each: what a vehicle file says of them, their wrench, their place in draws and fits."""
+"""Hydrodynamic terms, one file each: keys in a vehicle file, wrench, and entries in draws and fits."""
 
 from finssim.physics.terms.composed import add_term
 from finssim.vehicles.terms import Term

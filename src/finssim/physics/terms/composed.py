@@ -30,11 +30,11 @@ from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.terms import TERMS, Term
 
 STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density": float}
-"""What a term's functions may take besides its parameters."""
+"""Arguments that a term's functions may take besides its parameters."""
 KINDS = {"float": float, "vec3": wp.vec3, "vec6": vec6, "mat66": mat66}
-"""What a parameter may be."""
+"""Types of a parameter."""
 PIECE = 8
-"""A row of parameters is a multiple of so many numbers, which a processor reads at once."""
+"""Multiple to which a row of parameters is padded, since a processor reads so many numbers together."""
 
 
 class TermError(ValueError):
@@ -123,7 +123,7 @@ class Slot:
 
 @cache
 def layout(terms: tuple[Term, ...]) -> tuple[Slot, ...]:
-    """Where the parameters of some terms stand in a row."""
+    """Return the position of the parameters of some terms in a row."""
     slots, first = [], 0
     for term in terms:
         kinds = {name: kind for f in _functions(term).values() for name, kind in _arguments(f).items()}

@@ -1,4 +1,4 @@
-"""What a fixed camera above a pool sees: tags and tiles through a flat or rippling surface."""
+"""Images of a fixed camera above a pool: tags and tiles through a flat or rippling surface."""
 
 from finssim.sensors.overhead_camera.render import OverheadCamera, Rectangle
 from finssim.sensors.overhead_camera.scene import Basin, Pose, Ripples, Scene, Sensor, TagInScene, Water

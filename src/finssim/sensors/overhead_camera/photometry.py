@@ -1,4 +1,4 @@
-"""What happens to light on its way to a number: reflection and loss in water, then charge, noise and digits."""
+"""Conversion of light to pixel values: reflection and loss in water, then charge, noise and digits."""
 # mypy: ignore-errors
 
 import warp as wp

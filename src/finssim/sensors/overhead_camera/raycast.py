@@ -107,7 +107,7 @@ def printed(cells: wp.array(dtype=wp.uint8), tag: TagData, x: float, y: float, s
 
 @wp.func
 def near_ray(origin: wp.vec3, ray: wp.vec3, centre: wp.vec3, radius: float) -> bool:
-    """Whether a ray passes a sphere.
+    """Return whether a ray passes a sphere.
 
     Args:
         origin: Of the ray, surface frame [m].
@@ -130,7 +130,7 @@ def meet_tag(
     angle: float,
     travelled: float,
 ) -> Surfel:
-    """Where a ray meets a tag.
+    """Return the point where a ray meets a tag.
 
     Args:
         cells: Bitmaps of all tags.
@@ -186,7 +186,7 @@ def tiles(basin: BasinData, x: float, y: float, face: int, spread: float) -> wp.
 
 @wp.func
 def on_deck(basin: BasinData, p: wp.vec3) -> bool:
-    """Whether a point of the surface, basin axes, lies beside the pool."""
+    """Return whether a point of the surface, basin axes, lies beside the pool."""
     beside = bool(False)
     for a in range(3):
         if a != basin.up and (p[a] < 0.0 or p[a] > basin.size[a]):
@@ -196,7 +196,7 @@ def on_deck(basin: BasinData, p: wp.vec3) -> bool:
 
 @wp.func
 def meet_basin(basin: BasinData, p: wp.vec3, d: wp.vec3, angle: float, travelled: float) -> Surfel:
-    """Where a ray from inside leaves the basin.
+    """Return the point where a ray from inside leaves the basin.
 
     Args:
         basin: The tiled box.

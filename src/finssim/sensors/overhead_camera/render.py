@@ -57,7 +57,7 @@ BORDER = 2
 
 
 def rectangles(scene: Scene, tags: Sequence[TagInScene], steepest: float) -> list[Rectangle]:
-    """A rectangle around the image of each tag; the complete image where that cannot be said.
+    """Return a rectangle around the image of each tag, or the complete image if there are no bounds.
 
     Args:
         scene: Camera and still surface.
@@ -107,7 +107,7 @@ def _corners(tag: TagInScene) -> Array:
 
 
 def _seen(scene: Scene, corners: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Where corners appear, on whichever side of the surface they are, and whether they do."""
+    """Return the image points of corners, on either side of the surface, and whether they have one."""
     camera = scene.camera
     view = project(camera, scene.interface, corners)
     dry = view.status == Status.WRONG_SIDE

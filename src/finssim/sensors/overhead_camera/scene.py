@@ -1,4 +1,4 @@
-"""What stands before a fixed camera above a pool: basin, water, light and tags, as plain data.
+"""The scene before a fixed camera above a pool: basin, water, light and tags, as plain data.
 
 Everything is in the pool frame unless a line says otherwise. Radiance is relative: white paper in the pool's light
 has 1. Colours and water constants are triples (red, green, blue).
@@ -25,7 +25,7 @@ UPRIGHT: Quadruple = (0.0, 0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Pose:
-    """Where a thing is: its origin [m] and its axes, q_p<thing> xyzw."""
+    """Pose of an object: its origin [m] and its axes, q_p<object> xyzw."""
 
     position: Triple
     orientation: Quadruple = UPRIGHT
@@ -45,9 +45,9 @@ class TagInScene:
     edge: float
     """Between the corners that a detector reports [m]."""
     pose: Pose
-    """At the start of the exposure."""
+    """Pose at the start of the exposure."""
     end: Pose | None = None
-    """At its end; None for a tag at rest."""
+    """Pose at the end of the exposure; None for a tag at rest."""
     border_cells: int | None = None
     """Cells along `edge`; None for all of the bitmap. Some families print cells outside the border too."""
     margin: float = 0.0
@@ -74,7 +74,7 @@ class TagInScene:
 
     @property
     def half_size(self) -> float:
-        """From the middle to the rim's edge [m]."""
+        """Distance from the middle to the rim's edge [m]."""
         return 0.5 * self.cell * len(self.bitmap) + self.margin
 
 
@@ -107,7 +107,8 @@ class Basin:
 
 @dataclass(frozen=True, kw_only=True)
 class Water:
-    """How water takes and adds light on the way from a thing to the surface: L = L0 exp(-c s) + B (1 - exp(-c s))."""
+    """Water, which absorbs and adds light on the way from an object to the surface: L = L0 exp(-c s) + B (1 - exp(-c
+    s))."""
 
     attenuation: Triple = (0.40, 0.10, 0.08)
     """Beam attenuation c [1/m]. Pure water absorbs 0.35 of red, 0.06 of green and 0.01 of blue; a filtered pool
@@ -125,9 +126,9 @@ class Ripples:
     wavelengths: tuple[float, float] = (0.08, 0.60)
     """Shortest and longest [m]."""
     waves: int = 16
-    """How many sines; their wavelengths are spread evenly on a logarithmic scale and share the mean square slope."""
+    """Number of sines; their wavelengths are spread evenly on a logarithmic scale and share the mean square slope."""
     seed: int = 0
-    """Of wavelengths, headings and phases."""
+    """Seed of wavelengths, headings and phases."""
 
     def __post_init__(self) -> None:
         shortest, longest = self.wavelengths
@@ -140,7 +141,7 @@ class Ripples:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """From light to numbers. All pixels are exposed at once, centred on the time asked for."""
+    """Conversion of light to numbers. All pixels are exposed together, centred on the requested time."""
 
     shutter: float = 0.0
     """Exposure time [s], during which tags and ripples move."""
@@ -157,7 +158,7 @@ class Sensor:
     spot: float = 1.0
     """Width of the square from which a pixel gathers light [px]: 1 for perfect optics, 1.5 to 2 for a cheap lens."""
     colour: bool = False
-    """Whether images have red, green and blue; otherwise one channel, 0.299 R + 0.587 G + 0.114 B."""
+    """True if images have red, green and blue; otherwise one channel, 0.299 R + 0.587 G + 0.114 B."""
 
     def __post_init__(self) -> None:
         if min(self.shutter, self.read_noise) < 0.0 or min(self.gain, self.full_well, self.gamma) <= 0.0:
@@ -180,7 +181,7 @@ class Scene:
     above."""
     ripples: Ripples | None = None
     tags: tuple[TagInScene, ...] = ()
-    """Those that stay where they are: surveyed tags on the floor."""
+    """Tags that do not move: surveyed tags on the floor."""
     sensor: Sensor = field(default_factory=Sensor)
     samples: int = 2
     """Rays per pixel along each image axis near tags (elsewhere one ray). Texture and tiles are filtered
@@ -211,7 +212,7 @@ class SurfaceFrame:
     R_sp: Array
     """(3, 3)."""
     camera_height: float
-    """Of the camera above the plane [m]."""
+    """Height of the camera above the plane [m]."""
 
     def point(self, point_p: ArrayLike) -> Array:
         """A point of the pool frame in the surface frame [m], (..., 3)."""

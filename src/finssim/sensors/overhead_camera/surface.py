@@ -19,7 +19,7 @@ GRAVITY = 9.81
 """[m/s²]"""
 
 SURFACE_TENSION = 7.28e-5
-"""Of water at 20 °C over its density, σ/ρ [m³/s²] (IAPWS: 0.0728 N/m)."""
+"""Surface tension of water at 20 °C over its density, σ/ρ [m³/s²] (IAPWS: 0.0728 N/m)."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Waves:
     amplitude: NDArray[np.float64]
     """[m], (N,)."""
     phase: NDArray[np.float64]
-    """At the pool's origin and time 0 [rad], (N,)."""
+    """Phase at the pool's origin and time 0 [rad], (N,)."""
 
     def height(self, xy: ArrayLike, time: float) -> NDArray[np.float64]:
         """Height above the still surface [m], (...,), at points (..., 2) [m]."""
