@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 EXTRAS := learn,torchrl,rsl-rl,skrl,pettingzoo,imitation,sweep,wandb,logs,vision,render,view,mujoco,mpc,perception,hardware,ros2,dev
-STRICT := $(wildcard $(addprefix src/finssim/,geometry physics control localization))
+STRICT := $(wildcard $(addprefix src/finssim/,geometry physics control localization)) studies
 # Named by content, so that a fresh checkout or another branch with the same requirements installs nothing again.
 STAMP := $(VENV)/.installed-$(shell cat pyproject.toml constraints.txt | cksum | cut -d ' ' -f 1)
 
@@ -46,7 +46,7 @@ docs: $(STAMP)  ## build the pages into site/
 
 clean:  ## remove what was built, the environment included
 	rm -rf $(VENV) build dist site .mypy_cache .pytest_cache .ruff_cache .hypothesis
-	find src tests examples -name __pycache__ -type d -prune -exec rm -rf {} +
+	find src tests examples studies benchmarks tools -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # torch goes first and alone: where a CPU wheel is at hand pip takes it, and no later step may exchange it. MAVProxy (GPLv3,
 # which a test runs as a process) goes last and alone: what it needs is there, and what it asks for exchanges OpenCV.

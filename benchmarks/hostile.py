@@ -29,6 +29,7 @@ import random
 import re
 import resource
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -480,7 +481,8 @@ def make(folder: Path, run: Callable[..., None]) -> None:
     steps = folder / "steps" / "surge_plus_9" / "data.csv"
     steps.write_text("".join(steps.read_text().splitlines(keepends=True)[:700]))
     run("train", "t1", "--steps", "1024", "--worlds", "16", "--out", "policy")
-    run("experiment", "stack", "t1", "--policy", "policy", "--episodes", "1", "--records", "--out", "stack")
+    stack = ["t1", "--policy", folder / "policy", "--episodes", "1", "--records", "--out", folder / "stack"]
+    subprocess.run([sys.executable, "-m", "studies.stack", *stack], cwd=ROOT, check=True, capture_output=True)
     shutil.copyfile(next((folder / "stack").rglob("*.mcap")), folder / "run.mcap")
     shutil.copyfile(next((folder / "stack").rglob("*.truth")), folder / "truth.fst")
     _parquet(folder / "trials" / "surge_plus_9" / "data.csv", folder / "bare.parquet")

@@ -34,8 +34,6 @@ COMMANDS = [
     "experiment",
     "experiment replay",
     "experiment localization",
-    "experiment faults",
-    "experiment soak",
     "calibrate camera",
     "calibrate pool",
     "calibrate mounts",

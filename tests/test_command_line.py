@@ -184,7 +184,7 @@ def test_an_option_means_the_same_in_every_command(words, capsys):
     """--seed is 1 where it has a default; the estimator is never called a mode."""
     assert boundary.run(app, [*words.split(), "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    seed = re.search(r"--seed INTEGER RANGE (?:(?! --).)*", text)
+    seed = re.search(r"--seed (?:<int range>|INTEGER RANGE) (?:(?! --).)*", text)
     assert seed is None or "[default: 1;" in seed[0] or words == "worlds show"
     assert "--mode" not in text.replace("--model", "")
 

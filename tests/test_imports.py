@@ -121,7 +121,6 @@ HOMES = {
     },
     "pymavlink": {
         "calibration/importers/ardusub.py",
-        "experiments/faults.py",
         "pool/ardusub.py",
         "robot/link/mavlink.py",
     },
@@ -212,6 +211,13 @@ def test_imports_follow_the_arrows():
         allowed = FOUNDATION | {own} | (set() if own in FOUNDATION else below(own))
         against[path.relative_to(SOURCE).as_posix()] = imported_layers(path) - allowed
     assert not {path: layers for path, layers in against.items() if layers}
+
+
+def test_the_package_imports_nothing_of_the_checkout():
+    """Studies, benchmarks and tools import the package, which is installed without them."""
+    outside = {"studies", "benchmarks", "tools", "tests"}
+    against = {path: imports(path) for path in MODULES}
+    assert not [path for path, names in against.items() if outside & {n.partition(".")[0] for n in names}]
 
 
 def test_heavy_libraries_stay_at_home():

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-SOURCE = Path(__file__).resolve().parents[1] / "src"
+ROOT = Path(__file__).resolve().parents[1]
 
 DIRECTED = set(
     "position velocity acceleration force moment torque wrench tau nu twist omega quaternion normal gravity current "
@@ -72,10 +72,11 @@ def missing(function: ast.FunctionDef) -> list[str]:
 def found() -> dict[str, list[str]]:
     """What is missing, by function."""
     out = {}
-    for path in sorted(SOURCE.rglob("*.py")):
+    files = [(path, ROOT / "src") for path in sorted((ROOT / "src").rglob("*.py"))]
+    for path, source in [*files, *((path, ROOT) for path in sorted((ROOT / "studies").rglob("*.py")))]:
         if path.name.startswith("_") and path.name != "__init__.py":
             continue
-        module = ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__")
+        module = ".".join(path.relative_to(source).with_suffix("").parts).removesuffix(".__init__")
         for name, function in functions(ast.parse(path.read_text(encoding="utf-8"))):
             if missing(function):
                 out[f"{module}:{name}"] = missing(function)

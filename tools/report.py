@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from finssim.command_line import run_script
-from finssim.experiments import anatomy, faults, soak, transfer
+from finssim.experiments import transfer
 from finssim.experiments.tables import Table, figure_text, markdown_table
 from finssim.files import atomic_write
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from studies import anatomy, faults, soak
 
 SEEING_HEADS = (
     "task",

@@ -72,11 +72,6 @@ SECTIONS: dict[str, dict[str, str | Experiment]] = {
             "finssim.experiments.localization_experiment:localization_experiment"
         ),
         "experiment replay": Experiment("finssim.experiments.replay_experiment:replay_experiment"),
-        "experiment anatomy": Experiment("finssim.experiments.anatomy:anatomy"),
-        "experiment open-water": Experiment("finssim.experiments.open_water:open_water"),
-        "experiment faults": Experiment("finssim.experiments.faults:faults_experiment"),
-        "experiment soak": Experiment("finssim.experiments.soak:soak"),
-        "experiment stack": Experiment("finssim.experiments.stack:play"),
     },
 }
 """Section of the help -> words of a command -> what it does, in the order of a user's path."""

@@ -14,7 +14,6 @@ from finssim.control.trajectories import load_trajectory
 from finssim.experiments.evaluate import evaluate
 from finssim.experiments.metrics import T1_SETPOINTS, measure_trial
 from finssim.experiments.records import DriveError, read_record
-from finssim.experiments.stack import site_of
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool import draw_plant
 from finssim.pool.camera import PoolCamera, camera_of
@@ -28,6 +27,7 @@ from finssim.tasks import task_named
 from finssim.tasks.agents import BASELINES
 from finssim.vehicles import load_vehicle
 from reference.policies import linear, written
+from studies.stack import site_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("brief_t1")]
 

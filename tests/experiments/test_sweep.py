@@ -15,10 +15,10 @@ from finssim.cli import app
 from finssim.control.policy import Policy
 from finssim.experiments import sweep as command
 from finssim.experiments import transfer
-from finssim.experiments.anatomy import anatomy
 from finssim.experiments.campaign import ClusterError
-from finssim.experiments.faults import faults_experiment
 from finssim.experiments.sweep import load_sweep
+from studies.anatomy import anatomy
+from studies.faults import faults_experiment
 
 ray = pytest.importorskip("ray")
 

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from finssim.experiments.open_water import swim, way_of
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import OPEN, draw_plant, positioning_of, site_of
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError
@@ -16,6 +15,7 @@ from finssim.robot.link.frames import Decoder
 from finssim.robot.messages import HEADING, POSE, POSITION, VELOCITY, NavigationAid
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import SITES, vehicle_at
+from studies.open_water import swim, way_of
 
 HEAVY = load_vehicle("bluerov2_heavy")
 

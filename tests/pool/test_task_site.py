@@ -11,8 +11,6 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.control import ControlError
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments import stack
-from finssim.experiments.stack import site_of
 from finssim.pool.fleet import Medium
 from finssim.pool.positioning import Exposure
 from finssim.robot.pilots import AgentPilot
@@ -21,6 +19,9 @@ from finssim.tasks.agents import BASELINES
 from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
 from reference.policies import linear, written
+from reference.programs import study
+from studies import stack
+from studies.stack import site_of
 
 FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -88,20 +89,10 @@ def test_what_a_task_sees_is_what_it_would_see_in_training():
 def test_the_command_keeps_its_episodes_and_goes_on(tmp_path, capsys, monkeypatch):
     """The second call plays the second episode alone, and prints both beside the batch."""
     monkeypatch.setattr(stack, "BATCH", 32)
-    words = [
-        "experiment",
-        "stack",
-        "docking",
-        "--policy",
-        "align-insert",
-        "--out",
-        str(tmp_path),
-        "--json",
-        "--episodes",
-    ]
-    assert boundary.run(app, [*words, "1"]) == 0
+    words = ["docking", "--policy", "align-insert", "--out", tmp_path, "--json", "--episodes"]
+    assert study("stack", *words, 1) == 0
     capsys.readouterr()
-    assert boundary.run(app, [*words, "2"]) == 0
+    assert study("stack", *words, 2) == 0
     said = capsys.readouterr()
     told = json.loads(said.out)
     assert "episode 1 of" not in said.err and "episode 2 of 2" in said.err

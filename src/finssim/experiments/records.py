@@ -668,8 +668,8 @@ def read_record(
     fitted = fitted_task(task, vehicle)
     if len(fitted.vehicles) > 1:
         raise DriveError(
-            f"task '{task}' has {len(fitted.vehicles)} vehicles and {path} is of one: finssim pool --task and finssim "
-            "experiment stack score it as it is played"
+            f"task '{task}' has {len(fitted.vehicles)} vehicles and {path} is of one: finssim pool --task and "
+            "python -m studies.stack score it during the run"
         )
     drive = read_drive(path, vehicle)
     steered = drive.stretch >= 0

@@ -214,7 +214,7 @@ class Referee:
         if start is not None and task.marks:
             raise ControlError(
                 f"task '{task.name}' needs the poses of {', '.join(task.marks)}, which are drawn with its world and "
-                "are in no record: finssim experiment stack scores it as it is played"
+                "are in no record: python -m studies.stack scores it during the run"
             )
         if start is not None:
             task = _told(type(task))(**{field.name: getattr(task, field.name) for field in fields(task)})
@@ -245,7 +245,7 @@ class Referee:
         if start is not None and begun is not None and begun.numpy().any():
             raise ControlError(
                 f"task '{task.name}' begins with a memory that its reset draws, and only where it was drawn can it be "
-                "scored: finssim experiment stack scores it as it is played"
+                "scored: python -m studies.stack scores it during the run"
             )
 
     @property
@@ -403,7 +403,7 @@ class TaskSite(Fleet):
         self.carrier = self.medium = Medium(self._positions, communication, seed)
         self.scored, self._since = 0, math.nan
         self._actions: dict[str, Array] = {}
-        about = {"command": "finssim experiment stack", "guide": goal.name, "armed": True}
+        about = {"command": "python -m studies.stack", "guide": goal.name, "armed": True}
         period = self.task.control_step if communication is None else communication.period
         for i, (name, vehicle) in enumerate(zip(names, vehicles, strict=True)):
             world = self.worlds[name]

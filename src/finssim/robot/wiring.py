@@ -197,7 +197,7 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[D
     with ExitStack() as stack:
         if wiring.lockstep and wiring.team:
             raise LinkError(
-                "a team runs in lock-step within one process: use finssim experiment stack, or omit --lockstep"
+                "a team runs in lock-step within one process: use python -m studies.stack, or omit --lockstep"
             )
         if not wiring.lockstep:
             _check_clock(wiring.robot)

@@ -1,4 +1,4 @@
-"""The link to an autopilot, against the emulated ArduSub in lock-step; how it lets go is `experiments.faults`'s."""
+"""The link to an autopilot, against the emulated ArduSub in lock-step; `studies.faults` tests how it ends."""
 
 import math
 from types import SimpleNamespace

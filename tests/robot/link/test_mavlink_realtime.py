@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from finssim.experiments.faults import Process
 from finssim.pool import read_truth
+from studies.faults import Process
 
 VEHICLE = ["--vehicle", "bluerov2_heavy", "--site", "tank"]
 

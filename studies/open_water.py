@@ -1,4 +1,7 @@
-"""How far off a vehicle is after minutes in open water: Doppler log, depth, IMU and compass, with fixes or without."""
+"""Drift of dead reckoning after minutes in open water: `python -m studies.open_water --out drift`.
+
+The vehicle has a Doppler log, depth sensor, IMU and compass, with or without fixes.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,10 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
+from finssim.command_line import Experiment, run_script
 from finssim.control.guidance import Station
 from finssim.control.trajectories import Trajectory
-from finssim.experiments.campaign import Progress, check_choices, write_json
+from finssim.experiments.campaign import check_choices, write_json
 from finssim.experiments.robot_trials import RobotTrial, play_in_pool
 from finssim.experiments.tables import Columns, Table, cells
 from finssim.experiments.trials import interpolated
@@ -23,6 +27,7 @@ from finssim.pool import read_truth
 from finssim.pool.draw_plant import positioning_of
 from finssim.pool.plant_spec import Severity
 from finssim.pool.run import make_plan
+from finssim.progress import Progress
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.perception import LET_IN_STD
@@ -33,13 +38,13 @@ from finssim.vehicles import Vehicle, load_vehicle
 Array = npt.NDArray[np.float64]
 
 DEPTH = -5.0
-"""Height of the way [m]."""
+"""Height of the path, world frame [m]."""
 SIDE = 10.0
-"""Of the square [m]."""
+"""Side of the square [m]."""
 PERIOD = 0.5
-"""Between compared estimates [s]."""
+"""Interval of compared estimates [s]."""
 INSIDE = 5.991
-"""95 % of squared Mahalanobis distances in the plane are smaller."""
+"""95 % quantile of squared Mahalanobis distances in the plane [-]."""
 WAYS = ("line", "square")
 COLUMNS: Columns = {
     "seed": ("seed", ".0f"),
@@ -54,15 +59,15 @@ COLUMNS: Columns = {
 
 
 def way_of(shape: str, duration: float, speed: float) -> Trajectory:
-    """A straight way along x, or squares of 10 m, at a constant speed.
+    """Return a straight path along x, or squares of 10 m, at a constant speed.
 
     Args:
-        shape: A name of `WAYS`.
-        duration: At least [s]; squares are finished.
-        speed: [m/s]
+        shape: Name in `WAYS`.
+        duration: Shortest duration [s]; squares are completed.
+        speed: Speed [m/s].
 
     Raises:
-        ValueError: There is no such shape.
+        ValueError: Unknown shape.
     """
     check_choices([shape], WAYS, "way", ValueError)
     corners = [[0.0, 0.0], [speed * duration, 0.0]]
@@ -91,31 +96,31 @@ def swim(
     controller: str = "pid",
     seed: int = 1,
 ) -> dict[str, Any]:
-    """One way through open water, by the robot's whole software in lock-step.
+    """Follow a path through open water with the robot's complete software in lock-step.
 
     Args:
-        vehicle: Of the catalogue or a file; it is equipped by `vehicle_at`.
-        way: What is followed, by its own estimate.
+        vehicle: Vehicle, to which `vehicle_at` adds the instruments of open water.
+        way: Path, followed by the robot's own estimate.
         plant: Seed of the vehicle's plant.
         severity: nominal, realistic or hard.
         positioning: none, motion-capture or usbl.
-        controller: PID.
-        seed: Of instruments and wire.
+        controller: Name of a PID.
+        seed: Seed of instruments and wire.
 
     Returns:
-        `way_m`; `drift_m`, the error in the plane at the end, `worst_m` on the way, `std_m`, its own estimate of it;
-        `inside`, share of estimates inside their own 95 % ellipse; `nees`, the squared Mahalanobis distance at the end;
-        `off_m`, the largest distance from the wanted motion; `heading_deg`; `fault`.
+        `way_m`; `drift_m`, the error in the plane at the end; `worst_m`, the largest one; `std_m`, its estimated
+        standard deviation; `inside`, fraction of estimates inside their 95 % ellipse; `nees`, the squared Mahalanobis
+        distance at the end; `off_m`, the largest distance from the required motion; `heading_deg`; `fault`.
 
     Raises:
-        ValueError: The robot was never ready.
+        ValueError: The robot was never armed.
     """
     start_warp()
     plan = make_plan(vehicle, str(plant), severity, camera="none", seed=seed, site="open-water")
     rows: list[tuple[float, ...]] = []
 
     def watch(runtime: Runtime) -> None:
-        """Keep what the estimator says of itself."""
+        """Store the estimate and its covariance."""
         reading = runtime.reading
         if reading is None or math.isnan(runtime.t) or (rows and reading.time < rows[-1][0] + PERIOD - 1e-6):
             return
@@ -177,22 +182,22 @@ def open_water(
 ) -> dict[str, Any]:
     """Measure the drift of dead reckoning (DVL, depth, IMU, compass) in open water [m].
 
-    Example: finssim experiment open-water --seeds 1 --out drift
+    Example: python -m studies.open_water --seeds 1 --out drift
 
     Args:
         out (DIR): Directory for the result.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         minutes: Duration of each run [min].
-        speed: [m/s]
+        speed: Speed [m/s].
         shape (WORD): line or square (of 10 m).
         positioning (NAME): Fixes: none, motion-capture or usbl.
         seeds: Runs, each with different water and noise.
         seed: Seed of every random number; equal seeds give equal results.
         severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
-        progress: Told the share that is done and what comes next.
+        progress: Receives the completed fraction and the next run.
     """
     ours, way = load_vehicle(vehicle), way_of(shape, 60.0 * minutes, speed)
-    positioning_of(positioning, seed)  # refuses what is none
+    positioning_of(positioning, seed)  # refuse an unknown name before the first run
     trials = []
     for k, s in enumerate(range(seed, seed + seeds)):
         progress(k / seeds, f"seed {s}")
@@ -213,8 +218,12 @@ def open_water(
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """A row for each way."""
+    """Return a table with a row for each run."""
     title = f"{result['vehicle']['name']}, {result['shape']}, positioning {result['positioning']}"
     heads = [*(heading for heading, *_ in COLUMNS.values()), ""]
     drifts = [{**t, "drift": t["drift_m"] / t["way_m"]} for t in result["trials"]]
     return [Table(title=title, heads=heads, rows=[[*cells(t, COLUMNS), t["fault"]] for t in drifts], left=())]
+
+
+if __name__ == "__main__":
+    run_script(Experiment("studies.open_water:open_water"))

@@ -1,4 +1,4 @@
-"""`finssim experiment soak`: the robot's whole software at work for hours of vehicle time, its memory watched."""
+"""Memory of the robot's software over hours of vehicle time: `python -m studies.soak --hours 20 --out soak`."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.experiments.campaign import Progress, write_json
+from finssim.command_line import Experiment, run_script
+from finssim.experiments.campaign import write_json
 from finssim.experiments.tables import Table
 from finssim.pool.run import make_plan
+from finssim.progress import Progress
 from finssim.provenance import provenance
 from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep
@@ -26,11 +28,11 @@ from finssim.vehicles import load_vehicle
 Array = NDArray[np.float64]
 
 SAMPLED = 10.0
-"""Vehicle time between two samples [s]."""
+"""Interval of samples in vehicle time [s]."""
 WARM = 0.25
-"""The first part of a run does not count: caches fill [-]."""
+"""Fraction at the start of a run that does not count, since caches fill [-]."""
 FLAT = 1.0
-"""Memory is flat if it grows by less in an hour of vehicle time [MiB/h]; 20 MiB in 20 hours."""
+"""Growth per hour of vehicle time below which memory is flat [MiB/h]: 20 MiB in 20 hours."""
 GOAL = "0,0,-0.5,0"
 HEADS = ("vehicle_s", "wall_s", "memory_mib", "error_m", "state")
 
@@ -48,7 +50,7 @@ def soak(
 
     Exit status 3: the memory grew, or the bridge stopped the vehicle.
 
-    Example: finssim experiment soak --hours 20 --out soak
+    Example: python -m studies.soak --hours 20 --out soak
 
     Args:
         out (DIR): Directory for the result and the samples.
@@ -56,10 +58,10 @@ def soak(
         seed: Seed of every random number; equal seeds give equal results.
         severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        progress: Told the share that is done and how it goes.
+        progress: Receives the completed fraction and the state.
 
     Returns:
-        What `soak.json` holds: `verdict`, `slope_mib_per_h`, first and last memory [MiB], errors [m], and totals.
+        Content of `soak.json`: `verdict`, `slope_mib_per_h`, first and last memory [MiB], errors [m], and totals.
     """
     duration, folder = 3600.0 * hours, Path(out)
     folder.mkdir(parents=True, exist_ok=True)
@@ -73,7 +75,7 @@ def soak(
         print(*HEADS, sep=",", file=file)
 
         def sample(runtime: Runtime) -> None:
-            """A row of the table for every so much of vehicle time."""
+            """Write a row of the table every `SAMPLED` seconds of vehicle time."""
             if pool.time < len(samples) * SAMPLED:
                 return
             error = float(np.linalg.norm(pool.plant.position - runtime.guide.at(0.0).position))
@@ -110,11 +112,11 @@ def soak(
 
 
 def verdict(vehicle_s: Array, memory: Array) -> dict[str, Any]:
-    """Whether memory is flat: its slope over all but the warm-up, by least squares.
+    """Judge whether memory is flat, by its least-squares slope over all but the warm-up.
 
     Args:
-        vehicle_s: Time of each sample [s], (k,).
-        memory: [MiB], (k,).
+        vehicle_s: Vehicle time of each sample [s], (k,).
+        memory: Memory of each sample [MiB], (k,).
 
     Returns:
         `verdict`: flat, grows, or too short to tell; `slope_mib_per_h`, None if too short; `first_mib`, `last_mib`.
@@ -128,7 +130,7 @@ def verdict(vehicle_s: Array, memory: Array) -> dict[str, Any]:
 
 
 def memory_mib() -> float:
-    """Memory of this process that is in use now [MiB]; the most it ever was where the system tells no more."""
+    """Return the memory that this process uses now [MiB], or its peak where the system does not report that."""
     try:
         # Not statm, which on a machine of many processors may be tens of MiB behind.
         rollup = Path("/proc/self/smaps_rollup").read_text(encoding="ascii")
@@ -138,7 +140,7 @@ def memory_mib() -> float:
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """How long, how fast, and what became of memory and vehicle."""
+    """Return sentences about duration, speed, memory and vehicle."""
     slope = result["slope_mib_per_h"]
     grown = "" if slope is None else f", {slope:+.2f} MiB per hour of vehicle time"
     rms = result["error_rms_m"]
@@ -152,3 +154,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         f"decisions missed: {result['missed_decisions']} of {result['decisions']}",
     ]
     return [Table(title="soak", sentences=lines)]
+
+
+if __name__ == "__main__":
+    run_script(Experiment("studies.soak:soak"))

@@ -1,4 +1,4 @@
-"""`finssim experiment soak`: memory that grows is told from memory that does not."""
+"""`python -m studies.soak`: growing memory is distinguished from memory that does not grow."""
 
 import csv
 import gc
@@ -8,9 +8,8 @@ import mmap
 import numpy as np
 import pytest
 
-from finssim import boundary
-from finssim.cli import app
-from finssim.experiments.soak import FLAT, memory_mib, verdict
+from reference.programs import study
+from studies.soak import FLAT, memory_mib, verdict
 
 
 def test_a_leak_is_told_from_a_cache_that_fills():
@@ -39,8 +38,7 @@ def test_memory_is_that_of_this_process():
 @pytest.mark.slow
 def test_a_short_soak_keeps_its_station_and_its_samples(capsys, tmp_path):
     """14 s of vehicle time: near the station, a row every 10 s."""
-    words = ["experiment", "soak", "--hours", "0.004", "--out", str(tmp_path), "--json"]
-    assert boundary.run(app, words) == 0
+    assert study("soak", "--hours", "0.004", "--out", tmp_path, "--json") == 0
     result = json.loads(capsys.readouterr().out)
     assert abs(result["vehicle_h"] - 0.004) < 1e-3 and result["error_max_m"] < 0.1 and not result["faults"]
     rows = list(csv.DictReader((tmp_path / "soak.csv").open()))

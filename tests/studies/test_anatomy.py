@@ -1,4 +1,4 @@
-"""`finssim experiment anatomy`: plants in which one thing is wrong, what a row tolerates of it, table and figure."""
+"""`python -m studies.anatomy`: plants with one wrong parameter, tolerated amounts, table and figure."""
 
 import json
 from dataclasses import replace
@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.experiments import anatomy as module
 from finssim.experiments import evaluate
-from finssim.experiments.anatomy import CAUSES, anatomy, tables_of, tolerated
 from finssim.experiments.plants import Plant
 from finssim.tasks.agents import agent_for
 from finssim.tasks.make import task_named
 from finssim.vehicles import load_vehicle
+from studies import anatomy as module
+from studies.anatomy import CAUSES, anatomy, tables_of, tolerated
 
 FINSROV = load_vehicle("finsrov")
 

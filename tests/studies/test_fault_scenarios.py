@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.experiments.faults import FaultyWire
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.quiet import start_warp
 from finssim.robot.link.frames import Decoder, encode_command
 from finssim.robot.messages import ThrusterCommand
 from finssim.vehicles import load_vehicle
+from studies.faults import FaultyWire
 
 VEHICLE = load_vehicle("finsrov")
 SURGE = encode_command(ThrusterCommand(True, (-0.3, -0.3, 0.0, 0.0, 0.0, -0.3, 0.3, 0.0)))

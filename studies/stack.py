@@ -1,4 +1,4 @@
-"""`finssim experiment stack`: any task through the deployed software in lock-step, beside the same in the batch."""
+"""Any task through the deployed software, compared with the batch: `python -m studies.stack t3 --policy DIR`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from finssim.command_line import Experiment, run_script
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.campaign import keep_result, load_result
@@ -27,7 +28,7 @@ from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 
 BATCH = 256
-"""Episodes in the batch, beside those through the stack."""
+"""Number of episodes in the batch."""
 ROWS = "episodes.json"
 
 
@@ -42,20 +43,20 @@ def site_of(
     guide: Guide | None = None,
     record: Path | None = None,
 ) -> TaskSite:
-    """One episode of a task in the virtual site, with a controller for all agents.
+    """Return a virtual site with one episode of a task, with a controller for all agents.
 
     In the pool vehicles are located by the overhead camera through the water, in open water by fixes of motion capture
     on their wires: 50 Hz, 2 mm, 0.3°, 20 ms late, one in a hundred lost.
 
     Args:
-        task: A task, its name, or FILE.py:CLASS of one's own.
-        controller: A policy's directory, or a baseline of the task.
-        vehicles: One for each of its places.
-        seed: Of the episode, of noise and of what is lost.
+        task: Task, its name, or FILE.py:CLASS of your own.
+        controller: Directory of a policy, or a baseline of the task.
+        vehicles: One for each agent of the task.
+        seed: Seed of the episode, of noise and of losses.
         plant: Seed of every vehicle's plant.
-        severity: How far the plants are from the vehicle files.
-        guide: The reference, of a task that follows one.
-        record: Folder that takes PLACE.mcap and PLACE.truth of every agent; None: nothing is kept.
+        severity: Distance of the plants from the vehicle files.
+        guide: Reference of a task that follows one.
+        record: Directory for PLACE.mcap and PLACE.truth of every agent; None: no records.
 
     Raises:
         PolicyError, ControlError, BaselineError: Controller, vehicles and task do not fit.
@@ -102,22 +103,22 @@ def play(
     Every vehicle has its plant, motor controller, bridge and pilot; robots exchange their positions, and the task
     scores the truth. Vehicles are located by the overhead camera in the pool, by motion capture in open water.
 
-    Example: finssim experiment stack team-pursuit --policy runs/team --episodes 20 --out runs/team-stack
+    Example: python -m studies.stack team-pursuit --policy runs/team --episodes 20 --out runs/team-stack
 
     Args:
-        task (TASK): Task, or FILE.py:CLASS of one's own.
-        policy (DIR|NAME): A policy's directory, or a baseline of the task.
-        episodes: How many.
+        task (TASK): Task, or your own as FILE.py:CLASS.
+        policy (DIR|NAME): Directory of a policy, or a baseline of the task.
+        episodes: Number of episodes.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         plant: Seed of every vehicle's plant.
         severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
         seed: Seed of every random number; equal seeds give equal results.
         out (DIR): Directory that keeps every episode; an interrupted one is continued.
         records: Store in --out the record (.mcap) and the truth (.truth) of every agent.
-        show: Called with a line after each episode.
+        show: Receives a line after each episode.
 
     Returns:
-        `stack` and `batch`: as `summarize_episodes`, with what was played.
+        `stack` and `batch`, each as of `summarize_episodes`, and the settings.
 
     Raises:
         PolicyError, ControlError, BaselineError, VehicleError, OutputError: As they say.
@@ -155,7 +156,7 @@ def play(
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """A row for each measure: the stack beside the batch."""
+    """Return a table with a row for each measure, of the stack and of the batch."""
     stack, batch = result["stack"], result["batch"]
     title = f"{result['task']}, {result['controller']}"
     heads = [title, f"stack, {stack['trials']}", f"batch, {batch['trials']}"]
@@ -164,3 +165,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         for name in stack["metrics"]
     ]
     return [Table(title=title, heads=heads, rows=rows, left=(0, 1, 2), intervals=True)]
+
+
+if __name__ == "__main__":
+    run_script(Experiment("studies.stack:play"))

@@ -1,6 +1,6 @@
-"""`finssim experiment faults`: break one thing after another while a vehicle drives, and see what it does.
+"""Faults injected while a vehicle drives: `python -m studies.faults --out faults`.
 
-Faults of the wire are played in lock-step with a hand on it, those of a whole process in real time, by kill -9.
+Faults of the wire are injected in lock-step, those of a process in real time, by kill -9.
 """
 
 from __future__ import annotations
@@ -25,18 +25,20 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.experiments.campaign import Progress, check_choices, run_jobs, write_json
+from finssim.command_line import Experiment, run_script
+from finssim.experiments.campaign import check_choices, run_jobs, write_json
 from finssim.experiments.robot_trials import PoolJob, noise_seed
 from finssim.experiments.tables import Table
 from finssim.pool import TruthError, VirtualPool, read_truth
 from finssim.pool.firmware import Firmware
+from finssim.progress import Progress
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import station_of
 from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import run_lockstep
-from finssim.robot.messages import Delivery, Picture, Telemetry
+from finssim.robot.messages import Delivery, Picture, Telemetry, ThrusterCommand
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.record_reader import Record, open_record
@@ -52,7 +54,7 @@ Array = NDArray[np.float64]
 
 
 class Course(NamedTuple):
-    """What truly happened, by the pool's clock."""
+    """True motion and thrust of a trial, by the pool's clock."""
 
     time: Array
     """[s], (k,)"""
@@ -61,25 +63,26 @@ class Course(NamedTuple):
     thrust: Array
     """Delivered, canonical order [N], (k, n)."""
     enabled: Array
-    """Whether a frame that enables the motors left the robot at this time, (k,); NaN where nobody noted."""
+    """1 where the robot sent a frame that enables the motors, else 0, (k,); NaN where it was not observed."""
 
 
 class FaultyWire:
-    """A world in lock-step whose time goes on by one period at each exchange, whatever the robot's clock says.
+    """World in lock-step whose time advances by one period at each exchange, independent of the robot's clock.
 
     Attributes:
-        pool: Behind it.
-        shift: By how much the robot's clock is ahead of the pool's [s]; a change is a jump of the robot's clock.
-        change: Applied to each snapshot of the vehicle; None leaves the bytes alone.
-        pictures: Applied to the pictures of an exchange; None leaves them alone.
-        others: What others on an autopilot's wire send at a time [s]; None: nobody else is there.
+        pool: Pool at the other end.
+        shift: Time by which the robot's clock is ahead of the pool's [s]; a change is a jump of the robot's clock.
+        change: Function applied to each snapshot of the vehicle; None leaves the bytes unchanged.
+        pictures: Function applied to the pictures of an exchange; None leaves them unchanged.
+        others: Function of the time [s] that returns frames of other stations on an autopilot's wire; None: no other
+            station.
     """
 
     def __init__(self, pool: VirtualPool, rate: float) -> None:
         """
         Args:
-            pool: At time 0.
-            rate: Exchanges a second [Hz].
+            pool: Pool at time 0.
+            rate: Exchanges per second [Hz].
         """
         self.pool = pool
         self.shift = 0.0
@@ -88,13 +91,13 @@ class FaultyWire:
         self.others: Callable[[float], list[bytes]] | None = None
         self._rate, self._turns = rate, 0
         self._decoder, mcu = Decoder(outputs=pool.vehicle.mcu.outputs), Decoder(MCU)
-        self._drives: Callable[[bytes], bool] = lambda data: any(c.enable for c in mcu.feed(data))
+        self._drives: Callable[[bytes], bool] = lambda data: any(_enables(m) for m in mcu.feed(data))
         if not isinstance(pool.firmware, Firmware):
             self._drives = _axes_reader()
         self._rows: list[tuple[float, Array, Array, bool]] = []
 
     def exchange(self, until: float, sent: Sequence[bytes]) -> Delivery:
-        """Let the pool go on by one period; `until` is the robot's belief and does not count."""
+        """Advance the pool by one period; `until`, a time of the robot's clock, is ignored."""
         self._note(sent)
         self._turns += 1
         more = self.others(self.pool.time) if self.others is not None else ()
@@ -110,7 +113,7 @@ class FaultyWire:
         )
 
     def course(self) -> Course:
-        """The truth at each exchange."""
+        """Return the truth at each exchange."""
         time, position, thrust, enabled = zip(*self._rows, strict=True)
         return Course(np.array(time), np.array(position), np.array(thrust), np.array(enabled, float))
 
@@ -120,15 +123,19 @@ class FaultyWire:
         self._rows.append((self.pool.time, plant.position.astype(float), plant.thrust.astype(float), drives))
 
     def _changed(self, data: bytes) -> bytes:
-        """The frame with its snapshot changed; other frames, and those that no longer decode, as they are."""
+        """Return a frame with its snapshot changed; other frames, and those that cannot be decoded, unchanged."""
         messages = self._decoder.feed(data)
         if self.change is None or len(messages) != 1 or not isinstance(messages[0], Telemetry):
             return data
         return encode_telemetry(self.change(messages[0]))
 
 
+def _enables(message: object) -> bool:
+    return isinstance(message, ThrusterCommand) and message.enable
+
+
 def _axes_reader() -> Callable[[bytes], bool]:
-    """Whether a frame to an autopilot moves an axis off its middle."""
+    """Return a function that detects whether a frame to an autopilot moves an axis off its centre."""
     from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
     mav = mavlink.MAVLink(None)
@@ -141,64 +148,64 @@ def _axes_reader() -> Callable[[bytes], bool]:
 
 @dataclass
 class Bench:
-    """All that a fault can lay hands on."""
+    """Parts of a trial that a fault can change."""
 
     pool: VirtualPool
     wire: FaultyWire
     runtime: Runtime
     recorder: Recorder
     undo: list[Callable[[], None]] = field(default_factory=list)
-    """Called when the trial is over."""
+    """Functions called at the end of the trial."""
 
 
 Touch = Callable[[Bench], None]
 STOP_WITHIN = 0.5
-"""Thrusters shall be at zero so soon after a fault, or the vehicle shall stay inside the workspace [s]."""
+"""Time after a fault within which thrust must be zero, unless the vehicle stays inside the workspace [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """One way in which something breaks."""
+    """One failure: functions that begin and end it."""
 
     begin: Touch
     during: Touch | None = None
-    """Called after every step while it lasts."""
+    """Called after every step during the fault."""
     end: Touch | None = None
     lasts: float = math.inf
-    """[s]"""
+    """Duration [s]."""
     cuts_record: bool = False
-    """Whether the record cannot go on."""
+    """True if the record ends with the fault."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """A row of the table: faults of one kind; its figures are those of the worst."""
+    """Row of the table: faults of one kind, with the figures of the worst."""
 
     title: str
     faults: Mapping[str, Fault]
-    """By the name of the variant."""
+    """Name of the variant -> fault."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Fields of `BridgeSettings` that differ from the vehicle's."""
     motions: tuple[str, ...] = ("station", "moving")
-    """What the vehicle is doing."""
+    """Motions of the vehicle."""
     must_fail: bool = False
-    """A control: with its watchdogs off, the vehicle has to be seen to fail."""
+    """True for the control: with its watchdogs off, the vehicle has to fail."""
     firmware: Literal["mcu", "ardusub"] = "mcu"
-    """What steers the motors."""
+    """Firmware that drives the motors."""
     ends: str = ""
-    """Pattern of the reason for which an autopilot's run must end; empty: it must drive on."""
+    """Pattern of the reason for which an autopilot's run must end; empty: it must continue."""
     limit: float = STOP_WITHIN
-    """By when its thrusters must stand still, from the fault [s]."""
+    """Time after the fault within which its thrusters must stop [s]."""
     handed_over: bool = False
-    """Somebody has the vehicle then, so that our axes must end rather than all thrust."""
+    """True if another pilot takes over, so that only our axes, not all thrust, must end."""
 
 
 RECORDER_TURN = 0.3
-"""Longer than the recorder's thread takes to put on disk what waits; lock-step time runs faster than it [s]."""
+"""Time longer than the recorder's thread needs to write its queue; lock-step time runs faster than it [s]."""
 
 
 def pool_fault(pictures: float = 0.0, **fields: Any) -> Touch:
-    """Sets fields of `pool.faults`; pictures are lost with a probability of their own."""
+    """Return a fault that sets fields of `pool.faults`, and loses pictures with a probability."""
 
     def begin(bench: Bench) -> None:
         vars(bench.pool.faults).update(fields)
@@ -212,7 +219,7 @@ def pool_fault(pictures: float = 0.0, **fields: Any) -> Touch:
 
 
 def stuck_sensors(*names: str) -> Touch:
-    """These fields of the telemetry keep their values, while sequence and clock go on."""
+    """Return a fault in which fields of the telemetry keep their values, while sequence and clock advance."""
 
     def begin(bench: Bench) -> None:
         held: dict[str, Any] = {}
@@ -228,7 +235,7 @@ def stuck_sensors(*names: str) -> Touch:
 
 
 def stuck_pictures(bench: Bench) -> None:
-    """The camera sends its last picture again and again, each with a new number and time."""
+    """Let the camera repeat its last picture, each time with a new number and time."""
     last: list[Picture] = []
 
     def change(pictures: Sequence[Picture]) -> Sequence[Picture]:
@@ -240,24 +247,24 @@ def stuck_pictures(bench: Bench) -> None:
 
 
 def two_publishers(bench: Bench) -> None:
-    """Somebody else commands full thrust, at every step."""
+    """Let a second publisher command full thrust at every step."""
     bridge, now = bench.runtime.bridge, bench.pool.time + bench.wire.shift
     bridge.command(now, np.full_like(bridge.force, 5.0), "intruder", stamp=now)
 
 
 def on_wire(**fields: Any) -> Touch:
-    """Sets fields of the wire."""
+    """Return a fault that sets fields of the wire."""
     return lambda bench: vars(bench.wire).update(fields)
 
 
 def jump_mcu_clock(step: float) -> Touch:
-    """The motor controller's clock jumps by so much [s]; its sequence goes on."""
+    """Return a fault in which the motor controller's clock jumps by a step [s]; its sequence continues."""
     moved = round(1000.0 * step)
     return on_wire(change=lambda telemetry: replace(telemetry, mcu_ms=(telemetry.mcu_ms + moved) % (1 << 32)))
 
 
 def full_disk(bench: Bench) -> None:
-    """The system takes no more bytes of any file that is as long as the record is now."""
+    """Let the system refuse more bytes for files that are as long as the record is now."""
     import resource
 
     time.sleep(RECORDER_TURN)
@@ -277,18 +284,18 @@ UNWATCHED: Mapping[str, Any] = {
     "clock_step": math.inf,
     "need_reading": False,
 }
-"""Bridge settings without watchdogs: the control that shows that they are needed, and that the table can tell."""
+"""Bridge settings without watchdogs, for the control that shows that they are needed and that the table detects it."""
 
 
 def _scenario(title: str, faults: Touch | Fault | Mapping[str, Touch], **more: Any) -> Scenario:
-    """A fault of one kind, or its variants by name; one that stays needs to say no more than how it begins."""
+    """Return a scenario of one fault, or of variants by name; a permanent fault is only a function that begins it."""
     variants = faults if isinstance(faults, Mapping) else {"": faults}
     by_name = {name: x if isinstance(x, Fault) else Fault(begin=x) for name, x in variants.items()}
     return Scenario(title=title, faults=by_name, **more)
 
 
 def _lost(title: str, share: float) -> Scenario:
-    """So much of what passes upwards, downwards, or both and of the pictures."""
+    """Return a scenario in which a fraction of the frames up, down, or both and of the pictures is lost."""
     everything = pool_fault(share, drop=share, drop_commands=share)
     up, down = pool_fault(drop=share), pool_fault(drop_commands=share)
     return _scenario(title, {"up": up, "down": down, "all": everything})
@@ -311,21 +318,21 @@ def _blind(lasts: float) -> Scenario:
 
 
 def reboot(bench: Bench) -> None:
-    """The motor controller, or the autopilot, starts anew."""
+    """Restart the motor controller or the autopilot."""
     bench.pool.reboot()
 
 
 def another_station(
     message: str, *fields: float, every: float = 0.04, times: float = math.inf, system: int = 255
 ) -> Touch:
-    """Another ground station on an autopilot's wire, which sends a message from now on.
+    """Return a fault in which another ground station on an autopilot's wire sends a message.
 
     Args:
         message: Name of the MAVLink message, in lower case.
-        fields: Of the message, in MAVLink's order.
-        every: Between two of them [s].
-        times: How often it is sent.
-        system: Number of that station.
+        fields: Fields of the message, in MAVLink's order.
+        every: Interval [s].
+        times: Number of messages [-].
+        system: System number of that station.
     """
 
     def begin(bench: Bench) -> None:
@@ -349,7 +356,7 @@ def another_station(
 
 
 def _command(number: int, *values: float) -> Touch:
-    """One command of another ground station."""
+    """Return a fault in which another ground station sends one command."""
     return another_station("command_long", 1, 1, number, 0, *values, *[0] * (7 - len(values)), times=1)
 
 
@@ -392,7 +399,7 @@ AUTOPILOT: Mapping[str, Scenario] = {
     "ap-corrupt": _autopilot("all frames spoiled", SILENT, 1.0, pool_fault(corrupt=1.0)),
     "ap-reboot": _autopilot("it restarts", f"restarted|{SILENT}", 0.5, reboot),
 }  # fmt: skip
-"""Those of an emulated ArduSub; what each must end in stands in docs/bluerov2.md."""
+"""Scenarios of an emulated ArduSub; docs/bluerov2.md lists how each must end."""
 
 SCENARIOS: Mapping[str, Scenario] = {
     "loss-0": _scenario("no fault", pool_fault()),
@@ -424,56 +431,56 @@ SCENARIOS: Mapping[str, Scenario] = {
     ),  # fmt: skip
     **AUTOPILOT,
 }
-"""Name -> scenario, in the order of the table; those with processes of their own are `faults.KILLS`."""
+"""Name -> scenario, in the order of the table; scenarios with separate processes are in `KILLS`."""
 
 
 RATE = 60.0
-"""Of the robot's loop [Hz]."""
+"""Rate of the robot's loop [Hz]."""
 MOTIONS = {
     "station": ("0,0,-0.5,0", "0,0,-0.5,0", 8.0, 4.0),
     "moving": ("-1.2,-0.3,-0.5,0", "1.2,0.3,-0.5,60", 3.0, 1.5),
 }
-"""Name -> start, goal, how long after arming the fault comes, and after the first thrust the kill [s]."""
+"""Name -> start, goal, time of the fault after arming, and of the kill after the first thrust [s]."""
 TANK_MOTIONS = {
     "station": ("0,0,-2,0", "0,0,-2,0", 8.0, math.nan),
     "moving": ("-1.2,-0.3,-2,0", "1.2,0.3,-2,30", 5.0, math.nan),
 }
-"""The same in the tank, of vehicles with an autopilot."""
+"""Motions in the tank, of vehicles with an autopilot."""
 WATCHED = 10.0
-"""How long the vehicle is watched after a fault that stays, and at least after one that passes [s]."""
+"""Time of observation after a permanent fault, and shortest one after a temporary fault [s]."""
 AFTERWARDS = 4.0
-"""How long after a fault that has passed [s]."""
+"""Time of observation after the end of a temporary fault [s]."""
 LONGEST = 70.0
-"""Time until the estimator knows where the vehicle is, with the longest fault [s]."""
+"""Longest trial: time until the estimator has a position, and the longest fault [s]."""
 ATTEMPTS = 3
 WATCHED_ALIVE = 8.0
-"""How long the one that lives on is watched after a kill [s]."""
+"""Time of observation of the surviving process after a kill [s]."""
 KILL_WEIGHT = 5.0
-"""Trials in lock-step that take as long as one in real time."""
+"""Number of trials in lock-step that take as long as one in real time."""
 STILL = 0.05
 """Thrust below which a thruster counts as stopped [N]."""
 QUIET = 1.0
-"""Thrusters have stopped if none pushed for the last so much of the fault [s]; less is a pause between two pulses."""
+"""Time without thrust at the end of a fault after which thrusters count as stopped [s]; less is a pause of pulses."""
 LONGEST_LOSS = 1.0
-"""The most that a record may lack at its end [s]."""
+"""Longest time that may be missing at the end of a record [s]."""
 INSET = np.array([0.4, 0.4, 0.2])
-"""The workspace of these trials is so much smaller than the vehicle file's on every side [m]: that of the pool's walls
-could not be left by a vehicle that does everything wrong."""
+"""Distance by which the workspace of these trials is smaller than the vehicle file's on every side, x, y, z [m]: a
+vehicle cannot leave a workspace that ends at the pool's walls."""
 
 
 def inset(lower: Any, upper: Any) -> tuple[Array, Array]:
-    """Lower and upper corner of the workspace in which faults are tried, world frame [m], each (3,)."""
+    """Return lower and upper corner of the workspace in which faults are tried, world frame [m], each (3,)."""
     return np.asarray(lower, float) + INSET, np.asarray(upper, float) - INSET
 
 
 def measured(course: Course, began: float, ended: float, box: tuple[Array, Array] | None) -> dict[str, Any]:
-    """Measures of a course.
+    """Measure a course.
 
     Args:
         course: The truth, to the end of the trial.
-        began: When the fault began, pool's clock [s].
-        ended: When it ended, or the trial [s].
-        box: Lower and upper corner of the workspace; None: where the vehicle is does not count.
+        began: Begin of the fault, pool's clock [s].
+        ended: End of the fault or the trial [s].
+        box: Lower and upper corner of the workspace; None: the vehicle's position does not count.
 
     Returns:
         `thrust_gone_s`, `frames_off_s`: from the fault to the last thrust, and to the last frame that enables motors;
@@ -496,7 +503,7 @@ def measured(course: Course, began: float, ended: float, box: tuple[Array, Array
 
 
 def passed(result: Mapping[str, Any]) -> bool:
-    """Whether a trial fulfils the contract: stopped in time or inside, nothing raised, the record readable."""
+    """Return whether a trial passed: stopped in time or inside, nothing raised, the record readable."""
     stopped_after, margin = result["thrust_gone_s"], result["margin_m"]
     stopped = stopped_after is not None and stopped_after <= STOP_WITHIN
     inside = margin is not None and margin >= 0.0
@@ -506,25 +513,25 @@ def passed(result: Mapping[str, Any]) -> bool:
 
 
 def _last_activity(time: Array, active: NDArray[np.bool_], began: float) -> float | None:
-    """When the last activity ended, counted from `began` [s]; None if it had not ended for `QUIET`."""
+    """Return the end of the last activity, counted from `began` [s]; None if it had not ended for `QUIET`."""
     last = float(time[active][-1]) if active.any() else began
     return None if time[-1] - last < QUIET else last - began
 
 
 @dataclass(frozen=True, kw_only=True)
 class FaultJob(PoolJob):
-    """A fault, in what motion, in which pool, whose vehicle is known: the row is the scenario of the catalogue."""
+    """Fault in a motion and a pool whose vehicle is given; the row is the name of the scenario."""
 
     variant: str
     motion: str
-    """What the vehicle does: station or moving."""
+    """Motion of the vehicle: station or moving."""
     camera: str = "corners"
 
 
 def fault_job(
     scenario: str, variant: str = "", motion: str = "station", vehicle: str = "finsrov", **settings: Any
 ) -> FaultJob:
-    """The job of a variant of a scenario; settings are further fields."""
+    """Return the job of a variant of a scenario; settings are further fields."""
     if scenario in SCENARIOS and SCENARIOS[scenario].firmware == "ardusub":
         settings |= {"firmware": "ardusub", "site": "tank"}
     return FaultJob(
@@ -534,15 +541,15 @@ def fault_job(
 
 
 def play(job: FaultJob, path: Path) -> dict[str, Any]:
-    """Play a job in lock-step.
+    """Run a job in lock-step.
 
     Args:
-        job: Which fault, in what motion, in which pool.
-        path: Not used: the record is read, and gone, before this ends.
+        job: Fault, motion and pool.
+        path: Not used: the record is read and removed before this ends.
 
     Returns:
-        The measures of `measured`; `state` and `reason` of the bridge at the end; `raised`, what broke through, or
-        empty; `record_lost_s` and `record_problem`; `ok`.
+        The measures of `measured`; `state` and `reason` of the bridge at the end; `raised`, the exceptions, or empty;
+        `record_lost_s` and `record_problem`; `ok`.
     """
     start_warp()
     scenario, aided = SCENARIOS[job.row], job.firmware == "ardusub"
@@ -555,7 +562,7 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
     pool = plan.standing(station_of(start), seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "run.mcap"
-        with Recorder(record, vehicle, {"command": "finssim experiment faults"}) as recorder:
+        with Recorder(record, vehicle, {"command": "python -m studies.faults"}) as recorder:
             bridge = Bridge(vehicle, BridgeSettings.of(vehicle, **{**workspace, **scenario.settings}))
             let_in = station_of(start).position[:2]
             reckoned = Perception(vehicle, None, mode="error-state", let_in=let_in) if aided else None
@@ -590,7 +597,7 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
 
 
 def ended_as_named(scenario: Scenario, result: Mapping[str, Any]) -> bool:
-    """Whether an autopilot's trial ended for the reason and in the time that its scenario names, or drove on."""
+    """Return whether an autopilot's trial ended for the reason and in the time of its scenario, or continued."""
     if not scenario.ends:
         return bool(result["state"] == "armed")
     ended_after = result["frames_off_s" if scenario.handed_over else "thrust_gone_s"]
@@ -602,7 +609,7 @@ def ended_as_named(scenario: Scenario, result: Mapping[str, Any]) -> bool:
 
 
 class _Script:
-    """Begins and ends the fault, and remembers how the bridge stood before the run was ended."""
+    """Run of a trial that begins and ends the fault, and stores the bridge's state before the run ends."""
 
     def __init__(self, bench: Bench, fault: Fault, when: float, watched: float) -> None:
         self.fault = fault
@@ -611,11 +618,11 @@ class _Script:
         self.began = math.nan
         """Pool's clock [s]; NaN before."""
         self.steps = 0
-        """Of the robot until the fault."""
+        """Steps of the robot before the fault."""
         self.state = self.reason = ""
 
     def _look(self, runtime: Runtime) -> None:
-        """After every step of the robot."""
+        """Begin, continue or end the fault after a step of the robot."""
         now, fault = self._bench.pool.time, self.fault
         self.state, self.reason = runtime.bridge.state, runtime.bridge.reason
         if math.isnan(self._armed) and not math.isnan(runtime.started):
@@ -631,18 +638,18 @@ class _Script:
             fault.during(self._bench)
 
     def _over(self, runtime: Runtime) -> bool:
-        """Whether the fault and what came of it have been watched for long enough."""
+        """Return whether the fault and its consequences have been observed for long enough."""
         lasts = self.fault.lasts
         watched = 0.0 if math.isinf(lasts) else lasts + AFTERWARDS
         return self._bench.pool.time >= self.began + max(self._watched, watched)
 
     def run(self) -> str:
-        """Run to the end; returns what was raised, in this thread or in another, or nothing."""
+        """Run to the end, and return the exceptions raised in this thread or in another, or an empty text."""
         bench, raised, hook = self._bench, list[str](), threading.excepthook
         threading.excepthook = lambda args: raised.append(f"{args.exc_type.__name__}: {args.exc_value}")
         try:
             run_lockstep(bench.runtime, bench.wire, LONGEST, rate=RATE, show=self._look, until=self._over)
-        except Exception as error:  # what breaks through is what this experiment looks for
+        except Exception as error:  # exceptions are a result of this study
             raised.append(f"{type(error).__name__}: {error}")
         finally:
             bench.recorder.close()
@@ -654,21 +661,21 @@ class _Script:
 
 
 def _record_lost(path: Path, lacks: Callable[[Record], float]) -> dict[str, Any]:
-    """`record_lost_s`: what a record lacks [s], None where it cannot be read; `record_problem`: why, or empty."""
+    """Return `record_lost_s`, the time missing in a record [s] or None, and `record_problem`, why it is unreadable."""
     try:
         with open_record(path) as record:
             return {"record_lost_s": max(lacks(record), 0.0), "record_problem": ""}
-    except Exception as error:  # whatever keeps a reader from reading is the finding
+    except Exception as error:  # any error of a reader is a result
         return {"record_lost_s": None, "record_problem": f"{type(error).__name__}: {error}"}
 
 
 def _record_cut(path: Path, at: float) -> dict[str, Any]:
-    """The same of a record that was cut at a time, robot's clock, which is this machine's [s]."""
+    """Return these for a record that was cut at a time of the robot's clock, which is this machine's [s]."""
     return _record_lost(path, lambda record: at - max(t for t, _, _ in record.sizes()) if record.cut else 0.0)
 
 
 def _first_stop(path: Path, since: float) -> float | None:
-    """When the bridge first stopped enabling the motors after a time, by the record's events, robot's clock [s]."""
+    """Return when the bridge first stopped enabling the motors after a time, from the record, robot's clock [s]."""
     with open_record(path) as record:
         for entry in record.messages(("events",)):
             kind = json.loads(entry.message.data)["kind"]
@@ -677,28 +684,28 @@ def _first_stop(path: Path, since: float) -> float | None:
     return None
 
 
-# Processes of a robot and its virtual pool: started as a person starts them, watched, and killed.
+# Processes of a robot and its virtual pool: started by their commands, observed, and killed.
 
 
 STARTING = 120.0
-"""Longest time that a process takes to start, or to do what is waited for [s]."""
+"""Longest time that a process takes to start, or to reach an awaited state [s]."""
 POLL = 0.005
-"""Between looks [s]."""
+"""Interval of polling [s]."""
 
 
 class ReliabilityError(ValueError):
-    """A trial could not be made: what it needs did not come about."""
+    """A trial could not run, since a process did not reach the state that it needs."""
 
 
 class Process:
-    """A `finssim` command in a process of its own, its words kept in files."""
+    """Process that runs a `finssim` command, with its output in files."""
 
     def __init__(self, arguments: Sequence[str], folder: Path, name: str) -> None:
         """
         Args:
-            arguments: Of the command line, after `finssim`.
-            folder: Takes NAME.out and NAME.err.
-            name: Of its files.
+            arguments: Words of the command line after `finssim`.
+            folder: Directory for NAME.out and NAME.err.
+            name: Name of the files.
         """
         self.name = name
         self._out, self._err = folder / f"{name}.out", folder / f"{name}.err"
@@ -714,26 +721,26 @@ class Process:
 
     @property
     def output(self) -> str:
-        """Standard output so far."""
+        """Standard output until now."""
         return self._out.read_text(encoding="utf-8", errors="replace")
 
     @property
     def complained(self) -> str:
-        """Standard error so far."""
+        """Standard error until now."""
         return self._err.read_text(encoding="utf-8", errors="replace")
 
     @property
     def running(self) -> bool:
-        """Whether it is there."""
+        """True while the process runs."""
         return self._process.poll() is None
 
     def kill(self) -> None:
-        """As `kill -9`."""
+        """End the process by `kill -9`."""
         self._process.kill()
         self._process.wait()
 
     def end(self) -> int:
-        """As Ctrl-C, and not as gently where that is not heard; returns the exit status."""
+        """End the process by Ctrl-C, or by a kill if it does not end, and return its exit status."""
         if self.running:
             interrupt(self._process)
         try:
@@ -746,12 +753,12 @@ class Process:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """A process does not outlive its block."""
+        """End the process with its block."""
         if self.running:
             self.kill()
 
     def broke(self) -> str:
-        """What broke through to the person who started it; nothing if it ended as it should."""
+        """Return the last line of a traceback, or an empty text if the process ended in order."""
         lines = self.complained.splitlines()
         if any(line.startswith("Traceback") for line in lines) or self._process.returncode == 1:
             return f"{self.name}: {lines[-1] if lines else 'exit status 1'}"
@@ -760,46 +767,46 @@ class Process:
 
 @dataclass(frozen=True)
 class Pair:
-    """A robot in a pool, each in a process of its own, and what they write."""
+    """Processes of a robot and its pool, and the files that they write."""
 
     pool: Process
     robot: Process
     port: int
-    """Of the motor controller."""
+    """Port of the motor controller."""
     truth: Path
     record: Path
 
     def next_truth(self) -> float:
-        """Wait until the truth file grows; returns the pool's clock then [s].
+        """Wait until the truth file grows, and return the pool's clock then [s].
 
-        The pool writes half a second at a time, so that the last record is as old as one look takes.
+        The pool writes every half second, so that the last record is as old as one poll takes.
         """
         size = self.truth.stat().st_size
         _await(lambda: self.truth.stat().st_size > size, "the truth file does not grow", self.pool)
         return float(read_truth(self.truth).time[-1])
 
     def turning(self) -> bool:
-        """Whether the thrusters turn, as the truth file tells."""
+        """Return whether the thrusters turn according to the truth file."""
         try:
             return bool(abs(read_truth(self.truth).thrust[-50:]).max(initial=0.0) > STILL)
         except TruthError:
-            return False  # not begun yet
+            return False  # the file is still empty
 
 
 @contextmanager
 def pair(job: FaultJob, folder: Path) -> Iterator[Pair]:
-    """Both at work on free ports, the robot armed and the thrusters turning.
+    """Start both on free ports, and yield when the robot is armed and the thrusters turn.
 
     Args:
-        job: Which vehicle, where to.
-        folder: Takes what they write.
+        job: Vehicle and motion.
+        folder: Directory for their files.
 
     Raises:
-        ReliabilityError: The pool never stood, or the vehicle never drove.
+        ReliabilityError: The pool never started, or the vehicle never drove.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
-        # And the five after it: another attempt is made where they are taken.
+        # The five ports after it are used too: another attempt follows if one is in use.
         port: int = free.getsockname()[1]
     start, goal, *_ = MOTIONS[job.motion]
     truth, record = folder / "truth", folder / "run.mcap"
@@ -814,7 +821,7 @@ def pair(job: FaultJob, folder: Path) -> Iterator[Pair]:
         robot=f"udp://127.0.0.1:{port}", pictures=f"udp://127.0.0.1:{port + 1}",
     )  # fmt: skip
     with Process(world, folder, "pool") as pool:
-        _await(lambda: "pictures: " in pool.output, "the pool never said 'pictures: '", pool)
+        _await(lambda: "pictures: " in pool.output, "the pool never printed 'pictures: '", pool)
         with Process(ours, folder, "robot") as robot:
             both_at_work = Pair(pool, robot, port, truth, record)
             _await(both_at_work.turning, "no thruster ever turned", robot, 20.0 * POLL)
@@ -822,34 +829,33 @@ def pair(job: FaultJob, folder: Path) -> Iterator[Pair]:
 
 
 def _arguments(*arguments: str, **options: Any) -> list[str]:
-    """A command line: words, then options with their values."""
+    """Return a command line: words, then options with their values."""
     return [*arguments, *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
 
 
 def _await(ready: Callable[[], bool], failure: str, process: Process, poll: float = POLL) -> None:
-    """Wait for what a process is to bring about.
+    """Wait until a process reaches a state.
 
     Raises:
-        ReliabilityError: It has ended, or takes too long.
+        ReliabilityError: The process ended, or takes too long.
     """
     deadline = time.monotonic() + STARTING
     while not ready():
         if not process.running or time.monotonic() > deadline:
-            last = (process.complained + process.output).strip()[-300:] or "it said nothing"
+            last = (process.complained + process.output).strip()[-300:] or "no output"
             raise ReliabilityError(f"{failure}: {process.name}: {last}")
         time.sleep(poll)
 
 
 def play_kill(job: FaultJob, path: Path) -> dict[str, Any]:
-    """Play a job whose scenario is one of `KILLS`, in real time; returns what `play` does.
+    """Run a job whose scenario is one of `KILLS`, in real time, and return the result as `play` does.
 
     Args:
-        job: Which fault, in what motion, in which pool.
-        path: Not used, as of `play`.
+        job: Fault, motion and pool.
+        path: Not used, as in `play`.
 
     Raises:
-        ReliabilityError: The vehicle never drove, in three attempts: a machine with too much to do stops it
-            before it is to be killed.
+        ReliabilityError: The vehicle never drove, in three attempts: a busy machine stops it before the kill.
     """
     for attempt in range(ATTEMPTS):
         try:
@@ -864,7 +870,7 @@ def play_kill(job: FaultJob, path: Path) -> dict[str, Any]:
 
 
 def _kill_robot(job: FaultJob, both: Pair) -> dict[str, Any]:
-    """The motor controller is left alone: its own timeout has to stop the motors."""
+    """Kill the robot: the motor controller's own timeout has to stop the motors."""
     began, killed = both.next_truth(), time.monotonic()
     both.robot.kill()
     time.sleep(WATCHED_ALIVE)
@@ -883,10 +889,10 @@ def _kill_robot(job: FaultJob, both: Pair) -> dict[str, Any]:
 
 
 def _kill_pool(job: FaultJob, both: Pair) -> dict[str, Any]:
-    """Vehicle and camera fall silent: the robot has to stop commanding.
+    """Kill the pool, so that vehicle and camera are silent: the robot has to stop commanding.
 
-    What it sends is heard at the pool's port, as soon as the system has given that free, and its bridge has put into
-    the record when it stopped: the later of the two counts.
+    Its frames are received at the pool's port as soon as the system has freed that, and its bridge has recorded when it
+    stopped: the later of the two counts.
     """
     began, killed = both.next_truth(), time.monotonic()
     both.pool.kill()
@@ -899,7 +905,7 @@ def _kill_pool(job: FaultJob, both: Pair) -> dict[str, Any]:
     course = Course(truth.time, truth.position, truth.thrust, np.ones(len(truth.time)))
     return {
         **measured(course, began, began, None),
-        # Of the vehicle nothing is left: the last frame that would turn a motor counts in place of its thrust.
+        # The vehicle is gone: the last frame that would turn a motor counts instead of its thrust.
         "thrust_gone_s": off,
         "frames_off_s": off,
         "state": summary.get("state", "no answer"),
@@ -910,7 +916,7 @@ def _kill_pool(job: FaultJob, both: Pair) -> dict[str, Any]:
 
 
 def _last_enabled(both: Pair, killed: float) -> float | None:
-    """When the last frame that enables motors came after the kill [s]; None if they never ended."""
+    """Return the time of the last frame that enables motors after the kill [s]; None if they never ended."""
     decoder, last = Decoder(MCU), killed
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
         end.bind(("127.0.0.1", both.port))
@@ -920,7 +926,7 @@ def _last_enabled(both: Pair, killed: float) -> float | None:
                 data = end.recv(2048)
             except TimeoutError:
                 continue
-            if any(command.enable for command in decoder.feed(data)):
+            if any(_enables(message) for message in decoder.feed(data)):
                 last = time.monotonic()
     # A process that has ended sends nothing more.
     return last - killed if not both.robot.running or time.monotonic() - last > QUIET else None
@@ -930,7 +936,7 @@ KILLS: dict[str, tuple[str, Callable[..., dict[str, Any]]]] = {
     "kill-robot": ("kill -9 of the robot's process", _kill_robot),
     "kill-pool": ("kill -9 of the pool's process", _kill_pool),
 }
-"""Name -> title and what plays it."""
+"""Name -> title and the function that runs it."""
 
 
 HEADS = (
@@ -953,7 +959,7 @@ NOTE = (
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """A row for each scenario, with the worst of its trials, and a sentence about each trial that failed."""
+    """Return a table with a row for each scenario, the worst of its trials, and a sentence about each failed trial."""
     trials: dict[str, list[Mapping[str, Any]]] = {}
     for trial in result["trials"]:
         trials.setdefault(trial["job"]["row"], []).append(trial)
@@ -988,7 +994,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 
 def _longest(trials: Sequence[Mapping[str, Any]], key: str) -> str:
-    """The longest time, and how many trials went on driving."""
+    """Return the longest time, and the number of trials that continued to drive."""
     times = [t[key] for t in trials if t[key] is not None]
     going = len(trials) - len(times)
     if not times:
@@ -997,7 +1003,7 @@ def _longest(trials: Sequence[Mapping[str, Any]], key: str) -> str:
 
 
 def _complaint(trial: Mapping[str, Any]) -> str:
-    """What was wrong with a trial that failed."""
+    """Return a sentence about a failed trial."""
     job, ended_after, margin = trial["job"], trial["thrust_gone_s"], trial["margin_m"]
     went = "thrust never ended" if ended_after is None else f"thrust ended after {ended_after:.2f} s"
     margin_text = "" if margin is None else f", inside by {margin:.2f} m"
@@ -1028,7 +1034,7 @@ def faults_experiment(
 
     Exit status 3: a trial failed.
 
-    Example: finssim experiment faults --scenarios link-cut,blind-3 --out faults
+    Example: python -m studies.faults --scenarios link-cut,blind-3 --out faults
 
     Args:
         out (DIR): Directory for JSON, Markdown, figures, policies and trials; an interrupted one is continued.
@@ -1042,13 +1048,13 @@ def faults_experiment(
             autopilot, in the tank, with a DVL instead of the camera).
         processes: Parallel trials; one per processor if not given.
         address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto; kills stay here.
-        progress: Told the share that is done and what comes next.
+        progress: Receives the completed fraction and the next trial.
 
     Returns:
-        What `faults.json` holds; `ok`: every trial passed, and every control failed.
+        Content of `faults.json`; `ok`: every trial passed, and every control failed.
 
     Raises:
-        ReliabilityError: An unknown scenario.
+        ReliabilityError: Unknown scenario.
     """
     vehicle = vehicle or {"mcu": "finsrov", "ardusub": "bluerov2_heavy"}[firmware]
     every = [name for name, scenario in SCENARIOS.items() if scenario.firmware == firmware]
@@ -1067,7 +1073,7 @@ def faults_experiment(
     jobs = [job for job in jobs if job.row not in KILLS]
     weight = KILL_WEIGHT * len(kills)
     share, folder, body = weight / (weight + len(jobs)), Path(out), load_vehicle(vehicle)
-    # A kill has the machine to itself.
+    # Kills run one by one, without other trials on the machine.
     results = run_jobs(
         kills, folder / "trials", play_kill, processes=1,
         progress=lambda part, text: progress(share * part, f"kills in real time: {text}"),
@@ -1091,5 +1097,9 @@ def faults_experiment(
 
 
 def row_ok(name: str, trials: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether the trials of a scenario came out as they must: a control has to fail."""
+    """Return whether all trials of a scenario have the required result: a control has to fail."""
     return bool(trials) and all(bool(trial["ok"]) is not _control(name) for trial in trials)
+
+
+if __name__ == "__main__":
+    run_script(Experiment("studies.faults:faults_experiment"))

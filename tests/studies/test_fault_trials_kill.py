@@ -2,7 +2,7 @@
 
 import pytest
 
-from finssim.experiments.faults import fault_job, play_kill
+from studies.faults import fault_job, play_kill
 
 
 @pytest.mark.slow

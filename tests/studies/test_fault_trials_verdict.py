@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.experiments.faults import STOP_WITHIN, Course, inset, measured, passed
+from studies.faults import STOP_WITHIN, Course, inset, measured, passed
 
 BOX = np.array([-1.0, -1.0, -1.0]), np.array([1.0, 1.0, 0.0])
 BEGAN = 2.0

@@ -1,12 +1,11 @@
-"""`finssim experiment faults`, as a person types it, and its table."""
+"""`python -m studies.faults` and its table."""
 
 import json
 
 import pytest
 
-from finssim import boundary
-from finssim.cli import app
-from finssim.experiments.faults import row_ok, tables_of
+from reference.programs import study
+from studies.faults import row_ok, tables_of
 
 GOOD = {
     "ok": True, "thrust_gone_s": 0.4, "frames_off_s": 0.1, "margin_m": 0.2, "state": "fault", "reason": "silence",
@@ -27,13 +26,13 @@ def told(*trials):
 @pytest.mark.slow
 def test_the_command_plays_a_scenario_and_goes_on_where_it_was(capsys, tmp_path):
     """The control, which fails as it must: status 0, a result and a table; again, without playing."""
-    words = ["experiment", "faults", "--scenarios", "control", "--processes", "1", "--out", str(tmp_path)]
-    assert boundary.run(app, [*words, "--json"]) == 0
+    words = ["--scenarios", "control", "--processes", "1", "--out", tmp_path]
+    assert study("faults", *words, "--json") == 0
     result = json.loads(capsys.readouterr().out)
     (only,) = result["trials"]
     assert result["ok"] and not only["ok"] and only["margin_m"] < 0.0
     written = next((tmp_path / "trials").glob("*.json")).stat().st_mtime_ns
-    assert boundary.run(app, words) == 0
+    assert study("faults", *words) == 0
     assert "control" in capsys.readouterr().out
     assert next((tmp_path / "trials").glob("*.json")).stat().st_mtime_ns == written
     assert "fails, as it must" in (tmp_path / "faults.md").read_text()
@@ -41,7 +40,7 @@ def test_the_command_plays_a_scenario_and_goes_on_where_it_was(capsys, tmp_path)
 
 def test_an_unknown_scenario_is_refused(capsys, tmp_path):
     """With the names of those there are."""
-    assert boundary.run(app, ["experiment", "faults", "--scenarios", "flood", "--out", str(tmp_path)]) == 2
+    assert study("faults", "--scenarios", "flood", "--out", tmp_path) == 2
     assert "unknown scenario 'flood'; available: kill-robot" in capsys.readouterr().err
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from finssim.experiments.faults import AUTOPILOT, SCENARIOS, fault_job, play
+from studies.faults import AUTOPILOT, SCENARIOS, fault_job, play
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""`finssim experiment anatomy`: how wrong may one thing about the vehicle be until a controller no longer holds?"""
+"""Largest error of one parameter that a controller tolerates: `python -m studies.anatomy --out anatomy`."""
 
 from __future__ import annotations
 
@@ -10,39 +10,41 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from finssim.experiments.campaign import Progress, check_choices, run_jobs, write_json
+from finssim.command_line import Experiment, run_script
+from finssim.experiments.campaign import check_choices, run_jobs, write_json
 from finssim.experiments.evaluate import Job, play
 from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
 from finssim.experiments.plants import Plant, load_plant
 from finssim.experiments.statistics import with_interval
 from finssim.experiments.tables import Columns, Table, cells
 from finssim.experiments.transfer import T1, controllers_of
+from finssim.progress import Progress
 from finssim.provenance import provenance
 from finssim.vehicles import load_vehicle
 
 TRAINING_SHARE = 0.3
-"""Of the progress bar."""
+"""Fraction of the progress bar for training."""
 HELD = 0.9
-"""A row tolerates what leaves it this share of its trials, and everything milder."""
+"""Fraction of its trials that a row must hold at an amount, and at all smaller ones, to tolerate it."""
 FIGURES: Columns = {
     "success": ("held", ".3f"),
     "e_p_m": ("e_p, median [mm]", ".2f", 1000.0),
     "t_s_s": ("t_s, mean [s]", ".2f"),
 }
 LEAST = 0.1
-"""Errors below this are drawn as this [mm]."""
+"""Smallest error in the figure [mm]; smaller ones are drawn at it."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """One thing that is wrong, by growing amounts."""
+    """Error of one parameter, in increasing amounts."""
 
     title: str
     unit: str
     amounts: tuple[float, ...]
-    """From none on."""
+    """Amounts, the first of which is zero."""
     plant: Callable[[float], Mapping[str, Any]]
-    """Amount -> the plant's keys."""
+    """Amount -> keys of the plant."""
 
 
 def _ranges(**entries: Any) -> dict[str, Any]:
@@ -80,14 +82,14 @@ CAUSES: Mapping[str, Cause] = {
     "latency": Cause("state known late by", "s", (0.0, 0.1, 0.2, 0.3, 0.4, 0.6),
                      lambda a: {"noise": {"delay": a}} if a else {}),
 }  # fmt: skip
-"""What may be wrong, by name."""
+"""Name -> cause."""
 ROWS = (
     "calibrated", "calibrated-dr", "no-lag", "mesh", "simplified", "calibrated-integral", "calibrated-pool",
     "pid-paper", "pid",
 )  # fmt: skip
-"""Rows of station keeping that differ in who steers."""
+"""Rows of station keeping with different controllers."""
 FOREIGN = "foreign"
-"""The plant in which all of it is wrong at once, another in each trial."""
+"""Plant with errors of all parameters together, drawn for each trial."""
 
 
 def anatomy(
@@ -104,9 +106,9 @@ def anatomy(
     address: str | None = None,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Test controllers of T1 in plants with one parameter wrong by increasing amounts, and with all wrong at once.
+    """Test controllers of T1 in plants with one parameter wrong by increasing amounts, and with all of them wrong.
 
-    Example: finssim experiment anatomy --causes lag,current --rows calibrated,pid --seeds 1 --out anatomy
+    Example: python -m studies.anatomy --causes lag,current --rows calibrated,pid --seeds 1 --out anatomy
 
     Args:
         out (DIR): Directory for JSON, Markdown, figure, policies and trials; an interrupted one is continued.
@@ -120,7 +122,7 @@ def anatomy(
         steps: Control steps of the training, summed over all worlds; the task's default if not given.
         processes: Parallel plants; one per processor if not given.
         address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto.
-        progress: Told the share that is done and what comes next.
+        progress: Receives the completed fraction and the next trial.
 
     Returns:
         `causes`: cause -> row -> figures at every amount; `foreign`: row -> figures; the jobs are in the directory.
@@ -177,7 +179,7 @@ def anatomy(
 
 
 def _figures(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Success, median error and mean settling time over all trials, with intervals from redrawing trials."""
+    """Return success, median error and mean settling time over all trials, with intervals from redrawn trials."""
     out: dict[str, Any] = {}
     for key, statistic in (("success", np.mean), ("e_p_m", np.median), ("t_s_s", np.mean)):
         values = (trial[key] for result in results for trial in result["per_trial"] if trial[key] is not None)
@@ -186,7 +188,7 @@ def _figures(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def tolerated(cause: Mapping[str, Any], row: str) -> float | None:
-    """The largest amount at which a row still holds `HELD` of its trials, and at all smaller ones; None: not even 0."""
+    """Return the amount up to which a row holds `HELD` of its trials at every amount; None: not even at 0."""
     largest = None
     for amount, figures in zip(cause["amounts"], cause["rows"][row], strict=True):
         if figures["success"]["value"] < HELD:
@@ -196,7 +198,7 @@ def tolerated(cause: Mapping[str, Any], row: str) -> float | None:
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """What each row tolerates of each cause; and the plant in which all is wrong."""
+    """Return a table of the amounts that each row tolerates, and one of the plant with all errors."""
     rows, vehicle = result["rows"], result["vehicle"]
     about = f"{vehicle['name']} {vehicle['sha256'][:12]}, seeds: {len(result['seeds'])}, setpoints in turn"
     lines = []
@@ -222,7 +224,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
-    """Error against the amount, a panel for each cause and a line for each row; hollow where too few trials hold."""
+    """Draw error over amount, a panel for each cause and a line for each row; hollow where too few trials hold."""
     causes, rows = result["causes"], result["rows"]
     across = min(4, len(causes))
     down = math.ceil(len(causes) / across)
@@ -250,3 +252,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
         axes.set_ylabel("e_p [mm]", fontsize=8)
     legend_below(figure, panels[0], 4)
     save_figure(figure, path)
+
+
+if __name__ == "__main__":
+    run_script(Experiment("studies.anatomy:anatomy"))

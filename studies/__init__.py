@@ -1,0 +1,1 @@
+"""Studies of this repository, run from a checkout: `python -m studies.faults --help`."""
