@@ -9,7 +9,16 @@ for variable in ("CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVER
     os.environ.pop(variable, None)
 os.environ["PLATFORM_ROS"] = "dds"
 
-WIRE = ("as_strict_as_rclpy", "graph_queries", "shim", "tf2", "topics", "two_processes", "wire_settings")
+WIRE = (
+    "as_strict_as_rclpy",
+    "graph_queries",
+    "shim",
+    "tf2",
+    "topics",
+    "two_processes",
+    "wire_settings",
+    "wire_types",
+)
 """Tests that need it."""
 
 # Cyclone's wheels end at Python 3.11; elsewhere the wire is that of a sourced ROS 2.

@@ -11,13 +11,14 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, NamedTuple
 
-from cyclonedds._clayer import ddspy_take
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
 from cyclonedds.core import (
     DDSException,
     DDSStatus,
+    Entity,
     GuardCondition,
     InstanceState,
     ReadCondition,
@@ -190,12 +191,93 @@ def ros_type_name(name: str) -> str:
     return f"{parts[0]}/{parts[1]}/{parts[3].removesuffix('_')}"
 
 
+# Functions of Cyclone's library that the binding lacks. Those of `_c` let other threads run meanwhile: a reliable
+# writer waits for its readers. Those of `_quick` wait for nothing and keep the interpreter's lock.
+
+
+_c = DDS._dll_handle
+_quick = ctypes.PyDLL(_c._name, handle=_c._handle)
+
+
+def _function(library: Any, name: str, result: Any, *arguments: Any) -> Any:
+    function = library[name]
+    function.restype, function.argtypes = result, arguments
+    return function
+
+
+_Handle, _Pointer, _Size = ctypes.c_int32, ctypes.c_void_p, ctypes.c_size_t
+_create_domain = _function(_c, "dds_create_domain", _Handle, ctypes.c_uint32, ctypes.c_char_p)
+_create_topic = _function(
+    _c, "dds_create_topic", _Handle, _Handle, _Pointer, ctypes.c_char_p, _Pointer, _Pointer
+)
+_get_typeinfo = _function(_c, "dds_get_typeinfo", _Handle, _Handle, _Pointer)
+_free_typeinfo = _function(_c, "dds_free_typeinfo", _Handle, _Pointer)
+_describe = _function(
+    _c, "dds_create_topic_descriptor", _Handle, ctypes.c_int, _Handle, _Pointer, ctypes.c_int64, _Pointer
+)
+_get_sertype = _function(_quick, "dds_get_entity_sertype", _Handle, _Handle, _Pointer)
+_keep_sertype = _function(_quick, "ddsi_sertype_ref", _Pointer, _Pointer)
+_sample_of = _function(
+    _quick, "ddsi_serdata_from_ser_iov", _Pointer, _Pointer, ctypes.c_int, _Size, _Pointer, _Size
+)
+_send = _function(_c, "dds_writecdr", _Handle, _Handle, _Pointer)
+_take = _function(
+    _quick, "dds_takecdr", _Handle, _Handle, _Pointer, ctypes.c_uint32, _Pointer, ctypes.c_uint32
+)
+_size_of = _function(_quick, "ddsi_serdata_size", ctypes.c_uint32, _Pointer)
+_lend = _function(_quick, "ddsi_serdata_to_ser_ref", _Pointer, _Pointer, _Size, _Size, _Pointer)
+_give_back = _function(_quick, "ddsi_serdata_to_ser_unref", None, _Pointer, _Pointer)
+_release = _function(_quick, "ddsi_serdata_unref", None, _Pointer)
+_count_readers = _function(_c, "dds_get_matched_subscriptions", _Handle, _Handle, _Pointer, _Size)
+
+LOCAL_DOMAIN = 1
+"""Cyclone's word for types that are known here."""
+
+DATA = 2
+"""Cyclone's word for a whole sample."""
+
+
+def _checked(code: int, what: str) -> int:
+    if code < 0:
+        raise DDSException(code, f"Occurred while {what}")
+    return code
+
+
+def _domain_of(number: int, xml: str) -> Domain:
+    domain = Domain.__new__(Domain)  # its own __init__ takes ASCII alone
+    Entity.__init__(domain, _create_domain(number, os.fsencode(xml)))
+    return domain
+
+
+SILENT = "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
+"""Configuration of a domain without a network."""
+
+SILENT_DOMAIN = MAX_DOMAIN + 1
+"""Number that no ROS domain has."""
+
+_making = threading.Lock()
+"""Held while a domain or a type is made."""
+
+
 class DdsTypes:
-    """Cyclone's types of a codec's messages, made when first asked for."""
+    """Cyclone's types of a codec's messages, made when first asked for and kept for the process."""
 
     def __init__(self, codec: Codec) -> None:
         self._codec = codec
         self._made: dict[tuple[str, bool], Any] = {}
+        self._described: dict[tuple[str, bool], ctypes.c_void_p] = {}
+
+    def descriptor_of(self, name: str, *, service: bool = False) -> ctypes.c_void_p:
+        """Return what Cyclone's library creates a topic from; arguments as of `type_of`.
+
+        Cyclone 11.0.1 reads its list of types without a lock while it translates a type, and crashes where another
+        of its threads changes that list: one that forgets a participant that has left, or one that discovers a peer.
+        The types are translated in a domain that has neither.
+        """
+        with _making:
+            if (name, service) not in self._described:
+                self._described[name, service] = _translate(self.type_of(name, service=service))
+            return self._described[name, service]
 
     def type_of(self, name: str, *, service: bool = False) -> Any:
         """The type of a message; that of a service's half begins with the client's number and the request's."""
@@ -219,6 +301,35 @@ class DdsTypes:
         return idl.sequence[self._field(*inner), count] if count else idl.sequence[self._field(*inner)]
 
 
+@cache
+def types_of(codec: Codec) -> DdsTypes:
+    """Return the types of a codec."""
+    return DdsTypes(codec)
+
+
+def _translate(dds_type: Any) -> ctypes.c_void_p:
+    domain = _domain_of(SILENT_DOMAIN, SILENT)
+    try:
+        participant = DomainParticipant(SILENT_DOMAIN)
+        topic = Topic(participant, "type", dds_type)
+        info, descriptor = ctypes.c_void_p(), ctypes.c_void_p()
+        _checked(_get_typeinfo(topic._ref, ctypes.byref(info)), "describing a type")
+        code = _describe(LOCAL_DOMAIN, participant._ref, info, 0, ctypes.byref(descriptor))
+        _free_typeinfo(info)
+        _checked(code, "translating a type")
+        return descriptor
+    finally:
+        domain.__del__()
+
+
+class _Topic(Topic):
+    """A topic of the library's own type, which no thread needs the interpreter for."""
+
+    def __init__(self, participant: DomainParticipant, name: str, descriptor: ctypes.c_void_p) -> None:
+        Entity.__init__(self, _create_topic(participant._ref, descriptor, name.encode(), None, None))
+        self.data_type, self._keepalive_entities = None, [participant]
+
+
 # Writers and readers of bytes on one DDS topic.
 
 
@@ -227,16 +338,43 @@ ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 
 class _Blob(ctypes.Structure):
     _fields_ = [("data", ctypes.c_void_p), ("size", ctypes.c_size_t)]
+    if os.name == "nt":
+        _fields_ = [("size", ctypes.c_ulong), ("data", ctypes.c_void_p)]
 
 
-# Through ctypes, which gives up the interpreter's lock while a reliable writer waits for its readers; the binding's
-# own write would hold it and stop every thread.
-_dds_write = DDS._dll_handle.dds_write
-_dds_write.argtypes, _dds_write.restype = [ctypes.c_int32, ctypes.c_void_p], ctypes.c_int32
+class SampleInfo(ctypes.Structure):
+    """What DDS says of a sample."""
 
-_count_readers = DDS._dll_handle.dds_get_matched_subscriptions
-_count_readers.argtypes = [ctypes.c_int32, ctypes.c_void_p, ctypes.c_size_t]
-_count_readers.restype = ctypes.c_int32
+    _fields_ = [
+        *((f"{name}_state", ctypes.c_int) for name in ("sample", "view", "instance")),
+        ("valid_data", ctypes.c_bool),
+        ("source_timestamp", ctypes.c_int64),
+        ("instance_handle", ctypes.c_uint64),
+        ("publication_handle", ctypes.c_uint64),
+        *((f"{name}_generation_count", ctypes.c_uint32) for name in ("disposed", "no_writers")),
+        *((f"{name}_rank", ctypes.c_uint32) for name in ("sample", "generation", "absolute_generation")),
+    ]
+
+
+def _bytes_of(sample: ctypes.c_void_p) -> bytes:
+    blob, size = _Blob(), _size_of(sample)
+    lent = _lend(sample, 0, size, ctypes.byref(blob))
+    data = ctypes.string_at(blob.data, size)
+    _give_back(lent, ctypes.byref(blob))
+    return data
+
+
+_kept: set[int] = set()
+"""Types of writers, kept for the process: a thread may still write while another leaves the wire."""
+
+
+def _type_of(writer: DataWriter) -> ctypes.c_void_p:
+    sertype = ctypes.c_void_p()
+    _checked(_get_sertype(writer._ref, ctypes.byref(sertype)), "reading the type of a writer")
+    if sertype.value is not None and sertype.value not in _kept:
+        _kept.add(sertype.value)
+        _keep_sertype(sertype)
+    return sertype
 
 
 class Endpoint:
@@ -269,6 +407,7 @@ class Writer(Endpoint):
         self.entity = DataWriter(publisher, topic, qos)
         self.entity.set_status_mask(DDSStatus.OfferedIncompatibleQos)
         self.topic, self.gid = topic.name, self.entity.guid.bytes
+        self._type = _type_of(self.entity)
 
     def write(self, buffer: bytearray) -> bool:
         """Send one sample, a multiple of four bytes; False if slow readers left no room for it within 100 ms.
@@ -280,7 +419,10 @@ class Writer(Endpoint):
             return True  # nobody would ever see it, and Cyclone copies even then
         view = (ctypes.c_char * 0).from_buffer(buffer)
         blob = _Blob(ctypes.addressof(view), len(buffer))
-        code = _dds_write(self.entity._ref, ctypes.byref(blob))
+        sample = _sample_of(self._type, DATA, 1, ctypes.byref(blob), len(buffer))
+        if not sample:
+            raise DDSException(DDSException.DDS_RETCODE_BAD_PARAMETER, f"while encoding for {self.topic}")
+        code = _send(self.entity._ref, sample)
         if code == DDSException.DDS_RETCODE_TIMEOUT:
             return False
         if code:
@@ -316,11 +458,12 @@ class Reader(Endpoint):
     def take(self) -> tuple[bytes, Any] | None:
         """The oldest waiting sample, and what DDS says of it; None without one."""
         while True:
-            samples = ddspy_take(self.entity._ref, ANY, 1)
-            if isinstance(samples, int) or not samples:
+            sample, info = ctypes.c_void_p(), SampleInfo()
+            if _take(self.entity._ref, ctypes.byref(sample), 1, ctypes.byref(info), ANY) <= 0:
                 return None
-            data, info = samples[0]
-            if info.valid_data:  # else only the news that a writer left
+            data = _bytes_of(sample) if info.valid_data else None
+            _release(sample)
+            if data is not None:  # else only the news that a writer left
                 return data, info
 
     def close(self) -> None:
@@ -366,7 +509,8 @@ FOREVER = 2**63 - 1
 NODE_LIST = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 
 _domains: dict[int, Domain] = {}
-"""Domains of this process that were configured here: Cyclone reads a domain's configuration once."""
+"""Domains of this process, kept until its end: Cyclone reads a domain's configuration once, and samples and types that
+are still in use lie in its memory."""
 
 
 @dataclass
@@ -425,15 +569,15 @@ class Participant:
     def __init__(self, settings: WireSettings, enclave: str = "/") -> None:
         self.settings = settings
         self.codec: Codec = codec_of(settings.distro.name)
-        if settings.xml is not None and settings.domain not in _domains:
-            _domains[settings.domain] = Domain(settings.domain, settings.xml)
+        with _making:
+            if settings.domain not in _domains:
+                xml = os.environ.get("CYCLONEDDS_URI", "") if settings.xml is None else settings.xml
+                _domains[settings.domain] = _domain_of(settings.domain, xml)
         user_data = Qos(Policy.Userdata(f"enclave={enclave};".encode()))
         self.entity = DomainParticipant(settings.domain, qos=user_data)
         self.gid: bytes = self.entity.guid.bytes
         self._publisher, self._subscriber = Publisher(self.entity), Subscriber(self.entity)
-        self._types = DdsTypes(
-            self.codec
-        )  # its own: Cyclone crashes on a type that an earlier participant registered
+        self._types = types_of(self.codec)
         self._topics: dict[tuple[str, str], Topic] = {}
         self._builtin: dict[str, Any] = {}
         self._lock = threading.Lock()
@@ -509,7 +653,8 @@ class Participant:
     def _topic(self, topic: str, name: str, *, service: bool = False) -> Topic:
         self.codec.message(name)
         if (topic, name) not in self._topics:
-            self._topics[topic, name] = Topic(self.entity, topic, self._types.type_of(name, service=service))
+            descriptor = self._types.descriptor_of(name, service=service)
+            self._topics[topic, name] = _Topic(self.entity, topic, descriptor)
         return self._topics[topic, name]
 
     def _type_hash(self, name: str) -> bytes:
