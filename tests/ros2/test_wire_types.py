@@ -8,6 +8,7 @@ import pytest
 from cyclonedds import topic as binding
 from cyclonedds.core import DDSException
 
+from finssim.ros2 import wire
 from finssim.ros2.codec import codec_of
 from finssim.ros2.wire import Participant, Quality, wire_settings
 
@@ -108,3 +109,19 @@ def test_who_still_writes_and_reads_after_the_end_is_refused(participant):
     with pytest.raises(DDSException):
         writer.write(word)
     assert reader.take() is None
+
+
+def test_a_peer_that_comes_while_the_peers_are_counted_is_counted(participant, monkeypatch):
+    """As nodes start at once on a busy machine: a node that asked for its graph then ended in IndexError."""
+    name, quality, late, matched = "std_msgs/msg/String", Quality(), [], wire._matched_writers
+    first = participant.writer("rt/word", name, quality)
+    reader = participant.reader("rt/word", name, quality)
+
+    def and_then_another(*given):
+        count = matched(*given)
+        if not late:
+            late.append(participant.writer("rt/word", name, quality))
+        return count
+
+    monkeypatch.setattr(wire, "_matched_writers", and_then_another)
+    assert {peer.key.bytes for peer in reader.peers()} == {first.gid, late[0].gid}

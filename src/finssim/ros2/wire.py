@@ -228,7 +228,8 @@ _size_of = _function(_quick, "ddsi_serdata_size", ctypes.c_uint32, _Pointer)
 _lend = _function(_quick, "ddsi_serdata_to_ser_ref", _Pointer, _Pointer, _Size, _Size, _Pointer)
 _give_back = _function(_quick, "ddsi_serdata_to_ser_unref", None, _Pointer, _Pointer)
 _release = _function(_quick, "ddsi_serdata_unref", None, _Pointer)
-_count_readers = _function(_c, "dds_get_matched_subscriptions", _Handle, _Handle, _Pointer, _Size)
+_matched_readers = _function(_c, "dds_get_matched_subscriptions", _Handle, _Handle, _Pointer, _Size)
+_matched_writers = _function(_c, "dds_get_matched_publications", _Handle, _Handle, _Pointer, _Size)
 
 LOCAL_DOMAIN = 1
 """Cyclone's word for types that are known here."""
@@ -377,6 +378,14 @@ def _type_of(writer: DataWriter) -> ctypes.c_void_p:
     return sertype
 
 
+def _handles(matched: Callable[[int, Any, int], int], endpoint: int) -> list[int]:
+    """Handles of the peers of an endpoint; one may come while they are counted, where the binding fails."""
+    room, handles = 0, None
+    while (count := _checked(matched(endpoint, handles, room), "counting peers")) > room:
+        room, handles = count, (ctypes.c_uint64 * count)()
+    return list(handles or ())[:count]
+
+
 class Endpoint:
     """What writers and readers share."""
 
@@ -431,13 +440,12 @@ class Writer(Endpoint):
 
     def matched(self) -> int:
         """How many readers are known to get it."""
-        return int(_count_readers(self.entity._ref, None, 0))
+        return int(_matched_readers(self.entity._ref, None, 0))
 
     def peers(self) -> list[Any]:
         """What is known of those readers."""
-        matched = (
-            self.entity.get_matched_subscription_data(h) for h in self.entity.get_matched_subscriptions()
-        )
+        handles = _handles(_matched_readers, self.entity._ref)
+        matched = (self.entity.get_matched_subscription_data(h) for h in handles)
         return [peer for peer in matched if peer is not None]
 
     def incompatible(self) -> str:
@@ -486,13 +494,12 @@ class Reader(Endpoint):
 
     def matched(self) -> int:
         """How many writers are known."""
-        return len(self.entity.get_matched_publications())
+        return _checked(_matched_writers(self.entity._ref, None, 0), "counting peers")
 
     def peers(self) -> list[Any]:
         """What is known of those writers."""
-        matched = (
-            self.entity.get_matched_publication_data(h) for h in self.entity.get_matched_publications()
-        )
+        handles = _handles(_matched_writers, self.entity._ref)
+        matched = (self.entity.get_matched_publication_data(h) for h in handles)
         return [peer for peer in matched if peer is not None]
 
     def incompatible(self) -> str:
