@@ -31,7 +31,7 @@ class Fields:
         self.where = label
 
     def has(self, key: str) -> bool:
-        """Whether the key is given, and not null."""
+        """Return whether the key has a value that is not null."""
         return self._values.get(key) is not None
 
     def given(self, key: str) -> bool:
@@ -39,13 +39,13 @@ class Fields:
         return key in self._values
 
     def take(self, key: str, default: Any = None) -> Any:
-        """The value as it stands, or the default."""
+        """Return the value as it is, or the default."""
         self._known.append(key)
         value = self._values.get(key)
         return default if value is None else value
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A finite number.
+        """Return a finite number.
 
         Raises:
             LocalizationError: It is missing without a default, or not a finite number.
@@ -56,7 +56,7 @@ class Fields:
         return self._finite(key, value)
 
     def numbers(self, key: str, count: int | None, default: Any = None) -> tuple[float, ...]:
-        """A list of finite numbers, of that many where `count` is given.
+        """Return a list of finite numbers, of that many where `count` is given.
 
         Raises:
             LocalizationError: It is missing without a default, of another length, or holds something else.
@@ -69,7 +69,7 @@ class Fields:
         return tuple(self._finite(key, item) for item in value)
 
     def word(self, key: str, default: str | None = None) -> str:
-        """A word.
+        """Return a word.
 
         Raises:
             LocalizationError: It is missing without a default, or is not a word.
@@ -80,7 +80,7 @@ class Fields:
         return value
 
     def section(self, key: str) -> Fields:
-        """A mapping inside this one; empty where it is not given.
+        """Return a mapping inside this one; empty where it is not given.
 
         Raises:
             LocalizationError: It is no mapping.
@@ -91,7 +91,7 @@ class Fields:
         return Fields(value, f"{self.where}: {key}")
 
     def finish(self) -> None:
-        """Refuse keys that nobody asked for.
+        """Refuse keys that were not taken.
 
         Raises:
             LocalizationError: There is one.
@@ -101,7 +101,7 @@ class Fields:
                 raise self.error(f"unknown key '{key}'; known keys: {', '.join(self._known)}")
 
     def error(self, sentence: str) -> LocalizationError:
-        """The error that says so of this section."""
+        """Return the error for a sentence about this section."""
         return LocalizationError(f"{self.where}: {sentence}")
 
     def _finite(self, key: str, value: Any) -> float:
@@ -159,11 +159,11 @@ _PART_OF_PICTURE = ("binning_x", "binning_y", "roi")
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a camera file holds."""
+    """Content of a camera file."""
 
     lens: Lens
     record: Mapping[str, Any] = field(default_factory=dict)
-    """How it was found: estimates, intervals, provenance; empty for a foreign file."""
+    """Record of the calibration: estimates, intervals, provenance; empty for another program's file."""
 
 
 def load_camera(path: str | Path) -> CameraFile:
@@ -198,7 +198,7 @@ def write_camera(path: str | Path, lens: Lens, record: Mapping[str, Any]) -> Non
     Args:
         path: The file (.yaml).
         lens: The lens.
-        record: How it was found, as plain values.
+        record: Record of the calibration, as plain values.
 
     Raises:
         OutputError: The file cannot be written.
@@ -210,7 +210,7 @@ def write_camera(path: str | Path, lens: Lens, record: Mapping[str, Any]) -> Non
 
 
 def lens_values(lens: Lens) -> dict[str, Any]:
-    """A lens as plain values, ready for YAML."""
+    """Return a lens as plain values, ready for YAML."""
     return {
         "model": lens.model,
         "width": lens.width,
@@ -224,7 +224,7 @@ def lens_values(lens: Lens) -> dict[str, Any]:
 
 
 def lens_from(values: Mapping[Any, Any], label: str) -> Lens:
-    """The lens of a `lens:` section.
+    """Return the lens of a `lens:` section.
 
     Args:
         values: The section.
@@ -271,7 +271,7 @@ def _lens(arguments: dict[str, Any], label: str) -> Lens:
 
 
 def _standard(text: str) -> str:
-    """OpenCV's dialect as YAML: its version line and its tags away."""
+    """Return OpenCV's dialect as YAML, without its version line and tags."""
     text = re.sub(r"\A\ufeff?%YAML[: ]1\.0[^\n]*\n", "", text)
     return re.sub(r"!!opencv-[\w-]+", "", text)
 
@@ -332,7 +332,7 @@ def _refuse_strange(tree: Mapping[Any, Any], known: set[str], label: str) -> Non
         if key in _PART_OF_PICTURE:
             if any(x not in (0, 1) for x in _numbers_in(value)):
                 raise LocalizationError(
-                    f"{label}: {key} is {value!r}, expected the whole picture, every pixel: calibrate without it"
+                    f"{label}: {key} is {value!r}, expected every pixel of the full image: calibrate without it"
                 )
         elif key not in known and any(_numbers_in(value)):
             raise LocalizationError(

@@ -100,7 +100,7 @@ def test_nothing_in_common_is_refused(tmp_path):
 
 def test_one_bad_pixel_refuses_the_file_and_an_empty_one_its_row(tmp_path):
     survey = read_survey(written(tmp_path, "s.csv", "id,x,y,z\na,0,0,0\nb,1,0,0\n"))
-    with pytest.raises(CalibrationError, match="p.csv: line 3: v is 'abc'.*whole file is refused"):
+    with pytest.raises(CalibrationError, match="p.csv: line 3: v is 'abc'.*file is refused"):
         observe([written(tmp_path, "p.csv", "id,u,v\na,1,2\nb,1,abc\n")], survey)
     seen = observe([written(tmp_path, "q.csv", "id,u,v\na,1,2\nb,1,\n")], survey)
     assert len(seen) == 1 and [

@@ -114,7 +114,7 @@ def test_a_grid_of_tags(tmp_path):
         ("surface: {}\ntags: {family: 99h9}\n", "unknown tag family '99h9'"),
         ("surface: {}\nunit: mile\n", "unknown unit 'mile'; available: m"),
         ("surface: {}\nfolds: 1\n", "folds is 1, expected at least 2"),
-        ("surface: {}\nfolds: 2.5\n", "folds is 2.5, expected a whole number"),
+        ("surface: {}\nfolds: 2.5\n", "folds is 2.5, expected an integer"),
         (f"surface: {{}}\npoints: points.csv\ngrid: {GRID}\n", "points and grid are given"),
         (f"surface: {{}}\ngrid: {GRID.replace('edge: 0.1', 'edge: 0.5')}\n", "spacing above the edge"),
         ("", "found nothing"),

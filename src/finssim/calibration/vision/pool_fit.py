@@ -86,8 +86,8 @@ ENOUGH = 500
 """Rows from which the search begins; the fit takes all."""
 
 ANYWHERE = 0.5
-"""Depth of the water over the distance of the camera, where nobody measured it, and the standard deviation of that: so
-weak that it only decides where the pixels say nothing."""
+"""Prior of the water's depth over the camera's distance where it was not measured, and its standard deviation: so weak
+that it matters only where the pixels contain no information."""
 
 MIRRORED = 0.6
 """Residual of the mirror image over that of the best model, below which the survey's frame is left-handed."""
@@ -251,7 +251,7 @@ def plane_starts(
 
 @dataclass(frozen=True)
 class BestStart:
-    """Where the search ended."""
+    """End of the search."""
 
     model: PoolModel
     pinhole: PoolModel
@@ -416,10 +416,10 @@ NOISE_ROWS = 2000
 """Rows from which the size of the errors is estimated."""
 
 STATED_SURVEY = 0.35
-"""Standard deviation of the logarithm of the survey's error: what is said of it is right within about a third."""
+"""Standard deviation of the logarithm of the survey's error: the stated error is right within about a third."""
 
 STATED_PIXEL, USUAL_PIXEL = 1.2, 0.4
-"""The same of the pixel's error, and its usual size [px]."""
+"""Standard deviation of the logarithm of a pixel's error, and its usual size [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -427,16 +427,16 @@ class Noise:
     """Standard errors."""
 
     pixel: float
-    """Of each image coordinate [px]."""
+    """Standard error of each image coordinate [px]."""
     survey: float = 0.002
-    """Of each coordinate of a location, where the survey does not give its own [m]."""
+    """Standard error of each coordinate of a location, where the survey does not give its own [m]."""
     survey_yaw: float = 0.0087
-    """Of the direction in which a tag was laid [rad]."""
+    """Standard error of a tag's direction [rad]."""
     scale: float = 1.0
-    """Of all survey errors, as the residuals tell it."""
+    """Factor on all survey errors, estimated from the residuals [-]."""
 
     def survey_modes(self, J_point: Array, observed: Observations) -> Array:
-        """What one standard error of a location's x, y, z and of a tag's direction does to each pixel [px], (N, 2, 4).
+        """Return the change of pixels by one standard error of a place's x, y, z and of a tag's turn [px], (N, 2, 4).
 
         Args:
             J_point: Derivative of the pixel by the point, (N, 2, 3).
@@ -506,7 +506,7 @@ def estimate_noise(
         prior: Information of the priors on the parameters, (P, P).
         fixed_pixel: The pixel's error is given and stays.
     """
-    if len(observed) > NOISE_ROWS:  # two numbers need no more; whole locations, evenly
+    if len(observed) > NOISE_ROWS:  # enough for two numbers; complete locations, evenly
         every = int(np.ceil(len(observed) / NOISE_ROWS))
         rows = np.flatnonzero(observed.location % every == 0)
         if len(rows) > NOISE_ROWS // 4:
@@ -564,12 +564,12 @@ class Refined:
     used: NDArray[np.bool_]
     """Rows that are not outliers, (N,)."""
     whiten: Whitener
-    """Of the rows used."""
+    """Whitening of the rows used."""
     active: NDArray[np.bool_]
     """Parameters fitted, (18,)."""
     prior: Prior
     covariance: Array
-    """Of all parameters, zero where held, (18, 18)."""
+    """Covariance of all parameters, zero where held, (18, 18)."""
     cost: float
     """Half the sum of squares that was minimised."""
     dof: float
@@ -692,7 +692,7 @@ def _refuse_few(used: NDArray[np.bool_], observed: Observations, parameters: int
 def _covariance(
     model: PoolModel, rows: Observations, whiten: Whitener, free: NDArray[np.intp], prior: Prior
 ) -> Array:
-    """Inverse information, in the order of `NAMES`; directions that nothing tells get a very large variance."""
+    """Return the inverse information, in the order of `NAMES`; a very large variance where there is none."""
     N, _ = normal_equations(model, rows, whiten, free, prior)
     scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
     values, vectors = np.linalg.eigh(N / np.outer(scale, scale))
@@ -715,7 +715,7 @@ class HeldOut:
     points: Array
     """Back-projected minus surveyed, in the plane of the point [m], (K, 3)."""
     rows: NDArray[np.intp]
-    """Of the observations, (K,)."""
+    """Indices of the observations, (K,)."""
     folds: int
 
     def as_json(self) -> dict[str, float | int | None]:
@@ -768,7 +768,7 @@ def held_out(fit: Refined, observed: Observations, folds: int, seed: int, normal
 
 
 def error_vectors(model: PoolModel, observed: Observations, normal: Array) -> Array:
-    """Where each pixel's ray meets the plane through its point, minus the point [m], (N, 3); NaN where it does not.
+    """Return where each pixel's ray meets the plane through its point, minus the point [m], (N, 3); NaN without one.
 
     Args:
         model: Camera and water.
@@ -786,19 +786,19 @@ def error_vectors(model: PoolModel, observed: Observations, normal: Array) -> Ar
     return np.asarray(origin + length[:, None] * direction - observed.points)
 
 
-# What was estimated, with intervals and whether the pictures tell it, and what to measure so that they do.
+# Estimates with intervals, and findings on what the pictures do not determine.
 
 IDENTIFIED = 0.7
-"""A standard error above this part of what was known before means that the pictures tell next to nothing."""
+"""Ratio of a standard error to its prior above which the pictures contain almost no information."""
 
 FAR = 0.05
-"""Standard error of a distance, over the whole distance, above which it counts as not determined."""
+"""Standard error of a distance, over the total distance, above which it counts as not determined."""
 
 AT_BOUND = 0.01
-"""Distance from the plane, over the whole distance, below which camera or points lie on it."""
+"""Distance from the plane, over the total distance, below which camera or points lie on it."""
 
 STEPS = np.array([1e-5] * 3 + [1e-6] * 5 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-6, 1e-6] + [1e-7] * 3)
-"""Of the derivatives by the parameters."""
+"""Steps of the derivatives by the parameters."""
 
 
 def estimates(fit: Refined, settings: Settings) -> tuple[dict[str, Estimate], Correlation]:
@@ -827,7 +827,7 @@ def estimates(fit: Refined, settings: Settings) -> tuple[dict[str, Estimate], Co
 
 
 def _quantities(model: PoolModel, surface: bool) -> dict[str, tuple[str, float]]:
-    """Name -> unit and value of everything that is told."""
+    """Return name -> unit and value of all quantities in the table."""
     camera, lens, n = model.camera, model.camera.lens, model.interface.normal
     rows = dict(zip(("camera_x", "camera_y", "camera_z"), (("m", x) for x in camera.position), strict=True))
     angles = np.degrees(quat_to_euler(np.asarray(camera.orientation)))
@@ -847,7 +847,7 @@ def _quantities(model: PoolModel, surface: bool) -> dict[str, tuple[str, float]]
 
 
 def _doubt(name: str, std: float, fit: Refined, settings: Settings) -> str:
-    """What a number rests on where the pictures do not tell it; empty where they do."""
+    """Return the basis of a number that the pictures do not determine; empty where they do."""
     model, prior = fit.model, fit.prior
     reach = model.clearance + max(model.depth, 0.0)
     before, sentence = np.inf, ""
@@ -867,7 +867,7 @@ def _doubt(name: str, std: float, fit: Refined, settings: Settings) -> str:
     return sentence if np.isfinite(before) and std > IDENTIFIED * before else ""
 
 
-# What a survey cannot tell, and what to measure so that the next one can.
+# Findings on what a survey does not determine, with the measurements that would.
 
 NARROW = np.radians(20.0)
 """Angle of incidence below which refraction looks like a nearer floor."""
@@ -911,7 +911,7 @@ def advice(
 def _separability(
     fit: Refined, observed: Observations, settings: Settings, table: Mapping[str, Estimate]
 ) -> Iterator[Finding]:
-    """On camera height, water height and index, which few points cannot separate."""
+    """Yield findings on camera height, water height and index, which few points cannot separate."""
     model, wet = fit.model, observed.subset(fit.used & ~observed.dry)
     surface = settings.surface
     height = table["camera_height" if surface else "camera_distance"]
@@ -946,7 +946,7 @@ def _separability(
 
 
 def _conflicts(fit: Refined, settings: Settings) -> Iterator[Finding]:
-    """Where the pixels pull an estimate far from what was known."""
+    """Yield findings where the pixels pull an estimate far from its prior."""
     prior, model = fit.prior, fit.model
     focal = NAMES.index("focal")
     plane_name = "water's height" if settings.surface else "window's place"
@@ -984,7 +984,7 @@ def _numbers(fit: Refined, observed: Observations) -> Iterator[Finding]:
 
 
 def _excluded_rows(fit: Refined, observed: Observations, surface: bool) -> Iterator[Finding]:
-    """Rows that were left out: marks above the water that nobody called dry, and others."""
+    """Yield findings on rows that were left out: marks above the water that are not flagged as dry, and others."""
     above = _above(fit, observed)
     wrong = int((~fit.used & ~above).sum())
     if above.any():
@@ -1014,10 +1014,10 @@ MAX_LEAN = np.radians(5.0)
 """A surface tilted further from the survey's z than this is none [rad]."""
 
 LENS_STEPS = (("focal", "center"), ("focal", "center", "distortion"))
-"""What the lens gives up where held-out points get better by it."""
+"""Groups of lens parameters that are fitted where the error at held-out points decreases."""
 
 BETTER = 0.9
-"""Factor on the held-out error that makes another group of parameters worth it."""
+"""Factor on the held-out error below which another group of parameters is fitted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -1039,7 +1039,7 @@ class PoolFit(Refined):
     lens_fitted: tuple[str, ...]
     """Groups of `FITTED` that the lens gave up."""
     findings: tuple[Finding, ...]
-    """The gravest first, then what is merely worth knowing."""
+    """Findings, the gravest first, notes last."""
     touching: tuple[str, ...]
     """Places of the survey, or the camera, that the plane came to rest against: it can pass neither."""
 
@@ -1123,7 +1123,7 @@ def _refined(
 def _best_lens(
     observed: Observations, best_start: BestStart, settings: Settings, notes: list[Finding]
 ) -> Refined:
-    """The fit as asked; where nobody asked, the lens is fitted as far as held-out points get better by it."""
+    """Return the fit as set; unless set, lens parameters are fitted if the error at held-out points decreases."""
     start = replace(best_start.model, interface=replace(best_start.model.interface, index_far=settings.index))
 
     def fitted(model: PoolModel, active: NDArray[np.bool_]) -> Refined:
@@ -1166,14 +1166,14 @@ def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
 
 
 def _released(observed: Observations, settings: Settings, fit: Refined, notes: list[Finding]) -> Refined:
-    """Let the surface tilt freely where the pixels contradict a level one and nobody set how level it is."""
+    """Let the plane tilt freely where the pixels contradict its prior direction and no tilt sigma is set."""
     if not np.isfinite(fit.prior.tilt_std) or settings.tilt_sigma is not None or not fit.active[6]:
         return fit
     free = _without(observed, settings, fit, replace(fit.prior, tilt_std=np.inf))
     assert fit.prior.normal is not None
     if free is None:
         return fit
-    # Small enough to be a tilt, and told by the pixels rather than free to go anywhere.
+    # Small enough to be a tilt, and determined by the pixels.
     lean = _lean(free.model, fit.prior.normal)
     error = float(np.sqrt(max(free.covariance[k, k] for k in (6, 7))))
     if not (lean < MAX_LEAN and error < lean / 3.0):
@@ -1224,7 +1224,7 @@ def _pinhole(observed: Observations, best_start: BestStart, settings: Settings, 
     return Refined(model, alike, fit.used, whiten, active, prior, nothing, cost, fit.dof)
 
 
-# What a finished calibration of a pool says against itself: no water, a wrong unit, a frame that cannot be told.
+# Findings against a finished calibration: no water, a wrong unit, an ambiguous frame.
 
 STRAIGHTER = 0.7
 """Held-out error of straight lines over that of refraction below which refraction is not believed."""
@@ -1239,14 +1239,15 @@ ODD, ABSURD = 3.0, 10.0
 """Residuals of a camera on the plane [px] above which it is doubted, and refused."""
 
 TOO_DEEP = 1.5
-"""Depth of the points below the plane as it was told, over the deepest that a camera above it could see so large."""
+"""Ratio of the stated depth of the points to the greatest at which the camera could see them so large, above which it
+is refused."""
 
 LEAST_THICKNESS = 0.02
-"""Thickness of the points, over their lesser width, below which their mirror image cannot be told from them."""
+"""Thickness of the points, over their lesser width, below which they equal their mirror image."""
 
 
 def doubted(fit: PoolFit, *, lens_stated: bool = True) -> PoolFit:
-    """The calibration with what speaks against it put first.
+    """Return the calibration with the findings against it put first.
 
     Args:
         fit: The calibration.
@@ -1262,7 +1263,7 @@ def doubted(fit: PoolFit, *, lens_stated: bool = True) -> PoolFit:
 
 
 def _refuse_depth(fit: PoolFit) -> None:
-    """Refuse a plane told so far from the points that the camera, seen through it, would be between."""
+    """Refuse a stated plane so far from the points that the camera would be between them."""
     depth, option = _measured_depth(fit)
     camera = fit.pinhole.model
     apparent = abs(float(fit.model.interface.normal @ (camera.camera.position - camera.reference)))
@@ -1288,7 +1289,7 @@ def _measured_depth(fit: PoolFit) -> tuple[float, str]:
 
 
 def _touching(fit: PoolFit) -> list[Finding]:
-    """Where the camera comes to rest on the plane, which it cannot pass; refused where that is absurd."""
+    """Return findings where the camera ends on the plane, which it cannot pass; refuse large residuals there."""
     model, error = fit.model, rms(fit.residual[fit.used])
     if model.clearance >= ON_PLANE * (model.clearance + max(model.depth, 0.0)) or error <= ODD:
         return []
@@ -1303,7 +1304,7 @@ def _touching(fit: PoolFit) -> list[Finding]:
 
 
 def _straight(fit: PoolFit) -> list[Finding]:
-    """Where straight lines foretell points better than refraction."""
+    """Return findings where straight lines predict points better than refraction."""
     bent, straight = fit.held_out, fit.pinhole_held_out
     if bent is None or straight is None or len(bent.rows) < FEWEST_COMPARED:
         return []
@@ -1314,7 +1315,7 @@ def _straight(fit: PoolFit) -> list[Finding]:
 
 
 def _handed(fit: PoolFit) -> list[Finding]:
-    """A flat survey whose z points down, or is left-handed: the same pixels, unless the water's height is told."""
+    """Return findings on a flat survey with z down or left-handed, which pixels do not distinguish."""
     settings = fit.settings
     if not settings.surface or fit.model.interface.normal[2] > 0.0 or settings.water_height is not None:
         return []
@@ -1341,14 +1342,14 @@ READING = (
     "level, camera file) are as accurate as stated. A note marks a number that the pixels do not "
     "determine, and names its prior. Judge the result by the error at points held out, in the depth "
     "where it will be used. "
-    "Arrows that swirl or grow outwards tell of a wrong lens, window or water height; others are noise."
+    "Arrows that swirl or grow outwards indicate a wrong lens, window or water height; others are noise."
 )
 
 
 def pool_json(
     fit: PoolFit, *, out: Path | None = None, inputs: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """What `--json` prints and the report's `fit.json` holds.
+    """Return the content of `--json` and of the report's `fit.json`.
 
     Args:
         fit: The calibration.
@@ -1378,7 +1379,7 @@ def pool_json(
 
 
 def pool_record(fit: PoolFit, inputs: Mapping[str, str]) -> dict[str, Any]:
-    """What the pool file remembers of its making: the same, less what is long."""
+    """Return the record in the pool file: the same without its long parts."""
     record = pool_json(fit, inputs=inputs)
     return {key: value for key, value in record.items() if key not in ("kind", "correlation", "out")}
 

@@ -1,4 +1,4 @@
-"""One camera before one plane: predicted pixels, what is known beforehand, and least squares for both."""
+"""Model of one camera before one plane: predicted pixels, priors, and least squares for both."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ length, optical centre [px], first five coefficients of distortion as the lens l
 
 
 def extended_lens(lens: Lens) -> Lens:
-    """The same lens with room for coefficients of distortion that it leaves out."""
+    """Return the same lens with zeros for the coefficients of distortion that it lacks."""
     missing = len(COEFFICIENTS[lens.model]) - len(lens.distortion)
     return replace(lens, distortion=(*lens.distortion, *([0.0] * missing))) if missing > 0 else lens
 
@@ -50,7 +50,7 @@ class PoolModel:
     camera: Camera
     interface: Interface
     reference: Array
-    """Point of the survey under water that the plane turns about and is told from, (3,) [m]."""
+    """Surveyed point under water, about which the plane turns and from which its distance counts, (3,) [m]."""
     refractive: bool = True
     """False: straight lines, as if nothing were between the camera and the points."""
 
@@ -76,7 +76,7 @@ class PoolModel:
         return np.array([np.log(lens.fx), lens.cx, lens.cy, *lens.distortion, 0.0, 0.0, 0.0, 0.0, 0.0])[:8]
 
     def predict(self, points: Array, dry: NDArray[np.bool_]) -> Array:
-        """Pixels of points, (N, 3) -> (N, 2); NaN where the camera cannot see them or they are beyond no plane.
+        """Return the pixels of points, (N, 3) -> (N, 2); NaN where the camera does not see them.
 
         Args:
             points: Pool frame [m].
@@ -94,7 +94,7 @@ class PoolModel:
         return pixels
 
     def jacobians(self, points: Array, dry: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Derivatives of `predict`: by the parameters in the order of `NAMES` (N, 2, 18), by the point (N, 2, 3)."""
+        """Return the derivatives of `predict`: by the parameters, as `NAMES` (N, 2, 18), by the point (N, 2, 3)."""
         J, J_point = np.zeros((len(points), 2, len(NAMES))), np.zeros((len(points), 2, 3))
         wet = ~dry if self.refractive else np.zeros(len(points), bool)
         if wet.any():
@@ -107,7 +107,7 @@ class PoolModel:
         return J, J_point
 
     def moved(self, step: Array) -> PoolModel:
-        """The model a small step away, (18,) in the order of `NAMES`."""
+        """Return the model a small step away, (18,) in the order of `NAMES`."""
         camera, plane = self.camera, self.interface
         turn = quat_to_matrix(quat_from_rotvec(step[3:6]))
         orientation = matrix_to_quat(turn @ np.asarray(camera.R_pc))
@@ -167,10 +167,10 @@ FITTED = {
     "center": ("center_x", "center_y"),
     "distortion": NAMES[13:],
 }
-"""What may be fitted -> its parameters."""
+"""Groups of parameters that may be fitted -> their names."""
 
 LENS_STD = (0.05, 0.03, 0.03, 0.15, 0.15, 0.02, 0.02, 0.1)
-"""How far a camera file that is only roughly right may be off: log focal, centre in widths of the image, distortion."""
+"""Standard deviations of a rough camera file: log focal, centre in widths of the image, distortion."""
 
 
 RANGES = {
@@ -192,7 +192,7 @@ THICKEST = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Priors and options of the fit: standard deviations describe what is known before the pictures.
+    """Priors and options of the fit; standard deviations are those before the pictures.
 
     The interface is the water surface, with its normal along the survey's z, unless a window is given.
     """
@@ -267,7 +267,7 @@ class Settings:
 
     @property
     def surface(self) -> bool:
-        """Whether the interface is the water surface."""
+        """True if the interface is the water surface."""
         return self.window is None
 
     @property
@@ -277,7 +277,7 @@ class Settings:
 
     @property
     def stated_depth(self) -> bool:
-        """Whether a measurement of the plane's place is given."""
+        """True if a measurement of the plane's place is given."""
         return any(x is not None for x in (self.water_height, self.water_depth, self.plane))
 
     @property
@@ -289,7 +289,7 @@ class Settings:
 
 
 def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.bool_]:
-    """Which of `NAMES` are fitted, (18,)."""
+    """Return a mask of the `NAMES` that are fitted, (18,)."""
     held = {
         "index": settings.index_sigma <= 0.0,
         "tilt": settings.tilt_sigma is not None and settings.tilt_sigma <= 0.0,
@@ -302,7 +302,7 @@ def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.
 
 
 def lens_std(settings: Settings, width: int) -> tuple[float, ...]:
-    """Standard deviations of `LENS_NAMES` before the pictures."""
+    """Return the standard deviations of `LENS_NAMES` before the pictures."""
     focal, x, y, *distortion = LENS_STD
     center = settings.center_sigma
     across = (center, center) if center > 0.0 else (x * width, y * width)
@@ -310,36 +310,36 @@ def lens_std(settings: Settings, width: int) -> tuple[float, ...]:
 
 
 LOST = 500.0
-"""Residual that stands for a point the model cannot see at all [px]."""
+"""Residual of a point that the model does not see [px]."""
 
 NEARER = 0.1
 """Part of its distance from a point or the camera that one step must leave the plane."""
 
 MAX_BOUNDS = 60
-"""Points looked at in one step, those that the plane comes nearest to."""
+"""Number of points considered in one step, those nearest to the plane."""
 
 Whitening = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """What is known beforehand: Gaussian, each standard deviation infinite where nothing is."""
+    """Gaussian prior; a standard deviation is infinite where nothing is known."""
 
     normal: Array | None = None
-    """Into the camera's side, (3,)."""
+    """Normal towards the camera, pool frame, unit, (3,)."""
     tilt_std: float = np.inf
     """[rad]"""
     depth: float = np.nan
     """Distance of the plane from the reference point [m]."""
     depth_std: float = np.inf
     start: PoolModel
-    """Holds index and lens that `index_std` and `lens_std` are about."""
+    """Model with the index and lens to which `index_std` and `lens_std` refer."""
     index_std: float = np.inf
     lens_std: tuple[float, ...] = (np.inf,) * 8
-    """Of log focal, centre [px], distortion."""
+    """Standard deviations of log focal, centre [px] and distortion."""
 
     def rows(self, model: PoolModel) -> tuple[Array, Array]:
-        """Residuals (M,) of the priors, each over its standard deviation, and their derivatives (M, 18)."""
+        """Return the residuals (M,) of the priors, each over its standard deviation, and their derivatives (M, 18)."""
         r, J = np.zeros(12), np.eye(len(NAMES))[6:]
         std = np.array([np.inf, np.inf, self.depth_std, self.index_std, *self.lens_std])
         if self.normal is not None:
@@ -356,7 +356,7 @@ class Prior:
 
 
 class Solution(NamedTuple):
-    """Where the search ended."""
+    """End of the search."""
 
     model: PoolModel
     cost: float
@@ -364,7 +364,7 @@ class Solution(NamedTuple):
 
 
 def residuals(model: PoolModel, observed: Observations) -> tuple[Array, NDArray[np.bool_]]:
-    """Measured minus predicted pixel (N, 2), and where there is one (N,); `LOST` elsewhere."""
+    """Return measured minus predicted pixels (N, 2) and where the model predicts one (N,); `LOST` elsewhere."""
     r = observed.pixels - model.predict(observed.points, observed.dry)
     ok = np.isfinite(r).all(axis=1)
     return np.where(ok[:, None], r, LOST), ok
@@ -418,7 +418,7 @@ def solve(
 def normal_equations(
     model: PoolModel, observed: Observations, whiten: Whitening, free: NDArray[np.intp], prior: Prior
 ) -> tuple[Array, Array]:
-    """Information (P, P) and gradient (P,) at a model, by the parameters `free`, priors included."""
+    """Return information (P, P) and gradient (P,) at a model, by the parameters `free`, priors included."""
     r, ok = residuals(model, observed)
     J = model.jacobians(observed.points, observed.dry)[0][..., free]
     J = np.where((ok & np.isfinite(J).all(axis=(1, 2)))[:, None, None], J, 0.0)
@@ -429,7 +429,7 @@ def normal_equations(
 
 
 def clearances(model: PoolModel, points: Array) -> Array:
-    """Distances of points from the far side of the plane and its window, on their own side positive, (N,) [m]."""
+    """Return the distances of points from the far side of plane and window, positive in the water, (N,) [m]."""
     return model.depth - (points - model.reference) @ model.interface.normal - model.interface.thickness
 
 

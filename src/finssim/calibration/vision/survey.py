@@ -1,4 +1,4 @@
-"""What was surveyed in a pool, and the pixels that belong to it, from tables as people write them and from pictures."""
+"""Surveyed points of a pool and their pixels, from tables in many spellings and from images."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ METRES = {**UNITS["length"], "inch": 0.0254}
 LENGTHS, ANGLES = ("x", "y", "z", "sigma", "edge"), ("yaw", "roll", "pitch")
 
 WIDEST = 300.0
-"""Spread of coordinates beyond which metres are not believed unless the file says so [m]."""
+"""Spread of coordinates beyond which the file must state the unit [m]."""
 
 _ALIASES = {
     "u": "u px pxx col column ximg ximage imagex imgx xpx upx pixelx xpixel pixelu upixel xpix pixx imgu "
@@ -69,14 +69,14 @@ class Row:
     """One line of a table."""
 
     line: int
-    """Of the file, from 1."""
+    """Line number in the file, from 1."""
     words: dict[str, str]
     """Cells that are not empty, by the standard name of their column."""
     numbers: dict[str, float]
-    """Those that are numbers: lengths in metres, angles in radians, pixels."""
+    """Cells with numbers: lengths in metres, angles in radians, pixels."""
 
     def missing(self, *names: str) -> list[str]:
-        """Of some columns, those without a number."""
+        """Return those of some columns that have no number."""
         return [name for name in names if name not in self.numbers]
 
     def position(self, z: float | None) -> Array:
@@ -89,7 +89,7 @@ class Row:
         return np.array([self.numbers["u"], self.numbers["v"]])
 
     def placed(self, name: str, points: Array) -> Placed:
-        """Points with what the row says of them."""
+        """Return points with the other cells of the row."""
         return Placed(
             name,
             points,
@@ -107,7 +107,7 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[Row, ...]
     united: bool
-    """Whether the file, or its reader, says the unit of lengths."""
+    """True if the file or its reader states the unit of lengths."""
 
     def refuse_other_units(self, spread: float) -> None:
         """Refuse coordinates that would be metres only in a lake."""
@@ -118,7 +118,7 @@ class Table:
             )
 
     def refuse(self, row: Row, sentence: str) -> CalibrationError:
-        """The error that says so of a row."""
+        """Return the error for a sentence about a row."""
         return CalibrationError(f"{self.path}: line {row.line}: {sentence}")
 
 
@@ -189,8 +189,8 @@ def _check(path: str, row: Row) -> None:
         word = row.words.get(name, "0")
         if _number(word) is None:
             raise CalibrationError(
-                f"{path}: line {row.line}: {name} is '{word}', expected a number: the whole file is refused; correct "
-                "the cell, or empty it to have the row left out"
+                f"{path}: line {row.line}: {name} is '{word}', expected a number: the file is refused; correct the "
+                "cell, or empty it to have the row left out"
             )
 
 
@@ -223,7 +223,7 @@ def _factor(name: str, unit: str, default: str | None, cells: list[str]) -> floa
 
 
 def _recognised(names: Sequence[str]) -> int:
-    """How many column names mean something here."""
+    """Return the number of column names that are known."""
     return sum(bool(_column(word)[0]) for word in names)
 
 
@@ -237,9 +237,9 @@ class Placed:
     sigma: float
     """Standard error of each coordinate [m]; NaN where the survey does not say."""
     dry: bool = False
-    """On the camera's side of the water."""
+    """True if the points are on the camera's side of the water."""
     group: str = ""
-    """Points of one rigid target; empty: by itself."""
+    """Name of the rigid target to which the points belong; empty: none."""
 
     def arm(self, corner: int) -> Array:
         """Displacement of a corner by a turn of its tag about z [m/rad], (3,)."""
@@ -320,7 +320,7 @@ def read_survey(
 
 
 def _surveyed(table: Table, row: Row, edge: float | None, z: float | None) -> tuple[str, int | None, Placed]:
-    """What a row places: its name, the number of its tag (None: a point, or any tag), and where it is."""
+    """Return the name of a row, the number of its tag (None: a point, or any tag), and its points."""
     edge = row.numbers.get("edge", edge)
     word = row.words.get("tag") or (row.words.get("id") if edge is not None else None)
     if "image" not in row.words and word is None:
@@ -351,14 +351,14 @@ class Observations:
     location: NDArray[np.intp]
     """Index into `locations`, (N,)."""
     names: tuple[str, ...]
-    """What each row is called: the point's id or tag/corner, with its picture where there are several."""
+    """Name of each row: the point's id or tag/corner, with its image where there are several."""
     locations: tuple[str, ...]
     sigma: Array
     """Standard error of the survey [m], (N,); NaN where it does not say."""
     arm: Array
     """Displacement of the point by a turn of its location about z [m/rad], (N, 3); zero for single points."""
     dry: NDArray[np.bool_]
-    """On the camera's side of the plane, (N,)."""
+    """True for points on the camera's side of the plane, (N,)."""
     findings: tuple[Finding, ...] = ()
 
     def __len__(self) -> int:

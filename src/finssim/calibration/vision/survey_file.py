@@ -1,5 +1,4 @@
-"""The survey file of `finssim calibrate pool`: the surveyed points, what is known of water, window and camera, and
-options of the fit."""
+"""Survey file of `finssim calibrate pool`: surveyed points, priors of water, window and camera, and options."""
 
 from __future__ import annotations
 
@@ -142,7 +141,7 @@ def _survey_file(top: Fields, path: Path) -> SurveyFile:
         if value is not None:
             options[setting] = math.radians(value) if key.endswith("_deg") else value
     if options.get("folds", 2.0) % 1.0:
-        raise top.error(f"folds is {options['folds']:g}, expected a whole number")
+        raise top.error(f"folds is {options['folds']:g}, expected an integer")
     if "folds" in options:
         options["folds"] = int(options["folds"])
     window = kinds == ["window"]
