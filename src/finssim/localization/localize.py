@@ -1,4 +1,4 @@
-"""What `finssim localize` runs: pictures in, one measured pose or one reason for each out."""
+"""Work of `finssim localize`: for each picture one measured pose or one reason."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 Array = npt.NDArray[np.float64]
 
-# What is known of the vehicle's height and tilt at the exposure of a picture, from files or from one number.
+# Height and tilt of the vehicle at the exposure of a picture, from files or from one number.
 
 LEVEL_STD = math.radians(2.0)
-"""Tilt of a vehicle of which nobody says how it leans [rad]."""
+"""Standard deviation of the tilt of a vehicle whose tilt is not given [rad]."""
 TILT_STD = math.radians(0.5)
 """Error of an IMU's roll and pitch [rad]."""
 DEPTH_STD = 0.01
 """Error of a depth where the vehicle file has no sensor [m]."""
 LONGEST_GAP = 1.0
-"""Depth and tilt are not interpolated between samples further apart [s]."""
+"""Longest gap between samples over which depth and tilt are interpolated [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class PriorSources:
     surface: float
     """Height of the still surface along `base.up`, from the pool's origin [m]."""
     depth: Series | float | None
-    """Of the pressure port below the surface, positive down [m]."""
+    """Depth of the pressure port below the surface, positive down [m]."""
     up: Series | None
     """Unit vector upwards in the body frame; None: level."""
     assumed: tuple[str, ...]
@@ -404,7 +404,7 @@ def _seen(
 
 
 def _count(inputs: Sequence[Path]) -> int | None:
-    """How many pictures there are; None with videos."""
+    """Return the number of pictures; None with videos."""
     from finssim.localization.detection.pictures import PICTURE_FILES
 
     count = 0
@@ -419,7 +419,7 @@ def _count(inputs: Sequence[Path]) -> int | None:
 
 @dataclass
 class Run:
-    """What the pictures gave."""
+    """Result of the pictures."""
 
     rows: list[Row] = field(default_factory=list)
     summary: dict[str, Any] = field(default_factory=dict)

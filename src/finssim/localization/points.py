@@ -1,4 +1,4 @@
-"""What `finssim project` and `finssim backproject` run: tables of points to pixels, and of pixels to points."""
+"""Work of `finssim project` and `finssim backproject`: tables of points to pixels, and of pixels to points."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ FORMAT = 1
 SUREST_PIXEL = 0.05
 """A corner is believed no more than this [px], however small the residuals were."""
 USUAL_PIXEL = 0.5
-"""Of a corner where no calibration says [px]."""
+"""Standard deviation of a corner without a calibration [px]."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,11 @@ class Pool:
     world_orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     """World axes to pool axes, xyzw."""
     record: Mapping[str, Any] = field(default_factory=dict)
-    """How it was found: estimates, intervals, provenance."""
+    """Record of the calibration: estimates, intervals, provenance."""
 
     @property
     def is_surface(self) -> bool:
-        """Whether the plane is a water surface with z up: its normal is nearer to z than to the horizon."""
+        """Return whether the plane is a water surface with z up: its normal is nearer to z than to the horizon."""
         return bool(self.interface.normal[2] > np.sqrt(0.5))
 
     @property
@@ -70,7 +70,7 @@ class Pool:
 
     @property
     def pixel_std(self) -> float:
-        """Standard deviation of a corner, per axis [px]: what the calibration's residuals told, otherwise 0.5."""
+        """Return the standard deviation of a corner, per axis [px]: from the calibration's residuals, otherwise 0.5."""
         residual = self.record.get("residual")
         value = residual.get("pixel_sigma") if isinstance(residual, Mapping) else None
         return max(float(value), SUREST_PIXEL) if isinstance(value, (int, float)) else USUAL_PIXEL

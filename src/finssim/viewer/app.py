@@ -40,9 +40,9 @@ COLOURS: dict[str, Colour] = {
     "water": (70, 150, 205),
     "box": (90, 110, 125),
 }
-"""What is drawn in which colour."""
+"""Object -> its colour."""
 PICTURE_HEIGHT = 0.16
-"""Of the frustum that stands for the camera [m]."""
+"""Size of the camera's frustum [m]."""
 
 
 class Scene:
@@ -184,7 +184,7 @@ class Scene:
         )
 
     def _look(self, server: viser.ViserServer) -> None:
-        """Where the eye is at first: beside and above the water."""
+        """Place the first viewpoint beside and above the water."""
         lower, upper = self.stage.lower, self.stage.upper
         middle, reach = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
         server.initial_camera.look_at = tuple(middle)
@@ -225,7 +225,7 @@ class Plot:
         return tuple(np.ascontiguousarray(column, float) for column in columns)
 
     def series(self) -> tuple[Any, ...]:
-        """How they are drawn: all of a curve faintly, what has been in full."""
+        """Return the lines: a complete curve faintly, and its past in full."""
         drawn: list[Any] = [{"label": "t [s]"}]
         for curve, colour in zip(self.curves, LINES, strict=False):
             drawn += [{"label": "", "stroke": f"{colour}40", "width": 1}]
@@ -241,26 +241,26 @@ def plots_of(curves: Sequence[Curve]) -> list[Plot]:
 
 
 def legend_of(plots: Sequence[Plot]) -> str:
-    """Which colour is which curve, as markup; curves of the same place in their plots share label and colour."""
+    """Return the colours of the curves, as markup; curves of the same place in their plots share label and colour."""
     labels = dict.fromkeys(
         (colour, curve.label) for plot in plots for colour, curve in zip(LINES, plot.curves, strict=False)
     )
     return " · ".join(f'<span style="color:{colour}">■</span> {label}' for colour, label in labels)
 
 
-# The clock of a view: it runs, stands, runs faster, and is set.
+# The clock of a view: it runs, pauses, runs faster, and is set.
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Times as fast as real."""
 LONGEST_TURN = 0.1
-"""What one turn of the loop may advance at single speed [s]: a world that is slower than real time slows the clock."""
+"""Greatest advance of one turn of the loop at single speed [s]: a world slower than real time slows the clock."""
 
 NEARLY = 0.05
 """So near to its end a recording is over [s]: a slider need not reach it to the last digit."""
 
 
 class Playback:
-    """Where in a source's time the view is."""
+    """Position of the view in a source's time."""
 
     def __init__(self, duration: float, *, speed: float = 1.0, playing: bool = True) -> None:
         """
@@ -275,7 +275,7 @@ class Playback:
 
     @property
     def live(self) -> bool:
-        """Whether there is no end, and no way back."""
+        """Return whether there is no end, and no way back."""
         return math.isinf(self.duration)
 
     def advance(self, elapsed: float) -> float:
@@ -287,7 +287,7 @@ class Playback:
         return self.time
 
     def play(self, playing: bool) -> None:
-        """Run or stand; from the end, run from the beginning."""
+        """Run or pause; from the end, run from the beginning."""
         if playing and self.time >= self.duration - NEARLY:
             self.time = 0.0
         self.playing = playing
@@ -304,7 +304,7 @@ Image = npt.NDArray[np.uint8]
 Array = npt.NDArray[np.float64]
 
 WIDTH = 480
-"""Of the drawn picture, at least, if the camera has so many [px]."""
+"""Least width of the drawn picture, if the camera has so many pixels [px]."""
 DARK, LINE, FIRST = (30, 45, 58), (40, 230, 90), (255, 70, 60)
 """Ground without a picture, the outline of a tag, and its first edge."""
 COPPER = np.array([1.25, 0.78, 0.5])
@@ -312,16 +312,16 @@ COPPER = np.array([1.25, 0.78, 0.5])
 INSET = 70
 """Half the edge of the part that is enlarged [px of the camera]."""
 ENLARGED = 1.5
-"""How much larger than in the camera's picture that part is drawn."""
+"""Magnification of that part of the camera's picture."""
 
 
 def blank() -> Image:
-    """What is shown before the first picture, (h, w, 3)."""
+    """Return the picture before the first one, (h, w, 3)."""
     return np.full((WIDTH * 9 // 16, WIDTH, 3), DARK, np.uint8)
 
 
 def draw_picture(picture: Picture) -> Image:
-    """A picture in colours, smaller by a whole number, (h, w, 3)."""
+    """Return a picture in colours, reduced by an integer factor, (h, w, 3)."""
     rows, columns = picture.size if picture.image is None else picture.image.shape[:2]
     every = max(1, columns // WIDTH)
     if picture.image is None:
@@ -338,7 +338,7 @@ def draw_picture(picture: Picture) -> Image:
 
 
 def draw_own(image: Image) -> Image:
-    """A picture of an own camera, or a sonar's fan in copper, larger by a whole number, (h, w, 3)."""
+    """Return a picture of an own camera, or a sonar's fan in copper, enlarged by an integer factor, (h, w, 3)."""
     if image.ndim == 2:
         image = np.clip(image[..., None] * COPPER, 0, 255).astype(np.uint8)
     times = max(1, -(-WIDTH // image.shape[1]))
@@ -376,7 +376,7 @@ def _outline(image: Image, corners: Array, reach: int) -> None:
 # The side of a view: clock, health, the camera's picture, events and plots.
 
 SLIDER_STEP = 0.02
-"""Of the time slider [s]."""
+"""Step of the time slider [s]."""
 
 
 class Panel:
@@ -599,7 +599,7 @@ class View:
         with (
             redirect_stdout(StringIO()),
             _only_own_pages(bind),
-        ):  # viser greets and says goodbye even where it is told not to
+        ):  # viser prints messages at start and end even if verbosity is off
             self.server = viser.ViserServer(host=bind, port=port, label="FinsSim", verbose=False)
         self.scene = Scene(self.server, source.stage)
         self.panel = Panel(self.server, source.stage, self.playback)
@@ -624,7 +624,7 @@ class View:
             self._plotted, self._since_plot = now, 0.0
 
     def run(self, until: Callable[[], bool], *, clock: Callable[[], float] = time.monotonic) -> None:
-        """Show the source until told to stop."""
+        """Show the source until a function asks to stop."""
         before = clock()
         while not until():
             now = clock()

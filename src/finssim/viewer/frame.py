@@ -1,4 +1,4 @@
-"""What a view shows: the stage, which stands still, and a frame for every moment."""
+"""Content of a view: the stage, which does not change, and a frame for every moment."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ViewError(ValueError):
 
 
 class Body(NamedTuple):
-    """A thing of a world that stands still."""
+    """A fixed body of a world."""
 
     name: str
     vertices: Array
@@ -34,7 +34,7 @@ class Body(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """Where the body is."""
+    """Pose of the body."""
 
     position: Array
     """World frame [m], (3,)."""
@@ -49,7 +49,7 @@ def nowhere() -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """What does not change while somebody looks."""
+    """The part of a view that does not change."""
 
     vehicle: Vehicle
     title: str
@@ -58,20 +58,20 @@ class Stage:
     upper: Array
     """The opposite corner [m], (3,)."""
     walls: bool = True
-    """Whether the box is a pool; otherwise it is the space in which the vehicle may move."""
+    """True if the box is a pool; otherwise it is the space in which the vehicle may move."""
     site: Pool | None = None
     """Camera, if one looks on."""
     path: Array = field(default_factory=nowhere)
     """Trajectory to follow, world frame [m], (k, 3)."""
     bodies: Sequence[Body] = ()
-    """Of the world around the vehicle."""
+    """Bodies of the world around the vehicle."""
     eyes: Sequence[str] = ()
     """Names of the vehicle's own cameras and sonars, whose pictures frames have."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What the camera saw last."""
+    """The camera's latest picture."""
 
     image: npt.NDArray[np.uint8] | None
     """Grey values; None where only tags are known."""
@@ -90,12 +90,13 @@ class Frame:
     estimate: Pose | None = None
     goal: Pose | None = None
     force: Array = field(default_factory=lambda: np.zeros(0))
-    """Of the thrusters, canonical order [N], (n,), or none."""
+    """Forces of the thrusters, canonical order [N], (n,), or none."""
     trail: Array = field(default_factory=nowhere)
-    """Where the vehicle was lately, world frame [m], (k, 3)."""
+    """Recent positions of the vehicle, world frame [m], (k, 3)."""
     picture: Picture | None = None
     pictures: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
-    """What the vehicle's own cameras saw last, (rows, columns, 3), and its sonars as fans from above, gray; by name."""
+    """Latest pictures of the vehicle's own cameras, (rows, columns, 3), and of its sonars as fans from above, gray; by
+    name."""
     status: Mapping[str, str] = field(default_factory=dict)
     """Name -> a few words or a number with its unit."""
     events: Sequence[str] = ()
@@ -115,7 +116,7 @@ class Curve(NamedTuple):
 
 
 class Source(Protocol):
-    """Gives frames. A recorded one at any time; a live one goes on to the time, and never back."""
+    """Source of frames. A recorded one gives any time; a live one advances to the time, and never goes back."""
 
     stage: Stage
     duration: float

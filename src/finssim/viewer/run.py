@@ -24,12 +24,12 @@ HEEDED = {
     "record": {"truth", "truth_offset", "basin", "world", "seed"},
     "folder": {"world"},
 }
-"""Kind of source -> the options, besides the vehicle, that it heeds."""
+"""Kind of source -> options, besides the vehicle, that it uses."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """What a person wants to look at."""
+    """Source that a person wants to view."""
 
     source: Annotated[str, "argument"] = "pool"
     """(pool|sim|FILE|FOLDER) Source: pool (the virtual pool with a robot in it), sim (the simulator), a record
@@ -144,7 +144,7 @@ def run(
 
 
 def _refuse_strangers(choice: Choice) -> None:
-    """Refuse options that the source would not heed."""
+    """Refuse options that the source would not use."""
     path = Path(choice.source)
     kind = choice.source if choice.source in HEEDED else "folder" if path.is_dir() else "record"
     usual = Choice()

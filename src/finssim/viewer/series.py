@@ -22,7 +22,7 @@ POSITION, HEADING = "position error [m]", "heading error [deg]"
 """Titles of the plots."""
 
 TRAIL = 30.0
-"""How much of the way is shown [s]."""
+"""Duration of the displayed trail [s]."""
 TRAIL_POINTS = 150
 KEPT = 1200
 """Points that a live curve has at most."""
@@ -60,7 +60,7 @@ class PoseSeries:
         return None if i < 0 else Pose(self.position[i], self.quaternion[i])
 
     def trail(self, time: float) -> Array:
-        """Where it was in the half minute before a time [s], world frame [m], (k, 3)."""
+        """Return the positions in the half minute before a time [s], world frame [m], (k, 3)."""
         first, last = np.searchsorted(self.time, (time - TRAIL, time))
         return self.position[first:last][:: max(1, (last - first) // TRAIL_POINTS)] if last else nowhere()
 
@@ -97,7 +97,7 @@ class Errors:
 
     @property
     def trail(self) -> Array:
-        """Where it was lately, (k, 3) [m]."""
+        """Return the recent positions, (k, 3) [m]."""
         return np.array(self._trail).reshape(-1, 3)
 
     @property
@@ -117,7 +117,7 @@ class Errors:
         return "-" if math.isnan(self.latest[2]) else f"{100.0 * self.latest[2]:.1f} cm"
 
     def curves(self) -> list[Curve]:
-        """Those that have a value."""
+        """Return the errors that have a value."""
         rows = np.array(self._rows).reshape(-1, 5)
         time = rows[:, 0]
         curves = [
@@ -142,15 +142,15 @@ def _error(a: Pose | None, b: Pose | None) -> tuple[float, float]:
 COARSE, FINE = 0.2, 0.01
 """Steps of the search [s]."""
 SAMPLES = 400
-"""Of the estimate, that are compared."""
+"""Number of samples of the estimate that are compared."""
 LONGEST = 86_400.0
-"""Of truth and estimate together [s]: the search takes 0.1 ms for each step."""
+"""Longest duration of truth and estimate together [s]; the search takes 0.1 ms for each of its steps."""
 OVERLAP = 0.5
 """Part of the estimate that the truth must cover."""
 
 
 def offset_between(estimate: PoseSeries, time: Array, position: Array) -> float:
-    """What to add to the truth's times so that it lies over the estimate [s].
+    """Return the time to add to the truth's times so that it matches the estimate [s].
 
     The one with the least mean square distance, of all under which at least half of the estimate is covered.
 

@@ -106,7 +106,7 @@ def box_edges(lower: Array, upper: Array) -> Array:
 
 
 def shown_of(vehicle: Vehicle, picture: Picture) -> npt.NDArray[np.uint8] | str:
-    """What a person sees of a reading of the vehicle's own sensors: a picture, a sonar's fan, or ranges in words."""
+    """Return a displayable reading of the vehicle's own sensors: a picture, a sonar's fan, or ranges as text."""
     if picture.image is None:
         ranges = [] if picture.ranges is None else picture.ranges.tolist()
         return ", ".join(f"{x:.2f} m" if np.isfinite(x) else "nothing in reach" for x in ranges)
@@ -117,7 +117,7 @@ def shown_of(vehicle: Vehicle, picture: Picture) -> npt.NDArray[np.uint8] | str:
 
 
 def world_bodies(layout: WorldLayout) -> list[Body]:
-    """The things of the first world of a layout, where they stand; the copies in a row are one thing.
+    """Return the bodies of the first world of a layout; the copies in a row are one body.
 
     Planes end 15 m from their middle, and basins have no walls: the stage has.
     """

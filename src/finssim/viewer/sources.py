@@ -1,4 +1,4 @@
-"""Where the frames of a view come from: the virtual pool, the simulator, records, and runs of the engine."""
+"""Sources of the frames of a view: the virtual pool, the simulator, records, and runs of the engine."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ Array = npt.NDArray[np.float64]
 RATE = 60.0
 """Steps of the robot's loop [Hz]."""
 EVENTS = 8
-"""That are shown."""
+"""Number of displayed events."""
 
 
 class PoolSource:
-    """The virtual pool and the whole software of a robot, which knows of the truth as little as ever."""
+    """The virtual pool and the complete software of a robot, which does not know the truth."""
 
     duration = math.inf
 
@@ -319,7 +319,7 @@ def _basin(way: np.ndarray, length: float) -> tuple[float, float, float]:
     return max(4.0, 2.0 * float(half[0])), max(2.0, 2.0 * float(half[1])), max(1.0, depth)
 
 
-# Frames of a record (.mcap), with the truth beside it where its file is at hand.
+# Frames of a record (.mcap), with the truth if its file is available.
 
 
 TOPICS = (
@@ -333,13 +333,13 @@ TOPICS = (
     "events",
 )
 POINTS = 1500
-"""Of a curve, at most."""
+"""Greatest number of points of a curve."""
 FRESH = 1.0
 """An older picture is not shown [s]."""
 
 
 class RecordSource:
-    """A record, read whole; `frame` looks things up."""
+    """A record, read completely; `frame` looks up values."""
 
     def __init__(
         self,
@@ -423,7 +423,7 @@ class RecordSource:
         )
 
     def curves(self) -> Sequence[Curve]:
-        """Errors of the whole record."""
+        """Return errors over the complete record."""
         return self._curves
 
     def close(self) -> None:
@@ -544,7 +544,7 @@ def _poses(times: list[float], poses: list[Any]) -> PoseSeries:
 
 
 def _thinned(path: Array) -> Array:
-    """Where the goal has been, without the times at which it stood still."""
+    """Return the positions of the goal, without the times at which it did not move."""
     if len(path) < 2:
         return path[:0]
     moved = np.flatnonzero(np.linalg.norm(np.diff(path, axis=0), axis=1) > 1e-6) + 1
@@ -566,7 +566,7 @@ def _tags_in(text: str) -> tuple[TagCorners, ...]:
             TagCorners(int(tag["id"]), np.asarray(tag["corners"], float).reshape(4, 2)) for tag in tags
         )
     except (ValueError, KeyError, TypeError, OverflowError):
-        return ()  # somebody else's words
+        return ()  # words of other programs
 
 
 def _pool_of(record: Record) -> Pool | None:
@@ -595,7 +595,7 @@ def _vehicle_of(record: Record) -> Vehicle:
 
 @contextmanager
 def _kept_file(record: Record, name: str, *references: tuple[str, ...]) -> Iterator[Path]:
-    """A file that the record keeps, in a folder of its own; `references` are its keys that may name other files.
+    """Yield a file that the record keeps, in a separate folder; `references` are its keys that may name other files.
 
     So may the devices of a vehicle's `perception`.
     """
@@ -687,9 +687,9 @@ class RunSource:
 # The wanted motion, as poses and lines to draw.
 
 PATH_POINTS = 240
-"""Of a trajectory's line."""
+"""Number of points of a trajectory's line."""
 STATION, TRAJECTORY = "0.8,0.3,-0.6,45", "ellipse"
-"""Where to go if nobody says."""
+"""Default goal."""
 
 
 def guide_for(goal: str | None, trajectory: str | None, task: str | None, vehicle: Vehicle) -> Guide:
@@ -706,7 +706,7 @@ def guide_for(goal: str | None, trajectory: str | None, task: str | None, vehicl
 
 
 def goal_pose(guide: Guide, t: float) -> Pose:
-    """Where the vehicle should be at a time since the start [s]."""
+    """Return the goal at a time since the start [s]."""
     reference = guide.at(t)
     return Pose(np.asarray(reference.position, float), np.asarray(quat_from_yaw(float(reference.yaw))))
 
@@ -719,7 +719,7 @@ def path_of(guide: Guide) -> npt.NDArray[np.float64]:
 
 
 def start_of(guide: Guide) -> Station:
-    """Where a vehicle begins: at the start of a trajectory, or in the middle, 0.5 m deep, for a station."""
+    """Return the start of a vehicle: the start of a trajectory, or the middle, 0.5 m deep, for a station."""
     if not math.isfinite(guide.duration):
         return Station((0.0, 0.0, -0.5), 0.0)
     first = guide.at(0.0)
@@ -727,10 +727,10 @@ def start_of(guide: Guide) -> Station:
     return Station((x, y, z), float(first.yaw))
 
 
-# Tags found in a picture for the person who looks, where nobody else has told where they are.
+# Tags found in a picture for the viewer, if no other process has reported them.
 
 LONGEST_STEP = 0.5
-"""A picture that is further from the one before is searched as a whole [s]."""
+"""Longest time since the picture before; after a longer one the complete picture is searched [s]."""
 
 
 class TagLook:

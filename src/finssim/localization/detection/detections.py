@@ -51,23 +51,23 @@ class Detection:
     corners: Array
     """Pixels (u, v), integers at pixel centres, (4, 2): top-left, top-right, bottom-right, bottom-left as printed."""
     margin: float = math.nan
-    """Contrast with which its bits were read [grey levels]: higher is surer; NaN where nobody said."""
+    """Contrast with which its bits were read [grey levels]: higher is more certain; NaN if it is not known."""
     hamming: int = 0
     """Bits that were corrected."""
     family: str = ""
-    """Such as `tag25h9`; empty where nobody said."""
+    """Family such as `tag25h9`; empty if it is not known."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What was found in one picture."""
+    """Tags found in one picture."""
 
     time: float
     """Time stamp of the picture [s]; NaN where it has none."""
     image: str
     """Its name; empty where it has none."""
     detections: tuple[Detection, ...]
-    """As found: an id may be there twice."""
+    """Detections in the order in which they were found: an id may occur twice."""
 
 
 def best_detections(detections: Iterable[Detection]) -> list[Detection]:

@@ -26,7 +26,7 @@ REACH = 0.1
 """White around the black border that is looked at [cells]. Little: many prints have less margin than the one cell that
 is asked for, and the blur brings in what lies beyond."""
 REACH_OF_DATA = -0.4
-"""The same where data cells lie at the outside of the tag and anything may lie beside them [cells]."""
+"""White around the border that is used if data cells lie at the outside of the tag, next to any background [cells]."""
 SAMPLES = 5
 """Along a cell, each way."""
 BLURS = np.array([0.2, 0.24, 0.29, 0.35, 0.42, 0.5])
@@ -34,7 +34,7 @@ BLURS = np.array([0.2, 0.24, 0.29, 0.35, 0.42, 0.5])
 SURROUND = 0.8
 """Reach of the local mean that is taken off, standard deviation [cells]."""
 FLAT = 0.5
-"""Share of the contrast of the whole tag below which a place counts as flat."""
+"""Share of the contrast of the complete tag below which a place counts as flat."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +123,11 @@ def _weights(places: Array, outside: int, cells: int, blur: float) -> tuple[Arra
     return share, -np.diff(bell, axis=1) / blur, np.diff(z * bell, axis=1) / blur
 
 
-# Corners to a few hundredths of a pixel: the whole known tag is laid over the picture until the two agree.
+# Corners to a few hundredths of a pixel: the known tag is fitted to the picture.
 #
-# The cells of a decoded tag are known, so each of their edges, inner ones too, tells where the tag lies. A homography
+# The cells of a decoded tag are known, so each of their edges, inner ones too, locates the tag. A homography
 # is fitted by Gauss-Newton (inverse compositional, so that its Jacobian is computed once) together with what the light
-# did: gain, offset, two slopes across the tag, and the blur. Blur widens an edge to both sides alike and moves no
+# did: gain, offset, two slopes across the tag, and the blur. Blur widens an edge equally to both sides and moves no
 # corner. Then the same in local contrast, which glare and shadows change little, with less weight where something hides
 # the tag.
 
@@ -139,7 +139,7 @@ STEPS = 15
 SETTLED = 2e-3
 """Movement of a corner below which the fit ends [px]."""
 COARSE = 0.05
-"""The same for the first part of the fit."""
+"""Movement of a corner below which the first part of the fit ends [px]."""
 SMALLEST_RESIDUAL = 0.02
 """Misfit that is always taken for noise, share of the contrast."""
 _SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -147,12 +147,12 @@ _SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """How a tag lies in the picture."""
+    """Fitted position of a tag in the picture."""
 
     corners: Array
-    """Of the measured edge, pixels, (4, 2)."""
+    """Corners of the measured edge, pixels, (4, 2)."""
     correlation: float
-    """Of the picture with the pattern: 1 is perfect, a tag that is not there has little."""
+    """Correlation of the picture with the pattern: 1 is perfect, and low if the tag is absent."""
     contrast: float
     """White minus black [gray levels]."""
 
@@ -198,16 +198,16 @@ def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> Fit | None:
 
 @dataclass(frozen=True, eq=False)
 class _Settled:
-    """Where a pattern came to rest on the patch."""
+    """Position on the patch at which a pattern converged."""
 
     corners: Array
     """(4, 2)."""
     gain: float
     """White minus black, in gray levels or in shares of the local contrast."""
     wider: float
-    """By how much the picture's blur is wider than the pattern's [cells]."""
+    """Difference between the picture's blur and the pattern's [cells]."""
     residual: Array
-    """What the pattern does not explain, in the same unit, (n,)."""
+    """Residual of the pattern, in the same unit, (n,)."""
     correlation: float
 
 
@@ -269,7 +269,7 @@ def _correlation(a: Array, b: Array) -> float:
 
 
 def _convex(corners: Array) -> bool:
-    """Whether the corners run clockwise in the picture (v down) around a convex ring."""
+    """Return whether the corners form a convex ring that runs clockwise in the picture (v down)."""
     side = np.roll(corners, -1, axis=0) - corners
     after = np.roll(side, -1, axis=0)
     return bool(np.all(side[:, 0] * after[:, 1] - side[:, 1] * after[:, 0] > 1.0))
@@ -347,11 +347,11 @@ Region = tuple[int, int, int, int]
 """Part of a picture: left, top, right, bottom [px], right and bottom just outside."""
 
 LEAST_CORRELATION = 0.7
-"""Of a picture with the tag that a library says is there; below it there is none."""
+"""Least correlation of a picture with the tag that a library reports; below it the tag counts as absent."""
 
 
 REFINEMENTS = ("fit", *EDGES)
-"""How corners are placed."""
+"""Methods of locating corners."""
 
 
 @dataclass(frozen=True)
@@ -457,14 +457,14 @@ LEAST = 8.0
 PER_LOSS = 0.5
 """Growth of the padding with every picture in which the tag was not found [edges]."""
 MAX_LOST = 30
-"""Pictures after which a lost tag is searched in the whole picture alone."""
+"""Number of pictures after which a lost tag is searched in complete pictures only."""
 AHEAD = 1.5
 """Regions reach from the last place of a tag, should it have stopped, to this many times its motion since."""
 
 
 @dataclass
 class SearchCounts:
-    """What a tracker did."""
+    """Counts of a tracker's searches."""
 
     pictures: int = 0
     regions: int = 0
@@ -474,15 +474,15 @@ class SearchCounts:
     found: int = 0
     """Tags, summed over pictures."""
     recovered: int = 0
-    """Tags that only the search of the whole picture found."""
+    """Tags that only the search of the complete picture found."""
     pixels: int = 0
     """Searched, summed over pictures."""
     pixels_given: int = 0
-    """Of all pictures."""
+    """Pixels of all pictures."""
 
     @property
     def share(self) -> float:
-        """Searched part of all pixels; above 1 where whole pictures were searched after regions."""
+        """Return the searched share of all pixels; above 1 if complete pictures were searched after regions."""
         return self.pixels / max(self.pixels_given, 1)
 
 
@@ -493,7 +493,7 @@ class _Remembered:
     corners: Array
     time: float
     velocity: Array = field(default_factory=lambda: np.zeros(2))
-    """Of the centre [px/s]."""
+    """Velocity of the centre [px/s]."""
     lost: int = 0
     """Pictures since."""
 
@@ -595,7 +595,7 @@ def region_around(corners: Array, lost: int = 0) -> Region:
 
 
 def merged(regions: list[Region]) -> list[Region]:
-    """The same places in regions of which no two overlap: those that do become one around both."""
+    """Return regions that cover the same places without overlap: those that overlap become one around both."""
     separate: list[Region] = []
     for region in regions:
         joined = region

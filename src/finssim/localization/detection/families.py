@@ -90,11 +90,11 @@ Cells = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Family:
-    """How the tags of a family are built."""
+    """Layout of the tags of a family."""
 
     name: str
     cells: int
-    """Cells along the edge of the whole bitmap."""
+    """Number of cells along the edge of the complete bitmap."""
     border: int
     """Cells along the edge that is measured, the `edge` of a vehicle or survey file: the outside of the black border,
     or the line between black and white ring where the border is reversed."""

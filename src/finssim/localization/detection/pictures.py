@@ -1,4 +1,4 @@
-"""Pictures and videos as a stream of gray pictures with names and times; what cannot be read is told and left out."""
+"""Pictures and videos as a stream of gray pictures with names and times; unreadable ones are reported and left out."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
 
 
 def _names(files: Sequence[Path]) -> dict[Path, str]:
-    """What each file is called: its own name, with its folders where two have the same."""
+    """Return the name of each file: its own, with its folders if two have the same."""
     often = Counter(file.name for file in files)
     return {file: file.name if often[file.name] == 1 else file.as_posix() for file in files}
 
@@ -231,7 +231,7 @@ def _read_times(path: Path) -> dict[str, float]:
 
 
 def _cut_short(raw: bytes) -> bool:
-    """Whether a PNG or JPEG file lacks its end; decoders would fill the rest with gray."""
+    """Return whether a PNG or JPEG file lacks its end; decoders would fill the rest with gray."""
     if raw.startswith(b"\x89PNG"):
         return b"IEND" not in raw
     if not raw.startswith(b"\xff\xd8"):

@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TiltGains:
-    """How quickly the accelerometer is believed."""
+    """Gains of the correction by the accelerometer."""
 
     proportional: float = 0.4
     """[1/s]: errors of tilt die away with its inverse."""
@@ -41,11 +41,11 @@ class Tilt:
     up: Array
     """Unit vector upwards, body frame, (..., 3)."""
     bias: Array
-    """Of the gyro, body frame [rad/s], (..., 3); only its horizontal part is ever learnt."""
+    """Bias of the gyro, body frame [rad/s], (..., 3); only its horizontal part is ever estimated."""
 
 
 def in_body_axes(vector_s: npt.ArrayLike, orientation: npt.ArrayLike) -> Array:
-    """What an IMU reads, written in body axes.
+    """Return the reading of an IMU in body axes.
 
     Args:
         vector_s: Angular rate or specific force, sensor frame, (..., 3).
@@ -61,7 +61,7 @@ def up_of(roll: npt.ArrayLike, pitch: npt.ArrayLike) -> Array:
 
 
 def height_above_origin(point: tuple[float, float, float], roll: float, pitch: float) -> float:
-    """How much higher than the body's origin a point of the body is [m]: `up_of` times it, in plain numbers."""
+    """Return the height of a point of the body above the body's origin [m]: `up_of` times it, in plain numbers."""
     x, y, z = point
     return math.cos(pitch) * (math.sin(roll) * y + math.cos(roll) * z) - math.sin(pitch) * x
 
@@ -119,14 +119,14 @@ Number: TypeAlias = Any
 
 @dataclass(frozen=True)
 class YawState:
-    """What the filter knows."""
+    """State of the filter."""
 
     yaw: Number
     """[rad], in [-pi, pi)."""
     bias: Number
-    """What the gyro shows too much of yaw rate [rad/s]."""
+    """Bias of the gyro's yaw rate [rad/s]."""
     variance: Number
-    """Of yaw [rad²]."""
+    """Variance of yaw [rad²]."""
     cross: Number
     """Covariance of yaw and bias [rad²/s]."""
     bias_variance: Number
@@ -146,12 +146,12 @@ class YawNoise:
     rate: float = 1e-3
     """Noise density of the rate [rad/s/√Hz]."""
     bias_walk: float = 2e-5
-    """Of its bias [rad/s²/√Hz]."""
+    """Random walk of its bias [rad/s²/√Hz]."""
 
 
 @dataclass(frozen=True)
 class YawInnovation:
-    """What a measured yaw says that the prediction did not."""
+    """Difference between a measured yaw and the predicted one."""
 
     residual: Number
     """The short way round [rad]."""
@@ -246,5 +246,5 @@ def capped(state: YawState, variance: float) -> YawState:
 
 
 def _wrapped(angle: Number) -> Number:
-    """The same angle in [-pi, pi) [rad]."""
+    """Return an angle in [-pi, pi) [rad]."""
     return (angle + math.pi) % math.tau - math.pi

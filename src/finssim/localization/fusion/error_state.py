@@ -65,7 +65,7 @@ LONGEST_SUPPORT = 200
 """Believed measurements that are counted."""
 
 OUTVOTED = 6
-"""A state that a gyro carries gives way to a run of refused measurements with this part of its own support."""
+"""Divisor of the support of a state carried by a gyro, which a run of refused measurements needs to replace it."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Suspects:
     covariance: tuple[tuple[float, ...], ...]
     """Its covariance."""
     hits: int = 1
-    """How many agree."""
+    """Number of measurements that agree."""
     misses: int = 0
     """Refused measurements in between that agree with none of them."""
 
@@ -117,7 +117,7 @@ def remember(
 
 
 def due(suspects: Suspects, gate: Gate) -> bool:
-    """Whether the run has lasted long enough, and is numerous enough, to take over."""
+    """Return whether the run has lasted long enough, and is numerous enough, to replace the state."""
     if math.isinf(gate.reacquire_after):
         return False
     # A microsecond of slack: stamps are sums of periods.
@@ -127,10 +127,10 @@ def due(suspects: Suspects, gate: Gate) -> bool:
 
 @dataclass(frozen=True)
 class Rival:
-    """What a state that was taken over said, kept alive in case that it was right."""
+    """A replaced state, kept in case it was right."""
 
     offset: float
-    """From what is believed now [units of the measurement]."""
+    """Difference from the current state [units of the measurement]."""
     held: int
     """Measurements that supported it."""
     won: int
@@ -145,7 +145,7 @@ class GateMemory:
     """Measurements believed since the state was last started from one; counted up to `reacquire_samples`."""
     suspects: Suspects | None = None
     believed: int = 0
-    """The same, counted up to `LONGEST_SUPPORT`."""
+    """Number of accepted measurements, counted up to `LONGEST_SUPPORT`."""
     rival: Rival | None = None
 
     @property
@@ -167,7 +167,7 @@ def judge(
     distance: float,
     drift: float,
 ) -> tuple[str, GateMemory]:
-    """Whether a measurement is accepted or refused as an outlier, and the gate's memory after it.
+    """Return whether a measurement is accepted or refused as an outlier, and the gate's memory after it.
 
     A state that was started from one measurement is no surer than that one: until `reacquire_samples` others have
     supported it, a run takes over as soon as it outnumbers its support.
@@ -206,7 +206,7 @@ def judge_carried(
     drift: float,
     carried: bool,
 ) -> tuple[str, GateMemory]:
-    """As `judge`, for the distance of a measurement from a state that another sensor carries on, as a gyro does yaw.
+    """Return the result of `judge` for a measurement of a state that another sensor carries, as a gyro carries yaw.
 
     Between two measurements the state is right to a fraction of a degree, so that a jump is the measurement's error, or
     the state was wrong all along. What has been believed for long gives way only to a run of a sixth of its support,
@@ -254,7 +254,7 @@ GYRO_HOLD = 0.3
 YAW_CAP = 10.0
 """Doubt of yaw does not grow beyond this variance [rad²]: far past a full circle."""
 STEEPEST = math.radians(80.0)
-"""Pitch beyond which the gyro tells no yaw rate."""
+"""Pitch beyond which the gyro gives no yaw rate."""
 KINEMATIC_GATES = ("vision", "yaw", "depth")
 """Streams in the order of their gates."""
 ACCEPTED, STEEP = (Outcome("imu", "accepted"),), (Outcome("imu", "steep"),)
@@ -274,7 +274,7 @@ class Track:
     roll: float = 0.0
     pitch: float = 0.0
     tilt: Tilt | None = None
-    """Of the filter for logs without an orientation."""
+    """Tilt of the filter for logs without an orientation."""
     vision_time: float | None = None
     yaw_seen: float | None = None
     """Time of the latest vision yaw that was believed [s]."""
@@ -282,7 +282,7 @@ class Track:
     imu_time: float | None = None
     velocity_time: float | None = None
     compass: bool = False
-    """Whether yaw is what a compass says, offset included."""
+    """True if yaw comes from a compass, including its offset."""
     gates: tuple[GateMemory, ...] = (GateMemory(),) * 3
     """Memories of the gates, in the order of `KINEMATIC_GATES`."""
 
@@ -424,7 +424,7 @@ class ConstantVelocity:
         axes: list[int],
         restart: Callable[[], Array],
     ) -> tuple[Track, Outcome]:
-        """The track after a fix or a depth that its gate has judged; `restart` is where the axes begin anew."""
+        """Return the track after a fix or a depth that its gate has judged; `restart` gives restarted axes."""
         s, k = self.settings, KINEMATIC_GATES.index(stream)
         innovation = position_filter.innovation(track.position, H, z, R)
         distance = float(innovation.mahalanobis)
@@ -479,7 +479,7 @@ class ConstantVelocity:
         return float(roll), float(pitch), tilt
 
     def _positioned(self, track: Track, time: float) -> Track:
-        """The track with its position at a time; axes without news slow down, then stand still."""
+        """Return the track with its position at a time; axes without measurements slow down, then stop."""
         s, then = self.settings, track.position_time
         if math.isnan(then) or time <= then:
             return changed(track, position_time=_later(then, time))
@@ -562,9 +562,9 @@ def _later(then: float, time: float) -> float:
 
 
 P, V, A, G, B = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
-"""Where δp, δv, δθ, δb_g and δb_a stand in the error state."""
+"""Indices of δp, δv, δθ, δb_g and δb_a in the error state."""
 C, S, D = 15, 16, slice(17, 20)
-"""Where the offset of the compass, the scale and the offset of the Doppler log stand in the aided one."""
+"""Indices of the offset of the compass, the scale and the offset of the Doppler log in the aided error state."""
 AIDED = 5
 """Numbers that log and compass add."""
 _I = {n: np.eye(n) for n in (15, 15 + AIDED)}
@@ -572,7 +572,7 @@ _I = {n: np.eye(n) for n in (15, 15 + AIDED)}
 
 @dataclass(frozen=True)
 class InertialState:
-    """What the filter knows."""
+    """State of the filter."""
 
     p: Array
     """Position of the IMU, pool frame [m], (..., 3)."""
@@ -585,7 +585,7 @@ class InertialState:
     accel_bias: Array
     """Body frame [m/s²], (..., 3)."""
     covariance: Array
-    """Of the error state, (..., n, n): n = 15, or 20 with `extra`."""
+    """Covariance of the error state, (..., n, n): n = 15, or 20 with `extra`."""
     extra: Array = field(default_factory=lambda: np.zeros(0))
     """Offset of the compass [rad], scale error [-] and offset of the Doppler log [m/s], (..., 5); none: (0,)."""
 
@@ -603,7 +603,7 @@ class ErrorStateNoise:
     accel_walk: float
     """[m/s³/√Hz]"""
     log_walk: float = 0.0
-    """Of the Doppler log's offset [m/s²/√Hz]."""
+    """Random walk of the Doppler log's offset [m/s²/√Hz]."""
 
 
 def predict(
@@ -671,7 +671,7 @@ def _noise(dt: float, noise: ErrorStateNoise, n: int) -> Array:
 
 @lru_cache(maxsize=8)
 def _noise_powers(noise: ErrorStateNoise, n: int) -> tuple[Array, Array, Array]:
-    """What goes with dt, dt²/2 and dt³/3 in the noise of a step, (n, n) each."""
+    """Return the coefficients of dt, dt²/2 and dt³/3 in the noise of a step, (n, n) each."""
     first, second, third = np.zeros((3, n, n))
     if n > 15:
         first[D, D] = noise.log_walk**2 * np.eye(3)
@@ -684,7 +684,7 @@ def _noise_powers(noise: ErrorStateNoise, n: int) -> tuple[Array, Array, Array]:
 
 
 def position_model(state: InertialState, lever: Array) -> tuple[Array, Array]:
-    """Where a body point is, and how the errors move it.
+    """Return the position of a body point, and its derivative by the errors.
 
     Args:
         state: The state.
@@ -734,7 +734,7 @@ def yaw_model(state: InertialState) -> tuple[Array, Array]:
 
 
 def heading_model(state: InertialState) -> tuple[Array, Array]:
-    """What a compass reads: yaw and its own offset.
+    """Return the reading of a compass: yaw and its own offset.
 
     Returns:
         Heading [rad], (..., 1), and its Jacobian, (..., 1, 20).
@@ -745,7 +745,7 @@ def heading_model(state: InertialState) -> tuple[Array, Array]:
 
 
 def velocity_model(state: InertialState, omega: Array, lever: Array) -> tuple[Array, Array]:
-    """What a Doppler log reads: (1 + s) [R' v + (ω - b_g) x l] + b_v.
+    """Return the reading of a Doppler log: (1 + s) [R' v + (ω - b_g) x l] + b_v.
 
     Args:
         state: The state.
@@ -847,7 +847,8 @@ def stopped(state: InertialState, axes: list[int]) -> InertialState:
 
 
 def parted(state: InertialState, axes: list[int], walk: float) -> InertialState:
-    """Some positions told apart from all other errors, and their variances grown by `walk` [m²]."""
+    """Return the state with some positions uncorrelated with all other errors, and their variances increased by `walk`
+    [m²]."""
     covariance = state.covariance.copy()
     of_axes = covariance[np.ix_(axes, axes)] + walk * np.eye(len(axes))
     covariance[axes, :] = 0.0
@@ -898,7 +899,7 @@ TILT_CAP = 0.5
 GATES = ("vision", "yaw", "depth", "velocity", "heading")
 """Streams in the order of their gates."""
 TIMED = ("vision", "depth", "velocity")
-"""Those whose latest believed measurement's time counts."""
+"""Streams whose latest accepted measurement's time counts."""
 
 
 @dataclass(frozen=True)
@@ -1156,7 +1157,7 @@ class ErrorState:
             covariance[15:, 15:] = np.diag(
                 np.square([a.heading_bias, a.velocity_scale, *[a.velocity_bias] * 3])
             )
-            if before.compass:  # yaw is then what the compass said, less its offset
+            if before.compass:  # yaw is then the compass's reading minus its offset
                 covariance[8, 8] += a.heading_bias**2
                 covariance[8, 15] = covariance[15, 8] = -(a.heading_bias**2)
         state = InertialState(
@@ -1173,7 +1174,7 @@ class ErrorState:
         return changed(track, depth_time=before.depth_time)
 
     def _until(self, track: InertialTrack, time: float) -> InertialTrack:
-        """The track at a time; velocity without news is drawn to rest, and then the position stands still."""
+        """Return the track at a time; velocity without measurements decays, and then the position stops."""
         s, then = self.settings, track.time
         if time <= then:
             return track
@@ -1202,9 +1203,7 @@ class ErrorState:
         after = predict(state, omega, force, dt, self._noise, self._gravity)
         if age <= s.coast:
             return after
-        if (
-            lost
-        ):  # the place is no longer told by the accelerometer, only that the vehicle may be anywhere near
+        if lost:  # the accelerometer no longer gives the position; the vehicle may be anywhere near
             walk = 2.0 * s.speed_std**2 / s.decay * dt
             after = parted(changed(after, p=np.append(state.p[:2], after.p[2])), [0, 1], walk)
         H = np.eye(len(after.covariance))[3:5]

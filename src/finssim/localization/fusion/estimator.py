@@ -44,13 +44,13 @@ SAME = 1e-7
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the other sensors said at the time of a picture."""
+    """Readings of the other sensors at the time of a picture."""
 
     roll: float
     """[rad]; NaN where no IMU sample is near."""
     pitch: float
     depth: float
-    """Of the pressure port [m]; NaN where no sample is near."""
+    """Depth of the pressure port [m]; NaN if no sample is near."""
 
 
 class Timeline(Generic[S]):
@@ -105,7 +105,7 @@ class Timeline(Generic[S]):
         return None
 
     def insert(self, sample: Sample) -> None:
-        """Put a sample that `refusal` lets pass in its place; states are out of date until `settle`."""
+        """Insert a sample that `refusal` accepts at its time; states are out of date until `settle`."""
         key = (sample.time, _RANK[sample.stream])
         k = bisect.bisect_right(self._keys, key)
         self._keys.insert(k, key)
@@ -157,7 +157,8 @@ class Timeline(Generic[S]):
         )
 
     def _around(self, time: float, stream: str) -> list[int]:
-        """Where the last sample of a stream before a time and the first not before it stand, as far as there are."""
+        """Return the indices of the last sample of a stream before a time and of the first not before it, if they
+        exist."""
         k = bisect.bisect_left(self._keys, (time, -1))
         before = next((i for i in range(k - 1, -1, -1) if self._samples[i].stream == stream), None)
         after = next((i for i in range(k, len(self._keys)) if self._samples[i].stream == stream), None)
@@ -176,7 +177,7 @@ def _between(points: list[tuple[float, float]], time: float, longest: float) -> 
     return nearest[1] if nearest else math.nan
 
 
-# What the estimator says of itself: vision state, ages, readiness, and what it refused and why.
+# Status of the estimator: vision state, ages, readiness, and what it refused and why.
 
 MODES = ("uninitialized", "fresh", "coast", "hold", "lost")
 
@@ -295,7 +296,7 @@ STREAMS = ("imu", "depth", "vision", "yaw", "velocity", "heading")
 AGREED = 10
 """Samples on one other clock after which that clock is believed."""
 UNHEARD = 10.0
-"""Silence that is taken for one where samples tell no arrival [s]."""
+"""Gap between samples without arrival times that counts as a silence [s]."""
 
 
 MODELS: dict[str, Any] = {"constant-velocity": ConstantVelocity, "error-state": ErrorState}
@@ -364,7 +365,7 @@ class Estimator:
         """Apply what was put, and count what became of it."""
         settled = self._timeline.settle(self._apply)
         for _, old, new in settled:
-            # An outcome that is the same object as before stands: those of the IMU's samples, which are most.
+            # An outcome that is the same object as before is kept: those of the IMU's samples, which are most.
             if old is new:
                 continue
             if old is not None:
@@ -433,7 +434,7 @@ class Estimator:
         head = self._timeline.head
         if math.isinf(head):
             return None
-        # Without arrivals a silence and a jump look alike, and silences are commoner.
+        # Without arrivals a silence and a jump cannot be distinguished, and silences are more frequent.
         waited = UNHEARD if sample.arrival is None else max(0.0, sample.arrival - self._arrived)
         forward = sample.time - head > waited + self.settings.jump
         if not forward and sample.time >= head - max(self.settings.horizon, self.settings.jump):

@@ -1,4 +1,4 @@
-"""What `finssim fuse` runs: a log through the estimator, as it would have gone live."""
+"""Work of `finssim fuse`: a log through the estimator, as in real time."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def summary_of(
     nis: dict[str, tuple[float, int]],
     truth: StreamTable | None,
 ) -> dict[str, Any]:
-    """What can be said of a run, as plain values.
+    """Return the summary of a run, as plain values.
 
     Args:
         rows: Of the table.
@@ -192,10 +192,10 @@ LONGEST = 4.0e6
 
 @dataclass
 class Run:
-    """What a log gave."""
+    """Result of a log."""
 
     rows: list[list[Any]] = field(default_factory=list)
-    """In the order of `fuse_output.COLUMNS`."""
+    """Rows in the order of `fuse_output.COLUMNS`."""
     summary: dict[str, Any] = field(default_factory=dict)
     interrupted: bool = False
 

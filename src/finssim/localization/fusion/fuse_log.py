@@ -38,9 +38,9 @@ class StreamTable:
     """One table of a log."""
 
     name: str
-    """As messages call it."""
+    """Name in messages."""
     t: Array
-    """Times, (n,), as they stand in the file [s]."""
+    """Times as in the file, (n,) [s]."""
     numbers: dict[str, Array]
     """Column, in lower case -> values, (n,)."""
     words: dict[str, list[str]]
@@ -48,7 +48,7 @@ class StreamTable:
     notes: list[str] = field(default_factory=list)
 
     def has(self, *names: str) -> bool:
-        """Whether all these columns hold a number somewhere."""
+        """Return whether all these columns hold a number somewhere."""
         return all(name in self.numbers and np.isfinite(self.numbers[name]).any() for name in names)
 
     def columns(self, *names: str) -> Array:
@@ -96,13 +96,13 @@ class Series:
     """Samples in the order of their times."""
 
     what: str
-    """Such as `depth`, as messages call it."""
+    """Quantity such as `depth`, for messages."""
     t: Array
     """[s], rising, (n,)."""
     values: Array
     """(n, k)"""
     longest_gap: float
-    """Nothing is interpolated between samples further apart than this [s]."""
+    """Longest gap between samples that is interpolated [s]."""
 
     def between(self, times: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
         """The values at some times [s], in a straight line between two samples, (m, k), and whether they are known."""
@@ -211,18 +211,18 @@ class NoFix:
 
 @dataclass
 class Log:
-    """What a log holds."""
+    """Content of a log."""
 
     samples: list[Sample] = field(default_factory=list)
-    """In the order of their arrival."""
+    """Samples in the order of their arrival."""
     frames: list[Frame] = field(default_factory=list)
     """Pictures with tags, in the order of their stamps, where the log has no fixes."""
     missed: list[NoFix] = field(default_factory=list)
     """Pictures that `finssim localize` refused."""
     truth: StreamTable | None = None
-    """Where the vehicle really was: t, x, y, z [m], yaw [rad], pool frame."""
+    """True pose of the vehicle: t, x, y, z [m], yaw [rad], pool frame."""
     notes: list[str] = field(default_factory=list)
-    """What was repaired or left out."""
+    """Repairs, and samples left out."""
 
 
 def load_log(path: str | Path, vehicle: Vehicle, *, latency: float = 0.0) -> Log:
@@ -286,7 +286,7 @@ def _present(name: str, table: StreamTable) -> bool:
 
 
 class ImuColumns(NamedTuple):
-    """What a table holds of an IMU, in body axes; NaN where a row has none."""
+    """Columns of an IMU in a table, in body axes; NaN in rows without a value."""
 
     omega: Array
     """Angular rate [rad/s], (n, 3)."""
@@ -339,7 +339,7 @@ def _imu(table: StreamTable, vehicle: Vehicle, log: Log, latency: float) -> list
             f"{table.name}: rates of turn come every {interval:.3g} s, expected at most {LONGEST_GAP:g} s: are its "
             "times in seconds?"
         )
-    if len(rows) > 1:  # an attitude that was logged in rows of its own is carried on to the next rate
+    if len(rows) > 1:  # an attitude that was logged in separate rows is kept until the next rate
         tilt = _carried(table.t, tilt)
     arrival = _arrival(table, 0.0 if sensor is None else sensor.latency)
     return [

@@ -46,52 +46,52 @@ class Aids:
     """Errors of Doppler log and compass; those that last since power-on are a part of the error state."""
 
     velocity_std: float = 0.01
-    """Of one sample, per axis [m/s]."""
+    """Standard deviation of one sample, per axis [m/s]."""
     velocity_bias: float = 0.001
     """Standard deviation of the offset, per axis [m/s]."""
     velocity_scale: float = 0.001
     """Standard deviation of the scale's error [-]."""
     velocity_walk: float = 0.0
-    """Of the offset [m/s²/√Hz]."""
+    """Random walk of the offset [m/s²/√Hz]."""
     heading_std: float = 0.01
-    """Of one sample [rad]."""
+    """Standard deviation of one sample [rad]."""
     heading_bias: float = 0.005
     """Standard deviation of the compass's offset [rad]."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Of the estimator. Times in seconds."""
+    """Settings of the estimator. Times in seconds."""
 
     fresh: float = 0.25
     """Age of vision up to which the state is called fresh."""
     coast: float = 0.75
-    """Up to which velocity is trusted to go on."""
+    """Time up to which velocity is extrapolated."""
     hold: float = 3.0
-    """Up to which velocity dies away; beyond it the position stands still and its covariance grows."""
+    """Time up to which velocity decays; beyond it the position is constant and its covariance grows."""
     imu_fresh: float = 0.10
     depth_fresh: float = 0.30
     horizon: float = 1.0
-    """How late a sample may come and still be put in its place."""
+    """Greatest delay of a sample that is still inserted at its time."""
     jump: float = 1.0
-    """How far a stamp may run ahead of its arrival before the clock is doubted."""
+    """Greatest lead of a stamp over its arrival before the clock is doubted."""
     gate: Gate = Gate()
     motion: Motion = Motion()
     half_life: float = 1.0
-    """Of velocity while the state is held."""
+    """Half-life of velocity while the state is held."""
     speed_std: float = 0.3
     """Speed per axis that the vehicle may have when nothing is known [m/s]."""
     largest_variance: float = 100.0
-    """Of a position [m²]: doubt does not grow beyond it."""
+    """Greatest variance of a position [m²], at which its growth ends."""
     vision_std: tuple[float, float] = (0.02, 0.03)
-    """Of x and y [m] and of yaw [rad], where a measurement brings no covariance."""
+    """Standard deviation of x and y [m] and of yaw [rad], if a measurement has no covariance."""
     vision_floor: tuple[float, float] = (0.002, 0.003)
     """Added to a measurement's own standard deviations, in squares [m, rad]: errors that its covariance leaves out."""
     depth_std: float = 0.01
     """[m]"""
     gyro: YawNoise = YawNoise()
     bias_std: float = 0.01
-    """Of the gyro at power-on [rad/s]."""
+    """Bias of the gyro at power-on [rad/s]."""
     blind_rate: float = 0.3
     """Noise density of the yaw rate where the gyro is silent [rad/s/√Hz]."""
     accel_noise: float = 0.02
@@ -99,16 +99,16 @@ class Settings:
     accel_bias_walk: float = 1e-3
     """[m/s³/√Hz]"""
     accel_bias_std: float = 0.05
-    """At power-on [m/s²]."""
+    """Bias of the accelerometer at power-on [m/s²]."""
     tilt_std: float = 0.03
-    """Of roll and pitch at the start of the error-state filter [rad]."""
+    """Standard deviation of roll and pitch at the start of the error-state filter [rad]."""
     ready_position: float = 0.04
     """Largest variance of a position with which the state is ready [m²]."""
     ready_yaw: float = 0.03
     """And of yaw [rad²]."""
     aids: Aids | None = None
-    """Of Doppler log and compass; None where there are none. Between fixes the position then drifts, as its covariance
-    tells, and is ready up to `largest_variance`."""
+    """Noise of Doppler log and compass; None without them. Between fixes the position then drifts as its covariance
+    states, and is ready up to `largest_variance`."""
 
     @property
     def decay(self) -> float:
@@ -122,7 +122,7 @@ LOST = 100.0
 
 @dataclass(frozen=True)
 class Site:
-    """What of pool and vehicle the fusion needs."""
+    """Numbers of pool and vehicle that the fusion needs."""
 
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Normal of the still surface, upwards, pool frame."""

@@ -13,7 +13,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PositionState:
-    """What the filter knows."""
+    """State of the filter."""
 
     x: Array
     """Position [m] and velocity [m/s], pool frame, (..., 6)."""
@@ -23,7 +23,7 @@ class PositionState:
 
 @dataclass(frozen=True)
 class Motion:
-    """How a vehicle moves when nobody looks, per axis of the pool frame.
+    """Model of a vehicle's motion between measurements, per axis of the pool frame.
 
     Position is the integral of velocity, and velocity that of white acceleration of density q, so that over dt
 
@@ -41,7 +41,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Innovation:
-    """What a measurement says that the prediction did not."""
+    """Difference between a measurement and its prediction."""
 
     residual: Array
     """Measured minus predicted, (..., m)."""
@@ -50,7 +50,7 @@ class Innovation:
     mahalanobis: Array
     """Squared Mahalanobis distance, (...)."""
     gain: Array
-    """Of the Kalman filter, (..., 6, m)."""
+    """Gain of the Kalman filter, (..., 6, m)."""
 
 
 _I6 = np.eye(6)
@@ -92,7 +92,7 @@ def process_noise(dt: float, motion: Motion) -> Array:
 
 @lru_cache(maxsize=16)
 def _noise_powers(motion: Motion) -> Array:
-    """What goes with dt, dt²/2 and dt³/3 in the noise of a step where nothing decays, (3, 36)."""
+    """Return the coefficients of dt, dt²/2 and dt³/3 in the noise of a step without decay, (3, 36)."""
     first, second, third = powers = np.zeros((3, 6, 6))
     i, j = [0, 1, 2], [3, 4, 5]
     first[j, j] = second[i, j] = second[j, i] = third[i, i] = motion.density

@@ -1,4 +1,4 @@
-"""What reaches the estimator: samples of the sensors, each with the time at which it was true and when it came."""
+"""Samples of the sensors that reach the estimator, each with the time at which it was true and its arrival."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 def changed(record: T, **fields: Any) -> T:
-    """What `dataclasses.replace` gives, several times quicker, for frozen dataclasses that check nothing when made.
+    """Return a changed frozen dataclass, faster than `dataclasses.replace`, if its constructor checks nothing.
 
     Args:
         record: The record, which stays as it is.
@@ -31,7 +31,7 @@ def changed(record: T, **fields: Any) -> T:
 
 @dataclass(frozen=True)
 class ImuSample:
-    """Angular rate, and what else the unit tells."""
+    """Angular rate, and the other readings of the unit."""
 
     time: float
     """When it was measured [s]."""
@@ -53,7 +53,7 @@ class DepthSample:
     time: float
     """When it was measured [s]."""
     depth: float
-    """Of the pressure port below the surface, positive down [m]."""
+    """Depth of the pressure port below the surface, positive down [m]."""
     arrival: float | None = None
     """When it was delivered [s]; None: with its time."""
     stream: str = field(default="depth", init=False)
@@ -61,7 +61,7 @@ class DepthSample:
 
 @dataclass(frozen=True)
 class VisionSample:
-    """Where the camera, motion capture or an acoustic positioning system sees the vehicle."""
+    """Pose of the vehicle by the camera, motion capture or an acoustic positioning system."""
 
     time: float
     """Middle of the exposure [s]: the picture's stamp less the camera's latency."""
@@ -70,7 +70,7 @@ class VisionSample:
     yaw: float | None
     """Left positive, pool frame [rad]; None where it is not known."""
     covariance: tuple[tuple[float, float, float], ...] | None = None
-    """Of x, y [m] and yaw [rad], (3, 3); None: the settings' own."""
+    """Covariance of x, y [m] and yaw [rad], (3, 3); None: that of the settings."""
     arrival: float | None = None
     """When it was delivered [s]; None: with its time."""
     stream: str = field(default="vision", init=False)
@@ -83,7 +83,7 @@ class VelocitySample:
     time: float
     """When it was measured [s]."""
     velocity: tuple[float, float, float]
-    """Of the log's place, body axes [m/s]."""
+    """Velocity at the log's position, body axes [m/s]."""
     arrival: float | None = None
     """When it was delivered [s]; None: with its time."""
     stream: str = field(default="velocity", init=False)
@@ -106,7 +106,7 @@ Sample: TypeAlias = "ImuSample | DepthSample | VisionSample | VelocitySample | H
 
 
 def refusal(sample: Sample) -> str | None:
-    """Why a sample cannot be used whatever else is known, or None: text for counting, such as "not finite"."""
+    """Return why a sample cannot be used in any case, or None: text for counting, such as "not finite"."""
     if not math.isfinite(sample.time) or not (sample.arrival is None or math.isfinite(sample.arrival)):
         return "time not finite"
     if isinstance(sample, ImuSample):
@@ -124,7 +124,7 @@ def refusal(sample: Sample) -> str | None:
 
 
 def _covariance(rows: tuple[tuple[float, float, float], ...]) -> bool:
-    """Whether it is a symmetric matrix that can be a covariance with nothing known exactly."""
+    """Return whether rows are a symmetric matrix that can be a covariance with nothing known exactly."""
     if len(rows) != 3 or any(len(row) != 3 for row in rows):
         return False
     (a, d, e), (D, b, f), (E, F, c) = rows
@@ -143,7 +143,7 @@ def _covariance(rows: tuple[tuple[float, float, float], ...]) -> bool:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one sample."""
+    """Result of one sample."""
 
     stream: str
     """`vision` (x and y), `yaw`, `depth` or `imu`."""
@@ -155,13 +155,13 @@ class Outcome:
 
     @property
     def used(self) -> bool:
-        """Whether the state took it in."""
+        """Return whether the state was updated by it."""
         return self.verdict in ("accepted", "initialized", "reacquired")
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Where the vehicle is at one time. NaN: not known yet."""
+    """Pose of the vehicle at one time. NaN: not known yet."""
 
     time: float
     x: Array

@@ -1,4 +1,4 @@
-"""What one picture says about the vehicle's pose, and what is known of it beforehand."""
+"""The vehicle's pose from one picture, and prior knowledge of it."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ class Measurement:
     """A key of `METHODS`."""
     ok: bool
     reason: str
-    """Why it was refused; empty when it was not."""
+    """Reason for a refusal; empty if it was accepted."""
     position: Array
     """t_pb: body origin [m], (3,)."""
     rotation: Array
     """R_pb: body to pool, (3, 3)."""
     covariance: Array
-    """Of (x, y, yaw) [m, m, rad], (3, 3)."""
+    """Covariance of (x, y, yaw) [m, m, rad], (3, 3)."""
     residual_px: float
     """Root mean square distance of the corners used from where the pose puts them [px]."""
     tags: tuple[int, ...] = ()
@@ -70,9 +70,9 @@ class Measurement:
     """Corners not used, by reason."""
     iterations: int = 0
     medium: str = ""
-    """Where the corners are: `water`, `air` or `both`."""
+    """Medium of the corners: `water`, `air` or `both`."""
     pose_covariance: Array | None = None
-    """Of position and a turn about pool axes [m, rad], (6, 6), from methods that measure all six."""
+    """Covariance of position and a turn about pool axes [m, rad], (6, 6), from methods that measure all six."""
 
     @property
     def x(self) -> float:
@@ -212,7 +212,8 @@ def correspondences(detections: Iterable[Detection], tags_b: Mapping[int, Array]
 
 
 def _clockwise(corners: Array) -> bool:
-    """Whether each corner turns right, by at least `SMALLEST` twice the area of its triangle, as seen with v down."""
+    """Return whether each corner turns right, by at least `SMALLEST` twice the area of its triangle, as seen with v
+    down."""
     if np.shape(corners) != (4, 2):
         return False
     (a, b), (c, d), (e, f), (g, h) = np.asarray(corners, float).tolist()

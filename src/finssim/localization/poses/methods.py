@@ -65,7 +65,7 @@ class RigidFit:
         return math.sqrt(float(self.missed @ self.missed) / len(self.missed))
 
     def response(self, shared: Array) -> Array:
-        """How the motion changes with errors that move many points at once.
+        """Return how the motion changes with errors that move many points together.
 
         Args:
             shared: Change of each point Q - P per unit of each error, (k, n, 2).
@@ -246,7 +246,7 @@ _STEP = 0.1
 """Step of the derivative with respect to the pixel [px]: optics change over hundreds of pixels: its error is 1e-4."""
 _STEPS = np.array([[[0.0, 0.0]], [[_STEP, 0.0]], [[0.0, _STEP]]])
 _GRAZING = 1e-3
-"""A ray that makes less than this angle with the plane of heights [rad] does not tell where the corner is."""
+"""Angle between a ray and the plane of heights below which the ray does not locate the corner [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +262,7 @@ class CornerPoints:
     status: npt.NDArray[np.int8]
     """(n,)"""
     in_air: npt.NDArray[np.bool_]
-    """Whether the corner is on the camera's side of the water, (n,)."""
+    """True if the corner is on the camera's side of the water, (n,)."""
 
 
 def corner_points(pool: Pool, R_pg: Array, pixels: Array, heights: Array, *, straight: bool) -> CornerPoints:
@@ -338,7 +338,7 @@ FEWEST = 3
 WORST = 4.0
 """A corner that misses its place by more than this [px], and by more than 8 standard deviations, is an outlier."""
 WORST_WITHOUT_WATER = 40.0
-"""The same where the water is left out, which alone may cost many pixels."""
+"""Limit for methods without water, which alone may cost many pixels."""
 _SUSPECTS = (
     "check the tag's id, edge and mount, the depth, the tilt and the pool file",
     "the tags contradict each other: check their ids and mounts, the depth, the tilt and the pool file",
@@ -498,7 +498,8 @@ def _covariance(
     R_pg: Array,
     pixel_std: float,
 ) -> Array:
-    """Covariance of (x, y, yaw), pool frame: pixels, each for itself; height and tilt, which move all corners at once.
+    """Return the covariance of (x, y, yaw), pool frame: pixels, each independent; height and tilt, which move all
+    corners.
 
     With the miss e_i = Q_i - P_i, an error δ that all share moves the solution by -H^-1 sum_i J_i' w_i A_i de_i/dδ.
     """
@@ -626,7 +627,8 @@ def mirrored(R_pb: Array, sight_p: Array, normal_b: Array) -> Array:
 See = Callable[[Array], tuple[Array, Array, npt.NDArray[np.bool_]]]
 """Points, pool frame (n, 3) -> pixels (n, 2), derivatives by the point (n, 2, 3), and which are seen (n,)."""
 ExtraRows = Callable[[Array, Array, Array], tuple[Array, Array]]
-"""t_pb, R_pb and a shift of the picture [px] -> misses of what is known (m,) and derivatives (m, 8), [px]."""
+"""Function of t_pb, R_pb and a shift of the picture [px] -> residuals of prior knowledge (m,) and derivatives (m, 8),
+[px]."""
 
 _STILL = 1e-10
 """A step that lowers the cost by less than this [px²] is the last,"""
@@ -643,16 +645,16 @@ class RefinedPose:
     rotation: Array
     """R_pb, (3, 3)."""
     shift: Array
-    """Of the whole picture [px], (2,); zero without prior knowledge."""
+    """Shift of the complete picture [px], (2,); zero without prior knowledge."""
     cost: float
-    """Sum of Huber's rho over the points, and of the squares of what is known [px²]."""
+    """Sum of Huber's rho over the points, and of the squares of prior knowledge [px²]."""
     missed: Array
     """Distance of each point from its pixel [px], (n,)."""
     H: Array
     """Weighted J'J by position, a turn about pool axes and, with prior knowledge, the shift, (6, 6) or (8, 8)."""
     curvature: Array
-    """What steps are made with: H, with prior knowledge without what lies along the miss of far points, where Huber's
-    rho does not curve."""
+    """Matrix of the steps: H, with prior knowledge without the part along the residual of far points, where Huber's rho
+    is not curved."""
     g: Array
     """Slope of half the cost, (6,) or (8,)."""
     iterations: int = 0
@@ -664,8 +666,8 @@ class RefinedPose:
         return math.sqrt(float(self.missed @ self.missed) / len(self.missed))
 
     def covariance(self, pixel_std: float) -> Array:
-        """Of position and a turn about pool axes, (6, 6); where nothing else is known it is enlarged where the misses
-        exceed the noise by far."""
+        """Return the covariance of position and a turn about pool axes, (6, 6); without prior knowledge it is enlarged
+        if the residuals exceed the noise by far."""
         factor = _inflation(self.missed, 6, pixel_std) if len(self.H) == 6 else 1.0
         scale = 1.0 / np.sqrt(np.diagonal(self.H))
         inverse = np.linalg.pinv(self.H * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
@@ -765,7 +767,8 @@ def _linearised(
 
 
 def through_lens(lens: Lens, R: Array | None = None, position: Array | None = None) -> See:
-    """What tells where points appear without water: in the optical frame, or in one in which the camera has a pose.
+    """Return the function to image points without water: in the optical frame, or in one in which the camera has a
+    pose.
 
     Args:
         lens: Of the camera.
@@ -783,7 +786,7 @@ def through_lens(lens: Lens, R: Array | None = None, position: Array | None = No
 
 
 def through_water(pool: Pool) -> See:
-    """What tells where points appear: bent at the interface, or straight where they are on the camera's side of it."""
+    """Return the function to image points: refracted at the interface, or straight on the camera's side of it."""
     camera, interface = pool.camera, pool.interface
     straight = through_lens(camera.lens, camera.R_pc, camera.position)
 
@@ -833,7 +836,7 @@ class Choice:
     best: RefinedPose
     second: RefinedPose | None
     gap: float
-    """By how much chi² the second is worse; infinite where there is none."""
+    """Difference of chi² of the second solution; infinite if there is none."""
 
     @property
     def turned(self) -> float:
@@ -841,7 +844,8 @@ class Choice:
         return 0.0 if self.second is None else _angle(self.best.rotation, self.second.rotation)
 
     def covariance(self, pixel_std: float) -> Array:
-        """Of position and a turn about pool axes, (6, 6): that of the best, and the chance that it is the second.
+        """Return the covariance of position and a turn about pool axes, (6, 6): that of the best, and the probability
+        of the second.
 
         P = w1 P1 + w2 (P2 + d d'), w2/w1 = exp(-gap/2), with d from the best to the second.
         """
@@ -1024,7 +1028,7 @@ def refractive_bundle(
 
 
 def _doubt(choice: Choice, pixel_std: float) -> str:
-    """Why the best pose is not to be believed; empty where it is."""
+    """Return why the best pose is doubtful; empty if it is not."""
     best, second = choice.best, choice.second
     if not best.converged:
         return f"did not converge in {best.iterations} steps"
@@ -1068,8 +1072,8 @@ def _upright(rotation: Array, up: Array) -> Array:
 
 
 def _deepened(apparent_pose: RefinedPose, pairs: Correspondences, pool: Pool) -> tuple[Array, Array] | None:
-    """Where a body is that appears at a pose: its corners, at their apparent depth times the ratio of the indices on
-    the refracted rays, and the rigid motion that fits these."""
+    """Return the pose of a body that appears at a pose: its corners, at their apparent depth times the ratio of the
+    indices on the refracted rays, and the rigid motion that fits these."""
     interface = pool.interface
     apparent = pairs.points_b @ apparent_pose.rotation.T + apparent_pose.position
     rays = back_project(pool.camera, interface, pairs.pixels)
@@ -1093,7 +1097,7 @@ METHOD = "refractive-weighted"
 HUBER = 2.5
 """Miss in standard deviations from which on Huber's rho grows linearly."""
 SUREST = 1e-6
-"""What is given as exact is held as tightly as this [m, rad, px]."""
+"""Standard deviation of prior knowledge that is given as exact [m, rad, px]."""
 MAX_STEPS = 30
 
 
@@ -1168,8 +1172,9 @@ def _constraint_rows(constraints: Constraints, pixel_std: float) -> ExtraRows:
 Method: TypeAlias = Callable[
     [Iterable[Detection], Pool, Mapping[int, Array], Constraints | None, float], Measurement
 ]
-"""Tags of one picture, pool, tag id -> corners in the body frame [m] (4, 3), what is known of height and tilt, standard
-deviation of a corner per axis [px] -> the measurement; it refuses a bad picture with a reason and raises nothing."""
+"""Function of the tags of one picture, pool, tag id -> corners in the body frame [m] (4, 3), prior knowledge of height
+and tilt, and the standard deviation of a corner per axis [px] -> the measurement; it refuses a bad picture with a
+reason and raises nothing."""
 
 METHODS: dict[str, Method] = {
     "refractive": planar_fit,
