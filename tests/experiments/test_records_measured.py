@@ -36,24 +36,24 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 X, Y, Z, YAW = T1_SETPOINTS["P03"]
 
 
-def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5)):
+def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5), vehicle=FINSROV):
     """A recorded run of the tuned PID on the pool's clock, and its truth, as long as `brief_t1` has it."""
-    true_site, known_site, settings = camera_of(FINSROV, 1, "realistic")
+    true_site, known_site, settings = camera_of(vehicle, 1, "realistic")
     truth, record = folder / "truth", folder / "run.mcap"
-    camera = PoolCamera(FINSROV, true_site, mode="corners", settings=settings, seed=1)
+    camera = PoolCamera(vehicle, true_site, mode="corners", settings=settings, seed=1)
     pool = VirtualPool(
-        FINSROV,
-        draw_plant(FINSROV, 1, "realistic"),
+        vehicle,
+        draw_plant(vehicle, 1, "realistic"),
         camera=camera,
         start=(start, quat_from_yaw(0.0)),
         seed=1,
         truth=truth,
     )
-    pilot = make_pilot("pid", FINSROV, task=task)
+    pilot = make_pilot("pid", vehicle, task=task)
     about = {"command": "finssim run", "pilot": pilot.describe()}
     guide_end = 0.0 if isinstance(guide, Station) else guide.duration
-    with Recorder(record, FINSROV, about, pictures="none", epoch=1e9) as recorder:
-        runtime = Runtime(FINSROV, known_site, pilot, guide, arm=True, recorder=recorder)
+    with Recorder(record, vehicle, about, pictures="none", epoch=1e9) as recorder:
+        runtime = Runtime(vehicle, known_site, pilot, guide, arm=True, recorder=recorder)
         run_lockstep(runtime, pool, seconds, until=lambda r: r.t >= max(24.0, guide_end) + 0.5)
     pool.close()
     return record, truth, runtime.started
@@ -133,6 +133,23 @@ def test_a_run_that_ended_early_is_named_and_has_no_late_errors(tmp_path, capsys
     assert "run.mcap: ended early" in capsys.readouterr().out
     assert boundary.run(app, ["evaluate", str(record), "--task", "t2"]) == 2
     assert "(evaluate --trajectory" in capsys.readouterr().err
+
+
+def test_a_record_of_a_vehicle_of_ones_own_is_measured_by_the_file_that_it_keeps(
+    tmp_path, capsys, monkeypatch
+):
+    """Without --vehicle, from another directory, after the file is gone; one that the record lacks is named."""
+    own = tmp_path / "minnow.yaml"
+    own.write_text("extends: finsrov\norigin: measured\nsource: test\nbody: {mass: 13.0}\n")
+    minnow = load_vehicle(own)
+    record, _, _ = driven(tmp_path, Station((X, Y, Z), YAW), 5.0, vehicle=minnow)
+    own.unlink()
+    monkeypatch.chdir(tmp_path.parent)
+    assert boundary.run(app, ["evaluate", str(record), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["vehicle"] == {"name": "minnow", "sha256": minnow.sha256} and told["records"]
+    assert boundary.run(app, ["evaluate", str(record), "--vehicle", "finsrov"]) == 2
+    assert "name the file that was driven with --vehicle" in capsys.readouterr().err
 
 
 def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.pool.virtual_pool import TruthError, read_truth
+from finssim.robot.record_messages import RecordError
 from finssim.robot.record_reader import open_record
 from finssim.vehicles import VehicleError
 from finssim.viewer.frame import ViewError
@@ -140,7 +141,7 @@ def test_the_name_of_a_vehicle_is_no_path(trial, tmp_path, monkeypatch, place):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     name = place.format(theirs.parent if place.startswith("{") else "home")
     bad = rewritten(trial.record, tmp_path / "bad.mcap", {f"{name}.yaml": "extends: finsrov\n"}, vehicle=name)
-    with pytest.raises(ViewError, match="bad.mcap: vehicle '.*expected the plain name"):
+    with pytest.raises(RecordError, match="bad.mcap: vehicle '.*expected the plain name"):
         RecordSource(bad)
     assert theirs.read_text(encoding="utf-8") == "precious: 1\n"
     assert {path.name for path in tmp_path.rglob("*")} == {"home", "mine.yaml", "bad.mcap"}
@@ -180,5 +181,5 @@ def test_a_record_names_vehicles_of_the_catalogue_or_keeps_their_file(trial, tmp
 )
 def test_what_a_record_keeps_names_no_file_elsewhere(trial, tmp_path, files, sentence):
     bad = rewritten(trial.record, tmp_path / "bad.mcap", files, vehicle="mine")
-    with pytest.raises(ViewError, match=sentence):
+    with pytest.raises(RecordError, match=sentence):
         RecordSource(bad)

@@ -36,6 +36,7 @@ from finssim.files import atomic_directory, plain_name
 from finssim.progress import progress_bar
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
+from finssim.robot.record_files import vehicle_of
 from finssim.robot.record_reader import open_record
 from finssim.tasks import task_named
 from finssim.tasks.agents import agent_for
@@ -403,8 +404,7 @@ def _subject(controller: Path, task: str | None, vehicle: str | Vehicle | None) 
     """
     if controller.suffix == ".mcap" and vehicle is None:
         with open_record(controller) as record:
-            name = record.metadata.get("vehicle")
-        vehicle = None if name is None else catalogue_vehicle(name, str(controller))
+            vehicle = vehicle_of(record) if "vehicle" in record.metadata else None
     if controller.is_dir() and (task is None or vehicle is None):
         trained = read_description(controller)
         task = task or trained.task

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,10 +16,8 @@ from finssim.control.guidance import Guide, Station
 from finssim.engine import Pool as Walls
 from finssim.engine import Simulator, Water
 from finssim.engine.recorder import ABOUT, read_run
-from finssim.files import plain_name
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.localization.detection.detector import RegionTracker, detector
-from finssim.localization.pool import Pool, load_pool
 from finssim.pool.onboard import OnboardSensors
 from finssim.pool.plant_spec import PlantSpecError, Severity
 from finssim.pool.run import make_plan
@@ -33,10 +29,11 @@ from finssim.robot.messages import TagCorners
 from finssim.robot.pictures import picture_of
 from finssim.robot.pilots import make_pilot
 from finssim.robot.reading import Reading
+from finssim.robot.record_files import pool_of, vehicle_of
 from finssim.robot.record_messages import STATES
 from finssim.robot.record_reader import Record, open_record
 from finssim.robot.runtime import Runtime
-from finssim.vehicles import Vehicle, VehicleError, catalogue_vehicle, load_vehicle
+from finssim.vehicles import Vehicle, catalogue_vehicle, load_vehicle
 from finssim.viewer.frame import Curve, Frame, Picture, Pose, Stage, ViewError, box_of, box_of_world, nowhere
 from finssim.viewer.series import (
     HEADING,
@@ -50,7 +47,7 @@ from finssim.viewer.series import (
 from finssim.viewer.shapes import shown_of, world_bodies
 from finssim.worlds import RangeBatch
 from finssim.worlds.layout import WorldLayout
-from finssim.yaml_file import json_value, read_mapping
+from finssim.yaml_file import json_value
 
 Array = npt.NDArray[np.float64]
 
@@ -367,9 +364,9 @@ class RecordSource:
             ViewError: Nothing in it that could be shown.
         """
         with open_record(path) as record:
-            self._vehicle = load_vehicle(vehicle) if vehicle else _vehicle_of(record)
+            self._vehicle = load_vehicle(vehicle) if vehicle else vehicle_of(record)
             self._read(record)
-            site, self._record = _pool_of(record), record.metadata
+            site, self._record = pool_of(record), record.metadata
         if not len(self._odom):
             raise ViewError(f"{path}: no estimate of a pose in it, on a topic odom: nothing to show")
         self._truth: PoseSeries | None = None
@@ -567,53 +564,6 @@ def _tags_in(text: str) -> tuple[TagCorners, ...]:
         )
     except (ValueError, KeyError, TypeError, OverflowError):
         return ()  # words of other programs
-
-
-def _pool_of(record: Record) -> Pool | None:
-    if "pool.yaml" not in record.files:
-        return None
-    with _kept_file(record, "pool.yaml", ("camera", "lens")) as file:
-        return load_pool(file)
-
-
-def _vehicle_of(record: Record) -> Vehicle:
-    """The vehicle that the record names, from the file that it keeps where the catalogue has another one now."""
-    name = record.metadata.get("vehicle")
-    if name is None:
-        raise ViewError(f"{record.path}: does not name its vehicle: give --vehicle")
-    file_name = f"{plain_name(name, f'{record.path}: vehicle', ViewError)}.yaml"
-    try:
-        vehicle = catalogue_vehicle(name, str(record.path))
-        if vehicle.sha256 == record.metadata.get("vehicle_sha256") or file_name not in record.files:
-            return vehicle
-    except VehicleError:
-        if file_name not in record.files:
-            raise
-    with _kept_file(record, file_name, ("extends",), ("hull", "file")) as file:
-        return load_vehicle(file)
-
-
-@contextmanager
-def _kept_file(record: Record, name: str, *references: tuple[str, ...]) -> Iterator[Path]:
-    """Yield a file that the record keeps, in a separate folder; `references` are its keys that may name other files.
-
-    So may the devices of a vehicle's `perception`.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / name
-        file.write_text(record.files[name], encoding="utf-8")
-        tree: Any = read_mapping(file, ViewError, such_as="name: value")
-        for keys in references:
-            value = tree
-            for key in keys:
-                value = value.get(key) if isinstance(value, dict) else None
-            if isinstance(value, str):
-                plain_name(value, f"{record.path}: {name}: {': '.join(keys)}", ViewError)
-        entries = tree.get("perception")
-        for entry in entries.values() if isinstance(entries, dict) else ():
-            if isinstance(entry, dict) and isinstance(entry.get("device"), str):
-                plain_name(entry["device"], f"{record.path}: {name}: perception: device", ViewError)
-        yield file
 
 
 # Frames of a run that the engine's recorder wrote.
