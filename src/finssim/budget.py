@@ -11,7 +11,7 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ TEXT = 512 << 20
 """Table in a text file, such as a log [bytes]."""
 CHUNK = 64 << 20
 """Chunk of a log after it is unpacked [bytes]."""
+UNPACKED = 4 << 30
+"""Log that is packed as whole files, after it is unpacked to the disk [bytes]."""
 CELLS = 1 << 27
 """Numbers in a table that is packed."""
 PIXELS = 1 << 26
@@ -59,6 +61,49 @@ def read_bytes(path: Path, refuse: type[Exception], name: str | None = None, lim
     if len(data) > limit:
         raise refuse(f"{name or path}: larger than {limit >> 20} MiB: give a smaller file")
     return data
+
+
+# Zstandard: a file does not have to say how much it unpacks to, so it is unpacked to nowhere first.
+
+
+def zstd() -> Any:
+    """Return the module that unpacks Zstandard."""
+    try:
+        from compression import zstd  # since Python 3.14
+    except ImportError:
+        from backports import zstd
+    return zstd
+
+
+def packed_with_zstd(file: Path) -> bool:
+    """Return whether a file begins as Zstandard begins: with a frame, or with one that is skipped."""
+    try:
+        with file.open("rb") as stream:
+            begins = stream.read(4)
+    except OSError:
+        return False
+    return begins == b"\x28\xb5\x2f\xfd" or (begins[1:] == b"\x2a\x4d\x18" and begins[0] >> 4 == 5)
+
+
+def check_unpacked(files: Iterable[Path], refuse: type[Exception], name: str, remedy: str) -> None:
+    """Refuse files that unpack to more than `UNPACKED` together; one that is damaged counts up to its damage.
+
+    Args:
+        files: Packed with Zstandard.
+        refuse: Class of the error, made from one sentence.
+        name: What the sentence calls the files.
+        remedy: What the sentence says to do.
+
+    Raises:
+        refuse: They unpack to more.
+    """
+    module, room = zstd(), UNPACKED
+    for file in files:
+        with suppress(module.ZstdError, EOFError), module.open(file, "rb") as unpacked:
+            while block := unpacked.read(1 << 20):
+                room -= len(block)
+                if room < 0:
+                    raise refuse(f"{name}: unpacks to more than {UNPACKED >> 20} MiB: {remedy}")
 
 
 # Pictures: their size is in their first bytes, and is read before anything is decoded.

@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from finssim.budget import CHUNK as CHUNK_BYTES
+from finssim.budget import zstd
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
@@ -196,11 +197,7 @@ def _unpacked(compression: str, packed: bytes) -> bytes:
     if compression == "":
         return packed
     if compression == "zstd":
-        try:
-            from compression import zstd  # since Python 3.14
-        except ImportError:
-            from backports import zstd
-        return bytes(zstd.ZstdDecompressor().decompress(packed, CHUNK_BYTES))
+        return bytes(zstd().ZstdDecompressor().decompress(packed, CHUNK_BYTES))
     if compression == "lz4":
         import lz4.frame
 

@@ -99,8 +99,8 @@ TOPICS = {
 SECONDS = 4.0
 
 
-def written(folder, storage, topics=("/odom", "/imu", "/wrench", "/pressure"), compressed=False):
-    """A bag of 4 s."""
+def written(folder, storage, topics=("/odom", "/imu", "/wrench", "/pressure"), mode=None):
+    """A bag of 4 s, packed where a mode is given."""
     queue = []
     for topic in topics:
         kind, make, rate = TOPICS[topic]
@@ -108,8 +108,8 @@ def written(folder, storage, topics=("/odom", "/imu", "/wrench", "/pressure"), c
             ns = START + int(i * 1e9 / rate)
             queue.append((ns + LATENCY, topic, STORE.serialize_cdr(make(ns, i), kind)))
     writer = Writer(folder, version=8, storage_plugin=storage)
-    if compressed:
-        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    if mode is not None:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
         connections = {t: writer.add_connection(t, TOPICS[t][0], typestore=STORE) for t in topics}
         for ns, topic, raw in sorted(queue, key=lambda item: item[0]):
@@ -208,12 +208,10 @@ def test_a_folder_that_lost_its_metadata_opens(tmp_path, storage):
 
 
 @pytest.mark.parametrize("part", [0.8, 0.5])
-@pytest.mark.parametrize("compressed", [False, True])
-def test_an_mcap_cut_off_opens_up_to_the_cut(tmp_path, part, compressed):
+@pytest.mark.parametrize("mode", [None, CompressionMode.STORAGE])
+def test_an_mcap_cut_off_opens_up_to_the_cut(tmp_path, part, mode):
     """The recorder lost power: no index, no end; what was written whole is there, also inside the last chunk."""
-    data = next(
-        written(tmp_path / "run", StoragePlugin.MCAP, compressed=compressed).glob("*.mcap")
-    ).read_bytes()
+    data = next(written(tmp_path / "run", StoragePlugin.MCAP, mode=mode).glob("*.mcap")).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: int(part * len(data))])
     (trial,) = read_trials([tmp_path / "cut.mcap"])
     assert 10 < len(trial.series("u")[0]) <= 80
@@ -276,3 +274,41 @@ def test_a_small_bag_that_unpacks_to_much_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(dispatch, "limited_memory", lambda: budget.limited_memory(128 << 20))
     with pytest.raises(CalibrationError, match="Unable to allocate|MemoryError"):
         read_trials([tmp_path / "bomb"])
+
+
+def packed_bag(folder, storage, size):
+    """A bag packed as a whole file, of one message of so many zeros after one that says something."""
+    writer = Writer(folder, version=8, storage_plugin=storage)
+    writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=STORE)
+        writer.write(connection, START, bytes(size))
+    return folder
+
+
+def test_a_bag_that_is_packed_as_a_whole_is_unpacked_up_to_a_limit(tmp_path, storage, monkeypatch):
+    """To a directory of its own on the disk; what is larger is not written, and its files may be given instead."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
+    (tmp_path / "scratch").mkdir()
+    bag = packed_bag(tmp_path / "bomb", storage, 64 << 20)
+    assert sum(file.stat().st_size for file in bag.iterdir()) < 1 << 20
+    monkeypatch.setattr(budget, "UNPACKED", 32 << 20)
+    unpacked = []
+    monkeypatch.setattr("shutil.copyfileobj", lambda *given: unpacked.append(given))
+    with pytest.raises(
+        CalibrationError, match="bomb: unpacks to more than 32 MiB: unpack its files with 'zstd -d'"
+    ):
+        read_trials([bag])
+    assert not unpacked and not list((tmp_path / "scratch").iterdir())
+
+
+def test_a_bag_that_is_packed_as_a_whole_says_what_the_plain_one_says(tmp_path, storage):
+    """With a frame to be skipped before it, too."""
+    plain = written(tmp_path / "plain", storage)
+    packed = written(tmp_path / "packed", storage, mode=CompressionMode.FILE)
+    (file,) = packed.glob("*.zstd")
+    file.write_bytes(b"\x50\x2a\x4d\x18\x02\0\0\0ab" + file.read_bytes())
+    (one,), (other,) = read_trials([plain]), read_trials([packed])
+    assert one.channels and sorted(one.channels) == sorted(other.channels)
+    for name in one.channels:
+        np.testing.assert_array_equal(one.series(name), other.series(name))

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
-from finssim.budget import limited_memory
+from finssim.budget import check_unpacked, limited_memory, packed_with_zstd
 from finssim.calibration.findings import CalibrationError, Finding, finding, listed
 from finssim.calibration.importers.assemble import (
     ColumnMap,
@@ -466,6 +466,10 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[Finding]]]:
         findings = [finding("as_read", remark=repair) for repair in repairs]
         if parts != [path] and path.is_dir():
             findings.append(finding("no_metadata", bag=path.name, files=len(parts)))
+        if path.is_dir():
+            packed = [file for file in sorted(path.iterdir()) if file.is_file() and packed_with_zstd(file)]
+            remedy = "unpack its files with 'zstd -d' and give these, each by itself"
+            check_unpacked(packed, CalibrationError, str(path), remedy)
         stack.enter_context(limited_memory())  # whatever a small bag may unpack to
         try:
             reader = AnyReader(parts, default_typestore=get_typestore(Stores.LATEST))
