@@ -21,11 +21,11 @@ from finssim.tasks.agents import NOWHERE, Agent, expert_for, restarted
 from finssim.yaml_file import json_value
 
 DATASET_FILE = "metadata.json"
-"""Which marks a data set of Minari."""
+"""File that marks a data set of Minari."""
 STATE = "state"
 """Key of the row of numbers in an observation with pictures."""
 OURS = "finssim"
-"""Key of the metadata under which stands what was demonstrated: task, vehicle, expert, seed, provenance."""
+"""Key of the metadata for the demonstrations: task, vehicle, expert, seed, provenance."""
 
 
 class DatasetError(ValueError):
@@ -45,9 +45,9 @@ class Episode:
     terminated: bool
     """Ended by the task; else by its time."""
     metrics: Mapping[str, float]
-    """Of the task, such as success."""
+    """Metrics of the task, such as success."""
     pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
-    """Of a task that sees, by name; (T + 1, height, width, 3)."""
+    """Pictures of a task with pictures, by name; (T + 1, height, width, 3)."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,13 @@ class Demonstrations:
     episodes: int
     mean_return: float
     about: Mapping[str, Any]
-    """What was demonstrated: task, observation, action, vehicle, expert, seed, provenance."""
+    """Description of the demonstrations: task, observation, action, vehicle, expert, seed, provenance."""
     pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
-    """By name, (N, height, width, 3)."""
+    """Pictures by name, (N, height, width, 3)."""
 
 
 def save(out: str | Path, episodes: Sequence[Episode], described: Mapping[str, Any]) -> Path:
-    """Write a data set whole or not at all; an earlier one at that place is replaced.
+    """Write a data set completely or not at all; an earlier one at that place is replaced.
 
     Args:
         out: Folder of the data set; `minari.MinariDataset(out)` reads it too.
@@ -170,7 +170,8 @@ def read_episodes(folder: str | Path) -> Iterator[Episode]:
 
 
 def about(folder: str | Path) -> dict[str, Any]:
-    """What a data set is of: task, observation, action, vehicle, expert, seed, provenance, episodes and steps.
+    """Return the description of a data set: task, observation, action, vehicle, expert, seed, provenance, episodes and
+    steps.
 
     Raises:
         DatasetError: There is none, or it was not made by FinsSim.
@@ -205,7 +206,7 @@ def data_sets_in(folder: str | Path) -> list[Path]:
 
 
 def _word(name: str) -> str:
-    """A name as Minari takes it: letters, digits and dashes."""
+    """Return a name as Minari takes it: letters, digits and dashes."""
     return "".join(c if c.isalnum() else "-" for c in name).strip("-") or "expert"
 
 
@@ -213,7 +214,7 @@ def _word(name: str) -> str:
 
 
 WORLDS = 64
-"""At once, at most."""
+"""Greatest number of worlds."""
 
 
 def collect(
@@ -342,7 +343,7 @@ def record_episodes(
             measured = environment.task.metrics(environment.arrays)
             broke = ended & (
                 environment.arrays.done.numpy() == 0
-            )  # began anew after a number that was not finite
+            )  # restarted after a number that was not finite
             broken += int(np.count_nonzero(broke & (quota > 0)))
             if broken > 10 * (count + rows):
                 raise DatasetError(

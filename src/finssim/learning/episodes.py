@@ -1,4 +1,4 @@
-"""How episodes went, kept where the worlds are: on a GPU no step waits for the host."""
+"""Statistics of episodes, kept on the device of the worlds: on a GPU no step waits for the host."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from finssim.tasks.environment import GREATEST_SEED
 
 
 TOTALS = ("final_return", "final_length", "final_held", "final_totals", "final_earned")
-"""What tasks measure an episode by, of the one that ended last in each world."""
+"""Measures of the episode that ended last in each world."""
 
 
 class EpisodeEnds:
@@ -45,7 +45,7 @@ class EpisodeEnds:
         self.ended = self._terminated != self._terminated
 
     def done(self) -> Any:
-        """Where an episode ended in the step just done, bool, (worlds,)."""
+        """Return where an episode ended in the latest step, bool, (worlds,)."""
         return (self._terminated | self._truncated) != 0
 
     def look(self, worlds: Any) -> None:
@@ -62,11 +62,11 @@ class EpisodeEnds:
         self.ended[...] = False
 
     def earned(self) -> dict[str, NDArray[np.float64]]:
-        """What each reward and each end added to the return, by world; see `Task.earned`."""
+        """Return what each reward and each end added to the return, by world; see `Task.earned`."""
         return self._environment.task.earned(self._copy)
 
     def metrics(self) -> tuple[NDArray[np.bool_], dict[str, NDArray[np.float64]]]:
-        """Where there was an end, and the task's measures by world, as NumPy: the one copy through the host."""
+        """Return where an episode ended, and the task's measures by world, as NumPy: the one copy through the host."""
         ended = self._arrays.numpy(self.ended)
         return ended, self._environment.task.metrics(self._copy)
 
@@ -136,14 +136,14 @@ class EpisodeTally:
         self._looks = 0
 
     def state(self) -> dict[str, Any]:
-        """What `load` takes."""
+        """Return the state that `load` takes."""
         return {
             "shortened": self._arrays.numpy(self._shortened),
             "episodes": np.array(self._episodes),
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Go on from a state that was taken between two updates."""
+        """Continue from a state that was taken between two updates."""
         self._shortened[...] = self._arrays.bools(state["shortened"])
         self._episodes.clear()
         self._episodes.extend(tuple(row) for row in state["episodes"].tolist())
@@ -163,7 +163,7 @@ def held_seed(seed: int) -> int:
 
 
 class HeldEvaluation:
-    """Runs a network through the first episode of every world of an environment of its own."""
+    """Evaluation of a network in the first episode of every world of a separate environment."""
 
     def __init__(self, environment: Environment, device: str = "cpu") -> None:
         """Take an environment that resets itself, and torch's device."""

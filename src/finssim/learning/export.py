@@ -241,7 +241,8 @@ def export_policy(
     also: Callable[[Path], None] | None = None,
     tolerance: float = 1e-6,
 ) -> Path:
-    """Writes a policy directory whole or not at all, after checking that onnxruntime computes what the network does.
+    """Write a policy directory completely or not at all, after checking that onnxruntime computes what the network
+    does.
 
     Args:
         network: A `Network`, or a torch module that maps observations (N, n) float32 to the mean action (N, m); the
@@ -290,7 +291,7 @@ def export_policy(
 
 
 def description_of(environment: Environment, **training: Any) -> PolicyDescription:
-    """What a policy directory says of the environment that its policy was trained in.
+    """Return the description of a policy directory for the environment that its policy was trained in.
 
     Args:
         environment: Its task, vehicle, action mode and scale, model and ranges.
@@ -477,7 +478,7 @@ def _answer(
     pictures: Mapping[str, NDArray[np.uint8]],
     limited: bool = True,
 ) -> NDArray[Any]:
-    """Action, in [-1, 1] if `limited`, and, beside it, the memory after, (N, m + k), computed with that type."""
+    """Return the action, in [-1, 1] if `limited`, and the memory after, (N, m + k), computed with that type."""
     inputs = [None if x is None else np.asarray(x, dtype=kind) for x in (observation, memory)]
     if isinstance(network, Network):
         action, after = network.as_type(kind).step(*inputs)

@@ -79,7 +79,7 @@ class Env(gymnasium.Env[Any, Any]):
         self._onlooker: Onlooker | None = None
 
     def render(self) -> NDArray[np.uint8] | None:
-        """With `render_mode="rgb_array"` the vehicle from behind, uint8 (360, 640, 3); otherwise nothing."""
+        """Return the vehicle from behind, uint8 (360, 640, 3), with `render_mode="rgb_array"`; otherwise None."""
         if self.render_mode != "rgb_array":
             return None
         self._onlooker = self._onlooker or Onlooker(self.environment)
@@ -190,7 +190,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         return observation, reward, terminated, truncated, info
 
     def _metrics(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
-        """How the episodes went that have ended, with masks."""
+        """Return the measures of the episodes that have ended, with masks."""
         totals: dict[str, Any] = {}
         for key, value in self.environment.task.metrics(self.environment.arrays).items():
             name = f"episode_{key}" if key in ("return", "length") else key

@@ -1,4 +1,4 @@
-"""Networks with their gradients by hand, for NumPy and torch alike: linear layers with tanh, a GRU, and Adam.
+"""Networks with gradients written by hand, for NumPy and torch: linear layers with tanh, a GRU, and Adam.
 
 Every function is written once with what the two libraries share (`@`, `tanh`, `where`, `out=`), so that the same lines
 learn with NumPy on a processor, without torch, and with torch on a GPU, without a copy through the host. Rows are
@@ -119,7 +119,7 @@ class Arrays:
         return saved
 
     def load(self, state: dict[str, Any]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         self._rng.bit_generator.state = state["numpy"]
         if self.device is not None:
             self._noise.set_state(self.xp.from_numpy(np.asarray(state["torch"])))
@@ -129,7 +129,7 @@ class Parameters:
     """All numbers of some networks in one row, and their gradient in another: an optimiser needs no more."""
 
     def __init__(self, arrays: Arrays, *networks: Any) -> None:
-        """Give the networks their memory: `shapes()` of each says what it needs, `bind` hands it over."""
+        """Allocate the memory of the networks: `shapes()` of each gives the shapes, `bind` assigns the arrays."""
         sizes = [[math.prod(shape) for shape in network.shapes()] for network in networks]
         total = sum(map(sum, sizes))
         self.values, self.gradient = arrays.zeros(total), arrays.zeros(total)
@@ -152,7 +152,7 @@ class Row:
         self.size = size
 
     def shapes(self) -> list[tuple[int, ...]]:
-        """Of the numbers."""
+        """Return the shape of the numbers."""
         return [(self.size,)]
 
     def bind(self, weights: list[Array], gradients: list[Array]) -> None:
@@ -171,7 +171,7 @@ class Stack:
         self._room: dict[tuple[int, ...], Array] = {}
 
     def shapes(self) -> list[tuple[int, ...]]:
-        """Of W, (inputs, outputs), and b, (outputs,), of each layer."""
+        """Return the shapes of W, (inputs, outputs), and b, (outputs,), of each layer."""
         return [shape for a, b in zip(self.sizes, self.sizes[1:], strict=False) for shape in ((a, b), (b,))]
 
     def bind(self, weights: list[Array], gradients: list[Array]) -> None:
@@ -249,7 +249,7 @@ class Gru:
         """W_x (inputs, 3 units), b_x, W_h (units, 3 units), b_h, with r, z and n side by side."""
 
     def shapes(self) -> list[tuple[int, ...]]:
-        """Of the weights."""
+        """Return the shapes of the weights."""
         k = 3 * self.units
         return [(self.inputs, k), (k,), (self.units, k), (k,)]
 

@@ -20,13 +20,13 @@ from finssim.files import atomic_directory
 from finssim.learning.demonstrations import OURS, DatasetError, Episode, about, read_episodes
 
 FORMAT = "v3.0"
-"""Of `codebase_version`."""
+"""Version of the format (`codebase_version`)."""
 INFO_FILE = "meta/info.json"
-"""Which marks a data set of LeRobot."""
+"""File that marks a data set of LeRobot."""
 FILE_MIB = 100
-"""A file of frames ends with the episode that takes it to this size [MiB]."""
+"""Size at which a file of frames ends with the current episode [MiB]."""
 FILES = 1000
-"""In a folder, at most."""
+"""Greatest number of files in a folder."""
 FILE_PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 
@@ -123,7 +123,7 @@ def _frames(
 def _episode_row(
     index: int, columns: Mapping[str, NDArray[Any]], began: int, file: int, title: str
 ) -> dict[str, Any]:
-    """Of the table of episodes: where its frames are, and their statistics."""
+    """Return a row of the table of episodes: the place of its frames, and their statistics."""
     steps = len(columns["action"])
     return {
         "episode_index": index,
@@ -183,7 +183,7 @@ def _columns(episode: Episode, index: int, began: int, fps: int) -> dict[str, ND
 
 
 def _features(columns: Mapping[str, NDArray[Any]], described: Mapping[str, Any]) -> dict[str, Any]:
-    """What `info.json` says of each column: type, shape, names."""
+    """Return the entry of each column in `info.json`: type, shape, names."""
     names: dict[str, Any] = {"action": list(described["action"]["labels"])}
     names["observation.state"] = [
         f"{entry['name']} {k}" if len(entry["indices"]) > 1 else entry["name"]
@@ -231,7 +231,8 @@ def _png(picture: NDArray[np.uint8]) -> bytes:
 
 
 def _statistics(x: NDArray[Any]) -> dict[str, Any]:
-    """What LeRobot normalizes by: of a picture each channel in [0, 1], shape (3, 1, 1); plain data."""
+    """Return the statistics by which LeRobot normalises: of a picture each channel in [0, 1], shape (3, 1, 1); plain
+    data."""
     picture = x.dtype == np.uint8
     rows = x.reshape(-1, x.shape[-1]) / 255.0 if picture else x.reshape(len(x), -1).astype(float)
     values = {

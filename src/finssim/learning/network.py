@@ -29,7 +29,7 @@ class Activation:
 
     kind: str
     alpha: float = 1.0
-    """Of Elu alone."""
+    """Slope of Elu alone."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Cell:
     """A GRU of torch's equations (gates r, z, n), one step at a time; its memory is what it put out."""
 
     from_x: Linear
-    """From its inputs to all gates side by side."""
+    """Weights from its inputs to all gates, side by side."""
     from_h: Linear
-    """From what it put out before to all gates."""
+    """Weights from its previous output to all gates."""
 
     @property
     def units(self) -> int:
@@ -68,7 +68,7 @@ class Network:
     mean: Array | None = None
     """Taken off each observation, (n,)."""
     scale: Array | None = None
-    """What it is multiplied with then, (n,)."""
+    """Factor after the mean is subtracted, (n,)."""
     history: int = 0
     """Earlier observations that it sees."""
     last_action: int = 0
@@ -117,7 +117,7 @@ class Network:
         return y, (xp.concatenate(after, 1) if len(after) > 1 else after[0]) if after else None
 
     def as_type(self, kind: Any) -> Network:
-        """With all numbers as NumPy's of that type."""
+        """Return the network with all numbers as NumPy's of that type."""
 
         def cast(value: Any) -> Any:
             if isinstance(value, tuple):
@@ -151,7 +151,7 @@ INTEGRAL_LIMIT = 0.1
 INTEGRAL_REACH = 0.04
 """Errors far beyond this are hardly collected: a way to go is no disturbance."""
 INTEGRAL_RATE = 0.015
-"""Of the collected error in a control step: several seconds at ten a second, slow beside the policy's own answer."""
+"""Share of the collected error in a control step: several seconds at ten a second, slow relative to the policy."""
 
 
 def with_integrals(
@@ -182,7 +182,7 @@ def with_integrals(
 
 
 def first_memory(network: Any, rows: int, device: str | None = None) -> Array | None:
-    """What a network remembers at the start of so many episodes, (rows, k); None if it never does.
+    """Return the memory of a network at the start of so many episodes, (rows, k); None if it has none.
 
     Args:
         network: A `Network` or a torch module.

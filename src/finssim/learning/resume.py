@@ -1,4 +1,4 @@
-"""What lets a killed training go on to the same result: random streams, and states in a file."""
+"""State of a training that continues to the same result: random streams, and arrays in a file."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from finssim.files import OutputError
 RESUME_FILE = "resume.npz"
 
 ARRAY, TENSOR, PAIRS = "__array__", "__tensor__", "__pairs__"
-"""Keys that stand for a NumPy array or a torch tensor of the file, and for a dictionary whose keys are no strings."""
+"""Keys that represent a NumPy array or a torch tensor of the file, and a dictionary whose keys are not strings."""
 
 
 class ResumeError(ValueError):
-    """A training that cannot go on from what is there."""
+    """A training that cannot continue from the existing files."""
 
 
 def random_state() -> dict[str, Any]:
@@ -77,7 +77,7 @@ def read_state(path: Path) -> dict[str, Any]:
 
 
 def _packed(value: Any, arrays: list[Any]) -> Any:
-    """What JSON can say of it; arrays go into the list, and their number stands for them."""
+    """Return a value in JSON's types; arrays are appended to the list, and their index replaces them."""
     if isinstance(value, np.ndarray):
         arrays.append(value)
         return {ARRAY: len(arrays) - 1}

@@ -1,4 +1,4 @@
-"""What every adapter does with an environment: make it from the arguments of `finssim.make`, and age its episodes."""
+"""Common part of the adapters: they make an environment from the arguments of `finssim.make`, and age its episodes."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from finssim.tasks import Environment, Task
 
 
 class _Worlds:
-    """What both forms do with the worlds."""
+    """Common part of both forms."""
 
     def __init__(self, task: str | Task | Environment, stagger: bool, options: dict[str, Any]) -> None:
         self.environment = served(task, options)

@@ -9,7 +9,7 @@ from finssim.tasks import Environment, EnvironmentSetupError
 
 
 class Tensors:
-    """Views that the environment writes in every step; whoever keeps one over a step makes a copy.
+    """Views that the environment writes in every step; copy those that are kept over a step.
 
     Attributes:
         observation: (worlds, agents, size); the first of the new episode where one ended.

@@ -41,7 +41,7 @@ class SeeingNetwork(nn.Module):
         self.shapes = {name: tuple(shape) for name, shape in shapes.items()}
         self.encoders = nn.ModuleDict()
         for name, (rows, columns, depth) in self.shapes.items():
-            layers: list[nn.Module] = [nn.InstanceNorm2d(depth)]  # what water does to a whole picture
+            layers: list[nn.Module] = [nn.InstanceNorm2d(depth)]  # effect of water on a complete picture
             for a, b in zip([depth, *channels], channels, strict=False):
                 layers += [nn.Conv2d(a, b, 3, stride=2, padding=1), nn.ELU()]
                 rows, columns = (rows + 1) // 2, (columns + 1) // 2

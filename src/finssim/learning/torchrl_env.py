@@ -123,7 +123,8 @@ class TorchRlEnv(EnvBase):
         return out
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """As TorchRL's, which merges a reset into every row; here the first observations are there already."""
+        """Return TorchRL's step; the first observations of new episodes are in place already, and are not merged into
+        every row."""
         tensordict = self.step(tensordict)
         following = self._step_mdp(tensordict)
         if self._begun.any():

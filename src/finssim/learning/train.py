@@ -216,7 +216,7 @@ def parse_settings(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def _finish(loop: Any, folder: Path, stopped: bool, console: Console, label: Path, took: float) -> None:
-    """Write the policy, or the policy so far; after Ctrl-C the interrupt goes on."""
+    """Write the policy, or the policy so far; after Ctrl-C the interrupt is raised again."""
     from finssim.learning.export import export_policy
     from finssim.learning.training_loop import after
 
@@ -237,12 +237,12 @@ def _finish(loop: Any, folder: Path, stopped: bool, console: Console, label: Pat
 
 
 def _path_beside(out: Path, side: Path) -> Path:
-    """Where an unfinished policy goes: a finished one that is there already must not be lost to it."""
+    """Return the directory of an unfinished policy, which must not replace a finished one."""
     return side / "interrupted" if (out / DESCRIPTION_FILE).is_file() else out
 
 
 def _identity(description: PolicyDescription) -> dict[str, Any]:
-    """What must be equal for a training to go on to the same result, by the name it has in a sentence."""
+    """Return what must be equal for a training to continue to the same result, by the name used in messages."""
     described = plain_data(
         description.model_dump(mode="json", include={"task", "action", "hydrodynamics", "seed"})
     )

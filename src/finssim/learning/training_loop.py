@@ -104,7 +104,7 @@ class TrainingView:
 
 
 CHECKPOINTS = 4
-"""In a training, at least: after each such part, or `CHECKPOINT_STEPS`, whichever comes first."""
+"""Least number of checkpoints in a training: after each such part, or `CHECKPOINT_STEPS`, whichever is first."""
 CHECKPOINT_STEPS = 500_000
 """Control steps of all worlds together between two checkpoints, at most."""
 RETAINED = 2
@@ -122,7 +122,7 @@ class Best:
     steps: int
     """After which it was measured."""
     network: bytes
-    """As ONNX."""
+    """Network as ONNX."""
 
 
 @dataclass
@@ -131,7 +131,7 @@ class Loop:
 
     learner: Learner
     description: PolicyDescription
-    """Of the policy as it will be."""
+    """Description of the final policy."""
     side: Path
     """Folder of checkpoints and log."""
     evaluate: Callable[[Any], Mapping[str, float]]
@@ -139,13 +139,13 @@ class Loop:
     show: Callable[[Mapping[str, Any]], None]
     """Called with every row of the curves."""
     progress: Callable[[float], None]
-    """Told the share of the training that is done, before each update: ranges may grow with it."""
+    """Function that receives the finished share of the training before each update: ranges may grow with it."""
     identity: Mapping[str, Any]
-    """What must be equal for a training to go on from a checkpoint."""
+    """Values that must be equal for a training to continue from a checkpoint."""
     until: float | None = None
     """Share of successes among the held episodes: reached in two evaluations in a row, the training is done."""
     project: str | None = None
-    """Of Weights & Biases, which is sent the curves too; None: nothing is sent."""
+    """Project of Weights & Biases that receives the curves too; None: nothing is sent."""
     curves: list[dict[str, Any]] = field(default_factory=list)
     best: Best | None = None
     """The network that did best in the held evaluations, the later of equals: what a training leaves behind."""
@@ -153,7 +153,7 @@ class Loop:
     """Time of the updates and evaluations so far [s], over all the pieces of a training that was resumed."""
 
     def run(self) -> bool:
-        """Update until the steps are done, or the held episodes succeed as often as `until` says.
+        """Update until the steps are done, or the held episodes succeed as often as `until` requires.
 
         Returns:
             Whether it was interrupted by Ctrl-C.
@@ -181,7 +181,7 @@ class Loop:
 
     @property
     def reached(self) -> bool:
-        """Whether the last two held evaluations reached `until`."""
+        """Return whether the last two held evaluations reached `until`."""
         if self.until is None:
             return False
         every = math.ceil(self.learner.settings.steps / EVALUATIONS)
@@ -221,7 +221,7 @@ class Loop:
         return {**counted, **learned, **held}
 
     def _passed(self, every: int) -> bool:
-        """Whether the last update went past a multiple of so many steps."""
+        """Return whether the last update passed a multiple of so many steps."""
         rows = (
             self.curves if self.curves and self.curves[-1]["steps"] < self.learner.steps else self.curves[:-1]
         )
@@ -229,7 +229,7 @@ class Loop:
         return bool(self.learner.steps // every > before // every)
 
     def _save(self) -> None:
-        """Write a checkpoint: a policy that can be run, and the state to go on from; older ones go.
+        """Write a checkpoint: a policy that can be run, and the state to continue from; older ones are removed.
 
         So do those after more steps, which an earlier training has left: `last_checkpoint` would take them for newer.
         """
@@ -257,7 +257,7 @@ class Loop:
             shutil.rmtree(other)
 
     def resume(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `last_checkpoint` found.
+        """Continue from the result of `last_checkpoint`.
 
         Raises:
             ResumeError: It is of another training.
@@ -279,7 +279,7 @@ class Loop:
 
 
 def _score(row: Mapping[str, Any]) -> tuple[float, float]:
-    """How good a held evaluation was: the share of successes, where the task knows one, then the return."""
+    """Return the score of a held evaluation: the share of successes, if the task has one, then the return."""
     share, total = (float(row.get(f"evaluation_{name}", 0.0)) for name in ("success", "return"))
     return (share if math.isfinite(share) else 0.0, total if math.isfinite(total) else -1e300)
 
@@ -318,7 +318,7 @@ class _CurveLog:
     """Rows of the curves as TensorBoard reads them, without torch; and for Weights & Biases."""
 
     def __init__(self, folder: Path, steps: int, run: Any = None) -> None:
-        """Go on after so many steps: what a killed or an earlier training logged later, TensorBoard is to forget.
+        """Continue after so many steps: TensorBoard drops what a killed or an earlier training logged later.
 
         Args:
             folder: Of TensorBoard.
@@ -346,7 +346,7 @@ class _CurveLog:
 
 
 def _wandb_run(project: str, side: Path, identity: Mapping[str, Any]) -> Any:
-    """The run of Weights & Biases for a training; one that is gone on with goes on in the same run.
+    """Return the run of Weights & Biases for a training; a resumed training continues the same run.
 
     Raises:
         LearningError: It cannot be begun: nobody is logged in, or nothing answers.

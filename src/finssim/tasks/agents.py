@@ -1,4 +1,4 @@
-"""Who acts: a PID, a policy or a baseline of a task, for any number of vehicles at once, in a batch or on a robot."""
+"""Agents: a PID, a policy or a baseline of a task, for any number of vehicles, in a batch or on a robot."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ Rows = NDArray[np.float32]
 """Observations or actions, (n, numbers)."""
 Mask = NDArray[np.bool_]
 Pictures = Mapping[str, NDArray[np.uint8]]
-"""What is seen, by name, uint8 (n, height, width, channels)."""
+"""Pictures by name, uint8 (n, height, width, channels)."""
 
 
 # Classical controllers by task: each sees what a policy sees and acts as a policy does.
@@ -65,7 +65,7 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 class Baseline(Protocol):
-    """A controller that keeps no state of its own: its memory goes in with every call and comes back."""
+    """A controller without internal state: its memory is an argument and a result of every call."""
 
     @property
     def period(self) -> float:
@@ -139,7 +139,7 @@ def turned_from(o: Array) -> Array:
 
 
 class TrackingMemory(NamedTuple):
-    """What `TrackingPid` remembers."""
+    """Memory of `TrackingPid`."""
 
     heading: Array
     """Heading since the start, counted from the yaw rate [rad], (n,)."""
@@ -242,7 +242,7 @@ class DriveBaseline:
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle) -> Any:
-        """With the numbers of a vehicle."""
+        """Return the baseline with the numbers of a vehicle."""
         return cls(drive=DriveNumbers.of(vehicle))
 
     def reset(self, n: int) -> None:
@@ -302,7 +302,7 @@ class ConsensusFormation(DriveBaseline):
     """
 
     side: float
-    """Of the net [m]."""
+    """Side of the net [m]."""
     reach: float
     """Distance from the net within which it has the target [m]."""
     shape: float = 0.6
@@ -316,7 +316,7 @@ class ConsensusFormation(DriveBaseline):
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle) -> ConsensusFormation:
-        """With the numbers of a vehicle, for the net that three of them carry by the task's default settings."""
+        """Return the baseline with the numbers of a vehicle, for the net that three of them carry by default."""
         task = Formation().fitted([vehicle])
         return cls(drive=DriveNumbers.of(vehicle), side=task.side, reach=task.reach)
 
@@ -370,7 +370,7 @@ class FormationPursuit(DriveBaseline):
     """Speed per distance to one's place [1/s]."""
 
     def places(self, observation: Array) -> Array:
-        """Where each agent should be, from itself, body frame [m], (n, 3); one row per agent."""
+        """Return the place of each agent relative to itself, body frame [m], (n, 3); one row per agent."""
         prey = CHASE_SCALE * observation[:, 6:9]
         mates = CHASE_SCALE * np.stack([observation[:, 16:19], observation[:, 24:27]], axis=1)
         herds = observation[:, [14, 22]]
@@ -407,18 +407,18 @@ class DockingPid(WrenchPid):
     """
 
     nose: float
-    """Of the vehicle, from its origin [m]."""
+    """Distance of the vehicle's nose from its origin [m]."""
     berth: float
-    """Where the nose is to rest, along the axis [m]."""
+    """Final place of the nose, along the axis [m]."""
     wait: float
-    """Where the nose waits until it is right, along the axis [m]."""
+    """Place where the nose waits until it is aligned, along the axis [m]."""
     gap: float
-    """How far beside the axis the nose may be in the tube [m]; towards the mouth it grows by `slope`."""
+    """Greatest distance of the nose from the axis in the tube [m]; towards the mouth it grows by `slope`."""
     slope: float
     lead: float
-    """How far the goal runs ahead of the nose [m]: it sets the speed."""
+    """Distance of the goal ahead of the nose [m], which sets the speed."""
     turn: float = np.radians(15.0)
-    """How far the vehicle may be turned away [rad]."""
+    """Greatest angle away from the axis [rad]."""
 
     @classmethod
     def for_vehicle(
@@ -473,7 +473,7 @@ class DockingPid(WrenchPid):
         return self.command(memory, track, Goal(aim - arm, level))
 
     def _ahead(self, nose: Array, forward: Array) -> Array:
-        """Where on the axis the nose is to go next [m], (n,), from where it is and points, dock axes, (n, 3)."""
+        """Return the nose's next place on the axis [m], (n,), from its position and direction, dock axes, (n, 3)."""
         aside = np.hypot(nose[..., 1], nose[..., 2])
         allowed = self.gap + self.slope * np.maximum(-nose[..., 0], 0.0)
         turned = np.arccos(np.clip(forward[..., 0], -1.0, 1.0))
@@ -486,16 +486,16 @@ class DockingPid(WrenchPid):
 
 
 def camera_of(vehicle: Vehicle, task: Task) -> dict[str, Any]:
-    """Of the camera that a task sees with: focal length as a share of its width, and place, body axes [m]."""
+    """Return the camera of a task: focal length as a share of its width, and position, body axes [m]."""
     device = device_of(vehicle, task.pictures[0].name)
     return {"focal_share": device.focal_length / device.width, "eye": tuple(device.mount.position.tolist())}
 
 
 class SightMemory(NamedTuple):
-    """What `LightServo` remembers; the axes are level, at the start, x where the vehicle pointed then."""
+    """Memory of `LightServo`; the axes are level, at the start, with x in the vehicle's initial direction."""
 
     position: Array
-    """Of the body origin, by its velocity and depth [m], (n, 3)."""
+    """Position of the body origin, by its velocity and depth [m], (n, 3)."""
     heading: Array
     """[rad], (n,)."""
     dock: Array
@@ -518,13 +518,13 @@ class LightServo(DockingPid):
     focal_share: float = 0.0
     """Focal length as a share of the picture's width."""
     eye: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the camera, body axes [m]."""
+    """Position of the camera, body axes [m]."""
     side: float = 1.16
-    """Of the square of lights [m]."""
+    """Side of the square of lights [m]."""
     before: float = 0.78
-    """How far it stands before the throat [m]."""
+    """Distance of the square before the throat [m]."""
     first: float = 2.8
-    """How far ahead the dock is taken to be until it has been found [m]."""
+    """Assumed distance of the dock until it has been found [m]."""
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD, **more: Any) -> Any:
@@ -685,13 +685,13 @@ class LineFollower(DriveBaseline):
     focal_share: float
     """Focal length as a share of the picture's width."""
     eye: tuple[float, float, float]
-    """Of the camera, body axes [m]."""
+    """Position of the camera, body axes [m]."""
     least: float = 60.0
     """Squared numbers of yellow, summed over a picture, below which it shows too little."""
     gain: float = 0.5
     """Speed to the side and down per distance [1/s]."""
     memory_share: float = 0.8
-    """Of the line before, in the next estimate."""
+    """Share of the line before, in the next estimate."""
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle) -> LineFollower:
@@ -763,7 +763,7 @@ class Side(NamedTuple):
     """A straight side of a net, as a ping shows it, in the plane of the body's x and y axes."""
 
     angle: Array
-    """Of its normal, away from the vehicle [rad], (n,)."""
+    """Angle of its normal, away from the vehicle [rad], (n,)."""
     distance: Array
     """Along that, of its straight line [m], (n,)."""
     right: Array
@@ -779,7 +779,7 @@ class Side(NamedTuple):
         return np.column_stack([self.distance * c - along * s, self.distance * s + along * c])
 
     def meets(self, other: Side, reach: float) -> Mask:
-        """Where the two lines cross at most so far beyond an end of each [m], at 3° to 40°, (n,)."""
+        """Return whether the two lines cross within a distance beyond an end of each [m], at 3° to 40°, (n,)."""
         turn = other.angle - self.angle
         sine = np.where(np.abs(turn) < 0.05, 1.0, np.sin(turn))
         beyond = np.zeros_like(turn)
@@ -803,23 +803,23 @@ class WallFollower(DriveBaseline):
     speed: float
     """Along the net [m/s]."""
     distance: float
-    """From it [m]."""
+    """Distance from the net [m]."""
     height: float
     """Above its foot [m]."""
     sector: float
-    """Of the sonar [rad]."""
+    """Sector of the sonar [rad]."""
     bin_length: float
     """[m]"""
     eye: tuple[float, float, float]
-    """Of the sonar, body axes [m]."""
+    """Position of the sonar, body axes [m]."""
     under: float
-    """Of the altimeter below the body origin [m]."""
+    """Distance of the altimeter below the body origin [m]."""
     least: float = 60.0
     """Level of an echo in the picture that counts."""
     behind: float = 0.03
     """The loudest echo of twine comes from so far behind the net's plane, from above or below the beam's middle [m]."""
     echoes: int = 12
-    """On a side, below which it is not believed."""
+    """Least number of echoes on a side for it to be used."""
     reach: float = 0.45
     """Sides that meet do so at most this beyond the last echo on each [m]."""
     tube: float = 0.14
@@ -827,11 +827,11 @@ class WallFollower(DriveBaseline):
     gain: float = 0.5
     """Speed per distance [1/s]."""
     integral: float = 0.3
-    """Of the error of the speed over ground, in the speed asked for [1/s]: what a stream takes away."""
+    """Integral gain of the error of the speed over ground [1/s], which compensates a stream."""
     jump: float = 0.25
     """Distance and heading change by less from ping to ping [m, rad]."""
     memory_share: float = 0.5
-    """Of distance and heading before, in the next estimate."""
+    """Share of distance and heading before, in the next estimate."""
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle) -> WallFollower:
@@ -1001,7 +1001,7 @@ def memory_leaves(memory: Any) -> list[Any]:
 
 
 def memory_from(leaves: Iterable[Any], fresh: Any) -> Any:
-    """The memory that `memory_leaves` took apart.
+    """Return the memory whose leaves `memory_leaves` listed.
 
     Args:
         leaves: What it gave.
@@ -1033,7 +1033,7 @@ TASKS_OF_PIDS = ("t1", "t2")
 
 
 NOWHERE = Goal(np.zeros((0, 3)), np.zeros((0, 4)))
-"""A goal that tells nothing: of an agent whose observation has all that it may know."""
+"""A goal without content: of an agent whose observation holds all that it may know."""
 
 
 class AgentError(ValueError):
@@ -1041,7 +1041,8 @@ class AgentError(ValueError):
 
 
 def known_in(environment: Environment) -> Known:
-    """What an environment measured: the observation of every agent of every world, the state of the first vehicle."""
+    """Return the measurements of an environment: the observation of every agent of every world, the first vehicle's
+    state."""
     arrays = environment.arrays
     observed: Rows = arrays.observation.numpy()
     state = (arrays.position, arrays.quaternion, arrays.velocity)
@@ -1054,7 +1055,7 @@ def known_in(environment: Environment) -> Known:
 
 
 class Agent(Protocol):
-    """Sees what is known and a goal, and keeps no state: its memory goes in with every call and comes back."""
+    """An agent without internal state: it sees measurements and a goal; its memory is an argument and a result."""
 
     name: str
     period: float
@@ -1062,7 +1063,7 @@ class Agent(Protocol):
     action: str
     """Action mode."""
     wrench_scale: Any
-    """Part of each wrench limit that action 1 stands for, one number or (6,)."""
+    """Share of each wrench limit that action 1 means, one number or (6,)."""
 
     def reset(self, n: int) -> Any:
         """Memory before the first of n episodes' actions: arrays with n rows, in tuples; or None."""
@@ -1071,7 +1072,7 @@ class Agent(Protocol):
         """Actions (n, size) and the memory after."""
 
     def describe(self) -> dict[str, Any]:
-        """Who it is, as plain data."""
+        """Return the agent's description as plain data."""
 
 
 class PolicyAgent:
@@ -1196,7 +1197,7 @@ def agent_for(
 def expert_for(
     name_or_directory: str | Path, vehicle: Vehicle, task: Task, action: str, scale: Any = 1.0
 ) -> PolicyAgent | BaselineAgent:
-    """Who is imitated: a baseline of the task or the policy of a directory, which see the observation alone.
+    """Return the expert: a baseline of the task or the policy of a directory, which see the observation alone.
 
     Args:
         name_or_directory: Which.
@@ -1241,7 +1242,7 @@ def rollout(
     *,
     record: Path | None = None,
 ) -> Iterator[tuple[int, Step | None]]:
-    """Let an agent act; whoever iterates looks at the worlds before each decision and after the last.
+    """Let an agent act, and yield before each decision and after the last.
 
     Args:
         agent: Who acts; several agents of a world share it.

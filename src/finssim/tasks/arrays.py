@@ -23,7 +23,7 @@ class ReferenceTable:
 
 @wp.struct
 class TargetMotion:
-    """How the target of every world moves; where it is stands in `goal_position`."""
+    """Motion of the target of every world; its position is in `goal_position`."""
 
     velocity: wp.array(dtype=wp.vec3)  # world frame [m/s]
     wanted: wp.array(dtype=wp.vec3)  # what the velocity goes to [m/s]
@@ -33,11 +33,11 @@ class TargetMotion:
 
 @wp.struct
 class MessageTable:
-    """What the agents of a world have heard of each other, and what is under way; see `communication`."""
+    """Messages that the agents of a world have received, and those under way; see `communication`."""
 
     on: int  # 0: everybody sees everybody
     period: int  # control steps between two messages of an agent
-    slots: int  # messages of one agent that can be under way at once
+    slots: int  # messages of one agent that can be under way together
     processing: float  # [s]
     speed_of_sound: float  # [m/s]
     loss: float  # probability, for every receiver
@@ -63,7 +63,7 @@ class NetTable:
 
 @wp.struct
 class Answers:
-    """What the functions of a task in plain torch answered, for the kernels that go on with it; see `torch_task`."""
+    """Answers of the functions of a task in plain torch, for the kernels that follow; see `torch_task`."""
 
     reward: wp.array2d(dtype=float)  # (worlds, agents)
     terminated: wp.array(dtype=int)

@@ -30,7 +30,7 @@ class TaskError(ValueError):
 
 
 class Played(NamedTuple):
-    """What the steps gave, by step and world."""
+    """Results of the steps, by step and world."""
 
     observation: NDArray[np.float32]
     """(steps, worlds, numbers of all agents)"""
@@ -39,11 +39,11 @@ class Played(NamedTuple):
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     metrics: dict[str, NDArray[np.float64]]
-    """At the end."""
+    """Values at the end."""
 
     @property
     def ended(self) -> NDArray[np.bool_]:
-        """Which episodes ended, (steps, worlds)."""
+        """Return which episodes ended, (steps, worlds)."""
         return self.terminated | self.truncated
 
 
@@ -146,7 +146,7 @@ def _repeats(first: Played, again: Played, many: Played) -> Iterator[str]:
 
 
 def _equal(first: Played, other: Played) -> bool:
-    """Whether the first worlds of another play gave the same numbers."""
+    """Return whether the first worlds of another play gave the same numbers."""
     pairs = zip(first[:4], other[:4], strict=True)
     return all(np.array_equal(a, b[:, :WORLDS], equal_nan=a.dtype.kind == "f") for a, b in pairs)
 
@@ -164,7 +164,7 @@ def _leaks(first: Played, past: Played) -> Iterator[str]:
 
 
 def _starts(played: Played) -> Iterator[str]:
-    """What is seen after a reset differs between worlds and episodes."""
+    """Yield findings on observations after a reset, which must differ between worlds and episodes."""
     starts = played.observation[played.ended]
     if len(starts) > 1 and len({row.tobytes() for row in starts}) == 1:
         yield "every episode starts alike: draw something at the start or in reset, from the key or with w.uniform"

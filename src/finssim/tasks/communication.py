@@ -11,19 +11,19 @@ from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.terms import measured_velocity
 
 MOST_UNDER_WAY = 32
-"""Messages of one agent that can be under way at once."""
+"""Greatest number of messages of one agent that can be under way."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Communication:
-    """How agents tell each other where they are. A message holds the sender's measured position and velocity."""
+    """Settings of the messages between agents. A message holds the sender's measured position and velocity."""
 
     period: float = 1.0
     """Time between two messages of an agent [s]; agents take turns within it."""
     processing: float = 0.1
-    """From the measurement to its use, besides the way through the water [s]."""
+    """Time from the measurement to its use, besides the way through the water [s]."""
     loss: float = 0.1
-    """Probability that a receiver misses a message; each receiver by itself."""
+    """Probability that a receiver misses a message, independently for each receiver."""
     speed_of_sound: float = 1500.0
     """[m/s]"""
 
@@ -84,7 +84,7 @@ def message_table(
 
 @wp.func
 def mate_position(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
-    """Where agent a takes agent b to be, world frame [m]: where it was when it sent the newest message heard."""
+    """Return the position of agent b as agent a knows it, world frame [m]: that of the newest message received."""
     x = arrays.position[w, b]
     if arrays.messages.on != 0 and a != b:
         x = arrays.messages.position[w, a * arrays.agent_reward.shape[1] + b]
@@ -93,7 +93,7 @@ def mate_position(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
 
 @wp.func
 def mate_velocity(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
-    """How agent a takes agent b to move, world frame [m/s]."""
+    """Return the velocity of agent b as agent a knows it, world frame [m/s]."""
     v = measured_velocity(arrays, w, b)
     if arrays.messages.on != 0 and a != b:
         v = arrays.messages.velocity[w, a * arrays.agent_reward.shape[1] + b]

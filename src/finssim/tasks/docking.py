@@ -1,4 +1,4 @@
-"""Docking: enter a funnel nose first, gently, and stay in its tube; where it is, is told, or found in a picture."""
+"""Docking: enter a funnel nose first, gently, and stay in its tube; its pose is given, or found in a picture."""
 
 import math
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ def in_dock(arrays: TaskArrays, p: Any, w: int, x: wp.vec3, q: wp.quat) -> wp.ve
 
 @wp.func
 def berth_offset(arrays: TaskArrays, p: Any, w: int, nose: wp.vec3) -> wp.vec3:
-    """From the nose to its berth, body frame [m]."""
+    """Return the way from the nose to its berth, body frame [m]."""
     R = wp.quat_to_matrix(wp.quat_inverse(arrays.quaternion[w, 0]) * arrays.goal_quaternion[w])
     return R * (wp.vec3(p.berth * p.funnel.tube_length, 0.0, 0.0) - nose)
 
@@ -55,22 +55,22 @@ BRISK = 0.9
 
 @dataclass(frozen=True)
 class Hull:
-    """What the task takes from the vehicle; the environment sets it. The defaults are FinsROV's, rounded."""
+    """Numbers of the vehicle that the task uses; the environment sets it. The defaults are FinsROV's, rounded."""
 
     length: float = 0.56
     """[m]"""
     girth: float = 0.2444
-    """From the body's x axis to a corner of its envelope [m]."""
+    """Distance from the body's x axis to a corner of its envelope [m]."""
     inertia: float = 27.1
-    """In surge, with the water that goes along [kg]."""
+    """Inertia in surge, with added mass [kg]."""
     speed: float = 0.476
-    """That the dock is built for, forwards [m/s]."""
+    """Forward speed that the dock is built for [m/s]."""
     thrust: float = 19.8
     """Greatest, forwards [N]."""
 
     @classmethod
     def of(cls, vehicle: Vehicle) -> "Hull":
-        """Of a vehicle's file."""
+        """Return the numbers of a vehicle's file."""
         length, width, height = map(float, vehicle.body.size)
         model = coefficients_of(vehicle)
         return cls(
@@ -179,7 +179,8 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class Docking(Task):
-    """Lengths in vehicle lengths, unless said otherwise; the dock's section in parts of the vehicle's girth.
+    """Docking. Lengths are in vehicle lengths, unless stated otherwise; the dock's section in shares of the vehicle's
+    girth.
 
     An episode goes on when it has succeeded: staying in is what pays. Sizes are ours: nothing is published.
     """
@@ -192,7 +193,7 @@ class Docking(Task):
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 40.0
     hull: Hull = Hull()
-    """Of the vehicle; the environment sets it."""
+    """Hull of the vehicle; the environment sets it."""
     throat: float = 1.2
     """Radius of the tube, in girths."""
     mouth: float = 2.0
@@ -204,15 +205,15 @@ class Docking(Task):
     rim: float = 0.5
     """Thickness of the block, in girths."""
     give: float = 0.15
-    """How far a hull point sinks in when the vehicle hits the dock at the speed it is built for, in girths."""
+    """Depth to which a hull point sinks in at the speed that the dock is built for, in girths."""
     damping: float = 0.2
-    """Of a contact point with the vehicle's mass on it, as a part of the critical."""
+    """Damping of a contact point that carries the vehicle's mass, as a share of the critical damping."""
     berth: float = 0.75
-    """Where the nose is to rest, in parts of the tube from the throat."""
+    """Final place of the nose, as a share of the tube from the throat."""
     inside: float = 0.5
-    """From where on it counts as inside, in parts of the tube."""
+    """Place from which it counts as inside, as a share of the tube."""
     dock_spread: tuple[float, float, float] = (1.5, 1.5, 0.8)
-    """The dock stands this far from the middle of the tank at most."""
+    """Greatest distance of the dock from the middle of the tank."""
     start: tuple[float, float] = (1.5, 4.0)
     """The nose starts this far before the mouth, ..."""
     start_aside: tuple[float, float] = (1.5, 0.8)
@@ -234,7 +235,7 @@ class Docking(Task):
     training_noise: MeasurementNoise = TRAINING
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Docking":
-        """With a dock that fits the vehicle."""
+        """Return the task with a dock that fits the vehicle."""
         return replace(self, hull=Hull.of(vehicles[0]))
 
     @property
@@ -346,7 +347,7 @@ def start_at_site(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class CameraDocking(SeeingTask, Docking):
-    """Docking into the dock of the site `dock`, which stands, looks and is lit otherwise in each episode.
+    """Docking into the dock of the site `dock`, whose pose, look and light differ in each episode.
 
     The row of numbers holds attitude, velocity and depth alone: where the dock is, the picture shows. What `docking`
     observes is `teacher`, for who may know it in training.
@@ -388,5 +389,5 @@ class CameraDocking(SeeingTask, Docking):
         return replace(Docking.arena(self), length=24.0, width=7.8 if self.placed else 24.0, depth=4.95)
 
     def terms(self) -> Terms:
-        """Those of `Docking`."""
+        """Return the terms of `Docking`."""
         return replace(super().terms(), start=start_at_site)

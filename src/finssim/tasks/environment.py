@@ -37,7 +37,7 @@ MOST_REPORTS = 3
 
 @dataclass(frozen=True)
 class Step:
-    """What one step gave; NumPy views of the environment's own arrays, valid until the next step."""
+    """Result of one step; NumPy views of the environment's own arrays, valid until the next step."""
 
     observation: Any
     """(worlds, size), or (worlds, agents, size) of several agents; the first of the new episode where one ended. Of a
@@ -61,7 +61,7 @@ def act(
     agents: int,
     world_offset: int,
 ):
-    """Thrusts of every vehicle: of an agent's own action, or of what the task says for one of the others."""
+    """Write the thrusts of every vehicle: of an agent's own action, or of the task's action for one of the others."""
     i, v = wp.tid()
     w = world_offset + i
     size = data.columns.shape[1]
@@ -436,7 +436,7 @@ class Environment:
             self._observed("final_"),
         )  # fmt: skip
 
-    # All that decides what comes next, as NumPy arrays: a run that goes on from them is the same run.
+    # The complete state, as NumPy arrays: a run that continues from them is the same run.
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Copies of the vehicles' states, delay lines, water, the task's arrays and all counters; see `load_state`.
@@ -454,7 +454,7 @@ class Environment:
         return {**saved, "counters.reported": reported.reshape(-1, 2)}
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from where `state()` of an environment made with the same arguments was taken, bit for bit.
+        """Continue from the `state()` of an environment made with the same arguments, bit for bit.
 
         Raises:
             EnvironmentSetupError: It was made with other arguments: a name or shape does not fit.
@@ -516,7 +516,7 @@ def refuse_other_thrusters(vehicles: Sequence[Vehicle], nominal: Sequence[Vehicl
 
 
 def checked_seed(seed: int) -> int:
-    """The seed, if the kernels can take it.
+    """Return the seed, if the kernels can take it.
 
     Raises:
         EnvironmentSetupError: They cannot.

@@ -1,4 +1,4 @@
-"""How large and how fast a task is for a vehicle: lengths and speeds that are the published ones for the paper's."""
+"""Sizes and speeds of a task for a vehicle: lengths and speeds that are the published ones for the paper's vehicle."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class Fit:
     """Factors on what a task is for FinsROV."""
 
     size: float = 1.0
-    """On lengths."""
+    """Factor on lengths."""
     pace: float = 1.0
-    """On speeds and accelerations."""
+    """Factor on speeds and accelerations."""
     weight: float = 1.0
-    """On masses and stiffnesses."""
+    """Factor on masses and stiffnesses."""
 
     def pool(self) -> Pool:
         """The paper's pool, in proportion, with walls as stiff for the vehicle as they are for FinsROV."""
@@ -55,7 +55,7 @@ class Fit:
 
 
 def authority(vehicle: Vehicle) -> Array:
-    """Part of each wrench limit that an agent's action of 1 stands for, (6,), up to 1.
+    """Return the share of each wrench limit that an agent's action of 1 means, (6,), up to 1.
 
     What accelerates the vehicle, added mass included, by `ACCELERATION` times its `room`, or turns it by `TURNING`: all
     of FinsROV's limits, and a fifth of those of a vehicle that is five times as strong for its mass. With all of them
@@ -68,14 +68,14 @@ def authority(vehicle: Vehicle) -> Array:
 
 
 def driven_axes(vehicle: Vehicle) -> tuple[int, ...]:
-    """Which of surge, sway and heave the thrusters control."""
+    """Return which of surge, sway and heave the thrusters control."""
     names = ("surge", "sway", "heave")
     limits = vehicle.wrench_limits
     return tuple(i for i, name in enumerate(names) if limits[i] > 0.0 and name in vehicle.controlled_axes)
 
 
 def coefficients_of(vehicle: Vehicle) -> str:
-    """Name of the hydrodynamic set whose coefficients stand for the vehicle: the calibrated one, if its file has it."""
+    """Return the name of the hydrodynamic set that describes the vehicle: the calibrated one, if its file has it."""
     sets = [name for name, model in vehicle.hydrodynamics.items() if isinstance(model, HydrodynamicSet)]
     return sets[0] if sets and "calibrated" not in sets else "calibrated"
 
@@ -103,7 +103,7 @@ class FittedTask(Task):
     training_noise: MeasurementNoise = TRAINING
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> FittedTask:
-        """As large and fast as suits the vehicle."""
+        """Return the task in the size and speed that suit the vehicle."""
         return replace(self, fit=fit(vehicles[0]))
 
     def arena(self) -> Pool:

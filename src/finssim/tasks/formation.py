@@ -42,7 +42,7 @@ NEAR = 3.0
 REACH = 4.0
 """Scaled distances are clipped here."""
 SETTLE = 0.5
-"""How fast what is held slides to the middle of the net [1/s]."""
+"""Rate at which a held target slides to the middle of the net [1/s]."""
 DEPTH_SCALE = 5.0
 """The depth is divided by this [m]."""
 
@@ -104,7 +104,7 @@ def spanned(x: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec4:
 
 @wp.func
 def corner_gap(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
-    """From the agent to its k-th next corner, body frame [m]."""
+    """Return the way from the agent to its k-th next corner, body frame [m]."""
     return gap_to(arrays, w, a, (a + k) % AGENTS)
 
 
@@ -123,13 +123,13 @@ def target_slip(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
 
 @wp.func
 def next_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """Where the agent takes the next corner to be, world frame [m]."""
+    """Return the position of the next corner as the agent knows it, world frame [m]."""
     return mate_position(arrays, w, a, (a + 1) % AGENTS)
 
 
 @wp.func
 def last_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """Where the agent takes the corner after that to be, world frame [m]."""
+    """Return the position of the corner after that as the agent knows it, world frame [m]."""
     return mate_position(arrays, w, a, (a + 2) % AGENTS)
 
 
@@ -222,7 +222,7 @@ def true_net(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
 
 @wp.func
 def holds(p: Any, net: wp.vec4) -> bool:
-    """Whether the net holds the target: near enough, and neither stretched too far nor slack."""
+    """Return whether the net holds the target: near enough, and neither stretched too far nor slack."""
     return net[0] <= p.reach and net[1] >= p.slack * p.side and net[3] <= p.stretch * p.side
 
 
@@ -303,7 +303,7 @@ class Formation(Team):
     spawn_radius: float = 1.0
     bounds: float = 8.0
     side: float = 1.2
-    """Of the triangle, between vehicles [m] (published: 0.6 m); longer vehicles make it longer: see `ROOM`."""
+    """Side of the triangle between vehicles [m] (published: 0.6 m), larger for longer vehicles: see `ROOM`."""
     stretch: float = 1.215
     """[sides]: the published net of 0.6 m has 0.7288 m when it is pulled taut."""
     slack: float = 0.5
@@ -317,7 +317,7 @@ class Formation(Team):
     grace: float = 1.0
     """[s]"""
     drift: float = 0.05
-    """Speed of a target that nobody holds, as a part of the speed that the slowest vehicle can hold."""
+    """Speed of a target that is not held, as a share of the speed that the slowest vehicle can hold."""
     jitter: float = 0.05
     """Largest shift of a vehicle from its corner at the start, per axis [m]."""
     nearest: float = 1.0

@@ -80,7 +80,7 @@ def approach(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -
 
 @wp.func
 def off_axis(p: Any, place: wp.vec3) -> float:
-    """How far the vehicle is outside the cone that leads to the gate's middle [m]."""
+    """Return how far the vehicle is outside the cone that leads to the gate's middle [m]."""
     return wp.max(wp.length(wp.vec2(place[1], place[2])) - 0.1 - 0.4 * wp.max(-place[0], 0.0), 0.0)
 
 
@@ -94,7 +94,7 @@ def is_lost(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) ->
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """At rest before the gate, beside its axis and turned a little; without a world the gate stands anywhere."""
+    """Start at rest before the gate, beside its axis and turned a little; without a world the gate's pose is drawn."""
     rng = wp.rand_init(key, w)
     yaw = wp.randf(rng, -3.14159265, 3.14159265)
     z = wp.randf(rng, -0.625 * p.depth, -0.4375 * p.depth)
@@ -131,7 +131,7 @@ class GateReward:
 
 @dataclass(frozen=True, kw_only=True)
 class Gate(SeeingTask):
-    """Pass the nearer gate of the site `gate`, which stands, looks and is lit otherwise in each episode.
+    """Pass the nearer gate of the site `gate`, whose pose, look and light differ in each episode.
 
     A bar is touched where the vehicle's envelope meets it; that ends the episode, so no force is needed.
     """
@@ -148,11 +148,11 @@ class Gate(SeeingTask):
     world: str = "gate"
     time_limit: float = 25.0
     hull: Hull = Hull()
-    """Of the vehicle; the environment sets it, ..."""
+    """Hull of the vehicle; the environment sets it, ..."""
     half: tuple[float, float, float] = (0.28, 0.19, 0.15)
     """... and half the extents of its envelope, which the body origin is the middle of as in contacts [m]."""
     depth: float = 3.2
-    """Of the water [m]."""
+    """Depth of the water [m]."""
     begin: tuple[float, float] = (2.0, 4.0)
     """So far before the gate at the start [m], ..."""
     aside: float = 0.3
@@ -164,13 +164,13 @@ class Gate(SeeingTask):
     reward: GateReward = field(default_factory=GateReward)
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Gate":
-        """With the envelope of the vehicle."""
+        """Return the task with the envelope of the vehicle."""
         length, width, height = (0.5 * float(x) for x in vehicles[0].body.size)
         return replace(self, hull=Hull.of(vehicles[0]), half=(length, width, height))
 
     @property
     def cruise(self) -> float:
-        """Speed towards the gate that is worth all of its reward [m/s]."""
+        """Return the speed towards the gate that gets all of its reward [m/s]."""
         return 0.6 * self.hull.speed
 
     @property

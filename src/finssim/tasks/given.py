@@ -1,4 +1,4 @@
-"""What an environment is given and gives: its vehicles, seeds and actions, checked; the result of a step."""
+"""Checks of an environment's vehicles, seeds and actions, and the result of a step."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING

@@ -69,7 +69,7 @@ def own_task(reference: str, **settings: Any) -> Task:
 
 
 def own_class(reference: str, base: type, kind: str) -> Any:
-    """A class (or any other callable) of somebody's own file or module.
+    """Return a class (or any other callable) of a user's file or module.
 
     Args:
         reference: FILE.py:NAME or MODULE:NAME.
@@ -95,11 +95,11 @@ def own_class(reference: str, base: type, kind: str) -> Any:
 
 
 def _of_file(path: Path) -> ModuleType:
-    """The module of a file, run once; files beside it can be imported by it."""
+    """Return the module of a file, run once; files beside it can be imported by it."""
     if not path.is_file():
         raise EnvironmentSetupError(f"there is no file {path}: give FILE.py:CLASS")
     full_path = path.resolve()
-    # A name of its own: two files of one name are two modules, and Warp keeps kernels by module.
+    # A unique name: two files of one name are two modules, and Warp keeps kernels by module.
     name = f"{full_path.stem}_{hashlib.sha256(str(full_path).encode()).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]
@@ -110,7 +110,7 @@ def _of_file(path: Path) -> ModuleType:
     sys.path.insert(0, str(full_path.parent))
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # somebody's own file may raise anything as it is imported
+    except Exception as error:  # a user's file may raise anything when it is imported
         del sys.modules[name]
         raise EnvironmentSetupError(f"{path} fails: {type(error).__name__}: {error}") from error
     finally:
@@ -139,11 +139,11 @@ OBSERVED: dict[str, MeasurementNoise | Sensing] = {
     "estimator": ESTIMATOR,
     "sensors": Sensing(),
 }
-"""What a controller may see, by name; besides them `training`, the noise that a task is trained with."""
+"""Observation of a controller by name; besides them `training`, the noise that a task is trained with."""
 
 
 def observed(name: str, task: Task | None = None) -> MeasurementNoise | Sensing:
-    """What a controller sees under that name, in a task; or with the fixes of a file.
+    """Return the observation of a controller by its name, in a task; or with the fixes of a file.
 
     Raises:
         EnvironmentSetupError: There is no such name, or the file is wrong.
@@ -159,7 +159,7 @@ def observed(name: str, task: Task | None = None) -> MeasurementNoise | Sensing:
 
 
 def task_named(task: str | Task, **settings: Any) -> Task:
-    """A task by its name, or one's own by FILE.py:CLASS or MODULE:CLASS, with settings of its own.
+    """Return a task by its name, or a user's task by FILE.py:CLASS or MODULE:CLASS, with given settings.
 
     Raises:
         EnvironmentSetupError: There is none of that name.

@@ -1,4 +1,4 @@
-"""What the controller is told of the state: the truth, or what localization would make of it."""
+"""Measurements that the controller observes: the truth, or the truth with errors as of localization."""
 
 import math
 from dataclasses import dataclass, fields
@@ -13,15 +13,15 @@ from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
 
 LONGEST_DELAY = 2.0
-"""Of what a controller sees [s]; states are kept for 50 control steps."""
+"""Greatest age of what a controller observes [s]; states are kept for 50 control steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementNoise:
-    """How what a controller sees differs from the truth: white noise, an offset by episode, gaps and a delay."""
+    """Errors of what the controller observes: white noise, an offset by episode, gaps and a delay."""
 
     position_std: float = 0.0
-    """Of the noise, drawn anew every control step, per axis [m]."""
+    """Standard deviation of the noise, drawn every control step, per axis [m]."""
     yaw_std: float = 0.0
     """[rad]"""
     velocity_std: float = 0.0
@@ -31,17 +31,17 @@ class MeasurementNoise:
     position_bias: float = 0.0
     """Standard deviation of an offset that lasts an episode, per axis [m]."""
     yaw_bias: float = 0.0
-    """The same of the heading [rad]."""
+    """Standard deviation of the heading's offset [rad]."""
     velocity_bias: float = 0.0
-    """The same of the linear velocity, per axis [m/s]."""
+    """Standard deviation of the linear velocity's offset, per axis [m/s]."""
     rate_bias: float = 0.0
-    """The same of the angular velocity, per axis [rad/s]."""
+    """Standard deviation of the angular velocity's offset, per axis [rad/s]."""
     dropout: float = 0.0
-    """Probability that a control step brings nothing new, below 1."""
+    """Probability that a control step has no new sample, below 1."""
     delay: float = 0.0
-    """How old it is [s], taken to the nearest control step; nothing is older than the episode."""
+    """Age of the measurement [s], rounded to the nearest control step; nothing is older than the episode."""
     graded: bool = False
-    """Whether worlds differ, from none of all this in the first to all of it in the last."""
+    """True if the errors grow from zero in the first world to all of them in the last."""
 
     def __post_init__(self) -> None:
         values = tuple(getattr(self, field.name) for field in fields(self))
@@ -56,7 +56,7 @@ class MeasurementNoise:
 
     @property
     def present(self) -> bool:
-        """Whether it differs at all."""
+        """Return whether there is any error."""
         return any(getattr(self, field.name) for field in fields(self))
 
 
@@ -103,7 +103,7 @@ def measure(
     seed: int,
     world_offset: int,
 ):
-    """What is seen of every vehicle; the draw depends on seed, world, vehicle, episode and step alone."""
+    """Write what is observed of every vehicle; the draw depends on seed, world, vehicle, episode and step alone."""
     i, v = wp.tid()
     w = world_offset + i
     m = measurement[w, v]

@@ -123,7 +123,7 @@ def squared_error(arrays: TaskArrays, p: Any, w: int, e: float, was: float) -> f
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """A target that stands still, and a vehicle somewhere else in the pool."""
+    """Start with a target at rest, and a vehicle elsewhere in the pool."""
     size = p.fit.size
     arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), size * p.low, size * p.high)
     arrays.goal_quaternion[w] = wp.quat_identity()
@@ -186,7 +186,8 @@ class MovingTarget(PoolTask):
         )
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """As every task's; success (10 steps in tolerance at any time), its time [s], error after `settle` (RMS) [m].
+        """Return every task's measures; success (10 steps in tolerance at any time), its time [s], error after `settle`
+        (RMS) [m].
 
         `success_time` is not a number where there was none, nor `error` where the episode was shorter.
         """

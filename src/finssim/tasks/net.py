@@ -38,8 +38,8 @@ AHEAD = (0.0, 0.5, 1.0)
 
 @wp.func
 def by_net(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec4:
-    """Where a point is by the net: way to its nearest point along x and y of the goal's axes, height z [m], and the
-    heading that faces the net there [rad].
+    """Return the position of a point relative to the net: way to its nearest point along x and y of the goal's axes,
+    height z [m], and the heading that faces the net there [rad].
 
     The net hangs straight down along the line through `reference`; its first and last side go on without end. Where
     two sides are nearly as near, the heading is between those that face the two.
@@ -60,7 +60,7 @@ def by_net(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec4:
 
 @wp.func
 def to_side(arrays: TaskArrays, w: int, k: int, last: int, place: wp.vec3) -> wp.vec2:
-    """From a point to the nearest of one of the net's sides, along x and y of the goal's axes [m]."""
+    """Return the way from a point to the nearest of one of the net's sides, along x and y of the goal's axes [m]."""
     a = arrays.reference.position[w, k]
     d = arrays.reference.position[w, k + 1] - a
     side = wp.vec2(d[0], d[1])
@@ -81,7 +81,7 @@ def place_now(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
 
 @wp.func
 def distance_now(place: wp.vec4) -> float:
-    """From the net [m]."""
+    """Return the distance from the net [m]."""
     return wp.length(wp.vec2(place[0], place[1]))
 
 
@@ -93,7 +93,7 @@ def facing(arrays: TaskArrays, w: int, place: wp.vec4) -> wp.quat:
 
 @wp.func
 def ahead(arrays: TaskArrays, p: Any, w: int, k: int) -> vec6:
-    """Of the line along the net, `ahead` [k] to the left of the vehicle: the way there [m], and where it faces, body
+    """Return the line along the net, `ahead` [k] to the left of the vehicle: the way there [m], and its direction, body
     frame."""
     x = arrays.position[w, 0]
     left = wp.quat_rotate(facing(arrays, w, by_net(arrays, w, x)), wp.vec3(0.0, 1.0, 0.0))
@@ -117,7 +117,7 @@ def misfacing(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> float
 
 @wp.func
 def touches(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
-    """Whether the vehicle's envelope, seen from above, comes as near to a side as growth on the net stands out.
+    """Return whether the vehicle's envelope, seen from above, comes as near to a side as growth on the net extends.
 
     It does not where along one of these directions there is more between the two: the nearest way from the vehicle's
     middle to the side, the side's normal, those of the envelope's own edges.
@@ -158,7 +158,7 @@ def along_speed(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> flo
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """At rest before the net's right side, not quite on the line, turned a little.
+    """Start at rest before the net's right side, not quite on the line, turned a little.
 
     Without a world the net is drawn: it has any heading, and sides that meet at angles as those of the site do.
     """
@@ -248,7 +248,7 @@ class Net(SeeingTask):
     half: tuple[float, float, float] = (0.28, 0.19, 0.15)
     """Half the extents of the vehicle's envelope [m]; the environment sets them."""
     distance: float = 1.5
-    """Of the body origin from the net [m], ..."""
+    """Distance of the body origin from the net [m], ..."""
     height: float = 4.4
     """... and above its foot [m]."""
     speed: float = 0.2
@@ -260,7 +260,7 @@ class Net(SeeingTask):
     hold: float = 0.1
     """For so long [s]."""
     growth: float = 0.12
-    """How far what grows on the net stands out [m]."""
+    """Thickness of the growth on the net [m]."""
     lost: float = 0.8
     """The line is lost so far from it [m]."""
     begin: tuple[float, float] = (-2.6, -2.1)
@@ -279,7 +279,7 @@ class Net(SeeingTask):
     reward: NetReward = field(default_factory=NetReward)
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Net":
-        """With the envelope of the vehicle."""
+        """Return the task with the envelope of the vehicle."""
         length, width, height = (0.5 * float(x) for x in vehicles[0].body.size)
         return replace(self, half=(length, width, height))
 
@@ -289,7 +289,7 @@ class Net(SeeingTask):
         return self.height - FOOT
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """The net's ends and corners, goal axes: a flat one, until a world or `start` says otherwise."""
+        """Allocate the net's ends and corners, goal axes: a flat net, until a world or `start` sets them."""
         corners = np.zeros((worlds, len(self.marks), 3), np.float32)
         corners[:, :, 1] = np.cumsum([-self.sides[0], *self.sides])
         arrays.reference.position = wp.array(corners, dtype=wp.vec3, device=device)
@@ -302,8 +302,8 @@ class Net(SeeingTask):
         )
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """As every task's; success, its time [s], way along the net and mean error of the distance [m], touched and
-        lost 0 or 1."""
+        """Return every task's measures; success, its time [s], way along the net and mean error of the distance [m],
+        touched and lost 0 or 1."""
         measured = super().metrics(arrays)
         measured["error"] /= self.control_step * np.maximum(measured["length"], 1.0)
         return measured

@@ -1,4 +1,4 @@
-"""What a policy sees on a robot: the observation of its task, by the kernels of training, of one world on the CPU."""
+"""Observation of a policy on a robot: that of its task, by the kernels of training, of one world on the CPU."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class Observer:
         return rows[self._place].copy()
 
     def _remember(self, action: Array) -> None:
-        """What was done last, as the observation finds it: one in torch is asked before the step is taken down."""
+        """Keep the last action, as the observation finds it: a task in torch is asked before the step is stored."""
         columns = slice(self._place * self._action_size, (self._place + 1) * self._action_size)
         a = self._arrays
         done = a.action.numpy()[0, columns].copy()
@@ -170,7 +170,7 @@ class Observer:
         self._steps = state.steps.numpy()
         self._pipeline = Pipeline(1, state.steps.device)
         everywhere = wp.ones(1, dtype=wp.int32, device=state.steps.device)
-        # An episode's first observation: what has been heard of the others is what is known of them now.
+        # In an episode's first observation, what has been received of the others is all that is known of them.
         task.add_observe(self._pipeline, Batch(state, self._arrays, 0), everywhere)
         try:
             self._pipeline.run()  # a robot's first decision must not wait for the compiler
@@ -178,7 +178,7 @@ class Observer:
             raise ControlError(f"task '{task.name}' cannot be observed on a robot: {error}") from None
 
     def _aim(self, guide: Guide) -> None:
-        """What of a guide is looked at ahead of time."""
+        """Write the part of a guide that is observed ahead of time."""
         if self._arrays.reference.position is None or self.task.world:
             return
         if math.isfinite(guide.duration) and guide.duration > self.task.time_limit:
@@ -187,14 +187,14 @@ class Observer:
         fill_table(self._arrays.reference, [guide])
 
     def _put(self, v: int, position: ArrayLike, quaternion: ArrayLike, nu: ArrayLike) -> None:
-        """What is measured of a vehicle."""
+        """Write the measurements of a vehicle."""
         a = self._arrays
         a.position.numpy()[0, v] = position
         a.quaternion.numpy()[0, v] = quaternion
         a.velocity.numpy()[0, v] = nu
 
     def _put_others(self, tracks: Mapping[str, Measured], now: Reference) -> None:
-        """What is known of everything that is not this vehicle."""
+        """Write the measurements of everything other than this vehicle."""
         a = self._arrays
         for v, name in enumerate(self.task.vehicles):
             if v == self._place:

@@ -14,7 +14,7 @@ from finssim.tasks.environment import Environment
 from finssim.tasks.given import EnvironmentSetupError
 
 COLOURS = ((0.95, 0.45, 0.04), (0.10, 0.45, 0.90), (0.85, 0.10, 0.15), (0.55, 0.75, 0.15))
-"""Of the vehicles' floats, in turn."""
+"""Colours of the vehicles' floats, in turn."""
 PARTS: dict[str, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...] | None]] = {
     "float": ((0.0, 0.0, 0.28), (1.0, 1.0, 0.44), None),
     "frame": ((0.0, 0.0, -0.22), (0.86, 0.86, 0.5), (0.12, 0.13, 0.15)),

@@ -32,7 +32,8 @@ AHEAD = (0.0, 1.2, 2.5)
 
 @wp.func
 def beside(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec4:
-    """Where a point is by the pipe: along it, to the left of it, above its axis [m], and the pipe's heading [rad].
+    """Return the position of a point relative to the pipe: along it, to the left of it, above its axis [m], and the
+    pipe's heading [rad].
 
     In the axes of the pipeline, whose pose is the goal's.
     """
@@ -83,7 +84,7 @@ def way_ahead(arrays: TaskArrays, p: Any, w: int, k: int, place: wp.vec4) -> wp.
 
 @wp.func
 def heading_off(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> float:
-    """How far the vehicle is turned from the pipe [rad], in [0, π]."""
+    """Return the angle between the vehicle and the pipe [rad], in [0, π]."""
     q = wp.quat_inverse(arrays.goal_quaternion[w]) * state.quaternion[w, 0]
     nose = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
     off = wp.atan2(nose[1], nose[0]) - place[3]
@@ -99,7 +100,7 @@ def progress(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec4) -
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """At rest above the pipe, not quite over it, and turned a little; without a world its heading is drawn."""
+    """Start at rest above the pipe, not quite over it, and turned a little; without a world its heading is drawn."""
     rng = wp.rand_init(key, w)
     yaw = wp.randf(rng, -3.14159265, 3.14159265)
     if not p.placed:
@@ -162,9 +163,9 @@ class Pipeline(SeeingTask):
     world: str = "pipeline"
     time_limit: float = 45.0
     hull: Hull = Hull()
-    """Of the vehicle; the environment sets it."""
+    """Hull of the vehicle; the environment sets it."""
     height: float = 0.9
-    """Of the body origin above the pipe's axis [m]."""
+    """Height of the body origin above the pipe's axis [m]."""
     distance: float = 8.0
     """Success: so far along the pipe from where the episode began [m], without having lost it."""
     hold: float = 0.1
@@ -174,7 +175,7 @@ class Pipeline(SeeingTask):
     begin: tuple[float, float] = (2.0, 18.0)
     """Along the pipe at the start [m], ..."""
     aside: float = 0.5
-    """... beside it, ..."""
+    """Greatest distance beside it, ..."""
     over: float = 0.2
     """... above or below the line [m] at most, ..."""
     turn: float = math.radians(20.0)
@@ -183,12 +184,12 @@ class Pipeline(SeeingTask):
     reward: PipelineReward = field(default_factory=PipelineReward)
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Pipeline":
-        """With the speed of the vehicle."""
+        """Return the task with the speed of the vehicle."""
         return replace(self, hull=Hull.of(vehicles[0]))
 
     @property
     def cruise(self) -> float:
-        """Speed along the pipe that is worth all of its reward [m/s]."""
+        """Return the speed along the pipe that gets all of its reward [m/s]."""
         return 0.6 * self.hull.speed
 
     @property
@@ -211,7 +212,7 @@ class Pipeline(SeeingTask):
         return f"{self.distance:g} m along the pipe without losing it"
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """As every task's; success, its time [s], worst (distance from the line [m]), lost 0 or 1."""
+        """Return every task's measures; success, its time [s], worst (distance from the line [m]), lost 0 or 1."""
         measured = super().metrics(arrays)
         del measured["begun"]
         return measured

@@ -46,9 +46,9 @@ from finssim.vehicles.capability import level_speed, terminal_speeds
 Array = NDArray[Any]
 
 RATE = 1.2
-"""How fast an error of the velocity goes [1/s]: as fast as motors and a control step of 0.1 s allow."""
+"""Rate at which an error of the velocity decays [1/s]: as fast as motors and a control step of 0.1 s allow."""
 YAW_RATE = 3.0
-"""The same of the yaw rate [1/s]: three times as fast as the heading, or the heading swings."""
+"""Rate at which an error of the yaw rate decays [1/s]: three times that of the heading, or the heading oscillates."""
 TURN = 1.0
 """Yaw rate asked for at a heading error of 1 rad [1/s]."""
 MOST_TURN = 0.8
@@ -59,7 +59,7 @@ ROWS = [0, 1, 2, 5]
 
 @wp.func
 def drive(d: Any, q: wp.quat, nu: vec6, target: wp.vec4) -> wp.vec4:
-    """Action that brings the velocity to a wanted one.
+    """Return the action that brings the velocity to a wanted one.
 
     tau = d1 v* + d2 |v*| v* + RATE m (v* - v) + (weight - buoyancy) up,  action = shared(tau / limit)
 
@@ -118,14 +118,14 @@ def write_scripted(arrays: TaskArrays, w: int, action: wp.vec4):
 
 @dataclass(frozen=True)
 class DriveNumbers:
-    """What following a velocity takes; rows are surge, sway, heave, yaw."""
+    """Numbers for following a velocity; rows are surge, sway, heave, yaw."""
 
     d1: tuple[float, float, float, float]
     """Linear damping [N s/m, N m s]."""
     d2: tuple[float, float, float, float]
     """Quadratic damping."""
     mass: tuple[float, float, float, float]
-    """With added mass [kg, kg m²]."""
+    """Inertia with added mass [kg, kg m²]."""
     limit: tuple[float, float, float, float]
     """Wrench of an action of 1 [N, N m]."""
     terminal: tuple[float, float, float, float]
@@ -162,7 +162,7 @@ class DriveNumbers:
         return cls(*rows, sink=vehicle.weight - vehicle.buoyancy, level=level_speed(vehicle, sets[0]))
 
     def action(self, velocity: Array, target: Array) -> NDArray[np.float32]:
-        """As `drive`, of a level vehicle.
+        """Return the result of `drive` for a level vehicle.
 
         Args:
             velocity: Surge, sway, heave, yaw rate [m/s, rad/s], (n, 4).
@@ -205,7 +205,7 @@ PI = 3.14159265
 
 @wp.func
 def prey_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """From agent a to the vehicle after the agents, body frame [m]."""
+    """Return the way from agent a to the vehicle after the agents, body frame [m]."""
     prey = arrays.agent_reward.shape[1]
     return wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.position[w, prey] - arrays.position[w, a])
 
@@ -219,7 +219,7 @@ def prey_motion(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
 
 @wp.func
 def gap_to(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
-    """From agent a to agent b, as far as a has heard, body frame of a [m]."""
+    """Return the way from agent a to agent b, as far as a has received, body frame of a [m]."""
     return wp.quat_rotate_inv(arrays.quaternion[w, a], mate_position(arrays, w, a, b) - arrays.position[w, a])
 
 
@@ -245,7 +245,7 @@ CHASE = (
 
 
 def mate(k: int, gap: Any, motion: Any) -> tuple[ObservationPart, ...]:
-    """6 numbers of the k-th team-mate, by the terms that tell where it is and how it moves."""
+    """Return the 6 numbers of the k-th team-mate: its relative position and velocity."""
     moves = "team-mate's velocity less one's own, body frame"
     return (
         ObservationPart("team-mate from here, body frame", 3, "m", DISTANCE_SCALE, REACH, gap, k),
@@ -253,11 +253,11 @@ def mate(k: int, gap: Any, motion: Any) -> tuple[ObservationPart, ...]:
     )
 
 
-# The scripted prey: a vehicle that wanders, keeps straight on or flees, by its own thrusters, no faster than told.
+# The scripted prey: a vehicle that wanders, keeps straight on or flees, by its own thrusters, up to a given speed.
 
 
 PREY_MODES = ("random", "straight", "hybrid", "line-of-sight", "mixed")
-"""What a prey does:
+"""Behaviours of a prey:
 
 random: a new direction and speed every few seconds. straight: one direction, drawn for the episode, at full speed.
 hybrid: flees from everybody near, askance, and wanders while nobody is. line-of-sight: flees straight away from the
@@ -265,12 +265,12 @@ nearest, always. mixed: one of the four, drawn for the episode.
 """
 
 RESERVE = 0.9
-"""A prey is never told to go faster than this part of the speed it can hold: the rest is for steering."""
+"""Greatest demanded speed of a prey, as a share of the speed it can hold: the rest is for steering."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prey:
-    """The prey's behaviour. Its speed is a part of what the slowest pursuer can hold, never a number of its own."""
+    """Behaviour of the prey. Its speed is a share of what the slowest pursuer can hold, never an absolute number."""
 
     mode: str = "mixed"
     """One of `PREY_MODES`."""
@@ -418,11 +418,11 @@ class OpenWater(Task):
     depth: float = 8.0
     """And sinking below this depth."""
     nearest: float = 2.0
-    """What is to be caught starts this far from the agents ..."""
+    """Least distance of what is to be caught from the agents at the start ..."""
     farthest: float = 5.0
     """... to this far."""
     speed: float = 0.0
-    """Of what is to be caught [m/s]: follows from the vehicles."""
+    """Speed of what is to be caught [m/s]: follows from the vehicles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -434,9 +434,9 @@ class Chase(OpenWater):
     moving: ClassVar[bool] = True
 
     prey: Prey = field(default_factory=Prey)
-    """What the prey does; it sees all agents."""
+    """Behaviour of the prey; it sees all agents."""
     prey_drive: DriveNumbers | None = field(default=None, repr=False)
-    """What the prey's thrusters do: follows from its vehicle."""
+    """Thrusters of the prey: follows from its vehicle."""
 
     def chased(self, part: float, vehicles: Sequence[Vehicle], **changes: Any) -> Any:
         """The task with the prey's thrust from its vehicle, and its speed.
@@ -462,7 +462,7 @@ class Team(OpenWater):
     collision: float = 0.6
     """Agents nearer to each other than this bump [m]; nothing stops them."""
     communication: Communication | None = None
-    """How agents know of each other; None: everybody sees everybody."""
+    """Messages between agents; None: every agent sees every other."""
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for the messages, if there are any."""
@@ -689,7 +689,7 @@ def mate_role(a: int, k: int) -> wp.vec2:
 
 @wp.func
 def mate_gap(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
-    """From the agent to its k-th team-mate, body frame [m]."""
+    """Return the way from the agent to its k-th team-mate, body frame [m]."""
     return gap_to(arrays, w, a, other(a, k))
 
 
@@ -773,7 +773,7 @@ def net_gap(state: State, p: Any, w: int) -> float:
 
 @wp.func
 def missing(p: Any, net: float, near: float) -> float:
-    """How much nearer the prey must come to be captured, by the mode's rule [m]; 0: it is near enough."""
+    """Return how much nearer the prey must come to be captured, by the mode's rule [m]; 0: it is near enough."""
     by_net = net - p.rules.net_reach
     by_vehicle = near - p.rules.proximity
     gap = by_net
@@ -811,7 +811,8 @@ def misfit(state: State, p: Any, w: int, a: int) -> float:
 
 @wp.func
 def is_captured(p: Any, net: float, near: float, held: float) -> bool:
-    """By the mode's rule; the net of modes net and either must have it for `hold`, without a break."""
+    """Return whether it is captured by the mode's rule; the net of modes net and either must have it for `hold`,
+    without a break."""
     netted = held > 0.0 and held >= p.rules.hold - 0.1 * p.control_step
     caught = netted and (p.rules.mode == 0 or p.rules.mode == 3)
     if p.rules.mode == 1:
@@ -849,7 +850,7 @@ class TeamPursuit(Team, Chase):
     observation: tuple[ObservationPart, ...] = field(default=TEAM, repr=False)
     spawn_radius: float = 1.5
     level: int = 3
-    """Which of `LEVELS`."""
+    """Index of `LEVELS`."""
     capture: str | None = None
     """One of `CAPTURE_MODES`; the level's if None. So are the next five."""
     proximity: float | None = None
@@ -867,7 +868,7 @@ class TeamPursuit(Team, Chase):
     nearest: float = 3.5
     reward: TeamReward = field(default_factory=TeamReward)
     prey_radius: float = 0.0
-    """Of its hull, level [m]: follows from its vehicle."""
+    """Radius of its hull, level [m]: follows from its vehicle."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.level < len(LEVELS):
@@ -879,7 +880,7 @@ class TeamPursuit(Team, Chase):
 
     @property
     def rules(self) -> Level:
-        """The level's rules, with what this task says otherwise."""
+        """Return the level's rules, with this task's own changes."""
         stated = {setting.name: getattr(self, setting.name, None) for setting in fields(Level)}
         return replace(
             LEVELS[self.level], **{name: value for name, value in stated.items() if value is not None}

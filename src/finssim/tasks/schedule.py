@@ -39,7 +39,7 @@ def count_successes(arrays: TaskArrays, counts: Counts, world_offset: int):
 
 
 class Schedule:
-    """Widens the ranges of one environment's draws, as their `curriculum` says."""
+    """Schedule that widens the ranges of one environment's draws, by their `curriculum`."""
 
     def __init__(self, plan: Curriculum, draws: Draws, task: Task) -> None:
         """Start with the narrow ranges.
@@ -93,7 +93,7 @@ class Schedule:
             self._set(self.plan.width(float(self._steps * self._draws.simulator.worlds)))
 
     def arrays(self) -> Iterator[tuple[str, wp.array]]:
-        """What decides how it goes on, by name."""
+        """Yield the arrays that determine its further course, by name."""
         counts, table = self.counts, self._draws.table
         yield from (("width", self._width), ("tried", counts.tried), ("succeeded", counts.succeeded))
         yield from (("ends", table.ends), ("probability", table.probability))

@@ -1,4 +1,4 @@
-"""What tasks have in common whose vehicle sees a site, which stands, looks and is lit otherwise in each episode."""
+"""Common parts of tasks whose vehicle observes a site, whose pose, look and light differ in each episode."""
 
 import math
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ OWN = (
     *own_velocity(clip=2.0),
     ObservationPart("depth", 1, "m", scale=DEPTH_SCALE, term="-arrays.position[w, a][2]"),
 )
-"""What a vehicle knows by its own sensors, wherever it is."""
+"""Parts of the observation from the vehicle's own sensors, in any place."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class SeeingTask(Task):
 
     @property
     def placed(self) -> bool:
-        """Whether a world says where what is to be seen is; without one it is drawn."""
+        """Return whether a world gives the place of the observed object; without one it is drawn."""
         return bool(self.world)
 
     def arena(self) -> Pool | None:

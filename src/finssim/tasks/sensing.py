@@ -1,4 +1,4 @@
-"""What the vehicle's own instruments and position fixes say, put together by a filter in the batch, world by world.
+"""Readings of the vehicle's own instruments and position fixes, combined by a filter in the batch, world by world.
 
 Gyro and accelerometer give rates, roll and pitch (the complementary filter of `localization.fusion.attitude`); fixes
 from outside give x, y and yaw, and z where there is no pressure gauge; a DVL gives velocity where there is one.
@@ -51,11 +51,11 @@ from finssim.vehicles import Vehicle
 from finssim.yaml_file import read_mapping
 
 FIX = 100
-"""Number of the fixes in the random key, apart from those of the kinds of sensor."""
+"""Number of the fixes in the random key, different from those of the kinds of sensor."""
 STANDING = 400
 """Control steps after which a filter's doubt has settled."""
 FASTEST = 0.3
-"""Deviation of a vehicle's speed per axis where nothing tells it [m/s], as `localization.fusion` takes it."""
+"""Standard deviation of a vehicle's speed per axis without any measurement of it [m/s], as in `localization.fusion`."""
 MOUNT = ("position", "orientation")
 PER_FIX = ("position_std", "yaw_std", "position_bias", "yaw_bias", "dropout", "delay")
 """Fields of a measurement noise that a fix has."""
@@ -125,7 +125,8 @@ def load_sensing(path: str | Path) -> Sensing:
 
 
 def seen_with(noise: MeasurementNoise | Sensing, vehicle: Vehicle) -> dict[str, Any]:
-    """What a controller sees, as plain data: errors, or fixes and the sensors aboard; no mounts, nothing that is 0."""
+    """Return the observation of a controller as plain data: errors, or fixes and the sensors aboard; no mounts, nothing
+    that is 0."""
     if isinstance(noise, MeasurementNoise):
         return {name: value for name, value in asdict(noise).items() if value}
     fixes = {"rate": noise.rate, **seen_with(noise.fixes, vehicle)} if noise.rate else None
@@ -141,7 +142,7 @@ def seen_with(noise: MeasurementNoise | Sensing, vehicle: Vehicle) -> dict[str, 
 
 @wp.struct
 class Aboard:
-    """What the filter knows of one vehicle: a doubt is variance, covariance, variance of a value and its rate."""
+    """State of the filter of one vehicle: a doubt is variance, covariance, variance of a value and its rate."""
 
     gauge: wp.bool  # whether z comes from a pressure gauge
     plane: wp.vec3  # settled doubt of x, and of y
@@ -166,7 +167,7 @@ class Estimates:
 
 @wp.struct
 class Readings:
-    """What the instruments show; arrays of a kind that no vehicle has are empty."""
+    """Readings of the instruments; arrays of a kind that no vehicle has are empty."""
 
     imu_errors: wp.array2d(dtype=ImuParameters)
     imu: ImuArrays
@@ -289,7 +290,8 @@ def begin(
 
 @wp.func
 def go_on(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
-    """The state a control step later: the gyro turns it, the accelerometer says where up is, velocity goes on."""
+    """Advance the state by a control step: the gyro turns it, the accelerometer gives the vertical, velocity is
+    integrated."""
     before = (step - 1) % e.position.shape[2]
     now = step % e.position.shape[2]
     imu = r.imu_errors[w, v]
@@ -324,7 +326,7 @@ def measured_at(e: Estimates, latency: int, step: int) -> int:
 def shift(
     e: Estimates, w: int, v: int, at: int, step: int, dt: float, dx: wp.vec3, dv: wp.vec3, turn: wp.vec2
 ):
-    """Take in what was learned of control step `at`: offsets, which go on growing until now, and the gyro's bias."""
+    """Apply a correction of control step `at`: offsets, which have grown since then, and the gyro's bias."""
     up = wp.quat_rotate_inv(e.quaternion[w, v, step % e.position.shape[2]], wp.vec3(0.0, 0.0, 1.0))
     e.bias[w, v] = e.bias[w, v] - turn[1] * up
     e.rate[w, v] = e.rate[w, v] + turn[1] * up
@@ -340,7 +342,7 @@ def shift(
 def take_fix(
     state: State, m: Measurement, e: Estimates, rate: wp.float64, dt: float, seed: int, w: int, v: int
 ):
-    """What was fixed as long ago as fixes take, if any of it has come: of several in a control step the mean."""
+    """Apply the fixes of their delay ago, if any arrived: of several in a control step the mean."""
     step = state.steps[w]
     at = measured_at(e, int(wp.rint(m.delay / dt)), step)
     if at < 1:
@@ -418,7 +420,7 @@ def estimate(
     state: State, arrays: TaskArrays, noise: wp.array2d(dtype=Measurement), r: Readings, e: Estimates, rate: wp.float64,
     dt: float, seed: int, mask: wp.array(dtype=int), starting: bool, world_offset: int,
 ):  # fmt: skip
-    """What is known of every vehicle: after a control step of all, or where an episode starts and mask is not 0."""
+    """Write every vehicle's estimate: after a control step of all, or where an episode starts and mask is not 0."""
     i, v = wp.tid()
     w = world_offset + i
     if mask[w] == 0 or state.frozen[w] != 0:
@@ -524,7 +526,7 @@ class SensingBatch:
 
 
 def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
-    """What the filter knows of a vehicle; its doubt is that after many control steps."""
+    """Return the initial state of the filter of a vehicle; its doubt is that after many control steps."""
     sensors, fixes = vehicle.sensors, sensing.fixes
     aboard = Aboard()
     aboard.gauge = sensors.depth is not None
@@ -546,7 +548,7 @@ def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
         if sensors.dvl is not None and _due(sensors.dvl.rate, step, dt):
             R = counted(sensors.dvl.noise_std, sensors.dvl.quantisation) + sensors.dvl.bias_initial**2
             plane, height = rate_known(plane, R), rate_known(height, R)
-    if not sensing.rate:  # nothing says where it is: it starts where it is known to be
+    if not sensing.rate:  # without a measurement of the position, it starts at its known start
         plane, yaw = wp.vec3(0.0, 0.0, min(plane[2], FASTEST**2)), wp.vec3(0.0, 0.0, yaw[2])
         if not aboard.gauge:
             height = wp.vec3(0.0, 0.0, min(height[2], FASTEST**2))

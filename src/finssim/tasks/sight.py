@@ -1,4 +1,4 @@
-"""What the vehicle of a task sees: a world drawn anew for each episode, pictures of cameras and sonars, and ranges."""
+"""Sensors of the site in a task: a world drawn for each episode, pictures of cameras and sonars, and ranges."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def first_draw(seed: int) -> int:
 
 
 def put_goal(task: Task, layout: WorldLayout, arrays: TaskArrays) -> None:
-    """Put a task's goal where its landmark stands in each world, and the reference where its marks do."""
+    """Set a task's goal to the place of its landmark in each world, and the reference to the places of its marks."""
     pose = layout.poses(task.landmark)
     arrays.goal_position.assign(np.float32(pose[:, :3]))
     arrays.goal_quaternion.assign(np.float32(pose[:, 3:]))
@@ -49,14 +49,14 @@ class Picture:
     """A picture that a task observes: of a camera in colours, of a sonar the echoes by beam and range."""
 
     name: str
-    """Of the entry in the vehicle's `perception`, such as `front_camera`."""
+    """Name of the entry in the vehicle's `perception`, such as `front_camera`."""
     width: int | None = None
     """Columns of a camera's [px], in place of the entry's; the height follows."""
     bins: int | None = None
     """The nearest range cells of a sonar, so many; all if None."""
 
     def device(self, vehicle: Vehicle) -> CameraDevice | SonarDevice:
-        """What takes it, a sonar with the range of its cells.
+        """Return the device that takes it, a sonar with the range of its cells.
 
         Raises:
             EnvironmentSetupError: The vehicle's sensor takes no pictures.
@@ -191,7 +191,7 @@ class Sight:
         put_goal(self._task, self.batch, self._arrays)
 
     def begin(self, mask: NDArray[np.bool_]) -> None:
-        """Take the first pictures of the episodes that have begun where mask is true, (worlds,)."""
+        """Take the first pictures of the episodes that have started where mask is true, (worlds,)."""
         self._mask.assign(mask.astype(np.int32))
         poses = self._poses_of(self._state, self._poses)
         for camera in self._metered.values():
@@ -239,7 +239,7 @@ class Sight:
             yield from ((f"sight.{name}.{key}", array) for key, array in sensor.arrays())
 
     def counters(self) -> dict[str, NDArray[Any]]:
-        """What else does, as copies."""
+        """Return the remaining counters, as copies."""
         updates = np.array([sensor.updates for sensor in self._sensors.values()])
         return {"drawn": self.batch.drawn, "episodes": self._episodes.copy(), "updates": updates}
 

@@ -146,8 +146,9 @@ class StationKeeping(PoolTask):
     training_noise: MeasurementNoise = MeasurementNoise(
         position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02, delay=0.1, graded=True
     )
-    """As late as an estimate, and noisier, by worlds from none to all of it: with exact states alone gains are learnt
-    that chatter; with noise alone, vehicles that hardly damp their turning are held only while it shakes them."""
+    """Delay and noise larger than an estimate's, from none in the first world to all in the last: with exact states
+    alone, policies learn gains that oscillate; with noise alone, vehicles with little damping in turning are held only
+    during noise."""
 
     def success_rule(self) -> str:
         """See `Task`."""

@@ -1,4 +1,4 @@
-"""What a task is: what is seen, done and paid for, as terms, and how long an episode takes."""
+"""Tasks: observation, action and reward, as terms, and the length of an episode."""
 
 import ast
 import hashlib
@@ -29,7 +29,7 @@ from finssim.vehicles import Vehicle
 
 
 class Batch(NamedTuple):
-    """What the parts of a task work on in one environment."""
+    """Objects that the parts of a task use in one environment."""
 
     state: State
     arrays: TaskArrays
@@ -45,7 +45,7 @@ class Task:
     others: ClassVar[tuple[str, ...]] = ()
     """Names of the vehicles after them, which the task commands."""
     title: ClassVar[str] = ""
-    """What is to be done, in a few words."""
+    """Title of the task, in a few words."""
     needs: ClassVar[tuple[str, ...]] = ()
     """Axes that every vehicle of the task must control; another is refused before anything is trained."""
     action: ClassVar[str] = "wrench6"
@@ -53,21 +53,21 @@ class Task:
     pool: ClassVar[Pool | None] = Pool()
     """Walls and floor, unless others are asked for; None is open water."""
     moving: ClassVar[bool] = False
-    """Whether what it goes to moves: a robot is then given a trajectory, otherwise a pose."""
+    """True if the goal moves: a robot is then given a trajectory, otherwise a pose."""
     world: ClassVar[str] = ""
     """Site that its vehicle sees, of the catalogue or a file; empty: nothing."""
     pictures: ClassVar[tuple[Picture, ...]] = ()
-    """What is observed beside the row of numbers."""
+    """Pictures that are observed besides the row of numbers."""
     ranges: ClassVar[tuple[str, ...]] = ()
     """Altimeters and rangefinders of the vehicle's `perception` whose range the row has, as `arrays.ranges[w, i]`."""
     landmark: ClassVar[str] = ""
     """Object of the world whose pose is the goal's."""
     marks: ClassVar[tuple[str, ...]] = ()
-    """Objects whose places in the goal's axes stand in `reference.position`, one after the other."""
+    """Objects whose places in the goal's axes are in `reference.position`, one after the other."""
     held_out: ClassVar[bool] = False
-    """Whether the looks of the world are drawn that are held out of training."""
+    """True if the looks of the world that are held out of training are drawn."""
     teacher: ClassVar[tuple[ObservationPart, ...]] = ()
-    """What a teacher observes in training in place of the row and the pictures."""
+    """Observation of a teacher in training, in place of the row and the pictures."""
     succeeds: ClassVar[str] = ""
     """When an episode is a success: `held`, for `hold` seconds at its end; `once`, for `hold` seconds at any time; or
     the name of an end. Empty: nothing is."""
@@ -83,10 +83,10 @@ class Task:
     time_limit: float = 20.0
     """Length of an episode in training [s]."""
     training_noise: MeasurementNoise = field(default_factory=MeasurementNoise)
-    """On what the controller sees in training."""
+    """Errors of what the controller observes in training."""
 
     def terms(self) -> Terms:
-        """Of what the task is made."""
+        """Return the terms of the task."""
         raise TypeError(f"task '{self.name}' has no terms: define terms()")
 
     def settings_class(self) -> type:
@@ -112,7 +112,7 @@ class Task:
         return sum(part.size for part in self.observation)
 
     def for_teacher(self) -> "Task":
-        """The same task for a teacher, who observes the `teacher` parts and no picture."""
+        """Return the same task for a teacher, who observes the `teacher` parts and no picture."""
         blind: dict[str, Any] = {"observation": self.teacher, "world": "", "pictures": ()}
         return replace(self, **blind)
 
@@ -126,7 +126,7 @@ class Task:
 
     @property
     def schema(self) -> ObservationSchema:
-        """The observation of an agent as a policy directory tells it, part by part."""
+        """Return the observation of an agent in the form of a policy directory, part by part."""
         entries, first = [], 0
         for part in self.observation:
             clip = None if part.clip is None else (-part.clip, part.clip)
@@ -165,11 +165,11 @@ class Task:
         return self.pool
 
     def dock(self) -> Dock | None:
-        """What stands in every world for the vehicle to enter; its pose is the goal's. None: nothing does."""
+        """Return the dock in every world for the vehicle to enter, whose pose is the goal's; None without one."""
         return None
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Give `arrays` what only this task uses; nothing unless the task says so."""
+        """Allocate the arrays that only this task uses; none by default."""
 
     def arrays(self, worlds: int, action_size: int, device: wp.Device) -> TaskArrays:
         """Zero arrays of the right size; the measured ones are left for the environment to fill or alias.
@@ -195,7 +195,7 @@ class Task:
         return out
 
     def success_rule(self) -> str:
-        """What counts as a success, with its numbers, in a few words."""
+        """Return the rule of success, with its numbers, in a few words."""
         hold = getattr(self, "hold", None)
         return "as metrics tells" if hold is None else f"within its tolerance for {hold:g} s, at the end"
 
@@ -219,7 +219,7 @@ class Task:
         pipeline.add(kernels_of(self).observe, [batch.arrays, settings_of(self), mask])
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """How the episode that ended last went, by world.
+        """Return the measures of the episode that ended last, by world.
 
         Returns:
             Name to numbers (worlds,): return, length in control steps, time held inside the tolerance at the end [s],
@@ -249,7 +249,7 @@ class Task:
         return out
 
     def earned(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """What each reward and each end added to the return of the episode that ended last, (worlds,) by name."""
+        """Return what each reward and end added to the return of the episode that ended last, (worlds,) by name."""
         columns = arrays.final_earned.numpy()
         return {name: np.array(columns[:, i], dtype=np.float64) for i, name in enumerate(self.earnings)}
 
@@ -257,7 +257,7 @@ class Task:
 # The kernels of a task, written from its terms; and the struct of its settings that they take.
 #
 # Each stage of an episode is one kernel for all tasks but for the terms that it calls: what every task does at the
-# start, in each step and at the end of an episode stands here once. A term is called by the names of its arguments, or
+# start, in each step and at the end of an episode is here once. A term is called by the names of its arguments, or
 # written out, if it is an expression, with these names in it:
 #
 #     state   the truth                           a     number of the agent; a reward without it is the team's
@@ -267,7 +267,7 @@ class Task:
 #
 # and after a step any of the task's totals by its name, as it was before, `was` for the total's own, and `held`: the
 # time within the tolerance of success without a break [s]; and whatever the task shares between its terms, by name. A
-# function of `finssim.tasks.terms` stands in an expression for what it gives.
+# function of `finssim.tasks.terms` is used in an expression for its result.
 
 
 APART = ("name", "observation", "training_noise", "communication")
@@ -276,7 +276,7 @@ VECTORS = {
     (float, 2): wp.vec2, (float, 3): wp.vec3, (float, 4): wp.vec4,
     (int, 2): wp.vec2i, (int, 3): wp.vec3i, (int, 4): wp.vec4i,
 }  # fmt: skip
-"""What a tuple of so many numbers is in a kernel."""
+"""Tuple of numbers -> type in a kernel."""
 STAGES = {
     "evaluate": "state: State, arrays: TaskArrays, p: P, weights: W, world_offset: int",
     "spawn": "state: State, arrays: TaskArrays, p: P, seed: int, mask: wp.array(dtype=int), world_offset: int",
@@ -295,11 +295,11 @@ class Kernels(NamedTuple):
     evaluate: wp.Kernel
     """After each step."""
     spawn: wp.Kernel
-    """Where an episode starts."""
+    """Kernel at the start of an episode."""
     observe: wp.Kernel
     """Its first observation."""
     command: wp.Kernel | None = None
-    """Before each step, of a task with vehicles of its own."""
+    """Kernel before each step, of a task with scripted vehicles."""
 
 
 _made: dict[tuple[Any, ...], Kernels] = {}
@@ -366,7 +366,7 @@ class _Writer:
         return f"({ast.unparse(tree)})"
 
     def _shared(self, terms: Mapping[str, Any], scope: dict[str, str]) -> tuple[list[str], dict[str, str]]:
-        """Lines that compute what terms share, and what is known with it."""
+        """Return the lines that compute what terms share, and the names defined by them."""
         lines, scope = [], dict(scope)
         for name, term in terms.items():
             lines.append(f"s_{name} = {self._value(term, f'shared {name!r}', **scope)}")
@@ -434,7 +434,8 @@ class _Writer:
         ]
 
     def _rewards(self, scope: Mapping[str, str]) -> list[str]:
-        """Every term once, for all agents or for each; what they add up to, and each by itself over the episode."""
+        """Return the lines that compute every reward once, for all agents or for each; their sum, and each over the
+        episode."""
         values = [self._value(term.term, f"reward {term.name!r}", **scope) for term in self.terms.rewards] + [
             f"wp.where(e{i}, 1.0, 0.0)" for i, _ in enumerate(self.terms.ends)
         ]
@@ -594,7 +595,7 @@ def _hints(annotated: Any) -> dict[str, Any]:
 
 
 def _kernel_type(hint: Any) -> Any:
-    """The type in a kernel, of a dataclass also where it may be None; None where kernels cannot take it."""
+    """Return the type in a kernel, of a dataclass also if it may be None; None if kernels cannot take it."""
     parts = get_args(hint)
     if get_origin(hint) in (Union, UnionType):
         rest = [part for part in parts if part is not type(None)]

@@ -27,11 +27,11 @@ class ObservationPart:
     scale: float = 1.0
     clip: float | None = None
     term: Any = field(default=None, repr=False)
-    """What gives the value, from what is measured: a float, or a vector of `size`. None in a task in plain torch."""
+    """Term that gives the value, from measurements: a float, or a vector of `size`. None in a task in plain torch."""
     index: int = 0
     """The term's argument `k`: of which team-mate, how far ahead, ..."""
     errors: tuple[int, ...] = ()
-    """Which of its numbers are 0 where the task wants the vehicle: what an integral may collect."""
+    """Indices of its numbers that are 0 at the goal, which an integral may collect."""
 
 
 @dataclass(frozen=True)
@@ -46,31 +46,31 @@ class RewardTerm:
 
 @dataclass(frozen=True)
 class End:
-    """What ends an episode before its time; of several that are true the first is the one. It is counted by name."""
+    """Condition that ends an episode early; of several that are true the first counts. It is counted by name."""
 
     name: str
     term: Any
     """-> bool"""
     reward: float = 0.0
-    """Of every agent, once."""
+    """Reward of every agent, once."""
 
 
 @dataclass(frozen=True)
 class Total:
-    """What is counted in an episode: a part of the task's metrics, by its name."""
+    """A sum over the episode: a part of the task's metrics, by its name."""
 
     name: str
     term: Any
     """-> float: the total after a step; `was` is the total before."""
     first: Any = 0.0
-    """Where an episode starts: a number, or a term of the start."""
+    """Value at the start of an episode: a number, or a term of the start."""
     index: int = 0
     """The term's argument `k`."""
 
 
 @dataclass(frozen=True)
 class Terms:
-    """All of a task but what is observed, which stands in its `observation`."""
+    """All parts of a task other than its `observation`."""
 
     start: Any
     """Puts vehicles and goal where an episode starts, drawn from `key` and the world alone."""
@@ -80,18 +80,18 @@ class Terms:
     """-> bool: within the tolerance of success; the time of that without a break is `arrays.held`."""
     totals: Sequence[Total] = ()
     advance: Any = None
-    """What goes on in the world besides the vehicles, after each step and before it is scored."""
+    """Term that changes the world besides the vehicles, after each step and before it is scored."""
     begin: Any = None
-    """What is done before the first observation, when the start has been measured."""
+    """Term before the first observation, when the start has been measured."""
     shared: Mapping[str, Any] = field(default_factory=dict)
-    """Of which several terms are made: name -> term of the truth, once a step; the terms take it by that name."""
+    """Values that several terms share: name -> term of the truth, once a step; the terms take it by that name."""
     seen: Mapping[str, Any] = field(default_factory=dict)
-    """The same for observation terms: name -> term of what is measured, once for each agent."""
+    """Values that observation terms share: name -> term of measurements, once for each agent."""
     meanings: Mapping[str, str] = field(default_factory=dict)
-    """What a reward, an end or a total that is an expression gives: name -> sentence with the unit. A function has its
+    """Meaning of a reward, an end or a total that is an expression: name -> sentence with the unit. A function has its
     docstring."""
     shown: bool = True
-    """Whether the observation is written by the terms of its parts; False: the task writes it by itself."""
+    """True if the observation is written by the terms of its parts; False: the task writes it."""
     command: Any = None
     """Writes `arrays.scripted`, the actions of the vehicles that the task commands, before each step."""
 
@@ -126,7 +126,7 @@ def close_episode(state: State, arrays: TaskArrays, w: int):
 
 @wp.func
 def report_frozen(state: State, arrays: TaskArrays, w: int):
-    """A frozen world ends and waits for its report, and nobody in it is rewarded."""
+    """End a frozen world, which waits for its report without rewards."""
     for a in range(arrays.agent_reward.shape[1]):
         arrays.agent_reward[w, a] = 0.0
     arrays.reward[w] = 0.0
@@ -145,7 +145,7 @@ def remember_actions(arrays: TaskArrays, w: int):
 
 @wp.func
 def uniform3(rng: wp.uint32, low: wp.vec3, high: wp.vec3) -> wp.vec3:
-    """A point drawn uniformly from a box; the caller passes a stream of its own."""
+    """Return a point drawn uniformly from a box; the caller passes a separate stream."""
     a = wp.randf(rng)
     b = wp.randf(rng)
     c = wp.randf(rng)
@@ -223,14 +223,14 @@ def world_velocity(state: State, w: int, v: int) -> wp.vec3:
 
 @wp.func
 def angular_velocity(state: State, w: int) -> wp.vec3:
-    """Of vehicle 0, body frame [rad/s]."""
+    """Return the angular velocity of vehicle 0, body frame [rad/s]."""
     nu = state.velocity[w, 0]
     return wp.vec3(nu[3], nu[4], nu[5])
 
 
 @wp.func
 def position_error(state: State, arrays: TaskArrays, w: int) -> float:
-    """From vehicle 0 to its goal [m]."""
+    """Return the distance from vehicle 0 to its goal [m]."""
     return wp.length(arrays.goal_position[w] - state.position[w, 0])
 
 
@@ -306,7 +306,7 @@ def measured_velocity(arrays: TaskArrays, w: int, v: int) -> wp.vec3:
 
 @wp.func
 def goal_offset(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """From an agent to the goal, body frame [m]."""
+    """Return the way from an agent to the goal, body frame [m]."""
     return wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.goal_position[w] - arrays.position[w, a])
 
 

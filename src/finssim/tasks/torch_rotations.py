@@ -63,7 +63,7 @@ def about_axis(axis: int, angle: Tensor) -> Tensor:
 
 
 def angle(q: Tensor) -> Tensor:
-    """Of a rotation, whatever its axis [rad], in [0, π], (...)."""
+    """Return the angle of a rotation, around any axis [rad], in [0, π], (...)."""
     return 2.0 * torch.atan(torch.linalg.vector_norm(q[..., :3], dim=-1) / q[..., 3].abs())
 
 

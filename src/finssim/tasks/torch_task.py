@@ -1,4 +1,4 @@
-"""A task in plain torch: four functions over all worlds at once; everything else is as with a task in Warp."""
+"""Tasks in plain torch: four functions over all worlds; everything else is as in a task in Warp."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,7 +17,7 @@ from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.terms import End, RewardTerm, Terms, Total
 
-# The terms of every task in plain torch, which go on with what its functions answered; and its draws.
+# The terms of every task in plain torch, which use the answers of its functions; and its draws.
 
 
 @wp.func
@@ -54,7 +54,7 @@ def draw(
 
 
 class Worlds:
-    """Where everything is, by world, in views that the next step overwrites: read them, and write `memory` alone.
+    """State of everything by world, in views that the next step overwrites: read them, and write `memory` alone.
 
     A world of one vehicle has rows (worlds, ...); of several (worlds, vehicles, ...), agents first.
 
@@ -125,14 +125,14 @@ class Worlds:
 
     @property
     def action(self) -> Tensor:
-        """What the agents did in this step, in [-1, 1]: (worlds, size), or (worlds, agents, size) of several; zero
+        """Actions of the agents in this step, in [-1, 1]: (worlds, size), or (worlds, agents, size) of several; zero
         before the first."""
         done = self._action.clamp(-1.0, 1.0)
         return self._by_agent(torch.where(self._steps[:, None] > 0, done, torch.zeros_like(done)))
 
     @property
     def previous_action(self) -> Tensor:
-        """The same of the step before; zero in the first."""
+        """Actions of the step before; zero in the first."""
         return self._by_agent(self._previous)
 
     @property
@@ -145,7 +145,7 @@ class Worlds:
         return torch.zeros((self.count, *size), device=self.device)
 
     def full(self, row: float | Sequence[float]) -> Tensor:
-        """The same number, (worlds,), or the same row, (worlds, size), for every world."""
+        """Return the same number, (worlds,), or the same row, (worlds, size), for every world."""
         values = torch.as_tensor(row, dtype=torch.float32, device=self.device)
         return values.expand(self.count, *values.shape)
 
@@ -175,7 +175,7 @@ class Worlds:
 
 
 class _Unknown(dict[str, Tensor]):
-    """A task's memory where nobody keeps one."""
+    """A task's memory if it keeps none."""
 
     def __missing__(self, name: str) -> Tensor:
         raise _unknown(f"w.memory['{name}']")
@@ -189,12 +189,12 @@ def _unknown(name: str) -> EnvironmentSetupError:
 
 
 RESET, OBSERVE, SCORE, SCRIPT = range(4)
-"""Stages, each with draws of its own."""
+"""Stages, each with separate draws."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """How an episode would begin in every world; it is taken where one begins.
+    """Start of an episode in every world; it is used where one starts.
 
     Rows are (worlds, ...), of several vehicles (worlds, vehicles, ...); what is None is zero, or no rotation.
     """
@@ -231,11 +231,11 @@ class TorchTask(Task):
     """Success: inside for so long, without a break, when the episode ends [s]; at least one step."""
 
     def reset(self, w: Worlds) -> Start:
-        """How an episode begins; what is drawn comes from `w.uniform` and `w.normal`."""
+        """Return the start of an episode; random numbers come from `w.uniform` and `w.normal`."""
         raise NotImplementedError(f"task '{self.name}': define reset(self, w) -> Start")
 
     def observe(self, w: Worlds) -> Sequence[Tensor]:
-        """What an agent sees: a tensor for each part of `observation`, in the part's unit.
+        """Return the observation of an agent: a tensor for each part of `observation`, in the part's unit.
 
         They are divided by the part's scale and limited to its clip here. Shapes: (worlds, size), or (worlds, agents,
         size) of several agents; a size of 1 may be left out.
@@ -243,19 +243,19 @@ class TorchTask(Task):
         raise NotImplementedError(f"task '{self.name}': define observe(self, w) -> tensors")
 
     def reward(self, w: Worlds) -> Tensor:
-        """Of the step just done: (worlds,), or (worlds, agents) of several agents."""
+        """Return the reward of the latest step: (worlds,), or (worlds, agents) of several agents."""
         raise NotImplementedError(f"task '{self.name}': define reward(self, w) -> tensor")
 
     def terminated(self, w: Worlds) -> Tensor:
-        """Where the episode failed, bool, (worlds,): nothing of worth could follow. Time ends it anyway."""
+        """Return where the episode failed, bool, (worlds,): no further reward is possible. Time ends it in any case."""
         return w.zeros()
 
     def inside(self, w: Worlds) -> Tensor:
-        """Where success has its tolerance kept, bool, (worlds,); nowhere unless defined."""
+        """Return where the tolerance of success is met, bool, (worlds,); nowhere unless defined."""
         return w.zeros()
 
     def counted(self, w: Worlds) -> Mapping[str, Tensor]:
-        """What this step adds to the `totals` of the episode, (worlds,) by name."""
+        """Return what this step adds to the `totals` of the episode, (worlds,) by name."""
         return {}
 
     def script(self, w: Worlds) -> Tensor:
@@ -263,7 +263,7 @@ class TorchTask(Task):
         raise NotImplementedError(f"task '{self.name}' has others: define script(self, w) -> tensor")
 
     def terms(self) -> Terms:
-        """What every task of this kind goes on with, once its functions have answered."""
+        """Return the terms that every task of this kind uses once its functions have answered."""
         return Terms(
             start=answered_start,
             shown=False,
@@ -417,7 +417,7 @@ def _run(batch: Batch, function: Callable[[], None], mask: wp.array | None = Non
 
 @contextmanager
 def _in_line(device: wp.Device) -> Iterator[None]:
-    """On a GPU: torch queues its work after the kernels that Warp queued."""
+    """On a GPU, run torch's work after the kernels that Warp queued."""
     if device.is_cpu:
         yield
     else:

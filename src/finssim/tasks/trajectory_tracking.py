@@ -33,7 +33,7 @@ ENDLESS = 1.0e9
 
 
 def reference_table(worlds: int, knots: int, spacing: float, device: wp.Device) -> ReferenceTable:
-    """An empty table of `knots` knots, `spacing` apart [s]."""
+    """Return an empty table of `knots` knots, `spacing` apart [s]."""
     table: ReferenceTable = allocated(ReferenceTable, worlds, device, position=knots, velocity=knots)
     table.spacing = spacing
     table.duration.fill_(1.0)
@@ -54,7 +54,7 @@ def held_time(r: ReferenceTable, w: int, t: float) -> float:
 
 @wp.func
 def reference_position(r: ReferenceTable, w: int, t: float) -> wp.vec3:
-    """Where the vehicle should be at a time since the episode's start, world frame [m]."""
+    """Return the reference position of the vehicle at a time since the episode's start, world frame [m]."""
     now = held_time(r, w, t)
     k = reference_knot(r, w, now)
     u = now / r.spacing - float(k)
@@ -127,7 +127,7 @@ def fill_table(table: ReferenceTable, guides: Sequence[Guide]) -> list[Reference
     ends = [np.minimum(t, guide.duration) for guide in guides]
     places = [guide.at(time) for guide, time in zip(guides, ends, strict=True)]
     velocity = np.stack([reference.velocity for reference in places])
-    # Past its end a motion goes on in the table, so that the piece with the end in it is followed; none reads further.
+    # Beyond its end a motion continues in the table, so that the piece with the end is followed; none reads further.
     beyond = (t - np.stack(ends))[..., None] * velocity
     table.position.assign(
         (np.stack([reference.position for reference in places]) + beyond).astype(np.float32)
@@ -139,11 +139,11 @@ def fill_table(table: ReferenceTable, guides: Sequence[Guide]) -> list[Reference
     return places
 
 
-# The shapes that T2 trains on, drawn anew for every episode inside the kernels: line, circle, lemniscate, helix.
+# The shapes that T2 trains on, drawn for every episode inside the kernels: line, circle, lemniscate, helix.
 
 
 SHAPE_NAMES = ("line", "circle", "lemniscate", "helix")
-"""By the number that the kernels use."""
+"""Names of the shapes by the number that the kernels use."""
 
 SPEED_SAMPLES = 96
 """Phases at which the greatest slope of a shape is looked for, as published."""
@@ -230,7 +230,7 @@ LEVELS = (
     ("circle", "lemniscate", "helix"),
     ("line", "circle", "lemniscate", "helix"),
 )
-"""Shapes of the three published levels of difficulty, and of ours, which has them all at once."""
+"""Shapes of the three published levels of difficulty, and of ours, which has all of them."""
 
 DISTANCE_SCALE = 3.0
 """Distances are divided by this in the observation [m]."""
@@ -243,7 +243,7 @@ REST = 1.0e-6
 
 @wp.func
 def reference_offset(arrays: TaskArrays, w: int, k: int) -> wp.vec3:
-    """From the vehicle to where the reference is k `LOOK_AHEAD` from now, body frame [m]."""
+    """Return the way from the vehicle to the reference in k `LOOK_AHEAD` from now, body frame [m]."""
     ahead = reference_position(arrays.reference, w, arrays.time[w] + LOOK_AHEAD * float(k))
     return wp.quat_rotate_inv(arrays.quaternion[w, 0], ahead - arrays.position[w, 0])
 
@@ -399,7 +399,7 @@ class TrajectoryTracking(FittedTask):
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0
     level: int = 3
-    """Which of `LEVELS` the shapes are drawn from: 0 to 2 as published, 3 all of them."""
+    """Index of the `LEVELS` that the shapes are drawn from: 0 to 2 as published, 3 all of them."""
     scale_low: tuple[float, float, float] = (0.3, 0.2, 0.04)
     """Half axes of a shape are drawn from here, along, across and up ..."""
     scale_high: tuple[float, float, float] = (1.2, 0.6, 0.12)
@@ -449,7 +449,7 @@ class TrajectoryTracking(FittedTask):
 
     @property
     def shapes(self) -> int:
-        """How many shapes there are to draw from."""
+        """Return the number of shapes to draw from."""
         return len(LEVELS[self.level])
 
     def terms(self) -> Terms:

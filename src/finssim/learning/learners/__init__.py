@@ -1,4 +1,4 @@
-"""The learners by name: each turns an environment into a network, whichever library it is made of."""
+"""The learners by name: each turns an environment into a network, with any library."""
 
 from finssim.learning.learners.catalogue import LEARNERS, Learner, LearnerKind, LearningError, learner_named
 

@@ -1,4 +1,4 @@
-"""What learners share: their settings, by task where they are not the defaults, and how they act in an environment."""
+"""Common parts of the learners: settings, those that differ by task, and acting in an environment."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Table = dict[str, dict[str, dict[str, Any]]]
 task's own lines outrank."""
 
 CHASE: dict[str, dict[str, Any]] = {
-    # A capture or delivery lies far ahead: ten seconds of foresight. It is worth so much more than a step that what the
+    # A capture or delivery is far ahead: ten seconds of foresight. Its reward so exceeds a step's that what the
     # value is wrong by must not use up the gradient that policy and value share; RSL-RL's do not share one.
     "on-policy": {"discount": 0.99, "value_weight": 0.05, "learning_rate": 2.0e-3, "steps": 1_000_000},
     "rsl-rl": {"value_weight": 1.0},
@@ -34,7 +34,7 @@ CHASE: dict[str, dict[str, Any]] = {
 }
 
 SIGHT: dict[str, dict[str, Any]] = {"bc": {"steps": 600_000, "hidden": (128, 64), "batch": 256}}
-"""Of tasks with pictures, each of which costs a network of its own."""
+"""Settings of tasks with pictures, which need separate networks."""
 
 SETTINGS: Table = {
     # Smaller networks than the default are as good here, and are learnt in three quarters of the time.
@@ -54,7 +54,7 @@ SETTINGS: Table = {
     "net": {"distill": {"teacher_steps": 300_000, "steps": 12_800}, **SIGHT},
     "camera-docking": SIGHT,
     "pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "teacher": "lead"}},
-    # With 1.5 million, half of the seeds have only begun to capture.
+    # After 1.5 million steps, half of the seeds have only started to capture.
     "team-pursuit": {
         "on-policy": {**CHASE["on-policy"], "steps": 3_600_000},
         "rsl-rl": CHASE["rsl-rl"],
@@ -73,7 +73,7 @@ SETTINGS: Table = {
         "ppo": {"discount": 0.99, "learning_rate": 2.0e-3, "steps": 1_500_000, "teacher": "consensus"},
     },
 }
-"""Of every training."""
+"""Settings of every training."""
 
 RANDOMIZED: Table = {
     # What must be learnt is more.
@@ -81,7 +81,7 @@ RANDOMIZED: Table = {
         "ppo": {"steps": 1_000_000},
         "on-policy": {"steps": 3_000_000},
     },
-    # What it saw and did in the last steps tells how this vehicle answers: thrust, lag, and how late the state comes.
+    # Observations and actions of the latest steps show how this vehicle responds: thrust, lag, and delay of the state.
     "t1": {"ppo": {"steps": 2_000_000, "history": 2, "last_action": True}},
     "t2": {
         "ppo": {"steps": 2_000_000, "history": 2, "last_action": True},
@@ -95,7 +95,7 @@ RANDOMIZED: Table = {
     "team-pursuit": {"ppo": {"steps": 3_000_000}, "on-policy": {"steps": 6_000_000}},
     "formation": {"ppo": {"steps": 3_000_000}, "on-policy": {"steps": 4_000_000}},
 }
-"""On top of those, where every episode has another vehicle (`--randomize`)."""
+"""Additional settings if every episode has another vehicle (`--randomize`)."""
 
 
 def task_settings(task: str, learner: str, randomized: bool) -> dict[str, Any]:
@@ -130,13 +130,13 @@ class OnPolicySettings:
     epochs: int = 5
     """Passes over a rollout."""
     learning_rate: float = 1.5e-3
-    """At the start; falls linearly to zero, which is what brings the last centimetres."""
+    """Learning rate at the start; it falls linearly to zero, which gives the last centimetres."""
     discount: float = 0.98
     """Per control step: 5 s of foresight at 10 Hz, a few time constants of the vehicle."""
     gae_lambda: float = 0.95
     clip: float = 0.2
     value_weight: float = 0.5
-    """Of the value's squared error beside the policy's objective, where both share a gradient norm."""
+    """Weight of the value's squared error relative to the policy's objective, if both share a gradient norm."""
     largest_gradient: float = 0.5
     """Longer gradients are shortened to this norm: an odd batch must not undo the work of many."""
     entropy_weight: float = 0.0
@@ -148,7 +148,7 @@ class OnPolicySettings:
 
 
 def expert_in(environment: Environment, name: str) -> Any:
-    """Who shows a learner in an environment what to do: a baseline of the task by name, or a policy directory.
+    """Return the expert of a learner in an environment: a baseline of the task by name, or a policy directory.
 
     Raises:
         AgentError: There is neither, or it acts in another mode than the environment's.
@@ -214,7 +214,7 @@ class ActingLearner:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Go on from a state of a learner that was made alike."""
+        """Continue from a state of a learner that was made in the same way."""
         self.steps = int(state["steps"])
         self.environment.load_state(state["environment"])
         self.tally.load(state["tally"])

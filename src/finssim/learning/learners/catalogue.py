@@ -1,4 +1,4 @@
-"""What a learner is, and every one by name. Nothing here imports a library of learning: a kind does when it is used."""
+"""The protocol of learners, and all learners by name. Nothing here imports a library of learning before it is used."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Learner(Protocol):
         """Everything that decides what comes next: parameters, optimisers, random streams, the environment."""
 
     def load(self, state: dict[str, Any]) -> None:
-        """Go on from a state of a learner that was made alike, bit for bit."""
+        """Continue from a state of a learner that was made in the same way, bit for bit."""
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,17 @@ class LearnerKind:
     """A learner that can be made: call it for one."""
 
     module: str
-    """Where its class is."""
+    """Module of its class."""
     name: str
     """Its class."""
     what: str
-    """In a few words."""
+    """Short description."""
     extra: str = "learn"
-    """What of FinsSim must be installed, as pip takes it."""
+    """Extra of FinsSim that it needs, as pip takes it."""
     agents: str = "any"
-    """How many agents of a task it can train: one, several, or any."""
+    """Number of agents of a task that it can train: one, several, or any."""
     sees: bool | None = False
-    """Whether it trains tasks that observe pictures, and these alone; None: with pictures and without."""
+    """True if it trains only tasks that observe pictures, False only tasks without; None: both."""
     own: type | None = None
     """The class itself, of a learner from outside the package."""
 
@@ -173,7 +173,7 @@ LEARNERS: dict[str, LearnerKind] = {
 MAY_BE_ZERO = ("warm_up", "expert_rounds", "history", "memory")
 """Settings that count what may be left out; of all others there is at least one."""
 LARGEST = 10**9
-"""Of anything that is counted."""
+"""Greatest value of any count."""
 SIGNED = ("log_std", "entropy")
 """Numbers that may be negative."""
 SHARES = ("discount", "gae_lambda", "smoothing", "taught")

@@ -28,7 +28,7 @@ class DistillSettings:
     """Settings of teacher and student."""
 
     worlds: int = 64
-    """Of the student."""
+    """Number of the student's worlds."""
     steps: int = 100_000
     """Control steps of the student, all worlds together."""
     teacher_worlds: int = 256
@@ -44,11 +44,11 @@ class DistillSettings:
     """Times that each new sample's number of samples is drawn from what is kept, in each round."""
     batch: int = 256
     learning_rate: float = 1.0e-3
-    """At the start; falls linearly to zero."""
+    """Learning rate at the start; it falls linearly to zero."""
     auxiliary: float = 0.3
     """Weight of the squared error of the predicted teacher's row."""
     colour: float = 0.3
-    """How far colours and levels of the pictures are varied while it learns: other waters do so much more."""
+    """Variation of the pictures' colours and levels during learning; other waters vary them much more."""
     hidden: tuple[int, ...] = (128, 64)
     """Units of the layers behind the encoder, ELU."""
 
@@ -160,7 +160,7 @@ class Distill(ActingLearner):
             self.tally.look()
 
     def _labels(self) -> torch.Tensor:
-        """What the teacher would do, (worlds, m)."""
+        """Return the teacher's actions, (worlds, m)."""
         assert self.teacher is not None
         rows = self._taught.numpy() if self.device == "cpu" else self._taught
         action, _ = self.teacher.step(rows, None)

@@ -31,24 +31,24 @@ class BcSettings:
     demonstrations: str = ""
     """Folder of a data set, from `finssim collect`."""
     worlds: int = 32
-    """In which the policy is tried while it learns; it learns nothing from them."""
+    """Number of worlds in which the policy is evaluated during learning; it learns nothing from them."""
     steps: int = 4_000_000
     """Demonstrated steps that are looked at, all passes together."""
     rollout: int = 8192 * 8
     """Looked at between two rows of the curve."""
     batch: int = 512
     learning_rate: float = 1.0e-3
-    """At the start; falls linearly to zero."""
+    """Learning rate at the start; it falls linearly to zero."""
     weight_decay: float = 1.0e-5
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers, ELU; of a task that sees, those behind the encoder of `distill`."""
     colour: float = 0.3
-    """How far colours of pictures are varied while it learns, as of `distill`."""
+    """Variation of the pictures' colours during learning, as in `distill`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DaggerSettings:
-    """Settings of DAgger (Ross et al. 2011): the learner drives, the expert says what it would have done."""
+    """Settings of DAgger (Ross et al. 2011): the learner acts, and the expert labels its observations."""
 
     expert: str = "pid"
     """A baseline of the task by name, or a policy directory."""
@@ -67,7 +67,7 @@ class DaggerSettings:
     """Over what is kept, in each round."""
     batch: int = 512
     learning_rate: float = 1.0e-3
-    """At the start; falls linearly to zero."""
+    """Learning rate at the start; it falls linearly to zero."""
     weight_decay: float = 1.0e-5
     hidden: tuple[int, ...] = (64, 64)
 
@@ -101,7 +101,7 @@ def demonstrations_for(environment: Environment, folder: str) -> Demonstrations:
 
 
 class _Cloner(ActingLearner):
-    """What both share: a network that is fitted to actions, and worlds in which it drives."""
+    """Common part of both: a network that is fitted to actions, and worlds in which it acts."""
 
     settings: Any
 

@@ -41,7 +41,7 @@ ROLLOUT_SAMPLES = 4096
 
 @dataclass(frozen=True, kw_only=True)
 class PpoSettings:
-    """The defaults; what a task has of its own stands in `task_settings`."""
+    """Default settings; those that differ by task are in `task_settings`."""
 
     worlds: int = 256
     steps: int = 400_000
@@ -53,7 +53,7 @@ class PpoSettings:
     epochs: int = 3
     """Passes over a rollout."""
     learning_rate: float = 4.0e-3
-    """At the start; falls linearly to zero, which is what brings the last centimetres."""
+    """Learning rate at the start; it falls linearly to zero, which gives the last centimetres."""
     discount: float = 0.98
     """γ, per control step: 5 s of foresight at 10 Hz, a few time constants of the vehicle."""
     gae_lambda: float = 0.95
@@ -72,13 +72,13 @@ class PpoSettings:
     history: int = 0
     """Observations of earlier control steps that the policy sees beside the newest."""
     last_action: bool = False
-    """Whether the policy sees what it did last."""
+    """True if the policy observes its last action."""
     integral: bool = True
-    """Whether to the task's `errors`, where it names some, their integrals are added, so that none lasts."""
+    """True if the integrals of the task's `errors`, if it names some, are added to them, so that no error lasts."""
     memory: int = 0
     """Units of a GRU in front of the policy's hidden layers, which remembers what cannot be seen; 0: none."""
     asymmetric: bool = True
-    """Whether the value sees what randomisation has drawn, which the policy does not."""
+    """True if the value observes what randomisation has drawn, which the policy does not."""
     teacher: str = ""
     """A baseline of the task by name, a policy directory, or `informed`, that is imitated first; none if empty."""
     informed_steps: int = 1_000_000
@@ -106,7 +106,7 @@ class InformedTeacher:
         )  # fmt: skip
 
     def train(self) -> None:
-        """Learn for `informed_steps` control steps; the student's episodes begin anew."""
+        """Learn for `informed_steps` control steps; the student's episodes restart."""
         ppo, environment = self._ppo, self._ppo.environment
         while ppo.steps < ppo.settings.steps:
             environment.set_progress(ppo.steps / ppo.settings.steps)
@@ -121,7 +121,8 @@ class InformedTeacher:
         return np.zeros((rows, len(self._ppo._errors)), np.float32)
 
     def act(self, memory: Any, reading: Known, goal: Any) -> tuple[Any, Any]:
-        """What it would do where the student's worlds are now, and its integrals after; a goal is in what is seen."""
+        """Return its action in the current state of the student's worlds, and its integrals after; the observation
+        holds the goal."""
         ppo, A = self._ppo, self._ppo.arrays
         observation, ppo._integral = A.array(reading.observation), A.array(memory)
         observation, integral = ppo._integrated(observation)
@@ -272,7 +273,7 @@ class Ppo(ActingLearner):
 
     @property
     def _taught(self) -> bool:
-        """Whether the teacher is imitated in this update."""
+        """Return whether the teacher is imitated in this update."""
         return self._teacher is not None and 1.0 - self.remaining < self.settings.taught
 
     def _ask(self, t: int) -> None:
@@ -309,13 +310,14 @@ class Ppo(ActingLearner):
             self._memory[:, k:] = h
 
     def _close(self, t: int) -> None:
-        """What came of step t; where time ended an episode, the value of its last observation is part of the reward."""
+        """Store the result of step t; where time ended an episode, the value of its last observation is part of the
+        reward."""
         A, e = self.arrays, self.environment
         self._r[t], self._go[t] = self._reward, 1.0
         terminated, truncated = self._terminated != 0, self._truncated != 0
         done = terminated | truncated
         if A.device is None and not done.any():
-            return  # on a GPU, to look would take longer than to go on
+            return  # on a GPU, testing takes longer than continuing
         late, done = (
             A.xp.broadcast_to(mask[:, None], (e.worlds, e.agents)).reshape(-1)
             for mask in (truncated & ~terminated, done)
@@ -344,7 +346,7 @@ class Ppo(ActingLearner):
     # Learning
 
     def _learn(self, advantage: Array, target: Array, before: Array, rate: float) -> dict[str, float]:
-        """Gradient steps on samples in random order; of a policy with a GRU, on whole rows in random order."""
+        """Take gradient steps on samples in random order; with a GRU, on complete rows in random order."""
         A, s, T = self.arrays, self.settings, self.settings.rollout
         actions = self._label if self._taught else self._u
         samples = [x[:T] for x in (self._x, self._c, actions, advantage, target, self._density)]

@@ -22,14 +22,14 @@ from finssim.tasks import Environment
 
 @dataclass(frozen=True, kw_only=True)
 class RslRlSettings(OnPolicySettings):
-    """As PPO's. RSL-RL shortens the gradients of policy and value each by itself."""
+    """Settings as those of PPO. RSL-RL clips the gradients of policy and value separately."""
 
     value_weight: float = 1.0
     """Policy and value share no weights: it scales the value's learning rate alone."""
     clip_values: bool = False
     """Values here are of the order of tens; steps limited to `clip` would take long to reach them."""
     asymmetric: bool = True
-    """Whether the critic sees the drawn parameters of vehicle and water, where the environment tells them."""
+    """True if the critic observes the drawn parameters of vehicle and water, if the environment gives them."""
 
 
 class RslRlPpo(ActingLearner):
@@ -52,7 +52,7 @@ class RslRlPpo(ActingLearner):
         groups = {"actor": ["policy"], "critic": list(groups_now.keys())}
         noise = {
             "class_name": "GaussianDistribution",
-            "std_type": "log",  # a step of the optimiser cannot take it to zero
+            "std_type": "log",  # the optimiser's step cannot take it to zero
             "init_std": float(torch.tensor(settings.log_std).exp()),
         }
         sizes = {"hidden_dims": list(settings.hidden), "activation": "elu"}
@@ -127,7 +127,7 @@ class RslRlPpo(ActingLearner):
         return TensorDict(groups, batch_size=[self._rows])
 
     def _add_last_values(self, reward: torch.Tensor, timed_out: torch.Tensor) -> None:
-        """Where time ended an episode, the discounted value of its last observation belongs to the reward.
+        """Add the discounted value of an episode's last observation to the reward where time ended the episode.
 
         RSL-RL's own way takes the value of the observation before.
         """
@@ -156,7 +156,8 @@ def _begin(mlp: Any, last_gain: float) -> None:
 
 
 def privileged_rows(environment: Environment, name: str = "privileged") -> torch.Tensor | None:
-    """What only a critic may see, one row per agent: a view of the environment's own memory; None if there is nothing.
+    """Return what only a critic may observe, one row per agent: a view of the environment's memory; None if there is
+    nothing.
 
     Args:
         environment: The worlds.

@@ -29,7 +29,7 @@ class TalliedWorlds(Sb3VecEnv):
     def step_wait(
         self,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """As every SB3 environment; and the tally looks."""
+        """Return the step as every SB3 environment does, and count its episodes."""
         result = super().step_wait()
         self.tally.look()
         return result
@@ -84,7 +84,7 @@ class Sb3Ppo(ActingLearner):
         return {**self.tally.row(), "action_std": torch.exp(m.policy.log_std).mean().item(), **logged}
 
     def _count(self) -> None:
-        """Bring steps and the share of the training up to date."""
+        """Update the steps and the share of the training."""
         self.steps = self.model.num_timesteps // self.environment.agents
         self.model._update_current_progress_remaining(self.steps, self.settings.steps)
 

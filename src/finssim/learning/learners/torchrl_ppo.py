@@ -27,7 +27,7 @@ from finssim.tasks import Environment
 
 @dataclass(frozen=True, kw_only=True)
 class TorchRlSettings(OnPolicySettings):
-    """As PPO's."""
+    """Settings as those of PPO."""
 
 
 class Head(nn.Module):
@@ -77,7 +77,7 @@ class TorchRlPpo(ActingLearner):
     rollout_samples = ROLLOUT_SAMPLES
     settings: TorchRlSettings
     value = OwnValue
-    """What the critic sees."""
+    """Network of the critic."""
 
     def __init__(
         self, environment: Environment, settings: TorchRlSettings, *, seed: int, device: str = "cpu"
@@ -143,7 +143,7 @@ class TorchRlPpo(ActingLearner):
         value = self.critic(observation)
         after = torch.cat([value[1:], self.critic(w.observation)[None]])
         done = torch.stack(ends)
-        # Where an episode ended, what follows is worth what its own last observation is, not the next one's first.
+        # Where an episode ended, what follows has the value of its own last observation, not of the next's first.
         after[done] = self.critic(torch.cat(lasts))
         advantage, target = self._advantage(value, after, torch.stack(rewards), done, torch.stack(kills))
         loc, scale = self.actor(observation)
