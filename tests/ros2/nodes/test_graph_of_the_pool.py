@@ -125,7 +125,9 @@ def graph(alone, tmp_path_factory):
 @pytest.mark.slow
 def test_a_station_is_held_through_topics_alone(graph):
     """Armed because it was asked for, by odometry near the goal; every node is on the graph and tells its health."""
-    assert graph.until(lambda: graph.state() == ARMED), "".join(graph.said)
+    # A machine that is busy while the nodes start may soon hold it again: that it was armed is what was asked for.
+    armed = lambda: any("hardware_bridge]: armed: armed by topic" in line for line in graph.said)  # noqa: E731
+    assert graph.until(armed), "".join(graph.said)
     reached = graph.until(lambda: graph.distance() < 0.15, each=graph.operate)
     states = [m.state for m in graph.heard["thrusters"]]
     if not reached and states.count(ARMED) < 0.5 * len(states):
@@ -142,7 +144,7 @@ def test_a_station_is_held_through_topics_alone(graph):
 @pytest.mark.slow
 def test_a_killed_controller_leaves_no_thrust(graph):
     """kill -9: the bridge's states say zero from half a second after the last command, and the launcher tells of it."""
-    assert graph.until(lambda: graph.state() == ARMED, each=graph.operate)
+    assert graph.until(lambda: graph.state() == ARMED and graph.heard["command"], each=graph.operate)
     os.kill(graph.pid("controller"), signal.SIGKILL)
     last = lambda: max(nanoseconds(m.header.stamp) for m in graph.heard["command"])  # noqa: E731
     age = lambda m: 1e-9 * (nanoseconds(m.header.stamp) - last())  # noqa: E731
