@@ -66,9 +66,9 @@ FORCE = 21196.0
 PITCH, ROLL, THROTTLE, YAW, FORWARD, LATERAL = range(6)
 """Input channels, from 0."""
 BOOT_INPUTS = (NEUTRAL,) * 8 + (1100,) * 10
-"""Pulse widths of the 18 inputs that nobody overrides: lights off, all else in the middle [µs]."""
+"""Pulse widths of the 18 inputs without an override: lights off, all others in the middle [µs]."""
 SPECIFIC_WEIGHT = 9800.0
-"""Of fresh water, as ArduPilot has it [Pa/m]."""
+"""Pressure gradient of fresh water, as in ArduPilot [Pa/m]."""
 METRES_PER_DEGREE = 111319.5
 CALIBRATION, STILL = 1.0, 0.03
 """For so long after the start the gyroscope is averaged [s], unless it turns faster than this [rad/s]."""
@@ -119,7 +119,7 @@ LIMITS = {INT8: 2**7 - 1, INT16: 2**15 - 1, INT32: 2**31 - 1}
 
 
 class ArduSub:
-    """One autopilot, from power-on; like `Firmware` it is told the time, and its motors turn in the plant.
+    """One autopilot, from power-on; like `Firmware` it is given the time, and its motors turn in the plant.
 
     Attributes:
         parameters: By name; they outlive a reboot.
@@ -217,21 +217,21 @@ class ArduSub:
     # What the pool calls.
 
     def reboot(self, now: float) -> None:
-        """Motors off, silence for the plant's `reboot_time`, then everything but the parameters anew."""
+        """Stop the motors, be silent for the plant's `reboot_time`, then restart everything but the parameters."""
         self._clock_start = 0
         self._start(now + self._spec.reboot_time)
 
     def running(self, now: float) -> bool:
-        """Whether it has finished starting."""
+        """Return whether it has finished starting."""
         return now >= self._boot
 
     @property
     def driving(self) -> bool:
-        """Whether it is armed."""
+        """Return whether it is armed."""
         return self.armed
 
     def receive(self, now: float, data: bytes) -> list[bytes]:
-        """Take a datagram of whole MAVLink frames; returns the answers. Whatever it holds, nothing is raised."""
+        """Read a datagram of complete MAVLink frames and return the answers; it raises nothing."""
         if not self.running(now):
             return []
         self._now = max(self._now, now)
@@ -241,7 +241,7 @@ class ArduSub:
             for_us = getattr(message, "target_system", self._id) in (0, self._id)
             if handler is not None and for_us and getattr(message, "target_component", 1) in (0, 1):
                 handler(message)
-        # What is left is no whole frame: it must not swallow the next one.
+        # The rest is no complete frame: it must not consume the next one.
         self._mav.buf, self._mav.buf_index = bytearray(), 0
         self._mav.expected_length = mavlink.HEADER_LEN_V1 + 2
         out = self._drain()
@@ -265,7 +265,7 @@ class ArduSub:
     def frames(
         self, now: float, sample: Sample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
     ) -> list[bytes]:
-        """What leaves at a sample of the IMU: telemetry that is due, and the lines of the Doppler log.
+        """Return what is sent at a sample of the IMU: telemetry that is due, and the lines of the Doppler log.
 
         Args:
             now: When it leaves [s].
@@ -386,7 +386,7 @@ class ArduSub:
         self._held = (*turning, throttle if self.mode == STABILIZE else self._climbing(throttle))
 
     def _climbing(self, stick: float) -> float:
-        """Throttle that climbs as the stick says or holds the depth, less near the surface."""
+        """Return the throttle that climbs by the stick or holds the depth, less near the surface."""
         p = self.parameters
         climb = 0.01 * p["PILOT_SPEED_UP"] * _dead(stick, 0.001 * p["THR_DZ"])
         if self.mode == SURFACE:
@@ -415,13 +415,13 @@ class ArduSub:
         self.target = self._speeds[np.arange(len(column)), column]
 
     def _demands(self) -> tuple[float, ...]:
-        """Of the mixer: roll, pitch, yaw, throttle, forward, lateral."""
+        """Return the demands of the mixer: roll, pitch, yaw, throttle, forward, lateral."""
         pitch, roll, throttle, yaw, forward, lateral = self._sticks()
         yaw *= self.parameters["ACRO_YAW_P"] / REALS["ACRO_YAW_P"]
         return (*(self._held or (roll, pitch, yaw, throttle)), forward, lateral)
 
     def _signs(self) -> Array:
-        """Of the motors that parameters turn against the vehicle file, (n,)."""
+        """Return the signs of the motors that parameters turn against the vehicle file, (n,)."""
         n = len(self.pulses)
         now = np.array([self.parameters[f"MOT_{i + 1}_DIRECTION"] for i in range(n)])
         return np.asarray(np.where(now < 0.0, -1.0, 1.0) * self._mixer.directions)
@@ -443,7 +443,7 @@ class ArduSub:
             self._release(channel)
 
     def _from_ground(self) -> bool:
-        """Whether the newest message came from the ground station that may steer."""
+        """Return whether the newest message came from the ground station that may steer."""
         return bool(self._sender[0] == self.parameters["SYSID_MYGCS"])
 
     def _on_heartbeat(self, message: Any) -> None:
@@ -473,7 +473,7 @@ class ArduSub:
             self._override(channel, NEUTRAL + max(-HALF_RANGE, min(HALF_RANGE, offset)))
 
     def _press(self, function: int) -> None:
-        """What a button does; those of lights, camera and trim do nothing."""
+        """Perform the function of a button; those of lights, camera and trim do nothing."""
         if function in (2, 3, 4):
             arm = function == 3 or (function == 2 and not self.armed)
             self._arm() if arm else self._disarm()
@@ -501,7 +501,7 @@ class ArduSub:
     # Arming, modes, failsafes.
 
     def _unfit(self) -> list[str]:
-        """Why it must not be armed."""
+        """Return why it must not be armed."""
         p = self.parameters
         reasons = []
         if self._sample is None or self._now - self._boot < CALIBRATION:
@@ -560,7 +560,8 @@ class ArduSub:
         return sets_in
 
     def _check_pilot(self, now: float) -> None:
-        """No input for FS_PILOT_TIMEOUT: sticks to neutral, and disarmed where FS_PILOT_INPUT says so; once a loss."""
+        """Without input for FS_PILOT_TIMEOUT, set the sticks to neutral, and disarm if FS_PILOT_INPUT demands it; once
+        a loss."""
         action = self.parameters["FS_PILOT_INPUT"]
         lost = action > 0 and now - self._pilot_seen > self.parameters["FS_PILOT_TIMEOUT"]
         if self._failsafe("pilot", lost, CRITICAL, "Lost manual control"):
@@ -568,7 +569,8 @@ class ArduSub:
             self._act({2: None}.get(int(action), self.mode))
 
     def _check_ground(self, now: float) -> None:
-        """No heartbeat of the ground station for FS_GCS_TIMEOUT, once there was one: what FS_GCS_ENABLE says."""
+        """Without a heartbeat of the ground station for FS_GCS_TIMEOUT, once there was one, do what FS_GCS_ENABLE
+        demands."""
         action, since = self.parameters["FS_GCS_ENABLE"], self._ground_seen
         lost = action > 0 and since > -math.inf and now - since > self.parameters["FS_GCS_TIMEOUT"]
         if self._failsafe(
@@ -611,7 +613,7 @@ class ArduSub:
 
     def _command(self, command: int, values: list[float]) -> None:
         """Do it or refuse it; one that is not known is unsupported, never met with silence."""
-        values = [value if abs(value) < 1e9 else -1.0 for value in values]  # NaN as well: no command takes it
+        values = [value if abs(value) < 1e9 else -1.0 for value in values]  # NaN too: no command accepts it
         do = COMMANDS.get(command)
         result = UNSUPPORTED if do is None else do(self, values)
         self._send("command_ack", command, result, 0, 0, *self._sender)
@@ -725,7 +727,7 @@ class ArduSub:
         self._send("mission_ack", *self._sender, mavlink.MAV_MISSION_ACCEPTED, message.mission_type)
 
     def _on_file_transfer_protocol(self, message: Any) -> None:
-        """Refuse, so that nobody waits: parameters go by PARAM_REQUEST_LIST."""
+        """Refuse, so that the client does not wait: parameters go by PARAM_REQUEST_LIST."""
         sequence, session, opcode = struct.unpack_from("<HBB", bytes(message.payload))
         fields = (sequence + 1) & 0xFFFF, session, FTP_NAK, 1, opcode, 0, 0, FTP_UNKNOWN
         payload = struct.pack("<HBBBBHIB", *fields).ljust(251, b"\0")
@@ -765,11 +767,11 @@ class ArduSub:
         self._statustext(INFO, f"Frame: {self._mixer.autopilot.name}")
 
     def _reporter(self, name: str) -> Callable[[], tuple[Any, ...]] | None:
-        """What gives the fields of a message, or of several, by its name."""
+        """Return the function that gives the fields of a message, or of several, by its name."""
         return getattr(self, f"_report_{name}", None)
 
     def _report(self, name: str) -> bool:
-        """Send a message with what is known now, if anything is; False where there is none of this name."""
+        """Send a message with current values, if there are any; return False if there is none of this name."""
         reporter = self._reporter(name)
         if reporter is None:
             return False
@@ -919,7 +921,7 @@ COMMANDS: dict[int, Callable[[ArduSub, list[float]], int]] = {
     mavlink.MAV_CMD_DO_MOTOR_TEST: ArduSub._do_refuse,
     mavlink.MAV_CMD_DO_SET_SERVO: ArduSub._do_refuse,
 }
-"""Those that are carried out or refused; every other is unsupported."""
+"""Commands that are performed or refused; every other is unsupported."""
 
 
 def _result(done: bool) -> int:
@@ -927,7 +929,7 @@ def _result(done: bool) -> int:
 
 
 def _name(number: float) -> str:
-    """Of a message by its number, in lower case; empty if there is none."""
+    """Return the name of a message by its number, in lower case; empty if there is none."""
     kind = mavlink.mavlink_map.get(int(number))
     return "" if kind is None else kind.msgname.lower()
 

@@ -43,14 +43,14 @@ _LOG = logging.getLogger("finssim.ardusub_sitl")
 
 
 class Pulses(NamedTuple):
-    """What SITL sends."""
+    """Packet that SITL sends."""
 
     frame_rate: int
     """Frames in a second of its clock [Hz]."""
     frame_count: int
     """Counts answers that SITL has taken."""
     pulses: tuple[int, ...]
-    """By output channel from 1, 16 or 32 [µs]; 0 where there is no signal."""
+    """Pulse widths by output channel from 1, 16 or 32 [µs]; 0 without a signal."""
 
 
 _LAYOUTS = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
@@ -75,7 +75,8 @@ def decode_pulses(data: bytes) -> Pulses | str:
 
 
 GRAVITY = 9.80665
-"""What ArduPilot takes off a specific force [m/s²]: with it, accelerations and velocities of an answer agree."""
+"""Gravity that ArduPilot subtracts from a specific force [m/s²]: with it, accelerations and velocities of an answer
+agree."""
 _FLIP = TO_FOSSEN.A
 _LONGEST_STEP = 0.005
 """Longest physics step [s]."""
@@ -187,11 +188,11 @@ class SitlWorld:
 
     @property
     def frozen(self) -> bool:
-        """Whether the vehicle stands still since its motion stopped being finite."""
+        """Return whether the vehicle is frozen since its motion stopped being finite."""
         return bool(self._frozen[0])
 
     def answer(self) -> bytes:
-        """The state as SITL's parser takes it: no JSON reader, but a search for names with what follows them."""
+        """Return the state in the form of SITL's parser, which searches for names and reads what follows them."""
         R = quat_to_matrix(self._quaternion)
         nu, nu_dot = self._nu.astype(float), self._nu_dot.astype(float)
         v, omega = nu[:3], nu[3:]
@@ -214,7 +215,7 @@ class SitlWorld:
 
 
 class _DopplerLog:
-    """The vehicle's Doppler log, looked at once per frame; its reports leave when their latency is over."""
+    """The vehicle's Doppler log, sampled once per frame; its reports are sent when their latency is over."""
 
     def __init__(self, vehicle: Vehicle, server: DvlServer, floor: float, seed: int) -> None:
         log = vehicle.sensors.dvl
@@ -330,7 +331,7 @@ class SitlServer:
                     self.counts["repeats"] += 1
                 newest = packet or newest
         if newest is not None and self._peer is not None:
-            with suppress(OSError):  # SITL has gone: its system says so
+            with suppress(OSError):  # SITL has gone, as its system reports
                 self._socket.sendto(self.answer(newest), self._peer)
         elif self.world.log is not None:
             self.world.log.server.poll()
@@ -351,7 +352,7 @@ class SitlServer:
         return packet
 
     def answer(self, packet: Pulses) -> bytes:
-        """What SITL gets for a packet; the world moves on if its frame is new, and starts again if it counts back."""
+        """Return the answer to a packet; the world advances if its frame is new, and restarts if it counts back."""
         count = packet.frame_count
         if count == self._last:
             self.counts["repeats"] += 1
@@ -370,7 +371,7 @@ class SitlServer:
         return self._answer
 
     def _note(self, kind: str, sentence: str, *values: Any) -> None:
-        """Count, and log the first of its kind; the end tells how many there were."""
+        """Count, and log the first of its kind; the end reports their number."""
         self.counts[kind] += 1
         if self.counts[kind] == 1 or kind == "restarts":
             _LOG.warning(sentence, *values)
@@ -381,7 +382,7 @@ class SitlServer:
 
 
 MOTOR_POWER = 385.0
-"""Of a T200 at full speed on 16 V, from its table [W]."""
+"""Power of a T200 at full speed on 16 V, from its table [W]."""
 
 
 def run(

@@ -34,7 +34,7 @@ Array = npt.NDArray[np.float64]
 
 # Tag corners as a detector reports them, computed from the optics without drawing a picture.
 
-# What a detector that lays the whole known tag over the picture makes of it when ripples bend the tag's image.
+# Result of a detector that fits the known tag to the picture when ripples bend the tag's image.
 #
 # The fit of `localization.detection` moves a homography until the edges of all cells agree with the picture, so its
 # corners are those of the tag as ripples shift it on average, not of the bent image. For small bends that is linear:
@@ -96,7 +96,8 @@ class CornerFit:
 
 
 def _fit_matrix(family: str, tag: int, along: Array, square: Array) -> Array:
-    """From motions of the nodes, all x before all y, to the fit's homography (8 rows) and what it leaves of them."""
+    """Return the matrix from motions of the nodes, all x before all y, to the fit's homography (8 rows) and its
+    residual."""
     points, across = _cell_edges(family, tag)
     columns, there = _warp_columns(points), _interpolation(along, points)
     rows = np.where(across[:, None], columns[:, 0], columns[:, 1])
@@ -164,13 +165,13 @@ def _adjugate(H: list[list[float]]) -> list[list[float]]:
 
 
 FLAT_STEPS = 2
-"""Of Newton's method for still water: within 1e-5 px. One is enough to begin with ripples."""
+"""Steps of Newton's method for still water: within 1e-5 px. One is enough as a start for ripples."""
 RIPPLE_STEPS = 2
 """For ripples, with the surface's curvature from the first: within 0.001 px rms at a slope of 0.01, 0.03 px at 0.03."""
 
 
 class RippledView:
-    """The same surface and the same law of refraction as the renderer's, solved from the point to the pixel."""
+    """The renderer's surface and law of refraction, solved from the point to the pixel."""
 
     def __init__(self, camera: Camera, interface: Interface, ripples: Ripples | None = None) -> None:
         """
@@ -209,7 +210,8 @@ class RippledView:
     def _crossing(
         self, px: Array, py: Array, depth: Array, time: float
     ) -> tuple[Array, Array, Array | float]:
-        """Where the ray from the camera to each point crosses the surface: x, y, height, surface frame [m], (N,).
+        """Return where the ray from the camera to each point crosses the surface: x, y, height, surface frame [m],
+        (N,).
 
         Found as the root of the miss: the ray through a place of the surface, bent by the slope there, lands beside
         the point.
@@ -238,8 +240,8 @@ class RippledView:
         flat: tuple[Array, Array, Array],
         time: float,
     ) -> tuple[Array, Array, Array]:
-        """From the place on still water to that on ripples. `flat`: d landing / d place along the radius and across it
-        on still water, and by how much curvature adds to them."""
+        """Return the place on ripples for a place on still water. `flat`: d landing / d place along the radius and
+        across it on still water, and how much curvature adds to them."""
         assert self._surface is not None
         x, y = still
         along, across, by_curvature = flat
@@ -262,7 +264,7 @@ class RippledView:
     def _step(
         self, x: Array, y: Array, height: Array, sx: Array, sy: Array, depth: Array
     ) -> tuple[Array, Array]:
-        """How far to the side a ray goes under water before it is at a depth [m], (N,) each."""
+        """Return the sideways distance of a ray under water until it is at a depth [m], (N,) each."""
         r = self._ratio
         drop = self._frame.camera_height - height
         length = np.sqrt(x * x + y * y + drop * drop)
@@ -385,20 +387,20 @@ def _reported(corners: Array, bend: float, pixel_noise: float, noise: Array) -> 
 
 
 HEIGHT = 1.4
-"""Of the camera above the water, for a pool of 4 m x 2 m [m]. The paper's hung at 1.21 m, from where its lens does not
-see the ends of the pool. From here it sees everything that is 0.4 m under the surface, and between the walls' last
-0.23 m everything from 0.1 m down."""
+"""Height of the camera above the water, for a pool of 4 m x 2 m [m]. The paper's was at 1.21 m, from where its lens
+does not see the ends of the pool. From here it sees everything that is 0.4 m under the surface, and between the walls'
+last 0.23 m everything from 0.1 m down."""
 SWIM = 0.4
-"""Where tags usually are, part of the pool's depth."""
+"""Usual depth of the tags, as a share of the pool's depth."""
 PAPER_POOL = 4.0, 2.0
 """[m]"""
 LATENCY = 0.045
-"""From the middle of the exposure to the robot's computer, on average [s]: readout, compression, USB."""
+"""Average time from the middle of the exposure to the robot's computer [s]: readout, compression, USB."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """How the camera takes its pictures, and what is on the vehicle that it looks at."""
+    """Settings of the camera, and true mounts of the tags."""
 
     rate: float = 30.0
     """Pictures a second [Hz]."""
@@ -413,9 +415,10 @@ class CameraSettings:
     ripples: float = 0.0
     """Root mean square of the water's slope."""
     pixel_noise: float = 0.03
-    """Of corners that are made without a picture, per axis [px]; rendered pictures have the noise of their pixels."""
+    """Noise of corners that are made without a picture, per axis [px]; rendered pictures have the noise of their
+    pixels."""
     mounts: Mapping[int, Mount] = field(default_factory=dict)
-    """Where tags truly sit, by id; those not named as the vehicle file has them."""
+    """True mounts of tags, by id; the others are as in the vehicle file."""
 
     def shutter(self, seed: int) -> Shutter:
         """Its shutter, from the seed of jitter and losses."""
@@ -485,7 +488,7 @@ def true_site(basin: Basin | None = None, *, finer: float = 1.0) -> Pool:
 
 
 def _height(basin: Basin) -> float:
-    """Of the camera above the water, from where it sees all of a pool [m]."""
+    """Return the height of the camera above the water from which it sees all of a pool [m]."""
     return HEIGHT * max(basin.length / PAPER_POOL[0], basin.width / PAPER_POOL[1])
 
 
@@ -526,7 +529,7 @@ def camera_of(
 
 
 def _calibrated(true: Pool, errors: _Errors, random: np.random.Generator, severity: str) -> Pool:
-    """What a survey with these errors finds of a camera."""
+    """Return the result of a survey of a camera with these errors."""
     lens, focal = true.camera.lens, 1.0 + errors.focal * random.normal(0.0, 1.0)
     lens = replace(lens, fx=lens.fx * focal, fy=lens.fy * focal)
     turn = quat_from_rotvec(random.normal(0.0, errors.tilt, 3))
@@ -559,13 +562,13 @@ STILL = 0.05
 SLOW = 0.4
 """Motion up to which one ray a pixel will do, where corners are placed to 0.03 px; beyond it, two by two [px]."""
 REACH = 0.2
-"""Of a tag's corner from the body's origin, for the motion that a turn makes [m]."""
+"""Distance of a tag's corner from the body's origin, for the motion by a turn [m]."""
 FREEBOARD = 0.1
-"""Of the pool's edge above the water [m]."""
+"""Height of the pool's edge above the water [m]."""
 
 
 class PictureCamera:
-    """Draws what moves anew in every picture, and the pool around it once."""
+    """Renders what moves in every picture, and the pool around it once."""
 
     def __init__(
         self,
@@ -712,12 +715,12 @@ class PoolCamera:
         return [self.develop(exposure) for exposure in self.exposures(t0, t1, pose_at)]
 
     def exposures(self, t0: float, t1: float, pose_at: PoseAt) -> list[Exposure]:
-        """As `advance`, before they are developed: for a process that draws them while another one goes on."""
+        """Return the exposures of `advance` before they are developed: for a process that renders them in parallel."""
         self._mail.post(self._shutter.advance(t0, t1, pose_at))
         return self._mail.arrived(t1)
 
     def develop(self, exposure: Exposure) -> Picture:
-        """What the robot gets of an exposure."""
+        """Return the robot's picture of an exposure."""
         start, end = (
             (self._R_pw @ position + self._t_pw, quat_multiply(self._q_pw, quaternion))
             for position, quaternion in (exposure.start, exposure.end)

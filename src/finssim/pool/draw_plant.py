@@ -39,30 +39,30 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Spread:
-    """How far a plant of one severity lies from the vehicle file: ±, uniform, unless a name says otherwise."""
+    """Distance of a plant of one severity from the vehicle file: ±, uniform, unless a name says otherwise."""
 
     hydrodynamics: float
-    """Of every diagonal entry of added mass and damping [-]."""
+    """Spread of every diagonal entry of added mass and damping [-]."""
     center: float
-    """Of the points where they are diagonal, per axis [m]."""
+    """Spread of the points where they are diagonal, per axis [m]."""
     tilt_deg: float
-    """Of the axes in which they are [deg]."""
+    """Spread of the axes in which they are diagonal [deg]."""
     hull_share: float
     """Part of the drag, on the axis where it is largest, that the hull's panels make [-]."""
     own_share: float
-    """Of the vehicle's speed that enters its propellers [-]."""
+    """Share of the vehicle's speed that enters its propellers [-]."""
     induced_share: float
-    """Of a neighbour's jet [-]."""
+    """Share of a neighbour's jet [-]."""
     deduction: tuple[float, float]
     """Least and most of the thrust [-]."""
     thrust: float
-    """Of each propeller's thrust, in each direction [-]."""
+    """Spread of each propeller's thrust, in each direction [-]."""
     motor: float
-    """Of each motor's lag, delay and slowest speed [-]."""
+    """Spread of each motor's lag, delay and slowest speed [-]."""
     fade: float
-    """Of the battery in a quarter of an hour [-]."""
+    """Discharge of the battery in a quarter of an hour [-]."""
     resistance: float
-    """Of the battery [ohm]."""
+    """Resistance of the battery [ohm]."""
     mass: float
     """[kg]"""
     gravity_offset: tuple[float, float]
@@ -106,7 +106,7 @@ SPREADS: dict[Severity, Spread] = by_severity(
     pressure_drift=(0.0, 2.0e-4, 4.0e-4),
     crystal=(0.0, 30.0, 60.0),
 )
-"""What a careful laboratory would have, and about twice that."""
+"""Spreads of a careful laboratory, and about twice those."""
 
 
 # How much of a vehicle's steady drag its panels and its propellers make, by axis: so that damping keeps the rest.
@@ -179,7 +179,7 @@ def hull_share(vehicle: Vehicle, share: float, drag: Array) -> dict[str, float]:
 
 
 def steady_share(vehicle: Vehicle, panels: Array, propellers: Mapping[str, float], deduction: float) -> Array:
-    """What panels and propellers take when cruising, by axis [N, N m], (6,).
+    """Return the share of drag by panels and propellers when cruising, by axis [N, N m], (6,).
 
     The propellers' part is the thrust lost to their own motion through the water, T V / (J0 n D), see `losses`, and to
     the thrust deduction: a file's damping was fitted to thrusts measured on a bench, so it holds both.
@@ -227,11 +227,11 @@ def less_share(vehicle: Vehicle, D1: Array, D2: Array, drag: Array) -> tuple[Arr
 
 
 DRAWN = 20261122
-"""Sets the draws of plants apart from everything else that a seed starts."""
+"""Number that separates the draws of plants from other uses of a seed."""
 
 
 def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") -> PlantSpec:
-    """A plant around the vehicle that stands in the pool; equal seeds give equal plants.
+    """Return a plant around the vehicle in the pool; equal seeds give equal plants.
 
     Args:
         vehicle: Its file, with a `calibrated` set, an IMU and a depth sensor.

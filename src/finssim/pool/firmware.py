@@ -49,14 +49,14 @@ IMU_ERRORS = (
 
 
 class Sample(NamedTuple):
-    """What the motor controller has read at one time."""
+    """Readings of the motor controller at one time."""
 
     gyro: tuple[float, float, float]
     """IMU frame [rad/s]."""
     accel: tuple[float, float, float]
     """Specific force, IMU frame [m/s²]."""
     depth: float
-    """Of the pressure port, positive down [m]."""
+    """Depth of the pressure port, positive down [m]."""
     pressure: float
     """Absolute [Pa]."""
 
@@ -119,7 +119,7 @@ class PoolSensors:
         )
 
     def aids(self, delay: float) -> list[NavigationAid]:
-        """What Doppler log and compass have delivered at the newest `sample`, as it leaves a delay [s] later."""
+        """Return what Doppler log and compass have delivered at the newest `sample`, sent a delay [s] later."""
         readings = []
         for kind, fresh, stamp, reading in self._aids:
             if not fresh[0]:
@@ -308,12 +308,12 @@ class Firmware:
         self.commands = 0
 
     def reboot(self, now: float) -> None:
-        """Motors off, silence for the plant's `reboot_time`, then everything anew: clock, counters, attitude."""
+        """Stop the motors, be silent for the plant's `reboot_time`, then restart clock, counters and attitude."""
         self._clock_start = 0
         self._start(now + self._spec.reboot_time)
 
     def running(self, now: float) -> bool:
-        """Whether it has finished starting."""
+        """Return whether it has finished starting."""
         return now >= self._boot
 
     def clock(self, now: float) -> int:
@@ -395,7 +395,7 @@ class Firmware:
     def frames(
         self, now: float, sample: Sample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
     ) -> list[bytes]:
-        """What leaves at a sample of the IMU: a snapshot and the navigation aids; nothing while it starts.
+        """Return what is sent at a sample of the IMU: a snapshot and the navigation aids; nothing while it starts.
 
         Args:
             now: When it leaves [s].
@@ -422,7 +422,7 @@ class Firmware:
             return None
         self._filter.update(sample.gyro, sample.accel, now - self._sampled)
         self._sampled = now
-        # Adding 0 turns the -0 of a motor that stands the wrong way round into 0.
+        # Adding 0 turns the -0 of a mirrored motor at rest into 0.
         self._rpm_outputs[self._output] = self._sign * speed / RPM + 0.0
         return Telemetry(
             sequence=self._next(),
@@ -438,7 +438,7 @@ class Firmware:
 
     @property
     def driving(self) -> bool:
-        """Whether the newest command lets thrusters turn."""
+        """Return whether the newest command lets thrusters turn."""
         return self._enabled
 
     def _flags(self, throttled: bool) -> int:

@@ -19,14 +19,14 @@ from finssim.tasks.communication import Communication
 __all__ = ["Fleet", "Medium", "one_picture"]
 
 
-# What vehicles send each other, on its way through the water: late by the way, and sometimes lost, as in training.
+# Messages between vehicles on their way through the water: late by the way, and sometimes lost, as in training.
 
 
 Array = NDArray[np.float64]
 
 
 class Medium:
-    """Brings a datagram to everybody else; which are lost follows from the seed and the order of sending."""
+    """Carries a datagram to all others; which are lost follows from the seed and the order of sending."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class Medium:
             heapq.heappush(under_way, (arrival, next(self._order), datagram))
 
     def receive(self, now: float, name: str) -> list[bytes]:
-        """What has reached somebody by a time [s], in the order of arrival."""
+        """Return what has reached a receiver by a time [s], in the order of arrival."""
         under_way, out = self._under_way[name], []
         while under_way and under_way[0][0] <= now + 1e-9:
             out.append(heapq.heappop(under_way)[2])
@@ -68,7 +68,7 @@ class Medium:
 
 
 class Fleet:
-    """What is in the water, by name.
+    """Vehicles and objects in the water, by name.
 
     Attributes:
         worlds: Plants and motor controllers.
@@ -77,13 +77,13 @@ class Fleet:
     """
 
     def __init__(self, worlds: Mapping[str, VirtualPool], medium: Medium | None = None) -> None:
-        """Of vehicles at the same time."""
+        """Make a fleet of vehicles at the same time."""
         self.worlds, self.medium = dict(worlds), medium
         self.runtimes: dict[str, Runtime] = {}
 
     @property
     def over(self) -> bool:
-        """Whether all that was to be done is done; the vehicles swim on."""
+        """Return whether the task is over; the vehicles continue to swim."""
         return False
 
     def turn(self, now: float, due: bool) -> None:

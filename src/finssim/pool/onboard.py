@@ -1,4 +1,4 @@
-"""What the vehicle's own cameras, sonars and altimeters measure of a world, at their rates, late and with losses."""
+"""Measurements of a world by the vehicle's own cameras, sonars and altimeters, with delays and losses."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Shutters:
             )  # fmt: skip
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Exposure]:
-        """As of one `Shutter`, by time; each exposure with the sensor's name."""
+        """Return exposures as one `Shutter` does, by time; each with the sensor's name."""
         exposures = [
             replace(exposure, source=name)
             for name, shutter in self._shutters.items()
@@ -124,17 +124,17 @@ class Cameras:
 
 @dataclass(frozen=True, kw_only=True)
 class OnboardPlan:
-    """All that `OnboardSensors` are made of, so that another process can make them."""
+    """Arguments of `OnboardSensors`, so that another process can make them."""
 
     vehicle: Vehicle
     world: str
     """Site of the catalogue, or a path."""
     seed: int
     solid: bool = True
-    """Whether the hull meets the world's things: not where the water is that of another site."""
+    """True if the hull collides with the world's bodies: not if the water is that of another site."""
 
     def layout(self) -> WorldLayout | None:
-        """What the hull meets, drawn as the sensors see it."""
+        """Return the bodies that the hull collides with, drawn as the sensors see them."""
         if not self.solid:
             return None
         layout = WorldLayout(self.world)

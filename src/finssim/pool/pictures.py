@@ -88,7 +88,7 @@ class UdpSender:
         self._socket.close()
 
 
-# Drawing pictures in a process of its own, so that telemetry never waits for one.
+# Rendering of pictures in a separate process, so that telemetry never waits for one.
 
 
 UNDRAWN = 8
@@ -101,7 +101,7 @@ ORPHANED = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPlan:
-    """All that `PoolCamera` is made of, so that another process can make it."""
+    """Arguments of `PoolCamera`, so that another process can make it."""
 
     vehicle: Vehicle
     site: Pool
@@ -122,7 +122,7 @@ class CameraPlan:
 
 
 class Plan(Protocol):
-    """All that a camera, or the vehicle's own sensors, are made of."""
+    """Arguments of a camera, or of the vehicle's own sensors."""
 
     def camera(self) -> Any:
         """Make it: `develop` gives the picture of an exposure."""
@@ -175,7 +175,7 @@ class PictureProcess:
 
     @property
     def complaint(self) -> str:
-        """Why pictures are missing, and what helps."""
+        """Return why pictures are missing, and what helps."""
         if self._process.exitcode is not None:
             return f"the process that draws ended (status {self._process.exitcode}): start the pool again"
         return f"{self.dropped} pictures could not be drawn in time: --camera corners needs no drawing"
@@ -217,7 +217,9 @@ def _deaf() -> Iterator[None]:
 
 def _draw(plans: Sequence[Plan], bind: Address, peer: Address, undrawn: Any, ready: Any, parent: int) -> None:
     """The process: draw each exposure as it comes, and send it when it is to arrive."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent says when to end
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches all processes; the parent decides when to end
     start_warp()
     try:
         sink, cameras = UdpSender(bind, peer), [plan.camera() for plan in plans]

@@ -254,7 +254,7 @@ def dragged_line(tether: SlackTether | None) -> TetherLine | None:
     )
 
 
-# Motors, their battery, and the speed loop that the firmware runs for each: Warp functions over all motors at once.
+# Motors, their battery, and the firmware's speed loop for each: Warp functions over all motors.
 
 
 RPM = 2.0 * math.pi / 60.0
@@ -282,7 +282,7 @@ class MotorBank:
     motor_power: float  # at full speed [W]
     idle_current: float  # [A]
 
-    loop: int  # 0: no speed loop, the target stands for a throttle
+    loop: int  # 0: no speed loop, the target is a throttle
     loop_steps: int  # motor steps between runs of the loop
     loop_period: float  # [s]
     rated: wp.array(
@@ -324,7 +324,7 @@ def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
     """
     measured = motors.speed[k] + motors.noise * noise
     if motors.speed[k] == 0.0:
-        measured = 0.0  # a shaft that stands gives no pulses to count
+        measured = 0.0  # a shaft at rest gives no pulses to count
     if motors.quantum > 0.0:
         measured = motors.quantum * wp.round(measured / motors.quantum)
     motors.measured[k] = measured
@@ -346,7 +346,7 @@ def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
     # Integrate only while the throttle is free to follow.
     if wp.abs(u) < 1.0 or u * error < 0.0:
         motors.integral[k] = motors.integral[k] + motors.ki * motors.loop_period * error
-    # A motor that is told to turn one way is never driven the other way: reversing is for the target to say.
+    # A motor with a target in one direction is never driven the other way: only the target can reverse it.
     return wp.clamp(u, wp.where(target > 0.0, 0.0, -1.0), wp.where(target > 0.0, 1.0, 0.0))
 
 
@@ -382,7 +382,7 @@ def turn_motors(motors: MotorBank, tick: int, dt: float, noise: wp.uint32):
         goal = steady_speed(motors, k, late, voltage)
         speed = motors.speed[k] + motors.alpha[k] * (goal - motors.speed[k])
         if goal == 0.0 and wp.abs(speed) < 1.0:
-            speed = 0.0  # friction stops a shaft for good
+            speed = 0.0  # friction stops a shaft permanently
         motors.speed[k] = speed
         part = wp.abs(speed) / motors.full[k]
         power += motors.motor_power * part * part * part
@@ -443,7 +443,7 @@ MOTOR_STEP = 0.001
 
 @wp.struct
 class Hidden:
-    """What acts on the body besides the engine's own forces."""
+    """Forces on the body besides the engine's own."""
 
     T: mat66  # body twist to the damping's axes
     D1: mat66
@@ -532,7 +532,7 @@ def drive(
 
 
 class Plant:
-    """One vehicle in one pool. Told shaft speeds, it moves; the firmware is its only commander."""
+    """One vehicle in one pool. It moves by shaft speeds that only the firmware commands."""
 
     def __init__(
         self,
@@ -677,7 +677,7 @@ def captured(run: Callable[[], None]) -> Callable[[], None]:
 
 
 def _engine_fields(vehicle: Vehicle, spec: PlantSpec) -> dict[str, Any]:
-    """The engine's parameters: the true body, no damping of its own, and an actuator that passes everything on."""
+    """Return the engine's parameters: the true body, no damping of its own, and an actuator without dynamics."""
     body = spec.body
     r_g = np.array(body.center_of_gravity)
     to_origin = body.mass * (r_g @ r_g * np.eye(3) - np.outer(r_g, r_g))

@@ -83,7 +83,7 @@ class CoupledMatrix(PrincipalAxes):
         return np.asarray(T.T @ np.diag(self.diagonal) @ T)
 
 
-# What a plant's file says of the water and of the forces on the hull.
+# Water and forces on the hull in a plant's file.
 
 
 Rows = tuple[Six, Six, Six, Six, Six, Six]
@@ -160,19 +160,19 @@ class SlackTether(Section):
     """A line that hangs slack and pulls only when it is nearly straight."""
 
     anchor: Three
-    """Where it leaves the pool's edge, world frame [m]."""
+    """Point where it leaves the pool's edge, world frame [m]."""
     attachment: Three
-    """On the vehicle, body frame [m]."""
+    """Point on the vehicle, body frame [m]."""
     length: float = Field(gt=0.0)
     """[m]"""
     stiffness: float = Field(default=15.0, ge=0.0)
-    """Of its last stretch before it is straight [N/m]."""
+    """Stiffness of its last stretch before it is straight [N/m]."""
     slack_share: float = Field(default=0.08, gt=0.0, lt=1.0)
     """The pull sets in at (1 - slack_share) length [-]."""
     diameter: float = Field(default=0.004, gt=0.0)
     """[m]"""
     drag_coefficient: float = Field(default=0.5, ge=0.0)
-    """Of a cylinder; less than 1.2, since a slack line follows only in part."""
+    """Drag coefficient of a cylinder; less than 1.2, since a slack line follows only in part."""
     wet_weight: float = 0.0
     """[N/m]; negative floats."""
 
@@ -210,7 +210,7 @@ class Circulation(Section):
     """The current: eddies that vanish at the walls, and in open water a stream and waves."""
 
     stream: Three = (0.0, 0.0, 0.0)
-    """The same everywhere, world frame [m/s]."""
+    """Uniform current, world frame [m/s]."""
     waves: tuple[Swell, ...] = ()
     eddies: tuple[Eddy, ...] = ()
     floor_share: float = Field(default=0.5, ge=0.0, le=1.0)
@@ -277,13 +277,13 @@ class TrueThruster(Section):
     gain_plus: float = Field(gt=0.0)
     """Thrust over the file's, forward [-]."""
     gain_minus: float = Field(gt=0.0)
-    """The same in reverse."""
+    """Gain in reverse."""
     deduction: float = Field(ge=0.0, lt=1.0)
     """Part of the thrust that its own jet takes back from the hull [-]."""
     time_constant: float = Field(gt=0.0)
-    """Of the shaft's speed [s]."""
+    """Time constant of the shaft's speed [s]."""
     delay: float = Field(ge=0.0, le=1.0)
-    """From throttle to shaft [s]."""
+    """Delay from throttle to shaft [s]."""
     dead_rpm_plus: float = Field(ge=0.0)
     """Slowest forward speed that turns the shaft [rpm]."""
     dead_rpm_minus: float = Field(ge=0.0)
@@ -293,7 +293,7 @@ class TrueThruster(Section):
 
 
 class Propellers(Section):
-    """How water that already moves takes thrust away: T (1 - V / (J0 n D)), V the inflow, n turns a second."""
+    """Loss of thrust by moving water: T (1 - V / (J0 n D)), V the inflow, n turns a second."""
 
     diameter: float = Field(default=0.07, gt=0.0)
     """D [m]."""
@@ -317,15 +317,15 @@ class Battery(Section):
     fade_time: float = Field(default=900.0, gt=0.0)
     """[s]; the voltage stays there afterwards."""
     resistance: float = Field(default=0.0, ge=0.0)
-    """Of cells and wiring [ohm]."""
+    """Resistance of cells and wiring [ohm]."""
     motor_power: float = Field(default=45.0, ge=0.0)
-    """Of one motor at `full_rpm`; falls with the cube of speed [W]."""
+    """Power of one motor at `full_rpm`; falls with the cube of speed [W]."""
     idle_current: float = Field(default=0.6, ge=0.0)
-    """Of everything else [A]."""
+    """Current of everything else [A]."""
 
 
 class Instruments(Section):
-    """How the instruments differ from the vehicle file."""
+    """Differences of the instruments from the vehicle file."""
 
     noise: float = Field(default=1.0, ge=0.0)
     """Factor on the file's noise, bias and drift [-]."""
@@ -337,7 +337,7 @@ class FirmwareSpec(Section):
     """The motor controller: its speed loop, clock and attitude filter, and the wire behind it."""
 
     loop_period: float = Field(default=0.002, ge=0.001, le=0.005)
-    """Of the rpm loop [s]."""
+    """Period of the rpm loop [s]."""
     feed_forward: float = Field(default=1.0, gt=0.0)
     """Throttle over what the file's speed range would need [-]."""
     gain: float = Field(default=0.4, ge=0.0)
@@ -351,19 +351,19 @@ class FirmwareSpec(Section):
     rpm_quantum: float = Field(default=8.0, ge=0.0)
     """[rpm]"""
     crystal_ppm: float = Field(default=0.0, ge=-500.0, le=500.0)
-    """How fast its clock runs [ppm]."""
+    """Error of its clock's rate [ppm]."""
     clock_start: int = Field(default=0, ge=0, lt=2**32)
     """Reading of its clock when the pool starts [ms]; 0 after a reboot."""
     reboot_time: float = Field(default=1.5, ge=0.0)
     """Silence after a reboot [s]."""
     attitude_gain: float = Field(default=0.5, ge=0.0)
-    """Of the accelerometer in the attitude filter [1/s]."""
+    """Gain of the accelerometer in the attitude filter [1/s]."""
     attitude_integral: float = Field(default=0.01, ge=0.0)
     """[1/s²]"""
     uplink: tuple[float, float] = (0.001, 0.003)
     """Shortest and longest way of a telemetry frame to the robot [s]."""
     downlink: tuple[float, float] = (0.0008, 0.0014)
-    """The same for a command."""
+    """Delay of a command."""
 
     @field_validator("uplink", "downlink")
     @classmethod
@@ -387,7 +387,7 @@ class PlantSpec(Section):
     damping: Damping
     hull: HullDrag = HullDrag()
     thrusters: dict[str, TrueThruster]
-    """By name, as in the vehicle file."""
+    """True thrusters by name, as in the vehicle file."""
     propellers: Propellers = Propellers()
     battery: Battery = Battery()
     buoyancy: BuoyancyDrift = BuoyancyDrift()
@@ -397,7 +397,7 @@ class PlantSpec(Section):
     firmware: FirmwareSpec = FirmwareSpec()
 
     def write(self, path: Path) -> None:
-        """Write the plant file, whole or not at all."""
+        """Write the plant file, completely or not at all."""
         text = yaml_text(self.model_dump(mode="json"), width=118)
         with atomic_write(path) as temporary:
             temporary.write_text(

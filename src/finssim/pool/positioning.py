@@ -17,7 +17,7 @@ from finssim.robot.messages import POSE, POSITION, NavigationAid
 __all__ = ["Exposure", "POSITIONING", "PoseAt", "Positioning", "PositioningSettings", "Shutter"]
 
 
-# When the overhead camera exposes and when the pictures arrive: a shutter that is told the time in ticks.
+# Exposure of the overhead camera and arrival of its pictures: a shutter that gets the time in ticks.
 
 
 Array = npt.NDArray[np.float64]
@@ -36,13 +36,13 @@ class Exposure:
     middle: float
     """[s]"""
     arrival: float
-    """At the robot's computer [s]."""
+    """Time of arrival at the robot's computer [s]."""
     start: tuple[Array, Array]
     """Pose when the shutter opened, as of `PoseAt`."""
     end: tuple[Array, Array]
     """Pose when it closed."""
     source: str = ""
-    """Which sensor of the vehicle; the overhead camera if empty."""
+    """Name of the vehicle's sensor; the overhead camera if empty."""
 
 
 class Shutter:
@@ -97,7 +97,7 @@ class Mail:
         self._waiting.extend(exposures)
 
     def arrived(self, t: float) -> list[Exposure]:
-        """Those that are there at a time [s], each once."""
+        """Return those that have arrived at a time [s], each once."""
         there = []
         while self._waiting and self._waiting[0].arrival <= t:
             there.append(self._waiting.popleft())
@@ -113,9 +113,9 @@ class PositioningSettings:
     std: float
     """Per axis [m]."""
     yaw_std: float = 0.0
-    """[rad]; 0: it tells no heading."""
+    """Standard deviation of the heading [rad]; 0: it gives none."""
     latency: float = 0.0
-    """From the measurement to arrival, on average [s]."""
+    """Average time from the measurement to arrival [s]."""
     jitter: float = 0.0
     """Standard deviation of the latency [s]."""
     dropout: float = 0.0
@@ -134,11 +134,11 @@ POSITIONING: Mapping[str, PositioningSettings] = {
         rate=0.5, std=0.5, latency=0.4, jitter=0.1, dropout=0.1, outliers=0.05, outlier_size=15.0
     ),
 }
-"""By name. Motion capture as under water or above; an ultra-short baseline at some ten metres."""
+"""Positioning systems by name. Motion capture under or above water; an ultra-short baseline at some ten metres."""
 
 
 class Positioning:
-    """Measures where the vehicle is, and tells the robot late."""
+    """Measures the position of the vehicle, and reports it late."""
 
     def __init__(self, settings: PositioningSettings, seed: int) -> None:
         """

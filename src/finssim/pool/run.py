@@ -1,4 +1,4 @@
-"""`finssim pool`: make a plant, a camera and a motor controller, and serve a robot until it is told to stop."""
+"""`finssim pool`: make a plant, a camera and a motor controller, and serve a robot until a signal stops it."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ __all__ = [
 TICK = 0.003
 """Between looks at the wire [s]."""
 MOST_BEHIND = 0.2
-"""A pool that is further behind gives up that time [s]: its clock stands still instead, as on a stopped computer."""
+"""Delay beyond which a pool gives up that time [s]: its clock stops instead, as on a stopped computer."""
 
 
 MOST_CALLERS = 8
 """Ground stations that are answered over UDP, and guests of a pool in lock-step: those that called last."""
 GUEST_PATIENCE = 2.0
-"""Within which a robot's first request must arrive whole [s]."""
+"""Time within which a robot's first request must arrive completely [s]."""
 
 
 class Clocked(Protocol):
@@ -78,10 +78,10 @@ class Clocked(Protocol):
 
 @dataclass
 class Pace:
-    """How well a pool kept real time."""
+    """Measure of a pool's real-time performance."""
 
     duration: float = 0.0
-    """Of the pool's clock [s]."""
+    """Duration by the pool's clock [s]."""
     late: float = 0.0
     """The most that the pool was behind at a tick [s]."""
     given_up: float = 0.0
@@ -91,11 +91,11 @@ class Pace:
     sent: int = 0
     """Frames to it."""
     pictures: int = 0
-    """That were sent from this process."""
+    """Number of pictures that were sent from this process."""
 
     @property
     def sentence(self) -> str:
-        """What a person wants to know."""
+        """Return the summary for a person."""
         pace_text = f"gave up {self.given_up:.2f} s" if self.given_up else "kept real time"
         return (
             f"{self.duration:.1f} s, {pace_text}, at most {1e3 * self.late:.0f} ms late; "
@@ -104,7 +104,7 @@ class Pace:
 
 
 class LockstepServer:
-    """A pool whose clock goes on as far as its one robot asks, and ends when the robot leaves."""
+    """A pool whose clock advances as far as its one robot asks, and ends when the robot leaves."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         """Listen.
@@ -120,7 +120,7 @@ class LockstepServer:
         self.address: tuple[str, int] = self._listener.getsockname()
 
     def serve(self, world: VirtualPool, *, duration: float = math.inf) -> str:
-        """Wait for a robot and serve it; no one else is let in.
+        """Wait for a robot and serve it; no other one is accepted.
 
         The robot is the first that sends a request. Whoever connects and leaves again, is silent or sends something
         else is not, and the pool continues to listen.
@@ -247,7 +247,7 @@ class GroundLinks:
         self.tcp = self._streams.address
 
     def receive(self) -> list[bytes]:
-        """Whole frames of all stations, which the other stations get too."""
+        """Return complete frames of all stations, which the other stations receive too."""
         self.dvl.poll()
         frames: list[bytes] = []
         with suppress(BlockingIOError, ConnectionError):
@@ -273,7 +273,7 @@ class GroundLinks:
         self._stack.close()
 
     def describe(self) -> str:
-        """Who is there."""
+        """Return the connected stations."""
         return f"{len(self._callers)} stations over UDP, {len(self._streams.clients)} over TCP"
 
     def _pass_on(self, stream: bytearray, source: object) -> list[bytes]:
@@ -286,7 +286,7 @@ class GroundLinks:
         """To all stations but the source."""
         for address in [*self._fixed, *self._callers]:
             if address != source:
-                with suppress(OSError):  # nobody listens there yet
+                with suppress(OSError):  # no receiver there yet
                     self._socket.sendto(frame, address)
         for station in list(self._streams.clients):
             if station is not source:
@@ -350,7 +350,7 @@ def serve_realtime(
     clock: Callable[[], float] = realtime.now,
     wait: Callable[[float], None] = realtime.wait,
 ) -> Pace:
-    """Let a site live in real time until the time is over or `until` says so.
+    """Run a site in real time until the time is over or `until` returns true.
 
     Args:
         site: With robots in other processes, at time 0.
@@ -413,11 +413,11 @@ def serve_realtime(
 # A virtual pool before it lives, and the command that makes it and serves it.
 
 MCU_PORT = 58766
-"""Of the motor controller; pictures come from the next port, lock-step is the one after."""
+"""Port of the motor controller; pictures come from the next port, lock-step uses the one after."""
 MESSAGES = 5
 """The messages of a team are this far from the first port."""
 ROOM = 2.0
-"""Vehicles of a team start so many lengths of the longest apart."""
+"""Distance between the starts of a team's vehicles, in lengths of the longest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -428,11 +428,11 @@ class PoolPlan:
     spec: PlantSpec
     camera: CameraPlan | None
     calibrated: Pool | None
-    """What a robot may know of the camera."""
+    """Calibration of the camera that a robot may know."""
     positioning: str = "none"
     """Name of the positioning system."""
     firmware: Literal["mcu", "ardusub"] = "mcu"
-    """Of the vehicle."""
+    """Firmware of the vehicle."""
     onboard: OnboardPlan | None = None
     """The vehicle's own cameras, sonars and altimeters, in the world that they see; None: there is none."""
 
@@ -665,7 +665,7 @@ def _serve_team(
     pool_file: Path | None,
     duration: float | None,
 ) -> None:
-    """Serve several vehicles, each to a robot of its own, from their first addresses on ten ports apart."""
+    """Serve several vehicles, each to a separate robot, from their first addresses on ten ports apart."""
     (bind, port), (host, first) = ours, theirs
     names = fleet.task.agents if isinstance(fleet, TaskSite) else tuple(fleet.worlds)
     if not 0 < port <= 65535 - 10 * len(names):
@@ -792,7 +792,7 @@ def swimming(
 
 
 def _tell_goal(site: TaskSite) -> None:
-    """Where the task's goal is, of one that stands still."""
+    """Print the place of the task's goal, if it does not move."""
     if site.task.moving:
         return
     x, y, z = site.referee.arrays.goal_position.numpy()[0]
@@ -801,7 +801,7 @@ def _tell_goal(site: TaskSite) -> None:
 
 
 def _tell_episode(site: Fleet) -> None:
-    """How the episode went, in a line."""
+    """Print the result of the episode, in a line."""
     if not isinstance(site, TaskSite):
         return
     if site.referee.over:

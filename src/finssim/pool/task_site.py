@@ -50,17 +50,17 @@ from finssim.worlds import WorldBatch
 __all__ = ["Referee", "ScriptedPilot", "TaskSite", "TrueState"]
 
 
-# A vehicle that the task commands, in the virtual site: it is told the truth, and acts as the task's script does.
+# A vehicle that the task commands, in the virtual site: it gets the true state, and acts by the task's script.
 
 
 Array = NDArray[np.float64]
 
 
 class TrueState:
-    """In place of a perception: the plant's own state, always known. Of vehicles that belong to the site alone."""
+    """Replacement of a perception: the plant's own state, always known. Of vehicles that belong to the site alone."""
 
     def __init__(self, world: VirtualPool) -> None:
-        """Of the vehicle in a virtual pool."""
+        """Give the state of the vehicle in a virtual pool."""
         self.vehicle, self._world = world.vehicle, world
 
     def telemetry(self, now: float, telemetry: Any, time: float) -> None:
@@ -155,17 +155,17 @@ def truth_of(worlds: Mapping[str, VirtualPool]) -> dict[str, Track]:
 
 
 SITE = "site"
-"""Who tells where a target is that no vehicle is."""
+"""Source of a target's position that is no vehicle."""
 
 
 @wp.func
 def as_told(state: State, arrays: TaskArrays, w: int):
-    """In place of a task's draws: vehicle and goal are where they have been put."""
+    """Replace a task's draws: vehicle and goal are at their given places."""
 
 
 @cache
 def _told(kind: type[Task]) -> type[Task]:
-    """A task whose start is told instead of drawn, and its goal's motion instead of made."""
+    """Return a task whose start is given instead of drawn, and so is its goal's motion."""
 
     def terms(task: Task) -> Terms:
         declared = kind.terms(task)
@@ -250,7 +250,7 @@ class Referee:
 
     @property
     def time(self) -> float:
-        """Of the last control step that was scored, in the episode [s]."""
+        """Return the time of the last control step that was scored, in the episode [s]."""
         return int(self._state.steps.numpy()[0]) * self.task.control_step
 
     def places(self) -> list[tuple[Array, Array]]:
@@ -278,7 +278,7 @@ class Referee:
         self.over = bool(a.terminated.numpy()[0] or a.truncated.numpy()[0])
 
     def _put(self, truth: Mapping[str, Track]) -> None:
-        """Where everybody is, by place."""
+        """Write the places of all vehicles."""
         for v, name in enumerate(self.task.vehicles):
             track = truth[name]
             for row, value in (
@@ -299,12 +299,12 @@ class Referee:
             a.target.velocity.numpy()[0] = now.velocity
 
     def metrics(self) -> dict[str, float]:
-        """How the episode went; see `Task.metrics`."""
+        """Return the measures of the episode; see `Task.metrics`."""
         return {name: float(values[0]) for name, values in self.task.metrics(self.arrays).items()}
 
 
 class _Goal:
-    """Where the task's goal is now, as a guide; it knows nothing of what comes."""
+    """Current place of the task's goal, as a guide; it knows nothing of the future."""
 
     name, duration = "task", np.inf
 
@@ -469,7 +469,7 @@ class TaskSite(Fleet):
 
     @property
     def over(self) -> bool:
-        """Whether the episode has ended."""
+        """Return whether the episode has ended."""
         return self.referee.over
 
     def turn(self, now: float, due: bool) -> None:
@@ -499,7 +499,7 @@ class TaskSite(Fleet):
         }
 
     def _target(self) -> Track | None:
-        """What drifts in the water, of a task with such a thing; for a robot elsewhere also a goal that moves."""
+        """Return the drifting object of a task that has one; for a robot elsewhere also a goal that moves."""
         a, net = self.referee.arrays, self.referee.arrays.net
         if self._goal_is_told:
             q = a.goal_quaternion.numpy()[0].astype(float)
@@ -512,7 +512,7 @@ class TaskSite(Fleet):
         return Track(net.target.numpy()[0].astype(float), level, nu)
 
     def tell_target(self) -> None:
-        """The site's own positioning tells everybody of the target."""
+        """Send the target's position, by the site's own positioning, to all."""
         target = self._target()
         if target is not None:
             now = max(world.time for world in self.worlds.values())

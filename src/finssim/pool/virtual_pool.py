@@ -82,7 +82,7 @@ class Truth(NamedTuple):
     thrust: Array
     """Delivered, canonical order [N], (k, n)."""
     voltage: Array
-    """Of the battery [V], (k,)."""
+    """Voltage of the battery [V], (k,)."""
     current: Array
     """Velocity of the water at the body, world frame [m/s], (k, 3)."""
 
@@ -135,7 +135,7 @@ class TruthWriter:
 
 
 def read_truth(path: str | Path) -> Truth:
-    """The records of a truth file, up to its last whole one.
+    """Return the records of a truth file, up to its last complete one.
 
     Raises:
         TruthError: It is not there or no truth file.
@@ -172,7 +172,7 @@ def read_truth(path: str | Path) -> Truth:
 
 
 REORDERED = 0.025
-"""How much later a frame that is overtaken arrives [s]: behind the two that follow it at 100 Hz."""
+"""Additional delay of a frame that is overtaken [s]: behind the two that follow it at 100 Hz."""
 
 PROBABILITIES = ("drop", "drop_commands", "corrupt", "reorder", "duplicate")
 NUMBERS = {f.name: f.values for f in TELEMETRY.payload if f.code == "f"}
@@ -186,7 +186,7 @@ class FaultError(ValueError):
 
 @dataclass
 class Faults:
-    """What is wrong at present; every field may be changed at any time, all draws come from the seed."""
+    """Active faults; every field may be changed at any time, all draws come from the seed."""
 
     seed: int = 0
     drop: float = 0.0
@@ -200,11 +200,11 @@ class Faults:
     duplicate: float = 0.0
     """Chance that a frame comes twice."""
     freeze_sensors: bool = False
-    """Instruments stand still; sequence numbers and clock go on."""
+    """True if instruments are frozen; sequence numbers and clock continue."""
     nan_field: str = ""
     """Telemetry field sent as NaN, `depth` or an element of one, `gyro.2`; none if empty."""
     freeze_depth: bool = False
-    """The pressure gauge stands still."""
+    """True if the pressure gauge is frozen."""
     dvl_silent: bool = False
     """The Doppler log of an `ArduSub` sends nothing."""
     no_heartbeat: bool = False
@@ -214,7 +214,7 @@ class Faults:
     leak: bool = False
     """Water at the leak sensor of an `ArduSub`."""
     battery_voltage: float = 0.0
-    """What the battery monitor of an `ArduSub` reads [V]; the true voltage if 0."""
+    """Reading of an `ArduSub`'s battery monitor [V]; the true voltage if 0."""
     _frozen: Telemetry | None = None
     _frozen_depth: tuple[float, float] | None = None
 
@@ -231,14 +231,14 @@ class Faults:
         self._random = random.Random(f"faults {self.seed}")
 
     def lost(self, commands: bool = False) -> bool:
-        """Whether the next frame is lost."""
+        """Return whether the next frame is lost."""
         return self._happens(self.drop_commands if commands else self.drop)
 
     def _happens(self, probability: float) -> bool:
         return probability > 0.0 and self._random.random() < probability
 
     def reading(self, sample: Sample) -> Sample:
-        """What the instruments read, with the pressure gauge frozen if so."""
+        """Return the readings of the instruments, with the pressure gauge frozen if so."""
         if not self.freeze_depth:
             self._frozen_depth = None
             return sample
@@ -283,7 +283,8 @@ class Faults:
 
 
 def _with_nan(frame: bytes, name: str, outputs: int) -> bytes:
-    """The frame with one field NaN, or one element of it, and a right CRC: no checksum tells a controller's NaN."""
+    """Return the frame with one field NaN, or one element of it, and a right CRC: no checksum detects a controller's
+    NaN."""
     field, _, element = name.partition(".")
     body = bytearray(frame[len(TELEMETRY.magic) : -2])
     at = 0
@@ -300,7 +301,7 @@ PoseAt = Callable[[float], tuple[Array, Array]]
 """Time [s] -> position (3,) and quaternion xyzw (4,) of the body in the world."""
 
 REMEMBERED = 1.0
-"""How far back `pose_at` reaches: longer than any exposure and its latency [s]."""
+"""Duration that `pose_at` covers: longer than any exposure and its latency [s]."""
 
 
 class PoolClockError(ValueError):
@@ -308,7 +309,7 @@ class PoolClockError(ValueError):
 
 
 class Camera(Protocol):
-    """What looks at the vehicle from outside."""
+    """An observer of the vehicle from outside."""
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> Sequence[Picture]:
         """Pictures that arrive after t0 and not after t1; exposures may lie up to `REMEMBERED` seconds back."""
@@ -395,7 +396,7 @@ class VirtualPool:
         return ArduSub(self.vehicle, self.spec)
 
     def exchange(self, until: float, sent: Sequence[bytes] = ()) -> Delivery:
-        """Let the world go on, with the frames that the robot sends now.
+        """Advance the world, with the frames that the robot sends now.
 
         Args:
             until: Robot's clock [s].
@@ -428,7 +429,7 @@ class VirtualPool:
         return Delivery(until, tuple(frames), tuple(pictures))
 
     def pose_at(self, time: float) -> tuple[Array, Array]:
-        """Where the vehicle is at a time of the last second, between physics steps; the nearest beyond them.
+        """Return the pose of the vehicle at a time of the last second, between physics steps; the nearest beyond them.
 
         Args:
             time: Robot's clock [s].

@@ -1,1 +1,1 @@
-"""What runs on the robot: the wire, the bridge, the control loop, the record. No simulator, no torch, no ROS."""
+"""Software of the robot: the wire, the bridge, the control loop, the record. No simulator, no torch, no ROS."""

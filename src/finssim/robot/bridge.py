@@ -27,11 +27,11 @@ from finssim.robot.messages import CommandEcho, Telemetry, ThrusterCommand
 from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 
-# What a bridge tells its operator and its record: events in order, a repeated one at most once a second.
+# Events of a bridge for its operator and its record, in order, a repeated one at most once a second.
 
 
 KEPT = 1000
-"""Events that wait for somebody to drain them."""
+"""Greatest number of events that are kept until they are read."""
 REPEAT = 1.0
 """Least time between two events of one kind and source [s]."""
 
@@ -98,7 +98,7 @@ FULL_RANGE = 0.1
 
 
 class BridgeError(ValueError):
-    """A bridge was set up with limits it cannot keep: the message says which and what to give."""
+    """A bridge was set up with limits it cannot keep: the message states which and what to give."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,9 +130,9 @@ class BridgeSettings:
     clock_step: float = 1.0
     """Longest step of the clock forward between two calls [s]."""
     reject_limit: float = 0.5
-    """Longest time that the motor controller may refuse every command, or not hear any [s]."""
+    """Longest time for which the motor controller may refuse every command, or receive none [s]."""
     need_reading: bool = True
-    """Whether the estimator must be ready; False lets an operator drive without localization."""
+    """True if the estimator must be ready; False lets an operator drive without localization."""
     vision_modes: tuple[str, ...] = ("fresh", "coast")
     """Modes of vision in which a reading may be acted on."""
 
@@ -204,7 +204,7 @@ def _slew(vehicle: Vehicle) -> Array:
 
 
 EARLY = 0.1
-"""How far a stamp may lie ahead of the robot's clock [s]."""
+"""Greatest lead of a stamp over the robot's clock [s]."""
 
 
 class Commander:
@@ -221,7 +221,7 @@ class Commander:
         self.forget()
 
     def forget(self) -> None:
-        """As before the first command."""
+        """Reset to the state before the first command."""
         self.force: Array = np.zeros(self._thrusters)
         """Of the newest command, canonical order [N], (n,)."""
         self.received = -math.inf
@@ -231,7 +231,7 @@ class Commander:
         self._heard: dict[str, float] = {}
 
     def rival(self, now: float, source: str) -> str:
-        """Another source that was heard, whatever it said, within the timeout; "" if there is none."""
+        """Return another source that sent a command within the timeout; "" if there is none."""
         self._heard[source] = now
         self._heard = {name: time for name, time in self._heard.items() if now - time <= self._timeout}
         return next((name for name in self._heard if name != source), "")
@@ -241,7 +241,7 @@ class Commander:
         return [name for name, time in self._heard.items() if now - time <= self._timeout]
 
     def accept(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None) -> str:
-        """Takes a command if it is fit to be used; otherwise says why not and keeps the one before.
+        """Accept a command if it is fit to be used; otherwise return the reason and keep the one before.
 
         Args:
             now: When it came [s].
@@ -267,7 +267,7 @@ class Commander:
         return ""
 
     def asks(self, now: float) -> bool:
-        """Whether the newest command still counts and asks for thrust."""
+        """Return whether the newest command still counts and demands thrust."""
         return now - self.received <= self._timeout and bool(self.force.any())
 
 
@@ -288,7 +288,7 @@ class TelemetryWatch:
         self.forget()
 
     def forget(self) -> None:
-        """As before the first message."""
+        """Reset to the state before the first message."""
         self.fresh_since = -math.inf
         self._last: Telemetry | None = None
         self._changed = {"gyro": math.inf, "accel": math.inf}
@@ -298,7 +298,7 @@ class TelemetryWatch:
         return now - self.fresh_since
 
     def malformed(self, message: Telemetry) -> str:
-        """Why a message cannot be used; "" if it can."""
+        """Return why a message cannot be used; "" if it can."""
         numbers = (*message.quaternion, *message.gyro, *message.accel, message.depth, message.pressure)
         if not all(map(math.isfinite, (*numbers, *(message.motor_rpm or ())))):
             return "a number in the telemetry is not finite"
@@ -332,7 +332,7 @@ class TelemetryWatch:
         return ""
 
     def frozen(self, now: float, limit: float) -> str:
-        """Which sensor has repeated its numbers to the last bit for longer than `limit` [s]; "" if none has."""
+        """Return the sensor that has repeated its exact numbers for longer than `limit` [s]; "" if none has."""
         for sensor, changed in self._changed.items():
             # Silence is another watchdog's: what counts is how long messages kept coming with the same numbers.
             if min(now, self.fresh_since) - changed > limit:
@@ -348,35 +348,35 @@ class TelemetryWatch:
 
 
 class Lasting:
-    """How long something has been so at every look."""
+    """Duration for which a condition held at every check."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """As if it had never been so."""
+        """Reset to the state before the condition ever held."""
         self._since, self._until = math.inf, -math.inf
 
     def look(self, now: float, so: bool) -> None:
-        """Whether it is so now [s]."""
+        """Note whether the condition holds now [s]."""
         if so:
             self._since, self._until = min(self._since, now), now
         else:
             self.forget()
 
     def longer(self, limit: float, now: float | None = None) -> bool:
-        """Whether it has been so for longer than `limit` [s], until `now`, or until the last look if None."""
+        """Return whether it has held for longer than `limit` [s], until `now`, or until the last check if None."""
         return (self._until if now is None else now) - self._since > limit
 
 
 class EchoWatch:
-    """What the motor controller made of the commands."""
+    """Echoes of commands by the motor controller."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """As before the first echo."""
+        """Reset to the state before the first echo."""
         self._count: int | None = None
         self._mcu_ms = 0
         self.rejected = Lasting()
@@ -399,7 +399,7 @@ class EchoWatch:
 
 
 class TiltWatch:
-    """How long a vehicle has been tilted beyond a limit."""
+    """Duration of a vehicle's tilt beyond a limit."""
 
     def __init__(self, limit: float, duration: float, level: npt.ArrayLike = (0.0, 0.0, 1.0)) -> None:
         """
@@ -423,12 +423,12 @@ class TiltWatch:
         self._tilted.look(now, up < self._cosine * square)
 
     def over(self, now: float) -> bool:
-        """Whether it lasted too long."""
+        """Return whether it lasted too long."""
         return self._tilted.longer(self._duration, now)
 
 
 class StateWatch:
-    """Whether what the estimator says may be acted on."""
+    """State of the estimator, and whether it may be acted on."""
 
     def __init__(self, timeout: float, modes: tuple[str, ...]) -> None:
         """
@@ -441,7 +441,7 @@ class StateWatch:
         self.forget()
 
     def forget(self) -> None:
-        """As before the first reading."""
+        """Reset to the state before the first reading."""
         self._oldest = -math.inf
         self._why = "no output of the estimator yet"
         self._pose: tuple[Array, Array] | None = None
@@ -457,7 +457,7 @@ class StateWatch:
         return None if self.missing(now) else self._pose
 
     def missing(self, now: float) -> str:
-        """Why there is none to act on; "" if there is."""
+        """Return why there is no state to act on; "" if there is."""
         if self._why:
             return self._why
         return (
@@ -467,7 +467,7 @@ class StateWatch:
         )
 
     def _unfit(self, reading: Reading) -> str:
-        """Why a reading cannot be acted on; "" if it can."""
+        """Return why a reading cannot be acted on; "" if it can."""
         if not reading.ready:
             return f"the estimator is not ready: {reading.reason or 'no reason given'}"
         if reading.mode not in self._modes:
@@ -513,7 +513,8 @@ class Workspace:
         self._allocator = Allocator.from_vehicle(vehicle)
 
     def left(self, position: Array) -> str:
-        """Which face lies more than the margin behind the vehicle; "" while it is inside. World frame [m], (3,)."""
+        """Return the face that lies more than the margin behind the vehicle; "" while it is inside. World frame [m],
+        (3,)."""
         for axis, name in enumerate("xyz"):
             if not self._outer[0][axis] <= position[axis] <= self._outer[1][axis]:
                 box = f"{self.lower[axis]:g} to {self.upper[axis]:g}"
@@ -578,7 +579,7 @@ class Clock:
         self._started = False
 
     def wrong(self, now: float) -> str:
-        """Takes the time of a call; says what is wrong with it, "" if nothing."""
+        """Note the time of a call, and return what is wrong with it; "" if nothing."""
         if not math.isfinite(now):
             return "the clock is not a number"
         step = now - self.now if self._started else 0.0
@@ -612,17 +613,17 @@ class Supervision:
         )
 
     def forget(self) -> None:
-        """As before the first message."""
+        """Reset to the state before the first message."""
         for watch in (self.commander, self.telemetry, self.echo, self.deaf, self.state):
             watch.forget()
         for tilt in self.tilts.values():
             tilt.forget()
 
     def take_telemetry(self, now: float, message: Telemetry, armed: bool) -> str:
-        """Takes a well-formed message that came while `armed`, or not; "restarted" if the controller began anew."""
+        """Note a well-formed message that came while `armed` or not; return "restarted" if the controller did."""
         news = self.telemetry.accept(now, message)
         if news != "old":
-            # Frames may be lost unseen; a firmware that sets no status bits says nothing of it.
+            # Frames may be lost unseen; a firmware that sets no status bits does not report it.
             self.deaf.look(now, armed and bool(message.flags & TOLD) and not message.flags & FOLLOWS)
             self.tilts["telemetry"].accept(now, message.quaternion)
         return news if news == "restarted" else ""
@@ -637,7 +638,7 @@ class Supervision:
             self.tilts["estimator"].accept(now, pose[1])
 
     def danger(self, now: float) -> str:
-        """What must stop the thrusters until somebody has looked."""
+        """Return what must stop the thrusters until an operator has acknowledged it; "" if nothing."""
         limits = self.settings
         if self.telemetry.age(now) > limits.telemetry_timeout:
             return f"no fresh telemetry from the {self.peer} for {limits.telemetry_timeout:g} s"
@@ -657,8 +658,8 @@ class Supervision:
         return side and f"left the workspace: {side}"
 
     def want(self, now: float, since: float) -> str:
-        """What thrust has to wait for: the estimator, or a command, counted from `since` [s] at the earliest."""
-        # The estimator first: a controller that is not told where it is falls silent for that very reason.
+        """Return what thrust waits for: the estimator, or a command, counted from `since` [s] at the earliest."""
+        # The estimator first: without a state, a controller is silent for that very reason.
         reason = self._estimator(now)
         if reason:
             return reason
@@ -666,7 +667,7 @@ class Supervision:
         return f"no command for {self.settings.command_timeout:g} s" if late else ""
 
     def unfit(self, now: float) -> str:
-        """What stands against arming."""
+        """Return why arming is refused; "" if it is not."""
         reason = self.danger(now) or self._estimator(now)
         if reason:
             return reason
@@ -697,13 +698,14 @@ RUNNING = ("armed", "hold")
 
 
 class Autopilot(Protocol):
-    """What stands between a bridge and the motors and may have a will of its own (`robot.runtime.Link`)."""
+    """The device between a bridge and the motors, which may act independently (`robot.runtime.Link`)."""
 
     peer: str
-    """What it is, in sentences."""
+    """Name of the device in messages."""
 
     def prepare(self, now: float) -> str:
-        """Called by `Bridge.arm` where nothing else stands against it: "" once commands count, else why not yet."""
+        """Prepare arming; called by `Bridge.arm` if nothing else prevents it. Return "" once commands count, else the
+        reason."""
 
     def alarm(self, now: float) -> str:
         """Asked at every tick of an armed bridge: why the vehicle is no longer ours; "" while it is."""
@@ -828,7 +830,7 @@ class Bridge:
             self._alarm("restart", f"the {self._watchdogs.peer} restarted: its clock went back")
 
     def echo(self, now: float, echo: CommandEcho) -> None:
-        """What the motor controller made of a command."""
+        """Note the motor controller's echo of a command."""
         if not self._at(now):
             return
         news = self._watchdogs.echo.accept(now, echo, self.state == "armed")
@@ -839,7 +841,7 @@ class Bridge:
             self.log.repeat(now, "command rejected", f"the {self._watchdogs.peer} refused a command: {flags}")
 
     def reading(self, now: float, reading: Reading) -> None:
-        """What the estimator knows."""
+        """Note a reading of the estimator."""
         if self._at(now):
             self._watchdogs.take_reading(now, reading)
 
@@ -859,7 +861,7 @@ class Bridge:
 
     @property
     def source(self) -> str:
-        """Who sent the newest command."""
+        """Return the source of the newest command."""
         return self._commander.source
 
     @property
@@ -878,7 +880,7 @@ class Bridge:
         return self._watchdogs.limited(now, self.motors.limited(self._commander.force))
 
     def _refusal(self, now: float) -> str:
-        """Why arming is refused; "" if nothing stands against it."""
+        """Return why arming is refused; "" if it is not."""
         if not self._at(now):
             return "the clock is not a number"
         if self.state == "fault":
@@ -900,7 +902,7 @@ class Bridge:
             self._wait(now, want)
 
     def _wait(self, now: float, want: str) -> None:
-        """In hold: go on with the first command after the condition passed, or give up after the limit."""
+        """In hold: continue with the first command after the condition passed, or give up after the limit."""
         if want:
             self.reason, self._passed_at = want, None
         elif self._passed_at is None:
@@ -945,7 +947,7 @@ class Bridge:
             self.log.repeat(self._clock.now, kind, text)
 
     def _fault(self, reason: str) -> None:
-        """Stop; the first reason stands until it is acknowledged."""
+        """Stop; the first reason is kept until it is acknowledged."""
         if self.state == "fault":
             self.log.repeat(self._clock.now, "also", reason)
         else:

@@ -1,4 +1,4 @@
-"""What a person asks a vehicle to do, as text, a file or a name: a station to keep or a trajectory to follow."""
+"""Goals of a vehicle as text, a file or a name: a station to keep or a trajectory to follow."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class GoalError(ValueError):
 
 
 AHEAD = 2.0
-"""So long a goal that is no longer heard of goes on as it went, and then stands still [s]."""
+"""Time for which a goal without messages continues its motion before it stops [s]."""
 
 
 class HeardGoal:
-    """A goal that moves, from the messages that tell of it: between them it goes on as it went, for `AHEAD` at most.
+    """A moving goal from messages: between them it continues its motion, for `AHEAD` at most.
 
     Attributes:
         started: When the guide's time began, on the clock of the tracks [s].
@@ -41,7 +41,7 @@ class HeardGoal:
         self._tracks, self.started = tracks, math.nan
 
     def at(self, t: npt.ArrayLike) -> Reference:
-        """Where it is at times since the start [s], (...); at the world's origin before it was heard of."""
+        """Return the goal at times since the start [s], (...); at the world's origin before the first message."""
         track = self._tracks.get(self.name) or Track(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6))
         velocity = quat_rotate(track.quaternion, track.nu[:3])
         since = np.asarray(t, float) + self.started - track.time

@@ -12,7 +12,7 @@ from finssim.system import handled
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Give a function that answers whether a stop signal has come; a second one interrupts at once."""
+    """Yield a function that returns whether a stop signal has come; a second signal interrupts immediately."""
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return

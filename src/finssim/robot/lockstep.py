@@ -32,11 +32,11 @@ _ARRIVED = struct.Struct("<dI")
 
 
 class LockstepError(ValueError):
-    """The other end is not there, has gone, or does not speak this protocol."""
+    """The other end is absent, has gone, or does not use this protocol."""
 
 
 def encode_request(until: float, sent: Sequence[bytes]) -> bytes:
-    """Ask a world to go on to a time [s] with what the robot sent to its motor controller."""
+    """Return a request to advance a world to a time [s] with the frames that the robot sent to its motor controller."""
     parts = [_F8.pack(until), _U4.pack(len(sent))]
     for frame in sent:
         parts += (_U4.pack(len(frame)), frame)
@@ -71,12 +71,12 @@ def encode_delivery(delivery: Delivery) -> bytes:
 
 
 def encode_refusal(sentence: str) -> bytes:
-    """Answer that the world cannot go on, and why."""
+    """Return the answer that the world cannot continue, and why."""
     return _message(REFUSAL, [sentence.encode()])
 
 
 def decode_delivery(kind: int, body: bytes) -> Delivery:
-    """What reached the robot.
+    """Return what reached the robot.
 
     Raises:
         LockstepError: A refusal, with its sentence, or no delivery.
@@ -129,7 +129,7 @@ def _picture(reader: _Reader) -> Picture:
 
 
 def _exactly(connection: socket.socket, size: int) -> bytes | None:
-    """That many bytes; None where there is nothing at all before the end."""
+    """Return that many bytes; None if the connection ended before the first."""
     buffer = bytearray(size)
     view, at = memoryview(buffer), 0
     while at < size:
@@ -143,7 +143,7 @@ def _exactly(connection: socket.socket, size: int) -> bytes | None:
 
 
 class _Reader:
-    """Takes a body apart from its front."""
+    """Reads the values of a body in order."""
 
     def __init__(self, body: bytes) -> None:
         self._body, self._at = body, 0
@@ -159,16 +159,16 @@ class _Reader:
 
 
 DEFAULT_PORT = 58768
-"""Where a pool listens for a robot in lock-step, on this machine."""
+"""Port of a pool for a robot in lock-step, on this machine."""
 LAST_FRAMES = 3
 """Frames without thrust that a run ends with."""
 
 
 class Exchange(Protocol):
-    """A world that stands still until it is asked to go on."""
+    """A world whose time stops until it is asked to advance."""
 
     def exchange(self, until: float, sent: Sequence[bytes]) -> Delivery:
-        """Let the world go on.
+        """Advance the world.
 
         Args:
             until: To this time, robot's clock [s].
@@ -180,13 +180,13 @@ class Exchange(Protocol):
 
 
 class Carrier(Protocol):
-    """Brings datagrams from one robot to the others."""
+    """Carries datagrams from one robot to the others."""
 
     def send(self, now: float, sender: str, datagram: bytes) -> None:
         """Take one at a time [s]."""
 
     def receive(self, now: float, name: str) -> Sequence[bytes]:
-        """What has reached a robot by a time [s]."""
+        """Return what has reached a robot by a time [s]."""
 
 
 class LockstepClient:
@@ -214,7 +214,7 @@ class LockstepClient:
         self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def exchange(self, until: float, sent: Sequence[bytes]) -> Delivery:
-        """Let the world go on; see `Exchange`.
+        """Advance the world; see `Exchange`.
 
         Raises:
             LockstepError: It refused, fell silent or has gone.
@@ -253,7 +253,7 @@ def run_lockstep(
     show: Callable[[Runtime], None] = lambda runtime: None,
     until: Callable[[Runtime], bool] = lambda runtime: False,
 ) -> float:
-    """Run a robot against a world until the time is over or `until` says so; then stop its thrusters.
+    """Run a robot against a world until the time is over or `until` returns true; then stop its thrusters.
 
     Args:
         runtime: The robot.
@@ -322,7 +322,7 @@ def run_together(
             show()
             if until():
                 break
-    # A world that broke off above stands still: only one that goes on needs to hear of the end.
+    # A world that ended above has stopped: only one that continues needs the last frames.
     last = [
         world.exchange(now + 1.0 / rate, runtime.stop(now, LAST_FRAMES)).time
         for runtime, world in stacks.values()

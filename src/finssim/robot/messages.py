@@ -1,4 +1,4 @@
-"""What crosses the wires of a robot, as plain values in SI units; `robot.link` turns them into bytes and back."""
+"""Messages on the wires of a robot, as plain values in SI units; `robot.link` encodes and decodes them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ThrusterCommand:
-    """What the motor controller is told, in its own order of outputs and with its own signs."""
+    """Command to the motor controller, in its own order of outputs and with its own signs."""
 
     enable: bool
     """False: motors off, whatever the numbers are."""
@@ -29,24 +29,24 @@ class Telemetry:
     mcu_ms: int
     """The controller's clock [ms], modulo 2³²."""
     quaternion: tuple[float, float, float, float]
-    """IMU frame to the level world of its own attitude filter, xyzw (wxyz on the wire)."""
+    """Rotation from the IMU frame to the level world of its own attitude filter, xyzw (wxyz on the wire)."""
     gyro: tuple[float, float, float]
     """IMU frame [rad/s]."""
     accel: tuple[float, float, float]
     """Specific force, IMU frame [m/s²]; +9.81 upwards at rest."""
     depth: float
-    """Of the pressure port, positive down [m]."""
+    """Depth of the pressure port, positive down [m]."""
     pressure: float
     """Absolute [Pa]."""
     flags: int
     """Status bits (see `robot.link`)."""
     motor_rpm: tuple[float, ...] | None
-    """Per motor output, with the controller's own signs [rpm]; None from a firmware that does not tell."""
+    """Speed per motor output, with the controller's own signs [rpm]; None from a firmware that does not report it."""
 
 
 @dataclass(frozen=True)
 class CommandEcho:
-    """What the motor controller made of a command, sent on request."""
+    """The motor controller's echo of a command, sent on request."""
 
     sequence: int
     mcu_ms: int
@@ -64,7 +64,7 @@ class CommandEcho:
 
 @dataclass(frozen=True)
 class NavigationAid:
-    """What a navigation instrument says, aboard (Doppler log, compass) or beside the water (positioning)."""
+    """Reading of a navigation instrument, aboard (Doppler log, compass) or beside the water (positioning)."""
 
     sequence: int
     """Counts up, modulo 2¹⁶."""
@@ -76,13 +76,13 @@ class NavigationAid:
     """VELOCITY: over the floor, log's axes [m/s]. HEADING: left positive from world x [rad], 0, 0. POSITION: x, y, z
     and POSE: x, y, yaw of the body origin, world frame [m, rad]."""
     std: tuple[float, float]
-    """Of a position, per axis [m], and of its yaw [rad]; 0 where the instrument does not tell."""
+    """Standard deviation of a position, per axis [m], and of its yaw [rad]; 0 if the instrument does not give it."""
 
 
 VELOCITY, HEADING, POSITION, POSE = 1, 2, 3, 4
 """Kinds of `NavigationAid`."""
 POSITION_STD, YAW_STD = 0.5, 0.1
-"""Of a fix that does not tell its own [m, rad]."""
+"""Standard deviations of a fix that does not give its own [m, rad]."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class TagCorners:
 
     tag_id: int
     corners: Array
-    """As `localization.detection.Detection.corners`, (4, 2) [px]."""
+    """Corners as in `localization.detection.Detection.corners`, (4, 2) [px]."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Picture:
     source: str = ""
     """Name in the vehicle's `perception`; the overhead camera if empty."""
     ranges: npt.NDArray[np.float32] | None = None
-    """Of an altimeter, a rangefinder or a DVL's beams [m], infinite where nothing is in reach, (beams,)."""
+    """Ranges of an altimeter, a rangefinder or a DVL's beams [m], infinite if nothing is in reach, (beams,)."""
 
 
 @dataclass(frozen=True)

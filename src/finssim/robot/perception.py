@@ -1,4 +1,4 @@
-"""From telemetry and pictures to the state that a controller reads. Bad data is counted and never raises."""
+"""The state that a controller reads, from telemetry and pictures. Bad data is counted and never raises."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ IMU_STUCK, DEPTH_STUCK = 0.2, 1.0
 
 
 class Stuck:
-    """Notices that a source says the same thing for too long."""
+    """Detector of a source that repeats the same value for too long."""
 
     def __init__(self, longest: float) -> None:
         """
@@ -75,7 +75,7 @@ class Stuck:
         self._since = math.nan
 
     def look(self, value: Hashable, time: float) -> bool:
-        """Whether the source has frozen, now that it says this.
+        """Note a value, and return whether the source has frozen.
 
         Args:
             value: What it says.
@@ -187,12 +187,12 @@ class Aboard:
 
 
 def _is_unit(q: tuple[float, float, float, float]) -> bool:
-    """Whether a quaternion is about one of unit length."""
+    """Return whether a quaternion has about unit length."""
     return abs(math.hypot(*q) ** 2 - 1.0) < 0.1
 
 
 def _within(values: Three, bound: float) -> bool:
-    """Whether all are numbers of at most that size."""
+    """Return whether all are numbers of at most that size."""
     return all(abs(v) <= bound for v in values)
 
 
@@ -204,7 +204,7 @@ Array = npt.NDArray[np.float64]
 ALPHA = 0.35
 """Part of a new difference that enters the speed (published velocity filter)."""
 LONGEST = 0.5
-"""Differences over longer times tell no speed [s]."""
+"""Longest time over which a difference gives a speed [s]."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ class _Axis:
     time: float = math.nan
 
     def after(self, value: Array, time: float) -> _Axis:
-        """With one more measurement, unless it is older."""
+        """Return the axis after one more measurement, unless it is older."""
         if not math.isnan(self.time) and time <= self.time:
             return self
         step = time - self.time
@@ -246,7 +246,7 @@ class Unfused:
             self._z = self._z.after(np.array([z]), time)
 
     def fix(self, position: tuple[float, float], yaw: float | None, time: float) -> None:
-        """Take in a fix; the first with a yaw says where the attitude filter's zero points.
+        """Note a fix; the first with a yaw gives the zero of the attitude filter.
 
         Args:
             position: x, y of the body origin, pool frame [m].
@@ -277,7 +277,7 @@ class Unfused:
 
 
 class Unlocated:
-    """In place of `Perception` where there is no pool file: never ready, so that no pilot that needs a state acts."""
+    """Replacement of `Perception` without a pool file: never ready, so that no pilot that needs a state acts."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
@@ -324,9 +324,9 @@ PICTURE_STUCK = 0.4
 """Corners that stay the same to the last digit for this long are one picture sent again and again [s]."""
 
 LET_IN_STD = 0.05
-"""Standard deviation of the place where a vehicle is let in, per axis [m]."""
+"""Standard deviation of the initial position of a vehicle, per axis [m]."""
 LET_IN_AFTER = 0.5
-"""From the first state that is asked for until it is told: by then there is inertial data to carry it on [s]."""
+"""Time from the first requested state until the position is given: by then there is inertial data to integrate [s]."""
 
 JUMP = 1.0
 """Data that is older than the newest by more than this comes from a clock that was set back [s]."""
@@ -466,7 +466,7 @@ class Perception:
         return self.estimator.health(self.estimator.estimate())
 
     def _tell_let_in(self, now: float) -> None:
-        """Once, where the vehicle was let in."""
+        """Give the estimator, once, the initial position of the vehicle."""
         if self._let_in is None:
             return
         self._asked_since = now if math.isnan(self._asked_since) else self._asked_since
@@ -483,7 +483,7 @@ class Perception:
         return replace(estimate, x=raw.x, yaw=raw.yaw, vision_time=raw.vision_time)
 
     def _turning(self, estimate: Estimate) -> Array:
-        """Angular velocity, body frame [rad/s], less what is known of the gyro's bias: its part about the vertical."""
+        """Return the angular velocity, body frame [rad/s], minus the known gyro bias about the vertical."""
         if not math.isfinite(estimate.yaw_rate):
             return np.full(3, math.nan)
         omega, roll, cos = np.array(self._omega), estimate.roll, math.cos(estimate.pitch)
@@ -514,7 +514,7 @@ class Perception:
 
 
 class _WorldFrame:
-    """Turns what is known in the pool frame into world and body axes."""
+    """Conversion of the state from the pool frame to world and body axes."""
 
     def __init__(self, pool: Pool | None, up: tuple[float, float, float]) -> None:
         T = np.eye(4) if pool is None else pool.T_wp
@@ -553,12 +553,12 @@ class _WorldFrame:
 
 
 def _older(time: float, last: float) -> bool:
-    """Whether something comes again or late; much too late means that the clock was set back."""
+    """Return whether a sample is repeated or late; a very late one means that the clock was set back."""
     return last - JUMP < time <= last
 
 
 def _why(health: Health, camera: bool) -> str:
-    """In words why a state is not ready, to somebody who has a camera or not."""
+    """Return why a state is not ready, in words for a user with or without a camera."""
     if math.isnan(health.age_imu) or not health.imu_fresh:
         return "no inertial data"
     if math.isnan(health.age_depth) or not health.depth_fresh:

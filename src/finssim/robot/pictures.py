@@ -99,12 +99,12 @@ LARGEST = 64 * 2**20
 
 @dataclass(frozen=True)
 class Posted:
-    """A picture and what its sender said about the time."""
+    """A picture and its sender's times."""
 
     picture: Picture
     """`time` is on the sender's clock."""
     late: float
-    """How much later than `time` it was sent [s]: what drawing it took beyond the camera's latency."""
+    """Delay of its sending after `time` [s]: the drawing time beyond the camera's latency."""
 
 
 def encode_picture(picture: Picture, *, late: float = 0.0, compress: bool = False) -> bytes:
@@ -196,19 +196,19 @@ def _announced(data: bytes) -> tuple[int, int] | None:
 
 # Messages longer than a datagram: cut into numbered fragments, and put together again with bounded memory.
 #
-# magic "FSPF", message u32, index u16, count u16, CRC-32 of the whole message u32; then a piece of it.
+# magic "FSPF", message u32, index u16, count u16, CRC-32 of the complete message u32; then a piece of it.
 # All little endian; every piece but the last has the same length.
 
 
 _FRAGMENT_HEAD = struct.Struct("<4sIHHI")
 _FRAGMENT_MAGIC = b"FSPF"
 LONGEST_FRAGMENT = 60_000
-"""Bytes of the message in a datagram: what loopback takes whole. Elsewhere 1400 keep below a network's MTU."""
+"""Bytes of the message in a datagram, within the limit of loopback. Elsewhere 1400 are below a network's MTU."""
 MOST_FRAGMENTS = 4096
 UNFINISHED = 4
-"""Messages that may be under way at once; an older one is given up."""
+"""Greatest number of messages under way; an older one is dropped."""
 MOST_BYTES = 32 * 2**20
-"""That unfinished messages may hold together."""
+"""Greatest size of all unfinished messages together."""
 
 
 def fragments(data: bytes, number: int, size: int = LONGEST_FRAGMENT) -> list[bytes]:
@@ -228,7 +228,7 @@ def fragments(data: bytes, number: int, size: int = LONGEST_FRAGMENT) -> list[by
 
 
 class Assembler:
-    """Takes fragments in any order, some twice and some never; gives whole messages. Never raises."""
+    """Assembles fragments in any order, some repeated and some lost, to complete messages. Never raises."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -277,7 +277,7 @@ class Assembler:
             self.counts["incomplete"] += 1
 
 
-# Pictures over UDP from one peer alone, received by a thread of its own so that none waits for the control loop.
+# Pictures over UDP from one peer alone, received by a separate thread so that none waits for the control loop.
 
 
 _WAITING = 16
@@ -381,7 +381,7 @@ class NoPictures:
         """Nothing to let go of."""
 
     def describe(self) -> str:
-        """That there is none."""
+        """Return that there is none."""
         return "no pictures"
 
 
@@ -403,7 +403,7 @@ def open_pictures(address: str, bind: str = DEFAULT_PICTURES) -> PictureSource:
     raise LinkError(f"unknown source of pictures {address!r}: give udp://HOST:PORT or none")
 
 
-# A picture source whose tags are found on a thread of its own, so that the control loop never waits for a detector.
+# A picture source whose tags are found on a separate thread, so that the control loop never waits for a detector.
 
 
 _TAGS_LOG = logging.getLogger(__name__)
@@ -448,7 +448,7 @@ class TagFinder:
         self._thread.start()
 
     def receive(self, now: float) -> list[Picture]:
-        """What has been looked at since the last call."""
+        """Return the pictures that were searched since the last call."""
         pictures = []
         while self._found:
             pictures.append(self._found.popleft())

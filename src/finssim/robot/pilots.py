@@ -1,4 +1,4 @@
-"""Who steers: a PID, a policy or a person, behind one interface; a switch between them."""
+"""Pilots: a PID, a policy or a person, with one interface; a switch between them."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 BY_AXES, TURN = 2.0 / 3.0, 1.0
-"""Part of a task's reach, and most of a turn that is shown at once [rad], for a vehicle that is steered by axes: a
-Doppler log locates it, and loses the floor when the vehicle leans on its way."""
+"""Share of a task's reach, and greatest turn that is observed [rad], for a vehicle that is steered by axes: a Doppler
+log locates it, and loses the floor when the vehicle leans."""
 
 
 class Pilot(Protocol):
@@ -38,7 +38,7 @@ class Pilot(Protocol):
 
     @property
     def name(self) -> str:
-        """By which the bridge knows who commands."""
+        """Name by which the bridge identifies who commands."""
 
     @property
     def period(self) -> float:
@@ -46,10 +46,10 @@ class Pilot(Protocol):
 
     @property
     def needs_state(self) -> bool:
-        """Whether it may only decide on a reading that is ready."""
+        """Return whether it may only decide on a reading that is ready."""
 
     def describe(self) -> dict[str, Any]:
-        """Who it is, as plain data."""
+        """Return its description as plain data."""
 
     def reset(self) -> None:
         """Forget what was before."""
@@ -120,7 +120,7 @@ class AgentPilot:
         self.reset()
 
     def describe(self) -> dict[str, Any]:
-        """Who it is, as plain data."""
+        """Return its description as plain data."""
         about = self.agent.describe() | ({"input_noise": self._input_noise} if self._input_noise else {})
         if self.observer is None:
             return about
@@ -140,7 +140,7 @@ class AgentPilot:
             self.observer.restart()
 
     def disturb_input(self, *, position_std: float, yaw_std: float, seed: int = 0) -> None:
-        """From now on see position and heading with independent errors, drawn anew for every decision.
+        """Add independent errors to position and heading, drawn for every decision.
 
         The published ablation "+ localization noise" has 5 cm per axis and 10 degrees; it touches the controller's
         input alone.
@@ -251,7 +251,7 @@ class ModeSwitch:
 
     @property
     def pilot(self) -> Pilot:
-        """Who steers."""
+        """Return the active pilot."""
         return self._pilots[self.mode]
 
     name = "mode-switch"
@@ -264,7 +264,7 @@ class ModeSwitch:
 
     @property
     def needs_state(self) -> bool:
-        """Whether the pilot that steers may only decide on a reading that is ready."""
+        """Return whether the active pilot may only decide on a reading that is ready."""
         return self.pilot.needs_state
 
     @property

@@ -1,4 +1,4 @@
-"""What a robot knows of its vehicle at one time."""
+"""State of a robot's vehicle at one time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Reading:
-    """What is known of the vehicle at one time; it is a `control.guidance.Measured`."""
+    """State of the vehicle at one time, in the form of a `control.guidance.Measured`."""
 
     time: float
     """[s], the robot's clock."""
@@ -27,14 +27,14 @@ class Reading:
     nu: Array
     """Velocity of the body origin and angular velocity, body frame [m/s, rad/s], (6,)."""
     ready: bool
-    """Whether a controller may act on it."""
+    """True if a controller may act on it."""
     mode: str = "fresh"
-    """Of vision: uninitialized, fresh, coast, hold or lost."""
+    """Mode of vision: uninitialized, fresh, coast, hold or lost."""
     reason: str = ""
-    """Why it is not ready; empty if it is."""
+    """Reason why it is not ready; empty if it is."""
     std: Array = field(default_factory=lambda: np.full(7, np.nan))
     """Standard deviations of position [m], velocity [m/s] and yaw [rad], (7,)."""
     tracks: Mapping[str, Track] = field(default_factory=dict)
-    """What is known of other vehicles, by name."""
+    """States of other vehicles, by name."""
     pictures: Mapping[str, Picture] = field(default_factory=dict)
     """The latest reading of each of the vehicle's own cameras, sonars and altimeters, by name."""

@@ -1,4 +1,4 @@
-"""All that FinsSim says of a robot as ROS 2 messages: topics and their policies, types, and what makes the messages.
+"""Data of a robot as ROS 2 messages: topics and their policies, types, and functions that make the messages.
 
 Frames are map, base_link and imu_link, units SI.
 """
@@ -37,7 +37,7 @@ from finssim.vehicles.defaults import with_navigation
 from finssim.worlds.description import CameraDevice, Device, RangeDevice, SonarDevice, device_of
 from finssim.worlds.rays import fan_picture
 
-# Names, types, frames and policies of all that FinsSim says of a robot: one table, for topics, records and page.
+# Names, types, frames and policies of all data of a robot: one table, for topics, records and the page.
 
 
 STREAM, COMMAND, LATCHED, SENSOR = "stream", "command", "latched", "sensor"
@@ -56,12 +56,12 @@ INFINITE = (9223372036, 854775807)
 
 
 def is_reliable(quality: str) -> bool:
-    """Whether lost messages are sent again."""
+    """Return whether lost messages are sent again."""
     return quality != SENSOR
 
 
 def is_latched(quality: str) -> bool:
-    """Whether who comes late gets the last message."""
+    """Return whether a late subscriber gets the last message."""
     return quality == LATCHED
 
 
@@ -71,7 +71,8 @@ def depth_of(quality: str) -> int:
 
 
 def offered_qos(quality: str) -> str:
-    """What rosbag2 keeps of a topic's policies: a list of profiles in YAML, as numbers, which every release reads.
+    """Return the topic's policies in the form of rosbag2: a list of profiles in YAML, as numbers, which every release
+    reads.
 
     Its names for policies came with Jazzy, whose reader tries numbers first; Humble's knows nothing else.
     """
@@ -97,7 +98,7 @@ class Topic:
     name: str
     """Below the vehicle's namespace, unless it begins with a slash."""
     type: str
-    """As `nav_msgs/msg/Odometry`."""
+    """Type such as `nav_msgs/msg/Odometry`."""
     quality: str
     """One of `QUALITIES`."""
     frame: str
@@ -206,11 +207,11 @@ OWN_TOPICS = {
 }  # fmt: skip
 """Kind of a sensor of the vehicle -> key -> topic, for NAME in its `perception`."""
 FAN_ROWS = 400
-"""Of a sonar's fan [px]."""
+"""Height of a sonar's fan [px]."""
 
 
 def own_kind(device: Device) -> str:
-    """Which of `OWN_TOPICS` a device has."""
+    """Return which of `OWN_TOPICS` a device has."""
     if isinstance(device, CameraDevice):
         return "camera"
     return "sonar" if isinstance(device, SonarDevice) else "beams" if device.beams == 4 else "range"
@@ -239,7 +240,7 @@ class RecordError(ValueError):
 
 
 METADATA = "finssim"
-"""Name of the metadata record that says what the record is of."""
+"""Name of the metadata record that describes the record."""
 
 
 @cache
@@ -269,7 +270,7 @@ SHARED = ("", MAP, "camera", "camera_link", "camera_optical")
 """Frames of the pool and its camera, which vehicles have in common."""
 
 IMU_VARIANCES = ((0.02, 0.02, 0.05), (0.01,) * 3, (0.1,) * 3)
-"""Of attitude [rad²], rates [rad²/s²] and specific force [m²/s⁴], as the published bridge sends them."""
+"""Variances of attitude [rad²], rates [rad²/s²] and specific force [m²/s⁴], as in the published bridge."""
 
 UNKNOWN = 1.0e6
 """Variance of what is not known [m², rad², m²/s²]."""
@@ -277,7 +278,7 @@ UNKNOWN = 1.0e6
 DIAGONAL = np.diag_indices(6)
 
 PRESSURE_VARIANCE = (0.05 * 9.81e3) ** 2
-"""Of 0.05 m of water [Pa²]: the published 0.0025 m²."""
+"""Variance of 0.05 m of water [Pa²]: the published 0.0025 m²."""
 
 STATES = ("disarmed", "armed", "hold", "fault")
 """Words for the states of the bridge, in their order."""
@@ -286,7 +287,7 @@ MOST = 2**32 - 1
 """Largest count of a uint32."""
 
 FIRST_TIME, LAST_TIME = -(2**31) * 10**9, 2**31 * 10**9 - 1
-"""Of builtin_interfaces/Time, whose seconds are an int32 [ns]."""
+"""Range of builtin_interfaces/Time, whose seconds are an int32 [ns]."""
 
 LEVELS = ("ok", "warn", "error", "stale")
 """Words for the levels of a diagnostic, in their order."""
@@ -370,7 +371,8 @@ class Messages:
         return self.filled("HardwareTelemetry", stamp, IMU, values)
 
     def aid(self, stamp: int, aid: NavigationAid) -> tuple[str, Any] | None:
-        """What a navigation instrument measured, with the key of its topic; None where there is no such instrument.
+        """Return the message of a navigation instrument, with the key of its topic; None if there is no such
+        instrument.
 
         What it does not measure has the variance `UNKNOWN`; rates and specific force of a compass are told as missing.
         """
@@ -442,7 +444,7 @@ class Messages:
         return of["tf2_msgs/msg/TFMessage"]([stamped])
 
     def estimator(self, stamp: int, reading: Reading, health: Mapping[str, Any]) -> Any:
-        """Whether the estimate may be acted on; what `health` does not tell is NaN, 0 or empty."""
+        """Return whether the estimate may be acted on; values missing in `health` are NaN, 0 or empty."""
         std = np.asarray(reading.std, float)
         judged = {"position_std": std[:3], "velocity_std": std[3:6], "yaw_std": std[6]}
         status = {"ready": reading.ready, "mode": reading.mode, "reason": reading.reason}
@@ -470,7 +472,7 @@ class Messages:
         return self.filled("ThrusterCommand", stamp, BASE, values)
 
     def thrusters(self, stamp: int, state: str, values: Mapping[str, Any]) -> Any:
-        """What the bridge made of commands."""
+        """Return the state of the bridge and its commands."""
         values_of_bridge = {"state": STATES.index(state), "names": self.names}
         return self.filled("ThrusterState", stamp, BASE, {**values, **values_of_bridge})
 
@@ -479,7 +481,7 @@ class Messages:
         return self.filled("PolicyInfo", stamp, BASE, {**values, "pilot": pilot})
 
     def echo(self, stamp: int, echo: CommandEcho) -> Any:
-        """What the motor controller made of a command."""
+        """Return the motor controller's echo of a command."""
         return self.filled("CommandEcho", stamp, BASE, vars(echo))
 
     def picture(self, stamp: int, packed: bytes | None, frame: str = "camera") -> Any | None:
@@ -511,7 +513,8 @@ class Messages:
         )  # fmt: skip
 
     def of_own(self, stamp: int, picture: Picture) -> dict[str, Callable[[], Any]]:
-        """What makes the messages of a reading of the vehicle's own sensors, by key of its topic; empty for a stranger.
+        """Return functions that make the messages of a reading of the vehicle's own sensors, by key of its topic; empty
+        for an unknown sensor.
 
         Args:
             stamp: Of its exposure [ns].
@@ -600,7 +603,7 @@ class Messages:
         return of["diagnostic_msgs/msg/DiagnosticArray"](self.header(stamp, ""), [status])
 
     def frame(self, name: str) -> str:
-        """A frame's name as this vehicle says it."""
+        """Return a frame's name with the vehicle's prefix."""
         return name if name in SHARED else self._prefix + name
 
     def header(self, stamp: int, frame: str) -> Any:

@@ -1,4 +1,4 @@
-"""Records read back, finished or cut: what they are about, their messages in time order; cut ones made whole.
+"""Reader of records, complete or cut: their description, and messages in time order; repair of cut ones.
 
 `finssim record info`, `record repair` and `play`.
 """
@@ -46,7 +46,7 @@ def repair(file: Path, *, out: Path | None = None, as_json: bool = False) -> Non
 
 
 def repair_record(path: Path, out: Path) -> list[str]:
-    """Write a whole record of all that can be read of a cut or damaged one.
+    """Write a complete record of all that can be read of a cut or damaged one.
 
     Args:
         path: The record; it stays as it is.
@@ -89,7 +89,7 @@ def write_whole(source: Path, target: Path, notes: list[str]) -> None:
     from mcap.stream_reader import StreamReader
     from mcap.writer import CompressionType, Writer
 
-    schemas, channels, started = {0: 0}, dict[int, int](), False  # numbered anew
+    schemas, channels, started = {0: 0}, dict[int, int](), False  # numbered again
     with source.open("rb") as reading, target.open("wb") as writing:
         writer = Writer(writing, compression=CompressionType.LZ4)
         try:
@@ -134,7 +134,7 @@ class Entry(NamedTuple):
     kind: str
     """Its type, such as `sensor_msgs/msg/Imu`."""
     message: Any
-    """With the type's fields."""
+    """Message with the type's fields."""
 
 
 NO_TYPE = "no type"
@@ -167,7 +167,7 @@ class Record:
 
     @property
     def cut(self) -> bool:
-        """Whether it has no proper end, as after a crash or while it is being written."""
+        """Return whether it has no proper end, as after a crash or while it is being written."""
         return bool(self.notes)
 
     def topic(self, name: str) -> str:
@@ -204,7 +204,7 @@ class Record:
                 )
             try:
                 decoded = types().deserialize_cdr(message.data, schema.name)
-            except Exception as error:  # rosbags has no class of its own for what a message's bytes break
+            except Exception as error:  # rosbags has no exception class for errors in a message's bytes
                 raise RecordError(
                     f"{self.path}: a message of {channel.topic} at {time:.3f} s is no {schema.name}: {error}"
                 ) from None
@@ -242,7 +242,7 @@ def open_record(path: Path | str) -> Iterator[Record]:
 
 
 def _indexed(file: Any) -> bool:
-    """Whether the file has a summary that can be read, with the schemas of all its channels."""
+    """Return whether the file has a readable summary, with the schemas of all its channels."""
     from mcap.reader import make_reader
 
     try:

@@ -31,20 +31,20 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 
 class _Whole:
-    """A file opened without a buffer, as a stream that takes every write whole or raises."""
+    """A file opened without a buffer, as a stream that writes every piece completely or raises."""
 
     def __init__(self, file: Any) -> None:
         self._file, self.written = file, 0
 
     def write(self, data: bytes) -> None:
-        """Write all of it; counted only when the system has taken it whole."""
+        """Write all of it; counted only when the system has written it completely."""
         view = memoryview(data)
         while view:
             view = view[self._file.write(view) or 0 :]
         self.written += len(data)
 
     def tell(self) -> int:
-        """Bytes of the whole records in the file."""
+        """Return the number of bytes of the complete records in the file."""
         return self.written
 
     def flush(self) -> None:
@@ -70,7 +70,7 @@ POLLS = 5
 
 
 class RecordSink:
-    """A file that messages are put into from one thread and written by another.
+    """A file that one thread adds messages to and another one writes.
 
     A chunk is written and flushed to disk when its messages span `chunk_seconds`, or lie in it that long: a process
     that is killed loses no more than that and a fifth of it. Where the system refuses to write, the file is closed
@@ -166,7 +166,7 @@ class RecordSink:
             self._drain()
             self.writer.finish()
             self._stream.flush()
-        except Exception as error:  # whatever it is, it must be told, and must not stop the vehicle's control
+        except Exception as error:  # any error must be reported, and must not stop the vehicle's control
             self._stop(error)
         finally:
             self._file.close()
@@ -193,7 +193,7 @@ class RecordSink:
         self._opened = None
 
     def _stop(self, error: Exception) -> None:
-        """Give up: the file ends after its last whole record, if the system lets it."""
+        """Give up: the file ends after its last complete record, if the system permits it."""
         reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
         self.problem = (
             f"{self.path}: recording stopped: {reason}: the record up to then is kept; free some "
@@ -207,12 +207,12 @@ class RecordSink:
             self._file.seek(0, os.SEEK_END)
             self._file.write(END)
         except OSError:
-            # No room even for that: readers find the last whole record themselves.
+            # No room even for that: readers find the last complete record themselves.
             LOG.warning("%s: ends without a summary: `finssim record repair` writes one", self.path)
 
 
 class Recorder:
-    """Writes a record; every method returns at once, and none raises because of the disk.
+    """Writes a record; every method returns immediately, and none raises because of the disk.
 
         with Recorder("run.mcap", vehicle, {"seed": 1, "command": "finssim run"}) as recorder:
             recorder.telemetry(now, telemetry)
@@ -277,7 +277,7 @@ class Recorder:
 
     @property
     def problem(self) -> str:
-        """Why recording stopped, in a sentence; empty while it goes on."""
+        """Return why recording stopped, in a sentence; empty while it runs."""
         return self._sink.problem
 
     @property
@@ -331,7 +331,7 @@ class Recorder:
             self._put("wrench", at, self._messages.wrench(at, wrench))
 
     def thrusters(self, now: float, state: str, **values: Any) -> None:
-        """What the bridge made of commands; fields of `finssim_msgs/ThrusterState`, lists in canonical order.
+        """Record the state of the bridge; fields of `finssim_msgs/ThrusterState`, lists in canonical order.
 
         Args:
             now: [s]
@@ -342,7 +342,7 @@ class Recorder:
         self._put("thrusters", at, self._messages.thrusters(at, state, values))
 
     def echo(self, now: float, echo: CommandEcho) -> None:
-        """What the motor controller made of a command."""
+        """Record the motor controller's echo of a command."""
         at = self._ns(now)
         self._put("echo", at, self._messages.echo(at, echo))
 
@@ -358,7 +358,7 @@ class Recorder:
         self._put("policy", at, self._messages.policy(at, pilot, values))
 
     def goal(self, now: float, position: npt.ArrayLike, yaw: float) -> None:
-        """Where the vehicle should be now, map frame [m], (3,), and its heading [rad]."""
+        """Record the goal of the vehicle now, map frame [m], (3,), and its heading [rad]."""
         at = self._ns(now)
         self._put("goal", at, self._messages.goal(at, np.asarray(position, float), yaw))
 

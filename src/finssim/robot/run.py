@@ -1,4 +1,4 @@
-"""`finssim run`: put a robot together, or a team's, run it on its wires or in lock-step, and tell how it went."""
+"""`finssim run`: assemble a robot, or a team's, run it on its wires or in lock-step, and report the result."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ UPDATE = 1.0
 AFTERWARDS = 2.0
 """A trajectory's end is held for so long before the run ends [s]."""
 MUTE = 3.0
-"""A vehicle that has said nothing for so long is told of [s]."""
+"""Silence of a vehicle after which it is reported [s]."""
 
 
 class _Monitor:
-    """Looks at a runtime after every step; knows when the run is over, and tells at the end.
+    """Observer of a runtime after every step, which decides when the run is over, and reports at the end.
 
     Note:
         Errors are those of the estimate, which is all that a robot knows.
@@ -101,7 +101,7 @@ class _Monitor:
             self.status.update(f"{self.state}{f' ({reason})' if reason else ''}: {self._newest}")
 
     def over(self, runtime: Runtime) -> bool:
-        """Whether the run is over."""
+        """Return whether the run is over."""
         return self.state == "fault" or runtime.t > self._end
 
     @property
@@ -131,7 +131,7 @@ class _Monitor:
 
 
 def _waiting(runtime: Runtime) -> str:
-    """What a run that never began was waiting for; empty for one that did."""
+    """Return what a run that never started was waiting for; empty for one that did."""
     began = not math.isnan(runtime.started)
     return "" if began or runtime.reading is None else runtime.reading.reason
 
@@ -141,7 +141,7 @@ AIDS = {"vision": "position fixes", "velocity": "velocities", "heading": "compas
 
 
 def _used(report: Mapping[str, Any]) -> dict[str, str]:
-    """How many pictures became part of the state, and how many of what came in their place."""
+    """Return how many pictures were used for the state, and how many of their replacements."""
     rows = {}
     for stream, name in AIDS.items():
         verdicts = report["samples"].get(stream)
@@ -153,7 +153,7 @@ def _used(report: Mapping[str, Any]) -> dict[str, str]:
 
 
 def show(report: dict[str, Any], console: Console) -> None:
-    """Print what `_Monitor.report` told as a table."""
+    """Print the result of `_Monitor.report` as a table."""
     table = Table(show_header=False, box=None)
     latency = report["latency_s"]
     position, yaw = report["position_rms_m"], report["yaw_rms_deg"]
@@ -183,7 +183,7 @@ def show(report: dict[str, Any], console: Console) -> None:
     console.print(table)
 
 
-# `finssim run --team POLICY`: a stack of its own for every agent of a task, each in a process of its own.
+# `finssim run --team POLICY`: a separate stack for every agent of a task, each in its own process.
 
 
 APART = 10
@@ -264,7 +264,7 @@ def run_team(
                     env=environment,
                     stdout=subprocess.PIPE,
                     encoding="utf-8",
-                    **SEPARATE,  # Ctrl-C reaches us alone, and we tell them once
+                    **SEPARATE,  # Ctrl-C reaches only this process, which passes it on once
                 )
             while not interrupted() and any(child.poll() is None for child in children.values()):
                 time.sleep(POLL)
@@ -278,7 +278,7 @@ def run_team(
 
 
 def _tell(report: dict[str, Any], as_json: bool) -> None:
-    """How each went."""
+    """Print the result of each."""
     if as_json:
         print(json.dumps(report))
         return
@@ -292,7 +292,7 @@ def _tell(report: dict[str, Any], as_json: bool) -> None:
 FAULT = 3
 """Exit status of a run that ended in a fault of the vehicle."""
 UNHEARD = 4
-"""Exit status of a run in which the vehicle said nothing."""
+"""Exit status of a run in which the vehicle sent nothing."""
 _GO = Station((0.0, 0.0, 0.0), 0.0, name="team")
 """The guide of a vehicle that goes by the others alone."""
 _SEEN = Station((0.0, 0.0, 0.0), 0.0, name="sight")
@@ -464,13 +464,13 @@ def run(
 
 
 def _is_address(text: str) -> bool:
-    """Whether that is HOST:PORT."""
+    """Return whether that is HOST:PORT."""
     host, _, port = text.rpartition(":")
     return bool(host) and port.isdecimal()
 
 
 def _pilot(policy: str, vehicle: Vehicle, task: str | None, *, agent: str | None, follows: bool) -> Pilot:
-    """Who steers; a PID that follows a trajectory is that of T2."""
+    """Return the pilot; a PID that follows a trajectory is that of T2."""
     if task is not None:
         from finssim.tasks.observer import fitted_task
 
@@ -481,7 +481,7 @@ def _pilot(policy: str, vehicle: Vehicle, task: str | None, *, agent: str | None
 
 
 def _alone(pilot: Pilot) -> bool:
-    """Whether it does a task of one vehicle."""
+    """Return whether it does a task of one vehicle."""
     observer = getattr(pilot, "observer", None)
     return observer is not None and len(observer.task.vehicles) == 1
 
@@ -512,7 +512,7 @@ def _team(pilot: Pilot, wiring: Wiring) -> Team | None:
 def _opened(
     link: AbstractContextManager[Drive], record: AbstractContextManager[Recorder | None]
 ) -> Iterator[tuple[Drive, Recorder | None]]:
-    """What the robot is connected to, and a record; none is left of a run that could not be connected."""
+    """Yield the connection of the robot, and a record; no record remains of a run that could not be connected."""
     with ExitStack() as stack:
         recorder = stack.enter_context(record)
         try:

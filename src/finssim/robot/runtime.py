@@ -1,4 +1,4 @@
-"""The robot's software, one step at a time: what has come in, what is known of it, what is decided, what goes out."""
+"""The robot's software, one step at a time: inputs, state, decision, outputs."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Ticks:
         self._next = start
 
     def due(self, now: float, period: float) -> tuple[bool, int]:
-        """Whether it is time, and how many turns were missed altogether since the last one.
+        """Return whether it is time, and how many turns were missed altogether since the last one.
 
         Args:
             now: [s]
@@ -83,15 +83,15 @@ class Counters:
     overruns: int = 0
     """Steps that took longer than their period."""
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    """From the arrival of the newest picture in the state to the command that is decided on it [s]."""
+    """Time from the arrival of the newest picture in the state to the command that is decided on it [s]."""
     events: deque[Any] = field(default_factory=lambda: deque(maxlen=200))
     """The latest events of the bridge."""
     onboard: Counter[str] = field(default_factory=Counter)
     """Readings of the vehicle's own cameras, sonars and altimeters, by name."""
     sight: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    """From the exposure of the oldest picture that a decision is made on to its command [s]."""
+    """Time from the exposure of the oldest picture that a decision uses to its command [s]."""
     inference: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    """What deciding took, of a pilot that sees pictures [s]."""
+    """Duration of decisions, of a pilot that uses pictures [s]."""
     _newest: float = math.nan
     _pending: float = math.nan
     _exposed: float = math.nan
@@ -104,7 +104,7 @@ class Counters:
             self._newest = arrival
 
     def decided(self, exposed: float = math.nan, took: float = math.nan) -> None:
-        """A decision was made on what is known now.
+        """Note a decision on the current state.
 
         Args:
             exposed: When the oldest picture that it is made on was taken [s]; NaN without pictures.
@@ -116,7 +116,7 @@ class Counters:
             self.inference.append(took)
 
     def sent(self, now: float) -> None:
-        """What was decided has gone out [s]."""
+        """Note that the decision was sent [s]."""
         if not math.isnan(self._pending):
             self.latencies.append(now - self._pending)
             self._pending = math.nan
@@ -148,7 +148,7 @@ USED = ("accepted", "initialized", "reacquired")
 
 
 class Link(Autopilot, Protocol):
-    """Who turns the bridge's commands into motion at the other end of the wire: a motor controller or an autopilot."""
+    """Conversion of the bridge's commands for the other end of the wire: a motor controller or an autopilot."""
 
     def feed(self, now: float, data: bytes) -> list[Message]:
         """Messages that bytes complete, which came at a time [s]; never raises, whatever they are."""
@@ -285,7 +285,7 @@ class Runtime:
         self.attach(self.intake.link)
 
     def attach(self, link: Link) -> None:
-        """Speak with what is at the other end of the wire: the vehicle's motor controller if nothing else is told."""
+        """Set the link to the other end of the wire: the vehicle's motor controller by default."""
         self.link = self.intake.link = self.bridge.autopilot = link
 
     def step(
@@ -326,7 +326,7 @@ class Runtime:
         return self.link.encode(now, command, self.bridge.state)
 
     def sent(self, now: float) -> None:
-        """Tell when the datagrams of the last step went out [s], for the latency of a decision."""
+        """Note when the datagrams of the last step were sent [s], for the latency of a decision."""
         self.counters.sent(now)
 
     def start(self, now: float) -> None:
@@ -340,7 +340,7 @@ class Runtime:
     def hand_over(
         self, now: float, pilot: Pilot, guide: Guide, *, arm: bool, recorder: Recorder | None = None
     ) -> None:
-        """Disarm, and begin anew with another pilot and guide, once all stands for arming again.
+        """Disarm, and restart with another pilot and guide, once arming is possible again.
 
         Args:
             now: Robot's clock [s].
@@ -380,7 +380,7 @@ class Runtime:
         self.start(now)
 
     def _unseen(self, now: float) -> str:
-        """Which picture the pilot needs and the robot does not have, or only one that is too old; empty for none."""
+        """Return the picture that the pilot needs and the robot lacks, or only has too old; empty for none."""
         for name in getattr(self.pilot, "pictures", ()):
             if name not in self.intake.pictures:
                 return f"no picture of {name} yet"
@@ -421,10 +421,12 @@ class Runtime:
             )  # fmt: skip
 
     def _asked(self, now: float, reading: Reading) -> Array | None:
-        """What the pilot wants; None, and the vehicle stopped, where it fails."""
+        """Return the pilot's thrust; None, and the vehicle stopped, if it fails."""
         try:
             force = np.asarray(self.pilot.act(reading, self.guide, now - self.started), float)
-        except Exception as error:  # whatever a pilot does wrong, the thrusters must stop and the loop go on
+        except (
+            Exception
+        ) as error:  # whatever a pilot does wrong, the thrusters must stop and the loop continue
             self.bridge.stop(now, f"pilot {self.pilot.name} failed: {' '.join(str(error).split())[:200]}")
             return None
         if force.shape != self.force.shape or not np.isfinite(force).all():

@@ -1,4 +1,4 @@
-"""Vehicles tell each other where they are: a datagram each, and what is known of the others from them.
+"""Exchange of estimates between vehicles: one datagram each, and tracks of the others from them.
 
 What is sent is the sender's name and its estimate: an acoustic modem, a radio on a float or a computer beside the pool
 carries it. What has not arrived is not known; how old it is, is.
@@ -51,7 +51,7 @@ def encode_track(name: str, track: Track, now: float) -> bytes:
 
 
 def decode_track(data: bytes, now: float) -> tuple[str, Track] | None:
-    """Name and track of a datagram that has just come; None where it is no such datagram, or says what cannot be.
+    """Return name and track of a received datagram; None if it is no such datagram, or impossible.
 
     Args:
         data: The datagram.
@@ -113,7 +113,7 @@ class Team:
                 self.tracks[name] = track
 
     def known(self, reading: Reading) -> Reading:
-        """The reading with what is known of the others; not ready before all have been heard of.
+        """Return the reading with the tracks of the others; not ready before all have been received.
 
         However old a message is, it stands, as in training: who is lost stops alone.
         """
@@ -124,7 +124,7 @@ class Team:
         return replace(reading, ready=False, reason=f"nothing heard of {', '.join(missing)}")
 
     def tell(self, now: float, reading: Reading) -> list[bytes]:
-        """What to send now: nothing while it is not this vehicle's turn, or while it does not know where it is."""
+        """Return the datagrams to send now: none out of this vehicle's turn, or while its position is unknown."""
         if self._ticks is None:
             self._ticks = Ticks(now + self._turn)
         due, _ = self._ticks.due(now, self._period)

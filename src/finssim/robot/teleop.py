@@ -57,14 +57,14 @@ class TeleopError(ValueError):
 
 @dataclass(frozen=True)
 class Hands:
-    """What a device shows at one time. Axes are in [-1, 1]: forward, left, up, turn left."""
+    """State of a device at one time. Axes are in [-1, 1]: forward, left, up, turn left."""
 
     surge: float = 0.0
     sway: float = 0.0
     heave: float = 0.0
     yaw: float = 0.0
     dead_man: bool = False
-    """Whether somebody holds on: without it there is no thrust."""
+    """True if the dead-man switch is held: without it there is no thrust."""
     precision: bool = False
     boost: bool = False
     arm: bool = False
@@ -76,7 +76,7 @@ class Hands:
     mode: bool = False
     """The button that hands over to the other pilot is down."""
     present: bool = True
-    """Whether the device is there."""
+    """True if the device is connected."""
 
     @property
     def gear(self) -> Gear:
@@ -101,7 +101,7 @@ def shaped(deflection: Array, dead_band: float = DEAD_BAND, expo: float = EXPO) 
 
 @dataclass(frozen=True)
 class TeleopCommand:
-    """What a person wants now."""
+    """Command of a person now."""
 
     wrench: Array = field(default_factory=lambda: np.zeros(6))
     """Body frame [N, N m], (6,)."""
@@ -114,10 +114,10 @@ class TeleopCommand:
 
 
 class Device(Protocol):
-    """A gamepad, a keyboard, or what stands in for one."""
+    """A gamepad, a keyboard, or a replacement for one."""
 
     def read(self, now: float) -> Hands | None:
-        """What it shows now [s]; None where it has not been heard since the last call. Never waits."""
+        """Return its state now [s]; None without news since the last call. Never waits."""
 
 
 class Operator:
@@ -149,7 +149,7 @@ class Operator:
         return self.command.wrench
 
     def look(self, now: float) -> TeleopCommand:
-        """What the person wants at a time [s]."""
+        """Return the person's command at a time [s]."""
         hands, before = self.device.read(now), self._before
         if hands is not None and hands.present:
             self._heard = now
@@ -163,7 +163,7 @@ class Operator:
         return TeleopCommand(hands.wrench, hands.gear, hands.stop, frozenset(edges))
 
     def turn(self, now: float, bridge: Bridge) -> None:
-        """Look at the device at a time [s], and arm, disarm or stop as it says."""
+        """Read the device at a time [s], and arm, disarm or stop accordingly."""
         self.command = command = self.look(now)
         armed = bridge.state in ("armed", "hold")
         waiting, self._arming = now < self._arming, self._arming if not command.stop else -math.inf
@@ -220,7 +220,7 @@ GEAR_KEYS = {"1": "precision", "2": "cruise", "3": "boost"}
 
 
 class Keys:
-    """Which keys are held: a terminal tells presses and repeats, but no release.
+    """Keys that are held: a terminal reports presses and repeats, but no release.
 
     A key counts as held for `hold` seconds after its last press, which has to be longer than the keyboard waits before
     it repeats. That is the dead-man switch too: nobody at the keys, no thrust.
@@ -250,7 +250,7 @@ class Keys:
             self._pressed.clear()
 
     def hands(self, now: float) -> Hands:
-        """What is held now."""
+        """Return the state of the held keys."""
         held = {name: value for name, (at, value) in self._pressed.items() if 0.0 <= now - at < self.hold}
         axes: dict[str, Any] = {name: held.get(name, 0.0) for name in ("surge", "sway", "heave", "yaw")}
         buttons: dict[str, Any] = {name: name in held for name in KEY_BUTTONS.values()}
@@ -325,7 +325,7 @@ class Keyboard:
         return keys
 
     def read(self, now: float) -> Hands:
-        """What is held now; never waits. A terminal that was closed is a device that is lost."""
+        """Return the state of the held keys; never waits. A terminal that was closed is a lost device."""
         for key in self.pressed():
             self.keys.press(now, key)
         return self.keys.hands(now) if self._open else Hands(present=False)
@@ -351,7 +351,7 @@ def _windows_keyboard() -> Any:
 
 
 def _windows_keys(console: Any) -> list[str]:
-    """Return the keys pressed since the last call; the console announces a special key by a character of its own."""
+    """Return the keys pressed since the last call; the console marks a special key by a prefix."""
     keys = []
     while console.kbhit():
         key = console.getwch()
@@ -373,7 +373,7 @@ STICKS = {"left_x": 0, "left_y": 1, "left_trigger": 2, "right_x": 3, "right_trig
 BUTTONS = {"stop": 1, "boost": 2, "acknowledge": 3, "dead_man": 4, "precision": 5, "mode": 6, "arm": 7}
 """Their buttons."""
 AXIS_COUNT, BUTTON_COUNT = 1 + max(STICKS.values()), 1 + max(BUTTONS.values())
-"""How many a pad has to have."""
+"""Least numbers of axes and buttons of a pad."""
 
 
 class Pad:
@@ -383,7 +383,7 @@ class Pad:
         self._moved = set[int]()
 
     def hands(self, axes: Sequence[float], buttons: Sequence[Any]) -> Hands:
-        """What the pad shows, as SDL has it: right and backwards are positive, a trigger goes from -1 to 1."""
+        """Return the pad's state, with SDL's signs: right and backwards are positive, a trigger goes from -1 to 1."""
         return Hands(
             surge=-axes[STICKS["left_y"]],
             sway=-axes[STICKS["left_x"]],
@@ -393,7 +393,8 @@ class Pad:
         )
 
     def _pulled(self, axes: Sequence[float], axis: int) -> float:
-        """How far a trigger is pulled, [0, 1]; 0, which is half way, is shown until it is moved for the first time."""
+        """Return how far a trigger is pulled, [0, 1]; 0, which is half way, is shown until it is moved for the first
+        time."""
         if axes[axis] != 0.0:
             self._moved.add(axis)
         return (axes[axis] + 1.0) / 2.0 if axis in self._moved else 0.0
@@ -441,7 +442,7 @@ class Gamepad:
         self._pygame.display.quit()
 
     def read(self, now: float = 0.0) -> Hands:
-        """What the pad shows; never waits."""
+        """Return the state of the pad; never waits."""
         for event in self._pygame.event.get():
             if event.type == self._pygame.JOYDEVICEREMOVED:
                 self._device = None
@@ -607,7 +608,7 @@ def _controller(
 
 
 def _status_line() -> Callable[[Runtime, Operator], None]:
-    """Updates one line on the terminal: state, gear, wrench, and what there is to tell."""
+    """Return a function that updates one line on the terminal: state, gear, wrench, and messages."""
     newest = -math.inf
 
     def show(runtime: Runtime, operator: Operator) -> None:

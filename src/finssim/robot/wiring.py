@@ -1,4 +1,4 @@
-"""How a robot is connected: to a motor controller and a camera in real time, or to a virtual pool in lock-step."""
+"""Connections of a robot: to a motor controller and a camera in real time, or to a virtual pool in lock-step."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def run_realtime(
     clock: Callable[[], float] = realtime.now,
     wait: Callable[[float], None] = realtime.wait,
 ) -> float:
-    """Run a robot on its wires until the time is over, `until` says so, or Ctrl-C; then stop its thrusters.
+    """Run a robot on its wires until the time is over, `until` returns true, or Ctrl-C; then stop its thrusters.
 
     Deadlines are multiples of the period since the start, so that nothing drifts. A step that is late is counted as an
     overrun; the deadlines that it missed are left out.
@@ -130,12 +130,12 @@ def _calm() -> Iterator[None]:
 
 
 POOL_ADDRESS = "udp://127.0.0.1:58766"
-"""Where the motor controller of a virtual pool on this machine listens."""
+"""Address of the motor controller of a virtual pool on this machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wiring:
-    """How the robot is connected."""
+    """Connection of the robot."""
 
     robot: str = "pool"
     """Address of the motor controller or autopilot, or `pool`."""
@@ -150,7 +150,7 @@ class Wiring:
 
 
 def link_of(robot: str, vehicle: Vehicle) -> Link:
-    """Who is at the other end of an address: an autopilot at `mavlink`, else the vehicle's motor controller.
+    """Return the other end of an address: an autopilot for `mavlink`, otherwise the vehicle's motor controller.
 
     Raises:
         LinkError, ControlError: pymavlink is missing, or the vehicle has no autopilot.
@@ -167,7 +167,7 @@ def link_of(robot: str, vehicle: Vehicle) -> Link:
 
 
 class Drive(Protocol):
-    """Runs a robot on what it is connected to, until the time is over or `until` says so; returns how long [s]."""
+    """Runs a robot on its connection, until the time is over or `until` returns true; returns the duration [s]."""
 
     def __call__(
         self,

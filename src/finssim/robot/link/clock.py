@@ -16,11 +16,11 @@ _WRAP = 1 << 32
 _OVERTAKEN = 5000
 """[ms] A frame at most this much older than the newest was overtaken by it."""
 _STEP = 0.25
-"""[s] Frames earlier than the line by more, or all later in a whole second, come from a clock that was moved."""
+"""Frames earlier than the line by more [s], or all later for a second, come from a clock that was moved."""
 _SECOND = 1.0
 """[s] Of each such span, the frame with the least delay is kept."""
 _BASELINE = 5.0
-"""[s] A drift is told from a span of the kept frames of at least this."""
+"""Least span of the kept frames from which a drift is estimated [s]."""
 
 
 class ClockMap:
@@ -75,7 +75,7 @@ class ClockMap:
         return min(arrival, self._line(m))
 
     def _began_anew(self, mcu_ms: int, arrival: float) -> bool:
-        """Whether a controller that made the newest frame can since have started and counted so far."""
+        """Return whether a controller that made the newest frame can since have started and counted so far."""
         since = arrival - self._line(self._time)
         return self._newest is not None and mcu_ms < self._newest and 0.001 * mcu_ms <= since + _STEP
 
@@ -84,7 +84,7 @@ class ClockMap:
         return m + self.drift * m + self._offset
 
     def _restart(self, mcu_ms: int, m: float, arrival: float) -> float:
-        """Begin anew with one frame, keeping the drift, which belongs to the two crystals."""
+        """Restart with one frame, keeping the drift, which belongs to the two crystals."""
         self._newest, self._time, self._second = mcu_ms, m, arrival
         self._kept = deque([(m, arrival - m)])
         self._offset = arrival - m - self.drift * m
@@ -103,7 +103,7 @@ class ClockMap:
         return late - self.drift * m
 
     def _all_late(self) -> bool:
-        """Whether not one frame of the last second came near the line."""
+        """Return whether no frame of the last second came near the line."""
         return self._relative(self._kept[-1]) > self._offset + _STEP
 
     def _next_second(self, m: float, arrival: float) -> None:

@@ -21,11 +21,11 @@ import numpy.typing as npt
 
 from finssim.robot.messages import CommandEcho, NavigationAid, Telemetry, ThrusterCommand
 
-# What a frame is made of: fields in the order of the wire, and the one description that writes and reads them.
+# Fields of a frame in the order of the wire: the one description that writes and reads them.
 
 
 class LinkError(ValueError):
-    """An address or a message is refused; the text says what, where and what to do."""
+    """An address or a message is refused; the text states what, where and what to do."""
 
 
 class Field(NamedTuple):
@@ -34,11 +34,11 @@ class Field(NamedTuple):
     name: str
     """Attribute of the message, or of the frame alone where it has a `constant`."""
     code: str
-    """As `struct` has it: ? B H I f."""
+    """Code of `struct`: ? B H I f."""
     meaning: str
-    """With its unit, for the table of the documentation."""
+    """Meaning with its unit, for the table of the documentation."""
     values: int = 1
-    """How many values; 0: one per motor output."""
+    """Number of values; 0: one per motor output."""
     constant: int | None = None
     """Value that is always sent; None: the message's."""
     order: tuple[int, ...] = ()
@@ -51,7 +51,7 @@ class Layout:
 
     title: str
     message: type
-    """What it is decoded to."""
+    """Type that it is decoded to."""
     magic: bytes
     header: tuple[Field, ...]
     """A field `length` counts the bytes of the payload."""
@@ -171,8 +171,9 @@ def _codes(fields: tuple[Field, ...], outputs: int) -> str:
 
 @lru_cache(maxsize=64)
 def _crc_terms(length: int) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.int64], int]:
-    """What each byte of a message of that length adds to its CRC: 256 numbers per place in a row, where each place
-    begins in them, and the CRC of zeros alone. The CRC is linear: all that is added is added by exclusive or."""
+    """Return the contribution of each byte of a message of that length to its CRC: 256 numbers per place in a row, the
+    start of each place in them, and the CRC of zeros alone. The CRC is linear: contributions are combined by exclusive
+    or."""
     single = np.arange(256, dtype=np.uint16)
     for _ in range(8):
         single = np.where(single & 1, (single >> 1) ^ 0xA001, single >> 1).astype(np.uint16)
@@ -196,7 +197,7 @@ def crc16_modbus(data: bytes) -> int:
 
 @dataclass(frozen=True)
 class DebugConfig:
-    """What the host asks the motor controller to send beside telemetry."""
+    """Messages that the host requests from the motor controller besides telemetry."""
 
     sequence: int
     """Counts up, modulo 2¹⁶."""
@@ -247,7 +248,7 @@ def command_count(flags: int) -> int:
 
 
 def _head(kind: int) -> tuple[Field, ...]:
-    """What telemetry, echo and debug configuration begin with after their magic."""
+    """Return the first fields of telemetry, echo and debug configuration after their magic."""
     return (
         Field("type", "B", "kind of frame", constant=kind),
         Field("version", "B", "of the layout", constant=1),
@@ -379,13 +380,13 @@ def _outputs(values: Sequence[float]) -> int:
     return len(values)
 
 
-# Frames out of a stream of bytes: whole or in parts, with garbage between them, and never a wrong one.
+# Frames from a stream of bytes: complete or in parts, with garbage between them, and never a wrong one.
 
 
 HOST = (TELEMETRY, ECHO, NAVIGATION)
-"""What the robot's computer listens for."""
+"""Frames that the robot's computer reads."""
 MCU = (COMMAND, DEBUG_CONFIG)
-"""What the motor controller listens for."""
+"""Frames that the motor controller reads."""
 
 _HEADER = 6
 """Bytes of magic, type, version and length."""
@@ -421,7 +422,7 @@ class Decoder:
 
     @property
     def counts(self) -> dict[str, int | dict[str, int]]:
-        """What has been accepted and refused so far."""
+        """Return the numbers of accepted and refused frames so far."""
         return {"accepted": dict(self.accepted), **self.refused, "skipped_bytes": self.skipped_bytes}
 
     def feed(self, data: bytes) -> list[Message]:
@@ -452,7 +453,7 @@ class Decoder:
         return messages
 
     def _frame(self, data: bytes, at: int) -> Form | str | None:
-        """The frame that begins at a magic, why none does, or None while too few bytes have come to tell."""
+        """Return the frame that begins at a magic, why none does, or None while there are too few bytes to decide."""
         form = self._plain.get(data[at])
         if form is None:
             prefix = data[at : at + _HEADER]
@@ -495,11 +496,11 @@ class McuLink:
         return self._decoder.feed(data)
 
     def prepare(self, now: float) -> str:
-        """Nothing stands between the bridge and the motors."""
+        """Return "": no device is between the bridge and the motors."""
         return ""
 
     def alarm(self, now: float) -> str:
-        """Nobody else can take the vehicle; what its telemetry says is for the bridge."""
+        """Return "": no other device can control the vehicle; the bridge checks its telemetry."""
         return ""
 
     def encode(self, now: float, command: ThrusterCommand, state: str) -> list[bytes]:

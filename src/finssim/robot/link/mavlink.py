@@ -50,8 +50,8 @@ PARAMETERS = ("JS_GAIN_DEFAULT", "JS_THR_GAIN", "BARO1_GND_PRESS", "BARO2_GND_PR
 MANUAL_PERIOD, HEARTBEAT_PERIOD, ASK_AGAIN = 0.03, 1.0, 0.5
 """Between two frames of axes, two heartbeats, and two attempts at the same request [s]."""
 REQUEST_LASTS = 3.0
-"""Whoever asked to arm so long ago is still waited for, at neutral axes, before the autopilot is disarmed again [s]: a
-person presses a key twice, and `ros2 service call` takes its time."""
+"""Time for which a request to arm is still waited for, at neutral axes, before the autopilot is disarmed again [s]: a
+person presses a key twice, and `ros2 service call` takes some time."""
 SELDOM, SMOOTH = 2.0, 0.2
 """Mean time between two messages, part of that asked for, at which they come too seldom; how much the newest counts."""
 PATIENCE = 3.0
@@ -61,23 +61,24 @@ HEARTBEAT_LOST = 3.0
 REMEMBERED = 1.0
 """Inputs that were sent so long ago may still be reported as received [s]."""
 STRANGE, STRANGERS, OF = 12.0, 2, 4
-"""Difference from every input that was sent at which one is somebody else's [µs], and how many of the last reports make
-it certain: two pilots take turns."""
+"""Difference from every sent input at which an input is another pilot's [µs], and how many of the last reports confirm
+it: two pilots take turns."""
 OTHERS = (
     "manual control from elsewhere, or our frames are lost: the autopilot receives other inputs than ours"
 )
 HEADING_PERIOD = 0.2
 """Between headings that are taken from the autopilot's attitude [s]."""
 DVL_FRESH = 1.0
-"""With a report of the Doppler log this new, the autopilot's own velocity is not used [s]."""
+"""Age of a report of the Doppler log up to which the autopilot's own velocity is not used [s]."""
 CRITICAL = 5
 """HEARTBEAT.system_status of a failsafe."""
 AIDED, NOT_AIDED = 2, 128
 """EKF_STATUS_REPORT.flags: horizontal velocity is known; position is held by assumption."""
 ACCELEROMETER_RANGE = 16000
-"""Of the autopilots' instruments [mg]: of spoiled frames one in 65 536 passes, and the estimator trusts this."""
+"""Greatest acceleration of the autopilots' instruments [mg]: of damaged frames one in 65 536 passes, and the estimator
+trusts it."""
 STANDARD_ATMOSPHERE = 101325.0
-"""At the surface, until the autopilot tells its own [Pa]."""
+"""Pressure at the surface, until the autopilot reports its own [Pa]."""
 G = 9.80665
 
 
@@ -137,7 +138,7 @@ class MavlinkLink:
         self._forget()
 
     def _forget(self) -> None:
-        """As before the autopilot's first word."""
+        """Reset to the state before the autopilot's first message."""
         self.mode: int | None = None
         self.armed, self.says, self._failing = False, "", False
         self._alive = self._boot_ms = -math.inf
@@ -253,7 +254,7 @@ class MavlinkLink:
         return []
 
     def _inputs(self, now: float, m: Any) -> list[Message]:
-        """Whose inputs the autopilot received: ours, or somebody's who steers too."""
+        """Return a message if the inputs that the autopilot received are another pilot's."""
         if not self._sent or now - self._sent[-1][0] > REMEMBERED:
             return []
         inputs = np.array([getattr(m, f"chan{i}_raw") for i in range(1, 7)], float)
@@ -265,7 +266,7 @@ class MavlinkLink:
         return []
 
     def _velocity(self, now: float, m: Any) -> list[Message]:
-        """The autopilot's own velocity, where it has one and no Doppler log speaks to us."""
+        """Return the autopilot's own velocity, if it has one and no Doppler log reports."""
         v = (m.vx, m.vy, m.vz)
         if now - self._dvl_at < DVL_FRESH or now - self._aided_at > 2.0 or not all(map(math.isfinite, v)):
             return []
@@ -309,7 +310,7 @@ class MavlinkLink:
     # -- what is asked of it ----------------------------------------------------------------------------------
 
     def prepare(self, now: float) -> str:
-        """Bring the autopilot to where commands count: mode MANUAL, armed. Only for somebody who means to arm.
+        """Bring the autopilot to where commands count: mode MANUAL, armed. Call it only to arm.
 
         Returns:
             "" once it is; until then in a sentence what is waited for.
@@ -337,7 +338,8 @@ class MavlinkLink:
         return ""
 
     def alarm(self, now: float) -> str:
-        """What has taken the vehicle out of our hands, in a sentence; "" while nothing has. Asked while it is armed."""
+        """Return why the vehicle is no longer under our control, in a sentence; "" while it is. Called while it is
+        armed."""
         if now - self._alive > HEARTBEAT_LOST:
             return f"no heartbeat from the autopilot for {HEARTBEAT_LOST:g} s"
         if self._others:
@@ -370,7 +372,7 @@ class MavlinkLink:
         frames += self._questions(now)
         running, requested = state in ("armed", "hold"), now - self._wanted < REQUEST_LASTS
         if self._others or not (running or requested or self._ours):
-            return frames  # somebody else has the vehicle, or nobody asked for it
+            return frames  # another pilot controls the vehicle, or it was not requested
         if now - self._manual_at >= MANUAL_PERIOD - 1e-6 or not running:
             self._manual_at = now
             frames.append(self._axes(now, command))

@@ -1,4 +1,4 @@
-"""How frames travel: to the motor controller over UDP or a serial line, or between two ends in memory."""
+"""Transports of frames: to the motor controller over UDP or a serial line, or between two ends in memory."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _DATAGRAM = 2048
 _DATAGRAMS_AT_ONCE = 1024
 """Datagrams taken by one call, so that a flood cannot hold the loop up."""
 _SILENT = 5.0
-"""A peer that was not named has gone when it said nothing for so long [s]."""
+"""Silence after which a peer that was not named counts as gone [s]."""
 _NAMED = 64
-"""Refused senders that are told apart; those beyond are counted together."""
+"""Greatest number of refused senders that are counted separately; further ones are counted together."""
 
 
 class UdpTransport:
@@ -114,7 +114,9 @@ class UdpTransport:
                 data, sender = self._socket.recvfrom(self._longest)
             except BlockingIOError:
                 break
-            except ConnectionError:  # how some systems tell that an earlier datagram found nobody
+            except (
+                ConnectionError
+            ):  # some systems report in this way that an earlier datagram had no receiver
                 continue
             except OSError:  # closed
                 break
@@ -174,7 +176,7 @@ def _name(address: Address) -> str:
 
 
 State = TypeVar("State")
-"""What a server remembers of a client."""
+"""State of a client that a server keeps."""
 
 
 def bound_socket(kind: int, address: tuple[str, int]) -> socket.socket:
@@ -326,7 +328,7 @@ class SerialTransport:
             self._lose(problem)
 
     def receive(self) -> list[bytes]:
-        """What has come, as one piece or none; opens a lost device again when it is time."""
+        """Return the received bytes, as one piece or none; open a lost device again when it is time."""
         if not self._ready():
             return []
         try:
@@ -337,7 +339,7 @@ class SerialTransport:
         return [data] if data else []
 
     def close(self) -> None:
-        """Close the device for good."""
+        """Close the device permanently."""
         self._closed = True
         self._drop()
 
@@ -347,7 +349,7 @@ class SerialTransport:
         return f"serial {self.device} at {self.baud} baud, {state}"
 
     def _ready(self) -> bool:
-        """Whether there is a line, after an attempt to open it if one is due."""
+        """Return whether there is a line, after an attempt to open it if one is due."""
         now = self._clock()
         if self._port is None and not self._closed and now >= self._next_try:
             self._next_try = now + self.retry
@@ -392,7 +394,7 @@ def _opened(device: str, baud: int) -> Any:
 
 
 def _problems(*more: type[Exception]) -> tuple[type[Exception], ...]:
-    """What a lost device raises: `termios.error` is no OSError, and other systems have none."""
+    """Return the exceptions of a lost device: `termios.error` is no OSError, and other systems have none."""
     try:
         from termios import error
     except ImportError:
@@ -401,7 +403,7 @@ def _problems(*more: type[Exception]) -> tuple[type[Exception], ...]:
 
 
 def _written(port: Any, data: bytes) -> int:
-    """Bytes that the line took at once; pyserial's own `write` waits on POSIX, whatever its timeout."""
+    """Return the number of accepted bytes; pyserial's own `write` waits on POSIX, whatever its timeout."""
     return os.write(port.fileno(), data) if os.name == "posix" else int(port.write(data))
 
 
@@ -409,8 +411,8 @@ def _written(port: Any, data: bytes) -> int:
 
 
 _SILENCE, _RETRY, _PATIENCE = 5.0, 1.0, 3.0
-"""A server that says nothing for so long has gone (an unplugged cable ends no connection); between attempts to reach
-it; longest wait for an attempt [s]."""
+"""Silence after which a server counts as gone (an unplugged cable ends no connection); time between attempts to reach
+it; longest duration of an attempt [s]."""
 _MOST_AT_ONCE = 1 << 18
 """Bytes taken by one call, so that a flood cannot hold the loop up."""
 
@@ -424,7 +426,7 @@ class TcpTransport:
     """
 
     title = "tcp"
-    """What is at the other end, for messages."""
+    """Name of the other end in messages."""
 
     def __init__(self, peer: Address, *, clock: Callable[[], float] = time.monotonic) -> None:
         """
@@ -441,11 +443,11 @@ class TcpTransport:
         self._socket: socket.socket | None = None
 
     def pieces(self, data: bytes | None) -> list[bytes]:
-        """What to give for bytes that came; None: a new connection begins."""
+        """Return the pieces of received bytes; None: a new connection begins."""
         return [data] if data else []
 
     def receive(self) -> list[bytes]:
-        """What has come since the last call, oldest first."""
+        """Return what was received since the last call, oldest first."""
         if not self._ready():
             return []
         assert self._socket is not None  # it is ready
@@ -466,7 +468,7 @@ class TcpTransport:
         return pieces
 
     def send(self, data: bytes) -> None:
-        """Send bytes; what cannot leave whole is counted."""
+        """Send bytes; what cannot be sent completely is counted."""
         try:
             if not self._ready() or self._socket is None or self._socket.send(data) < len(data):
                 self.send_errors += 1
@@ -474,17 +476,17 @@ class TcpTransport:
             self.send_errors += 1
 
     def close(self) -> None:
-        """Leave for good."""
+        """Close the connection permanently."""
         self._closed = True
         self._drop()
 
     def describe(self) -> str:
-        """Where the other end is and whether it is there."""
+        """Return the address of the other end and whether it is connected."""
         state = "closed" if self._closed else "connected" if self.connected else "not connected"
         return f"{self.title} at {_name(self.peer)}, {state}"
 
     def _ready(self) -> bool:
-        """Whether there is a connection, after the next step of making one."""
+        """Return whether there is a connection, after the next step of making one."""
         now = self._clock()
         if self._socket is None and not self._closed and now >= self._next_try:
             self._next_try, self._since = now + _RETRY, now
@@ -527,7 +529,7 @@ class _Beside:
         self.send = wire.send
 
     def receive(self) -> list[bytes]:
-        """What came over both."""
+        """Return what was received over both."""
         return [data for wire in self._wires for data in wire.receive()]
 
     def close(self) -> None:
@@ -542,17 +544,17 @@ class _Beside:
 
 @dataclass(frozen=True)
 class MavlinkAddress:
-    """Where an autopilot is: `mavlink://KIND:...?dvl=HOST:PORT&key=FILE`, KIND udpin, udpout, tcp or serial."""
+    """Address of an autopilot: `mavlink://KIND:...?dvl=HOST:PORT&key=FILE`, KIND udpin, udpout, tcp or serial."""
 
     kind: str
     where: str
     dvl: str = ""
     """HOST or HOST:PORT of a Water Linked log; empty: none."""
     key: bytes = b""
-    """Of signing; empty: none."""
+    """Key of signing; empty: none."""
 
     DEFAULT = "udpin:127.0.0.1:14550"
-    """Where the autopilot of a virtual pool on this machine sends to, and its log."""
+    """Addresses to which the autopilot of a virtual pool on this machine sends, and of its log."""
 
     @classmethod
     def of(cls, address: str) -> MavlinkAddress:
@@ -580,7 +582,7 @@ class MavlinkAddress:
         return cls(kind, target, options.get("dvl", "" if rest else "127.0.0.1"), key)
 
     def open(self) -> Transport:
-        """The wire, with the log's beside it.
+        """Return the wire, together with the log's.
 
         Raises:
             LinkError: It cannot be opened.
@@ -641,7 +643,7 @@ class MemoryTransport:
             self._outbox.append(bytes(data))
 
     def receive(self) -> list[bytes]:
-        """What the other end has sent, oldest first."""
+        """Return what the other end has sent, oldest first."""
         received = list(self._inbox) if self._open else []
         self._inbox.clear()
         return received
@@ -651,7 +653,7 @@ class MemoryTransport:
         self._open = False
 
     def describe(self) -> str:
-        """In memory, open or closed."""
+        """Return that it is in memory, open or closed."""
         return "in memory" if self._open else "in memory, closed"
 
 

@@ -37,7 +37,7 @@ _LONGEST_LINE = 1 << 16
 
 @dataclass(frozen=True)
 class DvlVelocity(NavigationAid):
-    """A velocity over the floor, with what else its report tells."""
+    """A velocity over the floor, with the other values of its report."""
 
     altitude: float
     """Distance to the floor along the log's z axis [m]; NaN if not reported."""
@@ -97,7 +97,7 @@ def _number(value: Any, lowest: float, highest: float) -> float:
 
 
 BEAM_ANGLE = math.radians(22.5)
-"""Of the four beams from the log's z axis [rad]."""
+"""Angle of the four beams from the log's z axis [rad]."""
 _AZIMUTHS = np.radians([45.0, 135.0, 225.0, 315.0])
 _ACROSS = math.tan(BEAM_ANGLE) * np.stack([np.cos(_AZIMUTHS), np.sin(_AZIMUTHS)], axis=1)
 _BEAMS = math.cos(BEAM_ANGLE) * np.column_stack([_ACROSS, np.ones(4)])
@@ -155,7 +155,7 @@ def _line(value: dict[str, Any]) -> bytes:
 
 
 class _Lines:
-    """A stream of bytes as whole lines; one that grows beyond `_LONGEST_LINE` is dropped."""
+    """Complete lines of a stream of bytes; one that grows beyond `_LONGEST_LINE` is dropped."""
 
     def __init__(self) -> None:
         self._rest, self._skipping = b"", False
@@ -172,7 +172,7 @@ class _Lines:
 
 
 class DvlClient(TcpTransport):
-    """The connection to a log, a `Transport` of whole lines."""
+    """The connection to a log, a `Transport` of complete lines."""
 
     title = "Water Linked DVL"
 
@@ -190,7 +190,7 @@ class DvlClient(TcpTransport):
         self._lines = _Lines()
 
     def pieces(self, data: bytes | None) -> list[bytes]:
-        """The lines that these bytes end; None begins anew."""
+        """Return the lines that these bytes complete; None restarts."""
         if data is None:
             self._lines = _Lines()
         return [] if data is None else self._lines.feed(data)
