@@ -37,11 +37,11 @@ from finssim.vehicles import AXES, Vehicle, VehicleError, load_vehicle
 if TYPE_CHECKING:
     from rich.console import Console
 
-# What holds between the trials of a set: vehicles, roles, names, what all of them tell together.
+# Checks between the trials of a set: vehicles, roles, names, and what they determine together.
 
 
 def identified_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> list[str]:
-    """Names of the trials that tell a parameter of an axis; held-out and refused ones do not count."""
+    """Return the names of the trials that determine a parameter of an axis; held-out and refused ones do not count."""
     return [
         report.name
         for report in reports
@@ -79,12 +79,12 @@ def set_findings(reports: Sequence[TrialReport]) -> list[Finding]:
     return findings
 
 
-# What a check of trials says, as data.
+# Result of a check of trials, as data.
 
 Verdict = Literal["usable", "usable with care", "refused"]
 
 PARAMETERS = ("m_eff", "d1", "d2", "k", "buoyancy")
-"""What a trial may tell of an axis; k of roll and pitch, buoyancy of heave."""
+"""Parameters that a trial may determine of an axis; k of roll and pitch, buoyancy of heave."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ class StreamReport:
 
 @dataclass(frozen=True, kw_only=True)
 class Identifiability:
-    """Whether a trial tells a parameter."""
+    """Result for one parameter: whether a trial determines it, and why."""
 
     can: bool
     why: str
@@ -119,13 +119,13 @@ class AxisReport:
 
     axis: str
     source: str
-    """Of the velocity: measured, derived from ..., or nothing."""
+    """Source of the velocity: measured, derived from ..., or nothing."""
     fastest: float = np.nan
     """95th percentile of the speed [m/s, rad/s]."""
     noise: float = np.nan
-    """Of one velocity sample [m/s, rad/s]."""
+    """Noise of one velocity sample [m/s, rad/s]."""
     decades: float = 0.0
-    """log10 of the fastest over the slowest speed that stands out of the noise."""
+    """log10 of the fastest over the slowest speed above the noise."""
     strongest: float = 0.0
     """95th percentile of the wrench [N, N m]."""
     work: float = 0.0
@@ -139,7 +139,7 @@ class AxisReport:
     """Time without input and motion [s]."""
     excited: bool = False
     tells: dict[str, Identifiability] = field(default_factory=dict)
-    """By parameter."""
+    """Identifiability by parameter."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +153,7 @@ class TrialReport:
     """[s]"""
     rows: int = 0
     inputs: str = ""
-    """What drove it: rpm, force, tau, pwm, command, passive, or nothing."""
+    """Kind of input: rpm, force, tau, pwm, command, passive, or nothing."""
     streams: tuple[StreamReport, ...] = ()
     axes: tuple[AxisReport, ...] = ()
     findings: tuple[Finding, ...] = ()
@@ -161,7 +161,7 @@ class TrialReport:
 
     @property
     def verdict(self) -> Verdict:
-        """By the worst finding."""
+        """Return the verdict of the worst finding."""
         levels = {finding_.severity for finding_ in self.findings}
         return "refused" if "refused" in levels else "usable with care" if "care" in levels else "usable"
 
@@ -260,7 +260,8 @@ def _axes(axes: Sequence[AxisReport]) -> Table:
 
 
 def _identifiability_table(axes: Sequence[AxisReport]) -> Table:
-    """What each axis tells, and why not the rest; reasons that several share are said once."""
+    """Return a table of what each axis determines, and the reasons for the rest; reasons that several share are listed
+    once."""
     grid = Table.grid(padding=(0, 1))
     for a in axes:
         by_reason: dict[tuple[bool, str], list[str]] = {}
@@ -351,7 +352,7 @@ def _report(trial: Trial, names: tuple[str, ...]) -> StreamReport:
 
 
 def _sampling(report: StreamReport) -> list[Finding]:
-    """What is wrong with the times of a stream."""
+    """Return findings about the times of a stream."""
     findings = []
     much = report.missing > LONGEST_MISSING
     if report.gaps == 1:
@@ -410,7 +411,7 @@ def _values(trial: Trial, name: str) -> list[Finding]:
 
 
 def _coarse(y: Array) -> bool:
-    """Whether a signal moves over so few steps of its resolution that it repeats values by itself."""
+    """Return whether a signal has so coarse a resolution that it repeats values."""
     steps = np.abs(np.diff(np.unique(y)))
     return bool(np.ptp(y) < COARSE * steps.min())
 
@@ -422,7 +423,8 @@ OFTEN = 0.05
 
 
 def input_findings(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
-    """What was assumed of the inputs, time at the limits, in the dead zones and beyond what the thrusters can give."""
+    """Return findings about the inputs: assumptions, time at the limits, in the dead zones and beyond the thrusters'
+    reach."""
     findings = list(inputs.findings)
     if inputs.source == "passive":
         return findings
@@ -495,16 +497,16 @@ def _thrusters(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
 
 
 def _in_dead_zone(rpm: Array, lowest: float, highest: float) -> float:
-    """Part of the driven time in which a shaft would stand still."""
+    """Return the share of the driven time in which a shaft would not turn."""
     driven = np.abs(rpm) > 1.0
     inside = (rpm > 0.95 * lowest) & (rpm < 0.95 * highest) & driven
     return float(inside.sum() / max(1, driven.sum()))
 
 
-# What a trial tells of an axis, parameter by parameter, and why not.
+# Identifiability of each parameter of an axis in a trial, with the reasons.
 
 SEPARATE = 0.6
-"""Decades of speed that linear and quadratic damping need to be told apart."""
+"""Decades of speed that are needed to distinguish linear and quadratic damping."""
 
 LEAST_TILT = np.radians(1.0)
 """Standard deviation of an angle that its restoring moment needs [rad]."""
@@ -517,7 +519,7 @@ LEAST_INERTIA = 0.05
 
 
 def with_identifiability(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> AxisReport:
-    """The report with what the axis tells."""
+    """Return the report with the identifiability of the axis."""
     specific = {"k": ("roll", "pitch"), "buoyancy": ("heave",)}
     names = [name for name in PARAMETERS if report.axis in specific.get(name, AXES)]
     if blocked := _blocked(report, inputs):
@@ -533,7 +535,7 @@ def with_identifiability(report: AxisReport, motion: Motion, inputs: Drive, vehi
 
 
 def _blocked(report: AxisReport, inputs: Drive) -> str:
-    """Why the axis tells nothing at all, or nothing."""
+    """Return why the axis determines nothing at all, or nothing."""
     if not report.source:
         return f"no velocity: {NO_VELOCITY[report.axis]}"
     if not np.isfinite(report.fastest):
@@ -569,7 +571,7 @@ def _damping(report: AxisReport) -> dict[str, tuple[bool, str]]:
 
 
 def _passive_identifiability(report: AxisReport) -> dict[str, tuple[bool, str]]:
-    """Parameter -> whether a trial without thrust tells it, and why."""
+    """Return for each parameter whether a trial without thrust determines it, and why."""
     force = {"heave": "buoyancy excess", "roll": "restoring moment", "pitch": "restoring moment"}.get(
         report.axis
     )
@@ -584,7 +586,7 @@ def _passive_identifiability(report: AxisReport) -> dict[str, tuple[bool, str]]:
 def _driven_identifiability(
     report: AxisReport, motion: Motion, vehicle: Vehicle
 ) -> dict[str, tuple[bool, str]]:
-    """Parameter -> whether a trial with inputs tells it, and why."""
+    """Return for each parameter whether a trial with inputs determines it, and why."""
     i, q = AXES.index(report.axis), motion.quaternion
     n = max(1, round(SHORT * motion.rate))
     change = np.abs(motion.nu[n:, i] - motion.nu[:-n, i])
@@ -618,7 +620,7 @@ def _driven_identifiability(
 # Whether a trial's numbers agree with each other: units, signs, axes.
 
 RATE = 25.0
-"""Of the grid on which columns are compared [Hz]."""
+"""Rate of the grid on which columns are compared [Hz]."""
 
 AGAINST = -0.5
 """Correlation below which two columns that should agree run against each other."""
@@ -657,7 +659,7 @@ GYRO_BIAS = 0.03
 
 
 def unit_findings(trial: Trial) -> list[Finding]:
-    """Angles in degrees, told from values that radians cannot have."""
+    """Return findings about angles in degrees, recognised by values that radians cannot have."""
     findings = []
     for name, limit in (("roll", 1.05 * np.pi), ("pitch", 0.55 * np.pi)):
         _, y = trial.series(name)
@@ -776,7 +778,7 @@ def _heading(trial: Trial) -> list[Finding]:
     if not {"roll", "pitch"} & set(named) and _tilts_unseen(trial):
         return []
     rate = (q_at * np.sin(phi) + r * np.cos(phi)) / np.maximum(np.cos(theta), STEEP)
-    # A gap of the gyro hides a turn, and a vehicle on its nose has no heading: each stretch begins anew.
+    # A gap of the gyro hides a turn, and a vehicle on its nose has no heading: each stretch starts again.
     step = np.diff(t)
     wide = (step > longest_step(t)) | (np.cos(theta[1:]) < STEEP) | (np.cos(theta[:-1]) < STEEP)
     turns = np.where(wide, 0.0, 0.5 * (rate[1:] + rate[:-1]) * step)
@@ -907,7 +909,7 @@ def _stands_out(rates: Array, samples: Array) -> bool:
 
 
 def _against(found: Relation) -> bool:
-    """Return whether a signal is surely the negative of another that it should equal, rather than noise beside it."""
+    """Return whether a signal is significantly the negative of another that it should equal."""
     return found.correlation < AGAINST and found.sure and -NEGATIVE < found.slope < -1.0 / NEGATIVE
 
 
@@ -926,20 +928,20 @@ LEAST_WRENCH = 0.01
 """Part of what the vehicle can give below which an axis is not driven."""
 
 LONG_PUSH = 3.0
-"""Time of input after which its work says something of its sign [s]."""
+"""Time of input after which its work is significant for its sign [s]."""
 
 HOLD = 0.5
 """[s]"""
 
 UNLIKELY = 0.01
-"""Chance below which a speed answers its wrench, where the work says the same."""
+"""Probability below which a speed responds to its wrench, if the work agrees."""
 
 ANSWERS = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Time constants of the speeds of vehicles [s]."""
 
 
 def axis_reports(motion: Motion, inputs: Drive, vehicle: Vehicle) -> list[AxisReport]:
-    """One report per axis, without what it tells."""
+    """Return one report per axis, without identifiability."""
     passive = inputs.source == "passive"
     return [_axis(i, motion, passive, vehicle) for i in range(6)]
 
@@ -1028,7 +1030,7 @@ def work_findings(
 
 
 def _answer(nu: Array, tau: Array, rate: float) -> Relation:
-    """Return how a speed follows its wrench through a lag of first order, apart from a constant push and the start.
+    """Return how a speed follows its wrench through a first-order lag, besides a constant force and the start.
 
     The lag is the one of `ANSWERS` that explains most; the significance allows for the choice.
     """
@@ -1148,7 +1150,7 @@ def _header_vehicle(trial: Trial, findings: list[Finding]) -> Vehicle | None:
 
 
 def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple[str, list[AxisReport]]:
-    """What drove the vehicle, and every axis; findings are added."""
+    """Return the kind of input and the report of every axis; findings are added."""
     try:
         inputs = drive(trial, vehicle)
     except CalibrationError as error:

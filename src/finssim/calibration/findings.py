@@ -1,4 +1,4 @@
-"""What is found out about data and fits: one record for all of it, worded here alone; and the error of this package."""
+"""Findings about data and fits, with all their wordings, and the error of this package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, Literal
 import yaml
 
 Severity = Literal["refused", "care", "note"]
-"""What a finding makes of a trial or fit: nothing can rest on it; something may not; worth knowing."""
+"""Severity: refused (the trial or fit cannot be used), care (a part may not be used), note (for information)."""
 
 SEVERITIES: tuple[Severity, ...] = ("refused", "care", "note")
 """The worst first."""
@@ -47,7 +47,7 @@ class Finding:
     """Key of `wordings`."""
     severity: Severity
     subject: str = ""
-    """What it is about: a trial, file, thruster, axis or parameter; empty where that goes without saying."""
+    """Subject: a trial, file, thruster, axis or parameter; empty if it is obvious."""
     values: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Fields of the sentence, in SI or in the unit that the sentence names."""
 
@@ -60,7 +60,7 @@ class Finding:
         return f"{self.subject}: {self.text}" if self.subject else self.text
 
     def about(self, subject: str) -> Finding:
-        """The same about something, or about a part of it where it has a subject already."""
+        """Return the finding with a subject, or with a part of the subject that it has."""
         return replace(self, subject=f"{subject}: {self.subject}" if self.subject else subject)
 
     def as_json(self) -> dict[str, Any]:
@@ -100,7 +100,8 @@ def sentences(findings: Iterable[Finding]) -> list[str]:
 
 
 def plain(value: Any, digits: int = 17) -> Any:
-    """The same as JSON has it: lists, text, and numbers of so many significant digits, None where one is not finite."""
+    """Return a value in JSON's types: lists, text, and numbers of so many significant digits, None for those that are
+    not finite."""
     if isinstance(value, Mapping):
         return {key: plain(item, digits) for key, item in value.items()}
     value = value.tolist() if hasattr(value, "tolist") else value
@@ -119,7 +120,7 @@ def wordings() -> dict[str, tuple[Severity, str]]:
 
 
 class CalibrationError(ValueError):
-    """A trial, table or fit that cannot be used; the message says where, what was found and what to do.
+    """A trial, table or fit that cannot be used; the message states where, what was found and what to do.
 
     Attributes:
         subject: The trial or file that cannot be used; empty where the reason names it.
@@ -127,6 +128,6 @@ class CalibrationError(ValueError):
     """
 
     def __init__(self, reason: str, subject: str = "") -> None:
-        """What is wrong, and with which trial or file."""
+        """Make the error with its reason, and the trial or file that it concerns."""
         super().__init__(f"{subject}: {reason}" if subject else reason)
         self.reason, self.subject = reason, subject

@@ -1,4 +1,4 @@
-"""What a calibration found: estimates with intervals, what they rest on, and what could not be told."""
+"""Results of a calibration: estimates with intervals, their basis, and what could not be determined."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Estimate:
     """95 % interval; infinite or NaN ends where the data say nothing."""
     unit: str
     identifiable: bool
-    """Whether the data determine it; False also where it rests on a bound."""
+    """True if the data determine it; False also if it rests on a bound."""
     note: str = ""
-    """Why it is not identifiable, or what the number rests on."""
+    """Reason why it is not identifiable, or basis of the number."""
     path: str | None = None
     """Dotted path of the number in the vehicle file, where it has one."""
 
@@ -56,7 +56,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Correlation:
-    """How the errors of the estimates go together."""
+    """Correlation of the errors of the estimates."""
 
     names: tuple[str, ...]
     matrix: Array
@@ -104,7 +104,7 @@ class Fit:
     before: Vehicle
     """The vehicle that the fit started from."""
     estimates: dict[str, Estimate]
-    """By name, in the order of a report."""
+    """Estimates by name, in the order of a report."""
     changes: dict[str, Any]
     """For `Vehicle.replace`: dotted path -> value, only of what the data determine."""
     quality: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -118,7 +118,7 @@ class Fit:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Method options, seed."""
     interrupted: bool = False
-    """Whether Ctrl-C ended it before it converged; the estimates are the best until then."""
+    """True if Ctrl-C ended it before it converged; the estimates are the best until then."""
 
     @cached_property
     def vehicle(self) -> Vehicle:

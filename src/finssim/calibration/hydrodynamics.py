@@ -51,13 +51,14 @@ deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4
 one make differ by a tenth."""
 
 ADDED_MASS_STD = 0.7
-"""Of the logarithm of a catalogue's added mass, a factor of two: published sets of one vehicle differ by as much."""
+"""Standard deviation of the logarithm of a catalogue's added mass, a factor of two: published sets of one vehicle
+differ by as much."""
 
 INERTIA_STD = 0.5
-"""Of the logarithm of a catalogue's effective moment of inertia."""
+"""Standard deviation of the logarithm of a catalogue's effective moment of inertia."""
 
 GIVEN_STD = 0.03
-"""Of the logarithm of an inertia that is given."""
+"""Standard deviation of the logarithm of a given inertia."""
 
 MULTIPLIED = ("m_eff", "added_mass", "d1", "d2", "bias", "k")
 """Estimates of an axis that a thrust scale multiplies."""
@@ -276,7 +277,7 @@ def _left_out(without: Callable[[int], Fit], trials: Sequence[Trial]) -> dict[st
 
 
 def _unknown_voltage(trials: Sequence[Trial], vehicle: Vehicle) -> bool:
-    """Whether all that is known of the thrust is pulse widths, and the battery's voltage is not."""
+    """Return whether only pulse widths are known of the thrust, without the battery's voltage."""
     driven = [trial for trial in trials if not trial.header.passive]
     try:
         sources = {drive(trial, vehicle).source for trial in driven}
@@ -297,7 +298,7 @@ def _thrust_scale(fit: Fit | None, vehicle: Vehicle, known: Mapping[str, float])
     for i, axis in enumerate(AXES):
         found = fit.estimates.get(f"{axis}.m_eff") if fit is not None else None
         if found is None or not found.estimate > 0.0 or (axis in ("roll", "pitch") and axis not in known):
-            continue  # a stiffness that nobody knows goes with the inertia of roll and pitch
+            continue  # an unknown stiffness is confounded with the inertia of roll and pitch
         expected = known.get(axis, float(plant.M_RB[i, i] + plant.M_A[i, i]))
         std = INERTIA_STD if i > 2 else ADDED_MASS_STD * float(plant.M_A[i, i]) / expected
         std = GIVEN_STD if axis in known else std

@@ -49,9 +49,9 @@ class AttitudeSignal:
     turn: Array
     """Rotation to use for vectors: `quaternion`, or level with the measured heading, (m, 4); NaN where unknown."""
     heading: bool
-    """Whether the heading is measured; where it is not, `quaternion` has heading 0 and only its tilt means anything."""
+    """True if the heading is measured; otherwise `quaternion` has heading 0 and only its tilt is meaningful."""
     tilt: bool
-    """Whether roll and pitch are measured."""
+    """True if roll and pitch are measured."""
 
 
 def attitude_samples(trial: Trial) -> tuple[Array, Array, tuple[str, ...]]:
@@ -120,7 +120,7 @@ def up_in_body(quaternion: Array) -> Array:
 # Velocity and position of the body origin on a grid, measured or derived from what is.
 
 STEEPEST = 0.3
-"""Cosine of the tilt below which a vertical velocity tells nothing of heave."""
+"""Cosine of the tilt below which a vertical velocity does not determine heave."""
 
 
 @dataclass
@@ -190,7 +190,7 @@ def arm_velocity(omega: Array, arm: Array) -> Array:
 
 
 def _lacks(omega: Array, arm: Array) -> bool:
-    """Whether a rate that would move a point at `arm` is unknown throughout."""
+    """Return whether a rate that would move a point at `arm` is unknown throughout."""
     unknown = ~np.asarray(np.isfinite(omega).any(axis=0))
     return any(unknown[i] and np.delete(arm, i).any() for i in range(3))
 
@@ -247,7 +247,8 @@ def depth_place(trial: Trial, vehicle: Vehicle) -> Array:
 def _derived(
     nu: Array, source: list[str], flow: Array, attitude: AttitudeSignal, trial: Trial, findings: list[Finding]
 ) -> list[tuple[Array, str]]:
-    """u, v, w from the world velocity of the origin, and the names of their sources; no name where it tells nothing."""
+    """Return u, v, w from the world velocity of the origin, and the names of their sources; no name if it is not
+    determined."""
     known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
     turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
     horizontal = trial.has("x", "y") and attitude.heading
@@ -275,7 +276,7 @@ ACCELERATION = ("ax", "ay", "az")
 
 
 def holds_gravity(trial: Trial, gravity: float) -> bool:
-    """Whether the accelerations are specific force, from the header or from their size.
+    """Return whether the accelerations are specific force, from the header or from their size.
 
     Vehicles under water accelerate far less than gravity: what is about as large as gravity holds it. With only ax or
     ay there is nothing to tell it by, and an accelerometer is assumed.
@@ -302,19 +303,19 @@ MOST = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """A trial on a uniform grid of n times. Body frame, about the body origin, unless said otherwise."""
+    """A trial on a uniform grid of n times. Body frame, about the body origin, unless stated otherwise."""
 
     t: Array
-    """On the trial's clock [s], (n,)."""
+    """Times on the trial's clock [s], (n,)."""
     rate: float
-    """Of the grid [Hz]."""
+    """Rate of the grid [Hz]."""
     nu: Array
     """u, v, w, p, q, r, smoothed [m/s, rad/s], (n, 6); NaN where unknown. Relative to the ground, or to the water where
     the header says so and gives no current."""
     raw: Array
-    """The same for measured axes, not smoothed, in straight lines between samples, (n, 6); NaN where not measured."""
+    """Velocities of measured axes, not smoothed, linear between samples, (n, 6); NaN if not measured."""
     quaternion: Array
-    """Body to world, (n, 4); NaN where roll and pitch are unknown. The heading is 0 where nobody measured it."""
+    """Rotation from body to world, (n, 4); NaN without roll and pitch. The heading is 0 if it was not measured."""
     position: Array
     """World frame [m], (n, 3); NaN where unknown."""
     tau: Array
@@ -322,13 +323,14 @@ class Motion:
     phase: NDArray[np.str_]
     """(n,); empty words where the trial names none."""
     valid: NDArray[np.bool_]
-    """Whether the wrench and every axis that is known for most of the trial are known, (n,)."""
+    """True if the wrench and every axis that is known for most of the trial are known, (n,)."""
     nu_source: tuple[str, ...]
-    """By axis: `measured`, `derived from position`, `derived from depth`, `derived from attitude`, or nothing."""
+    """Source of each axis: `measured`, `derived from position`, `derived from depth`, `derived from attitude`, or
+    nothing."""
     noise_std: Array
-    """By axis, the standard deviation of one sample of a measured velocity, or of the value of a derived one, (6,)."""
+    """Standard deviation by axis of one sample of a measured velocity, or of the value of a derived one, (6,)."""
     findings: tuple[Finding, ...] = ()
-    """What was assumed."""
+    """Assumptions."""
 
 
 def motion(trial: Trial, vehicle: Vehicle) -> Motion:
@@ -389,7 +391,7 @@ def _valid(tau: Array, nu: Array) -> NDArray[np.bool_]:
 
 
 RATE = 100.0
-"""Of the grid on which streams are compared [Hz]; the peak is found between its points."""
+"""Rate of the grid on which streams are compared [Hz]; the peak is found between its points."""
 
 LONGEST = 1.0
 """Offsets up to this are looked for [s]."""
@@ -401,18 +403,18 @@ BLOCKS = 10
 """Parts of a recording, each left out in turn to see how far the offset rests on it."""
 
 LEAST = 0.6
-"""Correlation below which two streams do not agree on any motion, so that nothing is said."""
+"""Correlation below which two streams do not agree on any motion, so that their offset is unknown."""
 
 
 class Offset(NamedTuple):
-    """How one stream lies in time to another."""
+    """Time offset between two streams."""
 
     seconds: float
-    """What to add to the stream's times so that both agree."""
+    """Time to add to the stream's times so that both agree [s]."""
     std: float
     """Standard deviation of `seconds` [s]."""
     correlation: float
-    """Of the two streams once they agree, -1 to 1."""
+    """Correlation of the two streams once they agree, -1 to 1."""
 
 
 def on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int = 2) -> tuple[Array, Array]:
@@ -486,7 +488,7 @@ def _sums(x: Array, y: Array, lag: int, edges: NDArray[np.int64]) -> Array:
 
 
 def _correlation(sums: Array) -> Array:
-    """From sums of x², y² and x y, (lags, 3) -> (lags,)."""
+    """Return the correlation from sums of x², y² and x y, (lags, 3) -> (lags,)."""
     return np.asarray(sums[:, 2] / np.maximum(np.sqrt(sums[:, 0] * sums[:, 1]), 1e-300))
 
 
@@ -574,7 +576,8 @@ def white_noise(values: Array) -> float:
 
 
 def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:
-    """Which samples are not spikes: far from the median of their five nearest, by the spread of all such distances.
+    """Return which samples are not spikes: far from the median of their five nearest, by the spread of all such
+    distances.
 
     Args:
         t: Times [s], (n,).

@@ -1,4 +1,4 @@
-"""Excitation programmes: the wrenches a vehicle is driven with so that its motion tells its hydrodynamics."""
+"""Excitation programmes: wrenches whose motion determines a vehicle's hydrodynamics."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["Programme", "RATE", "programmes", "which_axes", "write_programme"]
 
 Array = NDArray[np.float64]
 
-# Multi-sines: all axes at once, each with frequencies of its own, for fits of coupled dynamics.
+# Multi-sines: all axes together, each with separate frequencies, for fits of coupled dynamics.
 
 DRAWS = 30
 """Random phases tried; those with the lowest peaks are taken."""
@@ -100,7 +100,7 @@ def _lowest_peak(harmonics: NDArray[np.int64], turns: Array, rng: np.random.Gene
 
 
 def _feasible(tau: Array, vehicle: Vehicle) -> float:
-    """Largest factor up to 1 at which the thrusters give the whole wrench at every time."""
+    """Return the largest factor up to 1 at which the thrusters give the wrench at every time."""
     start_warp()
     allocator = Allocator.from_vehicle(vehicle)
     weights = np.where(vehicle.wrench_limits > 0.0, 1.0 / np.maximum(vehicle.wrench_limits, 1e-9), 0.0)
@@ -120,7 +120,7 @@ def _feasible(tau: Array, vehicle: Vehicle) -> float:
 KINDS = ("published", "validation", "multisine")
 
 RATE = 50.0
-"""Of the commands [Hz]."""
+"""Rate of the commands [Hz]."""
 LONGEST = 3600.0
 """Duration of a multi-sine [s]."""
 
@@ -158,7 +158,7 @@ FINSROV_LIMITS = (18.586585, 18.068824, 25.636077, 3.791353, 2.535180, 6.947713)
 
 @dataclass(frozen=True, kw_only=True)
 class Programme:
-    """What to command over time. Row k is held over [t_k, t_k + 1/rate)."""
+    """Commands over time. Row k is held over [t_k, t_k + 1/rate)."""
 
     name: str
     """Unique among the programmes made together; good as the name of a folder."""
@@ -171,7 +171,7 @@ class Programme:
     phase: NDArray[np.str_]
     """A word of `finssim.calibration.trials.trial.PHASES` for every row, (n,)."""
     ascent_speed: float | None = None
-    """Where given, the coast may end early: once the vehicle has risen faster than this [m/s] for `ascent_time`."""
+    """Speed at which the coast may end early, once the vehicle has risen faster for `ascent_time` [m/s]."""
     ascent_time: float = 2.0
     """[s]"""
 
@@ -187,7 +187,7 @@ class Programme:
 
     @property
     def sha256(self) -> str:
-        """Of what it commands, and when."""
+        """Return the digest of its commands and times."""
         return hashlib.sha256(self.tau_desired.tobytes() + "".join(self.phase).encode()).hexdigest()
 
 
@@ -274,7 +274,7 @@ def programmes(
 
 
 def _level_limit(axis: Axis, vehicle: Vehicle) -> float:
-    """Drag of surge or sway at `STEADY` of the speed at which a vehicle that hovers begins to tilt by itself [N]."""
+    """Return the drag of surge or sway at `STEADY` of the speed at which a hovering vehicle begins to tilt [N]."""
     i = AXES.index(axis)
     if i > 1 or not min(vehicle.wrench_limits[:2]) > 0.0:
         return math.inf

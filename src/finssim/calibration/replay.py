@@ -40,7 +40,7 @@ __all__ = [
 ]  # fmt: skip
 
 RESPONSES = (*NU, "roll", "pitch", "depth")
-"""What is compared: body velocities, and attitude and depth where they were measured."""
+"""Compared columns: body velocities, and attitude and depth if they were measured."""
 
 UNITS = {name: COLUMNS[name].unit for name in RESPONSES}
 """Response -> unit."""
@@ -49,7 +49,7 @@ EXCITED = 0.3
 """An axis counts as excited where its input reaches this share of that of the most excited axis."""
 
 ONSET = 0.1
-"""The input has begun, and has ended, where it is this share of its greatest magnitude."""
+"""Share of its greatest magnitude at which the input has begun, and has ended."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +65,7 @@ class Pair:
     rate: float
     """[1/s]"""
     axes: tuple[Axis, ...]
-    """Which the trial excites; scored."""
+    """Axes that the trial excites, which are scored."""
     phase: NDArray[np.str_]
     """Words of `PHASES`, (n,)."""
     tau: Array
@@ -73,7 +73,7 @@ class Pair:
     measured: dict[str, Array]
     """Response (of `RESPONSES`) -> (n,); velocities and angles smoothed as for a fit."""
     raw: dict[str, Array] = field(default_factory=dict)
-    """The same as it was measured; only where it was."""
+    """Measured values, not smoothed."""
     source: dict[str, str] = field(default_factory=dict)
     """Response -> "measured", or what it was derived from."""
     noise: dict[str, float] = field(default_factory=dict)
@@ -81,14 +81,14 @@ class Pair:
     simulated: dict[str, dict[str, Array]] = field(default_factory=dict)
     """Model -> response -> (n,)."""
     segment: NDArray[np.int64] | None = None
-    """Which uninterrupted replay a sample belongs to, -1 for none, (n,); None for a single one."""
+    """Uninterrupted replay that a sample belongs to, -1 for none, (n,); None for a single one."""
     diverged: dict[str, float] = field(default_factory=dict)
     """Model -> time when its simulation stopped being finite [s]; only where it did."""
     late: dict[str, float] = field(default_factory=dict)
     """Model -> by how much the recorded motion lags the recorded commands beyond the model's motors [s], for which the
     comparison allows; only where it shows."""
     in_sample: bool = False
-    """Whether the vehicle was fitted on this very trial."""
+    """True if the vehicle was fitted on this very trial."""
     findings: tuple[Finding, ...] = ()
 
     def response(self, axis: Axis) -> str:
@@ -96,7 +96,7 @@ class Pair:
         return NU[AXES.index(axis)]
 
     def scored(self) -> NDArray[np.bool_]:
-        """Samples that a score of the whole trial covers: excitation and coast; all where there is neither, (n,)."""
+        """Return the samples that a score of the trial covers: excitation and coast; all if there is neither, (n,)."""
         inside = np.isin(self.phase, ("excitation", "coast"))
         return inside if inside.any() else np.ones(len(self.t), dtype=bool)
 
@@ -158,7 +158,7 @@ def onset(pair: Pair, axis: Axis) -> int | None:
 
 
 def _active(tau: Array, axes: Sequence[Axis]) -> NDArray[np.bool_]:
-    """Where the input of one of the axes is above a tenth of its greatest magnitude there, (n,)."""
+    """Return where the input of one of the axes is above a tenth of its greatest magnitude there, (n,)."""
     magnitude = np.abs(np.nan_to_num(tau[:, [AXES.index(a) for a in axes]]))
     greatest = magnitude.max(axis=0, initial=0.0)
     return np.asarray(((magnitude >= ONSET * greatest) & (greatest > 0.0)).any(axis=1))
@@ -187,7 +187,7 @@ def resampled(t: Array, values: Array, times: Array) -> Array:
 
 
 RESAMPLES, SEED = 2000, 20260903
-"""Of the trial bootstrap, as the paper's replay validation has them."""
+"""Settings of the trial bootstrap, as in the paper's replay validation."""
 
 FEWEST = 8
 """Samples that a score needs at least."""
@@ -288,7 +288,7 @@ class Aggregate(NamedTuple):
     by_axis: dict[str, float]
     trials: int
     why: str = ""
-    """Why there is no number, or no interval."""
+    """Reason why there is no number, or no interval."""
 
 
 def aggregate(
@@ -339,9 +339,9 @@ class Ahead(NamedTuple):
     seconds: Array
     """(H,)"""
     rmse: Array
-    """In the response's unit, (H,); NaN where nothing could be compared."""
+    """Root mean square errors in the response's unit, (H,); NaN if nothing could be compared."""
     persistence: Array
-    """The same of the prediction that nothing changes, (H,)."""
+    """Errors of the prediction that nothing changes, (H,)."""
     nrmse: Array
     """Root mean square of error / span, (H,)"""
     count: NDArray[np.int64]
@@ -390,7 +390,7 @@ RATE = 50.0
 """Responses are compared at this rate, or at the log's own where that is slower [1/s]."""
 
 STEP = 0.02
-"""Of the simulation; integrated by RK4 [s]."""
+"""Step of the simulation; integrated by RK4 [s]."""
 
 LATEST, LEAST_LATE = 0.25, 0.02
 """Largest and smallest offset between the clocks of commands and motion that a comparison allows for [s]."""
@@ -426,7 +426,7 @@ def replay_pairs(
     models: Sequence[str],
     progress: Callable[[str], None] | None = None,
 ) -> tuple[list[Pair], list[Finding]]:
-    """Every trial beside what each model makes of it, simulated from its start and anew after every gap.
+    """Return every trial with each model's prediction, simulated from its start and again after every gap.
 
     Args:
         trials: Recorded trials.
@@ -528,7 +528,7 @@ def _add(
     which: Sequence[int],
     vehicle: Vehicle,
 ) -> None:
-    """Write what a model made of a trial's segments into its pair."""
+    """Write a model's prediction of a trial's segments into its pair."""
     n = len(pair.t)
     pieces = []
     for number, (segment, k) in enumerate(zip(segments, which, strict=True)):
@@ -664,7 +664,7 @@ def replay_predictions(
 
 
 def _ahead(pair: Pair, segment: Segment, ahead: Array, response: str) -> Array:
-    """What was measured at times after a segment's start, where it counts, (T,)."""
+    """Return the measurements at times after a segment's start that count, (T,)."""
     since = ahead + segment.t0 - pair.t0
     values = resampled(pair.t, np.where(pair.scored(), pair.measured[response], np.nan), since)
     return np.where(ahead <= segment.duration + 1e-9, values, np.nan)
@@ -691,13 +691,13 @@ class Replay:
     pairs: tuple[Pair, ...]
     """Trials beside their replays."""
     left_out: tuple[Finding, ...] = ()
-    """Of each trial that could not be replayed."""
+    """Reason for each trial that could not be replayed."""
     horizon: float | None = None
-    """How far predictions from measured states looked ahead [s]; None for none."""
+    """Horizon of predictions from measured states [s]; None without them."""
     ahead: dict[Axis, dict[str, Ahead]] = field(default_factory=dict)
     """Axis -> model -> error of those predictions."""
     seed: int = SEED
-    """Of the bootstrap."""
+    """Seed of the bootstrap."""
 
     @cached_property
     def scores(self) -> dict[str, tuple[dict[Axis, Score], ...]]:
@@ -709,7 +709,7 @@ class Replay:
 
     @property
     def in_sample(self) -> bool:
-        """Whether there is no held-out trial: then all numbers rest on trials that the vehicle was fitted on."""
+        """Return whether there is no held-out trial: then all numbers rest on trials that the vehicle was fitted on."""
         return bool(self.pairs) and all(pair.in_sample for pair in self.pairs)
 
     def aggregate(self, model: str, *, in_sample: bool | None = None) -> Aggregate:
@@ -732,7 +732,7 @@ class Replay:
         return aggregate(rows, seed=self.seed)
 
     def as_json(self) -> dict[str, Any]:
-        """What `--json` prints."""
+        """Return what `--json` prints."""
         return replay_json(self)
 
 
@@ -860,7 +860,7 @@ def run_replay(
 MODEL_LABELS = {"calibrated": "Calibrated Fossen", "mesh": "Physics-mesh", "simplified": "Simplified Fossen"}
 COLORS = {"calibrated": "#0072B2", "mesh": "#009E73", "simplified": "#D55E00"}
 OTHERS = ("#CC79A7", "#56B4E9", "#E69F00")
-"""Okabe and Ito's palette: tells models apart for the colour-blind too."""
+"""Okabe and Ito's palette, which the colour-blind can distinguish too."""
 BLACK = "#1a1a1a"
 STYLES = {"calibrated": (0, ()), "mesh": (0, (6, 1.6)), "simplified": (0, (1.6, 1.2))}
 """Line styles, for a print without colours."""
@@ -1114,7 +1114,7 @@ PHASES = ("excitation", "coast")
 
 
 def replay_json(replay: Replay) -> dict[str, Any]:
-    """What `finssim replay --json` prints and `replay.json` holds.
+    """Return what `finssim replay --json` prints and `replay.json` holds.
 
     The numbers at the top are of the first model; `models` has those of all. What could not be computed is null, and
     `why` says why.
@@ -1273,7 +1273,7 @@ def _headline(replay: Replay) -> str:
 
 
 def _axis_table(replay: Replay) -> tuple[list[str], Rows]:
-    """NRMSE by axis, a column for each model; held-out and in-sample apart."""
+    """Return NRMSE by axis, a column for each model, with held-out and in-sample trials separate."""
     kinds = [k for k in (False, True) if any(p.in_sample == k for p in replay.pairs)]
     rows: Rows = []
     for kind in kinds:
@@ -1317,7 +1317,8 @@ def _ahead_table(replay: Replay) -> tuple[list[str], Rows]:
 
 
 def _remarks(replay: Replay) -> list[str]:
-    """What could not be scored or replayed, what was derived, and why there is no interval; equal ones together."""
+    """Return remarks: what could not be scored or replayed, what was derived, and missing intervals; equal ones
+    together."""
     findings: list[Finding] = [*replay.left_out]
     for model in replay.models:
         reason = replay.aggregate(model).why

@@ -84,7 +84,7 @@ def command_line(kind: str, inputs: Iterable[Path], options: Mapping[str, Any]) 
 BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
 PER_FIGURE = 6
 MAX_CURVES = 48
-"""More are not drawn; the report says so."""
+"""Greatest number of drawn curves; the report states how many are not drawn."""
 
 
 def fit_pictures(fit: Fit) -> dict[str, tuple[str, bytes]]:
@@ -142,7 +142,7 @@ def draw_curves(curves: Sequence[Curve]) -> Iterator[Figure]:
 
 
 def png(figure: Figure) -> bytes:
-    """The same bytes for the same figure."""
+    """Return the bytes of a figure, equal for equal figures."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
     return buffer.getvalue()
@@ -233,7 +233,7 @@ def new_figure(width: float, height: float, constrained: bool = True) -> Figure:
 
 
 HEADS = ("parameter", "estimate", "95 % interval", "unit")
-"""Of every table of estimates; what follows differs."""
+"""Headings of every table of estimates; further ones differ."""
 
 QUALITY = {
     "r2": "R²",
@@ -252,7 +252,7 @@ QUALITY = {
 def fit_json(
     fit: Fit, vehicle: Vehicle, *, out: Path | None = None, findings: Sequence[Finding] = ()
 ) -> dict[str, Any]:
-    """What `--json` prints and the report's `fit.json` holds; numbers that are not finite are None.
+    """Return what `--json` prints and the report's `fit.json` holds; numbers that are not finite are None.
 
     Args:
         fit: The fit.
@@ -310,7 +310,8 @@ def file_number(estimate: Estimate, vehicle: Vehicle) -> float | None:
 
 
 def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
-    """What became of a parameter: `written`, `file kept`, or whether the data tell it where the file has no place.
+    """Return the state of a parameter: `written`, `file kept`, or whether the data determine it if the file has no
+    place for it.
 
     `unsure`: written, though the data tell it together with another, as a part of the drag, and not alone.
     """
@@ -348,11 +349,11 @@ class Report:
     """A calibration for people, on the terminal and on a page."""
 
     title: str
-    """Of the page."""
+    """Title of the page."""
     headline: str
     """Above the table on the terminal."""
     heads: Sequence[str]
-    """Of the table of estimates."""
+    """Headings of the table of estimates."""
     estimates: Sequence[Estimate]
     cells: Callable[[Estimate], tuple[str, ...]]
     """Texts of an estimate, in the order of `heads`."""
@@ -360,14 +361,14 @@ class Report:
     """The figures that say how good the calibration is, one sentence each."""
     findings: Sequence[Finding]
     reading: str
-    """What the intervals mean."""
+    """Meaning of the intervals."""
     advice_title: str = "Advice"
     remarks: Sequence[str] = ()
-    """On the estimates, below their table."""
+    """Remarks on the estimates, below their table."""
 
     @property
     def notes(self) -> list[str]:
-        """Remarks, and findings worth knowing."""
+        """Return remarks and findings for information."""
         return [*self.remarks, *sentences(item for item in self.findings if item.severity == "note")]
 
     @property

@@ -60,7 +60,7 @@ class Recording:
     acceleration: NDArray[np.float32]
     """nu_dot [m/s², rad/s²], (n, W, 6)."""
     thrust: NDArray[np.float32]
-    """What the vehicle file says the propellers give at their speeds, before a plant's `gain` [N], (n, W, k)."""
+    """Thrust that the vehicle file gives for the propellers' speeds, before a plant's `gain` [N], (n, W, k)."""
     command: NDArray[np.float32]
     """Thrust asked for from this state on [N], (n, W, k)."""
 
@@ -206,19 +206,19 @@ class NoiseProfile:
     own_sensors: bool = False
     """IMU and depth as the vehicle file's sensors give them: rate, noise, bias, quantisation, latency, dropout."""
     velocity_std: float = 0.0
-    """Of u, v, w from outside [m/s]."""
+    """Standard deviation of u, v, w from outside [m/s]."""
     attitude_std: float = 0.0
-    """Of roll and pitch [rad]."""
+    """Standard deviation of roll and pitch [rad]."""
     yaw_std: float = 0.0
     """[rad]"""
     position_std: float = 0.0
-    """Of x, y, z [m]."""
+    """Standard deviation of x, y, z [m]."""
     depth_std: float = 0.0
-    """Where the vehicle's own sensor is not used [m]."""
+    """Standard deviation of the depth, if the vehicle's own sensor is not used [m]."""
     gyro_std: float = 0.0
-    """Where the vehicle's own IMU is not used [rad/s]."""
+    """Standard deviation of the gyro, if the vehicle's own IMU is not used [rad/s]."""
     accel_std: float = 0.0
-    """Where the vehicle's own IMU is not used [m/s²]."""
+    """Standard deviation of the accelerometer, if the vehicle's own IMU is not used [m/s²]."""
     velocity_window: float | None = None
     """u, v, w come from measured position, depth and attitude by local parabolas over this time [s], as an offline
     smoother makes them; `velocity_std` is then not used."""
@@ -352,7 +352,7 @@ def _sensor_channels(
 
 
 def _specific_force(recording: Recording, vehicle: Vehicle, every: int) -> Array:
-    """What an ideal accelerometer at the IMU's place reads, body axes [m/s²]: see `finssim.sensors.imu`."""
+    """Return the reading of an ideal accelerometer at the IMU's place, body axes [m/s²]: see `finssim.sensors.imu`."""
     nu, nu_dot = recording.velocity[::every].astype(float), recording.acceleration[::every].astype(float)
     q = recording.quaternion[::every].astype(float)
     imu = vehicle.sensors.imu
@@ -371,7 +371,7 @@ def _from_position(x: Array, q: Array, window: float, interval: float) -> Array:
     n = max(3, 2 * round(0.5 * window / interval) + 1)
     n = min(n, len(x) - 1 + len(x) % 2)
     v = savgol_filter(x, n, 2, deriv=1, delta=interval, axis=0, mode="interp")
-    # q and -q are one attitude: choose signs so that the numbers do not jump, also after a whole turn.
+    # q and -q are one attitude: choose signs so that the numbers do not jump, also after a full turn.
     jump = np.where(np.sum(q[1:] * q[:-1], axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
     q = np.concatenate([q[:1], q[1:] * np.cumprod(jump, axis=0)])
     smooth = savgol_filter(q, n, 2, axis=0, mode="interp")

@@ -1,4 +1,4 @@
-"""How far estimates can be trusted: what every trial says about them, and how the trials agree.
+"""Uncertainty of estimates: the evidence of every trial, and the agreement of the trials.
 
 Notation: a fit minimises Σ_g |W_g^½ r_g(theta)|² over trials g. Trial g contributes N_g = J_gᵀ W J_g to the normal
 matrix and s_g = J_gᵀ W r_g to the score, r = measured - predicted, both at the solution, where Σ s_g = 0. Nothing else
@@ -37,7 +37,7 @@ ALONE = 0.9
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What each trial says about the parameters, linearised at the solution."""
+    """Evidence of each trial on the parameters, linearised at the solution."""
 
     names: tuple[str, ...]
     """(P,)"""
@@ -46,7 +46,7 @@ class Evidence:
     score: Array
     """s_g, (G, P); they add up to zero where no bound is active."""
     unit: str = "trials"
-    """What g counts: `trials`, or `blocks` of consecutive samples where there are too few trials."""
+    """Unit of the groups: `trials`, or `blocks` of consecutive samples if there are too few trials."""
     prior: Array | None = None
     """Inverse covariance of what was known before any trial, (P, P); None without."""
 
@@ -65,11 +65,11 @@ class Covariance:
     local: Array
     """Inverse information Σ_g N_g: errors independent and of the stated variance, (P, P)."""
     trials: Array
-    """From the disagreement of the trials, (P, P): holds whatever the noise is within a trial."""
+    """Covariance from the disagreement of the trials, (P, P): valid for any noise within a trial."""
     dof: Array
     """Degrees of freedom of each variance in `trials`, (P,); infinite where `local` has to serve."""
     alone: NDArray[np.bool_]
-    """Whether a parameter rests on one trial, so that no disagreement can show, (P,)."""
+    """True if a parameter rests on one trial, so that no disagreement can show, (P,)."""
 
     @property
     def std(self) -> Array:
@@ -179,7 +179,8 @@ def intervals(theta: Array, covariance: Covariance) -> Array:
 
 
 def correlated_samples(residual: Array, breaks: Sequence[int] = ()) -> float:
-    """Samples that one independent sample stands for: 1 + 2 Σ ρ_k up to the first pair with negative sum (Geyer 1992).
+    """Return the number of samples per independent one: 1 + 2 Σ ρ_k up to the first pair with negative sum (Geyer
+    1992).
 
     Args:
         residual: Equally spaced, (n,).

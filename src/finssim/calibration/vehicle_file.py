@@ -190,7 +190,7 @@ def vehicle_text(tree: Mapping[str, Any], origins: Mapping[Key, Provenance]) -> 
 
 
 def _annotated(node: Any, path: Key, inherited: Provenance | None, origins: Mapping[Key, Provenance]) -> Any:
-    """A node with the marks that tell the origins of its numbers to a reader who inherits one."""
+    """Return a node with the marks that give the origins of its numbers to a reader who inherits one."""
     if isinstance(node, Mapping):
         common = _common(node, path, origins, inherited)
         inner = {key: _annotated(v, (*path, str(key)), common, origins) for key, v in node.items()}
@@ -233,12 +233,12 @@ def _items(rows: list[Any], pad: str) -> Iterator[str]:
 
 
 def _rows(node: Any) -> bool:
-    """Whether a node is a list of more than plain values."""
+    """Return whether a node is a list of more than plain values."""
     return isinstance(node, list) and any(isinstance(item, (list, Mapping)) for item in node)
 
 
 def _unit(path: Key) -> str:
-    """Of the value at a path; empty where there is none to write."""
+    """Return the unit of the value at a path; empty if there is none to write."""
     term = TERMS.get(path[2]) if path[0] == "hydrodynamics" and len(path) > 2 else None
     return UNITS.get(path[-1], "") if term is None else term.units.get(path[-1], "")
 
@@ -267,7 +267,7 @@ def _common(
 
 
 def _marks(origin: Provenance | None, inherited: Provenance | None) -> dict[str, str]:
-    """What must be written so that a reader who inherits one origin finds the other."""
+    """Return what must be written so that a reader who inherits one origin finds the other."""
     if origin is None or origin == inherited:
         return {}
     if inherited is not None and origin.origin == inherited.origin:
@@ -287,7 +287,7 @@ def _on_single_line(path: Key) -> bool:
 
 
 def _word(value: Any) -> str:
-    """A value as YAML on one line, as it may stand inside a list or mapping."""
+    """Return a value as YAML on one line, as allowed inside a list or mapping."""
     return _yaml([value], flow=True).strip()[1:-1]
 
 
@@ -317,7 +317,7 @@ def _prose(text: str) -> list[str]:
 
 
 PER_THRUSTER = ("position", "axis", "group", "motor_index", "motor_sign")
-"""What a thruster keeps for itself; the rest goes to its group where all its members agree."""
+"""Keys of a single thruster; the rest is written for its group if all its members agree."""
 
 
 def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
@@ -421,7 +421,7 @@ def _same(
     thrusters: Mapping[str, Any],
     origins: Mapping[tuple[str, ...], Provenance],
 ) -> bool:
-    """Whether two thrusters hold the same under a key, of the same origin."""
+    """Return whether two thrusters hold the same under a key, of the same origin."""
     if key not in thrusters[member] or thrusters[first][key] != thrusters[member][key]:
         return False
     paths = [path for path, _ in leaves(thrusters[first][key], (key,))]
@@ -463,7 +463,7 @@ def calibrated(fit: Fit) -> Vehicle:
     record = _calibration_record(fit)
     source = f"calibration {number}: {record.sentence()}"
     try:
-        # Seven digits: far more than any interval is worth, and a file that can be read.
+        # Seven digits: far more than any interval needs, and a readable file.
         changes = plain(fit.changes, 7)
         after = before.replace(changes, Provenance("measured", source)) if changes else before
     except VehicleError as error:
@@ -508,8 +508,8 @@ def retained_values(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
 
 
 def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
-    """The findings of a fit, and what speaks against its vehicle: checks that it fails and its parent did not, and fits
-    without use.
+    """Return the findings of a fit, and those against its vehicle: checks that it fails and its parent did not, and
+    fits without use.
 
     Args:
         fit: The fit.
@@ -569,7 +569,7 @@ def _plain_value(value: Any) -> Any:
 
 
 def _covers(changes: Sequence[Key], leaf: Key, vehicle: Vehicle) -> bool:
-    """Whether one of the changes set this number, or a list or section that holds it."""
+    """Return whether one of the changes set this number, or a list or section that holds it."""
     return any(
         _same_number(change, leaf[: len(change)], vehicle) or _same_number(change, leaf, vehicle)
         for change in changes
@@ -577,7 +577,7 @@ def _covers(changes: Sequence[Key], leaf: Key, vehicle: Vehicle) -> bool:
 
 
 def _same_number(pattern: Key, leaf: Key, vehicle: Vehicle) -> bool:
-    """Whether a path of an estimate or change means a number of the file's tree.
+    """Return whether a path of an estimate or change means a number of the file's tree.
 
     `*` is any name; `thruster_groups.G.x` is x of every thruster of G; an entry of a diagonal matrix may be given by
     row and column or by row alone.
@@ -622,11 +622,11 @@ def _note(estimate: Estimate | None, value: float) -> str:
 # Ranges of domain randomisation from the intervals of a calibration.
 
 NARROWEST = 0.02
-"""A told parameter varies by at least this part to either side: intervals know of noise, not of a wrong model."""
+"""Least variation of a determined parameter to either side: intervals cover noise, not a wrong model."""
 WIDEST = (0.0, 5.0)
 """Factors beyond these are cut."""
 UNTOLD = (0.5, 2.0)
-"""For what the trials could not tell, and for what the vehicle file guesses."""
+"""Range of what the trials could not determine, and of what the vehicle file guesses."""
 OTHER = (0.9, 1.1)
 """For what was not asked of the trials, and the vehicle file has from somewhere."""
 

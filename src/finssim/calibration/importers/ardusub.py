@@ -45,20 +45,20 @@ WRONG_CLOCK = 5.0
 
 @dataclass(frozen=True)
 class Log:
-    """What a log holds, by kind of message."""
+    """Content of a log, by kind of message."""
 
     shown: str
     telemetry: bool
-    """Whether it is a `.tlog` or a recording of BlueOS, not written by the autopilot."""
+    """True for a `.tlog` or a recording of BlueOS, which the autopilot did not write."""
     times: dict[str, Array] = field(default_factory=dict)
     """Kind -> times [s], (n,)."""
     messages: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
     """Kind -> fields of each message, n of them."""
     parameters: dict[str, float] = field(default_factory=dict)
-    """The autopilot's parameters, as last said."""
+    """Parameters of the autopilot, with their latest values."""
 
     def has(self, kind: str) -> bool:
-        """Whether there are two such messages at least."""
+        """Return whether there are at least two such messages."""
         return len(self.messages.get(kind, ())) >= 2
 
     def numbers(self, kind: str, name: str) -> Array:
@@ -135,7 +135,7 @@ class _Clock:
             if stamp < self.last - 1.0:  # the autopilot started again
                 self.offsets.append(math.inf)
             self.last = stamp
-            # The message that travelled fastest tells the difference of the clocks.
+            # The message with the shortest delay gives the difference of the clocks.
             self.offsets[-1] = min(self.offsets[-1], receipt - stamp)
         self.receipts.setdefault(kind, []).append(receipt)
         self.stamps.setdefault(kind, []).append(stamp)
@@ -204,11 +204,11 @@ def _messages(
 
 
 MAVLINK_TOPIC = re.compile(r"mavlink/(\d+)/(\d+)/([A-Z0-9_]+)")
-"""Of a recording of BlueOS: system, component and kind of a message."""
+"""Topic of a recording of BlueOS: system, component and kind of a message."""
 
 
 def _recorded(path: Path, kinds: frozenset[str]) -> Iterator[tuple[str, dict[str, Any], float]]:
-    """The same of an MCAP of BlueOS' recorder, which keeps messages of its MAVLink server as JSON."""
+    """Yield the messages of an MCAP of BlueOS' recorder, which keeps messages of its MAVLink server as JSON."""
     from mcap.reader import NonSeekingReader
 
     systems: set[int] = set()
@@ -245,7 +245,7 @@ def _plain(value: Any) -> Any:
 
 
 def _of_autopilot(sender: tuple[int, int], kind: str, fields: dict[str, Any], systems: set[int]) -> bool:
-    """Whether the vehicle's autopilot sent it; position sensors and pilots speak for themselves.
+    """Return whether the vehicle's autopilot sent it; position sensors and pilots use the same link.
 
     Args:
         sender: System and component.
@@ -266,7 +266,7 @@ def _number(value: Any) -> float:
     return float(value) if isinstance(value, (int, float)) else math.nan
 
 
-# Velocity and position in ArduSub logs: what the autopilot estimates, and what a DVL or camera told it.
+# Velocity and position in ArduSub logs: estimates of the autopilot, and measurements of a DVL or camera.
 
 VELOCITY_KINDS = frozenset(
     (
@@ -282,7 +282,7 @@ VELOCITY_KINDS = frozenset(
 )
 
 HORIZONTAL_VELOCITY, RELATIVE_POSITION, ABSOLUTE_POSITION, STANDING_STILL = 2, 8, 16, 128
-"""Flags of the filter's state; the last says that it assumes a constant position, for it has no measurement of one."""
+"""Flags of the filter's state; the last means that it assumes a constant position, without a measurement of one."""
 
 ESTIMATES = {
     "XKF1": ("XKF4", "SS", ("VN", "VE", "VD", "PN", "PE", "PD")),
@@ -380,7 +380,7 @@ ARMED_FLAG = 128
 def read_ardusub(
     path: Path, requested: ArduSubMap, vehicle: Vehicle | None, *, pulses: bool = True
 ) -> list[Stream]:
-    """What an ArduSub log says, one stream for each kind of message.
+    """Return the content of an ArduSub log, one stream for each kind of message.
 
     Args:
         path: `.BIN`, `.tlog`, or `.mcap` of BlueOS.
@@ -496,7 +496,7 @@ def _voltage(log: Log) -> Stream | None:
             continue
         instance = log.some(kind, "Instance", 0)
         volts = unit * instance.numbers(kind, name)
-        measured = (volts > 1.0) & (volts < 65.0)  # 0 and 65.535 V stand for "not measured"
+        measured = (volts > 1.0) & (volts < 65.0)  # 0 and 65.535 V mean "not measured"
         if measured.sum() >= 2:
             return instance.stream(kind, {"voltage": volts}).selected(measured)
     return None
@@ -550,7 +550,7 @@ def _pulses(log: Log, requested: ArduSubMap, vehicle: Vehicle | None) -> list[St
 MANUAL = 19
 """The mode in which the pilot's axes pass the mixer as they are."""
 STICK_CHANNELS = ("pitch", "roll", "throttle", "yaw", "forward", "lateral")
-"""What channels 1 to 6 of an ArduSub ask for."""
+"""Demands of channels 1 to 6 of an ArduSub."""
 USUAL_YAW = 3.375
 """ACRO_YAW_P at which the yaw axis is passed on as it is."""
 
@@ -580,7 +580,7 @@ def _driven_by_sticks(
         raise CalibrationError(f"{log.shown}: {error}") from None
     note = finding("sticks_mixed", frame=FRAMES[config][0], gain=1.0)
     pulses = log.stream(kind, channels, note, mapped)
-    # A held command knows no gap but one of the whole recording.
+    # A held command has no gap other than one of the complete recording.
     manual_streams, other = [], 0
     for stream in (*streams, pulses):
         manual = (_mode(log, stream.t) == MANUAL) | ~_armed(log, stream.t)
@@ -624,13 +624,13 @@ def _gains(log: Log) -> Log:
 
 
 def _mode(log: Log, t: Array) -> Array:
-    """Number of the autopilot's mode at times; MANUAL where the log tells none."""
+    """Return the number of the autopilot's mode at times; MANUAL if the log has none."""
     kind, name = ("HEARTBEAT", "custom_mode") if log.telemetry else ("MODE", "ModeNum")
     return _held(log, kind, name, t, MANUAL)
 
 
 def _armed(log: Log, t: Array) -> NDArray[np.bool_]:
-    """Whether it was armed at times; always where the log does not tell."""
+    """Return whether it was armed at times; always if the log does not contain it."""
     arming = _arming(log)
     if arming is None:
         return np.ones(len(t), dtype=bool)

@@ -1,4 +1,4 @@
-"""Which output of an ArduSub autopilot drives which thruster, and which way."""
+"""Assignment of the outputs of an ArduSub autopilot to thrusters, with their direction."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ MOTOR_1 = 33
 """SERVOn_FUNCTION of the first motor."""
 
 LEAST_LIKENESS = 1.4
-"""Of a motor's factors to a thruster: 1 from the direction of the force and 1 from the signs of its moments at most."""
+"""Least likeness of a motor's factors to a thruster: at most 1 from the direction of the force and 1 from the signs of
+its moments."""
 
 
 def outputs_of(

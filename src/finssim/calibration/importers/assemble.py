@@ -1,4 +1,4 @@
-"""From mapped columns to a trial: axes, velocities of the world, pressure."""
+"""Trials from mapped columns: axes, velocities of the world, pressure."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from finssim.yaml_file import read_mapping
 
 
 class ColumnSource(Part):
-    """Where the numbers of one canonical column come from: sign (scale * column + offset) in `unit`."""
+    """Source of one canonical column: sign (scale * column + offset) in `unit`."""
 
     column: str | None = None
     """Name of a column, or dotted path of a field such as `twist.twist.linear.x` or `data[3]`."""
@@ -55,10 +55,10 @@ class ColumnSource(Part):
     """A constant in place of a column."""
     scale: float = 1.0
     offset: float = 0.0
-    """In `unit`, added after scaling."""
+    """Offset in `unit`, added after scaling."""
     sign: Literal[1, -1] = 1
     unit: str | None = None
-    """Of scale * column + offset; the unit of the canonical column where not given."""
+    """Unit of scale * column + offset; the unit of the canonical column if None."""
 
     @model_validator(mode="before")
     @classmethod
@@ -150,7 +150,7 @@ class Frame(Part):
 
 
 class SourceMap(Part):
-    """How one file or topic is read."""
+    """Map of one file or topic."""
 
     time: TimeColumn | None = None
     """Needed for files; topics have stamps."""
@@ -163,13 +163,13 @@ class SourceMap(Part):
     split: str | None = None
     """Column whose changes of value begin a new trial."""
     spaces: bool = False
-    """Whether blanks separate the columns of a text table; commas, semicolons and tabs are found out."""
+    """True if blanks separate the columns of a text table; commas, semicolons and tabs are detected."""
     skip_rows: int = Field(default=0, ge=0)
     """Lines before the line of names."""
     names: tuple[str, ...] | None = None
     """Names of the columns of a file that has no line of names."""
     stamps: Literal["header", "received"] = "header"
-    """Of a topic: the stamps in its messages, where it has them, or the times at which they were recorded."""
+    """Times of a topic: the stamps in its messages, if it has them, or the times at which they were recorded."""
 
     @model_validator(mode="before")
     @classmethod
@@ -211,7 +211,7 @@ GROUPS = tuple(dict.fromkeys(column.group for column in COLUMNS.values()))
 
 
 class ArduSubMap(Part):
-    """What is taken from an ArduSub log, and how its mixer turns sticks into pulses."""
+    """Map of an ArduSub log, and settings of the mixer from sticks to pulses."""
 
     outputs: dict[str, str] = Field(default_factory=dict)
     """Output of the autopilot -> thruster, `{C1: T1, C2: -T2}`; a minus where longer pulses push backwards."""
@@ -221,9 +221,9 @@ class ArduSubMap(Part):
     barometer: int | None = Field(default=None, ge=0)
     """The pressure sensor in the water; the primary one where not given."""
     stamps: Literal["header", "received"] = "header"
-    """Of a .tlog: the autopilot's own clock where a message has it, or the times at which messages were received."""
+    """Times of a .tlog: the autopilot's own clock if a message has it, or the times at which messages were received."""
     frame: Literal["VECTORED", "VECTORED_6DOF"] | None = None
-    """Of the mixer that `stick_*` columns went through."""
+    """Frame of the mixer that `stick_*` columns went through."""
     gain: float = Field(default=1.0, gt=0.0, le=1.0)
     """Pilot gain (PilotGain, JS_GAIN_DEFAULT) of `stick_*` columns, where they are the joystick's, not scaled yet."""
     motor_directions: tuple[Literal[1, -1], ...] = ()
@@ -231,13 +231,13 @@ class ArduSubMap(Part):
 
 
 class SplitRule(Part):
-    """What makes several trials of one log."""
+    """Rule that splits a log into several trials."""
 
     by: Literal["phase", "gaps", "arming", "column", "windows"]
     longest_gap: float = Field(default=2.0, gt=0.0)
-    """Of `gaps`: a longer pause begins a new trial [s]."""
+    """Longest pause within a trial, for `gaps` [s]."""
     windows: dict[str, tuple[float, float]] = Field(default_factory=dict)
-    """Of `windows`: trial -> from and to [s] after the start of the log."""
+    """Trial -> start and end [s] after the start of the log, for `windows`."""
     shortest: float = Field(default=1.0, ge=0.0)
     """Shorter pieces are left out [s]."""
 
@@ -280,16 +280,16 @@ class ColumnMap(Part):
     time_offsets: dict[str, float] = Field(default_factory=dict)
     """Column, or group (command velocity rates acceleration attitude position depth) -> seconds added to its times."""
     surface_pressure: float | None = Field(default=None, ge=0.0)
-    """Of the surface as the sensor reads it, for `pressure` columns [Pa]; 0 for a gauge."""
+    """Pressure of the surface as the sensor reads it, for `pressure` columns [Pa]; 0 for a gauge."""
     header: dict[str, Any] = Field(default_factory=dict)
-    """What `trial.yaml` of every trial says."""
+    """Keys of `trial.yaml` of every trial."""
     trials: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """Trial -> what its `trial.yaml` says beside or instead of that."""
+    """Trial -> further keys of its `trial.yaml`, which replace those of every trial."""
 
     @model_validator(mode="before")
     @classmethod
     def _short(cls, data: Any) -> Any:
-        """`trial.yaml` keys stand at the top level; one source for all files may stand there too."""
+        """Accept keys of `trial.yaml`, and a single source for all files, at the top level."""
         data = dict(data)
         single = {
             key: data.pop(key) for key in list(data) if key in SourceMap.model_fields and key != "split"
@@ -308,7 +308,7 @@ class ColumnMap(Part):
         return {**data, "header": {**data.get("header", {}), **header}}
 
     def header_of(self, trial: str, vehicle: str | None, recorded: Mapping[str, Any] | None = None) -> Header:
-        """The header of a trial; a vehicle given on the command line comes first, what the log says itself last.
+        """Return the header of a trial; a vehicle given on the command line has priority, the log's own header is last.
 
         Raises:
             CalibrationError: A key or value that `trial.yaml` does not take.
@@ -411,7 +411,7 @@ WORDED = {
     "arming": ("arming", "the log has no arming messages"),
     "column": ("split", "no source of the map names a split column"),
 }
-"""Rule -> the words that it goes by, and what is said where there are none."""
+"""Rule -> the words that it uses, and the message if there are none."""
 
 
 def _labels(name: str, table: Table, rule: SplitRule) -> NDArray[np.int64]:
@@ -453,18 +453,18 @@ Texts = NDArray[np.str_]
 
 @dataclass(frozen=True, kw_only=True)
 class Stream:
-    """What one file, topic or kind of message says, in canonical columns and SI."""
+    """Content of one file, topic or kind of message, in canonical columns and SI."""
 
     source: str
-    """What messages call it."""
+    """Name of the source in messages."""
     t: Array
-    """On the clock of the log [s], (n,)."""
+    """Times on the clock of the log [s], (n,)."""
     channels: dict[str, Array] = field(default_factory=dict)
     """Canonical or extra column -> values, (n,) each."""
     words: dict[str, Texts] = field(default_factory=dict)
     """`phase`, `split` or `arming` -> a word for every sample, (n,) each; a word holds until the next."""
     findings: tuple[Finding, ...] = ()
-    """What was repaired or left out."""
+    """Repairs, and data that was left out."""
 
     def selected(self, rows: NDArray[np.intp] | NDArray[np.bool_], t: Array | None = None) -> Stream:
         """Some of the samples, in that order; at times `t` where given."""
@@ -476,7 +476,7 @@ class Stream:
         )
 
     def noting(self, *findings: Finding) -> Stream:
-        """The same with more findings."""
+        """Return the stream with more findings."""
         return replace(self, findings=(*self.findings, *findings))
 
 
@@ -485,7 +485,7 @@ class Table:
     """Several streams on the union of their times."""
 
     start: float
-    """Of the log's clock at t = 0 [s]."""
+    """Time of the log's clock at t = 0 [s]."""
     t: Array
     """Strictly increasing from 0 [s], (n,)."""
     channels: dict[str, Array]
@@ -571,7 +571,7 @@ def merge(streams: Sequence[Stream]) -> Table:
     _refuse_doubles(each)
     _refuse_disjoint(each)
     start = min(float(stream.t[0]) for stream in each)
-    # On whole microseconds, so that a written and read trial has the same times.
+    # In integer microseconds, so that a written and read trial has the same times.
     each = [replace(stream, t=np.round(stream.t - start, 6)) for stream in each]
     columns = {name: (stream.t, values) for stream in each for name, values in stream.channels.items()}
     spoken = {name: (stream.t, texts) for stream in each for name, texts in stream.words.items()}

@@ -41,7 +41,7 @@ from finssim.yaml_file import json_value
 
 TABLES = (".csv", ".tsv", ".txt", ".dat", ".parquet", ".pq")
 TIME_NAMES = ("t", "time", "time_s", "time_secs", "timestamp", "stamp")
-"""Names under which the time is looked for where no map says it; seconds."""
+"""Names of the time column without a map; seconds."""
 
 
 def read_stream(path: Path, source: SourceMap | None) -> Stream:
@@ -190,13 +190,13 @@ def _column_list(table: Table) -> str:
 # What our own records add to a bag: thrusters by name, phases and arming from events, the vehicle they are of.
 
 NATIVE = "finssim_msgs/msg/"
-"""Types by which a bag of ours is known, whoever wrote the file."""
+"""Prefix of the types in our own bags."""
 
 TRIAL_TOPICS = ("odom", "imu", "joint_states", "thruster_state", "thruster_cmd", "telemetry", "pressure")
-"""Last parts of the topics that a trial is made of; the wanted wrench and the goal say nothing about what happened."""
+"""Last parts of the topics of a trial; the wanted wrench and the goal do not describe what happened."""
 
 COMPASS = "/compass/imu"
-"""An Imu that tells a heading alone, without rates and specific force."""
+"""Topic of an Imu that gives a heading alone, without rates and specific force."""
 
 ARMING = {"armed": "armed", "disarmed": "disarmed", "fault": "disarmed"}
 """Kind of an event -> whether thrusters may turn from then on; while it holds, an armed bridge stays armed."""
@@ -240,7 +240,7 @@ def _names(message: Any) -> list[str]:
 
 
 def spoken_events(topic: str, events: Iterable[tuple[float, str]], start: float) -> Stream | None:
-    """Phases and arming that the events of a record tell; None where they tell neither.
+    """Return phases and arming from the events of a record; None if they contain neither.
 
     Args:
         topic: Of the events.
@@ -253,7 +253,7 @@ def spoken_events(topic: str, events: Iterable[tuple[float, str]], start: float)
             event = json_value(text, CalibrationError, topic)
             kind, word = str(event["kind"]), str(event.get("text", ""))
         except (ValueError, KeyError, TypeError, AttributeError):
-            continue  # somebody else's words
+            continue  # words of other programs
         if kind != "phase" and kind not in ARMING:
             continue
         times.append(time)
@@ -265,7 +265,7 @@ def spoken_events(topic: str, events: Iterable[tuple[float, str]], start: float)
 
 
 def recorded_header(path: Path) -> tuple[dict[str, Any], list[Finding]]:
-    """What a record says for `trial.yaml`, and findings about it; nothing of a foreign file.
+    """Return the keys of a record for `trial.yaml`, and findings about it; nothing of a foreign file.
 
     Raises:
         CalibrationError: The record's own words for the header are broken.
@@ -327,8 +327,8 @@ USUAL: dict[str, dict[str, str]] = {
     "sensor_msgs/msg/BatteryState": {"voltage": "voltage"},
     "finssim_msgs/msg/HardwareTelemetry": {"depth": "depth"},
 }
-"""Type -> canonical column -> field. An Imu's attitude is taken only where a map says so, for many leave it unset.
-Where two of them hold one column and no map says which, the type that stands first here is believed."""
+"""Type -> canonical column -> field. An Imu's attitude is used only if a map names it, for many leave it unset. If two
+types hold one column and no map chooses, the first type here is used."""
 
 _PART = re.compile(r"([^.\[\]]+)|\[([^\]]*)\]")
 
@@ -520,7 +520,7 @@ def _messages(reader: Any, connections: Sequence[Any]) -> Iterator[tuple[int, An
 
 
 def _events(reader: Any) -> list[Stream]:
-    """What the events of our own records say."""
+    """Return the streams of the events of our own records."""
     connections = [c for c in reader.connections if c.topic.endswith("/events") and c.msgtype == TEXT]
     texts = ((time * 1e-9, message.data) for time, message in _messages(reader, connections))
     stream = spoken_events("events", texts, reader.start_time * 1e-9) if connections else None
@@ -689,7 +689,7 @@ def read_trials(
 def _groups(
     paths: list[Path], mapped: ColumnMap, format: Format, vehicle: str | None, has_map: bool
 ) -> list[Group]:
-    """Trial, streams and what the log says for the header, for each log or set of tables."""
+    """Return trial, streams and the log's keys for the header, for each log or set of tables."""
     if not paths:
         raise CalibrationError("no logs given: give at least one file")
     groups: list[Group] = []
@@ -730,7 +730,7 @@ def _kind(path: Path) -> Format:
 
 
 def _without_profile(path: Path) -> bool:
-    """Whether an MCAP's header names no profile, unlike one of ROS 2: BlueOS' recorder writes such files."""
+    """Return whether an MCAP's header names no profile, unlike one of ROS 2: BlueOS' recorder writes such files."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -739,7 +739,7 @@ def _without_profile(path: Path) -> bool:
 
 
 def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[Group]:
-    """Tables by trial: those for which `{trial}` or the first `*` of their patterns stands for the same text."""
+    """Return tables by trial: those for which `{trial}` or the first `*` of their patterns matches the same text."""
     if paths and has_map and not mapped.files:
         raise CalibrationError(
             f"the map has no entry for files such as {paths[0].name}: give 'files:' or 'columns:'"
@@ -764,7 +764,7 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
     groups: list[Group] = []
     for trial, sources in by_trial.items():
         if len(paths) == 1 and sources[0][0] in mapped.files and not set("*{") & set(sources[0][0]):
-            trial = paths[0].stem  # a single file has a name of its own
+            trial = paths[0].stem  # a single file gives its name
         patterns = [pattern for pattern, _, _ in sources]
         for pattern in patterns:
             if patterns.count(pattern) > 1:
@@ -783,7 +783,7 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
 
 def _trial_name(pattern: str, path: Path) -> str | None:
     """The trial that a file belongs to, or None where the pattern does not fit."""
-    # Without {trial} the first * stands for the trial; without either, the folder does.
+    # Without {trial} the first * gives the trial's name; without either, the folder does.
     before, mark, after = pattern.partition("{trial}" if "{trial}" in pattern else "*")
     hit = re.fullmatch(
         _expression(before) + ("(?P<trial>.+?)" if mark else "") + _expression(after), path.name

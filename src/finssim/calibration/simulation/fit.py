@@ -66,7 +66,7 @@ Array = NDArray[np.float64]
 # The fit of simulations to segments; finite differences are worlds.
 
 EXTRAS = ("thrust_scale", "thrust_lag", "thrust_delay", "buoyancy_excess", "k")
-"""What can be estimated besides the axes' own numbers and the parameters of the vehicle's terms."""
+"""Parameters that can be estimated besides the axes' own numbers and the parameters of the vehicle's terms."""
 
 MARGIN = 0.95
 """Part of the rigid-body inertia that a negative added mass may take away."""
@@ -91,12 +91,12 @@ class Coordinate:
     low: float
     high: float
     scale: float
-    """What counts as a large change; finite differences step a small part of it."""
+    """Size of a large change; finite differences take a small share of it as step."""
 
 
 @dataclass(frozen=True)
 class Plants:
-    """What W vectors mean to the simulator."""
+    """Simulator's parameters for W vectors."""
 
     fields: dict[str, Array]
     """Fields of `VehicleParameters`, (W, 1, ...)."""
@@ -240,7 +240,7 @@ class Parameters:
 
     @property
     def nuisances(self) -> int:
-        """How many coordinates, the last ones, are there for the sake of the others."""
+        """Return the number of nuisance coordinates, which are the last ones."""
         return len(self.imposed) + 2 * len(self.unseen)
 
     def mass_floor(self) -> Array:
@@ -281,7 +281,7 @@ class Parameters:
         return z + (k + gravity_part) / (water.density * water.gravity * volume)
 
     def plants(self, x: Array) -> Plants:
-        """What the simulator needs.
+        """Return the simulator's parameters.
 
         Args:
             x: Vectors, (W, P); numbers outside the box count as on its edge.
@@ -325,10 +325,10 @@ CLOSE = 0.25
 """Part of a standard error (of independent noise) that a converged estimate may still be off."""
 
 DAMPINGS = np.array([1e-2, 1e-1, 1.0, 1e1, 1e2, 1e4])
-"""Factors on the damping that are tried at once."""
+"""Factors on the damping that are tried together."""
 
 SMALL = 0.05
-"""Fall of half the sum of losses that is not worth another iteration: an error of a third of a standard error."""
+"""Decrease of half the sum of losses below which iteration ends: an error of a third of a standard error."""
 
 
 class Point(NamedTuple):
@@ -337,7 +337,7 @@ class Point(NamedTuple):
     theta: Array
     """Shared by all segments, (P,)."""
     z: Array
-    """Of each segment alone, deviations from the prior's mean, (S, q)."""
+    """Coordinates of each segment, as deviations from the prior's mean, (S, q)."""
 
 
 class Linear(NamedTuple):
@@ -353,19 +353,19 @@ class Linear(NamedTuple):
 
 @dataclass(frozen=True)
 class Solution:
-    """Where a fit ended."""
+    """End of a fit."""
 
     point: Point
     std: Array
-    """Of every sample, (N,)."""
+    """Standard deviation of every sample, (N,)."""
     cost: float
     """Half the sum of the losses."""
     linear: Linear
     iterations: int
     converged: bool
-    """Whether the last step is negligible beside the error that independent noise would leave."""
+    """True if the last step is negligible relative to the error that independent noise would leave."""
     step: Array
-    """What an undamped step would still change in theta, (P,)."""
+    """Change of theta by an undamped step, (P,)."""
     interrupted: bool = False
 
 
@@ -535,7 +535,7 @@ class Residuals:
         return len(self.value)
 
     def predicted(self, response: Response, late: Array) -> tuple[Array, Array]:
-        """What every candidate's sensors would have read at the samples' times, and its rate of change.
+        """Return the readings of every candidate's sensors at the samples' times, and their rate of change.
 
         Args:
             response: Of the candidates.
@@ -680,10 +680,10 @@ OFFSETS = {"p": 0.02, "q": 0.02, "r": 0.02, "roll": 0.03, "pitch": 0.03, "depth"
 levels that were mounted askew [rad], pressure at the surface [m]."""
 
 LATEST = 0.3
-"""By how much a stream may lag or lead the inputs [s]."""
+"""Greatest lag or lead of a stream relative to the inputs [s]."""
 
 LATE_STD = 0.05
-"""By how much streams lag or lead, as far as one knows beforehand [s]: noisy data cannot tell a lag from inertia."""
+"""Prior standard deviation of the lag of streams [s]: noisy data do not distinguish a lag from inertia."""
 
 
 # Where each segment begins: what was measured there, and how far a fit may move it.
@@ -692,13 +692,13 @@ STATES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
 """Numbers of an initial state: nu, a small turn about the body axes [rad], a world displacement [m]."""
 
 UNKNOWN = np.array([0.5, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 1e-6, 1e-6, 1e-6, 1e-6])
-"""Standard deviation of what nobody measured; heading and place do not matter then."""
+"""Standard deviation of unmeasured values; heading and place do not matter then."""
 
 LOOSE = np.array([0.2, 0.2, 0.2, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
-"""Of what was measured and is compared: wide, for the same measurements count as residuals."""
+"""Standard deviation of measured and compared values: wide, for the same measurements count as residuals."""
 
 TIGHT = np.array([0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.02, 0.02, 0.02, 0.03, 0.03, 0.03])
-"""Of what was measured and is not compared."""
+"""Standard deviation of measured values that are not compared."""
 
 SHOWN_BY = (
     *(("u", "x", "y"), ("v", "x", "y"), ("w", "z", "depth"), ("p", "roll"), ("q", "pitch"), ("r", "yaw")),
@@ -707,23 +707,23 @@ SHOWN_BY = (
 """Channels that show a state, in the order of `STATES`."""
 
 STEPS = np.array([0.002] * 9 + [0.005] * 3)
-"""Of the finite differences: small, for what is unstable multiplies them."""
+"""Steps of the finite differences: small, for instability multiplies them."""
 
 
 RELATIVE_STEP = 0.006
-"""Of the finite differences, against a coordinate's size: single precision leaves them three digits."""
+"""Step of the finite differences, relative to a coordinate's size: single precision leaves them three digits."""
 
 GRAIN = 0.004
-"""Part of a number that nobody minds."""
+"""Share of a number that is negligible."""
 
 COARSE = 0.05
-"""Of a channel's range: residuals of that size are small while the parameters are still far off."""
+"""Size of residuals relative to a channel's range that counts as small while the parameters are far off."""
 
 VAGUE = 8.0
-"""What is known of a fitted number beforehand: the file's within so many times its scale."""
+"""Prior standard deviation of a fitted number: the file's value within so many times its scale."""
 
 EXACT_CLOCK = 1e-3
-"""How far the stream that serves as the clock may lag [s]."""
+"""Greatest lag of the stream that serves as the clock [s]."""
 
 FLOOR = 1e-4
 """Smallest noise of a channel, against the range it covers: below it are the simulation's own errors."""
@@ -791,7 +791,7 @@ class Shooting:
         self.low = np.concatenate([parameters.low, -far])
         self.high = np.concatenate([parameters.high, far])
         # Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a
-        # solution, over short segments, nothing else keeps them from infinity. Streams tell the same time to hundredths
+        # solution, over short segments, nothing else keeps them finite. Streams agree on the time to hundredths
         # of a second.
         self.prior_mean = np.concatenate([parameters.expected, 0.0 * far])
         imposed = np.arange(len(parameters.low)) >= self.judged
@@ -810,7 +810,7 @@ class Shooting:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of theta: the parameters, then the lags of the streams [s]."""
+        """Return the names of theta: the parameters, then the lags of the streams [s]."""
         return self.parameters.names + tuple(f"{stream}.late" for stream in self.streams)
 
     def start(self) -> Point:
@@ -834,7 +834,7 @@ class Shooting:
         return self.measured.difference(value + out)
 
     def _predicted(self, points: Point) -> tuple[Array, Array]:
-        """What sensors without offsets would have read and its rate of change, (N, C) each."""
+        """Return the readings of sensors without offsets and their rate of change, (N, C) each."""
         P, C = len(self.parameters.names), len(points.theta)
         p = self.parameters.plants(points.theta[:, :P])
         fields = dict(p.fields)
@@ -905,7 +905,7 @@ class Shooting:
         return np.asarray(np.maximum.reduceat(own.max(axis=1), self.edges[:-1]))
 
     def grain(self, theta: Array) -> Array:
-        """Differences of theta that nobody minds, (P,)."""
+        """Return negligible differences of theta, (P,)."""
         P = len(self.parameters.names)
         size = np.maximum(np.abs(theta[:P]), 0.1 * self.parameters.scale)
         return GRAIN * np.append(size, np.full(len(theta) - P, 1.0))
@@ -916,7 +916,7 @@ class Shooting:
         self.low[late], self.high[late] = -far, far
 
     def size(self) -> Array:
-        """What counts as a large residual of every sample far from a solution, (N,)."""
+        """Return the size of a large residual of every sample far from a solution, (N,)."""
         size = np.maximum(3.0 * self.first_noise, COARSE * self.measured.spread())
         return np.asarray(size[self.measured.channel])
 
@@ -925,13 +925,13 @@ class Shooting:
         return np.asarray(self.measured.noise(residual, self._floor)[self.measured.channel])
 
 
-# The fit of a vehicle with them: first, what each trial, or each block of a few trials, says about its parameters.
+# The fit of a vehicle with them: first, the evidence of each trial, or block of a few trials, on its parameters.
 
 FEWEST_TRIALS = 4
-"""With fewer, trials are cut into blocks to estimate the spread."""
+"""Trials below which they are cut into blocks to estimate the spread."""
 
 BLOCKS = 24
-"""That many, all trials together."""
+"""Number of blocks of all trials together."""
 
 
 class Confidence(NamedTuple):
@@ -940,7 +940,7 @@ class Confidence(NamedTuple):
     evidence: Evidence
     covariance: Covariance
     free: Array
-    """Where the last step would go without bounds, (P,)."""
+    """Result of the last step without bounds, (P,)."""
     interval: Array
     """95 %, around `free` and containing theta, (P, 2)."""
 
@@ -981,7 +981,7 @@ def evidence_of(problem: Shooting, solution: Solution) -> Evidence:
     if problem.few or len(np.unique(trial)) < FEWEST_TRIALS:
         unit, group = "blocks", _blocks(problem, trial)
     parts = [np.flatnonzero(group == label) for label in np.unique(group)]
-    # What is known beforehand is one more witness.
+    # Prior knowledge is one more group.
     known = problem.prior_precision
     pull = known * (problem.prior_mean - solution.point.theta)
     normal = [(slopes[rows].T * weight[rows]) @ slopes[rows] for rows in parts]
@@ -1020,7 +1020,7 @@ PATHS = {
     "thrust_lag": "thrusters.*.time_constant",
     "thrust_delay": "thrusters.*.delay",
 }
-"""Coordinates besides those of the axes that are reported, and where they stand in the vehicle file."""
+"""Reported coordinates besides those of the axes, and their places in the vehicle file."""
 
 
 def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> dict[str, Number]:
@@ -1082,7 +1082,7 @@ def axis_result(
 def other_estimates(
     p: Parameters, numbers: Mapping[str, Number]
 ) -> tuple[dict[str, Estimate], list[Finding]]:
-    """Of what no axis has for itself, and which of them rest on a bound."""
+    """Return the estimates that belong to no axis, and findings on those that rest on a bound."""
     out, bounds = dict[str, Estimate](), list[Finding]()
     units = {c.name: c.unit for c in p.coordinates if c.name in PATHS} | {
         path: unit_of(path) for path in p.terms
@@ -1113,7 +1113,7 @@ def other_estimates(
     return out, bounds
 
 
-# What trials show: which axes they excite, which measurements tell of an axis, how fast the vehicle answers.
+# Content of the trials: excited axes, measurements of each axis, response time of the vehicle.
 
 TELL = {
     "surge": ("u", "x", "y"),
@@ -1123,7 +1123,7 @@ TELL = {
     "pitch": ("q", "pitch"),
     "yaw": ("r", "yaw"),
 }
-"""Measured columns that tell of an axis, the most direct first."""
+"""Measured columns that determine an axis, the most direct first."""
 
 DRIFTING = {"x": "u", "y": "v", "z": "w", "depth": "w", "yaw": "r"}
 """Integrals without a restoring force: where the rate is measured they add drift, not knowledge."""
@@ -1197,8 +1197,8 @@ def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
         noise = s.motion.noise_std[i]
         answers = _range(nu) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
         pushed = limits[i] > 0.0 and _range(tau[:, i]) > PUSH * limits[i]
-        # Weight rights roll and pitch again: a swing tells of them whatever began it, be it small. If they were not
-        # fitted, the file's stiffness, which nobody may have measured, would decide how surge and sway go on.
+        # Weight rights roll and pitch: a small swing determines them, whatever started it. If they were not
+        # fitted, the file's stiffness, which may be a guess, would determine the later course of surge and sway.
         swings = i in (3, 4)
         if answers and (pushed or swings or s.drive.source == "passive"):
             out.add(axis)
@@ -1247,7 +1247,7 @@ def sampling(trials: Sequence[Streams]) -> float:
 # What a simulation-error fit shows besides its estimates: figures by axis, curves, findings.
 
 LATE = 0.03
-"""Lag of a stream worth a warning [s]."""
+"""Lag of a stream that leads to a warning [s]."""
 
 SHOWN = 4
 """Trials in the curve of an axis."""
@@ -1256,8 +1256,8 @@ SHOWN = 4
 def _shown_by(
     problem: Shooting, axis: str
 ) -> tuple[str, NDArray[np.int64], NDArray[np.int64], dict[int, float]]:
-    """The most direct channel in use that tells of an axis, its samples (n,), their trials (n,), and the range of the
-    channel in each trial, from the 5th to the 95th percentile; no samples where there is no such channel."""
+    """Return the most direct used channel that determines an axis, its samples (n,), their trials (n,), and the range
+    of the channel in each trial, from the 5th to the 95th percentile; no samples without such a channel."""
     m = problem.measured
     name = next((c for c in TELL[axis] if c in m.names), "")
     rows = np.flatnonzero(m.channel == m.names.index(name)) if name else np.empty(0, int)
@@ -1321,7 +1321,7 @@ def fit_findings(
     found: Confidence,
     used: Sequence[Streams],
 ) -> list[Finding]:
-    """What a reader should know before using the numbers."""
+    """Return findings that a reader needs before using the numbers."""
     out = []
     if solution.interrupted:
         out.append(finding("interrupted"))
@@ -1350,13 +1350,13 @@ def _close(solution: Solution, found: Confidence, judged: int) -> bool:
 
 
 class Clock:
-    """Tells progress over several stages: iteration, cost, rate and what may remain."""
+    """Progress over several stages: iteration, cost, rate and remaining time."""
 
     def __init__(self, progress: Callable[[float, str], None] | None) -> None:
         self.progress, self.begin, self.part = progress, time.perf_counter(), 0.0
 
     def __call__(self, words: str, toward: float = 1.0) -> None:
-        # How many iterations remain nobody knows; each takes a share of the rest.
+        # The number of remaining iterations is unknown; each takes a share of the rest.
         self.part += 0.2 * max(toward - self.part, 0.0)
         spent = time.perf_counter() - self.begin
         if self.progress:
@@ -1382,7 +1382,7 @@ def changes(
     for path, matrix in _matrices(p, x).items():
         old = np.asarray(getattr(p.set, path.rpartition(".")[2]), float)
         for i, axis in enumerate(AXES):
-            # Axes that nobody measured were simulated: the others hold with their numbers.
+            # Axes without measurements were simulated: the others hold with their numbers.
             if f"{path}.{i}.{i}" in axes or axis in p.unseen:
                 for j in range(6):
                     # Couplings are written where the fit did away with them.
@@ -1414,10 +1414,10 @@ def _drag_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: fl
 
 
 STEP = 0.02
-"""Of the simulation [s]."""
+"""Step of the simulation [s]."""
 
 SHORT = 2.5
-"""Of the segments at first [s]: over so short a time every problem is nearly linear."""
+"""Initial length of the segments [s]: over so short a time every problem is nearly linear."""
 
 OWN_ERROR, BETWEEN = 0.003, 0.05
 """Error of the simulation itself, as a part of an estimate; and how it grows with the time between samples of the
@@ -1441,7 +1441,7 @@ class Stage:
 
     @property
     def x(self) -> Array:
-        """Where the parameters ended, (P,)."""
+        """Return the final parameters, (P,)."""
         return self.solution.point.theta[: len(self.problem.parameters.names)]
 
 
@@ -1540,7 +1540,7 @@ class Stages:
         return Stage(problem, solution, confidence(problem, solution))
 
     def numbers(self, stage: Stage) -> dict[str, Number]:
-        """Of a stage."""
+        """Return the numbers of a stage."""
         return numbers_of(stage.problem.parameters, stage.x, stage.found, self.own_error)
 
     def report(self, words: str, toward: float) -> Callable[[int, float], None]:
@@ -1565,14 +1565,14 @@ class Stages:
                 f"no interval of these trials has both inputs and measurements of {', '.join(self.axes)}"
             )
         commanded = np.array([s.commanded for s in self.segments])
-        # Where every input is said to have acted, whoever asks for a lag doubts that.
+        # If every input is stated to have acted, a request for a lag doubts that.
         self.lagged = commanded if commanded.any() else np.ones_like(commanded)
 
     def _part(self, one: Streams) -> float:
         return self.shorter.get(one.trial.name, 1.0)
 
     def problem(self, kinds: dict[str, str], start: dict[str, float]) -> Shooting:
-        """What is free, over the segments."""
+        """Return the problem of the free parameters, over the segments."""
         parameters = Parameters(
             self.vehicle,
             axes=self.axes,
@@ -1675,7 +1675,7 @@ def fit_by_simulation(
     begin: Fit | None = None,
     progress: Progress | None = None,
 ) -> Fit:
-    """Fit by simulation error over all trials at once.
+    """Fit by simulation error over all trials together.
 
     Trials are cut into segments with an initial state each; Levenberg-Marquardt moves the parameters, the initial
     states, offsets of the sensors and lags of their streams, with derivatives from parallel worlds. All numbers hold at

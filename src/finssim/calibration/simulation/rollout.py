@@ -1,4 +1,4 @@
-"""Many candidate plants over many segments at once, as parallel worlds of one simulator."""
+"""Many candidate plants over many segments, as parallel worlds of one simulator."""
 
 from __future__ import annotations
 
@@ -45,34 +45,34 @@ class Segment:
     trial: str
     """Name of the trial."""
     index: int
-    """Which of the trials of a fit it belongs to."""
+    """Index of its trial in the fit."""
     t0: float
     """Its start on the trial's clock [s]."""
     step: float
     """[s]"""
     force: Array
-    """What the motors are told in each step [N, N m]: the mean of a held command; of an applied force, which is
-    linear between samples, the value at the step's end. (steps, k)"""
+    """Command of the motors in each step [N, N m]: the mean of a held command; of an applied force, which is linear
+    between samples, the value at the step's end. (steps, k)"""
     before: Array
-    """The same in the steps before, the newest last; repeats the first value before the trial began. (m, k)"""
+    """Command in the steps before, the newest last; repeats the first value before the trial began. (m, k)"""
     B: Array
     """Wrench about the body origin per unit force, (6, k)."""
     commanded: bool
-    """Whether delay, dead zone, lag, slew and limits lie between `force` and what acts."""
+    """True if delay, dead zone, lag, slew and limits lie between `force` and what acts."""
     thrusters: bool
-    """Whether the k forces are the vehicle's thrusters in canonical order."""
+    """True if the k forces are the vehicle's thrusters in canonical order."""
     position: Array
-    """At the start, world frame [m], (3,); 0 where unknown."""
+    """Position at the start, world frame [m], (3,); 0 if unknown."""
     quaternion: Array
-    """At the start, body to world, (4,); level and heading 0 where unknown."""
+    """Rotation at the start, body to world, (4,); level and heading 0 if unknown."""
     nu: Array
-    """At the start, of the body origin [m/s, rad/s], (6,); 0 where unknown."""
+    """Velocity of the body origin at the start [m/s, rad/s], (6,); 0 if unknown."""
     known: NDArray[np.bool_]
-    """Which of nu (6), roll, pitch, yaw, x, y, z at the start come from measurements, (12,)."""
+    """Flags of nu (6), roll, pitch, yaw, x, y, z at the start that come from measurements, (12,)."""
     sink: float
     """Added to the height while simulating [m], so that a vehicle that stayed wholly submerged cannot surface."""
     density: float
-    """Of the water [kg/m³]."""
+    """Density of the water [kg/m³]."""
     current: Array
     """World frame [m/s], (3,)."""
     measured: dict[str, tuple[Array, Array]]
@@ -80,7 +80,7 @@ class Segment:
     velocity_at: Array
     """Body point whose velocity u, v, w are [m]."""
     velocity_in_water: bool
-    """Whether u, v, w are relative to the water."""
+    """True if u, v, w are relative to the water."""
     position_at: Array
     """Body point whose position x, y, z are [m]."""
     depth_at: Array
@@ -201,7 +201,7 @@ def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, i
 
 
 def _told(d: Drive, edges: Array) -> Array:
-    """What the motors are told in each step between `edges` [s], (steps, k); see `Segment.force`."""
+    """Return the command of the motors in each step between `edges` [s], (steps, k); see `Segment.force`."""
     if d.commanded:
         return _means(d, edges)
     # An actuator without lag ramps from one value to the next: each is the value at its step's end, or the mean around
@@ -247,7 +247,7 @@ def _start(m: Motion, t0: float) -> tuple[Array, Array, Array, NDArray[np.bool_]
 
 
 def _sink(m: Motion, vehicle: Vehicle, a: float, b: float) -> float:
-    """How far down to simulate [m]: not at all where the vehicle came near the surface.
+    """Return how far down to shift the simulation [m]: not at all if the vehicle came near the surface.
 
     No vehicle flies: heights well above 0 have another zero than the surface, such as a motion capture's on the floor,
     and then the vehicle counts as submerged.
@@ -265,7 +265,7 @@ def _sink(m: Motion, vehicle: Vehicle, a: float, b: float) -> float:
     return DEEP if float(center.max()) < -reach else 0.0
 
 
-# Many candidate plants over many segments at once.
+# Many candidate plants over many segments.
 
 Single = NDArray[np.float32]
 
@@ -284,18 +284,18 @@ OPEN = 1.0e6
 
 @dataclass(frozen=True)
 class Response:
-    """What every candidate did on every segment; rows from a world's end, or its divergence, on are NaN."""
+    """Response of every candidate on every segment; rows from a world's end, or its divergence, on are NaN."""
 
     t: NDArray[np.float64]
     """Since the segment's start [s], (n + 1,)."""
     nu: Single
-    """Of the body origin, body frame [m/s, rad/s], (n + 1, C, S, 6)."""
+    """Velocity of the body origin, body frame [m/s, rad/s], (n + 1, C, S, 6)."""
     position: Single
-    """Of the body origin, world frame [m], (n + 1, C, S, 3)."""
+    """Position of the body origin, world frame [m], (n + 1, C, S, 3)."""
     quaternion: Single
     """Body to world, (n + 1, C, S, 4)."""
     finite: NDArray[np.bool_]
-    """Whether a world came to its segment's end, (C, S)."""
+    """True if a world reached its segment's end, (C, S)."""
 
 
 class Rollouts:
@@ -451,7 +451,7 @@ class Rollouts:
         return self._simulators[candidates]
 
     def _pass(self, C: int, given: dict[str, NDArray[Any]], out: dict[str, Single]) -> NDArray[np.bool_]:
-        """One pass of candidates that fit in memory; writes their responses and tells which came to the end."""
+        """Simulate candidates that fit in memory; write their responses and return which reached the end."""
         sim, S = self._simulator(C), len(self.segments)
         shape = (C, S)
 
@@ -490,7 +490,7 @@ class Rollouts:
     def _place(
         self, sim: Simulator, write: Callable[[Any, NDArray[Any]], None], start: dict[str, NDArray[Any]]
     ) -> None:
-        """Put every world into the state `start` where it says one, else into its segment's own."""
+        """Set every world to the state `start`, if it gives one, otherwise to its segment's own."""
         for name, own in (("nu", "velocity"), ("quaternion", "quaternion"), ("position", "position")):
             values = start.get(name, np.stack([getattr(s, name) for s in self.segments])[None])
             if name == "position":
@@ -517,7 +517,7 @@ class Rollouts:
             nu[:, those] = now
 
     def _march(self, sim: Simulator, C: int, out: dict[str, Single]) -> NDArray[np.bool_]:
-        """Simulate the segments; writes what every world does and tells which came to the end."""
+        """Simulate the segments; write the response of every world and return which reached the end."""
         n, S = self._force.shape[:2]
         command, begin = self._command(sim, C), sim.state.steps.numpy().reshape(C, S).copy()
         views = {

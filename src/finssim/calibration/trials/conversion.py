@@ -26,7 +26,7 @@ GRAVITY = 9.80665
 """Standard gravity, of the units g and kgf [m/s²]."""
 
 POUND = 0.45359237
-"""Of the units lbf and ozf, which is a sixteenth of it [kg]."""
+"""Mass of the units lbf and ozf, which is a sixteenth of it [kg]."""
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 """Seconds in one of each."""
@@ -105,7 +105,7 @@ def unit_of(canonical: str) -> str:
 
 
 def factor(unit: str | None, canonical: str) -> float:
-    """What a number in `unit` is multiplied by to be in the unit of the canonical column; 1 for no unit.
+    """Return the factor from a number in `unit` to the unit of the canonical column; 1 for no unit.
 
     Raises:
         CalibrationError: Unknown unit, or one of another dimension.
@@ -195,7 +195,7 @@ def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.i
 
 
 def _collides(t: Array, columns: Mapping[str, Array], i: int) -> bool:
-    """Whether the rows from `i` on retell times that the same columns have had before."""
+    """Return whether the rows from `i` on repeat times of earlier rows of the same columns."""
     earlier = np.flatnonzero(t[:i] >= t[i])
     later = i + np.flatnonzero(t[i:] <= t[:i].max())
     if len(earlier) <= FEW or len(later) <= FEW:
@@ -339,7 +339,7 @@ def tidy_quaternions(channels: Channels) -> list[Finding]:
 
 
 def upside_down(channels: Mapping[str, Array]) -> bool:
-    """Whether the attitude has the vehicle on its back most of the time, as with one axis convention left out."""
+    """Return whether the vehicle is on its back most of the time, as with one axis convention left out."""
     if all(name in channels for name in QUATERNION):
         q = np.stack([channels[name] for name in QUATERNION], axis=-1)
     elif "roll" in channels:

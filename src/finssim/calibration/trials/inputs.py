@@ -1,4 +1,4 @@
-"""What pushed the vehicle in a trial: the recorded inputs as forces, and the wrench that they applied."""
+"""Inputs of a trial: the recorded inputs as forces, and the wrench that they applied."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def require_fittable(trials: Sequence[Trial], vehicle: Vehicle) -> None:
 
 
 def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
-    """What no vehicle can have done: speeds, and speeds or kinetic energy beyond what its thrust can give.
+    """Return findings about the impossible: speeds, and speeds or kinetic energy beyond what the thrust can give.
 
     Args:
         trial: As it was read.
@@ -99,7 +99,7 @@ def _unearned(trial: Trial, vehicle: Vehicle) -> list[Finding]:
     try:
         inputs = drive(trial, vehicle)
     except CalibrationError:
-        return []  # whoever needs the inputs says what is missing
+        return []  # a function that needs the inputs reports what is missing
     v = np.column_stack([np.interp(inputs.t, *trial.series(name)) for name in "uvw"])
     tau = np.nan_to_num(applied_wrench(inputs, vehicle, inputs.t)[:, :3])
     power = np.abs(np.sum(tau * v, axis=1))
@@ -145,7 +145,7 @@ class Motors:
     slew: Array
     """[N/s], or [rad/s²] where `speed`."""
     speed: NDArray[np.bool_]
-    """Whether lag and slew act on shaft speed rather than on thrust."""
+    """True if lag and slew act on shaft speed rather than on thrust."""
     c_plus: Array
     """T = c± ω|ω| [N s²/rad²]."""
     c_minus: Array
@@ -258,10 +258,10 @@ def _followed(t: Array, u: Array, at: Array, time_constant: float, slew: float) 
     return np.asarray(u[last] - remaining * np.exp(-(since - ramps) / time_constant))
 
 
-# Which columns of a trial tell what drove the vehicle.
+# Columns of a trial that describe its inputs.
 
 ORDER = ("rpm_", "force_", "tau", "pwm_", "command_")
-"""Inputs from the one that tells most of what acted to the one that tells least."""
+"""Kinds of input, from the closest to what acted to the least close."""
 
 
 def input_columns(trial: Trial, vehicle: Vehicle) -> dict[str, list[str]]:
@@ -274,7 +274,7 @@ def input_columns(trial: Trial, vehicle: Vehicle) -> dict[str, list[str]]:
 
 
 def first_complete(present: dict[str, list[str]], trial: Trial, vehicle: Vehicle) -> str:
-    """The kind of input that tells most of what acted, of those that are there for every thruster.
+    """Return the kind of input closest to what acted, of those that are present for every thruster.
 
     Of a wrench any axis will do.
 
@@ -320,7 +320,7 @@ def _missing_inputs(present: dict[str, list[str]], vehicle: Vehicle) -> str:
 
 
 ACTED = ("rpm_", "force_", "tau")
-"""Inputs that are what acted, unless the header says otherwise."""
+"""Inputs that are what acted, unless the header states otherwise."""
 
 RPM = 2.0 * np.pi / 60.0
 """rad/s of one turn a minute."""
@@ -339,19 +339,19 @@ class Drive:
     names: tuple[str, ...]
     """Thrusters, or `tau_x` ... `tau_n`."""
     commanded: bool
-    """Whether these were asked for: limits, dead zone, delay, lag and slew of the motors lie before what acted."""
+    """True if these were commanded: limits, dead zone, delay, lag and slew of the motors lie before what acted."""
     thrusters: bool
-    """Whether the channels are the vehicle's thrusters, in canonical order."""
+    """True if the channels are the vehicle's thrusters, in canonical order."""
     held: bool
-    """Whether a value acts until the next, rather than in a straight line to it."""
+    """True if a value acts until the next, rather than linearly to it."""
     spans: Array
     """Beginnings and ends of the stretches in which the inputs are known [s], (s, 2)."""
     source: str
     """`rpm`, `force`, `tau`, `pwm`, `command`, or `passive`."""
     end: float | None = None
-    """From here on the recording goes on and the inputs are unknown [s]; None where they last as long."""
+    """Time from which on the recording continues and the inputs are unknown [s]; None if they last as long."""
     findings: tuple[Finding, ...] = ()
-    """What was assumed."""
+    """Assumptions."""
 
     def at(self, t: Array) -> Array:
         """Forces at given times [s], (m,) -> (m, k), before the motors; beyond the ends the nearest."""
@@ -421,7 +421,8 @@ def _undriven(trial: Trial) -> Drive:
 
 
 def _between(trial: Trial, kind: str, columns: list[str]) -> tuple[bool, bool, bool]:
-    """Whether inputs were commanded, hold from row to row, and are seen to hold though the header does not say."""
+    """Return whether inputs were commanded, hold from row to row, and are observed to hold though the header does not
+    state it."""
     header = trial.header
     commanded = header.inputs == "commanded" or (header.inputs is None and kind not in ACTED)
     if header.inputs_between is not None:
@@ -443,7 +444,7 @@ def _channels(
 
 
 def _assumed(kind: str, present: dict[str, list[str]], stepped: bool) -> list[Finding]:
-    """What was assumed."""
+    """Return findings about the assumptions."""
     source = kind.rstrip("_")
     findings = [
         finding("inputs_incomplete", kind=k, used=source) for k in ORDER[: ORDER.index(kind)] if present[k]
@@ -494,7 +495,8 @@ def _spans(t: Array) -> Array:
 
 
 def _held_spans(t: Array, recording: Array, end: float | None) -> Array:
-    """A command holds until the next, but not through a gap of the whole recording, nor beyond its stream's end."""
+    """Return where a command holds until the next, but not through a gap of the complete recording, nor beyond its
+    stream's end."""
     inside = recording[(recording >= t[0]) & (recording <= (np.inf if end is None else end))]
     return _spans(inside)
 
@@ -511,7 +513,7 @@ def _end(trial: Trial, t: Array, force: Array) -> float | None:
 
 
 def _keeps_levels(trial: Trial, columns: list[str]) -> bool:
-    """Whether inputs stay exactly at levels and jump between them from row to row, as a program sets them.
+    """Return whether inputs stay exactly at levels and jump between them from row to row, as a program sets them.
 
     What motors delivered passes through the values between, and what a sensor measured never repeats.
     """

@@ -52,30 +52,30 @@ class TrialWater(_Section):
     density: float | None = Field(default=None, gt=0.0)
     """[kg/m³]"""
     depth: float | None = Field(default=None, gt=0.0)
-    """Of the pool [m]."""
+    """Depth of the pool [m]."""
     current: Point | None = None
     """World frame [m/s]."""
 
 
 class Header(_Section):
-    """Everything is optional; what is left out is as the trial format's page says."""
+    """Content of `trial.yaml`. All keys are optional; the page on trials gives their defaults."""
 
     vehicle: str | None = None
     """Name or file of the vehicle."""
     axis: tuple[Axis, ...] = ()
     """Axes that the trial excites; found from the data where empty."""
     role: Literal["fit", "held-out"] | None = None
-    """Whether a fit may use it; a fit refuses held-out trials."""
+    """Role of the trial in a fit; a fit refuses held-out trials."""
     description: str = ""
     inputs: Literal["applied", "commanded"] | None = None
-    """Whether the input columns are what acted (measured, reconstructed) or what was asked for, before delay and lag.
-    `None`: `rpm_*`, `force_*` and `tau_*` acted, `pwm_*` and `command_*` were asked for."""
+    """Kind of the input columns: what acted (measured, reconstructed) or what was commanded, before delay and lag.
+    `None`: `rpm_*`, `force_*` and `tau_*` acted, `pwm_*` and `command_*` were commanded."""
     inputs_between: Literal["held", "linear"] | None = None
-    """What inputs did between two samples. `None`: what was asked for is held, and so is what keeps exact levels and
-    jumps from row to row; anything else that acted goes in a straight line."""
+    """Inputs between two samples. `None`: commands are held, and so are inputs that keep exact levels and jump from row
+    to row; anything else that acted is linear."""
     inputs_after: Literal["held", "zero", "unknown"] | None = None
-    """What acts after an input stream that ends before the recording does. `None`: a last command of no thrust is held,
-    any other is unknown from one sample later on."""
+    """Inputs after the end of an input stream within the recording. `None`: a last command of no thrust is held, any
+    other is unknown from one sample later on."""
     passive: bool = False
     """Thrusters off: no input columns are needed."""
     wrench_at: Annotated[
@@ -92,17 +92,17 @@ class Header(_Section):
     depth_at: Point | None = None
     """Body point of the pressure sensor [m]; the vehicle's depth sensor where not given."""
     acceleration: Literal["specific_force", "kinematic", "auto"] = "auto"
-    """Whether ax, ay, az hold gravity (an accelerometer: +9.81 up at rest) or not; found from the data if `auto`."""
+    """Kind of ax, ay, az: with gravity (an accelerometer: +9.81 up at rest) or without; `auto` finds it."""
     velocity: Literal["ground", "water"] = "ground"
-    """What u, v, w are relative to."""
+    """Reference of u, v, w."""
     voltage: float | None = Field(default=None, gt=0.0)
-    """Of the battery [V], for pulse widths; a column `voltage` comes first."""
+    """Voltage of the battery [V], for pulse widths; a column `voltage` has priority."""
     water: TrialWater = Field(default_factory=TrialWater)
 
     @model_validator(mode="before")
     @classmethod
     def _single_axis(cls, data: Any) -> Any:
-        """A single axis may stand without brackets."""
+        """Accept a single axis without brackets."""
         if isinstance(data, dict) and "convert" in data:
             raise refuse_section(
                 "convert is gone: import the table with a map of its columns, units, frame and clocks (trials import)"
@@ -201,9 +201,9 @@ class Trial:
     phase: NDArray[np.str_] | None = None
     """A word of `PHASES` or "" for every row, (n,); None where the log names no phases."""
     header: Header = field(default_factory=Header)
-    """What `trial.yaml` says."""
+    """Content of `trial.yaml`."""
     findings: tuple[Finding, ...] = ()
-    """What was repaired or left out while reading."""
+    """Repairs, and data that was left out while reading."""
     path: Path | None = None
     """Folder or file it was read from."""
 
@@ -275,7 +275,7 @@ class Trial:
         )
 
     def has(self, *columns: str) -> bool:
-        """Whether every one of these columns holds at least two finite samples."""
+        """Return whether every one of these columns holds at least two finite samples."""
         return all(c in self.channels and np.isfinite(self.channels[c]).sum() >= 2 for c in columns)
 
     def series(self, column: str) -> tuple[Array, Array]:
@@ -288,7 +288,7 @@ class Trial:
 
     @property
     def duration(self) -> float:
-        """From the first row to the last [s]."""
+        """Time from the first row to the last [s]."""
         return float(self.t[-1] - self.t[0])
 
     def __repr__(self) -> str:

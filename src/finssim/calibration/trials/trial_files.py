@@ -48,7 +48,7 @@ class Table:
     words: dict[str, list[str]] = field(default_factory=dict)
     """Column -> text, for columns in which no cell is a number (and for `phase`)."""
     findings: list[Finding] = field(default_factory=list)
-    """What was left out or repaired."""
+    """Repairs, and data that was left out."""
 
     @property
     def columns(self) -> list[str]:
@@ -253,7 +253,7 @@ def without_repeats(channels: dict[str, Array]) -> list[Finding]:
 
 
 def new_samples(values: Array) -> NDArray[np.bool_]:
-    """Which rows are new, (n, c) -> (n,); all where the rows do not repeat in a regular way.
+    """Return which rows are new, (n, c) -> (n,); all if the rows do not repeat in a regular way.
 
     Long runs are taken for rest: in them a row counts as new every usual run.
     """
@@ -275,7 +275,7 @@ def new_samples(values: Array) -> NDArray[np.bool_]:
 
 
 def _coarse(changes: Array) -> bool:
-    """Whether most changes are of one size: the last digit of a sensor, which repeats for another reason."""
+    """Return whether most changes are of one size: the last digit of a sensor, which repeats for another reason."""
     steps = np.abs(np.diff(changes))
     steps = steps[steps > 0.0]
     return len(steps) > 0 and float(np.mean(steps < 1.001 * steps.min())) > 0.5
@@ -433,7 +433,7 @@ def header_text(header: Header) -> str:
 
 
 def _content(path: Path) -> str:
-    """What a file holds besides comments and blank lines."""
+    """Return the content of a file without comments and blank lines."""
     lines = path.read_bytes().decode("utf-8", errors="replace").splitlines()
     return "".join(line for line in lines if line.strip() and not line.lstrip().startswith("#"))
 
@@ -598,7 +598,7 @@ def trials_at(path: Path) -> list[Path]:
 
 
 def _unique_names(trials: list[Trial], paths: list[Path]) -> list[str]:
-    """Names of the trials; equal ones get as many of their parent folders as tells them apart."""
+    """Return the names of the trials; equal ones get as many of their parent folders as distinguish them."""
     names = [trial.name for trial in trials]
     parents = [list(path.resolve().parts[-2::-1]) for path in paths]
     depth = 0

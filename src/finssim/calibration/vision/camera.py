@@ -1,4 +1,4 @@
-"""What `finssim calibrate camera` runs: read pictures, find the board, fit the lens, write the camera file."""
+"""Work of `finssim calibrate camera`: read pictures, find the board, fit the lens, write the camera file."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ Array = NDArray[np.float64]
 # Boards of known corners, and where a picture shows those corners.
 
 COMMON_SIZES = ((9, 6), (8, 6), (7, 6), (7, 5), (8, 5), (10, 7), (11, 8), (6, 4), (6, 5), (11, 7), (9, 7))
-"""Inner corners that are tried where nobody says how many the board has."""
+"""Inner corners that are tried if the board's size is not given."""
 
 REFINE_SHARE = 0.35
 """Half width of the window that refines a corner, in distances to its nearest neighbour: no other corner is in it."""
@@ -75,7 +75,7 @@ class Board:
     marker: float | None = None
     """Edge of a marker's black border [m]; None for a chessboard."""
     dictionary: str = "DICT_5X5_100"
-    """Of the markers, as OpenCV calls it."""
+    """Dictionary of the markers, by OpenCV's name."""
 
     def __post_init__(self) -> None:
         least = 3 if self.marker is None else 2
@@ -113,13 +113,13 @@ class BoardView:
 
     name: str
     width: int
-    """Of the picture [px]."""
+    """Width of the picture [px]."""
     height: int
-    """Of the picture [px]."""
+    """Height of the picture [px]."""
     pixels: Array
     """(n, 2); integer coordinates are pixel centres."""
     points: Array
-    """The same corners on the board, board frame, z = 0 [m], (n, 3)."""
+    """Corners on the board, board frame, z = 0 [m], (n, 3)."""
 
 
 def parse_size(text: str, option: str) -> tuple[int, int]:
@@ -272,7 +272,7 @@ UNSURE_FOCAL = 0.02
 """Half width of its interval, relative, beyond which a focal length does not count as identified."""
 
 UNSURE_CENTRE = 0.02
-"""The same for the principal point, in widths of the image."""
+"""Half width of a certain principal point, in widths of the image."""
 
 COLUMNS, ROWS = 12, 9
 """Points of the picture at which the uncertainty of a pixel is computed."""
@@ -284,7 +284,7 @@ BORDER = 0.10
 """Empty share of the picture's width or height that is spoken of."""
 
 FLAT, TILTED = math.radians(10.0), math.radians(20.0)
-"""Tilts below which a board tells next to nothing of the focal length, and little."""
+"""Tilts below which a board gives almost no information on the focal length, and little."""
 
 FEW_VIEWS = 10
 LARGE_ERROR = 1.0
@@ -397,7 +397,7 @@ def board_pose(lens: Lens, view: BoardView) -> Pose | None:
 
 
 def evidence(bundle: Bundle, views: Sequence[BoardView]) -> Evidence:
-    """What each view says about the lens once its own pose is taken out, for intervals that treat a view as one."""
+    """Return the evidence of each view on the lens without its own pose, for intervals that treat a view as one."""
     blocks = []
     for view, pose, residual in zip(views, bundle.poses, bundle.residuals, strict=True):
         points_c = pose.at(view.points)
@@ -419,7 +419,7 @@ class View:
     """Measured less predicted, (n, 2) [px]."""
     pose: Pose
     left_out: str = ""
-    """Why it was not used; empty if it was."""
+    """Reason why it was not used; empty if it was."""
 
     @property
     def rms(self) -> float:
@@ -445,11 +445,11 @@ class CameraFit:
     rms: float
     """Root of the mean squared distance of corners over the views used [px]."""
     held_out_rms: float
-    """The same for views that the lens was not fitted to, only their pose; NaN if there are too few views [px]."""
+    """Residual of views that the lens was not fitted to, only their pose; NaN if there are too few views [px]."""
     error95: tuple[float, float]
     """Largest radius of the 95 % circle of a pixel of known direction, where corners were seen and anywhere [px]."""
     covariance: Covariance
-    """Of the lens's numbers, in the order of `lens_names`."""
+    """Covariance of the lens's numbers, in the order of `lens_names`."""
     findings: tuple[Finding, ...]
     settings: dict[str, Any] = field(default_factory=dict)
 
@@ -550,7 +550,7 @@ def _without_outliers(views: Sequence[BoardView], bundle: Bundle) -> tuple[list[
 
 
 def _without_strays(view: BoardView, residual: Array) -> BoardView:
-    """The view without corners that are far off among those of its own."""
+    """Return the view without corners that are far off among those of its own."""
     size = np.linalg.norm(residual, axis=-1)
     keep = size <= STRAY * max(float(np.median(size)), 1e-6)
     return replace(view, pixels=view.pixels[keep], points=view.points[keep])
@@ -587,7 +587,7 @@ def _views(views: Sequence[BoardView], used: Mapping[str, int], bundle: Bundle) 
 
 
 def _estimates(lens: Lens, half: Array) -> dict[str, Estimate]:
-    """By name, from half widths of the 95 % intervals in the order of `lens_names`."""
+    """Return estimates by name, from half widths of the 95 % intervals in the order of `lens_names`."""
     estimates = {}
     for name, value, width in zip(lens_names(lens.model), lens_vector(lens), half, strict=True):
         unit, limit, note = "-", math.inf, "not told"
@@ -653,7 +653,7 @@ def pixel_error(lens: Lens, at: Array, corners: Array, covariance: Covariance) -
 def camera_findings(
     lens: Lens, views: Sequence[View], estimates: Mapping[str, Estimate], error95: tuple[float, float]
 ) -> tuple[Finding, ...]:
-    """Coverage, tilt and what cannot be told, and what to photograph; none if nothing is to say."""
+    """Return findings on coverage, tilt and undetermined numbers, and what to photograph; none if all is well."""
     tilts, findings = np.array([view.tilt for view in views]), []
     tilted = int(np.sum(tilts > TILTED))
     if tilts.max() < FLAT:
@@ -693,14 +693,14 @@ READING = (
 )
 
 DIGITS = 7
-"""Of the numbers in a record."""
+"""Digits of the numbers in a record."""
 
 OF_A_VIDEO = 15
-"""Of a video every so many pictures are looked at: its neighbours show the same view."""
+"""Interval between used pictures of a video: neighbours show the same view."""
 
 
 def camera_record(fit: CameraFit) -> dict[str, Any]:
-    """What a camera file remembers: estimates, intervals, residuals and where they come from, as plain values."""
+    """Return the record of a camera file: estimates, intervals, residuals and their origin, as plain values."""
     record = {
         "estimates": {
             name: {"estimate": e.estimate, "ci95": e.ci95, "unit": e.unit}
@@ -718,7 +718,7 @@ def camera_record(fit: CameraFit) -> dict[str, Any]:
 
 
 def camera_json(fit: CameraFit, out: Path | None = None) -> dict[str, Any]:
-    """What `--json` prints: the record, the lens, every view, the correlation of the errors and the coverage."""
+    """Return what `--json` prints: the record, the lens, every view, the correlation of the errors and the coverage."""
     views = [
         {
             "name": view.name,

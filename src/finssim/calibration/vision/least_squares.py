@@ -137,7 +137,7 @@ class Block(NamedTuple):
 
 
 def block_of(shared: Array, local: Array, residual: Array) -> Block:
-    """From whitened rows.
+    """Return a block from whitened rows.
 
     Args:
         shared: Derivatives of the prediction with respect to the shared unknowns, (n, P).
@@ -179,7 +179,7 @@ def arrow_reduced(blocks: Sequence[Block], damping: float) -> tuple[Array, Array
 def arrow_evidence(
     blocks: Sequence[Block], names: tuple[str, ...], unit: str, groups: int | None = None
 ) -> Evidence:
-    """What each group says about the shared unknowns once its own are taken out.
+    """Return the evidence of each group on the shared unknowns without its own.
 
     Args:
         blocks: At the solution.

@@ -53,7 +53,7 @@ from finssim.vehicles import Vehicle, load_vehicle
 Array = NDArray[np.float64]
 
 AXES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
-"""Of a small motion of a tag: about the outer axes [rad], and along them [m]."""
+"""Axes of a small motion of a tag: about the outer axes [rad], and along them [m]."""
 
 HUBER = 3.0
 """Corners further off than this many standard deviations count linearly."""
@@ -61,7 +61,7 @@ HUBER = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """What was measured when one picture was taken."""
+    """Measurements when one picture was taken."""
 
     time: float
     """[s]"""
@@ -70,7 +70,7 @@ class Moment:
     up: Array | None = None
     """Direction of up by the IMU, in body axes as its mount in the vehicle file has them, (3,)."""
     depth: float | None = None
-    """Of the pressure port [m]."""
+    """Depth of the pressure port [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,16 +78,16 @@ class Noise:
     """Standard deviations."""
 
     pixel: float = 0.3
-    """Of a coordinate of a corner [px]."""
+    """Standard deviation of a coordinate of a corner [px]."""
     up: float = 0.009
-    """Of roll and pitch [rad]."""
+    """Standard deviation of roll and pitch [rad]."""
     depth: float = 0.01
     """[m]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """What is taken as known."""
+    """Known values."""
 
     pool: Pool
     corners_t: Array
@@ -100,7 +100,7 @@ class Rig:
 
     @property
     def edge(self) -> float:
-        """Of a tag [m]."""
+        """Return the edge of a tag [m]."""
         return float(np.linalg.norm(self.corners_t[0] - self.corners_t[1]))
 
 
@@ -117,7 +117,7 @@ class MountState:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the shared unknowns, in the order of a step."""
+        """Return the names of the shared unknowns, in the order of a step."""
         return tuple(f"{tag}.{axis}" for tag in ("reference", *self.others) for axis in AXES)
 
     def mount(self, tag: int, reference: int) -> Pose:
@@ -346,7 +346,7 @@ def minimise(
 
 
 def as_before(state: MountState, origin: MountState, frozen: Sequence[str]) -> MountState:
-    """With unknowns of the start put back."""
+    """Return the state with unknowns of the start restored."""
     back = np.zeros(len(state.names))
     for name, total in zip(frozen, change(origin, state, frozen), strict=True):
         back[state.names.index(name)] = -total
@@ -367,15 +367,15 @@ def change(before: MountState, after: MountState, free: Sequence[str]) -> Array:
 
 
 MAX_MOMENTS = 150
-"""Moments that are used, spread over the recording; more tell the same."""
+"""Greatest number of used moments, spread over the recording; more add nothing."""
 
 FEWEST_MOMENTS = 8
 BLOCKS = 12
 UNSURE_ANGLE = math.radians(3.0)
-"""Half width of the 95 % interval of an angle beyond which it does not count as told."""
+"""Half width of the 95 % interval of an angle beyond which it does not count as determined."""
 
 UNSURE_LENGTH = 0.02
-"""The same for a length [m]."""
+"""Half width of the 95 % interval of a length beyond which it does not count as determined [m]."""
 
 TURNED = math.radians(25.0)
 """Disagreement about up beyond which a mount is taken as turned, and not as inexact."""
@@ -389,27 +389,27 @@ FAR = 6.0
 
 @dataclass(frozen=True, kw_only=True)
 class MountFit:
-    """Mounts, and how far the motion tells them."""
+    """Mounts, and how well the motion determines them."""
 
     state: MountState
     rig: Rig
     moments: tuple[Moment, ...]
-    """Those used."""
+    """Used moments."""
     free: tuple[str, ...]
     """Shared unknowns that were estimated, of `state.names`."""
     frozen: tuple[str, ...]
-    """Those that the motion does not tell, kept as they were."""
+    """Unknowns that the motion does not determine, kept as they were."""
     covariance: Covariance
-    """Of `free`."""
+    """Covariance of `free`."""
     rms: float
     """Root of the mean squared distance of corners [px]."""
     held_out_rms: float
-    """The same for moments whose pose alone was fitted, to mounts from other moments [px]."""
+    """Residual of moments whose pose alone was fitted, to mounts from other moments [px]."""
     excluded: int
     """Moments left out as far off."""
 
     def half_width(self, name: str) -> float:
-        """Of the 95 % interval of a shared unknown; infinite if it is not free."""
+        """Return the half width of the 95 % interval of a shared unknown; infinite if it is not free."""
         if name not in self.free:
             return math.inf
         return float(intervals(np.zeros(len(self.free)), self.covariance)[self.free.index(name), 1])
@@ -444,7 +444,8 @@ def fit_mounts(
     *,
     held_out: bool = True,
 ) -> MountFit:
-    """Mounts of all tags, from moments of a moving vehicle whose IMU and pressure port are mounted as its file says.
+    """Fit mounts of all tags, from moments of a moving vehicle whose IMU and pressure port are mounted as its file
+    states.
 
     Tags relative to one another follow from pictures that show two. How the reference tag sits in the body follows from
     the IMU's tilt (its whole orientation, once the vehicle tilts two ways) and from the depth (its height over the
@@ -515,14 +516,14 @@ def _held_out(rig: Rig, state: MountState, moments: Sequence[Moment], free: tupl
 
 
 def _spread(moments: Sequence[Moment]) -> list[Moment]:
-    """At most `MAX_MOMENTS`, evenly over the recording."""
+    """Return at most `MAX_MOMENTS`, evenly over the recording."""
     if len(moments) <= MAX_MOMENTS:
         return list(moments)
     return [moments[i] for i in np.unique(np.linspace(0, len(moments) - 1, MAX_MOMENTS).astype(int))]
 
 
 def _candidates(state: MountState, moments: Sequence[Moment]) -> tuple[str, ...]:
-    """Shared unknowns that the sensors at hand could tell."""
+    """Return the shared unknowns that the available sensors can determine."""
     up, depth = any(m.up is not None for m in moments), any(m.depth is not None for m in moments)
     observable = {"turn_x": up, "turn_y": up, "turn_z": up, "z": depth, "x": depth and up, "y": depth and up}
     candidates = [f"reference.{axis}" for axis, available in observable.items() if available]
@@ -548,7 +549,7 @@ def _without_far(
 
 
 def _least_observable(free: Sequence[str], half: Array) -> str | None:
-    """The unknown that is least told, by its half width in its own unit, if it is not told well enough."""
+    """Return the least determined unknown, by its half width in its own unit, if it is not determined well enough."""
     limits = np.array([UNSURE_ANGLE if "turn" in name else UNSURE_LENGTH for name in free])
     ratio = np.where(np.isfinite(half), half, np.inf) / limits
     worst = int(np.argmax(ratio))
@@ -596,7 +597,7 @@ def _by_vision(rig: Rig, state: MountState, moments: Sequence[Moment]) -> MountS
 
 DETECTIONS, IMU, DEPTH = "detections.csv", "imu.csv", "depth.csv"
 LONGEST_AGE = 0.3
-"""A sensor is asked at an exposure only between two samples that are no further apart [s]."""
+"""Greatest distance between the samples around an exposure at which a sensor is read [s]."""
 
 SETTLING = 5.0
 """Until the tilt of gyro and accelerometer has forgotten its start [s]."""
@@ -604,7 +605,7 @@ SETTLING = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class MountLog:
-    """What a folder holds."""
+    """Content of a folder."""
 
     pictures: tuple[tuple[float, Mapping[int, Array]], ...]
     """Time of the exposure [s] and tag -> pixels of its corners (4, 2), in order of time."""
@@ -615,9 +616,9 @@ class MountLog:
     depth: Series | None
     """[m]"""
     sha256: str
-    """Of the files read."""
+    """Digest of the read files."""
     findings: tuple[Finding, ...]
-    """What was left out or is missing."""
+    """Data that was left out or is missing."""
 
     def moments(self, imu_offset: float = 0.0) -> tuple[Moment, ...]:
         """The pictures with tilt and depth at their time.
@@ -766,7 +767,7 @@ def distance_std(fit: MountFit) -> float:
 def tag_estimates(
     fit: MountFit, mounts: Mapping[int, Pose], vehicle: Vehicle
 ) -> tuple[list[Estimate], dict[str, Any]]:
-    """Estimates of every tag, and the mounts to write; a tag of which nothing is told keeps the file's."""
+    """Return estimates of every tag, and the mounts to write; an undetermined tag keeps the file's."""
     estimates, written, any_identified = [], {}, False
     for tag, mount in vehicle.tags.mounts.items():  # type: ignore[union-attr]
         written[tag] = {"position": list(mount.position), "orientation": list(mount.orientation)}
@@ -809,7 +810,7 @@ def _half_widths(fit: MountFit, tag: int) -> Array:
 
 
 def of_frozen(fit: MountFit) -> list[Finding]:
-    """What the motion does not tell of the tags."""
+    """Return findings on what the motion does not determine of the tags."""
     findings, tag = [], fit.rig.reference
     frozen = [name.partition(".")[2] for name in fit.frozen if name.startswith("reference.")]
     turns = tuple(name[-1] for name in frozen if "turn" in name)
@@ -825,7 +826,8 @@ def of_frozen(fit: MountFit) -> list[Finding]:
 
 
 def calibrate_mounts(log: MountLog, pool: Pool, vehicle: Vehicle, *, name: str, seed: int = 0) -> Fit:
-    """Where tags sit in the body, with everything that the motion shows; IMU and pressure port are right in the file.
+    """Fit the tags' mounts in the body, with everything that the motion determines; IMU and pressure port are right in
+    the file.
 
     Args:
         log: The recording.
@@ -891,8 +893,8 @@ UNSURE_CLOCK = 0.05
 
 
 def _clock(rig: Rig, mounts: Mapping[int, Pose], log: MountLog) -> Estimate | None:
-    """What is to be added to the IMU's times, by turns that the pixels alone show: tilts by the IMU agree with its gyro
-    whatever its clock does."""
+    """Return the time to add to the IMU's times, by turns that the pixels alone show: tilts by the IMU agree with its
+    gyro whatever its clock does."""
     if log.turning is None:
         return None
     alone = fit_mounts(rig, mounts, [replace(m, up=None, depth=None) for m in log.moments()], held_out=False)
@@ -904,7 +906,7 @@ def _clock(rig: Rig, mounts: Mapping[int, Pose], log: MountLog) -> Estimate | No
 def imu_clock(
     t_picture: Array, attitude: Array, up_p: Array, t_imu: Array, vertical_rate: Array
 ) -> Estimate | None:
-    """What is to be added to the IMU's times, from turns about the vertical between neighbouring pictures.
+    """Return the time to add to the IMU's times, from turns about the vertical between neighbouring pictures.
 
     n · log(R_2 R_1ᵀ) is the turn from one picture to the next; its rate is compared with ω · up, ω and up in any one
     frame of the vehicle, so that neither the IMU's mounting nor the tilt is needed.
