@@ -71,8 +71,9 @@ interface: {height: 1.0}
     "way.csv": "t,x,y,z,yaw\n0,0,0,-0.5,0\n5,0.5,0,-0.5,0.5\n10,1,0,-0.5,1\n",
     "parameters.yaml": "/**:\n  ros__parameters: {vehicle: finsrov, rate: 20.0}\n/finsrov/controller:\n"
     "  ros__parameters: {goal: [0.5, 0.0, -0.5, 90.0], armed: false}\n",
-    "sweep.yaml": "task: t1\nseeds: [1]\ntrain: {steps: 1, worlds: 16}\nsettings:\n  nominal: {}\n"
-    "grid: {action: [nonsense]}\nevaluate: {plants: [nominal], trials: 1}\n",
+    "sweep.yaml": "task: t1\nseeds: [1]\ntrain: {steps: 1, worlds: 16}\n"
+    "grid: {action: [nonsense], settings.epochs: [2, 4]}\nevaluate: {plants: [nominal], trials: 1}\n",
+    "small-sweep.yaml": "task: t1\nseeds: [1]\ntrain: {steps: 1024, worlds: 16}\nevaluate: {trials: 1}\n",
     "points.csv": "id,x,y,z\nnear,0.1,0.2,0.3\nabove,0.1,0.2,1.3\nfar,9.0,0.2,0.3\n",
     "pixels.csv": "id,u,v\na,300,200\nb,320.5,240\n",
     "rack/rack.yaml": "about: A rack.\nwater: {jerlov: II, veil: [0.1, 0.2, 0.3]}\nobjects:\n"
@@ -108,7 +109,7 @@ class Kind:
 
     name: str
     file: str
-    """Below the folder of whole files; in a folder of several files the one that is changed."""
+    """Path or pattern below the folder of seeds; in a folder of several files the one that is changed."""
     commands: tuple[str, ...]
     """`{}` is the file, or the folder that it is in where `folder`; `OUT` an output, `SEEDS` the whole files."""
     folder: int = 0
@@ -201,6 +202,7 @@ def kinds() -> list[Kind]:
         Kind("table of a way", "way.csv", ("evaluate pid --task t2 --trajectory {} --trials 1",)),
         Kind("parameters of ROS", "parameters.yaml", (f"{PARAMETERS} {{}}",)),
         Kind("sweep", "sweep.yaml", ("sweep {} --out OUT/swept",)),
+        Kind("result of a sweep", "swept/evaluations/*.json", ("sweep SEEDS/small-sweep.yaml --processes 1 --out {}",), folder=2, inside=True),  # noqa: E501
         Kind("world", "world.yaml", (
             "worlds show {}", "worlds show {} --seed 3 --json", "worlds show {} --out OUT/seen.png",
         ), weight=2),
@@ -481,6 +483,7 @@ def make(folder: Path, run: Callable[..., None]) -> None:
     steps = folder / "steps" / "surge_plus_9" / "data.csv"
     steps.write_text("".join(steps.read_text().splitlines(keepends=True)[:700]))
     run("train", "t1", "--steps", "1024", "--worlds", "16", "--out", "policy")
+    run("sweep", "small-sweep.yaml", "--processes", "1", "--out", "swept")
     stack = ["t1", "--policy", folder / "policy", "--episodes", "1", "--records", "--out", folder / "stack"]
     subprocess.run([sys.executable, "-m", "studies.stack", *stack], cwd=ROOT, check=True, capture_output=True)
     shutil.copyfile(next((folder / "stack").rglob("*.mcap")), folder / "run.mcap")
@@ -793,7 +796,7 @@ def place_input(kind: Kind, seeds: Path, scratch: Path) -> tuple[Path, Path]:
     for name in ("in", "out", "tmp"):
         shutil.rmtree(scratch / name, ignore_errors=True)
         (scratch / name).mkdir()
-    source = seeds / kind.file
+    source = next(seeds.glob(kind.file))
     top = source.parents[kind.folder - 1] if kind.folder else source
     target = scratch / ("out" if kind.inside else "in") / top.name
     if not kind.folder:

@@ -126,7 +126,7 @@ READERS = {
     "policy": (policy, POLICY, "policy.yaml"),
     "sweep": (
         load_sweep,
-        "task: t1\nseeds: [1]\ntrain: {steps: 1, worlds: 16}\nsettings: {nominal: {steps: 2}}\n"
+        "task: t1\nseeds: [1]\ntrain: {steps: 1, worlds: 16}\ngrid: {steps: [2]}\n"
         "evaluate: {plants: [nominal], trials: 1}\n",
         "sweep.yaml",
     ),

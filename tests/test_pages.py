@@ -61,11 +61,10 @@ def test_the_vehicle_on_the_page_loads(tmp_path):
 
 def test_the_ranges_and_the_plant_on_the_pages_load(tmp_path):
     """The example files of the learning and evaluation pages are what the commands take."""
-    sensing, ranges, sweep, search = blocks(ROOT / "docs" / "learning.md", "yaml")
+    sensing, ranges, sweep = blocks(ROOT / "docs" / "learning.md", "yaml")
     (plant,) = blocks(ROOT / "docs" / "evaluation.md", "yaml")
-    search = f"task: t1\nseeds: 3\n{search}"
     for example, load in (
-        (sensing, load_sensing), (ranges, load_ranges), (plant, load_plant), (sweep, load_sweep), (search, load_sweep),
+        (sensing, load_sensing), (ranges, load_ranges), (plant, load_plant), (sweep, load_sweep),
     ):  # fmt: skip
         (tmp_path / "example.yaml").write_text(example, encoding="utf-8")
         load(tmp_path / "example.yaml")

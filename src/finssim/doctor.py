@@ -50,8 +50,8 @@ EXTRAS = {
     ),
     "imitation": Extra({"minari": "minari"}, "collect demonstrations and learn from them"),
     "sweep": Extra(
-        {"ray": "ray", "optuna": "optuna"},
-        "train over seeds and settings on many machines, search for settings",
+        {"ray": "ray"},
+        "train over seeds and settings on many machines",
     ),
     "wandb": Extra({"wandb": "wandb"}, "send the curves of a training to Weights & Biases"),
     "logs": Extra(

@@ -2,8 +2,6 @@
 
 import contextlib
 import json
-import math
-import shutil
 import time
 from pathlib import Path
 
@@ -50,7 +48,7 @@ def ray_processes():
 
 @pytest.fixture
 def sweep_file(tmp_path):
-    """Two settings, each trained for one short update."""
+    """Two action modes, each trained for one short update."""
     path = tmp_path / "sweep.yaml"
     plan = {
         "task": "t1",
@@ -77,66 +75,32 @@ def swept(capsys, *words):
 
 @pytest.mark.slow
 def test_a_sweep_is_done_once_and_goes_on_where_it_was(tmp_path, sweep_file, capsys):
-    """A policy and a row for every job; only a run that is missing is made again; one that fails is told."""
+    """A policy and a row for every training; only a missing one is repeated; one that fails is in the table."""
     out = tmp_path / "out"
     status, result = swept(capsys, sweep_file, "--out", out, "--processes", 2)
     assert status == 0 and result["ok"] and len(result["rows"]) == 2
     for row in result["rows"]:
         assert set(row["plants"]) == {"current"} and row["plants"]["current"]["trials"] == 1
         assert Policy.load(out / "runs" / row["run"]).description.action["mode"] == row["options"]["action"]
-    kept = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("*/policy.onnx")}
+        assert row["training_s"] > 0.0
+    kept = {path: path.stat().st_mtime_ns for path in out.glob("*/*/policy.onnx")}
+    evaluations = {path: path.stat().st_mtime_ns for path in (out / "evaluations").iterdir()}
     gone = next(iter(kept)).parent
     for path in gone.iterdir():
         path.unlink()
     gone.rmdir()
-    changed(sweep_file, settings={"": {}, "bad": {"hydrodynamics": "soup"}})
+    changed(sweep_file, grid={"action": ["wrench6", "wrench4", "soup"]})
     status, again = swept(capsys, sweep_file, "--out", out, "--processes", 2)
-    assert status == 3 and not again["ok"] and len(again["rows"]) == 4
-    failed = [row for row in again["rows"] if "error" in row]
-    assert len(failed) == 2 and all(
-        row["name"].startswith("bad") and "soup" in row["error"] for row in failed
-    )
-    now = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("*/policy.onnx")}
+    assert status == 3 and not again["ok"] and len(again["rows"]) == 3
+    (failed,) = [row for row in again["rows"] if "error" in row]
+    assert failed["name"] == "action-soup" and "soup" in failed["error"]
+    assert failed["error"] in (out / "sweep.md").read_text(encoding="utf-8")
+    now = {path: path.stat().st_mtime_ns for path in out.glob("*/*/policy.onnx")}
     assert now.keys() == kept.keys()
     assert {path for path in kept if now[path] != kept[path]} == {gone / "policy.onnx"}
     assert {row["run"] for row in result["rows"]} <= {row["run"] for row in again["rows"]}
-
-
-def test_a_search_finds_the_least_and_proposes_the_same_again(tmp_path, monkeypatch):
-    """Of a made-up training whose error is how far log10 of the learning rate is from -4, and 1 more with a GRU."""
-    played = []
-
-    def made_up(job):
-        played.append(job.key)
-        rate, memory = job.options["settings"]["learning_rate"], job.options["settings"]["memory"]
-        error = abs(math.log10(rate) + 4.0) + (1.0 if memory else 0.0)
-        if job.seed == 2 and rate > 5e-4:
-            raise RuntimeError("diverged")
-        return {
-            "training_s": 0.0,
-            "machine": "here",
-            "plants": {"nominal": {"e_p_m": error}},
-        }, {}
-
-    monkeypatch.setattr(command, "play", made_up)
-    file = tmp_path / "sweep.yaml"
-    options = {
-        "settings.learning_rate": {"low": 1e-6, "high": 1e-2, "log": True}, "settings.memory": {"choice": [0, 32]},
-    }  # fmt: skip
-    plan = {"task": "t1", "seeds": 2, "search": {"trials": 24, "minimise": "e_p_m", "options": options}}
-    file.write_text(yaml.safe_dump(plan), encoding="utf-8")
-    result = command.sweep(file, out=tmp_path / "out", processes=1)
-    best = result["best"]
-    assert len(result["rows"]) == len(played) == 48 and best["value"] < 0.3
-    assert best["options"]["settings.memory"] == 0 and not result["ok"]
-    values = [r["plants"]["nominal"]["e_p_m"] for r in result["rows"] if "plants" in r]
-    assert best["value"] == pytest.approx(min(values))
-    gone = sorted((tmp_path / "out" / "runs").iterdir())[-3]
-    shutil.rmtree(gone)
-    failed = {row["run"] for row in result["rows"] if "error" in row}
-    played.clear()
-    again = command.sweep(file, out=tmp_path / "out", processes=1)
-    assert again["best"] == best and set(played) == {gone.name} | failed
+    evaluated = {path: path.stat().st_mtime_ns for path in (out / "evaluations").iterdir()}
+    assert evaluations.items() < evaluated.items() and len(evaluated) == 3  # one of the repeated training
 
 
 @pytest.fixture
@@ -162,18 +126,29 @@ def test_a_machine_that_is_lost_half_way_is_made_up_for(tmp_path, sweep_file, tw
     """One of two nodes is killed while both work. Every job still has its row and its policy."""
     changed(sweep_file, seeds=2)
     cluster, second = two_machines
-    keep, ended = command._keep, []
+    ended, train_policies = [], command.train_policies
 
-    def watched(job, *rest):
-        ended.append(job.key)
-        if len(ended) == 1:  # both nodes have work now: the one on its second job, or the other on its first
-            cluster.remove_node(second, allow_graceful=False)
-        return keep(job, *rest)
+    def watched(*words):
+        for policy, error in train_policies(*words):
+            ended.append(policy.name)
+            if (
+                len(ended) == 1
+            ):  # both nodes work now: one on its second training, the other on its first or second
+                cluster.remove_node(second, allow_graceful=False)
+            yield policy, error
 
-    monkeypatch.setattr(command, "_keep", watched)
+    monkeypatch.setattr(command, "train_policies", watched)
     result = command.sweep(sweep_file, out=tmp_path / "out", address=cluster.address)
-    assert result["ok"] and sorted(ended) == sorted(job.key for job in load_sweep(sweep_file).jobs())
-    assert len(list((tmp_path / "out" / "runs").glob("*/policy.onnx"))) == 4
+    assert result["ok"] and sorted(ended) == sorted(t.run for t in load_sweep(sweep_file).trainings())
+    assert len(list(tmp_path.glob("out/runs/*/policy.onnx"))) == 4
+    assert all(row["plants"]["current"]["trials"] == 1 for row in result["rows"])
+
+
+def test_a_table_without_a_policy_shows_the_errors():
+    """Where every training failed."""
+    row = {"name": "run", "seed": 1, "run": "run-seed1", "options": {}, "error": "TrainingError: no"}
+    (table,) = command.tables_of({"rows": [row]})
+    assert table.rows == [["run", "1", "–", "–", "TrainingError: no"]] and len(table.heads) == 5
 
 
 @pytest.mark.slow

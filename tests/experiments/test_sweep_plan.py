@@ -1,4 +1,4 @@
-"""Sweep files: every setting with every seed, and one sentence for what cannot be."""
+"""Sweep files: every combination with every seed, and one sentence for a file that cannot be used."""
 
 import math
 
@@ -9,7 +9,6 @@ from finssim.experiments.plants import PlantError
 from finssim.experiments.sweep import SweepError, load_sweep
 
 PLAIN = {"task": "t1", "seeds": 2, "train": {"steps": 1000}}
-SEARCH = {"trials": 3, "minimise": "e_p_m", "options": {"steps": {"low": 10, "high": 99}}}
 
 
 def written(folder, **changes):
@@ -18,45 +17,57 @@ def written(folder, **changes):
     return path
 
 
-def test_settings_times_grid_times_seeds(tmp_path):
-    """Seeds outermost, so that every setting has a result early; what is more special wins."""
+def test_grid_times_seeds(tmp_path):
+    """Seeds outermost, so that every combination has a result early; the grid overrides options of every training."""
     file = written(
         tmp_path,
         seeds=[5, 7],
-        settings={"plain": {}, "small": {"worlds": 64, "steps": 10}},
-        grid={"action": ["wrench6", "wrench4"], "randomize": [None, "pool"]},
+        train={"steps": 10, "action": "thruster8", "settings": {"epochs": 4, "discount": 0.9}},
+        grid={
+            "action": ["wrench6", "wrench4"],
+            "randomize": [None, "pool"],
+            "settings.learning_rate": [1e-4, 3e-4],
+        },
     )
-    jobs = load_sweep(file).jobs()
-    assert len(jobs) == 2 * 2 * 4 and [job.seed for job in jobs] == [5] * 8 + [7] * 8
-    small = [job for job in jobs if job.name == "small_action-wrench4_randomize-pool"]
-    assert [job.options for job in small] == [
-        {"steps": 10, "worlds": 64, "action": "wrench4", "randomize": "pool"}
+    trainings = load_sweep(file).trainings()
+    assert len(trainings) == 2 * 8 and [one.seed for one in trainings] == [5] * 8 + [7] * 8
+    name = "action-wrench4_randomize-pool_learning_rate-0.0003"
+    settings = {"epochs": 4, "discount": 0.9, "learning_rate": 3e-4}
+    assert [one.options for one in trainings if one.setting == name] == [
+        {"steps": 10, "action": "wrench4", "randomize": "pool", "settings": settings}
     ] * 2
-    assert len({job.key for job in jobs}) == len(jobs)
-    settings = {job.key.removesuffix(str(job.seed)) for job in jobs}
-    assert len(settings) == len(jobs) // 2
+    assert len({one.run for one in trainings}) == len(trainings)
+    assert all(one.run.startswith(f"{one.setting}-") for one in trainings)
+    assert len({one.run.removesuffix(f"-seed{one.seed}") for one in trainings}) == len(trainings) // 2
 
 
 def test_a_number_of_seeds_counts_from_one(tmp_path):
-    assert [job.seed for job in load_sweep(written(tmp_path, seeds=3)).jobs()] == [1, 2, 3]
+    assert [one.seed for one in load_sweep(written(tmp_path, seeds=3)).trainings()] == [1, 2, 3]
 
 
-def test_files_are_looked_for_beside_the_sweep(tmp_path):
-    """And their whole paths go to the workers."""
-    (tmp_path / "mine.yaml").write_text("{}", encoding="utf-8")
-    job = load_sweep(written(tmp_path, vehicle="mine.yaml", train={"randomize": "mine.yaml"})).jobs()[0]
-    assert job.vehicle == str(tmp_path / "mine.yaml") == job.options["randomize"]
+def test_files_are_relative_to_the_sweep(tmp_path):
+    """Vehicle, ranges and plants; workers receive their full paths."""
+    for name in ("mine.yaml", "water.yaml"):
+        (tmp_path / name).write_text("{}", encoding="utf-8")
+    changes = {
+        "vehicle": "mine.yaml",
+        "train": {"randomize": "mine.yaml"},
+        "evaluate": {"plants": ["water.yaml"]},
+    }
+    plan = load_sweep(written(tmp_path, **changes))
+    assert plan.vehicle == plan.train["randomize"] == str(tmp_path / "mine.yaml")
+    assert plan.evaluate.plants == (str(tmp_path / "water.yaml"),)
 
 
-def test_a_changed_file_is_another_job(tmp_path):
-    """A plant is looked for beside the sweep too; what it says decides what comes of a job, so it is in the name."""
-    keys = []
-    for model in ("mesh", "simplified"):
-        (tmp_path / "mine.yaml").write_text(f"hydrodynamics: {model}", encoding="utf-8")
-        job = load_sweep(written(tmp_path, evaluate={"plants": ["mine.yaml"]})).jobs()[0]
-        assert job.plants == (str(tmp_path / "mine.yaml"),)
-        keys.append(job.key)
-    assert keys[0] != keys[1]
+@pytest.mark.parametrize("key", ["vehicle", "randomize"])
+def test_a_changed_file_is_another_training(tmp_path, key):
+    """The content of a vehicle or of ranges decides the policy, so it is in the name of its directory."""
+    runs = []
+    for name in ("finsrov", "bluerov2"):
+        (tmp_path / "mine.yaml").write_text(f"extends: {name}\n", encoding="utf-8")
+        changes = {"vehicle": "mine.yaml"} if key == "vehicle" else {"train": {"randomize": "mine.yaml"}}
+        runs.append(load_sweep(written(tmp_path, **changes)).trainings()[0].run)
+    assert runs[0] != runs[1]
 
 
 def test_a_plant_that_is_not_there_is_told_before_any_training(tmp_path):
@@ -68,34 +79,17 @@ def test_a_plant_that_is_not_there_is_told_before_any_training(tmp_path):
     "changes, sentence",
     [
         ({"task": "t9"}, "task is 't9', expected one of t1"),
-        ({"train": {"stepz": 1}}, "'stepz' is no option of a training; available: learner"),
+        ({"train": {"stepz": 1}}, "'stepz' is not an option of a training; available: learner"),
         ({"train": {"worlds": math.nan}}, "worlds is nan, expected a finite number"),
-        ({"settings": {"a": {"out": "x"}}}, "'out' is no option"),
+        ({"grid": {"out": ["x"]}}, "'out' is not an option"),
+        ({"grid": {"a.b": [1]}}, "'a.b' is not an option of a training; .*settings.NAME"),
+        ({"train": {"settings.epochs": 1}}, "'settings.epochs' is not an option"),
         ({"seeds": []}, "expected at least one, each once"),
         ({"seeds": [1, 1]}, "expected at least one, each once"),
         ({"evaluate": {"trials": 0}}, "evaluate.trials: Input should be greater than or equal to 1"),
         ({"evaluate": {"plants": []}}, "evaluate.plants: Tuple should have at least 1 item"),
         ({"tusk": "t1"}, "tusk: Extra inputs are not permitted"),
-        ({"search": SEARCH | {"maximise": "success"}}, "expected either 'minimise' or 'maximise'"),
-        ({"search": SEARCH, "grid": {"action": ["wrench6"]}}, "leave 'settings' and 'grid' out"),
-        ({"search": SEARCH | {"options": {"stepz": {"choice": [1]}}}}, "'stepz' is no option of a training"),
-        ({"search": SEARCH | {"options": {"a.b": {"choice": [1]}}}}, "one with a dot is settings.NAME"),
-        (
-            {"search": SEARCH | {"options": {"steps": {"low": 1, "choice": [1]}}}},
-            "expected either 'low' and 'high', or",
-        ),
-        (
-            {"search": SEARCH | {"options": {"steps": {"low": 1}}}},
-            "expected either 'low' and 'high', or 'choice'",
-        ),
-        (
-            {"search": SEARCH | {"options": {"steps": {"low": 2, "high": 1}}}},
-            "low is 2, expected less than high",
-        ),
-        (
-            {"search": SEARCH | {"options": {"steps": {"low": 0, "high": 1, "log": True}}}},
-            "'log' needs a 'low' above 0",
-        ),
+        ({"search": {"trials": 3}}, "search: Extra inputs are not permitted"),
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path, changes, sentence):
@@ -108,19 +102,8 @@ def test_a_file_that_is_not_there(tmp_path):
         load_sweep(tmp_path / "nothing.yaml")
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"settings": {"../../mine": {}}},
-        {"settings": {"/tmp/mine": {}}},
-        {"settings": {"a\\b": {}}},
-        {"settings": {"a" * 300: {}}},
-        {"grid": {"action": ["a\\b"]}},
-        {"settings": {"C:x": {}}, "grid": {"action": ["wrench6"]}},
-    ],
-    ids=range(6),
-)
-def test_a_setting_names_a_folder_of_the_sweep(tmp_path, changes):
-    """Each job has one, whose name begins with that of its setting and what the grid sets."""
+@pytest.mark.parametrize("value", ["../../mine\\x", "a\\b", "a" * 300], ids=range(3))
+def test_a_combination_names_a_directory_of_the_sweep(tmp_path, value):
+    """Each training has one, whose name begins with the options of the grid."""
     with pytest.raises(SweepError, match="^setting '.*expected the plain name of a file or folder"):
-        load_sweep(written(tmp_path, **changes)).jobs()
+        load_sweep(written(tmp_path, grid={"action": [value]})).trainings()

@@ -529,7 +529,6 @@ class Job(campaign.Job):
 
 
 def play(job: Job, _: Path) -> dict[str, Any]:
-    """The measures of every trial."""
+    """Run the trials of a job, and return the result of their evaluation."""
     options: dict[str, Any] = {"vehicle": job.vehicle, "trials": job.trials, "seed": job.noise}
-    result = evaluate_controller(job.controller, job.water, task=job.task, **options).result
-    return {"per_trial": result["per_trial"]}
+    return evaluate_controller(job.controller, job.water, task=job.task, **options).result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Generator, Hashable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import product
@@ -333,15 +333,36 @@ def controllers_of(
         if not finished(policy, body):
             options |= {"vehicle": vehicle, "action": action, "seed": seed, "steps": steps}
             missing[policy] = {"task": task, **options, "settings": {} if remembers else FORGETFUL}
-    with closing(
-        spread(_trained, list(missing.items()), 1 if len(missing) == 1 else processes, address)
-    ) as done:
-        for remaining, ((policy, _), outcome) in zip(reversed(range(len(missing))), done, strict=True):
-            with atomic_directory(policy, replaces=DESCRIPTION_FILE) as scratch:
-                for name, content in outcome.result().items():
-                    (scratch / plain_name(name, "file of a policy", PolicyError)).write_bytes(content)
+    with closing(train_policies(missing, processes, address)) as done:
+        for remaining, (_, error) in zip(reversed(range(len(missing))), done, strict=True):
+            if error is not None:
+                raise error
             progress(1.0 - remaining / len(missing), f"{remaining} trainings left")
     return controllers
+
+
+def train_policies(
+    trainings: Mapping[Path, Mapping[str, Any]], processes: int | None = None, address: str | None = None
+) -> Generator[tuple[Path, BaseException | None], None, None]:
+    """Train policies in parallel, on this machine or a cluster.
+
+    Args:
+        trainings: Directory of the policy -> arguments of `finssim.learning.train.train`.
+        processes, address: As of `campaign.spread`.
+
+    Yields:
+        A directory as soon as its policy is written, and None; or the error of its training.
+    """
+    with closing(
+        spread(_trained, list(trainings.items()), 1 if len(trainings) == 1 else processes, address)
+    ) as done:
+        for (policy, _), outcome in done:
+            error = outcome.exception()
+            if error is None:
+                with atomic_directory(policy, replaces=DESCRIPTION_FILE) as scratch:
+                    for name, content in outcome.result().items():
+                        (scratch / plain_name(name, "file of a policy", PolicyError)).write_bytes(content)
+            yield policy, error
 
 
 def _trained(policy: tuple[Path, Mapping[str, Any]]) -> dict[str, bytes]:
