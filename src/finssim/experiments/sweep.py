@@ -30,7 +30,7 @@ from finssim.vehicles import load_vehicle
 from finssim.yaml_file import first_problem, read_mapping
 
 RESULT_FILE = "sweep.json"
-SAME_FOR_ALL = ("task", "out", "seed", "console", "shown", "interrupted", "resume", "device", "vehicle")
+SAME_FOR_ALL = ("task", "out", "seed", "console", "as_json", "resume", "device", "vehicle")
 """Arguments of a training that a sweep sets itself."""
 MEASURES: dict[str, tuple[str, ...]] = {
     "t1": ("success", "e_p_m", "e_psi_deg", "t_s_s"),

@@ -48,8 +48,6 @@ def train(
     device: str = "cpu",
     console: Console | None = None,
     as_json: bool = False,
-    shown: Annotated[Path | None, "python"] = None,
-    interrupted: Annotated[Path | None, "python"] = None,
 ) -> Path:
     """Train a policy and write it to a directory that runs without the learner.
 
@@ -94,12 +92,10 @@ def train(
         device (DEVICE): Compute device: cpu or cuda.
         console: Where progress is shown; standard error if None.
         as_json: Print one JSON object about the policy, to standard output.
-        shown: Name of the directory in messages, where `out` is a temporary one.
-        interrupted: Where the policy so far goes after Ctrl-C; if None, `out`, or `OUT-training/interrupted` where
-            `out` holds an earlier policy.
 
     Returns:
-        The policy directory.
+        The policy directory. After Ctrl-C the unfinished policy is there, or in `OUT-training/interrupted` where `out`
+        contains an earlier policy.
 
     Raises:
         EnvironmentSetupError: Unknown task.
@@ -180,10 +176,8 @@ def train(
                 f"no checkpoint in {side} yet: starting from the beginning", soft_wrap=True, markup=False
             )
         stopped = loop.run()
-    folder = (interrupted or _path_beside(Path(out), side)) if stopped else Path(out)
-    _finish(
-        loop, folder, stopped, console, folder if stopped else shown or folder, time.perf_counter() - began
-    )
+    folder = _path_beside(Path(out), side) if stopped else Path(out)
+    _finish(loop, folder, stopped, console, time.perf_counter() - began)
     if as_json:
         print(json.dumps({"policy": str(folder), "best_steps": loop.best.steps, **loop.curves[-1]}))
     return folder
@@ -215,7 +209,7 @@ def parse_settings(texts: Sequence[str]) -> dict[str, Any]:
     return changes
 
 
-def _finish(loop: Any, folder: Path, stopped: bool, console: Console, label: Path, took: float) -> None:
+def _finish(loop: Any, folder: Path, stopped: bool, console: Console, took: float) -> None:
     """Write the policy, or the policy so far; after Ctrl-C the interrupt is raised again."""
     from finssim.learning.export import export_policy
     from finssim.learning.training_loop import after
@@ -230,7 +224,7 @@ def _finish(loop: Any, folder: Path, stopped: bool, console: Console, label: Pat
         best.network, folder, after(loop.description, done, not stopped, best.steps), curves=loop.curves
     )
     best_text = f", best after {best.steps:,}" if best.steps < done else ""
-    message = f"{title}: {label}  ({done:,} steps in {took:.1f} s{best_text})"
+    message = f"{title}: {folder}  ({done:,} steps in {took:.1f} s{best_text})"
     console.print(message, highlight=False, soft_wrap=True, markup=False)
     if stopped:
         raise KeyboardInterrupt
