@@ -375,3 +375,12 @@ def test_the_command_reads_folders_and_reports_broken_ones(simulated, tmp_path, 
     assert found == {"a": "usable", "b": "refused"}
     check([tmp_path / "a"], vehicle="bluerov2_heavy")
     assert "usable" in capsys.readouterr().out
+
+
+def test_of_many_columns_with_one_remark_four_are_named():
+    """A gap in six columns is one remark, which names four of them and counts the others."""
+    t = np.arange(0.0, 20.0, 0.05)
+    t[100:] += 5.0
+    channels = {name: 0.1 * np.sin(t + i) for i, name in enumerate(("p", "q", "r", "u", "v", "w"))}
+    found = check_trials([Trial(name="a", t=t, channels=channels)], VEHICLE)[0].findings
+    assert [one.subject for one in found if one.code == "gap"] == ["p, q, r, u and 2 more"]

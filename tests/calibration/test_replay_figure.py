@@ -100,3 +100,12 @@ def test_no_line_joins_two_replays():
     pair = square(5.0)
     restarted = Pair(**{**vars(pair), "segment": (T >= 5.0).astype(int)})
     assert np.isnan(lines(draw_overlay(restarted).axes[1])["Calibrated Fossen 0.000"]).sum() == 1
+
+
+@pytest.mark.parametrize(("axes", "columns"), [((0,), 1), ((0, 5), 2), ((0, 1, 2, 5), 2)])
+def test_panels_stand_in_two_columns(axes, columns):
+    """One axis fills the figure; several are drawn side by side in pairs."""
+    figure = draw_response_envelopes([square(5.0, axis=i, name=str(i)) for i in axes])
+    drawn = [a for a in figure.axes if a.get_visible()]
+    assert len(drawn) == len(axes)
+    assert {a.get_subplotspec().get_gridspec().ncols for a in drawn} == {columns}

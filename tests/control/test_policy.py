@@ -16,6 +16,7 @@ import yaml
 from onnx import TensorProto, helper, numpy_helper
 
 from finssim.control.policy import Policy, PolicyError
+from reference.policies import seeing
 
 GAIN = np.array([[0.5, 0.0, 0.0], [0.0, -0.25, 1.0]], dtype=np.float32)
 MODE = {"mode": "wrench2", "size": 2, "limits": [18.6, 6.9], "scale": [1.0, 0.5]}
@@ -248,3 +249,17 @@ def test_a_network_that_takes_too_much_memory_is_refused(folder):
     write(folder, model.SerializeToString())
     with pytest.raises(PolicyError, match="not a network onnxruntime can run"):
         Policy.load(folder)
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [None, np.zeros((1, 27, 47, 3), np.uint8), np.zeros((1, 27, 48, 3), np.float32)],
+    ids=["none", "another size", "another type"],
+)
+def test_a_picture_that_is_not_the_policys_is_refused(tmp_path, picture):
+    """A missing picture, one of another shape and one of another type are each refused before the network runs."""
+    policy = Policy.load(seeing(tmp_path / "policy"))
+    row = np.zeros((1, policy.description.observation.size), np.float32)
+    assert policy.step(None, row, {"front_camera": np.zeros((1, 27, 48, 3), np.uint8)})[0].shape == (1, 6)
+    with pytest.raises(PolicyError, match="the policy sees front_camera: it is given"):
+        policy.step(None, row, {} if picture is None else {"front_camera": picture})

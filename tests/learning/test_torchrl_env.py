@@ -134,3 +134,11 @@ def test_what_cannot_be_is_refused():
         env.step(now.clone().set("action", torch.zeros(2, 5)))
     with pytest.raises(EnvironmentSetupError, match="groups name left, expected each of left, right once"):
         TorchRlEnv(Pair(), groups={"some": ["left"]})
+
+
+def test_ends_are_of_two_kinds():
+    """Done, terminated and truncated are booleans by world: categories 0 and 1."""
+    spec = TorchRlEnv(SHORT, worlds=2).done_spec
+    assert {
+        key: (spec[key].n, tuple(spec[key].shape)) for key in ("done", "terminated", "truncated")
+    } == dict.fromkeys(("done", "terminated", "truncated"), (2, (2, 1)))

@@ -16,6 +16,7 @@ from finssim.robot.pictures import (
     Assembler,
     NoPictures,
     UdpPictures,
+    _announced,
     decode_picture,
     encode_picture,
     fragments,
@@ -225,3 +226,15 @@ def test_a_source_is_opened_by_its_address():
     for address in ("tcp://1.2.3.4:5", "shm:pool", "udp://127.0.0.1", "", "udp://localhost:99999"):
         with pytest.raises(LinkError, match=r"."):
             open_pictures(address, "127.0.0.1:0")
+
+
+@pytest.mark.parametrize("marker", [0xC4, 0xC8, 0xCC, 0xE0])
+def test_a_segment_before_the_frame_header_does_not_hide_the_size(marker):
+    """Huffman tables, extensions and the like may come before the frame header; none of them is taken for it."""
+    data = bytearray(encode_picture(Picture(1.0, 0, SMOOTH), compress=True))
+    start = data.index(b"\xff\xd8\xff")
+    dqt = data.index(b"\xff\xdb", start)
+    assert _announced(bytes(data[start:])) == SMOOTH.shape
+    segment = bytes([0xFF, marker, 0, 12]) + bytes(range(10))
+    assert _announced(bytes(data[start:dqt]) + segment + bytes(data[dqt:])) == SMOOTH.shape
+    assert _announced(b"\xff\xd8" + segment) is None

@@ -278,3 +278,13 @@ def test_own_sensors_are_in_the_record(tmp_path):
     assert found["altimeter/range"].range == 2.5 and found["sonar/sonar_image"].image.beam_count == 128
     with open_record(path) as record:
         assert describe_record(record)["topics"]["/finsrov/altimeter/range"]["messages"] == 1
+
+
+def test_shaft_speeds_need_the_output_of_every_thruster():
+    """Speeds of all outputs give all thrusters in their order; one output short gives no message."""
+    messages = Messages(VEHICLE)
+    message = messages.shafts(0, RPM)
+    assert list(message.name) == list(VEHICLE.thruster_names) and len(message.velocity) == 8
+    assert messages.shafts(0, RPM[:-1]) is None
+    unknown = VEHICLE.replace({"thrusters.V_LF.motor_index": None})
+    assert Messages(unknown).shafts(0, RPM) is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.findings import CalibrationError
-from finssim.calibration.vision.pool_fit import calibrate_pool, doubted
+from finssim.calibration.vision.pool_fit import _numbers, calibrate_pool, doubted
 from finssim.calibration.vision.pool_model import Settings
 from finssim.geometry.optics import Interface, Lens
 
@@ -253,3 +253,14 @@ def test_correlations_bear_the_names_of_the_table(plane):
     assert list(fit.correlation.names) == fitted
     np.testing.assert_allclose(np.diagonal(fit.correlation.matrix), 1.0)
     np.testing.assert_allclose(fit.correlation.matrix, fit.correlation.matrix.T, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_survey_that_is_rougher_than_stated_is_noticed_with_its_error():
+    """Errors of three times the assumed 2 mm are reported as 6 mm."""
+    seen = survey(overhead(), WATER, SOLID, 40)
+    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
+    assert "survey_rough" not in codes(fit)
+    rough = replace(fit, noise=replace(fit.noise, survey=0.002, scale=3.0))
+    (found,) = (one for one in _numbers(rough, seen) if one.code == "survey_rough")
+    assert found.values == {"times": 3.0, "error": pytest.approx(6.0)}

@@ -141,7 +141,9 @@ def test_a_video_gives_its_pictures_with_their_times(tmp_path, suffix, code):
     for number in range(8):
         writer.write(cv2.cvtColor(scene(20 * number), cv2.COLOR_GRAY2BGR))
     writer.release()
-    got = listed(path)
+    notes = []
+    got = listed(path, tell=notes.append)
+    assert notes == []
     assert [name for _, name, _ in got] == [f"run{suffix}#{i}" for i in range(8)]
     assert np.allclose([time for time, _, _ in got], 0.1 * np.arange(8), atol=1e-3)
     means = [float(image.mean()) for _, _, image in got]

@@ -272,7 +272,7 @@ UNSURE_FOCAL = 0.02
 """Half width of its interval, relative, beyond which a focal length does not count as identified."""
 
 UNSURE_CENTRE = 0.02
-"""Half width of a certain principal point, in widths of the image."""
+"""Half width of its interval, in widths of the image, beyond which a principal point does not count as identified."""
 
 COLUMNS, ROWS = 12, 9
 """Points of the picture at which the uncertainty of a pixel is computed."""
