@@ -1,4 +1,4 @@
-"""Experiments as campaigns: a bar while they work, trials over several processes that a later call goes on with."""
+"""Experiments as campaigns: a progress bar, and trials over several processes that a later call continues."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SETTINGS = 4
 PATIENCE = 10.0
 """For a cluster's answer to a first knock [s]."""
 RETRIES = 3
-"""How often work on a cluster is begun anew after its worker was lost."""
+"""Number of restarts of work on a cluster after its worker was lost."""
 
 
 class ClusterError(ValueError):
@@ -103,7 +103,7 @@ class ResultError(ValueError):
 
 
 def write_json(path: Path, result: Mapping[str, Any], tables: Sequence[Table] = ()) -> None:
-    """Write a result, and beside it, ending in .md, the page that a person reads.
+    """Write a result, and beside it, with the suffix .md, its page.
 
     Raises:
         ResultError: It holds a number that is not finite.
@@ -122,7 +122,7 @@ def write_json(path: Path, result: Mapping[str, Any], tables: Sequence[Table] = 
 
 
 def keep_result(path: Path, result: Mapping[str, Any]) -> None:
-    """Write a result that a later call goes on with, with its digest."""
+    """Write a result that a later call continues with, with its digest."""
     write_json(path, {**result, "sha256": _digest(result)})
 
 
@@ -152,13 +152,13 @@ class Job:
     """One trial as plain data: equal jobs give equal results, and a result is kept under its key."""
 
     row: str
-    """Of the table."""
+    """Row of the table."""
     target: str
-    """What is to be done."""
+    """Goal of the trial."""
     plant: int = 1
     """Seed of the pool, or number of the plant."""
     seed: int = 1
-    """Of the noise."""
+    """Seed of the noise."""
 
     def described(self) -> dict[str, Any]:
         """Everything that decides the result, with the contents of files in place of their names."""
@@ -202,7 +202,7 @@ def run_jobs(
     progress: Progress = lambda part, text: None,
     show: Show = lambda job, result: None,
 ) -> list[dict[str, Any]]:
-    """Play what has no result yet; after Ctrl-C or a kill the next call goes on where this one was.
+    """Play the jobs that have no result yet; after Ctrl-C or a kill the next call continues.
 
     Args:
         jobs: Trials; equal ones are played once.
@@ -238,7 +238,8 @@ def run_jobs(
 def spread(
     work: Callable[[Any], Any], items: Sequence[Any], processes: int | None = None, address: str | None = None
 ) -> Generator[tuple[Any, Future[Any]], None, None]:
-    """Work on items in processes of their own, as many at once as there are processors if None; in this one if 1.
+    """Yield the results of items in separate processes, as many in parallel as there are processors if None; in this
+    process if 1.
 
     On a cluster work whose process or machine is lost begins anew elsewhere, `RETRIES` times.
 
@@ -281,7 +282,7 @@ def spread(
         for future in as_completed(futures):
             yield futures[future], future
     except BaseException:
-        # End without waiting for what nobody will read.
+        # End without waiting for results that are not read.
         workers = list((executor._processes or {}).values())
         executor.shutdown(wait=False, cancel_futures=True)
         for worker in workers:
@@ -325,7 +326,7 @@ def _on_cluster(
 
 
 def _call(work: Callable[[Any], Any], item: Any) -> Any:
-    """Of a worker: Ray takes plain functions alone."""
+    """Call the work in a worker: Ray takes plain functions alone."""
     return work(item)
 
 
@@ -352,8 +353,8 @@ def _knock(address: str) -> None:
 
 
 def _prepare(parent: int) -> None:
-    """Of a worker: one thread, since there are as many workers as processors; no life without its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears Ctrl-C and ends its workers
+    """Prepare a worker: one thread, since there are as many workers as processors, and an end with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends its workers
     os.environ["OMP_NUM_THREADS"] = "1"
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 

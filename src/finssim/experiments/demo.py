@@ -1,4 +1,4 @@
-"""`finssim demo`: the whole loop on one machine, from a vehicle nobody measured to a policy in a pool."""
+"""`finssim demo`: the complete loop on one machine, from an unmeasured vehicle to a policy in a pool."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ __all__ = ["demo"]
 SHARE = 0.9
 """Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""
 BALLASTED = 0.25
-"""Weight less buoyancy of a vehicle that floats well enough by itself [N]."""
+"""Weight minus buoyancy of a vehicle that floats well enough [N]."""
 
 
 def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str, list[float]]:
@@ -91,7 +91,7 @@ def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str
             continue
         level = np.asarray(values, float)
         scale = size if i < 3 else 1.0
-        if i < 2:  # all levels of the axis alike, so that those of different trials stay different
+        if i < 2:  # all levels of the axis equally, so that those of different trials stay different
             fastest = size * float(theirs.terminal_speed(published.wrench_limits)[i])
             scale *= min(1.0, STEADY * level_speed(vehicle, axis=i) / fastest)
         if min(ours.stiffness[i], theirs.stiffness[i]) > 0.0:
@@ -122,7 +122,7 @@ def trimmed(programme: Programme, vehicle: Vehicle) -> Programme:
 
 
 PERIODS = {"surge": 4.0, "sway": 4.0, "heave": 2.4, "roll": 2.0, "pitch": 2.0, "yaw": 4.0}
-"""Of the wave, some five time constants of a small vehicle [s]."""
+"""Period of the wave, some five time constants of a small vehicle [s]."""
 WAVES = 2.5
 """The first and the last half of a half wave, so that the middle of the way is where it began."""
 
@@ -154,12 +154,12 @@ def shuttles(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> list[Pr
     return plan
 
 
-# A vehicle nobody measured, trials, and what they make identifiable.
+# An unmeasured vehicle, trials, and what they determine.
 
 
 TRIALS = "trials"
 VEHICLE_FILES = ("{}_rough.yaml", "{}_identified.yaml")
-"""Of the vehicle before and after."""
+"""Files of the vehicle before and after."""
 SET = "hydrodynamics.calibrated"
 
 HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [7.0], "yaw": [1.0]}
@@ -171,13 +171,13 @@ Record = Callable[[Mapping[str, Path], str], Mapping[str, Sequence[Path]]]
 
 @dataclass(frozen=True)
 class Identification:
-    """What the trials told."""
+    """Result of the trials."""
 
     vehicle: Vehicle
-    """As read back from its file."""
+    """Vehicle as read back from its file."""
     fit: Fit
     replay: Replay
-    """On the held-out trials, of the identified vehicle."""
+    """Replay of the held-out trials by the identified vehicle."""
     truth: Vehicle
     """The vehicle of the catalogue that made the trials, or around which the pool's own was drawn."""
     findings: tuple[Finding, ...]
@@ -185,7 +185,7 @@ class Identification:
 
 
 def rough_vehicle(truth: Vehicle) -> Vehicle:
-    """What one knows of a vehicle before any trial: weighed, measured out, thrusters from a bench.
+    """Return what is known of a vehicle before any trial: its weight and size, and thrusters from a bench.
 
     Its hydrodynamics are guesses: added mass of half the displaced water on every linear axis, damping of the order of
     other small vehicles, forces growing with the square of the length, moments with its fourth power and moments of
@@ -205,7 +205,7 @@ def rough_vehicle(truth: Vehicle) -> Vehicle:
 
 
 def _named(vehicle: Vehicle, title: str, description: str) -> Vehicle:
-    """The same vehicle under words of its own."""
+    """Return the same vehicle with another name and description."""
     return vehicle.model_copy(update={"title": title, "description": description})
 
 
@@ -334,7 +334,7 @@ def _training(curves: NDArray[Any]) -> Any:
 
 
 def _identification(result: Identification, hardware: bool) -> list[Table]:
-    """What the trials made identifiable, and how the result replays others."""
+    """Return tables of what the trials determined, and of the replay of other trials."""
     score = result.replay.aggregate(result.replay.models[0]).value
     source, same = ("a robot", "on the same robot") if hardware else ("the virtual pool", "in the same pool")
     lead = (
@@ -406,20 +406,20 @@ COAST = 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class Scope:
-    """How much of everything a demonstration does."""
+    """Extent of a demonstration."""
 
     levels: dict[str, list[float]]
     """Axis -> levels of the steps and pulses that the fit is made from, for FinsROV [N, N m]."""
     shuttles: dict[str, list[float]]
-    """The same of the square waves."""
+    """Levels of the square waves."""
     held_out: dict[str, list[float]]
-    """The same of those that are replayed."""
+    """Levels of the replayed trials."""
     setpoints: tuple[str, ...]
     """Tried by every controller, with the tags' corners computed."""
     pictures: tuple[str, ...]
     """Tried by the policy with pictures drawn and searched."""
     duration: float = 60.0
-    """Of a trial [s]."""
+    """Duration of a trial [s]."""
 
 
 FULL = Scope(
@@ -436,7 +436,7 @@ FULL = Scope(
     setpoints=tuple(T1_SETPOINTS),
     pictures=("P02",),
 )
-"""What `finssim demo` does."""
+"""Scope of `finssim demo`."""
 
 
 def demo(
@@ -517,10 +517,10 @@ def demo(
 
 @dataclass(frozen=True, kw_only=True)
 class _Demonstration:
-    """What is done, with what and where."""
+    """A demonstration: its steps, with their arguments and places."""
 
     out: Path
-    """In which it is done."""
+    """Directory of the results."""
     name: str
     """Name or file of the vehicle, as the catalogue has it."""
     standing: Vehicle
@@ -587,7 +587,7 @@ class _Demonstration:
 
     @property
     def site(self) -> str:
-        """Where trials are made."""
+        """Return the place of the trials."""
         return FIRMWARES[self.firmware].site if self.robot is None else self.robot.site
 
     def report(self, text: str) -> None:
@@ -596,7 +596,7 @@ class _Demonstration:
 
     @contextmanager
     def _working(self, doing: str) -> Iterator[Progress]:
-        """Show what is done, and how far it is; a robot's session has a line of its own."""
+        """Show the current work and its progress; a robot's session has a separate line."""
         text = f"{doing} {'in the virtual pool' if self.robot is None else 'on the robot'}"
         self.report(text)
         with nullcontext() if self.robot is not None else self.console.status(text) as status:

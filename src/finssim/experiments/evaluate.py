@@ -87,10 +87,10 @@ def paper_name(result: Mapping[str, Any]) -> str:
 
 
 class Form(NamedTuple):
-    """How the trials of a task that is measured as in the paper are summed up and shown."""
+    """Summary and display of a task that is measured as in the paper."""
 
     kind: str
-    """What a trial goes to: the key of its name in a row."""
+    """Kind of goal: the key of its name in a row."""
     targets: Sequence[str]
     columns: Columns
     caption: str
@@ -113,7 +113,7 @@ FORMS: Mapping[str, Form] = {
         "trajectories.png", draw_tracking,
     ),
 }  # fmt: skip
-"""Every other task is measured in episodes as in training, by itself."""
+"""Forms of the paper's tasks; every other task is measured in episodes as in training."""
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
@@ -147,7 +147,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 
 def _remarks(trials: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What is to be known of records: why one is not complete, and how far its estimate was from the truth."""
+    """Return remarks on records: why one is not complete, and how far its estimate was from the truth."""
 
     def name(trial: Mapping[str, Any]) -> str:
         return str(next(trial[key] for key in ("record", "setpoint", "trajectory", "trial") if key in trial))
@@ -186,9 +186,9 @@ class Evaluation:
     """One controller in one plant."""
 
     result: dict[str, Any]
-    """What `--json` prints: who, where, the measures over all trials, `per_trial`, provenance."""
+    """Result that `--json` prints: controller, place, measures over all trials, `per_trial`, provenance."""
     trials: Sequence[Trial] = ()
-    """Of T1 and T2, for figures."""
+    """Trials of T1 and T2, for figures."""
 
     def __repr__(self) -> str:
         count = len(self.result.get("per_trial", ()))
@@ -452,7 +452,7 @@ def _recorded(
 
 
 def _plants(names: Sequence[str | Path]) -> list[Plant]:
-    """The plants; each must have a name of its own, under which its results are told apart."""
+    """Return the plants; each must have a unique name, which separates its results."""
     if not names:
         raise EvaluationError("no plant is given: name at least one, such as 'nominal'")
     plants = [load_plant(name) for name in names]

@@ -1,4 +1,4 @@
-"""`finssim excite --pool` and `--robot`: programmes played by the robot's whole software, and the trials they make."""
+"""`finssim excite --pool` and `--robot`: programmes played by the robot's complete software, and their trials."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ Array = NDArray[np.float64]
 HELD = ("surge", "sway", "heave", "yaw")
 """Axes that are held while others are excited; roll and pitch right themselves."""
 HELD_IN_TURNS = ("heave",)
-"""The same while the heading is excited: a place cannot be held in axes that go round."""
+"""Axes that are held while the heading is excited: a position cannot be held in axes that turn."""
 
 
 class ProgrammePilot:
@@ -162,7 +162,7 @@ class ProgrammePilot:
         return replace(goal, position=np.asarray(goal.position, float) + quat_rotate(q, along))
 
     def _row(self, reading: Measured, t: float) -> int:
-        """Which row it is the turn of; excitations and coasts that have done their work are left early."""
+        """Return the row to play; excitations and coasts that have done their work are left early."""
         phases, position = self._programme.phase, np.array(reading.position, float)
         self._origin = position if self._origin is None else self._origin
         row = int(t * self._programme.rate + 1e-6) + self._skipped
@@ -178,7 +178,7 @@ class ProgrammePilot:
         return row
 
     def _risen(self, reading: Measured, t: float) -> bool:
-        """Whether the vehicle has risen steadily for long enough."""
+        """Return whether the vehicle has risen steadily for long enough."""
         if self._programme.ascent_speed is None:
             return False
         velocity = quat_rotate(reading.quaternion, np.asarray(reading.nu)[:3])
@@ -196,14 +196,14 @@ Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 WALL, SURFACE, FLOOR = 0.35, 0.15, 0.12
 """Water kept between the vehicle's envelope and these at the ends of a run [m]; these three grow with `room`."""
 STOPPING = {"surge": 0.35, "sway": 0.3, "heave": 0.06}
-"""Of the way, kept for the coast after an excitation [m]."""
+"""Share of the room that is kept for the coast after an excitation [m]."""
 LEAST_ROOM = 0.15
 """Way on which nothing can be learnt [m]."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a programme begins."""
+    """Start of a programme."""
 
     position: tuple[float, float, float]
     """Body origin, world frame [m]."""
@@ -289,7 +289,7 @@ def programme_trial(
 
 
 def about_programme(programme: Programme, label: str) -> dict[str, Any]:
-    """What a record says of the trial that it makes."""
+    """Return a record's description of the programme's trial."""
     return {"trial": {"axis": list(programme.axes), "description": f"{label}: {programme.name}"}}
 
 
@@ -324,7 +324,7 @@ class PoolRun(PoolJob):
 
     @property
     def water(self) -> Box:
-        """Of the pool."""
+        """Return the water of the pool."""
         standing = load_vehicle(self.pool_vehicle)
         return box_of(site_of(self.site, draw_plant(standing, self.plant, self.severity)).basin)  # type: ignore[arg-type]
 
@@ -373,7 +373,7 @@ def record_programmes(
     console: Console | None = None,
     **pool: Any,
 ) -> dict[str, list[Path]]:
-    """Make trials of programmes, played by the robot's whole software at the start that `start_of` gives each.
+    """Make trials of programmes, played by the robot's complete software at the start that `start_of` gives each.
 
     Args:
         plans: What is played.
@@ -441,7 +441,7 @@ def _on_robot(
 
 
 def fastest_text(programme: Programme, outcome: Outcome) -> str:
-    """How fast a programme made the vehicle, and how long it took."""
+    """Return the greatest speed of a programme, and its duration, as text."""
     pilot, t = outcome.trial.pilot, outcome.runtime.t
     assert isinstance(pilot, ProgrammePilot)
     unit = "m/s" if programme.axes[0] in AXES[:3] else "rad/s"
@@ -459,7 +459,7 @@ def _in_pool(
     show: Show = lambda job, result: None,
     **settings: Any,
 ) -> None:
-    """The same in a pool.
+    """Make trials of programmes in a pool.
 
     Args:
         plans, folders, vehicle: As of `record_programmes`.
@@ -645,7 +645,7 @@ def excite_on_robot(
 def _about(
     vehicle: Vehicle, played: Sequence[Programme], seed: int, kind: str, place_values: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What the folder is of."""
+    """Return the description of the folder."""
     return {
         "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
         "kind": kind,

@@ -28,7 +28,7 @@ QUARTILES = (0.25, 0.5, 0.75)
 LONGEST_OF_THREE = 28
 """Letters of a label; where one is longer, the legend has two columns."""
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's palette: tells controllers apart for the colour-blind too."""
+"""Okabe and Ito's palette, which the colour-blind can distinguish too."""
 DPI = 130
 
 
@@ -54,13 +54,13 @@ def clean(*panels: Any) -> None:
 
 
 def legend_below(figure: Any, axes: Any, columns: int) -> None:
-    """What is labelled in one of the panels, below them all."""
+    """Draw the legend of one of the panels below them all."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
 def save_figure(figure: Any, path: Path) -> Path:
-    """Write it, whole or not at all; the suffix of the path chooses the format.
+    """Write a figure, completely or not at all; the suffix of the path chooses the format.
 
     Raises:
         OutputError: The file cannot be written.
@@ -71,7 +71,7 @@ def save_figure(figure: Any, path: Path) -> Path:
 
 
 def png(figure: Any) -> bytes:
-    """The same for a report."""
+    """Return the bytes of a figure for a report."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI)
     return buffer.getvalue()

@@ -44,7 +44,7 @@ IMAGES = 720
 REACH = (1.84, 0.84)
 """Outermost places from the middle of the 4 m x 2 m pool [m]."""
 WATER_HEIGHT = 1.0
-"""Of the surface over the floor, where z = 0 [m]."""
+"""Height of the surface over the floor, where z = 0 [m]."""
 
 TAG = Tags(family="tag25h9", edge=0.098, mounts={1: Mount(position=np.zeros(3))})
 """The tag of the published test; its own frame is the body."""
@@ -52,22 +52,22 @@ TAG = Tags(family="tag25h9", edge=0.098, mounts={1: Mount(position=np.zeros(3))}
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """What goes wrong, as standard deviations."""
+    """Errors, as standard deviations."""
 
     depth: float = 0.01
-    """Of the depth reading, once a visit [m]."""
+    """Error of the depth reading, drawn once a visit [m]."""
     tilt: float = float(np.radians(0.5))
-    """Of the roll and pitch readings, once a visit [rad]."""
+    """Error of the roll and pitch readings, drawn once a visit [rad]."""
     survey: float = 0.002
-    """Of a place along each axis [m]."""
+    """Error of a surveyed place along each axis [m]."""
     heading: float = float(np.radians(0.5))
-    """Of the tag's yaw as it was set down [rad]."""
+    """Error of the tag's yaw [rad]."""
     lens: float = 0.5
-    """Of focal length and principal point in the camera file [px]."""
+    """Error of focal length and principal point in the camera file [px]."""
     tape: float = 0.003
-    """Of the water's height as measured with a tape [m]."""
+    """Error of the water's height by tape [m]."""
     level: float = float(np.radians(0.1))
-    """Of the survey's frame against the plumb line, about x and about y [rad]."""
+    """Error of the survey's frame against the plumb line, about x and about y [rad]."""
     ripples: float = 0.01
     """Rms slope of the surface [-]."""
 
@@ -87,11 +87,11 @@ class Visit:
     nominal: Array
     """Position as surveyed, pool frame [m], (3,); the yaw as surveyed is 0."""
     position: Array
-    """Where it truly is [m], (3,)."""
+    """True position [m], (3,)."""
     R_pb: Array
-    """How it truly lies, (3, 3)."""
+    """True attitude, (3, 3)."""
     depth_read: float
-    """Depth of the tag as the pressure sensor tells it [m]."""
+    """Depth of the tag by the pressure sensor [m]."""
     roll_read: float
     pitch_read: float
     images: int
@@ -107,12 +107,12 @@ class Campaign:
     truth: Pool
     """Camera and water as they are."""
     lens: Lens
-    """As the camera file has it."""
+    """Lens of the camera file."""
     water_read: float
     """Height of the water as measured with a tape [m]."""
     visits: tuple[Visit, ...]
     calibrates: NDArray[np.bool_]
-    """Which visits calibrate; the others are held out, (170,)."""
+    """True for visits that calibrate; the others are held out, (170,)."""
 
 
 def published_pool(*, tilt_x: float = 0.0, tilt_y: float = 0.0) -> Pool:
@@ -211,9 +211,9 @@ SURROUND = 40
 INTERVAL = 0.5
 """Between pictures, as the published replay ran [s]."""
 CORNER_NOISE = 0.2
-"""Of the corners that `geometry` makes up [px]."""
+"""Noise of the corners of `geometry` [px]."""
 RENDERERS = ("own", "geometry")
-"""What looks at a visit: the overhead camera, or exact projection and noise, without pictures."""
+"""Source of a visit's pictures: the overhead camera, or exact projection and noise, without pictures."""
 
 
 @dataclass(frozen=True)
@@ -298,7 +298,7 @@ Row = dict[str, float | int | str]
 
 @dataclass(frozen=True)
 class Calibrated:
-    """What the operator has afterwards."""
+    """Result of the calibration."""
 
     refractive: Pool
     pinhole: Pool
@@ -307,7 +307,7 @@ class Calibrated:
     frames: list[Frame]
     """Detections of the half that calibrates."""
     survey: list[Row]
-    """Where the tag was said to lie in each of them."""
+    """Surveyed place of the tag in each of them."""
 
 
 def calibrate(campaign: Campaign, observed: Sequence[Picture]) -> Calibrated:
@@ -341,7 +341,7 @@ def calibrate(campaign: Campaign, observed: Sequence[Picture]) -> Calibrated:
 
 
 def survey_rows(campaign: Campaign, chosen: Sequence[Picture]) -> list[Row]:
-    """The survey as a table: where the tag was said to lie in each picture."""
+    """Return the survey as a table: the surveyed place of the tag in each picture."""
     rows: list[Row] = []
     for picture in chosen:
         x, y, z = campaign.visits[picture.visit].nominal.tolist()
@@ -379,7 +379,7 @@ METHOD_TITLES = {
 refractive calibration."""
 
 LIFT = 0.4
-"""How much higher than the places of the calibration the tag is shown once more [m]."""
+"""Height of the additional visit above the places of the calibration [m]."""
 Z_STD = 0.01
 TILT_STD = float(np.radians(0.5))
 TAGS_B = tag_corners_b(TAG)
@@ -410,7 +410,7 @@ CALIBRATION: Columns = {
     "tilt_deg": ("tilt [°]", ".3f"),
     "index": ("index", "+.4f"),
 }
-"""What a calibration got wrong: key -> heading and format."""
+"""Errors of a calibration: key -> heading and format."""
 
 
 @dataclass(frozen=True)
@@ -418,7 +418,7 @@ class Scores:
     """One method on one campaign's held-out visits."""
 
     visits: NDArray[np.intp]
-    """Those that were located at least once, (n,)."""
+    """Visits that were located at least once, (n,)."""
     surveyed: Array
     """Mean estimate minus surveyed place, x and y [m], (n, 2)."""
     true: Array
@@ -426,7 +426,7 @@ class Scores:
     pictures: int
     located: int
     reasons: Mapping[str, int]
-    """Why pictures gave no position, with how many."""
+    """Reasons why pictures gave no position, with their numbers."""
 
     @property
     def rmse(self) -> float:
@@ -596,7 +596,7 @@ class SeedResult:
     campaign: Campaign
     calibration: Calibrated
     scores: Mapping[str, Scores]
-    """By method."""
+    """Scores by method."""
 
 
 def localization_experiment(
@@ -705,7 +705,7 @@ def _scored(campaign: Campaign, observed: Sequence[Picture], calibration: Calibr
 
 
 def _errors(seed_result: SeedResult) -> dict[str, Any]:
-    """What the calibration of one seed got wrong, the truth being known here."""
+    """Return the errors of the calibration of one seed, whose truth is known here."""
     true, fit = seed_result.campaign.truth, seed_result.calibration.refractive
     (x, y, height), (x_fit, y_fit, height_fit) = true.camera.position, fit.camera.position
     over = height - true.interface.height(x, y)

@@ -84,7 +84,7 @@ def paper_row(name: str) -> dict[str, Any]:
 
 
 ERRORS = ("horizontal_rmse_m", "vertical_rmse_m", "p95_m")
-"""What the paper reports of tracking."""
+"""Errors that the paper reports of tracking."""
 PAPER_T2: Mapping[str, Mapping[str, Sequence[float]]] = PAPER["tracking"]
 """Table of T2: controller -> trajectory -> the figures in the order of `ERRORS`."""
 
@@ -104,7 +104,7 @@ YAW_TOLERANCE = math.radians(10.0)
 """Largest yaw error that counts as holding the heading [rad]."""
 
 SUCCESS_DURATION = 10.0
-"""How long both must hold without a break [s]."""
+"""Time for which both must hold without a break [s]."""
 
 EVALUATION_WINDOW = (40.0, 60.0)
 """Part of the trial in which the late errors are taken [s]."""
@@ -274,7 +274,7 @@ SEARCH_WAY = 0.3
 """Way that is searched ahead at least, however slow the reference is there [m]."""
 
 COMPLETE = 0.98
-"""Part of the way that counts as the whole."""
+"""Share of the way that counts as complete."""
 
 """Smallest share of the duration's samples that must have a position."""
 
@@ -396,7 +396,7 @@ def _way_share(guide: Guide, time: float) -> float:
 
 
 def effort_measures(t: Array, thrust: Array, limits: tuple[ArrayLike, ArrayLike]) -> dict[str, float]:
-    """What the thrusters were asked.
+    """Return measures of the thrusters' effort.
 
         energy = ∫ sum |f|^1.5 dt [N^1.5 s]: up to a factor, a propeller's shaft energy (momentum theory)
         smoothness = RMS of the thrusts' change per second, as a part of their limits [1/s]; 0 is smoothest

@@ -30,7 +30,7 @@ class PlantError(ValueError):
 
 
 class Plant(BaseModel):
-    """What differs; everything left out is as in the vehicle file, in still water, without noise."""
+    """Differences of a plant; keys that are left out are as in the vehicle file, in still water, without noise."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -39,20 +39,20 @@ class Plant(BaseModel):
     hydrodynamics: str | None = None
     """calibrated, mesh or simplified."""
     ranges: Ranges | None = None
-    """Drawn anew for every trial: a mapping, or the name or file of ranges."""
+    """Ranges drawn for every trial: a mapping, or the name or file of ranges."""
     water: Water | None = None
     """Current, shear, drift_std, drift_time, depth, waves; still if None."""
     noise: MeasurementNoise | None = None
-    """On what the controller sees [m, rad, m/s, rad/s]."""
+    """Errors of what the controller observes [m, rad, m/s, rad/s]."""
     observe: str | None = None
-    """In place of `noise`: truth, estimator, or sensors, those of the vehicle file with position fixes; or a file of
-    fixes."""
+    """Observation in place of `noise`: truth, estimator, or sensors, those of the vehicle file with position fixes; or
+    a file of fixes."""
     extra_time_constant: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
     """Added to every thruster's [s]."""
     extra_delay: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
     """Added to every thruster's [s]."""
     held_out: bool = False
-    """Of a task that sees: the looks of its site that are held out of training."""
+    """True for the looks of a site that are held out of training."""
     vehicle: dict[str, Any] = Field(default_factory=dict)
     """Dotted path in the vehicle file -> another value, such as body.mass: 12.5."""
 
@@ -70,7 +70,7 @@ class Plant(BaseModel):
         return self
 
     def with_view(self, observe: str) -> Plant:
-        """The same plant, seen otherwise.
+        """Return the same plant with another observation.
 
         Raises:
             PlantError: There is no such way to see.
@@ -82,7 +82,8 @@ class Plant(BaseModel):
             raise PlantError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
 
     def observe_record(self, vehicle: Vehicle) -> dict[str, Any]:
-        """What a result says of `observe`, with its numbers, as a policy's description does; empty if there is none."""
+        """Return the description of `observe` in a result, with its numbers, as in a policy's description; empty
+        without one."""
         if self.observe is None:
             return {}
         return {"observe": {"name": self.observe, **seen_with(observed(self.observe), self.changed(vehicle))}}

@@ -1,5 +1,5 @@
-"""What was done with a vehicle, out of its record: demonstrations (`finssim collect RECORD.mcap`), or a trial that is
-measured as in simulation, by the robot's own estimate or by a truth (`finssim evaluate RECORD.mcap`)."""
+"""Motion of a vehicle from its record: demonstrations (`finssim collect RECORD.mcap`), or a trial that is measured as
+in simulation, by the robot's own estimate or by a truth (`finssim evaluate RECORD.mcap`)."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ from finssim.yaml_file import json_value
 Array = NDArray[np.float64]
 
 TOPICS = ("thruster_cmd", "odom", "policy_info", "goal", "estimator_status", "thruster_state")
-"""What a demonstration is made of; `events` are read where there are any."""
+"""Topics of a demonstration; `events` are read if there are any."""
 REMEDY = "record a drive with --pool-file and pictures"
 LACKS = {
     "thruster_cmd": f"nobody commanded: {REMEDY}",
     "odom": f"it holds no estimate of where it was: {REMEDY}",
 }
-"""What a record without these says of a drive."""
+"""Topic -> message about a record without it."""
 TELEOP = "finssim teleop"
 PERSON = "person"
 """Mode of a teleoperated vehicle in which its operator steers, and the one it begins in."""
 NO_GOAL = (0.0, 0.0, 0.0, 0.0)
-"""Stands in the record of a drive by hand without a goal."""
+"""Goal in the record of a drive by hand without a goal."""
 
 
 class DriveError(ValueError):
@@ -68,25 +68,25 @@ class Drive:
     driver: str
     """teleop, or the pilot's name."""
     pilot: dict[str, Any]
-    """Who steered, as the record describes it; empty where it does not."""
+    """Pilot as the record describes it; empty if it does not."""
     period: float
-    """Of the decisions [s]."""
+    """Period of the decisions [s]."""
     time: Array
     """Robot's clock [s], (N,)."""
     motion: Motion
-    """As estimated, with the thrusts and the pilot's actions, which have size 0 where the record does not tell them, as
-    of a person; its times are NaN where the record does not tell the guide's start."""
+    """Estimated motion, with the thrusts and the pilot's actions, which have size 0 if the record lacks them, as of a
+    person; its times are NaN if the record lacks the guide's start."""
     guide: str
-    """Name of the station or trajectory; empty where the record does not tell it."""
+    """Name of the station or trajectory; empty if the record lacks it."""
     goal: Array
-    """Where the vehicle should be: x, y, z [m], yaw [rad], world frame, (N, 4)."""
+    """Goal of the vehicle: x, y, z [m], yaw [rad], world frame, (N, 4)."""
     stretch: NDArray[np.int64]
     """Number of the stretch a decision belongs to, (N,): all through it the robot was armed, the estimate ready and
     the driver at the helm. Negative: in none."""
 
     @property
     def has_goal(self) -> bool:
-        """Whether anybody said where to."""
+        """Return whether the record has a goal."""
         return self.driver != "teleop" or bool(np.any(self.goal != NO_GOAL))
 
 
@@ -173,7 +173,7 @@ def _mapping(record: Record, key: str) -> dict[str, Any]:
 
 
 def _helm(steps: Array, events: list[tuple[float, Any]], teleop: bool) -> NDArray[np.bool_]:
-    """Whether the one who is to be learnt from steers at each step: of a drive by hand the person."""
+    """Return whether the demonstrator steers at each step: in a drive by hand the person."""
     if not teleop:
         return np.ones(len(steps), dtype=np.bool_)
     changes = [(t, event["text"] == PERSON) for t, event in events if event["kind"] == "mode"]
@@ -204,7 +204,8 @@ def _xyz(v: Any) -> tuple[float, float, float]:
 
 
 NEAR_WRENCH = 0.05
-"""A wrench counts as said by an action if it is off by less, per axis, in parts of the wrench limits."""
+"""Greatest difference of a wrench from an action, per axis, as a share of the wrench limits, for the action to count as
+known."""
 FEW = 0.05
 """Part of the decisions that may be off by more: those at the limits of the thrusters."""
 
@@ -251,7 +252,7 @@ def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[
 Indices = NDArray[np.int64]
 
 END = "end"
-"""In place of a goal: where a stretch ended."""
+"""Mark of the end of a stretch, in place of a goal."""
 NEAR = 0.25
 """A decision may lie so far from the task's grid of times, in parts of its period."""
 SAME_GOAL = 1.0e-3
@@ -348,7 +349,7 @@ def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
 def _guides(
     drive: Drive, vehicle: Vehicle, moving: bool, goal: Station | str | None
 ) -> Callable[[Indices], Guide]:
-    """What tells a stretch's guide from the indices of its decisions."""
+    """Return a function from the indices of decisions to the guide of a stretch."""
     if moving:
         trajectory = trajectory_of(drive, vehicle, None if goal is None else str(goal))
         return lambda rows: trajectory
@@ -476,7 +477,7 @@ def datasets(places: Sequence[Path], *, lerobot: Path | None = None) -> dict[str
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """What was collected; or a row for each data set."""
+    """Return a table of what was collected; or a row for each data set."""
     if "task" in result:
         means = {name: x for name, x in result.get("metrics", {}).items() if x is not None}
         text = f"{result['episodes']} episodes, {result['steps']:,} steps{'; means: ' * bool(means)}"
@@ -581,15 +582,15 @@ EARLY = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedTrial(Trial):
-    """What one record shows."""
+    """Content of one record."""
 
     path: Path
     pilot: dict[str, Any]
-    """Who steered, as the record describes it."""
+    """Pilot as the record describes it."""
     estimate: Motion
-    """What the robot knew at its decisions; the motion is the truth, where there is one, or the estimate."""
+    """The robot's estimate at its decisions; the motion is the truth, if there is one, or the estimate."""
     stopped: bool
-    """Whether it ended before its time."""
+    """True if it ended before its time."""
     duration: float
     """Up to when it is measured [s]."""
     offset: float | None
@@ -614,7 +615,7 @@ class RecordedTrial(Trial):
         }
 
     def _scored(self, task: Task, vehicle: Vehicle) -> tuple[dict[str, float | None], str]:
-        """How a task measures an episode of one vehicle that was played elsewhere.
+        """Return the task's measures of an episode of one vehicle that was played elsewhere.
 
         Returns:
             Its metrics, None where there is none; and why there are none, in a sentence, which counts without success.
@@ -706,7 +707,7 @@ def read_record(
 
 
 def _goal_history(drive: Drive, steered: NDArray[np.bool_], duration: float) -> Trajectory:
-    """Where a moving goal was, as the record has it; held after its end, up to a time [s].
+    """Return the course of a moving goal by the record; held after its end, up to a time [s].
 
     Raises:
         DriveError: There was no goal.
@@ -723,7 +724,7 @@ def _goal_history(drive: Drive, steered: NDArray[np.bool_], duration: float) -> 
 
 
 def _goals(drive: Drive, steered: NDArray[np.bool_]) -> Array:
-    """Where the vehicle should have been, by decision."""
+    """Return the goals of the vehicle, by decision."""
     if not drive.has_goal:
         raise DriveError(f"{drive.path}: was driven by hand to no goal: a record of finssim run has one")
     return drive.goal[steered & (drive.motion.t >= 0.0)]

@@ -84,7 +84,7 @@ class ReplayPlant:
         return trials
 
     def forces(self, vehicle: Vehicle) -> Callable[[Simulator], None]:
-        """What acts besides the engine's own forces: coupled damping and the loss of thrust, from the present state."""
+        """Return the function that writes forces besides the engine's own: coupled damping and the loss of thrust."""
         D = self.linear_damping.matrix()
         p = SimpleNamespace(**self.spec["propellers"])
         thrusters = list(vehicle.thrusters.values())
@@ -173,7 +173,7 @@ PAPER_TABLE_3: Mapping[str, Any] = PAPER["replay"]
 """Model -> NRMSE and 95 % interval in the paper: Unity against its real vehicle in its pool."""
 
 REPEATS = 8
-"""Of every published level and direction; the odd ones are fitted, the even ones replayed."""
+"""Repeats of every published level and direction; the odd ones are fitted, the even ones replayed."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
-"""Trials by the robot's whole software, on a robot or in the virtual pool: waited for, brought to the start, played,
-recorded and measured, one after the other.
-"""
+"""Trials by the robot's complete software, on a robot or in the virtual pool: waiting, way to the start, trial, record
+and measures."""
 
 from __future__ import annotations
 
@@ -54,36 +53,38 @@ NEAR, TURNED = 0.10, math.radians(10.0)
 EXACTLY = (NEAR, TURNED, 0.05, math.radians(5.0), 2.0)
 """A vehicle is at its start within this of it [m, rad] and no faster than this [m/s, rad/s] for so long [s]."""
 ROUGHLY = (0.15, math.radians(20.0), 0.1, math.inf, 10.0)
-"""The same where the start need not be exact: a PID tuned from guesses may circle its goal for ever."""
+"""Bounds if the start need not be exact: a PID tuned from guesses may circle its goal forever."""
 AFLOAT = (0.30, math.radians(20.0), 0.4, math.inf, 2.0)
-"""The same in open water, where waves leave nothing at rest."""
+"""Bounds in open water, where waves leave nothing at rest."""
 APPROACH = 60.0
-"""Longest way to a start, and longest wait for the vehicle with nobody beside it [s]."""
+"""Longest way to a start, and longest wait for the vehicle without an attendant [s]."""
 
 
 def start_bounds(site: str, exact: bool) -> tuple[tuple[float, ...], ...]:
-    """How near to its start is near enough, any of them: `EXACTLY`, in open water `AFLOAT`; `ROUGHLY` unless exact."""
+    """Return the bounds that are near enough to a start, any of them: `EXACTLY`, in open water `AFLOAT`; `ROUGHLY`
+    unless exact."""
     near = AFLOAT if site == "open-water" else EXACTLY
     return (near,) if exact else (near, ROUGHLY)
 
 
 Ended = Literal["over", "fault", "skipped", "interrupted", "not there"]
-"""How a trial ended: by itself, by the bridge, at the operator's wish, by Ctrl-C, or the start was never reached."""
+"""End of a trial: by itself, by the bridge, by the operator, by Ctrl-C, or before its start was reached."""
 
 
 class Attendant(Protocol):
     """The person beside the water."""
 
     def keys(self) -> Sequence[str]:
-        """Pressed since the last call: enter goes on, x or space stops the thrusters, s skips, q ends; never waits."""
+        """Return the keys pressed since the last call: enter continues, x or space stops the thrusters, s skips, q
+        ends; never waits."""
 
     def line(self, text: str) -> None:
-        """How it stands now; called at every step."""
+        """Show the current state; called at every step."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotTrial:
-    """What is played. A new one for every attempt, since pilots remember."""
+    """A trial to play. A new one for every attempt, since pilots have memory."""
 
     name: str
     pilot: Pilot
@@ -91,26 +92,26 @@ class RobotTrial:
     duration: float
     """Longest, from arming [s]."""
     over: Callable[[Runtime], bool]
-    """Whether it has come to its end."""
+    """Function that returns whether it has reached its end."""
     watch: Callable[[Runtime], None] = lambda runtime: None
     """Looks on after every step of the trial itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How a trial went."""
+    """Result of a trial."""
 
     trial: RobotTrial
     runtime: Runtime
     fault: str
-    """Why it ended before its time, or never began; empty if it did neither."""
+    """Reason why it ended before its time, or never began; empty if it did neither."""
     ended: Ended = "over"
     begun: bool = True
-    """Whether the trial itself was begun, not only the way to its start."""
+    """True if the trial was started, not only the way to its start."""
 
 
 def fault_of(trial: RobotTrial, runtime: Runtime) -> str:
-    """Why a trial that was begun ended before its time; empty if it did not."""
+    """Return why a started trial ended before its time; empty if it did not."""
     if runtime.bridge.state == "fault":
         return runtime.bridge.reason
     if math.isnan(runtime.started):
@@ -173,7 +174,7 @@ class Stages:
             self._trial.watch(runtime)
 
     def _over(self, runtime: Runtime) -> bool:
-        """Whether to end; goes from stage to stage."""
+        """Return whether to end, and change from stage to stage."""
         assert runtime.reading is not None  # a step has been made
         now = runtime.reading.time
         self._since = now if math.isnan(self._since) else self._since
@@ -189,7 +190,7 @@ class Stages:
         return self._attendant.keys() if self._attendant else ()
 
     def _stopped(self, runtime: Runtime, now: float) -> bool:
-        """Whether the operator stops the thrusters now."""
+        """Return whether the operator stops the thrusters now."""
         if not {"x", " "} & set(self._keys()):
             return False
         runtime.bridge.stop(now, "stopped by the operator")
@@ -200,7 +201,7 @@ class Stages:
             self._attendant.line(text)
 
     def _wait(self, runtime: Runtime, reading: Reading, now: float) -> bool:
-        """Thrusters cannot turn: until the state is known and the attendant says go."""
+        """Wait with disabled thrusters until the state is known and the attendant starts the trial."""
         keys = self._keys()
         if now == self._since:
             return False  # what was pressed before anybody was asked means nothing
@@ -259,7 +260,7 @@ class Stages:
         return (late or t > self._trial.duration + GETTING_READY) and self._end("not there")
 
     def there(self, reading: Reading, now: float) -> bool:
-        """Whether the vehicle has been at its start, at rest, for long enough."""
+        """Return whether the vehicle has been at its start, at rest, for long enough."""
         off = (
             float(np.abs(reading.position - self._start.position).max()),
             abs(self._turn(reading)),
@@ -287,7 +288,7 @@ ABORTED = "aborted"
 
 
 class RobotError(ValueError):
-    """Trials on a robot cannot be made, or cannot go on."""
+    """Trials on a robot cannot be made, or cannot continue."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,20 +296,20 @@ class OnRobot:
     """A robot, and how trials are made on it."""
 
     wiring: Wiring
-    """Its wires; a virtual pool in a process of its own is another of them."""
+    """Connection of the robot; a virtual pool in a separate process is another one."""
     pool_file: Path | None
     """Camera, water and frames; None: no camera looks, position fixes come by wire."""
     site: str = "pool"
-    """Where it is, by which it is equipped: pool, tank or open-water."""
+    """Site that determines its equipment: pool, tank or open-water."""
     arm: bool = False
     """Thrusters may turn; trials are refused without it."""
     by_hand: bool = False
-    """Somebody carries the vehicle to every start; False: the tuned PID steers it there."""
+    """True if a person carries the vehicle to every start; False: the tuned PID steers it there."""
     unattended: bool = False
-    """Nobody presses a key: the way to a start begins as soon as the state is known, and a fault ends it all."""
+    """True without an attendant: trials begin as soon as the state is known, and a fault ends the session."""
     let_in: tuple[float, float] | None = None
-    """Where the vehicle is when the session begins, x and y, world frame [m]: dead reckoning goes on from there through
-    all trials. None: a camera or position fixes locate it."""
+    """Position of the vehicle when the session begins, x and y, world frame [m]: dead reckoning continues from there
+    through all trials. None: a camera or position fixes locate it."""
 
     @property
     def title(self) -> str:
@@ -344,7 +345,7 @@ def robot_or_none(
     unattended: bool = False,
     let_in: str | None = None,
 ) -> OnRobot | None:
-    """The robot that options name; none where they name none, and nothing tells of one.
+    """Return the robot that options name; None without a robot and without options of one.
 
     Args:
         robot (ADDRESS): Run on this robot: its motor controller's udp://HOST:PORT or serial:DEVICE, its autopilot's
@@ -426,11 +427,12 @@ class Session:
 
     @cached_property
     def _reckoning(self) -> Perception:
-        """Of a robot that was let in: one for all trials, so that what it reckons is carried from each to the next."""
+        """Return the perception of a robot with dead reckoning: one for all trials, so that its state is carried from
+        each to the next."""
         return Perception(self.equipped, None, mode="error-state", let_in=self.robot.let_in)
 
     def notify(self, text: str) -> None:
-        """Tell whoever watches."""
+        """Print a message for the attendant."""
         self.console.print(text, highlight=False, markup=False)
 
     def trial(
@@ -507,7 +509,7 @@ class Session:
             self.notify(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
 
     def _put_away(self, partial: Path, record: Path, outcome: Outcome) -> None:
-        """Keep what there is of a trial that was begun; nothing was recorded of one that was not."""
+        """Keep the record of a started trial; nothing was recorded of one that was not."""
         if not outcome.begun:
             partial.unlink(missing_ok=True)
             return
@@ -554,7 +556,7 @@ def session(
 
 
 def take_folder(file: Path, about: Mapping[str, Any]) -> None:
-    """Begin a folder in which things stay as they are made, or go on in one that is of the very same settings.
+    """Start a folder in which results stay as they are made, or continue one with equal settings.
 
     Args:
         file: In the folder, which may be new: takes the settings.
@@ -589,25 +591,25 @@ def check_starts(starts: Mapping[str, Station], vehicle: str | Vehicle) -> None:
 
 
 HARDWARE = "hardware"
-"""In place of the severity of a pool, and of what its camera sends."""
+"""Replacement of the severity of a pool and of its camera's mode, on a robot."""
 
 
 class Firmware(NamedTuple):
-    """How a vehicle is tried that it steers."""
+    """Trials of a vehicle with a kind of firmware."""
 
     action: str | None
-    """Of policies; the task's own if None."""
+    """Action mode of policies; the task's own if None."""
     site: str
     camera: str
 
 
 FIRMWARES = {"mcu": Firmware(None, "pool", "corners"), "ardusub": Firmware("pilot6", "tank", "none")}
-"""What steers the motors: a controller that takes shaft speeds, in the pool under a camera, or an autopilot that takes
-axes, in a tank by Doppler log, depth and compass."""
+"""Firmwares: a controller that takes shaft speeds, in the pool under a camera, or an autopilot that takes axes, in a
+tank by Doppler log, depth and compass."""
 
 
 def firmware_of(name: str, vehicle: Vehicle, robot: OnRobot | None = None) -> str:
-    """The name of what steers, or that of what a robot's address says.
+    """Return the name of the firmware, or that of a robot's address.
 
     Raises:
         ValueError: There is no such firmware.
@@ -623,7 +625,7 @@ def firmware_of(name: str, vehicle: Vehicle, robot: OnRobot | None = None) -> st
 
 @dataclass(frozen=True, kw_only=True)
 class PoolJob(campaign.Job):
-    """What the robot's whole software does in a pool, whose vehicle it knows only so well."""
+    """A trial of the robot's complete software in a pool, whose vehicle it knows only approximately."""
 
     vehicle: str | Vehicle = "finsrov"
     """The vehicle, its name or file, as controller and localization know it."""
@@ -639,7 +641,7 @@ class PoolJob(campaign.Job):
     """mcu or ardusub: an autopilot, on whose vehicle a Doppler log and a compass take the camera's place."""
 
     def plan(self, seed: int) -> PoolPlan:
-        """Of its pool, with a seed for noise."""
+        """Return the plan of its pool, with a seed for noise."""
         camera: Any = "none" if self.firmware == "ardusub" else self.camera
         return make_plan(
             self.pool_vehicle, str(self.plant), self.severity, camera=camera, seed=seed, site=self.site,
@@ -658,7 +660,7 @@ class Job(PoolJob):
     controller: str
     """Policy directory, or the name of a PID."""
     fusion: bool = True
-    """Whether the controller sees the fused state, or what each sensor said last."""
+    """True if the controller observes the fused state, False: the latest reading of each sensor."""
     position_noise: float = 0.0
     """Added to what the controller sees, per axis [m]."""
     yaw_noise: float = 0.0
@@ -690,7 +692,7 @@ def play_in_pool(
     recorder: Recorder | None = None,
     **estimator: Any,
 ) -> Outcome:
-    """Play a trial by the robot's whole software in lock-step with a pool.
+    """Play a trial by the robot's complete software in lock-step with a pool.
 
     Args:
         trial: What to do.
@@ -704,7 +706,7 @@ def play_in_pool(
     """
     world = plan.standing(start, seed=seed, truth=truth)
     if plan.firmware == "ardusub":
-        # Dead reckoning counts from where the vehicle is let in, so nobody can be wrong about that place.
+        # Dead reckoning counts from the start, whose position is exact.
         estimator = {"mode": "error-state", "let_in": start.position[:2], **estimator}
     perception = Perception(vehicle, plan.calibrated, **estimator)
     runtime = Runtime(
@@ -752,7 +754,7 @@ def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial,
 
 
 class _Estimates:
-    """What the robot believed, at the period of the series."""
+    """Estimates of the robot, at the period of the series."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, Any, Any]] = []

@@ -25,7 +25,7 @@ UNITS = ("N", "N", "N", "N m", "N m", "N m")
 
 
 class CommandError(ValueError):
-    """The words of a command line do not describe a wrench or a run; the message says which and what to write."""
+    """The words of a command line do not describe a wrench or a run; the message states which and what to write."""
 
 
 def parse_wrench(text: str) -> NDArray[np.float64]:

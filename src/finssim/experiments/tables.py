@@ -24,7 +24,7 @@ WIDE = 160
 
 
 def paper(row: Sequence[str]) -> bool:
-    """Whether a row is the paper's own."""
+    """Return whether a row is the paper's own."""
     return row[0].lstrip().startswith("paper")
 
 
@@ -61,7 +61,7 @@ def console_table(
 
 
 def markdown_table(heads: Sequence[str], rows: Rows, *, left: Sequence[int] = (0,)) -> str:
-    """The same on a page."""
+    """Return the table as Markdown."""
     rule = ["---" if k in left else "--:" for k in range(len(heads))]
     lines = ([head.replace("\n", " ") for head in heads], rule, *rows)
     return "\n".join("| " + " | ".join(line) + " |" for line in lines if line is not None)
@@ -69,11 +69,11 @@ def markdown_table(heads: Sequence[str], rows: Rows, *, left: Sequence[int] = (0
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """What a person reads of an experiment: a table with the words around it, or the words alone."""
+    """Table of an experiment with its text, or the text alone."""
 
     title: str
     headline: str = ""
-    """The title says all if empty."""
+    """Headline; the title is used if empty."""
     heads: Sequence[str] = ()
     rows: Rows = ()
     note: str = ""
@@ -83,7 +83,7 @@ class Table:
     whole: Sequence[int] = ()
     """Columns whose cells are never broken on a screen."""
     intervals: bool = False
-    """Whether a narrow screen shows the intervals of cells too."""
+    """True if a narrow screen shows the intervals of cells too."""
     pictures: Mapping[str, str] = field(default_factory=dict)
     """File beside the page -> what it shows."""
 

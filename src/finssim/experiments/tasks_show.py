@@ -41,7 +41,7 @@ def attribute_docs(kind: type) -> dict[str, str]:
 
 
 SEPARATE = ("name", "observation", "control_step", "substeps", "time_limit", "training_noise", "reward")
-"""Fields that are told by themselves."""
+"""Fields that are shown separately."""
 
 
 def describe_task(
@@ -103,7 +103,7 @@ def describe_task(
 
 
 def _text(task: Task, part: ObservationPart | RewardTerm | End | Total) -> str:
-    """What the task says of a term; otherwise the docstring of the function, also of one that is shared by name.
+    """Return the task's text of a term; otherwise the docstring of the function, also of one that is shared by name.
 
     An expression of which nothing is said is its own text, but in an observation, whose part is named by what it is.
     """
@@ -117,7 +117,7 @@ def _text(task: Task, part: ObservationPart | RewardTerm | End | Total) -> str:
 
 
 def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
-    """What 1 and -1 of every component stand for."""
+    """Return the meaning of 1 and -1 of every component."""
     chosen = action_mode(mode, vehicle)
     components = [
         {"name": label, "low": low, "high": high, "unit": "N m" if label in AXES[3:] else "N"}
@@ -138,7 +138,7 @@ def _reward(task: Task) -> dict[str, Any]:
 
 
 def _settings(task: Task) -> list[dict[str, Any]]:
-    """What can be changed, and what is drawn in every episode."""
+    """Return the settings, and what is drawn in every episode."""
     docs, values = attribute_docs(type(task)), task.record()
     names = (field.name for field in fields(task) if field.name not in SEPARATE)
     return [{"name": name, "value": _limited(values[name]), "told": docs.get(name, "")} for name in names]

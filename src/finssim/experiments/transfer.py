@@ -45,7 +45,7 @@ Results = Mapping[str, Sequence[Mapping[str, Any]]]
 """Row -> results of its trials."""
 
 TRAINING_SHARE = 0.4
-"""Of the progress bar."""
+"""Width of the progress bar."""
 DIFFERENCES_NOTE = (
     "Each figure is the mean of row less reference, over pairs of trials with the same pool, seed and target; in "
     "brackets 95 % from a bootstrap of plants and seeds. paper: the difference of its rows, on hardware, single runs."
@@ -72,7 +72,7 @@ class Row:
 
     title: str
     training: Mapping[str, Any] | None = None
-    """What its policy is trained in, as `rows.yaml` has it; None for a PID."""
+    """Training of its policy, as in `rows.yaml`; None for a PID."""
     controller: str = ""
     """Name of the PID."""
     paper: str | None = None
@@ -80,7 +80,7 @@ class Row:
     changes: dict[str, Any] = field(default_factory=dict)
     """Fields of its jobs."""
     targets: Sequence[str] | None = None
-    """What is played, if not all."""
+    """Played targets, if not all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,17 +91,17 @@ class Spec:
     """Its command, and the name of its files."""
     title: str
     rows: Mapping[str, Row]
-    """In the order of the table."""
+    """Rows in the order of the table."""
     targets: Sequence[str]
     """Setpoints or trajectories that are played."""
     allowed_targets: Sequence[str]
     """All that may be requested."""
     kind: str
-    """What targets are, in the plural."""
+    """Kind of the targets, in the plural."""
     by_target: bool
-    """Whether the table has a line for each target."""
+    """True if the table has a line for each target."""
     columns: Columns
-    """Of a row."""
+    """Columns of a row."""
     note: str
     bases: Sequence[str]
     """The rows that the others are compared with, a table for each that was played."""
@@ -261,7 +261,7 @@ def transfer_experiment(
         spec.name, chosen, run_seeds, folder, vehicle, steps, action,
         lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
     )  # fmt: skip
-    if robot is not None:  # there is one plant, and nobody chose its severity
+    if robot is not None:  # there is one plant, whose severity was not chosen
         pools, severity, camera = range(1), HARDWARE, HARDWARE
         site = robot.site if firmware == "ardusub" else site
     elif firmware == "ardusub":
@@ -305,7 +305,7 @@ def controllers_of(
     processes: int | None = None,
     address: str | None = None,
 ) -> dict[tuple[str, int], str]:
-    """Who steers, by row and seed; policies that are not finished in the folder are trained.
+    """Return the controllers by row and seed; policies that are not finished in the folder are trained.
 
     Args:
         task: Of the policies.
@@ -374,7 +374,7 @@ def _trained(policy: tuple[Path, Mapping[str, Any]]) -> dict[str, bytes]:
 
 
 def finished(directory: Path, vehicle: Vehicle | None = None) -> bool:
-    """Whether a whole policy lies there: not one that was interrupted, or cut short while it was written.
+    """Return whether a complete policy is there: not one that was interrupted, or cut short while it was written.
 
     Args:
         directory: Directory.
@@ -460,11 +460,11 @@ T1_DRAWN = ("calibrated", "mesh", "simplified", "pid-paper", "pid", "calibrated-
 """The paper's four curves, and ours."""
 
 T2_DRAWN = 4
-"""Rows that are drawn, at most: more cannot be told apart."""
+"""Greatest number of drawn rows, which can still be distinguished."""
 
 
 def played_in(result: Mapping[str, Any], targets_name: str) -> str:
-    """In what an experiment was played, and with which vehicle."""
+    """Return the place of an experiment, and its vehicle, as text."""
     plants, seeds = len(result["plants"]), len(result["seeds"])
     of = f"{targets_name}: {len(result['targets'])}; {result['vehicle']['name']} {result['vehicle']['sha256'][:12]}"
     if result.get("robot"):
@@ -487,7 +487,7 @@ def _draw_t1(by_row: Results, folder: Path) -> Path:
 
 
 def _draw_t2(by_row: Results, folder: Path) -> Path | None:
-    """Of each row and trajectory the trial with the median error; None if nothing was flown."""
+    """Draw the trial with the median error of each row and trajectory; return None if none was played."""
     runs = {}
     for name, results in by_row.items():
         flown: dict[str, list[Mapping[str, Any]]] = {}
@@ -589,5 +589,5 @@ def t2(*, trajectories: Annotated[Sequence[str] | None, ","] = None, **options: 
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """Those of either."""
+    """Return the tables of either."""
     return SPECS[result["experiment"]].tables(result)

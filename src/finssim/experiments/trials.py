@@ -1,4 +1,4 @@
-"""Trials: what a vehicle did on its way to a goal, measured alike wherever it was played, and those in the simulator.
+"""Trials: motion of a vehicle to a goal, measured in the same way wherever it was played, and trials in the simulator.
 
 In the simulator there is one world for each trial, all stepped together: station keeping, tracking, and episodes of any
 task from start to end.
@@ -70,11 +70,11 @@ class Motion:
     nu: Array | None = None
     """Velocity of the body origin, body frame [m/s, rad/s], (T, 6); None where it is not measured."""
     thrust: Array | None = None
-    """Of each thruster [N], (T, n); None where not known."""
+    """Thrust of each thruster [N], (T, n); None if it is not known."""
     action: Array | None = None
-    """Of the agent from then on, in [-1, 1], (T, size); None where not known."""
+    """Action of the agent from then on, in [-1, 1], (T, size); None if it is not known."""
     heading_only: bool = False
-    """Whether roll and pitch are not known."""
+    """True if roll and pitch are not known."""
 
     @property
     def yaw(self) -> Array:
@@ -89,8 +89,8 @@ class Motion:
         return replace(self, **{name: None if x is None else x[rows] for name, x in arrays.items()})
 
     def at(self, t: float) -> Track:
-        """Where the vehicle was at a time [s], between the samples; velocities that are not measured are differences
-        over a `PERIOD` to either side."""
+        """Return the state of the vehicle at a time [s], between the samples; velocities that are not measured are
+        differences over a `PERIOD` to either side."""
         position, quaternion = self._pose(t)
         if self.nu is not None:
             return Track(position, quaternion, interpolated(t, self.t, self.nu))
@@ -149,25 +149,25 @@ def localization_errors(truth: Motion, estimate: Motion) -> dict[str, float] | N
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """What a vehicle did on its way, in the simulator, in the virtual pool, on a robot or in a record."""
+    """Motion of a vehicle to its goal, in the simulator, in the virtual pool, on a robot or in a record."""
 
     name: str
-    """Of its setpoint or trajectory."""
+    """Name of its setpoint or trajectory."""
     guide: Guide
     motion: Motion
-    """By which it is measured, from the guide's start."""
+    """Motion that is measured, from the guide's start."""
 
     @property
     def goal(self) -> Array:
-        """Where the guide begins: x, y, z [m], yaw [rad], world frame, (4,)."""
+        """Return the start of the guide: x, y, z [m], yaw [rad], world frame, (4,)."""
         start = self.guide.at(0.0)
         return np.array([*start.position, float(start.yaw)])
 
     def measures(
         self, task: str, limits: tuple[ArrayLike, ArrayLike], *, stopped: bool = False
     ) -> dict[str, Any]:
-        """What `measure_trial` gives for T1, with its goal and `effort_measures` where thrusts are known; or what
-        `measure_tracking` gives for T2, with `success`.
+        """Return the result of `measure_trial` for T1, with its goal and `effort_measures` if thrusts are known; or
+        that of `measure_tracking` for T2, with `success`.
 
         Args:
             task: t1 or t2.
@@ -193,7 +193,7 @@ class Trial:
 
 
 def follows(task: Task) -> bool:
-    """Whether it follows a reference that is known ahead."""
+    """Return whether it follows a reference that is known ahead."""
     return hasattr(task, "knot_spacing")
 
 
@@ -301,7 +301,7 @@ def _goals(guides: Sequence[Guide], t: float) -> Goal:
 EPISODES = 64
 """Unless another number is requested: an interval of a rate is then some ±0.12."""
 LABELS = ("trial", "record", "fault", "localization", "clock_offset_s")
-"""What a trial's row has besides its metrics."""
+"""Keys of a trial's row besides its metrics."""
 
 
 class EpisodeError(ValueError):
@@ -345,7 +345,7 @@ def run_episodes(
             continue
         ended = running & (step.terminated | step.truncated)
         if ended.any():
-            # A world that broke is terminated but not done; having begun anew, it is not frozen any more.
+            # A broken world is terminated but not done; after its restart, it is not frozen any more.
             complete = ended & (environment.arrays.done.numpy() != 0)
             for name, values in task.metrics(environment.arrays).items():
                 metrics[name][complete] = values[complete]

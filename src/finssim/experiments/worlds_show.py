@@ -25,7 +25,7 @@ from finssim.worlds.description import (
 from finssim.worlds.rays import fan_picture
 
 WIDTH = 800
-"""Of the camera's part of a picture [px], each the mean of 2 x 2 rays."""
+"""Width of the camera's part of a picture [px], each the mean of 2 x 2 rays."""
 SETTLING = 10
 """Small pictures until automatic exposure has settled."""
 LAMPS = ((0.15, 0.30, -0.05), (0.15, -0.30, -0.05))

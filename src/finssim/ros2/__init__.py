@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class Ros2Error(ValueError):
-    """A setting, name or definition of ROS 2 cannot be used; the message is one sentence that says what to do."""
+    """A setting, name or definition of ROS 2 cannot be used; the message is one sentence that states what to do."""
 
 
 class MessageError(AssertionError):

@@ -1,4 +1,4 @@
-"""Which rclpy a process uses: that of a sourced ROS 2 if it can be imported, our shim on the same wire if not."""
+"""Choice of rclpy for a process: that of a sourced ROS 2 if it can be imported, otherwise our shim on the same wire."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["activate", "install"]
 
 @dataclass(frozen=True)
 class Backend:
-    """What `import rclpy` gives."""
+    """Modules that `import rclpy` gives."""
 
     name: str
     """"native" or "dds"."""
@@ -63,7 +63,8 @@ def activate(interfaces: Sequence[Path] = (), *, announce: bool = True) -> Backe
 
 
 def _why_not_native() -> str:
-    """Why the real rclpy cannot be used; empty if it can. Found by importing: half-sourced shells have it broken."""
+    """Return why the real rclpy cannot be used; empty if it can. Found by importing: half-sourced shells have it
+    broken."""
     try:
         importlib.import_module("rclpy")
         importlib.import_module("rclpy.node")
@@ -156,7 +157,7 @@ def install(interfaces: Sequence[Path] = ()) -> None:
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds message packages, and says of rclpy's other parts what they need."""
+    """Finds message packages, and reports what rclpy's other parts need."""
 
     def __init__(self, codec: Codec) -> None:
         self._codec, self._packages = codec, codec.packages()
@@ -182,7 +183,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 class _Absent(importlib.abc.MetaPathFinder):
-    """Asked last: says of packages of ROS 2 that are nowhere what to do without them."""
+    """Finder that is asked last: it reports what to do without missing packages of ROS 2."""
 
     def find_spec(self, name: str, path: Any, target: Any = None) -> None:
         hint = PACKAGES.get(name.partition(".")[0])

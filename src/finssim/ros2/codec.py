@@ -31,7 +31,7 @@ class Distro:
     gid_length: int
     """Bytes of an endpoint's identifier in the node list: 24 up to Humble, 16 since Iron."""
     type_hashes: bool
-    """Whether endpoints announce the hash of their type (since Iron)."""
+    """True if endpoints announce the hash of their type (since Iron)."""
 
 
 DISTROS = {
@@ -44,7 +44,7 @@ DISTROS = {
 
 
 def distro_of(environ: Mapping[str, str] = os.environ) -> Distro:
-    """The release to speak: that of `ROS_DISTRO`, Jazzy where it is not set.
+    """Return the release to use: that of `ROS_DISTRO`, Jazzy if it is not set.
 
     Raises:
         Ros2Error: A release that is not known.
@@ -247,12 +247,12 @@ class Octet(bytes):
 
     @classmethod
     def of(cls, number: int) -> Octet:
-        """From its number."""
+        """Return the octet of a number."""
         return cls((number,))
 
 
 def check_of(described: Any, nested: Callable[[str], type]) -> Check:
-    """What checks a value of a field and gives it back as the message keeps it.
+    """Return the function that checks a value of a field and returns it in the message's form.
 
     Args:
         described: The field, as rosbags has it.
@@ -399,7 +399,7 @@ class Message:
 
     __slots__ = ()
     TYPE: str
-    """As `nav_msgs/msg/Odometry`."""
+    """Type such as `nav_msgs/msg/Odometry`."""
     _checks: Mapping[str, Callable[[Any], Any]]
     _zeros: Mapping[str, Callable[[], Any]]
     _spelled: Mapping[str, str]
@@ -487,7 +487,7 @@ def _maker(cls: type[Message], described: Mapping[str, Any]) -> Callable[..., Me
 
 
 def _zero(described: Any, nested: Callable[[str], type[Message]], default: Any) -> Callable[[], Any]:
-    """What makes a field's default: zero, empty, or as its definition says."""
+    """Return the function that makes a field's default: zero, empty, or as in its definition."""
     kind, detail = described
     if default is not None:
         check = check_of(described, nested)

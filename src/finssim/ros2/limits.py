@@ -1,4 +1,4 @@
-"""Names of rclpy that the built-in one lacks, and the sentence that says what to do instead."""
+"""Names of rclpy that the built-in one lacks, with the sentence that states what to do instead."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ PACKAGES = {
 
 
 class Limited:
-    """A class of rclpy that says of what it lacks what to do."""
+    """A class of rclpy that reports what to do about what it lacks."""
 
     def __getattr__(self, name: str) -> NoReturn:
         for kind in type(self).__mro__:

@@ -1,4 +1,4 @@
-"""What nodes say to each other: the table of topics, frames, services, and the rclpy profiles of their policies."""
+"""Messages between nodes: the table of topics, frames, services, and the rclpy profiles of their policies."""
 
 from __future__ import annotations
 

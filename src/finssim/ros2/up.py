@@ -1,4 +1,4 @@
-"""`finssim ros2 up`: a whole graph of nodes as processes, without ROS installed."""
+"""`finssim ros2 up`: a complete graph of nodes as processes, without ROS installed."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Supervisor:
         ros = ["--ros-args", "-r", f"__ns:=/{self._plan.namespace}", "--params-file", str(self._parameters)]
         command = [sys.executable, "-m", "finssim", "ros2", "node", name, *ros]
         environment = {**os.environ, PARENT: str(os.getpid())}
-        # In a session of its own: Ctrl-C reaches us alone, and the nodes end in our order.
+        # In a separate session: Ctrl-C reaches this process alone, and the nodes end in our order.
         process = subprocess.Popen(
             command,
             env=environment,
@@ -92,7 +92,7 @@ class Supervisor:
         return child
 
     def look(self) -> list[Child]:
-        """Nodes that have died since the last look, each told once."""
+        """Return the nodes that have died since the last call, each once."""
         died = [c for c in self.children if not c.dead and c.process.poll() is not None]
         for child in died:
             child.dead = True
@@ -122,7 +122,7 @@ def _status(code: int) -> str:
     return f"signal {signal.Signals(-code).name}" if code < 0 else f"status {code}"
 
 
-# `finssim ros2 up`: a whole graph of nodes as processes, without ROS installed.
+# `finssim ros2 up`: a complete graph of nodes as processes, without ROS installed.
 
 
 DIED, FAULT = 1, 3
@@ -133,7 +133,7 @@ STARTING = 180.0
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What a person may choose."""
+    """Options of the command."""
 
     policy: str = "pid"
     """(DIR|pid|pid-paper) A policy's directory, or pid, or pid-paper."""
@@ -420,7 +420,7 @@ GRAPHS = {"sim": ("sim", "controller"), "robot": ROBOT, "pool": ("virtual_pool",
 """Graph -> nodes, in the order of their start; they end in the reverse order, the bridge after who commands it."""
 
 MCU_PORT = 58766
-"""Of a virtual pool's motor controller, if not told otherwise; pictures leave from the next port."""
+"""Port of a virtual pool's motor controller by default; pictures are sent from the next port."""
 
 
 @dataclass
@@ -435,9 +435,9 @@ class Plan:
     extra: tuple[str, ...] = ()
     """Nodes besides those of the graph: recorder, teleop."""
     blind: bool = False
-    """Whether no camera looks, so that nothing is localized by it."""
+    """True if no camera is used for localization."""
     sees: bool = False
-    """Whether pictures of the vehicle's own sensors come all the same."""
+    """True if pictures of the vehicle's own sensors are used nevertheless."""
 
     def __post_init__(self) -> None:
         if self.graph not in GRAPHS:
@@ -450,7 +450,7 @@ class Plan:
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """In the order of their start."""
+        """Return the nodes in the order of their start."""
         excluded = (("localizer",) if self.sees else ("camera", "localizer")) if self.blind else ()
         return (*(name for name in GRAPHS[self.graph] if name not in excluded), *self.extra)
 

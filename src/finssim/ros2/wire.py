@@ -55,19 +55,19 @@ LOOPBACK_WORDS = "sends on the loopback alone, listens on every address"
 
 @dataclass(frozen=True)
 class WireSettings:
-    """How a participant joins."""
+    """Settings of a participant."""
 
     domain: int
     """ROS domain, 0 to 232."""
     xml: str | None
     """Configuration of Cyclone; None where the environment's own or Cyclone's default rules."""
     interface: str
-    """The same in words, for the line at the start."""
+    """Interface in words, for the line at the start."""
     distro: Distro
 
 
 def wire_settings(environ: Mapping[str, str] = os.environ, domain: int | None = None) -> WireSettings:
-    """Settings as the environment has them: this machine only, unless it says otherwise.
+    """Return the settings of the environment: this machine only, unless it states otherwise.
 
     `CYCLONEDDS_URI` wins over everything. Without it, the network is used only when `ROS_LOCALHOST_ONLY=0`, or
     `ROS_AUTOMATIC_DISCOVERY_RANGE` is SUBNET or SYSTEM_DEFAULT.
@@ -116,18 +116,18 @@ BLOCKING_NS = 100_000_000
 """The longest a reliable writer waits for its readers; ROS 2 would wait for ever and stop the control loop."""
 
 POLICY_NAMES = {2: "DURABILITY", 4: "DEADLINE", 8: "LIVELINESS", 11: "RELIABILITY", 12: "DESTINATION_ORDER"}
-"""DDS's numbers of the policies that can keep two endpoints apart."""
+"""DDS's numbers of the policies that can make two endpoints incompatible."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """What a writer offers or a reader asks for; the defaults are ROS 2's."""
+    """Policies that a writer offers or a reader requests; the defaults are ROS 2's."""
 
     depth: int = 10
     """Samples kept; 0 keeps all."""
     reliable: bool = True
     transient_local: bool = False
-    """Whether the last samples are kept for readers that come later."""
+    """True if the last samples are kept for readers that come later."""
     deadline: float = 0.0
     """Longest time between samples [s]; 0 is no promise."""
     lifespan: float = 0.0
@@ -235,7 +235,7 @@ LOCAL_DOMAIN = 1
 """Cyclone's word for types that are known here."""
 
 DATA = 2
-"""Cyclone's word for a whole sample."""
+"""Cyclone's number for a complete sample."""
 
 
 def _checked(code: int, what: str) -> int:
@@ -344,7 +344,7 @@ class _Blob(ctypes.Structure):
 
 
 class SampleInfo(ctypes.Structure):
-    """What DDS says of a sample."""
+    """Information of DDS about a sample."""
 
     _fields_ = [
         *((f"{name}_state", ctypes.c_int) for name in ("sample", "view", "instance")),
@@ -387,11 +387,11 @@ def _handles(matched: Callable[[int, Any, int], int], endpoint: int) -> list[int
 
 
 class Endpoint:
-    """What writers and readers share."""
+    """Common part of writers and readers."""
 
     entity: Any
     topic: str
-    """With its prefix, e.g. `rt/finsrov/odom`."""
+    """Topic with its prefix, e.g. `rt/finsrov/odom`."""
     gid: bytes
     """The endpoint's globally unique identifier, 16 bytes."""
     closed = False
@@ -425,7 +425,7 @@ class Writer(Endpoint):
             DDSException: The wire refused it for another reason.
         """
         if not self._keeps and self.matched() == 0:
-            return True  # nobody would ever see it, and Cyclone copies even then
+            return True  # it has no reader, and Cyclone copies even then
         view = (ctypes.c_char * 0).from_buffer(buffer)
         blob = _Blob(ctypes.addressof(view), len(buffer))
         sample = _sample_of(self._type, DATA, 1, ctypes.byref(blob), len(buffer))
@@ -439,11 +439,11 @@ class Writer(Endpoint):
         return True
 
     def matched(self) -> int:
-        """How many readers are known to get it."""
+        """Return the number of known readers."""
         return int(_matched_readers(self.entity._ref, None, 0))
 
     def peers(self) -> list[Any]:
-        """What is known of those readers."""
+        """Return the known readers."""
         handles = _handles(_matched_readers, self.entity._ref)
         matched = (self.entity.get_matched_subscription_data(h) for h in handles)
         return [peer for peer in matched if peer is not None]
@@ -464,7 +464,7 @@ class Reader(Endpoint):
         """True while a sample waits."""
 
     def take(self) -> tuple[bytes, Any] | None:
-        """The oldest waiting sample, and what DDS says of it; None without one."""
+        """Return the oldest waiting sample, and DDS's information about it; None without one."""
         while True:
             sample, info = ctypes.c_void_p(), SampleInfo()
             if _take(self.entity._ref, ctypes.byref(sample), 1, ctypes.byref(info), ANY) <= 0:
@@ -493,11 +493,11 @@ class Reader(Endpoint):
         )
 
     def matched(self) -> int:
-        """How many writers are known."""
+        """Return the number of known writers."""
         return _checked(_matched_writers(self.entity._ref, None, 0), "counting peers")
 
     def peers(self) -> list[Any]:
-        """What is known of those writers."""
+        """Return the known writers."""
         handles = _handles(_matched_writers, self.entity._ref)
         matched = (self.entity.get_matched_publication_data(h) for h in handles)
         return [peer for peer in matched if peer is not None]
@@ -507,7 +507,7 @@ class Reader(Endpoint):
         return self._incompatible(self.entity.get_requested_incompatible_qos_status())
 
 
-# One DDS participant, as ROS 2 has one per context: its endpoints, and the nodes it tells its peers about.
+# One DDS participant, as ROS 2 has one per context: its endpoints, and the nodes that it announces to its peers.
 
 
 FOREVER = 2**63 - 1
@@ -535,7 +535,7 @@ class EndpointRecord(NamedTuple):
     """A writer or reader on the wire, as discovery has it."""
 
     topic: str
-    """With its prefix."""
+    """Topic with its prefix."""
     dds_type: str
     gid: bytes
     """16 bytes."""
@@ -543,7 +543,7 @@ class EndpointRecord(NamedTuple):
 
     @property
     def user_data(self) -> bytes:
-        """What the endpoint tells its peers."""
+        """Return the data of the endpoint for its peers."""
         return next((bytes(p.data) for p in self.qos if isinstance(p, Policy.Userdata)), b"")
 
     @property
@@ -610,7 +610,7 @@ class Participant:
         return Reader(self._subscriber, self._topic(topic, name, service=True), dds_qos(quality, user_data))
 
     def announce(self, nodes: Sequence[NodeRecord]) -> None:
-        """Tell every peer, those that come later too, which nodes this participant holds."""
+        """Announce the nodes of this participant to every peer, also to those that come later."""
         with self._lock:
             message = self.codec.message(NODE_LIST)(
                 gid=self._gid(self.gid), node_entities_info_seq=[self._node(n) for n in nodes]
@@ -654,7 +654,7 @@ class Participant:
             return list(known.values())
 
     def close(self) -> None:
-        """Leave the wire at once: peers are told, and wait for nothing."""
+        """Leave the wire immediately: peers are notified, and nothing waits."""
         self.entity.__del__()
 
     def _topic(self, topic: str, name: str, *, service: bool = False) -> Topic:
@@ -698,7 +698,7 @@ PREFIX = struct.Struct("<Qq")
 """Number of the client and of its request, right after the CDR header."""
 
 REPLY_PATIENCE = 1.0
-"""How long a reply waits for its client's reader to be discovered [s]."""
+"""Time for which a reply waits for its client's reader to be discovered [s]."""
 
 _count = itertools.count(1)
 
@@ -730,7 +730,7 @@ class ServerEnd:
         self._late: list[tuple[float, bytes, bytearray]] = []
 
     def take(self) -> Callable[[], None] | None:
-        """What answers the next request; None without one."""
+        """Return the answer to the next request; None without one."""
         self._send_late()
         sample = self.reader.take()
         if sample is None:
@@ -750,7 +750,7 @@ class ServerEnd:
             self._late.append((time.monotonic() + REPLY_PATIENCE, client, reply))
 
     def _reachable(self, client: bytes) -> bool:
-        """Whether the client's reader is known: a reply sent before that would be lost."""
+        """Return whether the client's reader is known: a reply sent before that would be lost."""
         if client and client not in self._clients:
             self._clients = {_client_id(peer) for peer in self.writer.peers()}
         return not client or client in self._clients
@@ -777,7 +777,7 @@ class ClientEnd:
         self._sequence = itertools.count(1)
 
     def ready(self) -> bool:
-        """Whether a server is known to take requests and to answer."""
+        """Return whether a server is known to take requests and to answer."""
         return self.writer.matched() > 0 and self.reader.matched() > 0
 
     def send(self, request: Message) -> int:
@@ -798,13 +798,13 @@ class ClientEnd:
         while (sample := self.reader.take()) is not None:
             data = sample[0]
             client, sequence = PREFIX.unpack_from(data, 4)
-            if client == self._number:  # every client of a service hears all its answers
+            if client == self._number:  # every client of a service receives all its answers
                 return sequence, self._codec.deserialize(data[:4] + data[20:], f"{self._name}_Response")
         return None
 
 
 def _tag(participant: Participant, key: str) -> bytes:
-    """What marks both ends of one server or client as belonging together."""
+    """Return the mark of both ends of one server or client."""
     number = participant.gid[:12] + struct.pack(">I", next(_count))
     return (f"{key}=" + ".".join(f"{byte:02x}" for byte in number) + ";").encode()
 
@@ -818,7 +818,7 @@ def _client_id(peer: object) -> bytes:
     return b""
 
 
-# Waiting for any of many endpoints at once.
+# Waiting for any of many endpoints.
 
 
 class Waiter:

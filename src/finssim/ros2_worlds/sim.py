@@ -139,7 +139,8 @@ class SharedClock:
 
 
 class Sim(RobotNode):
-    """Simulated time begins at 0, or follows /clock where somebody publishes it already; the state is the truth."""
+    """Simulator node. Its time begins at 0, or follows /clock if another node publishes it already; the state is the
+    truth."""
 
     def __init__(self) -> None:
         super().__init__("sim")
@@ -175,7 +176,7 @@ class Sim(RobotNode):
 
     def _follow(self, now: float) -> None:
         """Step up to a time of another's clock [s]; no more than a few steps, the rest is left out."""
-        if now < self.time - MOST_BEHIND * STEP:  # that clock began anew
+        if now < self.time - MOST_BEHIND * STEP:  # that clock restarted
             self.time = now
         due = int((now - self.time) / STEP + 0.01)
         steps = min(due, MOST_BEHIND)
@@ -226,7 +227,7 @@ class Sim(RobotNode):
         self.sensors.reset()
 
     def _on_reset(self, request: Any, response: Any) -> Any:
-        """Back to the start, disarmed; time goes on."""
+        """Return to the start, disarmed; time continues."""
         self.bridge.disarm(self.time)
         self._reset()
         response.success, response.message = True, f"at {self.start.position}"

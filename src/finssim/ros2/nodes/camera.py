@@ -13,7 +13,7 @@ POLL = 90.0
 
 
 class Camera(RobotNode):
-    """Publishes pictures, stamped with the middle of their exposure; each form only while somebody listens to it."""
+    """Publishes pictures, stamped with the middle of their exposure; each form only while there is a subscriber."""
 
     def __init__(self) -> None:
         super().__init__("camera")

@@ -1,4 +1,4 @@
-"""Controller node: PID, policy or a person's wrench to thrusts, while the bridge says that it is armed."""
+"""Controller node: PID, policy or a person's wrench to thrusts, while the bridge reports that it is armed."""
 
 from __future__ import annotations
 
@@ -116,14 +116,14 @@ class _Timed:
         return force
 
 
-# Controller node: PID, policy or a person's wrench to thrusts, while the bridge says that it is armed.
+# Controller node: PID, policy or a person's wrench to thrusts, while the bridge reports that it is armed.
 
 
 STATE_TIMEOUT = 0.5
 """Oldest reading to act on, where the vehicle file does not say [s]."""
 PATH_POINTS = 200
 MOST_PICTURES = 16
-"""That wait while the bridge is not armed; the oldest is forgotten."""
+"""Greatest number of pictures that wait while the bridge is not armed; the oldest is dropped."""
 
 
 class Controller(RobotNode):
@@ -160,7 +160,7 @@ class Controller(RobotNode):
         self.create_timer(1.0, self._tell)
 
     def _turn(self) -> None:
-        if self.bridge.silent:  # which is no word of disarming: a trajectory goes on when it speaks again
+        if self.bridge.silent:  # which does not mean disarming: a trajectory continues with its next message
             return
         now, armed = self.now(), self.bridge.state in ("armed", "hold")
         begins, self.armed = armed and not self.armed, armed
@@ -188,7 +188,7 @@ class Controller(RobotNode):
             del self._seen[:-MOST_PICTURES]
 
     def _follow(self, guide: Guide) -> None:
-        """From now on, if the vehicle may go there.
+        """Follow a guide from now on, if the vehicle may go there.
 
         Raises:
             GoalError: It may not.
@@ -209,7 +209,7 @@ class Controller(RobotNode):
         self.send("path", self.make.path(self.ns(self.now()), stamps, way.position, way.yaw))
 
     def _take(self, guide: Guide | str) -> None:
-        """Follow what a message said, or say why it cannot be."""
+        """Follow the guide of a message, or report why it is not possible."""
         if isinstance(guide, str):
             self.event("refused", guide)
         else:
@@ -220,7 +220,7 @@ class Controller(RobotNode):
 
     def _on_mode(self, message: Any) -> None:
         if self.modes.select(str(message.data)):
-            self.runtime.started = math.nan  # who takes over begins anew
+            self.runtime.started = math.nan  # the next pilot restarts
 
     def _try(self, make: Any) -> None:
         try:

@@ -73,7 +73,7 @@ def telemetry_of(message: Any) -> Telemetry:
 
 
 def aid_of(key: str, message: Any, age: float, frame: str) -> NavigationAid | str:
-    """What a navigation instrument measured, or why it cannot be used; what is no number is left to those who use it.
+    """Return the reading of a navigation instrument, or why it cannot be used; missing numbers are left to its users.
 
     Args:
         key: Of its topic: positioning, dvl or compass.
@@ -248,7 +248,7 @@ def ros_type(name: str) -> Any:
 
 
 class RosMessages(Messages):
-    """As `robot.record_messages`, for publishers; and what a record does not hold."""
+    """Messages as in `robot.record_messages`, for publishers; and those that a record does not hold."""
 
     def __init__(self, vehicle: Vehicle, prefix: str = "") -> None:
         super().__init__(vehicle, prefix)
@@ -263,7 +263,7 @@ class RosMessages(Messages):
         return of["geometry_msgs/msg/PoseWithCovarianceStamped"](self.header(stamp, MAP), pose)
 
     def compressed(self, stamp: int, image: npt.NDArray[np.uint8]) -> Any | None:
-        """The same as JPEG; None where it cannot be packed."""
+        """Return a picture as JPEG; None if it cannot be packed."""
         return self.picture(stamp, jpeg(image), OPTICAL)
 
     def found_tags(self, stamp: int, picture: Picture, finder: str) -> Any:
@@ -313,7 +313,7 @@ class _Makers(dict[str, Callable[..., Any]]):
 
 
 def _converter(kind: str) -> Callable[[Any], Any]:
-    """What makes a value into one that a field of real rclpy takes."""
+    """Return the function that converts a value for a field of the real rclpy."""
     if kind in ("octet", "byte"):
         return lambda value: bytes([value]) if isinstance(value, int) else value
     if kind == "sequence<uint8>":

@@ -114,7 +114,7 @@ KNOWN = [0, 1, 2, 5]
 UNKNOWN = 1.0e6
 """Variance of a heading [rad²] or a height [m²] that is not known."""
 TILT_VARIANCE = 0.02
-"""Of roll and pitch, which are the attitude filter's [rad²]."""
+"""Variance of roll and pitch, which are the attitude filter's [rad²]."""
 
 
 class FixFrame:
@@ -173,11 +173,11 @@ class FixFrame:
 
 
 GAP = 0.5
-"""After a longer silence the way between two readings is not known, and odom stands still over it [s]."""
+"""Silence after which the way between two readings is not known, and odom is constant over it [s]."""
 
 
 class Pose(NamedTuple):
-    """Of one frame in another."""
+    """Pose of one frame in another."""
 
     position: Array
     """[m], (3,)"""
@@ -185,7 +185,7 @@ class Pose(NamedTuple):
     """xyzw, (4,)"""
 
     def times(self, other: Pose) -> Pose:
-        """Of a frame of the second pose in that of the first."""
+        """Return the pose of a frame of the second pose in that of the first."""
         position = self.position + np.asarray(quat_rotate(self.orientation, other.position))
         return Pose(position, np.asarray(quat_multiply(self.orientation, other.orientation)))
 
@@ -223,7 +223,7 @@ class Odometer:
 
 
 class Frames:
-    """Says where everything is; of the one node that knows the vehicle's state."""
+    """Publishes all frames, in the one node that knows the vehicle's state."""
 
     def __init__(self, node: RobotNode, pool: Pool | None = None) -> None:
         """

@@ -94,13 +94,13 @@ class BridgeTopics:
         self._bridge.reading(self._node.now(), reading)
 
     def _on_match(self, info: Any) -> None:
-        """Publishers came or went: two are a fault at once, even if one has left again before this is told."""
+        """Note that publishers came or went: two are a fault immediately, even if one has left again before."""
         highest = self._matched + info.total_count_change
         self._matched = info.current_count
         self._judge(highest)
 
     def _count(self) -> None:
-        """The same, seen twice a second; all that Humble has, whose rclpy looks through the whole graph for it."""
+        """Count publishers twice a second; all that Humble has, whose rclpy searches the complete graph for it."""
         count = getattr(self._commands, "get_publisher_count", None)
         topic = self._node.topic("command")
         self._publishers = int(count() if count else self._node.count_publishers(topic))
@@ -127,7 +127,7 @@ RPM = 2.0 * math.pi / 60.0
 
 
 class HardwareBridge(RobotNode):
-    """Frames to and from the motor controller; disarmed until the topic `arm` says true, whatever else comes."""
+    """Frames to and from the motor controller; disarmed until the topic `arm` is true."""
 
     def __init__(self) -> None:
         super().__init__("hardware_bridge")
@@ -192,7 +192,7 @@ class HardwareBridge(RobotNode):
         self.diagnose(level, state + (f": {self.bridge.reason}" if self.bridge.reason else ""), counts)
 
     def close(self) -> None:
-        """Disarm, tell the motor controller so, and let go of the wire."""
+        """Disarm, send that to the motor controller, and release the wire."""
         self.bridge.disarm(self.now())
         for _ in range(LAST_FRAMES):
             for data in self.intake.link.encode(self.now(), self.bridge.tick(self.now()), self.bridge.state):

@@ -98,7 +98,7 @@ class _Kept:
         self.newest: VisionSample | None = None
 
     def fix(self, frame: Frame, estimator: Estimator) -> VisionSample | str:
-        """As `Fixes.fix`."""
+        """Return the result of `Fixes.fix`."""
         result = self._fixes.fix(frame, estimator)
         valid = isinstance(result, VisionSample) and bool(np.isfinite(result.position).all())
         self.newest = result if isinstance(result, VisionSample) and valid else None

@@ -96,10 +96,10 @@ class RemoteState:
 
 
 class RemoteBridge:
-    """The bridge of another process: what it is told travels as messages, its state comes back as one."""
+    """The bridge of another process: commands travel as messages, its state returns as one."""
 
     getting_ready = False
-    """Whether arming waits for an autopilot, which a state does not tell: press again when it has armed."""
+    """True if arming waits for an autopilot, which a state does not report: request it again when it has armed."""
 
     def __init__(self, node: RobotNode, source: Callable[[], str] | None = None) -> None:
         """
@@ -114,12 +114,12 @@ class RemoteBridge:
 
     @property
     def state(self) -> str:
-        """As the bridge last said; disarmed where it is silent."""
+        """Return the latest state of the bridge; disarmed while it is silent."""
         return "disarmed" if self.silent else self._state
 
     @property
     def silent(self) -> bool:
-        """Whether nothing has been heard of it for too long."""
+        """Return whether no message has come from it for too long."""
         return self._node.now() - self._at > SILENT
 
     def arm(self, now: float, source: str) -> str:
@@ -147,7 +147,7 @@ class RemoteBridge:
         return requested
 
     def reading(self, now: float, reading: Reading) -> None:
-        """The bridge hears the estimator itself."""
+        """Ignore a reading: the bridge receives the estimator's directly."""
 
     def telemetry(self, now: float, telemetry: Telemetry) -> None:
         """None comes here."""
@@ -169,7 +169,7 @@ class RemoteBridge:
             )
 
 
-# The node of `finssim ros2 up` itself: sees the state, and asks for arming where it was told to.
+# The node of `finssim ros2 up`: it observes the state, and requests arming if that was demanded.
 
 
 ASK_EVERY = 1.0
@@ -177,7 +177,7 @@ ASK_EVERY = 1.0
 
 
 class Watcher(RobotNode):
-    """Looks at one vehicle. It arms only where it was told to, and only once."""
+    """Observes one vehicle. It arms only on demand, and only once."""
 
     listening = LISTENING
 
@@ -200,7 +200,7 @@ class Watcher(RobotNode):
         Readings(self, self._on_reading)
 
     def turn(self, timeout: float) -> None:
-        """Hear what has come, waiting for it no longer than that [s]."""
+        """Process the received messages, waiting for them no longer than that [s]."""
         end = time.monotonic() + timeout
         while (remaining := end - time.monotonic()) > 0.0:
             rclpy.spin_once(self, timeout_sec=remaining)

@@ -1,4 +1,4 @@
-"""What every node of a robot has: a vehicle, a clock in seconds, the topics of the table, and an orderly end."""
+"""Common parts of a robot's nodes: a vehicle, a clock in seconds, the topics of the table, and an orderly end."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from finssim.vehicles.defaults import numbered, vehicle_at
 URGENCY = -10
 """Niceness of a node that others wait for; only a privileged user may have it, others do without."""
 LISTENING = 1.0
-"""How long a node that was started listens for another of its name [s]."""
+"""Time for which a started node listens for another of its name [s]."""
 FORGOTTEN = 11.0
 """When the wire has forgotten a node that was killed [s]: its lease of ten, and one to spare."""
 REFUSED = 2
-"""Exit status of a node that cannot do what it is told."""
+"""Exit status of a node that refuses its arguments."""
 
 
 class TwinError(ValueError):
@@ -44,9 +44,9 @@ class RobotNode(Node):
     """
 
     listening = 0.0
-    """How long a new node listens for another of its name before it says anything [s]; `run` sets it."""
+    """Time for which a new node listens for another of its name before it publishes [s]; `run` sets it."""
     urgent = True
-    """Whether it stands between a sensor and a thruster, and goes before other programs where it may."""
+    """True for nodes between a sensor and a thruster, which have priority over other programs if permitted."""
 
     def __init__(self, name: str, others: Sequence[str] = ()) -> None:
         """
@@ -142,7 +142,7 @@ class RobotNode(Node):
             self._out[key].publish(message)
 
     def heard(self, key: str) -> bool:
-        """Whether somebody listens to what we publish."""
+        """Return whether our topic has a subscriber."""
         return key in self._out and bool(self._out[key].get_subscription_count())
 
     def hears(self, key: str, take: Callable[[Any], None], **options: Any) -> Any:
@@ -195,7 +195,7 @@ class RobotNode(Node):
         except (ValueError, ParameterException) as error:
             return _refused(error)
         except Exception:
-            if rclpy.ok():  # else a signal shut the context down during a call, which real rclpy does at once
+            if rclpy.ok():  # else a signal shut the context down during a call, as the real rclpy does
                 raise
         finally:
             if node is not None:
@@ -212,7 +212,7 @@ class RobotNode(Node):
 
 
 def matched_callbacks(matched: Callable[[Any], None]) -> Any:
-    """Event callbacks that tell a subscription of publishers that come and go; None on Humble, which cannot."""
+    """Return event callbacks that report publishers of a subscription; None on Humble, which lacks them."""
     try:
         from rclpy.event_handler import SubscriptionEventCallbacks
     except ImportError:

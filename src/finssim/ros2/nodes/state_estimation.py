@@ -76,7 +76,7 @@ class StateEstimation(RobotNode):
 
 
 def health_values(health: Health) -> dict[str, Any]:
-    """What EstimatorStatus says beyond a reading."""
+    """Return the fields of EstimatorStatus besides a reading."""
     vision = health.counts.get("vision", {})
     used = sum(n for word, n in vision.items() if word in USED)
     return {

@@ -86,7 +86,7 @@ class JoyDevice:
         self._newest = message
 
     def read(self, now: float) -> Hands | None:
-        """What the newest message shows; None where none came since the last look, or it is too short."""
+        """Return the content of the newest message; None without one since the last call, or if it is too short."""
         message, self._newest = self._newest, None
         if message is None or len(message.axes) < AXIS_COUNT or len(message.buttons) < BUTTON_COUNT:
             return None

@@ -1,4 +1,4 @@
-"""Names of nodes and topics, and what stands after `--ros-args`: remapping, parameters and their files, log levels."""
+"""Names of nodes and topics, and the arguments after `--ros-args`: remapping, parameters, their files, log levels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from finssim.yaml_file import DEEPEST
 TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"
 _TOPIC = re.compile(rf"^(~|(~/|/)?{TOKEN}(/{TOKEN})*)$")
 LONGEST_NODE, LONGEST_NAMESPACE, LONGEST_TOPIC = 255, 245, 247
-"""As rmw counts them: RMW_NODE_NAME_MAX_NAME_LENGTH, RMW_NAMESPACE_MAX_LENGTH, RMW_TOPIC_MAX_NAME_LENGTH."""
+"""Greatest lengths by rmw: RMW_NODE_NAME_MAX_NAME_LENGTH, RMW_NAMESPACE_MAX_LENGTH, RMW_TOPIC_MAX_NAME_LENGTH."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def read_parameters(path: Path, overrides: Overrides) -> None:
 
 
 def parsed_value(text: str) -> Any:
-    """A parameter's value as it stands after `-p name:=`; None for an empty list, whose type nobody knows.
+    """Return a parameter's value after `-p name:=`; None for an empty list, whose type is unknown.
 
     Raises:
         ValueError: It is empty, not YAML, a mapping, or a list of different types.
@@ -257,7 +257,7 @@ def _value(tree: Tree) -> Any:
 
 
 def _scalar(event: Any) -> bool | int | float | str:
-    """What rcl's `get_value` makes of it, which is neither YAML 1.1 nor 1.2."""
+    """Return the result of rcl's `get_value`, which is neither YAML 1.1 nor 1.2."""
     text: str = event.value
     if event.style in ("'", '"') or event.tag == STRING:
         return text
@@ -276,14 +276,14 @@ def _scalar(event: Any) -> bool | int | float | str:
     return float(match["number"] or re.sub(r"\.", "", text)) if match else text
 
 
-# What stands after `--ros-args` on a command line: remapping, parameters, log levels.
+# Arguments after `--ros-args` on a command line: remapping, parameters, log levels.
 
 
 _SWITCHES = {
     f"--{way}-{what}-logs" for way in ("enable", "disable") for what in ("rosout", "stdout", "external-lib")
 }
 _TARGETS = {"__node": TOKEN, "__name": TOKEN, "__ns": rf"/|(/{TOKEN})+"}
-"""What a node's name or namespace may be replaced with."""
+"""Target -> pattern of its replacements, of a node's name or namespace."""
 
 
 @dataclass
@@ -295,7 +295,7 @@ class RosArguments:
     levels: list[tuple[str, LoggingSeverity]] = field(default_factory=list)
     enclave: str = "/"
     rest: list[str] = field(default_factory=list)
-    """What is not for ROS."""
+    """Arguments that are not for ROS."""
 
 
 def parse_arguments(arguments: Sequence[str]) -> RosArguments:

@@ -72,7 +72,7 @@ class Context(Limited):
         return self._participant
 
     def ok(self) -> bool:
-        """Whether joined, and not asked to leave by a signal."""
+        """Return whether it has joined, and no signal has asked it to leave."""
         return self._participant is not None and not self.asked_to_leave
 
     def get_domain_id(self) -> int:
@@ -80,7 +80,7 @@ class Context(Limited):
         return self.participant.settings.domain
 
     def announce(self) -> None:
-        """Tell peers and executors that nodes or endpoints came or went."""
+        """Notify peers and executors that nodes or endpoints came or went."""
         with self._lock:
             self.changes += 1
             self.participant.announce([node.record() for node in self.nodes])
@@ -154,7 +154,7 @@ def renew_default_context() -> Context:
 
 
 def ok(*, context: Context | None = None) -> bool:
-    """Whether the context is on the wire."""
+    """Return whether the context has joined."""
     return (context or get_default_context()).ok()
 
 

@@ -17,7 +17,7 @@ from finssim.ros2.wire import ClientEnd, Quality, ServerEnd
 
 
 class QoSSubscriptionMatchedInfo(NamedTuple):
-    """Publishers that a subscription was matched with, and how that changed since it was told last."""
+    """Publishers that a subscription was matched with, and the change since the last event."""
 
     total_count: int
     """All that ever were."""
@@ -27,7 +27,7 @@ class QoSSubscriptionMatchedInfo(NamedTuple):
 
 
 class SubscriptionEventCallbacks:
-    """What to call for a subscription's events: of those of rclpy only `matched`."""
+    """Callbacks of a subscription's events: of those of rclpy only `matched`."""
 
     def __init__(
         self, *, matched: Callable[[QoSSubscriptionMatchedInfo], None] | None = None, **others: Any
@@ -82,11 +82,11 @@ class Future(Limited):
         self._callbacks: list[Callable[[Future], Any]] = []
 
     def done(self) -> bool:
-        """Whether it has come, or never will."""
+        """Return whether it has a result, or never will."""
         return self._finished
 
     def cancelled(self) -> bool:
-        """Whether nobody waits for it any more."""
+        """Return whether it was cancelled."""
         return self._cancelled
 
     def result(self) -> Any:
@@ -96,7 +96,7 @@ class Future(Limited):
         return self._result
 
     def exception(self) -> BaseException | None:
-        """What went wrong."""
+        """Return its exception."""
         return self._exception
 
     def set_result(self, result: Any) -> None:
@@ -105,7 +105,7 @@ class Future(Limited):
         self._finish()
 
     def set_exception(self, exception: BaseException) -> None:
-        """Tell what went wrong."""
+        """Set its exception."""
         self._exception = exception
         self._finish()
 
@@ -116,7 +116,7 @@ class Future(Limited):
             self._finish()
 
     def add_done_callback(self, callback: Callable[[Future], Any]) -> None:
-        """Call it with this future once done, at once if it is."""
+        """Call a function with this future once it is done, immediately if it is."""
         if self.done():
             callback(self)
         else:
@@ -194,7 +194,7 @@ def check_callback(callback: Any, takes: int) -> None:
         raise TypeError("a coroutine as callback needs a sourced ROS 2: give an ordinary function")
     try:
         signature = inspect.signature(callback)
-    except ValueError:  # one of Python's own, which tells nothing
+    except ValueError:  # one of Python's own, which has no message
         return
     try:
         signature.bind(*range(takes))
@@ -237,7 +237,7 @@ class Publisher(Endpoint):
             )
 
     def get_subscription_count(self) -> int:
-        """How many subscriptions are known to get it."""
+        """Return the number of known subscriptions."""
         return int(self._writer.matched())
 
     def destroy(self) -> None:
@@ -272,7 +272,7 @@ class Subscription(Endpoint):
             self._reader.watch_matches()
 
     def take(self) -> Callable[[], None] | None:
-        """What calls back with news of publishers, or the oldest waiting message; None without either."""
+        """Return the callback with news of publishers, or with the oldest waiting message; None without either."""
         if self._on_match is not None:
             info = QoSSubscriptionMatchedInfo(*self._reader.matches())
             if info.total_count_change or info.current_count_change:
@@ -284,7 +284,7 @@ class Subscription(Endpoint):
         return lambda: self._deliver(data)
 
     def get_publisher_count(self) -> int:
-        """How many publishers are known."""
+        """Return the number of known publishers."""
         return int(self._reader.matched())
 
     def destroy(self) -> None:
@@ -361,7 +361,7 @@ class Client(Endpoint):
         return future
 
     def service_is_ready(self) -> bool:
-        """Whether a server is known."""
+        """Return whether a server is known."""
         return self._end.ready()
 
     def wait_for_service(self, timeout_sec: float | None = None) -> bool:
@@ -378,7 +378,7 @@ class Client(Endpoint):
         self._pending = {n: f for n, f in self._pending.items() if f is not future}
 
     def take(self) -> Callable[[], None] | None:
-        """What hands over the next answer; None without one."""
+        """Return the callback with the next answer; None without one."""
         answer = self._end.take()
         if answer is None:
             return None

@@ -51,18 +51,18 @@ class Timer(Limited):
         return self.callback
 
     def time_until_next_call(self) -> int:
-        """How long until it is due [ns]; begins anew where the clock went back."""
+        """Return the time until it is due [ns]; it restarts if the clock went back."""
         now = self.clock.tick()
         if now < self._last:
             self._last, self._next = now, now + self._period
         return self._next - now
 
     def is_ready(self) -> bool:
-        """Whether it is due."""
+        """Return whether it is due."""
         return not self._cancelled and self.time_until_next_call() <= 0
 
     def is_canceled(self) -> bool:
-        """Whether it rests."""
+        """Return whether it is cancelled."""
         return self._cancelled
 
     def cancel(self) -> None:
@@ -70,7 +70,7 @@ class Timer(Limited):
         self._cancelled = True
 
     def reset(self) -> None:
-        """Begin anew: the next call comes one period from now."""
+        """Restart: the next call is one period from now."""
         self._cancelled = False
         self._last = self.clock.tick()
         self._next = self._last + self._period
@@ -80,14 +80,14 @@ class Timer(Limited):
 
 
 LONGEST_WAIT = 0.1
-"""The longest sleep [s]: Python hears of Ctrl-C only between sleeps."""
+"""Longest sleep [s]: Python handles Ctrl-C only between sleeps."""
 
 MISMATCH_PERIOD = 1.0
-"""How often a busy executor looks for peers that do not fit [s]; one that wakes for nothing looks at once."""
+"""Period at which a busy executor looks for peers that do not fit [s]; one without work looks immediately."""
 
 
 class ExternalShutdownException(Exception):
-    """The context was shut down by somebody else while an executor spun."""
+    """The context was shut down by another caller while an executor spun."""
 
 
 class SingleThreadedExecutor(Limited):

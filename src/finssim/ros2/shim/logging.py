@@ -11,7 +11,7 @@ from typing import Any
 
 
 class LoggingSeverity(IntEnum):
-    """How grave a line is."""
+    """Severity of a line."""
 
     UNSET = 0
     DEBUG = 10
@@ -22,7 +22,7 @@ class LoggingSeverity(IntEnum):
 
 
 SUPPORTED = ("throttle_duration_sec", "throttle_time_source_type", "skip_first", "once")
-"""What a call may be conditioned by."""
+"""Conditions of a call."""
 
 
 @dataclass
@@ -62,7 +62,7 @@ class RcutilsLogger:
         return get_logger_effective_level(self.name)
 
     def is_enabled_for(self, severity: int) -> bool:
-        """Whether lines of a severity are shown."""
+        """Return whether lines of a severity are shown."""
         return severity >= self.get_effective_level()
 
     def log(self, message: str, severity: int, **when: Any) -> bool:
@@ -110,15 +110,15 @@ class RcutilsLogger:
         return site
 
     def debug(self, message: str, **when: Any) -> bool:
-        """For whoever looks for a fault."""
+        """Log a line for debugging."""
         return self.log(message, LoggingSeverity.DEBUG, **when)
 
     def info(self, message: str, **when: Any) -> bool:
-        """As it should be."""
+        """Log a line for information."""
         return self.log(message, LoggingSeverity.INFO, **when)
 
     def warning(self, message: str, **when: Any) -> bool:
-        """Worth a look."""
+        """Log a warning."""
         return self.log(message, LoggingSeverity.WARN, **when)
 
     warn = warning
@@ -133,7 +133,7 @@ class RcutilsLogger:
 
 
 def _due(site: _Site) -> bool:
-    """Whether the conditions of a call let it through this time; in the order of rclpy."""
+    """Return whether the conditions of a call let it through this time; in the order of rclpy."""
     now = time.monotonic()
     if now < site.last + site.when.get("throttle_duration_sec", 0.0):
         return False
@@ -148,7 +148,7 @@ def _due(site: _Site) -> bool:
 
 
 def get_logger(name: str) -> RcutilsLogger:
-    """A logger of a name; what calls are bound to is counted by each logger anew, as in rclpy."""
+    """Return a logger of a name; each logger counts the conditions of calls separately, as in rclpy."""
     return RcutilsLogger(name)
 
 

@@ -131,7 +131,7 @@ class Node(NodeParameters, NodeGraph, Limited):
 
     @property
     def context(self) -> Context:
-        """What it belongs to."""
+        """Return its context."""
         return self._context
 
     @property
@@ -180,7 +180,7 @@ class Node(NodeParameters, NodeGraph, Limited):
         return self._clock
 
     def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
-        """The full name that a topic's name stands for, remapped unless `only_expand`."""
+        """Return the full name of a topic, remapped unless `only_expand`."""
         return remapped(topic, self._name, self._namespace, () if only_expand else self._rules)
 
     resolve_service_name = resolve_topic_name
@@ -279,7 +279,7 @@ class Node(NodeParameters, NodeGraph, Limited):
         return list(self._ends)
 
     def takers(self) -> Iterator[Any]:
-        """Those endpoints that may have work."""
+        """Yield the endpoints that may have work."""
         return (end for end in list(self._ends) if hasattr(end, "take"))
 
     def record(self) -> NodeRecord:
@@ -318,7 +318,7 @@ class Node(NodeParameters, NodeGraph, Limited):
     def _parameters_changed(
         self, new: list[Parameter], changed: list[Parameter], removed: list[Parameter]
     ) -> None:
-        """Tell everybody on /parameter_events, and follow `use_sim_time`."""
+        """Publish on /parameter_events, and follow `use_sim_time`."""
         for parameter in (*new, *changed):
             if parameter.name == "use_sim_time" and self._time_source is not None:
                 self._time_source.use_simulated(bool(parameter.value))

@@ -58,7 +58,7 @@ class _Type(Enum):
         )
 
     def check(self, value: Any) -> bool:
-        """Whether a value is of this type."""
+        """Return whether a value is of this type."""
         if self is _Type.NOT_SET:
             return value is None
         for kind, single, many in _KINDS:
@@ -107,42 +107,42 @@ class Parameter:
 
     @property
     def name(self) -> str:
-        """As declared."""
+        """Return the declared name."""
         return self._name
 
     @property
     def type_(self) -> _Type:
-        """Of the value."""
+        """Return the type of the value."""
         return self._type
 
     @property
     def value(self) -> Any:
-        """What it holds."""
+        """Return its value."""
         return self._value
 
     def __repr__(self) -> str:
         return f"Parameter(name={self.name!r}, type_={self.type_.name}, value={self.value!r})"
 
     def get_parameter_value(self) -> Any:
-        """As rcl_interfaces/ParameterValue."""
+        """Return it as rcl_interfaces/ParameterValue."""
         message = codec_of().message("rcl_interfaces/msg/ParameterValue")(type=self.type_.value)
         if self.type_ is not _Type.NOT_SET:
             setattr(message, f"{self.type_.name.lower()}_value", self.value)
         return message
 
     def to_parameter_msg(self) -> Any:
-        """As rcl_interfaces/Parameter."""
+        """Return it as rcl_interfaces/Parameter."""
         cls = codec_of().message("rcl_interfaces/msg/Parameter")
         return cls(name=self.name, value=self.get_parameter_value())
 
     @classmethod
     def from_parameter_msg(cls, message: Any) -> Parameter:
-        """From rcl_interfaces/Parameter."""
+        """Return a parameter from rcl_interfaces/Parameter."""
         return cls(message.name, _Type(message.value.type), parameter_value_to_python(message.value))
 
 
 def parameter_value_to_python(message: Any) -> Any:
-    """What a rcl_interfaces/ParameterValue holds."""
+    """Return the value of a rcl_interfaces/ParameterValue."""
     kind = _Type(message.type)
     if kind is _Type.NOT_SET:
         return None
@@ -322,7 +322,7 @@ class NodeParameters:
         del self._values[name], self._descriptors[name]
 
     def has_parameter(self, name: str) -> bool:
-        """Whether it is declared."""
+        """Return whether it is declared."""
         return name in self._values
 
     def get_parameter(self, name: str) -> Parameter:
@@ -470,7 +470,7 @@ class NodeParameters:
         return ""
 
     def _refusal(self, parameter: Parameter, descriptor: Any, *, declaring: bool) -> str:
-        """Why a value cannot be set; "" if it can."""
+        """Return why a value cannot be set; "" if it can."""
         descriptor.name, kind = parameter.name, parameter.type_
         if descriptor.read_only and not declaring:
             return "is read-only: set it at the start"
@@ -490,7 +490,7 @@ class NodeParameters:
 
 
 def _outside(value: float, limits: Any, close: float) -> str:
-    """What is wrong with a number in a range; its ends always fit."""
+    """Return why a number is outside of a range; its ends are always inside."""
     low, high = sorted((limits.from_value, limits.to_value))
     if any(math.isclose(value, end, rel_tol=close, abs_tol=0.0) for end in (low, high)):
         return ""

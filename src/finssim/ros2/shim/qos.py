@@ -10,7 +10,7 @@ from finssim.ros2.wire import Quality
 
 
 class HistoryPolicy(IntEnum):
-    """Which samples are kept."""
+    """Policy of kept samples."""
 
     SYSTEM_DEFAULT = 0
     KEEP_LAST = 1
@@ -18,7 +18,7 @@ class HistoryPolicy(IntEnum):
 
 
 class ReliabilityPolicy(IntEnum):
-    """Whether lost samples are sent again."""
+    """Policy of repeating lost samples."""
 
     SYSTEM_DEFAULT = 0
     RELIABLE = 1
@@ -26,7 +26,7 @@ class ReliabilityPolicy(IntEnum):
 
 
 class DurabilityPolicy(IntEnum):
-    """Whether a reader that comes late gets earlier samples."""
+    """Policy of earlier samples for readers that come late."""
 
     SYSTEM_DEFAULT = 0
     TRANSIENT_LOCAL = 1
@@ -34,7 +34,7 @@ class DurabilityPolicy(IntEnum):
 
 
 class LivelinessPolicy(IntEnum):
-    """Who says that a writer is alive; only the automatic one."""
+    """Policy of reporting that a writer is alive; only the automatic one."""
 
     SYSTEM_DEFAULT = 0
     AUTOMATIC = 1

@@ -49,7 +49,7 @@ class ConnectivityException(TransformException):
 
 
 class ExtrapolationException(TransformException):
-    """The time lies outside of what is known."""
+    """The time lies outside of the known range."""
 
 
 class InvalidArgumentException(TransformException):
@@ -213,7 +213,7 @@ class Buffer(Limited):
         return (not reason, reason) if return_debug_tuple else not reason
 
     def get_latest_common_time(self, target_frame: str, source_frame: str) -> Time:
-        """Return the latest time at which the whole chain between two frames is known."""
+        """Return the latest time at which the chain between two frames is known."""
         return Time(nanoseconds=self._look(target_frame, source_frame, 0)[0])
 
     def _set(self, transform: Any, *, static: bool) -> None:

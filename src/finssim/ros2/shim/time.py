@@ -12,7 +12,7 @@ from finssim.ros2.limits import Limited
 
 
 class ClockType(IntEnum):
-    """What a clock counts."""
+    """Kinds of clock."""
 
     UNINITIALIZED = 0
     ROS_TIME = 1
@@ -47,13 +47,13 @@ class Duration:
         return f"Duration(nanoseconds={self.nanoseconds})"
 
     def to_msg(self) -> Any:
-        """As builtin_interfaces/Duration."""
+        """Return it as builtin_interfaces/Duration."""
         seconds, nanoseconds = divmod(self.nanoseconds, 10**9)
         return codec_of().message("builtin_interfaces/msg/Duration")(sec=seconds, nanosec=nanoseconds)
 
     @classmethod
     def from_msg(cls, message: Any) -> Duration:
-        """From builtin_interfaces/Duration."""
+        """Return a duration from builtin_interfaces/Duration."""
         return cls(nanoseconds=message.sec * 10**9 + message.nanosec)
 
 
@@ -79,7 +79,7 @@ class Time:
             raise OverflowError(f"a time of {self.nanoseconds} ns: expected less than 2^63")
 
     def seconds_nanoseconds(self) -> tuple[int, int]:
-        """Whole seconds, and the nanoseconds beyond them."""
+        """Return full seconds, and the nanoseconds beyond them."""
         return divmod(self.nanoseconds, 10**9)
 
     def __add__(self, other: Duration) -> Time:
@@ -109,13 +109,13 @@ class Time:
         return f"Time(nanoseconds={self.nanoseconds}, clock_type={self.clock_type.name})"
 
     def to_msg(self) -> Any:
-        """As builtin_interfaces/Time."""
+        """Return it as builtin_interfaces/Time."""
         seconds, nanoseconds = self.seconds_nanoseconds()
         return codec_of().message("builtin_interfaces/msg/Time")(sec=seconds, nanosec=nanoseconds)
 
     @classmethod
     def from_msg(cls, message: Any, clock_type: ClockType = ClockType.ROS_TIME) -> Time:
-        """From builtin_interfaces/Time."""
+        """Return a time from builtin_interfaces/Time."""
         return cls(nanoseconds=message.sec * 10**9 + message.nanosec, clock_type=clock_type)
 
     def _same_clock(self, other: Time) -> int:
@@ -149,16 +149,16 @@ class Clock(Limited):
         return Time(nanoseconds=time.monotonic_ns() if steady else time.time_ns(), clock_type=self.clock_type)
 
     def tick(self) -> int:
-        """What timers count [ns]: never jumps with the system's time of day."""
+        """Return the time of timers [ns], which never jumps with the system's time of day."""
         return time.monotonic_ns()
 
     @property
     def real(self) -> bool:
-        """Whether it runs by itself."""
+        """Return whether it runs without messages."""
         return True
 
     def sleep_for(self, duration: Duration) -> bool:
-        """Sleep by this clock; only for one that runs by itself."""
+        """Sleep by this clock; only for one that runs without messages."""
         time.sleep(max(duration.nanoseconds, 0) / 1e9)
         return True
 
