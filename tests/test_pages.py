@@ -48,7 +48,7 @@ def test_python_on_a_page_runs(page, tmp_path, monkeypatch):
 
 def test_the_vehicle_on_the_page_loads(tmp_path):
     """The example vehicle is a vehicle, and a wrong axis in it gives the error that the page shows."""
-    (example,) = blocks(ROOT / "docs" / "vehicles.md", "yaml")
+    (example,) = blocks(ROOT / "docs" / "reference" / "vehicle_file.md", "yaml")
     (tmp_path / "minnow.yaml").write_text(example, encoding="utf-8")
     assert load_vehicle(tmp_path / "minnow.yaml").thruster_names == ("left", "right")
     (tmp_path / "minnow.yaml").write_text(example.replace("[1, 0, 0]", "[0.94, 0, 0]", 1), encoding="utf-8")
@@ -56,7 +56,7 @@ def test_the_vehicle_on_the_page_loads(tmp_path):
         load_vehicle(tmp_path / "minnow.yaml")
     shown = "minnow.yaml: thrusters.left: axis has length 0.94, expected 1: give a body-frame unit vector"
     assert str(refused.value).endswith(shown)
-    assert shown in (ROOT / "docs" / "vehicles.md").read_text(encoding="utf-8")
+    assert shown in (ROOT / "docs" / "reference" / "vehicle_file.md").read_text(encoding="utf-8")
 
 
 def test_the_ranges_and_the_plant_on_the_pages_load(tmp_path):
@@ -72,7 +72,7 @@ def test_the_ranges_and_the_plant_on_the_pages_load(tmp_path):
 
 def test_the_pools_on_the_page_load(tmp_path):
     """The full file and the shortest one are what the commands take."""
-    full, shortest = blocks(ROOT / "docs" / "pool_file.md", "yaml")
+    full, shortest = blocks(ROOT / "docs" / "reference" / "pool_file.md", "yaml")
     for example, height in ((full, 0.96), (shortest, 1.0)):
         (tmp_path / "pool.yaml").write_text(example, encoding="utf-8")
         assert load_pool(tmp_path / "pool.yaml").interface.height(0.0, 0.0) == pytest.approx(height)
@@ -84,7 +84,7 @@ def test_the_survey_on_the_page_calibrates_a_pool(tmp_path, monkeypatch):
     from calibration.vision.surveyed_pools import FLOOR, PLUMB_BOB, overhead, survey
 
     monkeypatch.chdir(tmp_path)
-    (example,) = blocks(ROOT / "docs" / "pool_calibration.md", "yaml")
+    (example,) = blocks(ROOT / "docs" / "reference" / "survey_file.md", "yaml")
     Path("survey.yaml").write_text(example, encoding="utf-8")
     write_camera("camera.yaml", PLUMB_BOB, {})
     seen = survey(overhead(), Interface.water(1.02), FLOOR, 30)
@@ -124,7 +124,7 @@ def test_the_world_on_the_page_loads(tmp_path):
 def test_every_range_of_the_section_on_randomisation_loads(tmp_path):
     """Whole files, and the schedules line by line, of which a file has one."""
     path = tmp_path / "ranges.yaml"
-    *_, first, tied, schedules = blocks(ROOT / "docs" / "simulation.md", "yaml")
+    *_, first, tied, schedules = blocks(ROOT / "docs" / "reference" / "ranges.md", "yaml")
     for example in (first, tied, *(f"mass: [0.9, 1.1]\n{line}" for line in schedules.splitlines())):
         path.write_text(example, encoding="utf-8")
         load_ranges(path)

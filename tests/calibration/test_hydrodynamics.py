@@ -19,7 +19,7 @@ from finssim.calibration.vehicle_file import calibrated
 from finssim.vehicles import load_vehicle
 
 DATA = Path(__file__).parents[1] / "data" / "standins"
-DOCS = Path(__file__).parents[2] / "docs" / "trials.md"
+DOCS = Path(__file__).parents[2] / "docs" / "reference" / "trial_format.md"
 
 
 def read(pattern, name, folder, tmp):

@@ -11,7 +11,7 @@ from finssim.robot.goals import GoalError
 from finssim.ros2 import Ros2Error
 from finssim.ros2.up import GRAPHS, NODES, Options, Plan, plan_of, topics_of
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ros2.md").read_text()
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "ros2_nodes.md").read_text()
 FILE = Path("/somewhere/pool.yaml")
 
 

@@ -402,7 +402,7 @@ class PlantSpec(Section):
         with atomic_write(path) as temporary:
             temporary.write_text(
                 f"# A plant of FinsSim's virtual pool: finssim pool --plant {Path(path).name}\n"
-                "# Units are SI unless a name says otherwise; docs/virtual_pool.md explains every key.\n"
+                "# Units are SI unless a name says otherwise; docs/reference/plant.md explains every key.\n"
                 + text,
                 encoding="utf-8",
             )

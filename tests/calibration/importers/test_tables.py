@@ -13,12 +13,13 @@ from finssim.calibration.trials.trial_files import load_trial
 from finssim.files import OutputError
 
 HINSDALE = Path(__file__).parents[2] / "data" / "hinsdale"
-DOCS = Path(__file__).parents[3] / "docs" / "trials.md"
+DOCS = Path(__file__).parents[3] / "docs"
 
 
 def shipped_map(name):
-    """The map file that the page on trials prints under this name."""
-    block = DOCS.read_text(encoding="utf-8").split(f"# {name}\n", 1)[1]
+    """Return the map file that one of the two pages on trials prints under this name."""
+    pages = [(DOCS / page).read_text(encoding="utf-8") for page in ("trials.md", "reference/trial_format.md")]
+    block = "\n".join(pages).split(f"# {name}\n", 1)[1]
     return block.split("```", 1)[0]
 
 

@@ -322,7 +322,7 @@ def test_places_without_a_trial_are_refused(tmp_path):
 
 def test_the_header_on_the_page_is_read(tmp_path):
     """The example of the trial format's page, with a log that it fits."""
-    page = (Path(__file__).resolve().parents[3] / "docs" / "trials.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[3] / "docs" / "reference" / "trial_format.md").read_text("utf-8")
     example = page.split("```yaml\n")[1].split("```")[0]
     trial = load_trial(csv(tmp_path / "x", "t,u,v\n0,1,2\n1,1,2\n", example))
     assert trial.header.role == "fit" and trial.header.axis == ("surge",)

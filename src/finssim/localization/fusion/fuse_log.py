@@ -250,7 +250,7 @@ def load_log(path: str | Path, vehicle: Vehicle, *, latency: float = 0.0) -> Log
         tables = {name: full_table for name in ("imu", "depth", "vision") if _present(name, full_table)}
         if not tables:
             raise LocalizationError(
-                f"{path}: no column p, q, r, depth, or x and y: see docs/trials.md for the names"
+                f"{path}: no column p, q, r, depth, or x and y: see docs/reference/trial_format.md for the names"
             )
     readers = {"imu": _imu, "depth": _depth, "vision": _vision}
     for name, table in tables.items():
