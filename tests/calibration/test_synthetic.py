@@ -155,7 +155,7 @@ def test_a_dive_ends_when_the_ascent_is_steady():
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ({"rate": 30.0}, "expected 200 Hz over a whole number"),
+        ({"rate": 30.0}, "expected 200 Hz over an integer"),
         ({"columns": ("speed",)}, "no column 'speed'"),
         ({"inputs": ("current",)}, "unknown input 'current'"),
         ({"inputs": ("pwm",)}, "no 'esc'"),

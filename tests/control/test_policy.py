@@ -159,7 +159,7 @@ def test_a_missing_directory_or_file_is_named(folder):
         ({"control_period": float("inf")}, "control_period: Input should be less than or equal to 10"),
         (
             {"action": {"mode": "wrench2"}},
-            "action: size is None, expected a positive whole number",
+            "action: size is None, expected a positive integer",
         ),
         ({"observation": {"size": 3, "entries": []}}, "expected each of 0 to 2 once"),
     ],

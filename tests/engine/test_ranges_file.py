@@ -62,7 +62,7 @@ def test_ranges_that_ship_load(name):
 
 WAVES = "waves: {{count: {}, amplitude: {}, wavelength: {}}}"
 SMALL = ("[0, 0.03]", "[3, 8]")
-COUNT = "expected two whole numbers [low, high] with 0 <= low <= high <= 8"
+COUNT = "expected two integers [low, high] with 0 <= low <= high <= 8"
 
 IMPOSSIBLE = {
     "no mass": ("mass: [0, 0]", "mass: is [0.0, 0.0], expected numbers above 0"),

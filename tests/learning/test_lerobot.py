@@ -159,7 +159,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path, capsys):
         export_lerobot(old, out)
     odd = save(tmp_path / "sets/odd", EPISODES, {**DESCRIBED, "period": 0.15})
     with pytest.raises(
-        DatasetError, match=r"a step takes 0.15 s, expected a whole number of steps in a second"
+        DatasetError, match=r"a step takes 0.15 s, expected an integer number of steps in a second"
     ):
         export_lerobot(odd, out)
     assert boundary.run(app, ["datasets", str(tmp_path / "sets"), "--lerobot", str(out)]) == 2

@@ -79,7 +79,7 @@ def test_one_camera_tells_vehicles_apart_by_their_tags():
             "--team names 2 vehicles, but task 'formation' has 3",
         ),
         (["pool", "--team", "finsrov,finsrov", "--camera", "pictures"], "give --camera corners, or none"),
-        (["pool", "--team", "finsrov,finsrov,finsrov,finsrov"], "4 vehicles 1.1 m apart have no room in 4 m"),
+        (["pool", "--team", "finsrov,finsrov,finsrov,finsrov"], "4 vehicles 1.1 m apart do not fit into 4 m"),
         (["run", "--team", "lead"], "--team lead is a baseline: give its task with --task"),
         (["run", "--team", "lead", "--task", "pursuit"], "has one agent: run it with --policy lead"),
         (["run", "--team", "consensus", "--task", "formation", "--agent", "corner_1"], "leave --agent"),

@@ -270,7 +270,7 @@ def test_launch_files_start_what_up_starts(launched, graph, given):
 
 def test_a_number_that_is_none_is_refused(launched):
     """At launch, before any process."""
-    with pytest.raises(Ros2Error, match="seed:=x: expected a whole number"):
+    with pytest.raises(Ros2Error, match="seed:=x: expected an integer"):
         launched("sim", seed="x")
 
 

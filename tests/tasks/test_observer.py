@@ -107,7 +107,7 @@ def test_the_prey_of_a_pursuit_without_a_track_is_where_the_guide_is():
 def test_a_team_mate_that_nobody_tells_of_is_named():
     me = Track(np.zeros(3), quat_from_yaw(0.0), np.zeros(6))
     with pytest.raises(
-        ControlError, match="'team-pursuit' looks at 'left_netter', and nobody tells where it is"
+        ControlError, match="'team-pursuit' looks at 'left_netter', whose position is not known"
     ):
         Observer("team-pursuit", FINSROV).observe(me, Station((1.0, 0.0, -1.0), 0.0), 0.0)
 

@@ -447,9 +447,7 @@ def trials_of(
     profile = _profile(noise)
     every = round(1.0 / (rate * recording.step)) if rate > 0.0 else 0
     if every < 1 or abs(every * recording.step * rate - 1.0) > 1e-6:
-        raise CalibrationError(
-            f"rate is {rate:g} Hz, expected {1.0 / recording.step:g} Hz over a whole number"
-        )
+        raise CalibrationError(f"rate is {rate:g} Hz, expected {1.0 / recording.step:g} Hz over an integer")
     chosen = DEFAULT_COLUMNS if columns is None else tuple(columns)
     measured = measure(recording, vehicle, profile, every=every, seed=seed)
     for name in chosen:

@@ -124,7 +124,7 @@ class PolicyDescription(_Record):
         if not isinstance(action.get("mode"), str):
             raise ValueError("needs `mode`, the action mode's name")
         if not isinstance(action.get("size"), int) or not 1 <= action["size"] <= LARGEST:
-            raise ValueError(f"size is {action.get('size')!r}, expected a positive whole number")
+            raise ValueError(f"size is {action.get('size')!r}, expected a positive integer")
         return action
 
     @property
@@ -376,8 +376,8 @@ def _open_network(folder: Path, description: PolicyDescription) -> Any:
     expected = description.files.get(NETWORK_FILE, "none")
     if digest != expected:
         raise PolicyError(
-            f"{path}: corrupt: its SHA-256 starts {digest[:12]}, "
-            f"but {DESCRIPTION_FILE} says {expected[:12]}: copy the directory again"
+            f"{path}: corrupt: its SHA-256 starts with {digest[:12]}, "
+            f"but {DESCRIPTION_FILE} has {expected[:12]}: copy the directory again"
         )
     try:
         import onnxruntime

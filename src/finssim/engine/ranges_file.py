@@ -65,7 +65,7 @@ def _factor_or_with_mass(value: Any) -> Any:
 def _count(pair: tuple[int, int]) -> tuple[int, int]:
     if not 0 <= pair[0] <= pair[1] <= MAX_WAVES:
         raise ValueError(
-            f"is {list(pair)}, expected two whole numbers [low, high] with 0 <= low <= high <= {MAX_WAVES}"
+            f"is {list(pair)}, expected two integers [low, high] with 0 <= low <= high <= {MAX_WAVES}"
         )
     return pair
 

@@ -112,7 +112,7 @@ def write_json(path: Path, result: Mapping[str, Any], tables: Sequence[Table] = 
         text = json.dumps(result, indent=1, allow_nan=False)
     except ValueError:
         raise ResultError(
-            f"{path}: not written, since it would hold a number that is not finite: look for one in what it is made of"
+            f"{path}: not written, since it would hold a number that is not finite: look for one in its inputs"
         ) from None
     with atomic_write(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")

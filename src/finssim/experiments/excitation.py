@@ -487,7 +487,7 @@ def _in_pool(
                 continue
             if result["fault"]:
                 raise CalibrationError(
-                    f"{run.target} in the virtual pool: {result['fault']}: give lower levels, or fewer axes at once"
+                    f"{run.target} in the virtual pool: {result['fault']}: give lower levels, or fewer axes"
                 )
             source, folder = Path(scratch) / result["key"], folders[run.row]
             (folder / RECORDS).mkdir(parents=True, exist_ok=True)

@@ -65,7 +65,7 @@ def play(
             raise PlaybackError(f"{path} is no directory of a policy: only an episode of a policy is filmed")
         if speed != 1.0:
             raise PlaybackError(
-                "--speed is of a film: the messages of a record are printed at once, leave it out"
+                "--speed is of a film: the messages of a record are printed without waiting, leave it out"
             )
         play_record(path, topics=topics, start=start)
         return

@@ -111,7 +111,7 @@ def read_drive(path: Path, vehicle: Vehicle) -> Drive:
     numbers = dict(zip(steps.tolist(), _stretches(steps, columns, _helm(steps, events, teleop)), strict=True))
     complete = [t for t in sorted(columns["thruster_cmd"]) if all(t in columns[name] for name in TOPICS)]
     if not complete:
-        raise DriveError(f"{path}: no decision at which there was an estimate: nothing to learn from")
+        raise DriveError(f"{path}: no decision at which there was an estimate: no demonstration")
     rows, time = {name: [columns[name][t] for t in complete] for name in TOPICS}, np.array(complete)
     stretch = np.array([numbers[t] for t in complete])
     first = rows["policy_info"][int(np.argmax(stretch >= 0))]
@@ -551,8 +551,8 @@ def collect_records(
     if not demonstrations:
         names = ", ".join(str(path) for path in records)
         raise DriveError(
-            f"{names}: the robot was never armed, its estimate ready and its driver in control for two decisions "
-            f"{the_task.control_step:g} s apart towards one goal: nothing to learn from"
+            f"{names}: the robot was never armed, its estimate ready and its driver active for two decisions "
+            f"{the_task.control_step:g} s apart towards one goal: no demonstration"
         )
     described = {
         "task": the_task.name,
@@ -679,7 +679,7 @@ def read_record(
         raise DriveError(f"{path}: the robot was never armed with its state known: nothing was done in it")
     if task not in PUBLISHED and not np.size(drive.motion.action):
         raise DriveError(
-            f"{path}: does not tell what the pilot did, in [-1, 1], which '{task}' scores: record a run of this version"
+            f"{path}: lacks the pilot's actions in [-1, 1], which '{task}' scores: record a run of this version"
         )
     longest = {"t1": duration, "t2": math.inf}.get(task, fitted.time_limit)
     if follows(fitted):
@@ -736,7 +736,7 @@ def _station(drive: Drive, steered: NDArray[np.bool_], task: str) -> Guide:
     if float(np.abs(goals - goals[0]).max()) > SAME_GOAL:
         raise DriveError(
             f"{drive.path}: its goal moves, and '{task}' has one: measure it with --task t2 or t3, or record each "
-            "station by itself"
+            "station separately"
         )
     return station_at(goals[0])
 

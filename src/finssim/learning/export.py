@@ -398,7 +398,7 @@ def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> 
     k = int(getattr(network, "memory_size", 0))
     if shape != (2, m + k):
         raise ExportError(
-            f"the network maps (2, {n}) to (2, {shape[1] - k}), but the description says (2, {m})"
+            f"the network maps (2, {n}) to (2, {shape[1] - k}), but the description has (2, {m})"
         )
     if isinstance(network, Network):
         return write_graph(network, n, m)

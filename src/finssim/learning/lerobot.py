@@ -58,7 +58,7 @@ def export_lerobot(source: str | Path, out: str | Path) -> dict[str, Any]:
 
     if Path(os.path.realpath(out)).is_relative_to(os.path.realpath(source)):
         raise DatasetError(
-            f"--lerobot {out}: lies in the data set {source}, which is read: give a folder beside it"
+            f"--lerobot {out}: lies in the data set {source}, which is read: give a folder next to it"
         )
     described = about(source)
     fps, title = _rate(described, source), str(described.get("title") or described["task"])
@@ -151,7 +151,7 @@ def _rate(described: Mapping[str, Any], source: str | Path) -> int:
     fps = round(1.0 / period)
     if abs(fps * period - 1.0) > 1e-6:
         raise DatasetError(
-            f"{source}: a step takes {period:g} s, expected a whole number of steps in a second"
+            f"{source}: a step takes {period:g} s, expected an integer number of steps in a second"
         )
     return fps
 

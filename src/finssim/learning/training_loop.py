@@ -266,7 +266,7 @@ class Loop:
             saved = state["identity"].get(name)
             if saved != value:
                 raise ResumeError(
-                    f"cannot go on in {self.side}: {name} was {saved!r} and is {value!r} now: "
+                    f"cannot continue in {self.side}: {name} was {saved!r} and is {value!r} now: "
                     "give the original settings, or omit --resume"
                 )
         if "best" not in state:

@@ -759,7 +759,7 @@ def swimming(
     spacing = ROOM * max(max(v.body.size) for v in ours)
     if spacing * len(ours) > basin.length:
         raise PlantSpecError(
-            f"{len(ours)} vehicles {spacing:.1f} m apart have no room in {basin.length:g} m: take a larger --site"
+            f"{len(ours)} vehicles {spacing:.1f} m apart do not fit into {basin.length:g} m: give a larger --site"
         )
     eyes: list[PoolCamera | None] = [None] * len(ours)
     calibrated = None

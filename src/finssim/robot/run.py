@@ -238,7 +238,7 @@ def run_team(
     kind, _, address = (POOL_ADDRESS if robot == "pool" else robot).rpartition("//")
     if kind not in ("", "udp:"):
         raise ControlError(
-            f"--robot {robot}: a team's motor controllers are at udp://HOST:PORT, ten ports apart"
+            f"--robot {robot}: a team's motor controllers are at udp://HOST:PORT, ten ports from each other"
         )
     (theirs, port), (host, own_port) = host_port(address, "--robot"), host_port(bind, "--bind")
     alike = [
@@ -383,7 +383,7 @@ def run(
     if team is not None:
         if agent is not None or trajectory is not None or lockstep or number or let_in is not None:
             raise ControlError(
-                "--team has every agent in its place: leave --agent, --trajectory, --lockstep, --number and --let-in "
+                "--team starts every agent: leave --agent, --trajectory, --lockstep, --number and --let-in "
                 "out"
             )
         options = {

@@ -229,7 +229,7 @@ def launched(graph: str, given: Mapping[str, str]) -> tuple[str, dict[str, dict[
     values: dict[str, Any] = {**given}
     for name in {"port", "seed"} & given.keys():
         if not given[name].isdecimal():
-            raise Ros2Error(f"{name}:={given[name]}: expected a whole number")
+            raise Ros2Error(f"{name}:={given[name]}: expected an integer")
         values[name] = int(given[name])
     nothing = dict.fromkeys((option.name for option in fields(Options)), None)
     pool_file = given.get("pool_file", "pool.yaml" if graph == "pool" else None)

@@ -91,9 +91,7 @@ def wire_settings(environ: Mapping[str, str] = os.environ, domain: int | None = 
 
 def _domain(text: str) -> int:
     if not (text.isdecimal() and int(text) <= MAX_DOMAIN):
-        raise Ros2Error(
-            f"ROS domain '{text}': expected a whole number from 0 to {MAX_DOMAIN} in ROS_DOMAIN_ID"
-        )
+        raise Ros2Error(f"ROS domain '{text}': expected an integer from 0 to {MAX_DOMAIN} in ROS_DOMAIN_ID")
     return int(text)
 
 

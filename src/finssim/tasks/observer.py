@@ -212,7 +212,7 @@ class Observer:
             return tracks[name]
         if otherwise is None:
             raise ControlError(
-                f"task '{self.task.name}' looks at '{name}', and nobody tells where it is; known: "
+                f"task '{self.task.name}' looks at '{name}', whose position is not known; known: "
                 f"{', '.join(tracks) or 'none'}"
             )
         q = quat_from_yaw(otherwise.yaw)

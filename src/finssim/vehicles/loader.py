@@ -130,7 +130,7 @@ def _with_parents(path: Path, label: str, children: tuple[Path, ...]) -> tuple[T
             file = path.parent.resolve() / device
             if not file.is_file():
                 raise VehicleError(
-                    f"{label}: perception.{name}: no file {device} beside it: give a sensor's file, or a name of "
+                    f"{label}: perception.{name}: no file {device} next to it: give a sensor's file, or a name of "
                     "'finssim worlds'"
                 )
             entry["device"] = str(file)

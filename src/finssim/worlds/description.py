@@ -521,7 +521,7 @@ class World(Part):
             return self._models[name]
         path = self.beside(self.objects[name].file or "", f"objects.{name}: file")
         if not path.is_file():
-            raise WorldError(f"{self.path}: objects.{name}: no file {path.name} beside it")
+            raise WorldError(f"{self.path}: objects.{name}: no file {path.name} next to it")
         try:
             self._models[name] = parts_of(path)
             for part in self._models[name]:

@@ -242,7 +242,7 @@ def test_one_sentence_says_what_a_bag_has_not(tmp_path, text, sentence):
 def test_two_sources_of_one_column_are_refused(tmp_path):
     """Nobody but the user knows which is better."""
     bag = written(tmp_path / "run", StoragePlugin.MCAP, ("/odom", "/array"))
-    with pytest.raises(CalibrationError, match="u comes from /odom and from /array"):
+    with pytest.raises(CalibrationError, match="u is in /odom and in /array"):
         mapped(
             bag,
             "topics:\n  /odom: {columns: {u: twist.twist.linear.x}}\n  /array: {columns: {u: 'data[0]'}}\n",

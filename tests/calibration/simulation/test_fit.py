@@ -229,5 +229,5 @@ def test_what_cannot_be_fitted_is_refused():
     blind = [
         replace(t, channels={k: v for k, v in t.channels.items() if k in ("r", "tau_n")}) for t in trials
     ]
-    with pytest.raises(CalibrationError, match="nothing that tells of surge"):
+    with pytest.raises(CalibrationError, match="no measurement that determines surge"):
         fit_by_simulation(blind, vehicle, axes=["surge"])

@@ -99,7 +99,7 @@ def test_a_cell_that_is_no_number_is_refused_by_name(tmp_path, cell, place):
         (f"id,tag,{','.join(COLUMNS[3:11])}\n1,1,{NUMBERS}\n", "second column of tag"),
         (f"tag,{','.join(COLUMNS[3:11])}\n1,{NUMBERS},9\n", "line 2: 10 cells"),
         (f"tag,{','.join(COLUMNS[3:11])}\n1,2\n1,{NUMBERS}\n", "line 2: 2 cells"),
-        (f"tag,{','.join(COLUMNS[3:11])}\n-1,{NUMBERS}\n", "whole number"),
+        (f"tag,{','.join(COLUMNS[3:11])}\n-1,{NUMBERS}\n", "expected an integer from 0"),
     ],
 )
 def test_a_file_that_is_no_detections_file_is_refused(tmp_path, text, sentence):

@@ -296,7 +296,7 @@ class ColumnMap(Part):
         }
         if single:
             if "files" in data:
-                raise refuse_section(f"'{next(iter(single))}' stands beside 'files': write it inside a file")
+                raise refuse_section(f"'{next(iter(single))}' is next to 'files': write it inside a file")
             data["files"] = {"*": single}
         header = {key: data.pop(key) for key in list(data) if key in HEADER_KEYS}
         for key in data:
@@ -592,7 +592,7 @@ def _refuse_doubles(streams: Sequence[Stream]) -> None:
         for name in (*stream.channels, *stream.words):
             if name in sources:
                 raise CalibrationError(
-                    f"{name} comes from {sources[name]} and from {stream.source}: take it from one of them in the map"
+                    f"{name} is in {sources[name]} and in {stream.source}: choose one of them in the map"
                 )
             sources[name] = stream.source
 

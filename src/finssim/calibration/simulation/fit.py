@@ -1753,7 +1753,7 @@ def _axes(
     remarks += [finding("axis_doubtful", axis) for axis in axes if axis in seen and axis not in moved]
     chosen = tuple(a for a in AXES if a in axes and a in seen)
     if not chosen:
-        raise CalibrationError(f"nothing that tells of {', '.join(axes)} was measured in these trials")
+        raise CalibrationError(f"no measurement that determines {', '.join(axes)} is in these trials")
     return chosen, remarks
 
 

@@ -214,7 +214,7 @@ class Trial:
         if (step := float(np.median(np.diff(t)))) > SLOWEST:
             raise CalibrationError(
                 f"{self.name}: t has a row every {step:.3g} s, expected one every {SLOWEST:g} s at least: if its times "
-                "are in ms, import it with a map that says so (time: {column: t, unit: ms})"
+                "are in ms, import it with a map of the time's unit (time: {column: t, unit: ms})"
             )
         for column, values in self.channels.items():
             if column_of(column) is None:

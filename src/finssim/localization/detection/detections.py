@@ -174,7 +174,7 @@ def _number(table: TextTable, row: Mapping[str, str], name: str, label: str) -> 
 def _integer(table: TextTable, row: Mapping[str, str], name: str, label: str) -> int:
     value = _number(table, row, name, label)
     if value != int(value) or value < 0:
-        raise LocalizationError(f"{label}: {name} is {row[name]}, expected a whole number from 0")
+        raise LocalizationError(f"{label}: {name} is {row[name]}, expected an integer from 0")
     return int(value)
 
 

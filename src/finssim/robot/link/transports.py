@@ -591,9 +591,7 @@ class MavlinkAddress:
         if self.kind == "serial":
             device, _, baud = self.where.partition(",")
             if baud and not baud.isdecimal():
-                raise LinkError(
-                    f"serial:{self.where}: baud is {baud!r}, expected a whole number such as 115200"
-                )
+                raise LinkError(f"serial:{self.where}: baud is {baud!r}, expected an integer such as 115200")
             wire = SerialTransport(device, int(baud or 115200))
         else:
             end = host_port(self.where, f"mavlink://{self.kind}")
@@ -682,7 +680,7 @@ def open_transport(address: str, bind: str = DEFAULT_BIND) -> Transport:
         parts = urlsplit(rest)
         baud = parse_qs(parts.query).get("baud", ["115200"])[-1]
         if not baud.isdecimal():
-            raise LinkError(f"{address}: baud is {baud!r}, expected a whole number such as 115200")
+            raise LinkError(f"{address}: baud is {baud!r}, expected an integer such as 115200")
         return SerialTransport(parts.path, int(baud))
     if address.startswith("mavlink"):
         return MavlinkAddress.of(address).open()

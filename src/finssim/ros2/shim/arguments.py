@@ -222,9 +222,7 @@ def _add_nodes(above: str, tree: Tree, overrides: Overrides) -> None:
         if key != KEY:
             _add_nodes(f"{above}/{key.lstrip('/')}" if above else key, below, overrides)
         elif not _NAME.fullmatch(above):
-            raise ValueError(
-                f"{KEY} stands below '{above}', expected the name of a node such as /**/controller"
-            )
+            raise ValueError(f"{KEY} is below '{above}', expected the name of a node such as /**/controller")
         elif not isinstance(below, tuple):
             raise ValueError(f"{above}: expected parameters and values below {KEY}")
         else:
@@ -315,7 +313,7 @@ def parse_arguments(arguments: Sequence[str]) -> RosArguments:
             ros = False
         elif word not in _SWITCHES:
             if not tokens:
-                raise RosArgumentsError(f"--ros-args: {word} stands at the end: give its value after it")
+                raise RosArgumentsError(f"--ros-args: {word} is at the end: give its value after it")
             _take(parsed, word, tokens.pop(0))
     return parsed
 

@@ -240,7 +240,7 @@ def surface_frame(camera: Camera, interface: Interface) -> SurfaceFrame:
     height = float(n @ position + interface.offset)
     if height <= 0.0:
         raise SensorError(
-            f"camera stands {-height:.4g} m behind the interface: reverse the normal so that it points to the camera"
+            f"camera is {-height:.4g} m behind the interface: reverse the normal so that it points to the camera"
         )
     return SurfaceFrame(position - height * n, np.stack([first, np.cross(n, first), n]), height)
 
