@@ -148,8 +148,10 @@ def test_a_mistake_is_named(task, sentence):
         check_task(task())
 
 
-@pytest.mark.parametrize("name", ["own_task", "own_task_torch"])
-def test_the_page_shows_the_example(name):
+@pytest.mark.parametrize(
+    ("name", "page"), [("own_task", "reference/task_in_warp.md"), ("own_task_torch", "own_task.md")]
+)
+def test_the_page_shows_the_example(name, page):
     """Word for word, so that what is read is what runs."""
-    page = (EXAMPLE.parents[1] / "docs" / "own_task.md").read_text(encoding="utf-8")
+    page = (EXAMPLE.parents[1] / "docs" / page).read_text(encoding="utf-8")
     assert f"```py\n{(EXAMPLE.parent / f'{name}.py').read_text(encoding='utf-8')}```" in page
