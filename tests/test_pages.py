@@ -59,12 +59,12 @@ def test_the_vehicle_on_the_page_loads(tmp_path):
     assert shown in (ROOT / "docs" / "reference" / "vehicle_file.md").read_text(encoding="utf-8")
 
 
-def test_the_ranges_and_the_plant_on_the_pages_load(tmp_path):
+def test_the_sensing_the_sweep_and_the_plant_on_the_pages_load(tmp_path):
     """The example files of the learning and evaluation pages are what the commands take."""
-    sensing, ranges, sweep = blocks(ROOT / "docs" / "learning.md", "yaml")
+    sensing, sweep = blocks(ROOT / "docs" / "learning.md", "yaml")
     (plant,) = blocks(ROOT / "docs" / "evaluation.md", "yaml")
     for example, load in (
-        (sensing, load_sensing), (ranges, load_ranges), (plant, load_plant), (sweep, load_sweep),
+        (sensing, load_sensing), (plant, load_plant), (sweep, load_sweep),
     ):  # fmt: skip
         (tmp_path / "example.yaml").write_text(example, encoding="utf-8")
         load(tmp_path / "example.yaml")

@@ -318,7 +318,7 @@ def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials):
 
 def test_the_page_shows_the_example():
     """Word for word, so that what is read is what runs."""
-    page = (EXAMPLES.parent / "docs" / "own_task.md").read_text(encoding="utf-8")
+    page = (EXAMPLES.parent / "docs" / "reference" / "terms.md").read_text(encoding="utf-8")
     assert f"```py\n{(EXAMPLES / 'own_term.py').read_text(encoding='utf-8')}```" in page
 
 
