@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +16,8 @@ import pytest
 import yaml
 from onnx import TensorProto, helper, numpy_helper
 
+from finssim import boundary
+from finssim.cli import app
 from finssim.control.policy import Policy, PolicyError
 from reference.policies import seeing
 
@@ -263,3 +266,30 @@ def test_a_picture_that_is_not_the_policys_is_refused(tmp_path, picture):
     assert policy.step(None, row, {"front_camera": np.zeros((1, 27, 48, 3), np.uint8)})[0].shape == (1, 6)
     with pytest.raises(PolicyError, match="the policy sees front_camera: it is given"):
         policy.step(None, row, {} if picture is None else {"front_camera": picture})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "policy"],
+        ["play", "policy", "--video", "a.mp4"],
+        ["run", "--policy", "policy", "--pool-file", "none"],
+    ],
+)
+def test_a_policy_directory_names_no_file_to_run(tmp_path, monkeypatch, capsys, words):
+    """A policy whose task is FILE.py:CLASS, or whose vehicle is a path, is refused; no code of it runs."""
+    monkeypatch.chdir(tmp_path)
+    seeing("policy")
+    Path("evil.py").write_text("from pathlib import Path\nPath('ran').touch()\n", encoding="utf-8")
+    text = Path("policy/policy.yaml").read_text(encoding="utf-8")
+    Path("policy/policy.yaml").write_text(
+        text.replace("task: camera-docking", "task: evil.py:Evil"), encoding="utf-8"
+    )
+    assert boundary.run(app, words) == 2
+    assert "expected the plain name of a task" in capsys.readouterr().err
+    if words[0] != "run":  # whose vehicle is the one on the command line
+        bad = text.replace("name: finsrov", "name: ../finsrov.yaml")
+        Path("policy/policy.yaml").write_text(bad, encoding="utf-8")
+        assert boundary.run(app, words) == 2
+    assert not Path("ran").exists()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from finssim.engine import Simulator
 from finssim.physics.motors import admissible, first_order, speed_of_thrust, thrust_of_speed
 from finssim.physics.types import vec8
 
@@ -104,3 +105,16 @@ def test_the_slew_limit_holds_and_never_overshoots():
     x, target = rng.uniform(-1, 1, (2, N, 8)).astype(np.float32)
     (found,) = run(lag_kernel, [x, target], [vec8(*[1.0] * 8), vec8(*[0.5] * 8)], 1)
     assert found == pytest.approx(x + np.clip(target.astype(float) - x, -0.5, 0.5), abs=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [0.01, 0.049, 0.051, 0.5, 3.0])
+def test_the_lags_share_and_its_mean_are_exact(ratio):
+    """alpha = 1 - exp(-x) and beta = 1 - alpha / x, x = h / T, on both sides of where the series begins."""
+    simulator = Simulator("finsrov", control_step=0.1, substeps=4)
+    simulator.plant.time_constant.fill_(vec8(*[0.025 / ratio] * 8))
+    simulator.refresh()
+    alpha = -np.expm1(-ratio)
+    np.testing.assert_allclose(simulator.plant.alpha.numpy()[0, 0], alpha, rtol=1e-6)
+    np.testing.assert_allclose(
+        simulator.plant.beta.numpy()[0, 0], 1.0 - alpha / ratio, rtol=5e-5
+    )  # float32 in 1 - alpha / x

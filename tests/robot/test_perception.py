@@ -254,3 +254,14 @@ def test_what_cannot_be_is_refused():
         Perception(VEHICLE, pool, mode="x")
     with pytest.raises(LocalizationError, match="no tags"):
         Perception(VEHICLE.model_copy(update={"tags": None}), pool)
+
+
+def test_the_gyros_bias_is_taken_off_about_the_vertical():
+    """A tilted vehicle turns at 0.3 rad/s about the vertical, and its gyro reads 0.05 rad/s too much there."""
+    perception = Perception(VEHICLE, overhead())
+    roll, pitch = 0.2, -0.3
+    up = np.array([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
+    estimate = perception.estimator.estimate(0.0)
+    level = replace(estimate, roll=roll, pitch=pitch, yaw_rate=0.3)
+    perception._omega = 0.35 * up
+    np.testing.assert_allclose(perception._turning(level), 0.3 * up, atol=1e-12)

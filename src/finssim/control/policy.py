@@ -113,6 +113,15 @@ class PolicyDescription(_Record):
     files: dict[str, str] = Field(default_factory=dict)
     """SHA-256 of the other files of the directory that must not change (the network)."""
 
+    @field_validator("task")
+    @classmethod
+    def _names_no_code(cls, task: str) -> str:
+        if ":" in task:
+            raise ValueError(
+                f"task is {task!r}, expected the plain name of a task: only a user names a file with code"
+            )
+        return task
+
     @field_validator("action", "training", "provenance", mode="before")
     @classmethod
     def _plain_data(cls, value: Any) -> Any:

@@ -19,7 +19,7 @@ from finssim.robot.record_reader import play_record
 from finssim.tasks import Environment, task_named
 from finssim.tasks.agents import NOWHERE, agent_for, rollout
 from finssim.tasks.onlooker import Onlooker, write_video
-from finssim.vehicles import load_vehicle
+from finssim.vehicles import catalogue_vehicle, load_vehicle
 
 
 class PlaybackError(ValueError):
@@ -76,7 +76,7 @@ def play(
     start_warp()
     description = read_description(path)
     the_task = task_named(task or description.task)
-    body = load_vehicle(vehicle or description.vehicle.name)
+    body = load_vehicle(vehicle) if vehicle else catalogue_vehicle(description.vehicle.name, str(path))
     agent = agent_for(path, body, the_task)
     environment = load_plant(plant).environment(agent, the_task, body, seed=seed, auto_reset=False)
     with atomic_write(video) as temporary, progress_bar("episode") as show:

@@ -374,3 +374,14 @@ def test_the_first_gradient_step_sees_the_policy_that_acted():
     learner.update()
     assert numbers[0][1] == pytest.approx(0.0, abs=1e-5) and numbers[0][2] == 0.0
     assert numbers[-1][1] > 1e-4
+
+
+def test_imitation_is_half_the_mean_squared_distance_of_the_actions():
+    """The reported loss is 1/2 E |mean - label|², summed over an action's numbers."""
+    learner = made(StationKeeping())
+    rng = np.random.default_rng(7)
+    inputs = learner.actor.shapes()[0][0]
+    mean = learner.actor(rng.normal(size=(32, inputs)).astype(np.float32)).copy()
+    label = rng.normal(size=mean.shape).astype(np.float32)
+    expected = 0.5 * np.mean(np.sum((mean - label) ** 2, axis=1))
+    assert learner._imitate(mean, label, 0.0) == pytest.approx(expected, rel=1e-5)

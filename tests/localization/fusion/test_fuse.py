@@ -15,8 +15,8 @@ from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection, Frame, write_detections
 from finssim.localization.detection.families import tag_corners_b
 from finssim.localization.fusion.estimator import MODELS
-from finssim.localization.fusion.fuse import COLUMNS, fuse, run
-from finssim.localization.fusion.fuse_log import load_log
+from finssim.localization.fusion.fuse import COLUMNS, error_figures, fuse, run
+from finssim.localization.fusion.fuse_log import StreamTable, load_log
 from finssim.localization.fusion.fuse_settings import site_of
 from finssim.localization.fusion.streams import refusal
 from finssim.localization.localize import write_rows as write_localized
@@ -403,3 +403,19 @@ def test_an_interrupt_keeps_the_rows_so_far(tmp_path, pool, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv")
     assert 30 < len(read_out(tmp_path / "out.csv")[0]["t"]) < 150
+
+
+def test_errors_against_the_truth_are_those_of_each_column():
+    """Rows that are off by 1, 2 and 3 cm and 0.04 rad, with velocities that must not be taken for a position."""
+    t = np.arange(0.0, 2.0, 0.1)
+    rows = []
+    for time in t:
+        row = [0.0] * len(COLUMNS)
+        row[0], row[1:4], row[4:7], row[9] = time, [0.01, 0.02, -0.97], [5.0, 6.0, 7.0], 0.04
+        row[COLUMNS.index("state")] = "fresh"
+        rows.append(row)
+    numbers = {"x": 0.0 * t, "y": 0.0 * t, "z": 0.0 * t - 1.0, "yaw": 0.0 * t}
+    figures = error_figures(rows, StreamTable("truth", t, numbers, {}))["fresh"]
+    found = [figures[f"rms_{name}"] for name in ("x", "y", "z", "yaw")]
+    assert found == pytest.approx([0.01, 0.02, 0.03, 0.04])
+    assert figures["p95_horizontal"] == pytest.approx(math.hypot(0.01, 0.02))
