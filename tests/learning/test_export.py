@@ -117,7 +117,7 @@ def test_the_directory_holds_all_that_was_said_and_where_it_came_from(tmp_path):
 def test_a_network_of_other_sizes_is_refused_and_leaves_nothing(tmp_path):
     for network in (perceptron(nn.Tanh), Gated()):
         with pytest.raises(
-            ExportError, match=r"maps \(2, 16\) to \(2, 6\), but the description says \(2, 8\)"
+            ExportError, match=r"maps \(2, 16\) to \(2, 6\), but the description has \(2, 8\)"
         ):
             export_policy(network, tmp_path / "run", description(m=8))
         with pytest.raises(ExportError, match="does not take observations of 20 elements"):

@@ -63,8 +63,8 @@ def test_files_reach_the_nodes_they_name(parameters, node, values):
     ("text", "words"),
     [
         ("gain: 1.0", "gain: expected 'ros__parameters:'"),
-        ("ros__parameters: {gain: 1.0}", "stands below '', expected the name of a node"),
-        ("/a b: {ros__parameters: {gain: 1.0}}", "stands below '/a b'"),
+        ("ros__parameters: {gain: 1.0}", "is below '', expected the name of a node"),
+        ("/a b: {ros__parameters: {gain: 1.0}}", "is below '/a b'"),
         ("/**: {ros__parameters: {gain: }}", "gain: has no value"),
         ("/**: {ros__parameters: {gains: [1, 2.0]}}", "all of one type"),
         ("/**: {ros__parameters: {gains: [[1], [2]]}}", "plain values only"),
