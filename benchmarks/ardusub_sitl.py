@@ -10,9 +10,9 @@ import socket
 import struct
 import time
 
-from finssim.engine import Pool
 from finssim.pool.ardusub_sitl import SitlServer, SitlWorld
-from finssim.robot.link.water_linked import DvlServer
+from finssim.robot.links.water_linked import DvlServer
+from finssim.sim import Pool
 from finssim.vehicles import load_vehicle
 
 RATE = 400

@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.calibration.hydrodynamics import fit_hydrodynamics
-from finssim.calibration.programmes import Programme
-from finssim.calibration.replay import replay
-from finssim.calibration.synthetic import NoiseProfile, record, trials_of
-from finssim.calibration.trials.trial import Trial
-from finssim.calibration.vehicle_file import calibrated, scaled_thrust
+from finssim.identification.hydrodynamics import fit_hydrodynamics
+from finssim.identification.programmes import Programme
+from finssim.identification.replay import replay
+from finssim.identification.synthetic import NoiseProfile, record, trials_of
+from finssim.identification.vehicle_file import calibrated, scaled_thrust
+from finssim.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 FITTED = ("surge", "sway", "heave", "yaw")

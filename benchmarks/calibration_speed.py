@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.calibration.programmes import Programme, programmes
-from finssim.calibration.regression.regress import regress
-from finssim.calibration.simulation.fit import fit_by_simulation
-from finssim.calibration.synthetic import simulate_programme
-from finssim.calibration.trials.trial import Trial
-from finssim.calibration.trials.trial_files import write_trial
+from finssim.identification.programmes import Programme, programmes
+from finssim.identification.regression.regress import regress
+from finssim.identification.simulation.fit import fit_by_simulation
+from finssim.identification.synthetic import simulate_programme
+from finssim.trials.trial import Trial
+from finssim.trials.trial_files import write_trial
 from finssim.vehicles import load_vehicle
 
 AXES = "surge,sway,heave,yaw"

@@ -15,15 +15,22 @@ from typing import Any
 
 import warp as wp
 
-from finssim.command_line import Experiment, run_script
-from finssim.engine import Simulator
-from finssim.engine.launch import default_threads
-from finssim.experiments.tables import Table
-from finssim.progress import Progress
-from finssim.provenance import provenance
-from finssim.system import peak_memory, processor_name
-from finssim.worlds import CameraBatch, SonarBatch, WorldBatch, load_device, load_world, poses_of
-from finssim.worlds.description import CameraDevice, SonarDevice
+from finssim.cli.command_line import Experiment, run_script
+from finssim.core.progress import Progress
+from finssim.core.provenance import provenance
+from finssim.core.system import peak_memory, processor_name
+from finssim.evaluation.tables import Table
+from finssim.extensions.perception import (
+    CameraBatch,
+    SonarBatch,
+    WorldBatch,
+    load_device,
+    load_world,
+    poses_of,
+)
+from finssim.extensions.perception.description import CameraDevice, SonarDevice
+from finssim.sim import Simulator
+from finssim.sim.launch import default_threads
 
 SIZES = (16, 32, 64, 128)
 """Edge lengths of the images [px]."""

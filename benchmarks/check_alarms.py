@@ -21,11 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.calibration.check import check_trials
-from finssim.calibration.programmes import Programme
-from finssim.calibration.synthetic import NoiseProfile, Recording, record, trials_of
-from finssim.calibration.trials.trial import TAU, Header, Trial
-from finssim.engine import Simulator
+from finssim.identification.programmes import Programme
+from finssim.identification.synthetic import NoiseProfile, Recording, record, trials_of
+from finssim.sim import Simulator
+from finssim.trials.check import check_trials
+from finssim.trials.trial import TAU, Header, Trial
 from finssim.vehicles import Vehicle, load_vehicle
 
 VEHICLES = ("bluerov2", "bluerov2_einarsson", "bluerov2_heavy", "bluerov2_heavy_morgan", "finsrov", "lauv", "remus100",

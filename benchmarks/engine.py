@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from finssim.command_line import Experiment, run_script
-from finssim.engine import Simulator
-from finssim.engine.launch import default_threads
-from finssim.engine.simulator import find_device
-from finssim.experiments.tables import Table
-from finssim.progress import Progress
-from finssim.provenance import provenance
-from finssim.system import peak_memory, processor_name
+from finssim.cli.command_line import Experiment, run_script
+from finssim.core.progress import Progress
+from finssim.core.provenance import provenance
+from finssim.core.system import peak_memory, processor_name
+from finssim.evaluation.tables import Table
+from finssim.sim import Simulator
+from finssim.sim.launch import default_threads
+from finssim.sim.simulator import find_device
 from finssim.tasks import Environment, StationKeeping
 
 SECONDS = 1.0

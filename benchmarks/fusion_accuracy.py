@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.geometry.rotations import wrap_angle
+from finssim.core.rotations import wrap_angle
 from finssim.localization.fusion.estimator import MODELS, Estimator
 from finssim.localization.fusion.fuse import fuse
 from finssim.localization.fusion.fuse_log import load_log
 from finssim.localization.fusion.fuse_settings import Settings
-from finssim.localization.pool import load_pool
+from finssim.localization.overhead_camera import load_pool
 from finssim.vehicles import load_vehicle
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))

@@ -27,8 +27,8 @@ from finssim.pool import draw_plant
 from finssim.pool.ardusub import ArduSub
 from finssim.pool.firmware import Sample
 from finssim.pool.virtual_pool import Faults
-from finssim.robot.link.mavlink import MavlinkLink
-from finssim.robot.link.water_linked import encode_velocity
+from finssim.robot.links.mavlink import MavlinkLink
+from finssim.robot.links.water_linked import encode_velocity
 from finssim.robot.messages import ThrusterCommand
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at

@@ -533,11 +533,11 @@ def _what_a_camera_saw(folder: Path) -> None:
     """A survey of points below the water, and a vehicle that swims in a circle."""
     import numpy as np
 
-    from finssim.geometry.optics import Interface, Lens, project
+    from finssim.core.optics import Interface, Lens, project
     from finssim.localization.camera_file import write_camera
     from finssim.localization.detection.detections import Detection, Frame, write_detections
     from finssim.localization.detection.families import tag_corners_b
-    from finssim.localization.pool import load_pool
+    from finssim.localization.overhead_camera import load_pool
     from finssim.vehicles import load_vehicle
 
     pool, rng = load_pool(folder / "pool.yaml"), np.random.default_rng(0)
@@ -723,13 +723,13 @@ def _work(connection: Any, scratch: Path) -> None:
 
 
 def _run(words: list[str]) -> int:
-    from finssim import boundary
-    from finssim.cli import app
+    from finssim.cli import boundary
+    from finssim.cli.commands import app
 
     if words[0] != PARAMETERS:
         return int(boundary.run(app, words))
-    from finssim.ros2.shim.arguments import read_parameters
-    from finssim.ros2.shim.exceptions import RosArgumentsError
+    from finssim.extensions.ros2.shim.arguments import read_parameters
+    from finssim.extensions.ros2.shim.exceptions import RosArgumentsError
 
     try:
         read_parameters(Path(words[1]), {})

@@ -28,14 +28,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.fit import Estimate, Fit
-from finssim.calibration.programmes import Programme, programmes
-from finssim.calibration.regression.passive import passive
-from finssim.calibration.regression.regress import regress
-from finssim.calibration.replay import replay
-from finssim.calibration.simulation.fit import fit_by_simulation
-from finssim.calibration.synthetic import Recording, record, simulate_programme, trials_of
-from finssim.calibration.trials.trial import Header, Trial
+from finssim.identification.fit import Estimate, Fit
+from finssim.identification.programmes import Programme, programmes
+from finssim.identification.regression.passive import passive
+from finssim.identification.regression.regress import regress
+from finssim.identification.replay import replay
+from finssim.identification.simulation.fit import fit_by_simulation
+from finssim.identification.synthetic import Recording, record, simulate_programme, trials_of
+from finssim.trials.trial import Header, Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.vehicle import moved_to_origin
 

@@ -14,8 +14,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from finssim.robot.link.clock import ClockMap
-from finssim.robot.link.frames import MCU, Decoder, crc16_modbus, encode_command, encode_telemetry
+from finssim.robot.links.clock import ClockMap
+from finssim.robot.links.frames import MCU, Decoder, crc16_modbus, encode_command, encode_telemetry
 from finssim.robot.messages import Telemetry, ThrusterCommand
 
 ROUNDS, EACH = 40, 1000

@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 
 from finssim.control.guidance import Station
-from finssim.experiments.metrics import T1_SETPOINTS, T1_START
-from finssim.geometry.rotations import quat_from_yaw
+from finssim.core.quiet import start_warp
+from finssim.core.rotations import quat_from_yaw
+from finssim.evaluation.metrics import T1_SETPOINTS, T1_START
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.camera import PoolCamera, camera_of
-from finssim.quiet import start_warp
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle

@@ -6,7 +6,7 @@ import time
 
 import warp as wp
 
-from finssim.geometry.mesh import parametric_hull
+from finssim.core.mesh import parametric_hull
 from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh, mesh_displacement, mesh_drag
 from finssim.physics.types import vec6
 

@@ -11,7 +11,7 @@ import time
 import cv2
 import numpy as np
 
-from finssim.geometry.optics import Camera, Interface, Lens, back_project, project, projection_jacobians
+from finssim.core.optics import Camera, Interface, Lens, back_project, project, projection_jacobians
 
 LENS = Lens(
     1280,

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.geometry.optics import Camera, Interface, Lens
+from finssim.core.optics import Camera, Interface, Lens
 from finssim.localization.detection.families import bitmap
-from finssim.sensors.overhead_camera import (
+from finssim.sim.overhead_camera import (
     Basin,
     OverheadCamera,
     Pose,

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 import finssim
-from finssim.quiet import start_warp
+from finssim.core.quiet import start_warp
 from finssim.tasks import Task, task_named
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "t1_in_torch.py"

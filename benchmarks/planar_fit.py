@@ -19,11 +19,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from finssim.geometry.optics import Camera, Interface, Lens, project
-from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
+from finssim.core.optics import Camera, Interface, Lens, project
+from finssim.core.rotations import quat_from_euler, quat_to_matrix
 from finssim.localization.detection.detections import Detection
 from finssim.localization.detection.families import tag_corners_b
-from finssim.localization.pool import Pool
+from finssim.localization.overhead_camera import Pool
 from finssim.localization.poses import Constraints
 from finssim.localization.poses.methods import METHODS
 from finssim.vehicles import load_vehicle

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
-from finssim.calibration.vision.pool_model import Settings
-from finssim.calibration.vision.survey import Observations
-from finssim.geometry.optics import Camera, Interface, Layer, Lens, project
-from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_from_yaw, quat_to_matrix
+from finssim.core.optics import Camera, Interface, Layer, Lens, project
+from finssim.core.rotations import matrix_to_quat, quat_from_rotvec, quat_from_yaw, quat_to_matrix
 from finssim.localization.detection.families import corners
+from finssim.survey.points import Observations
+from finssim.survey.pool_fit import PoolFit, calibrate_pool
+from finssim.survey.pool_model import Settings
 
 DISTORTION = (0.02944176, -0.05975546, 0.00088098, 0.00179148, 0.01256862)
 LENS = Lens(1280, 720, 540.9305, 540.9305, 682.2341, 348.6136, "plumb_bob", DISTORTION)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from finssim.command_line import Experiment, run_script
+from finssim.cli.command_line import Experiment, run_script
 from finssim.control.allocation import Allocator
-from finssim.engine import Simulator
-from finssim.experiments.tables import Table
-from finssim.provenance import provenance
+from finssim.core.provenance import provenance
+from finssim.evaluation.tables import Table
+from finssim.sim import Simulator
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 PUBLISHED = Path(__file__).parent / "published"

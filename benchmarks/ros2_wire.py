@@ -13,7 +13,7 @@ import numpy as np
 
 os.environ.setdefault("ROS_DOMAIN_ID", "77")
 
-from finssim.ros2.backend import activate
+from finssim.extensions.ros2.backend import activate
 
 activate()
 

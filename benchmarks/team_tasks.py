@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from finssim import make
-from finssim.files import atomic_write
+from finssim.core.files import atomic_write
 from finssim.tasks import TASKS
 
 ROUNDS, SECONDS = 5, 2.0

@@ -22,7 +22,7 @@ import numpy as np
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.plant import Plant
 from finssim.pool.plant_spec import Basin, Circulation, PlantSpec
-from finssim.robot.link.frames import encode_command
+from finssim.robot.links.frames import encode_command
 from finssim.robot.messages import ThrusterCommand
 from finssim.vehicles import load_vehicle
 

@@ -1,7 +1,7 @@
 """Push a vehicle forward and to the left for ten seconds, and read where it went."""
 
 from finssim.control.allocation import Allocator
-from finssim.engine import Simulator
+from finssim.sim import Simulator
 from finssim.vehicles import load_vehicle
 
 vehicle = load_vehicle("finsrov")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from finssim.engine import Simulator, Water
+from finssim.sim import Simulator, Water
 
 WORLDS = 1000
 rng = np.random.default_rng(seed=1)

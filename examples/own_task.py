@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from finssim.engine.state import State
+from finssim.sim.state import State
 from finssim.tasks import Environment, ObservationPart, Task
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.check import check_task

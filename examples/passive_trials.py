@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.calibration.fit import Curve
-from finssim.calibration.regression.passive import passive
-from finssim.calibration.trials.trial import Header, Trial
+from finssim.identification.fit import Curve
+from finssim.identification.regression.passive import passive
+from finssim.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 
 MOCAP = ("", "x", "y", "z", "qx", "qy", "qz", "qw")

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 import finssim
+from finssim.agents.agents import baseline
 from finssim.tasks import ObservationPart
-from finssim.tasks.agents import baseline
 from finssim.tasks.station_keeping import OBSERVATION, Reward
 from finssim.tasks.torch_rotations import (
     about_axis,

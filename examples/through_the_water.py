@@ -14,8 +14,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.geometry.optics import Camera, Interface, Lens
-from finssim.geometry.rotations import (
+from finssim.core.optics import Camera, Interface, Lens
+from finssim.core.quiet import start_warp
+from finssim.core.rotations import (
     matrix_to_quat,
     quat_from_euler,
     quat_multiply,
@@ -27,10 +28,9 @@ from finssim.localization.detection.families import bitmap, tag_corners_b
 from finssim.localization.fusion.estimator import Estimator
 from finssim.localization.fusion.fuse_settings import site_of
 from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
-from finssim.localization.pool import Pool
+from finssim.localization.overhead_camera import Pool
 from finssim.localization.poses.methods import METHODS, Constraints
-from finssim.quiet import start_warp
-from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
+from finssim.sim.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
 from finssim.vehicles import load_vehicle
 
 DURATION, PERIOD = 8.0, 24.0

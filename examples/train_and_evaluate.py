@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from finssim.experiments.evaluate import evaluate_controller
-from finssim.experiments.plants import load_plant
+from finssim.evaluation.evaluate import evaluate_controller
+from finssim.evaluation.plants import load_plant
 from finssim.learning.train import train
 
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 600_000

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from finssim.control.guidance import Station
+from finssim.core.quiet import start_warp
 from finssim.pool import VirtualPool, draw_plant, read_truth
 from finssim.pool.camera import PoolCamera, camera_of
-from finssim.quiet import start_warp
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime

@@ -10,16 +10,16 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from finssim.command_line import Experiment, run_script
-from finssim.experiments.campaign import check_choices, run_jobs, write_json
-from finssim.experiments.evaluate import Job, play
-from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
-from finssim.experiments.plants import Plant, load_plant
-from finssim.experiments.statistics import with_interval
-from finssim.experiments.tables import Columns, Table, cells
-from finssim.experiments.transfer import T1, controllers_of
-from finssim.progress import Progress
-from finssim.provenance import provenance
+from finssim.cli.command_line import Experiment, run_script
+from finssim.core.progress import Progress
+from finssim.core.provenance import provenance
+from finssim.evaluation.campaign import check_choices, run_jobs, write_json
+from finssim.evaluation.evaluate import Job, play
+from finssim.evaluation.figures import COLORS, clean, legend_below, new_figure, save_figure
+from finssim.evaluation.plants import Plant, load_plant
+from finssim.evaluation.statistics import with_interval
+from finssim.evaluation.tables import Columns, Table, cells
+from finssim.studies.transfer import T1, controllers_of
 from finssim.vehicles import load_vehicle
 
 TRAINING_SHARE = 0.3

@@ -25,18 +25,19 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.command_line import Experiment, run_script
-from finssim.experiments.campaign import check_choices, run_jobs, write_json
-from finssim.experiments.robot_trials import PoolJob, noise_seed
-from finssim.experiments.tables import Table
+from finssim.cli.command_line import Experiment, run_script
+from finssim.core.progress import Progress
+from finssim.core.provenance import provenance
+from finssim.core.quiet import start_warp
+from finssim.core.system import SEPARATE, interrupt
+from finssim.evaluation.campaign import check_choices, run_jobs, write_json
+from finssim.evaluation.robot_trials import PoolJob, noise_seed
+from finssim.evaluation.tables import Table
 from finssim.pool import TruthError, VirtualPool, read_truth
 from finssim.pool.firmware import Firmware
-from finssim.progress import Progress
-from finssim.provenance import provenance
-from finssim.quiet import start_warp
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import station_of
-from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
+from finssim.robot.links.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.messages import Delivery, Picture, Telemetry, ThrusterCommand
 from finssim.robot.perception import Perception
@@ -45,7 +46,6 @@ from finssim.robot.record_reader import Record, open_record
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import link_of
-from finssim.system import SEPARATE, interrupt
 from finssim.vehicles import load_vehicle
 
 __all__ = ["SCENARIOS", "Bench", "Fault", "Scenario", "fault_job", "faults_experiment", "tables_of"]

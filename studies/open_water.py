@@ -15,21 +15,21 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.command_line import Experiment, run_script
+from finssim.cli.command_line import Experiment, run_script
 from finssim.control.guidance import Station
 from finssim.control.trajectories import Trajectory
-from finssim.experiments.campaign import check_choices, write_json
-from finssim.experiments.robot_trials import RobotTrial, play_in_pool
-from finssim.experiments.tables import Columns, Table, cells
-from finssim.experiments.trials import interpolated
-from finssim.geometry.rotations import quat_yaw
+from finssim.core.progress import Progress
+from finssim.core.provenance import provenance
+from finssim.core.quiet import start_warp
+from finssim.core.rotations import quat_yaw
+from finssim.evaluation.campaign import check_choices, write_json
+from finssim.evaluation.robot_trials import RobotTrial, play_in_pool
+from finssim.evaluation.tables import Columns, Table, cells
+from finssim.evaluation.trials import interpolated
 from finssim.pool import read_truth
 from finssim.pool.draw_plant import positioning_of
 from finssim.pool.plant_spec import Severity
 from finssim.pool.run import make_plan
-from finssim.progress import Progress
-from finssim.provenance import provenance
-from finssim.quiet import start_warp
 from finssim.robot.perception import LET_IN_STD
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime

@@ -12,17 +12,17 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.command_line import Experiment, run_script
-from finssim.experiments.campaign import write_json
-from finssim.experiments.tables import Table
+from finssim.cli.command_line import Experiment, run_script
+from finssim.core.progress import Progress
+from finssim.core.provenance import provenance
+from finssim.core.system import peak_memory
+from finssim.evaluation.campaign import write_json
+from finssim.evaluation.tables import Table
 from finssim.pool.run import make_plan
-from finssim.progress import Progress
-from finssim.provenance import provenance
 from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
-from finssim.system import peak_memory
 from finssim.vehicles import load_vehicle
 
 Array = NDArray[np.float64]

@@ -10,13 +10,13 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from finssim.command_line import Experiment, run_script
+from finssim.cli.command_line import Experiment, run_script
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.campaign import keep_result, load_result
-from finssim.experiments.plants import load_plant
-from finssim.experiments.tables import Table, figure_text
-from finssim.experiments.trials import EpisodeError, follows, run_episodes, summarize_episodes
+from finssim.evaluation.campaign import keep_result, load_result
+from finssim.evaluation.plants import load_plant
+from finssim.evaluation.tables import Table, figure_text
+from finssim.evaluation.trials import EpisodeError, follows, run_episodes, summarize_episodes
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.draw_plant import site_of as plant_at

@@ -8,8 +8,8 @@ import sys
 import pytest
 import typer
 
-from finssim.boundary import run
-from finssim.files import OutputError
+from finssim.cli.boundary import run
+from finssim.core.files import OutputError
 
 
 class OurError(ValueError):

@@ -7,13 +7,13 @@ import zlib
 import numpy as np
 import pytest
 
-from finssim import budget
-from finssim.calibration.findings import CalibrationError
-from finssim.calibration.trials.trial_files import read_table
+from finssim.core import budget
+from finssim.core.mcap_files import CHUNK, MAGIC, _record_end
 from finssim.localization import LocalizationError
 from finssim.localization.detection.pictures import read_picture, write_picture
-from finssim.mcap_files import CHUNK, MAGIC, _record_end
 from finssim.robot.pictures import picture_of
+from finssim.trials.findings import CalibrationError
+from finssim.trials.trial_files import read_table
 
 
 def png_header(width, height):

@@ -11,8 +11,9 @@ import pytest
 import yaml
 from typer.main import get_command
 
-from finssim import __version__, boundary
-from finssim.cli import app
+from finssim import __version__
+from finssim.cli import boundary
+from finssim.cli.commands import app
 
 COMMANDS = [
     "demo",

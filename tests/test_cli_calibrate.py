@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from finssim import boundary
-from finssim.calibration.trials.trial_files import load_trials, write_trial
-from finssim.cli import app
-from finssim.engine.ranges_file import load_ranges
+from finssim.cli import boundary
+from finssim.cli.commands import app
+from finssim.sim.ranges_file import load_ranges
+from finssim.trials.trial_files import load_trials, write_trial
 from finssim.vehicles import load_vehicle
 
 PARAMETER = {"estimate", "ci95", "unit", "identifiable", "note"}
@@ -195,7 +195,7 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, tmp_path, monkeypa
 @pytest.mark.slow
 def test_an_interrupted_fit_leaves_the_best_so_far(capsys, tmp_path, monkeypatch, trials):
     """Ctrl-C while candidates are simulated: a whole vehicle that says so, and status 130."""
-    from finssim.calibration.simulation import fit as simulation_fit
+    from finssim.identification.simulation import fit as simulation_fit
 
     whole = simulation_fit.fit_by_simulation
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim import boundary
-from finssim.cli import app
-from finssim.geometry.optics import project
-from finssim.geometry.rotations import (
+from finssim.cli import boundary
+from finssim.cli.commands import app
+from finssim.core.optics import project
+from finssim.core.rotations import (
     matrix_to_quat,
     quat_conjugate,
     quat_multiply,
@@ -23,9 +23,9 @@ from finssim.geometry.rotations import (
 from finssim.localization.detection.detections import Detection, Frame, write_detections
 from finssim.localization.detection.families import bitmap, tag_corners_b
 from finssim.localization.detection.pictures import write_picture
-from finssim.localization.pool import load_pool, write_pool
+from finssim.localization.overhead_camera import load_pool, write_pool
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
-from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene
+from finssim.sim.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene
 from finssim.vehicles import load_vehicle
 from localization.fusion.known_streams import SITE, attitude, position, streams
 
@@ -305,7 +305,7 @@ def test_localize_does_not_interpolate_over_a_long_gap(files, tmp_path, capsys):
 
 def test_localize_uses_pool_and_vehicle(files, tmp_path):
     """Water 10 cm higher puts the vehicle elsewhere, and so does a tag mounted elsewhere."""
-    from finssim.calibration.vehicle_file import write_vehicle
+    from finssim.identification.vehicle_file import write_vehicle
     from finssim.vehicles import Provenance
 
     higher = tmp_path / "higher.yaml"

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from finssim import boundary
-from finssim.calibration.trials.trial_files import load_trials
-from finssim.cli import app
+from finssim.cli import boundary
+from finssim.cli.commands import app
+from finssim.trials.trial_files import load_trials
 from finssim.vehicles import load_vehicle
 
 

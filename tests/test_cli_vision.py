@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.vision.board_views import PHOTOGRAPHS
-from calibration.vision.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
-from calibration.vision.surveyed_pools import FLOOR, PLUMB_BOB, SOLID, overhead, survey
-from finssim import boundary
-from finssim.calibration.vehicle_file import write_vehicle
-from finssim.cli import app
-from finssim.geometry.optics import Interface, Layer
-from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
+from finssim.cli import boundary
+from finssim.cli.commands import app
+from finssim.core.optics import Interface, Layer
+from finssim.core.rotations import quat_from_euler, quat_to_matrix
+from finssim.identification.vehicle_file import write_vehicle
 from finssim.localization.camera_file import load_camera, write_camera
 from finssim.localization.detection.families import bitmap
 from finssim.localization.detection.pictures import read_picture, write_picture
-from finssim.localization.pool import load_pool, write_pool
-from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene
+from finssim.localization.overhead_camera import load_pool, write_pool
+from finssim.sim.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene
 from finssim.vehicles import Provenance, load_vehicle
+from survey.board_views import PHOTOGRAPHS
+from survey.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
+from survey.surveyed_pools import FLOOR, PLUMB_BOB, SOLID, overhead, survey
 
 PARAMETER = {"estimate", "ci95", "unit", "identifiable", "note"}
 

@@ -6,24 +6,26 @@ from pathlib import Path
 import pytest
 import yaml
 
-from finssim import experiments, vehicles, worlds
-from finssim.calibration.importers.assemble import read_map
-from finssim.calibration.trials.trial_files import read_header
-from finssim.calibration.vision.survey_file import load_survey_file
+from finssim import evaluation as experiments
+from finssim import vehicles
 from finssim.control.modes import action_mode, mode_from_dict
 from finssim.control.policy import read_description
 from finssim.control.trajectories import read_trajectory
-from finssim.engine.ranges_file import SHIPPED, load_ranges
-from finssim.experiments.plants import load_plant
-from finssim.experiments.sweep import load_sweep
+from finssim.evaluation.plants import load_plant
+from finssim.extensions import perception as worlds
+from finssim.extensions.perception.description import load_device, load_world
 from finssim.localization.camera_file import load_camera
-from finssim.localization.pool import load_pool
+from finssim.localization.overhead_camera import load_pool
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.plant_spec import load_plant_spec
 from finssim.robot.goals import station_of
+from finssim.sim.ranges_file import SHIPPED, load_ranges
+from finssim.studies.sweep import load_sweep
+from finssim.survey.survey_file import load_survey_file
 from finssim.tasks.sensing import load_sensing
+from finssim.trials.importers.assemble import read_map
+from finssim.trials.trial_files import read_header
 from finssim.vehicles import load_vehicle
-from finssim.worlds.description import load_device, load_world
 
 VEHICLES = Path(vehicles.__file__).parent / "catalogue"
 WORLDS = Path(worlds.__file__).parent

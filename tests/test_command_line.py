@@ -10,9 +10,9 @@ import pytest
 import typer
 from typer.main import get_command
 
-from finssim import boundary, command_line
-from finssim.cli import COMMANDS, SECTIONS, app
-from finssim.command_line import Experiment, command_app, read, run_script
+from finssim.cli import boundary, command_line
+from finssim.cli.command_line import Experiment, command_app, read, run_script
+from finssim.cli.commands import COMMANDS, SECTIONS, app
 
 SOURCE = '''
 from __future__ import annotations
@@ -153,7 +153,7 @@ def test_every_option_has_help():
         for name, below in getattr(command, "commands", {}).items():
             walk(below, [*words, name])
 
-    from finssim.cli import app
+    from finssim.cli.commands import app
 
     assert isinstance(app, typer.Typer)
     walk(get_command(app), [])

@@ -6,10 +6,10 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from finssim.calibration.fit import Estimate, Fit
-from finssim.calibration.trials.trial import Trial
-from finssim.engine import Simulator
-from finssim.experiments.evaluate import evaluation
+from finssim.evaluation.evaluate import evaluation
+from finssim.identification.fit import Estimate, Fit
+from finssim.sim import Simulator
+from finssim.trials.trial import Trial
 from finssim.vehicles import catalogue, load_vehicle
 
 FINSROV = load_vehicle("finsrov")

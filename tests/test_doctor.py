@@ -7,8 +7,8 @@ from importlib.util import find_spec
 
 import pytest
 
-from finssim import doctor
-from finssim.doctor import EXTRAS, examine
+from finssim.cli import doctor
+from finssim.cli.doctor import EXTRAS, examine
 
 
 def test_a_working_machine_is_called_healthy():

@@ -10,9 +10,9 @@ import sys
 
 import pytest
 
-from finssim import boundary
-from finssim.cli import app
-from finssim.files import (
+from finssim.cli import boundary
+from finssim.cli.commands import app
+from finssim.core.files import (
     OutputError,
     atomic_directory,
     atomic_write,
@@ -94,7 +94,7 @@ def test_a_full_disk_leaves_nothing(tmp_path):
     """A write past the limit on file sizes fails as on a full disk: one sentence, no file."""
     target = tmp_path / "big.bin"
     script = (
-        "import sys; from finssim.files import *\n"
+        "import sys; from finssim.core.files import *\n"
         "try:\n"
         "    with atomic_write(sys.argv[1]) as temporary: temporary.write_bytes(bytes(100_000))\n"
         "except OutputError as error: print(error)\n"
@@ -166,7 +166,7 @@ def test_only_an_earlier_output_is_replaced(tmp_path):
 def test_a_killed_run_leaves_no_target(tmp_path):
     """A process killed while it writes leaves the target's name free."""
     script = (
-        "import sys, time; from finssim.files import *\n"
+        "import sys, time; from finssim.core.files import *\n"
         "with atomic_write(sys.argv[1]) as temporary:\n"
         "    temporary.write_text('half'); print('writing', flush=True); time.sleep(60)\n"
     )

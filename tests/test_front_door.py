@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import finssim as fs
-from finssim.calibration.findings import CalibrationError
-from finssim.engine import SimulatorError
-from finssim.experiments.evaluate import EvaluationError
+from finssim.evaluation.evaluate import EvaluationError
+from finssim.sim import SimulatorError
+from finssim.trials.findings import CalibrationError
 from finssim.vehicles.part import VehicleError
 from reference.cases import EVERY_VEHICLE_AND_MODEL, load, random_states
 from reference.motion import acceleration as reference_acceleration
@@ -185,8 +185,8 @@ def test_what_is_no_table_is_refused():
 @pytest.mark.slow
 def test_a_study_from_trials_to_the_pool(capfd, tmp_path):
     """Every step takes what the step before returned; nothing is printed on standard output."""
-    from finssim.calibration.programmes import programmes
-    from finssim.calibration.synthetic import simulate_programme
+    from finssim.identification.programmes import programmes
+    from finssim.identification.synthetic import simulate_programme
 
     truth = fs.load_vehicle("finsrov").replace({"hydrodynamics.calibrated.linear_damping.5.5": 1.2})
     trials = simulate_programme(programmes(["yaw"], truth), truth, inputs=("rpm",))

@@ -10,19 +10,19 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from finssim.calibration.importers.dispatch import read_trials
-from finssim.calibration.vision.pool_fit import run
-from finssim.engine.ranges_file import load_ranges
-from finssim.experiments.plants import load_plant
-from finssim.experiments.sweep import load_sweep
-from finssim.geometry.optics import Interface
+from finssim.core.optics import Interface
+from finssim.evaluation.plants import load_plant
+from finssim.extensions.perception import load_world
 from finssim.localization.camera_file import write_camera
-from finssim.localization.pool import load_pool
+from finssim.localization.overhead_camera import load_pool
+from finssim.sim.ranges_file import load_ranges
+from finssim.studies.sweep import load_sweep
+from finssim.survey.pool_fit import run
 from finssim.tasks import TASKS
 from finssim.tasks.sensing import load_sensing
+from finssim.trials.importers.dispatch import read_trials
 from finssim.vehicles import VehicleError, load_vehicle
 from finssim.vehicles.check import check_vehicle
-from finssim.worlds import load_world
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -40,10 +40,10 @@ def blocks(page: Path, language: str) -> list[str]:
 )
 def test_python_on_a_page_runs(page, tmp_path, monkeypatch):
     """The Python blocks of a page run one after the other, as a reader would try them."""
-    (tmp_path / "page.py").write_text("\n".join(blocks(page, "python")), encoding="utf-8")
+    (tmp_path / "core/page.py").write_text("\n".join(blocks(page, "python")), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     with mock.patch.dict(TASKS):  # a page adds a task
-        runpy.run_path("page.py", run_name="__main__")
+        runpy.run_path("core/page.py", run_name="__main__")
 
 
 def test_the_vehicle_on_the_page_loads(tmp_path):
@@ -81,7 +81,7 @@ def test_the_pools_on_the_page_load(tmp_path):
 @pytest.mark.slow
 def test_the_survey_on_the_page_calibrates_a_pool(tmp_path, monkeypatch):
     """The survey file of the page, with a survey of the published pool in millimetres: the camera to 15 mm."""
-    from calibration.vision.surveyed_pools import FLOOR, PLUMB_BOB, overhead, survey
+    from survey.surveyed_pools import FLOOR, PLUMB_BOB, overhead, survey
 
     monkeypatch.chdir(tmp_path)
     (example,) = blocks(ROOT / "docs" / "reference" / "survey_file.md", "yaml")

@@ -3,9 +3,9 @@
 import sys
 import threading
 
-from finssim import progress
-from finssim.progress import progress_bar
-from finssim.system import announce
+from finssim.core import progress
+from finssim.core.progress import progress_bar
+from finssim.core.system import announce
 
 
 def test_a_file_gets_a_line_at_once_and_one_every_ten_seconds(capsys, monkeypatch):

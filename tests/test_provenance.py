@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 import finssim
-from finssim.provenance import provenance
+from finssim.core.provenance import provenance
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -36,14 +36,12 @@ def test_an_installed_copy_does_not_claim_another_project_s_revision(tmp_path):
     """A package installed inside someone else's repository reports no revision."""
     package = tmp_path / "site-packages" / "finssim"
     package.mkdir(parents=True)
-    for name in ("__init__.py", "provenance.py"):
+    for name in ("__init__.py", "core/provenance.py"):
         (package / name).write_text((ROOT / "src" / "finssim" / name).read_text())
     git = ["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b"]
     subprocess.run([*git, "init", "-q"], check=True)
     subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "x"], check=True)
-    script = (
-        "import sys; sys.path.insert(0, sys.argv[1]); from finssim.provenance import *; print(provenance())"
-    )
+    script = "import sys; sys.path.insert(0, sys.argv[1]); from finssim.core.provenance import *; print(provenance())"
     run = subprocess.run(
         [sys.executable, "-B", "-c", script, package.parent],
         capture_output=True,

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.slow
 
 SCRIPT = """
 import json
-from finssim.quiet import start_warp
+from finssim.core.quiet import start_warp
 start_warp()
 import numpy as np
 from finssim.control.allocation import Allocator

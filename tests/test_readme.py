@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from finssim import __version__, boundary
-from finssim.cli import app
+from finssim import __version__
+from finssim.cli import boundary
+from finssim.cli.commands import app
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -4,8 +4,8 @@ import time
 
 import pytest
 
-from finssim import realtime
-from finssim.robot.link.frames import LinkError
+from finssim.core import realtime
+from finssim.robot.links.frames import LinkError
 from finssim.robot.wiring import Wiring, connected
 from finssim.vehicles import load_vehicle
 

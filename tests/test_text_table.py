@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from finssim.text_table import read_text_table, text_table
+from finssim.core.text_table import read_text_table, text_table
 
 
 class Refused(ValueError):

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from finssim.cli import COMMANDS
+from finssim.cli.commands import COMMANDS
+from finssim.core.system import peak_memory, stop_signals
 from finssim.robot import teleop
-from finssim.system import peak_memory, stop_signals
 
 SHIM = Path(__file__).parent / "reference" / "as_windows.py"
 

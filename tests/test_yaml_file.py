@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from finssim.yaml_file import DEEPEST, json_value, read_json, read_mapping, yaml_text
+from finssim.core.yaml_file import DEEPEST, json_value, read_json, read_mapping, yaml_text
 
 BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)

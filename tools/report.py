@@ -10,10 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from finssim.command_line import run_script
-from finssim.experiments import transfer
-from finssim.experiments.tables import Table, figure_text, markdown_table
-from finssim.files import atomic_write
+from finssim.cli.command_line import run_script
+from finssim.core.files import atomic_write
+from finssim.evaluation.tables import Table, figure_text, markdown_table
+from finssim.studies import transfer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

@@ -13,9 +13,9 @@ import time
 os.environ["MAVLINK20"] = "1"  # before the import: the message has no form in MAVLink 1
 from pymavlink import mavutil
 
-from finssim.geometry.frames import TO_FOSSEN
-from finssim.robot.link.transports import host_port
-from finssim.robot.link.water_linked import DvlClient, decode_line
+from finssim.core.frames import TO_FOSSEN
+from finssim.robot.links.transports import host_port
+from finssim.robot.links.water_linked import DvlClient, decode_line
 
 SHORTEST, LONGEST = 0.05, 1.0
 """ArduSub's EKF drops what comes faster; a longer gap is a lost bottom, over which nobody knows the way [s]."""

@@ -14,12 +14,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from finssim.calibration.fit import Fit
-    from finssim.calibration.trials.trial import Trial
     from finssim.control.policy import Policy
-    from finssim.engine.model import acceleration
-    from finssim.engine.simulator import Simulator
+    from finssim.identification.fit import Fit
+    from finssim.sim.model import acceleration
+    from finssim.sim.simulator import Simulator
     from finssim.tasks.environment import Environment
+    from finssim.trials.trial import Trial
     from finssim.vehicles.loader import catalogue, load_vehicle
     from finssim.vehicles.vehicle import Vehicle
     from finssim.workflow import evaluate, identify, run_in_pool, train
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Fit": "finssim.calibration.fit",
+    "Fit": "finssim.identification.fit",
     "Policy": "finssim.control.policy",
-    "Simulator": "finssim.engine.simulator",
-    "Trial": "finssim.calibration.trials.trial",
+    "Simulator": "finssim.sim.simulator",
+    "Trial": "finssim.trials.trial",
     "Vehicle": "finssim.vehicles.vehicle",
-    "acceleration": "finssim.engine.model",
+    "acceleration": "finssim.sim.model",
     "catalogue": "finssim.vehicles.loader",
     "evaluate": "finssim.workflow",
     "identify": "finssim.workflow",

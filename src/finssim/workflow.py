@@ -12,15 +12,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from finssim.progress import progress_bar, silent
+from finssim.core.progress import progress_bar, silent
 from finssim.vehicles import Vehicle, load_vehicle
 
 if TYPE_CHECKING:
-    from finssim.calibration.fit import Fit
-    from finssim.calibration.trials.trial import Trial
     from finssim.control.policy import Policy
-    from finssim.experiments.evaluate import Evaluations
+    from finssim.evaluation.evaluate import Evaluations
+    from finssim.identification.fit import Fit
     from finssim.tasks import Task
+    from finssim.trials.trial import Trial
 
 __all__ = ["evaluate", "identify", "run_in_pool", "train"]
 
@@ -56,10 +56,10 @@ def identify(
         CalibrationError: No trial can be used, or an argument is not known.
         VehicleError: There is no such vehicle.
     """
-    from finssim.calibration.hydrodynamics import fit_hydrodynamics
-    from finssim.calibration.report import usable
-    from finssim.calibration.trials.trial import Trial
-    from finssim.calibration.trials.trial_files import load_trials
+    from finssim.identification.hydrodynamics import fit_hydrodynamics
+    from finssim.identification.report import usable
+    from finssim.trials.trial import Trial
+    from finssim.trials.trial_files import load_trials
 
     body = load_vehicle(vehicle)
     given = [trials] if isinstance(trials, Trial | str | Path) else list(trials)
@@ -165,7 +165,7 @@ def evaluate(
             number of episodes.
         seed: Seed of every random number.
         progress: Whether progress is shown on standard error.
-        options: Further arguments of `finssim.experiments.evaluate.evaluate`.
+        options: Further arguments of `finssim.evaluation.evaluate.evaluate`.
 
     Returns:
         The result: `table`, `metrics`, `plot()`, and `each` with the trials of every plant.
@@ -174,7 +174,7 @@ def evaluate(
         EvaluationError, PolicyError, ControlError, PlantError, VehicleError: As they say.
     """
     from finssim.control.policy import Policy
-    from finssim.experiments.evaluate import evaluate_in_plants
+    from finssim.evaluation.evaluate import evaluate_in_plants
 
     named: Any = vehicle
     if isinstance(controller, Policy) and vehicle is None:
@@ -229,8 +229,8 @@ def run_in_pool(
         PolicyError, ControlError, PlantSpecError, VehicleError: As they say.
     """
     from finssim.control.policy import Policy
-    from finssim.experiments.evaluate import FORMS, EvaluationError, Evaluations, evaluation
-    from finssim.experiments.robot_trials import Job, play_trial
+    from finssim.evaluation.evaluate import FORMS, EvaluationError, Evaluations, evaluation
+    from finssim.evaluation.robot_trials import Job, play_trial
     from finssim.robot.pilots import make_pilot
 
     if task not in FORMS:
@@ -262,7 +262,7 @@ def _vehicle_of(policy: Policy) -> Vehicle:
     Raises:
         EvaluationError: The policy was trained for another vehicle.
     """
-    from finssim.experiments.evaluate import EvaluationError
+    from finssim.evaluation.evaluate import EvaluationError
     from finssim.vehicles import catalogue
 
     if isinstance(policy.vehicle, Vehicle):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
-from finssim.calibration.trials.trial import Trial
+from finssim.trials.trial import Trial
 
 RPM = math.pi / 30.0
 FINE = 2000.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.bench.curves import fit_esc
-from finssim.calibration.findings import CalibrationError
+from finssim.trials.findings import CalibrationError
 from finssim.vehicles import Esc, load_vehicle
 
 RANGE = (1100.0, 1500.0, 1900.0)

@@ -6,10 +6,10 @@ import pytest
 from bench.made_steps import RPM, held, lagged, sampled, step_log
 from finssim.bench.levels import find_steps, levels
 from finssim.bench.motor import cut_steps, fit_motor, fit_response
-from finssim.calibration.findings import CalibrationError
-from finssim.calibration.programmes import programmes
-from finssim.calibration.synthetic import simulate_programme
-from finssim.calibration.trials.trial import Header, Trial
+from finssim.identification.programmes import programmes
+from finssim.identification.synthetic import simulate_programme
+from finssim.trials.findings import CalibrationError
+from finssim.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

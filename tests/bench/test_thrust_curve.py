@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from finssim.bench.curves import dead_zone, fit_side
 from finssim.bench.tables import read_table
 from finssim.bench.thruster import fit_thruster
-from finssim.calibration.findings import CalibrationError
+from finssim.trials.findings import CalibrationError
 from finssim.vehicles import check_vehicle, load_vehicle
 
 T200 = Path(__file__).parents[1] / "data" / "t200"

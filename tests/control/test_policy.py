@@ -16,8 +16,8 @@ import pytest
 import yaml
 from onnx import TensorProto, helper, numpy_helper
 
-from finssim import boundary
-from finssim.cli import app
+from finssim.cli import boundary
+from finssim.cli.commands import app
 from finssim.control.policy import Policy, PolicyError
 from reference.policies import seeing
 

@@ -14,7 +14,7 @@ from finssim.control.trajectories import (
     load_trajectory,
     polyline,
 )
-from finssim.geometry.rotations import quat_from_yaw
+from finssim.core.rotations import quat_from_yaw
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

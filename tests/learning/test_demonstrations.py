@@ -6,11 +6,11 @@ import minari
 import numpy as np
 import pytest
 
-from finssim import boundary
-from finssim.cli import app
+from finssim.agents.agents import AgentError, expert_for
+from finssim.cli import boundary
+from finssim.cli.commands import app
 from finssim.learning.demonstrations import DatasetError, about, collect, load, record_episodes, save
 from finssim.tasks import Environment, make, task_named
-from finssim.tasks.agents import AgentError, expert_for
 from finssim.vehicles import load_vehicle
 
 SHORT = {"time_limit": 1.0}

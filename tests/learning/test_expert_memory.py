@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from finssim.agents.agents import BASELINES, baseline, memory_from, memory_leaves
 from finssim.learning.resume import read_state, write_state
 from finssim.tasks import TASKS, make
-from finssim.tasks.agents import BASELINES, baseline, memory_from, memory_leaves
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ import yaml
 from torch import nn
 
 import finssim
+from finssim.agents.agents import agent_for
 from finssim.control.policy import (
     ObservationEntry,
     ObservationSchema,
@@ -23,11 +24,10 @@ from finssim.control.policy import (
     PolicyError,
     VehicleIdentity,
 )
-from finssim.files import OutputError
+from finssim.core.files import OutputError
 from finssim.learning.export import ExportError, export_policy, save_policy
 from finssim.learning.torch_networks import ACTIVATIONS
 from finssim.tasks import task_named
-from finssim.tasks.agents import agent_for
 from finssim.vehicles import load_vehicle
 
 

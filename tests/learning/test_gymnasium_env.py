@@ -11,9 +11,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
+from finssim.extensions.perception.docking import CameraDocking
 from finssim.learning.gymnasium_env import Env, VectorEnv
 from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping
-from finssim.tasks.docking import CameraDocking
 
 SHORT = StationKeeping(time_limit=0.5)
 ALONE = [name for name, kind in TASKS.items() if len(kind.agents) == 1]

@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from finssim import boundary
-from finssim.cli import app
+from finssim.cli import boundary
+from finssim.cli.commands import app
 from finssim.learning import lerobot
 from finssim.learning.demonstrations import DatasetError, Episode, collect, load, save
 from finssim.learning.lerobot import export_lerobot

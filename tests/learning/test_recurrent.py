@@ -10,6 +10,7 @@ import yaml
 from torch import nn
 
 import finssim
+from finssim.agents.agents import NOWHERE, agent_for, expert_for, known_in, restarted
 from finssim.control.guidance import Known, Station
 from finssim.control.modes import action_mode
 from finssim.control.policy import Policy, PolicyError
@@ -20,7 +21,6 @@ from finssim.learning.torch_networks import plain_network
 from finssim.robot.pilots import make_pilot
 from finssim.robot.reading import Reading
 from finssim.tasks import StationKeeping
-from finssim.tasks.agents import NOWHERE, agent_for, expert_for, known_in, restarted
 from finssim.tasks.observer import Observer
 from reference.policies import FINSROV, written
 

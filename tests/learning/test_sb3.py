@@ -7,12 +7,12 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import VecCheckNan
 
-from finssim.engine import Pool
+from finssim.extensions.perception.docking import CameraDocking
+from finssim.extensions.perception.net import Net
 from finssim.learning.gymnasium_env import Env
 from finssim.learning.sb3 import Sb3VecEnv
+from finssim.sim import Pool
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, StationKeeping
-from finssim.tasks.docking import CameraDocking
-from finssim.tasks.net import Net
 from reference.pair import Pair
 
 SHORT = StationKeeping(time_limit=0.5)

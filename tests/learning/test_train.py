@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 import yaml
 
+from finssim.agents.agents import AgentError
 from finssim.control.modes import action_mode
 from finssim.control.policy import Policy
-from finssim.engine.ranges_file import RangesError
-from finssim.experiments.evaluate import evaluate_controller
-from finssim.experiments.plants import load_plant
-from finssim.files import OutputError
+from finssim.core.files import OutputError
+from finssim.evaluation.evaluate import evaluate_controller
+from finssim.evaluation.plants import load_plant
 from finssim.learning import episodes
 from finssim.learning.export import onnx_bytes
 from finssim.learning.learners import LEARNERS, LearningError
 from finssim.learning.resume import ResumeError, read_state, write_state
 from finssim.learning.train import TrainingError, train
 from finssim.learning.training_loop import Loop
+from finssim.sim.ranges_file import RangesError
 from finssim.tasks import EnvironmentSetupError, StationKeeping, Task, TrajectoryTracking
-from finssim.tasks.agents import AgentError
 from finssim.vehicles import VehicleError, load_vehicle
 from reference.guess import Guess
 

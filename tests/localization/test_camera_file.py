@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from finssim.geometry.optics import Lens
+from finssim.core.optics import Lens
 from finssim.localization import LocalizationError
 from finssim.localization.camera_file import load_camera, write_camera
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.geometry.rotations import quat_from_euler, wrap_angle
+from finssim.core.rotations import quat_from_euler, wrap_angle
 from finssim.localization import LocalizationError, localize
 from finssim.localization.detection.detections import Frame, write_detections
 from finssim.localization.detection.families import printable
 from finssim.localization.localize import prior_sources
-from finssim.localization.pool import write_pool
+from finssim.localization.overhead_camera import write_pool
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.vehicles import load_vehicle
 from localization.poses.seen_vehicle import POOLS, TAGS, rotation, seen

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.geometry.optics import Camera, Interface, Lens, back_project, project
+from finssim.core.optics import Camera, Interface, Lens, back_project, project
 from finssim.localization import LocalizationError
+from finssim.localization.overhead_camera import Pool, write_pool
 from finssim.localization.points import run_backproject, run_project
-from finssim.localization.pool import Pool, write_pool
 
 LENS = Lens(1280, 720, 540.9, 540.9, 652.2, 348.6, distortion=(0.029, -0.060, 0.0009, 0.0018, 0.0126))
 CAMERA = Camera(LENS, (0.03, -0.17, 2.17), (1.0, 0.0, 0.0, 0.0))  # looks straight down

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from finssim.engine import Pool, SurroundingsError
 from finssim.physics.contact import contact_wrench, wall_force
 from finssim.physics.types import vec6
+from finssim.sim import Pool, SurroundingsError
 from reference.body import rotation
 from reference.cases import random_attitudes
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.engine import Simulator
 from finssim.physics.terms.composed import composed, layout, parameter_row
 from finssim.physics.types import mat66, vec6
+from finssim.sim import Simulator
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.terms import TERMS, find_term, term_names
 from reference.examples import example

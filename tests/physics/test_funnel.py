@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.engine import Dock, SurroundingsError
 from finssim.physics.funnel import HULL_POINTS, Funnel, funnel_depth, hull_point
+from finssim.sim import Dock, SurroundingsError
 from reference.dock import depth_in, hull_points, section
 
 DOCK = Dock(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import finssim
-from finssim.geometry.mesh import MeshError, load_stl, mesh_volume, parametric_hull
+from finssim.core.mesh import MeshError, load_stl, mesh_volume, parametric_hull
 from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh, mesh_displacement, mesh_drag
 from finssim.physics.types import vec6
 

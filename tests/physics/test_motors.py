@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.engine import Simulator
 from finssim.physics.motors import admissible, first_order, speed_of_thrust, thrust_of_speed
 from finssim.physics.types import vec8
+from finssim.sim import Simulator
 
 wp.set_module_options({"enable_backward": False})
 N = 1000

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.calibration.vehicle_file import write_vehicle
-from finssim.engine import Simulator
-from finssim.engine.ranges_file import RangesError, load_ranges
+from finssim.identification.vehicle_file import write_vehicle
 from finssim.physics.terms import Term, add_term
 from finssim.physics.terms.composed import TermError, composed
 from finssim.physics.types import vec6
+from finssim.sim import Simulator
+from finssim.sim.ranges_file import RangesError, load_ranges
 from finssim.vehicles import VehicleError, check_vehicle, load_vehicle
 from finssim.vehicles.terms import TERMS
 from reference.draws import column, draw
@@ -198,7 +198,7 @@ def test_its_parameters_are_drawn_by_name(winged, tmp_path):
 
 def test_ranges_of_a_record_read_back(tmp_path):
     """What a training keeps of its ranges names the same entries again."""
-    from finssim.engine.ranges_file import Ranges
+    from finssim.sim.ranges_file import Ranges
 
     (tmp_path / "ranges.yaml").write_text(RANGES + "surge_damping: [0.9, 1.1]\n", encoding="utf-8")
     kept = load_ranges(tmp_path / "ranges.yaml").model_dump(mode="json")
@@ -260,8 +260,8 @@ def test_a_term_that_cannot_be_is_refused():
 @pytest.fixture(scope="module")
 def trials():
     """A multisine on surge and heave together of the vehicle with the wing, with noise of its sensors."""
-    from finssim.calibration.programmes import programmes
-    from finssim.calibration.synthetic import simulate_programme
+    from finssim.identification.programmes import programmes
+    from finssim.identification.synthetic import simulate_programme
 
     vehicle = load_vehicle("bluerov2").replace(
         {"hydrodynamics.calibrated.wing": {"lift": 40.0, "moment": 1.5}}
@@ -277,8 +277,8 @@ def believed(lift):
 @pytest.mark.slow
 def test_a_calibration_estimates_its_parameter(trials, tmp_path):
     """40 N s²/m² from trials of a vehicle whose file says 0: within the interval, which is narrower than a tenth."""
-    from finssim.calibration.simulation.fit import fit_by_simulation
-    from finssim.calibration.vehicle_file import calibrated, write_ranges
+    from finssim.identification.simulation.fit import fit_by_simulation
+    from finssim.identification.vehicle_file import calibrated, write_ranges
 
     fit = fit_by_simulation(trials, believed(0.0), axes=("surge", "heave"), estimate=("wing.lift",))
     found = fit.estimates["wing.lift"]
@@ -296,7 +296,7 @@ def test_a_calibration_estimates_its_parameter(trials, tmp_path):
 @pytest.mark.slow
 def test_a_known_wing_does_not_bias_what_is_fitted(trials):
     """The damping of heave from trials with a wing: as the file has it where the file has the wing, not without."""
-    from finssim.calibration.regression.regress import regress
+    from finssim.identification.regression.regress import regress
 
     vehicle = believed(40.0)
     chosen = vehicle.hydrodynamics["calibrated"]
@@ -308,8 +308,8 @@ def test_a_known_wing_does_not_bias_what_is_fitted(trials):
 
 @pytest.mark.slow
 def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials):
-    from finssim.calibration.findings import CalibrationError
-    from finssim.calibration.simulation.fit import fit_by_simulation
+    from finssim.identification.simulation.fit import fit_by_simulation
+    from finssim.trials.findings import CalibrationError
 
     for vehicle, name in ((load_vehicle("bluerov2"), "wing.lift"), (believed(1.0), "wing.lft")):
         with pytest.raises(CalibrationError, match=f"cannot estimate '{name}'"):

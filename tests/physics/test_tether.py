@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 from scipy.integrate import quad_vec
 
-from finssim.engine import SurroundingsError, TetherLine
 from finssim.physics.tether import tether_wrench
 from finssim.physics.types import vec6
+from finssim.sim import SurroundingsError, TetherLine
 from reference.body import rotation
 from reference.cases import random_attitudes
 

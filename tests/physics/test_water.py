@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.engine import SurroundingsError, Water, Wave
 from finssim.physics.water import Flow, WaterArrays, advance_drift, dispersion, flow_at, wave_number
+from finssim.sim import SurroundingsError, Water, Wave
 from reference.water import flow
 
 wp.set_module_options({"enable_backward": False})

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from finssim.geometry.rotations import quat_from_euler, quat_to_euler
+from finssim.core.rotations import quat_from_euler, quat_to_euler
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.ardusub import ALT_HOLD, MANUAL, STABILIZE, SURFACE
 from finssim.pool.firmware import AttitudeFilter
-from finssim.robot.link.water_linked import decode_line
+from finssim.robot.links.water_linked import decode_line
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import with_navigation
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim import boundary
-from finssim.cli import app
-from finssim.engine import Pool, Simulator, Water
+from finssim.cli import boundary
+from finssim.cli.commands import app
 from finssim.pool.ardusub_sitl import GRAVITY, Pulses, SitlServer, SitlWorld, decode_pulses
 from finssim.pool.plant_spec import Battery
-from finssim.robot.link.frames import LinkError
-from finssim.robot.link.water_linked import DvlClient, DvlServer, decode_line, encode_velocity
+from finssim.robot.links.frames import LinkError
+from finssim.robot.links.water_linked import DvlClient, DvlServer, decode_line, encode_velocity
+from finssim.sim import Pool, Simulator, Water
 from finssim.vehicles import load_vehicle
 
 HEAVY = load_vehicle("bluerov2_heavy")

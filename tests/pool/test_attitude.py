@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate, quat_to_euler
+from finssim.core.rotations import quat_from_euler, quat_inverse_rotate, quat_to_euler
 from finssim.pool.firmware import AttitudeFilter
 
 UP = (0.0, 0.0, 9.81)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.geometry.rotations import quat_from_euler
+from finssim.core.rotations import quat_from_euler
 from finssim.localization.detection.detector import detector
 from finssim.pool.camera import CameraSettings, PoolCamera, camera_of
 from finssim.pool.plant_spec import PlantSpecError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.pool.virtual_pool import NUMBERS, FaultError, Faults
-from finssim.robot.link.frames import TELEMETRY, Decoder, encode_telemetry, forms
+from finssim.robot.links.frames import TELEMETRY, Decoder, encode_telemetry, forms
 from finssim.robot.messages import Telemetry
 
 ZERO = Telemetry(1, 10, (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0, 0.0, 9.8), 0.5, 1.0e5, 0, (0.0,) * 8)

@@ -6,7 +6,7 @@ import pytest
 from finssim.pool import draw_plant
 from finssim.pool.firmware import Firmware, Sample
 from finssim.pool.plant import RPM
-from finssim.robot.link.frames import (
+from finssim.robot.links.frames import (
     HOST,
     Decoder,
     RejectFlag,

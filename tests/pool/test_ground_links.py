@@ -11,8 +11,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.fleet import Fleet
 from finssim.pool.run import GroundLinks, serve_realtime, whole_frames
-from finssim.robot.link.frames import LinkError
-from finssim.robot.link.water_linked import DvlClient, decode_line
+from finssim.robot.links.frames import LinkError
+from finssim.robot.links.water_linked import DvlClient, decode_line
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import with_navigation
 

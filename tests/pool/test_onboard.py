@@ -10,12 +10,12 @@ import pytest
 
 pytest.importorskip("newton", reason="finssim[perception] is not installed")
 
-from finssim.geometry.rotations import quat_from_yaw
+from finssim.core.rotations import quat_from_yaw
 from finssim.pool.onboard import OnboardSensors
 from finssim.pool.plant_spec import PlantSpecError
 from finssim.pool.run import LockstepServer, make_plan, run
 from finssim.robot.goals import station_of
-from finssim.robot.link.frames import encode_command
+from finssim.robot.links.frames import encode_command
 from finssim.robot.lockstep import LockstepClient
 from finssim.robot.messages import ThrusterCommand
 from finssim.vehicles import load_vehicle

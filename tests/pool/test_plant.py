@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from finssim.engine import Pool, Simulator
-from finssim.geometry.rotations import quat_to_matrix
+from finssim.core.rotations import quat_to_matrix
 from finssim.pool import draw_plant
 from finssim.pool.plant import Plant
 from finssim.pool.plant_spec import Basin, Battery, BuoyancyDrift, Circulation
+from finssim.sim import Pool, Simulator
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from finssim.geometry.optics import Camera, Interface, project
+from finssim.core.optics import Camera, Interface, project
 from finssim.pool.camera import RippledView, paper_lens
-from finssim.sensors.overhead_camera import Ripples
-from finssim.sensors.overhead_camera.surface import waves_of
+from finssim.sim.overhead_camera import Ripples
+from finssim.sim.overhead_camera.surface import waves_of
 
 RANDOM = np.random.default_rng(2)
 CAMERA = Camera(paper_lens(), [0.2, 0.1, 2.4], [1.0, 0.0, 0.0, 0.0])
@@ -36,7 +36,7 @@ def landing(view, pixels, ripples, z, time):
 
 
 def test_still_water_is_that_of_the_optics():
-    """Without ripples the pixels are those of `geometry.optics.project`, to 1e-4 px."""
+    """Without ripples the pixels are those of `core.optics.project`, to 1e-4 px."""
     pixels, ok = RippledView(CAMERA, WATER).pixels(POINTS, 0.0)
     assert ok.all()
     assert np.abs(pixels - project(CAMERA, WATER, POINTS).pixels).max() < 1e-4

@@ -12,15 +12,15 @@ import time
 import numpy as np
 import pytest
 
-from finssim import realtime
-from finssim.localization.pool import load_pool
+from finssim.core import realtime
+from finssim.localization.overhead_camera import load_pool
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.fleet import Fleet
 from finssim.pool.run import LockstepServer, make_plan, serve_realtime
 from finssim.pool.virtual_pool import VirtualPool, read_truth
 from finssim.robot.goals import station_of
-from finssim.robot.link.frames import Decoder, LinkError
-from finssim.robot.link.transports import UdpTransport, memory_pair
+from finssim.robot.links.frames import Decoder, LinkError
+from finssim.robot.links.transports import UdpTransport, memory_pair
 from finssim.robot.lockstep import LockstepClient, LockstepError, encode_request
 from finssim.robot.messages import Telemetry
 from finssim.robot.pictures import UdpPictures
@@ -325,8 +325,8 @@ def test_the_command_draws_pictures():
 )
 def test_the_command_refuses_in_one_sentence(capsys, tmp_path, monkeypatch, words, sentence):
     """A wrong option ends it with status 2 and a line that names it."""
-    from finssim import boundary
-    from finssim.cli import app
+    from finssim.cli import boundary
+    from finssim.cli.commands import app
 
     monkeypatch.chdir(tmp_path)
     assert boundary.run(app, ["pool", *words]) == 2
@@ -335,8 +335,8 @@ def test_the_command_refuses_in_one_sentence(capsys, tmp_path, monkeypatch, word
 
 def test_a_pool_that_finds_its_port_taken_leaves_the_files_of_the_other_alone(tmp_path, capsys):
     """Pool file and truth are written only when every wire is open."""
-    from finssim import boundary
-    from finssim.cli import app
+    from finssim.cli import boundary
+    from finssim.cli.commands import app
 
     files = tmp_path / "pool.yaml", tmp_path / "truth.fst"
     for file in files:

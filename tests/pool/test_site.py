@@ -5,8 +5,8 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from finssim.geometry.optics import Status, project
-from finssim.localization.pool import load_pool, write_pool
+from finssim.core.optics import Status, project
+from finssim.localization.overhead_camera import load_pool, write_pool
 from finssim.pool.camera import CameraSettings, camera_of, true_site
 from finssim.pool.plant_spec import Basin, PlantSpecError
 from finssim.vehicles import load_vehicle

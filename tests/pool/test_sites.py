@@ -11,7 +11,7 @@ from finssim.pool.plant_spec import PlantSpec, PlantSpecError
 from finssim.pool.positioning import POSITIONING, Positioning
 from finssim.pool.run import make_plan
 from finssim.pool.virtual_pool import VirtualPool
-from finssim.robot.link.frames import Decoder
+from finssim.robot.links.frames import Decoder
 from finssim.robot.messages import HEADING, POSE, POSITION, VELOCITY, NavigationAid
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import SITES, vehicle_at

@@ -10,8 +10,8 @@ import time
 import numpy as np
 import pytest
 
-from finssim import boundary
-from finssim.cli import app
+from finssim.cli import boundary
+from finssim.cli.commands import app
 from finssim.control.guidance import Station, Track
 from finssim.pool.fleet import Medium, one_picture
 from finssim.pool.run import MediumServer, swimming

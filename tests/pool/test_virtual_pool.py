@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
+from finssim.core.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import VirtualPool, draw_plant, read_truth
 from finssim.pool.plant import RPM
 from finssim.pool.plant_spec import Instruments
 from finssim.pool.virtual_pool import PoolClockError
-from finssim.robot.link.frames import Decoder, encode_command
+from finssim.robot.links.frames import Decoder, encode_command
 from finssim.robot.messages import ThrusterCommand
 from finssim.vehicles import load_vehicle
 

@@ -24,7 +24,9 @@ for home, names in ((signal, SIGNALS), (os, FUNCTIONS)):
 warnings.filterwarnings("error", category=EncodingWarning, module=r"finssim\.")
 
 if __name__ == "__main__":
-    from finssim import boundary, cli, system
+    from finssim.cli import boundary
+    from finssim.cli import commands as cli
+    from finssim.core import system
 
     system.replace_unwritable(sys.stdout, sys.stderr)
     statuses = []

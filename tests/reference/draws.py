@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from finssim.engine import Simulator
-from finssim.engine.packed import Packed
-from finssim.engine.randomize import Draws, Randomization
-from finssim.engine.ranges_file import Ranges
+from finssim.sim import Simulator
+from finssim.sim.packed import Packed
+from finssim.sim.randomize import Draws, Randomization
+from finssim.sim.ranges_file import Ranges
 
 
 def draw(

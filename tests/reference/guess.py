@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from finssim.engine.state import State
+from finssim.sim.state import State
 from finssim.tasks import ObservationPart, Task
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.terms import End, RewardTerm, Terms, place_at_rest

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from finssim.control.guidance import Goal
-from finssim.geometry.frames import FROM_CONTROLLER
-from finssim.geometry.rotations import quat_from_yaw, quat_to_euler, quat_yaw, wrap_angle
+from finssim.core.frames import FROM_CONTROLLER
+from finssim.core.rotations import quat_from_yaw, quat_to_euler, quat_yaw, wrap_angle
 
 SETPOINTS = np.array(
     [

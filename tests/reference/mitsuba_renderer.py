@@ -15,12 +15,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.geometry.rotations import quat_to_matrix
-from finssim.sensors.batch import SensorError
-from finssim.sensors.overhead_camera import Pose, Rectangle, Scene, TagInScene
-from finssim.sensors.overhead_camera.photometry import digitise, noise_key
-from finssim.sensors.overhead_camera.scene import SurfaceFrame, surface_frame
-from finssim.sensors.overhead_camera.surface import waves_of
+from finssim.core.rotations import quat_to_matrix
+from finssim.sim.overhead_camera import Pose, Rectangle, Scene, TagInScene
+from finssim.sim.overhead_camera.photometry import digitise, noise_key
+from finssim.sim.overhead_camera.scene import SurfaceFrame, surface_frame
+from finssim.sim.overhead_camera.surface import waves_of
+from finssim.sim.sensors.batch import SensorError
 
 __all__ = ["radiance_by_mitsuba", "render_with_mitsuba"]
 

@@ -133,7 +133,7 @@ def acceleration(n, model, position, q, nu, tau, water=None, t=0.0, thrust=None)
         q: xyzw (N, 4).
         nu: (N, 6).
         tau: Other wrenches about the body origin, body frame (N, 6).
-        water: `finssim.engine.Water` without drift; still if None.
+        water: `finssim.sim.Water` without drift; still if None.
         t: Time [s].
         thrust: Wrench of the thrusters (N, 6), which fades with the part of the volume that is out of the water.
 

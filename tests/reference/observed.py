@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from finssim.geometry.rotations import quat_from_yaw
+from finssim.core.rotations import quat_from_yaw
 
 
 def published_t1(measured, guide, t=0.0):

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from finssim.engine.state import State
+from finssim.sim.state import State
 from finssim.tasks import ObservationPart, Task
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.terms import End, RewardTerm, Terms, place_at_rest, uniform3

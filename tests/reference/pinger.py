@@ -3,8 +3,8 @@
 
 import warp as wp
 
-from finssim.sensors.batch import SensorBatch
-from finssim.sensors.sampling import WHITE, Truth, normal, parameters_of, sampling_kernel
+from finssim.sim.sensors.batch import SensorBatch
+from finssim.sim.sensors.sampling import WHITE, Truth, normal, parameters_of, sampling_kernel
 from finssim.vehicles.equipment import Sensor
 from finssim.vehicles.part import NonNegative
 

@@ -5,13 +5,13 @@ import threading
 from contextlib import contextmanager
 from dataclasses import replace
 
-from finssim.geometry.rotations import quat_from_yaw
-from finssim.localization.pool import write_pool
+from finssim.core.quiet import start_warp
+from finssim.core.rotations import quat_from_yaw
+from finssim.localization.overhead_camera import write_pool
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
 from finssim.pool.run import LockstepServer
 from finssim.pool.virtual_pool import VirtualPool
-from finssim.quiet import start_warp
 from finssim.robot.wiring import Wiring
 from finssim.vehicles.defaults import vehicle_at
 

@@ -6,8 +6,8 @@ MuJoCo's contacts are hard and its shapes are its own; only the geometry of the 
 import mujoco as mj
 import numpy as np
 
-from finssim.engine.solids import solid_shapes
-from finssim.geometry.frames import wxyz_from_xyzw
+from finssim.core.frames import wxyz_from_xyzw
+from finssim.sim.solids import solid_shapes
 
 SHELL = 1.0e-3
 """Half the thickness of a mesh [m]."""

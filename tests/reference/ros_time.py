@@ -3,13 +3,13 @@
 
 import time
 
-from finssim.ros2.backend import activate
+from finssim.extensions.ros2.backend import activate
 
 activate(announce=False)
 
 import rclpy
 
-from finssim.ros2.nodes.conversions import ros_type
+from finssim.extensions.ros2.nodes.conversions import ros_type
 
 PATIENCE = 120.0
 """Real time for one step, however busy the machine is [s]."""

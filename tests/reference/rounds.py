@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from finssim.geometry.optics import Camera, Interface, Lens, project
-from finssim.geometry.rotations import (
+from finssim.core.optics import Camera, Interface, Lens, project
+from finssim.core.rotations import (
     matrix_to_quat,
     quat_conjugate,
     quat_from_euler,
@@ -16,7 +16,7 @@ from finssim.geometry.rotations import (
     quat_to_matrix,
 )
 from finssim.localization.detection.families import tag_corners_b
-from finssim.localization.pool import Pool
+from finssim.localization.overhead_camera import Pool
 from finssim.robot.messages import Picture, TagCorners, Telemetry
 from finssim.vehicles import load_vehicle
 

@@ -4,7 +4,7 @@ import time
 
 from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
 from finssim.pool.virtual_pool import VirtualPool
-from finssim.robot.link.transports import UdpTransport
+from finssim.robot.links.transports import UdpTransport
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 

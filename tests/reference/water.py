@@ -17,7 +17,7 @@ class Flow:
 
 
 def flow(water, gravity, position, t):
-    """The flow of a `finssim.engine.Water` without drift, still above z = 0 as at z = 0.
+    """The flow of a `finssim.sim.Water` without drift, still above z = 0 as at z = 0.
 
     θ = k·x - ω t + φ0,  ∇φ = velocity,  ∂∇φ/∂t = acceleration,  η = A cos θ.
     """

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.robot.bridge import Bridge, BridgeError, BridgeSettings
-from finssim.robot.link.frames import StatusFlag
+from finssim.robot.links.frames import StatusFlag
 from finssim.vehicles import catalogue, load_vehicle
 from reference.bridge_rig import DT, Rig, echo, moves, quiet, reading, telemetry
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from finssim.control.guidance import Track
-from finssim.geometry.rotations import quat_from_yaw
+from finssim.core.rotations import quat_from_yaw
 from finssim.robot.goals import HeardGoal
 
 

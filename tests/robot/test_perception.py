@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.geometry.rotations import quat_from_yaw, quat_yaw
+from finssim.core.rotations import quat_from_yaw, quat_yaw
 from finssim.localization import LocalizationError
 from finssim.robot.messages import POSE, NavigationAid, Picture, TagCorners
 from finssim.robot.perception import Perception

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from finssim.pool.pictures import UdpSender
-from finssim.robot.link.frames import LinkError
+from finssim.robot.links.frames import LinkError
 from finssim.robot.messages import Picture, TagCorners
 from finssim.robot.pictures import (
     MOST_BYTES,

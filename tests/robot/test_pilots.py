@@ -8,14 +8,14 @@ import pytest
 import yaml
 from onnx import TensorProto, helper, numpy_helper
 
+from finssim.agents.controllers import controller
 from finssim.control import ControlError
 from finssim.control.allocation import Allocator
-from finssim.control.controllers import controller
 from finssim.control.guidance import Station, goal_at
 from finssim.control.modes import action_mode
 from finssim.control.policy import PolicyError
 from finssim.control.trajectories import through_points
-from finssim.geometry.rotations import quat_from_euler
+from finssim.core.rotations import quat_from_euler
 from finssim.robot.goals import GoalError, check_reachable, guide_of, station_of
 from finssim.robot.pilots import ModeSwitch, WrenchPilot, make_pilot
 from finssim.robot.reading import Reading

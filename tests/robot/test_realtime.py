@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from finssim.control.guidance import Station
-from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
-from finssim.robot.link.transports import memory_pair
+from finssim.robot.links.frames import MCU, Decoder, encode_telemetry
+from finssim.robot.links.transports import memory_pair
 from finssim.robot.messages import Picture
 from finssim.robot.pictures import TagFinder
 from finssim.robot.pilots import make_pilot

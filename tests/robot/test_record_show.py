@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from finssim import boundary
-from finssim.cli import app
+from finssim.cli import boundary
+from finssim.cli.commands import app
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")

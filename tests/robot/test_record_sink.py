@@ -81,7 +81,7 @@ def test_a_full_disk_stops_the_record_and_not_the_loop(tmp_path):
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_device_that_takes_nothing_is_refused_before_the_run(tmp_path):
     """A record at /dev/full would replace what exists."""
-    from finssim.files import OutputError
+    from finssim.core.files import OutputError
     from finssim.robot.recorder import Recorder
     from finssim.vehicles import load_vehicle
 

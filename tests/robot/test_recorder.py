@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import yaml
 
-from finssim.files import OutputError
-from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
+from finssim.core.files import OutputError
+from finssim.core.rotations import quat_from_euler, quat_to_matrix
 from finssim.robot.messages import (
     HEADING,
     POSE,

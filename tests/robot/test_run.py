@@ -7,11 +7,11 @@ import threading
 import numpy as np
 import pytest
 
-from finssim import boundary
-from finssim.cli import app
-from finssim.localization.pool import write_pool
+from finssim.cli import boundary
+from finssim.cli.commands import app
+from finssim.localization.overhead_camera import write_pool
 from finssim.pool import read_truth
-from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
+from finssim.robot.links.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import decode_request, encode_delivery, receive
 from finssim.robot.messages import Delivery
 from finssim.robot.record_reader import open_record

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from finssim.agents.agents import PidAgent
 from finssim.control import ControlError
 from finssim.control.guidance import Station
-from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
+from finssim.robot.links.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.messages import Delivery, Picture
 from finssim.robot.pilots import AgentPilot, make_pilot
 from finssim.robot.runtime import Runtime
-from finssim.tasks.agents import PidAgent
 from finssim.vehicles import load_vehicle
 from reference.rounds import Rounds, overhead, without_latency
 

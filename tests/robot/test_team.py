@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from finssim.control.guidance import Track
-from finssim.geometry.rotations import quat_from_euler
+from finssim.core.rotations import quat_from_euler
 from finssim.robot.reading import Reading
 from finssim.robot.team import Team, decode_track, encode_track
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.localization.pool import write_pool
+from finssim.localization.overhead_camera import write_pool
 from finssim.robot.interrupt import interruptible
-from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
-from finssim.robot.link.transports import memory_pair
+from finssim.robot.links.frames import MCU, Decoder, encode_telemetry
+from finssim.robot.links.transports import memory_pair
 from finssim.robot.messages import Telemetry
 from finssim.robot.teleop import Hands, drive
 from finssim.robot.wiring import Wiring, open_camera, run_realtime
@@ -184,8 +184,8 @@ def test_who_steers_is_on_record(world, tmp_path):
 )
 def test_what_would_do_nothing_or_lead_out_of_the_pool_is_refused(capsys, tmp_path, words, sentence):
     """Status 2 and a sentence, before a device or a wire is opened."""
-    from finssim import boundary
-    from finssim.cli import app
+    from finssim.cli import boundary
+    from finssim.cli.commands import app
 
     write_pool(overhead(), tmp_path / "pool.yaml")
     words = [str(tmp_path / "pool.yaml") if word == "POOL" else word for word in words]

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.experiments import evaluate
-from finssim.experiments.plants import Plant
-from finssim.tasks.agents import agent_for
+from finssim.agents.agents import agent_for
+from finssim.evaluation import evaluate
+from finssim.evaluation.plants import Plant
 from finssim.tasks.make import task_named
 from finssim.vehicles import load_vehicle
 from studies import anatomy as module

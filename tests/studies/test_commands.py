@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from finssim.command_line import read
+from finssim.cli.command_line import read
 from reference.programs import study
 
 ROOT = Path(__file__).resolve().parents[2]

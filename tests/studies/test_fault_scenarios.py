@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from finssim.core.quiet import start_warp
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.virtual_pool import VirtualPool
-from finssim.quiet import start_warp
-from finssim.robot.link.frames import Decoder, encode_command
+from finssim.robot.links.frames import Decoder, encode_command
 from finssim.robot.messages import ThrusterCommand
 from finssim.vehicles import load_vehicle
 from studies.faults import FaultyWire

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.engine.state import State
+from finssim.sim.state import State
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, ObservationPart
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.check import TaskError, check_task

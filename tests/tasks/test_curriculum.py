@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.engine.randomize import Randomization
-from finssim.engine.ranges_file import Ranges
-from finssim.experiments.plants import load_plant
+from finssim.evaluation.plants import load_plant
+from finssim.sim.randomize import Randomization
+from finssim.sim.ranges_file import Ranges
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
 from finssim.tasks.schedule import LOOK
 

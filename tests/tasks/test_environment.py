@@ -9,9 +9,9 @@ import pytest
 import warp as wp
 
 from finssim.control.modes import action_mode
-from finssim.engine.randomize import Randomization
-from finssim.engine.state import State
-from finssim.engine.surroundings import Pool
+from finssim.sim.randomize import Randomization
+from finssim.sim.site import Pool
+from finssim.sim.state import State
 from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, StationKeeping
 from finssim.tasks.terms import place_at_rest
 from reference.guess import Steady

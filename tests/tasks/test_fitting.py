@@ -7,12 +7,12 @@ import pytest
 from rich.console import Console
 
 from finssim import make
+from finssim.agents.pid import axis_model
 from finssim.control.modes import mode_from_dict
-from finssim.control.pid import axis_model
 from finssim.control.policy import Policy
-from finssim.engine import Pool
-from finssim.experiments.metrics import T1_SETPOINTS, in_room
+from finssim.evaluation.metrics import T1_SETPOINTS, in_room
 from finssim.learning.train import train
+from finssim.sim import Pool
 from finssim.tasks import EnvironmentSetupError
 from finssim.tasks.fitting import authority
 from finssim.tasks.given import crew

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from finssim.engine import Pool
+from finssim.sim import Pool
 from finssim.tasks import Environment, make
 from finssim.tasks.moving_target import MovingTarget
 

@@ -8,7 +8,7 @@ import pytest
 from finssim.control import ControlError
 from finssim.control.guidance import Reference, Station, Track
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.geometry.rotations import quat_from_yaw, quat_rotate, quat_yaw
+from finssim.core.rotations import quat_from_yaw, quat_rotate, quat_yaw
 from finssim.tasks import TASKS, Environment, follow, task_named
 from finssim.tasks.observer import Observer
 from finssim.tasks.task import Batch

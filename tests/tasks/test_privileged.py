@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.engine.randomize import Randomization
-from finssim.engine.ranges_file import Ranges, available
+from finssim.sim.randomize import Randomization
+from finssim.sim.ranges_file import Ranges, available
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping, make
 
 PARTS = {

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from finssim.engine.randomize import Randomization
-from finssim.engine.ranges_file import (
+from finssim.sim.randomize import Randomization
+from finssim.sim.ranges_file import (
     AXES,
     AxisScales,
     Ranges,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import finssim
-from finssim.engine import Water
-from finssim.engine.randomize import Randomization
-from finssim.engine.ranges_file import Curriculum, Ranges, load_ranges
+from finssim.sim import Water
+from finssim.sim.randomize import Randomization
+from finssim.sim.ranges_file import Curriculum, Ranges, load_ranges
 from finssim.tasks import TASKS, EnvironmentSetupError, MeasurementNoise
 from finssim.tasks.sensing import Sensing
 from finssim.vehicles import load_vehicle

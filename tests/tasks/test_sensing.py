@@ -7,9 +7,9 @@ import pytest
 import warp as wp
 
 import finssim
-from finssim.engine.randomize import Randomization
-from finssim.engine.ranges_file import Ranges
 from finssim.localization.fusion import attitude, position_filter
+from finssim.sim.randomize import Randomization
+from finssim.sim.ranges_file import Ranges
 from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, StationKeeping
 from finssim.tasks.check import check_task
 from finssim.tasks.sensing import Sensing, grown, rate_known, value_gain, value_known
@@ -58,7 +58,7 @@ def run(env, steps, push=0.4):
 
 def yaw_between(q, p):
     """Of attitude q beyond p [rad], (...)."""
-    d = finssim.geometry.rotations.quat_multiply(q, p * np.array([-1.0, -1.0, -1.0, 1.0]))
+    d = finssim.core.rotations.quat_multiply(q, p * np.array([-1.0, -1.0, -1.0, 1.0]))
     return 2.0 * np.arctan2(d[..., 2] * np.sign(d[..., 3]), np.abs(d[..., 3]))
 
 

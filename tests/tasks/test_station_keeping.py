@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from finssim.engine import Pool
+from finssim.sim import Pool
 from finssim.tasks import Environment, StationKeeping
 from finssim.tasks.station_keeping import Reward
 from finssim.tasks.task import kernels_of, settings_of

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from finssim.control.trajectories import TRAJECTORIES, load_trajectory
-from finssim.engine import Pool
+from finssim.sim import Pool
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping, TrajectoryTracking, follow
 from finssim.tasks.trajectory_tracking import LEVELS
 from tests.reference.observed import published_t2

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.calibration.vehicle_file import write_vehicle
-from finssim.geometry.rotations import quat_to_matrix
+from finssim.core.rotations import quat_to_matrix
+from finssim.identification.vehicle_file import write_vehicle
 from finssim.pool.camera import camera_of
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.plant_spec import Basin, basin_of

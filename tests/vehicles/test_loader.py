@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.geometry.mesh import parametric_hull, write_stl
+from finssim.core.mesh import parametric_hull, write_stl
 from finssim.vehicles import Vehicle, VehicleError, catalogue, load_vehicle
 from finssim.vehicles.part import sentence_of
 from vehicles.minnow import MINNOW

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from finssim.geometry.mesh import mesh_centroid, mesh_volume
+from finssim.core.mesh import mesh_centroid, mesh_volume
 from finssim.vehicles import (
     HydrodynamicSet,
     Provenance,

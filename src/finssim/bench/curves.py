@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from finssim.bench.solve import Solution, blocks, solve
 from finssim.bench.tables import STANDING
-from finssim.calibration.findings import CalibrationError
+from finssim.trials.findings import CalibrationError
 from finssim.vehicles import Esc
 
 __all__ = ["DeadZone", "EscFit", "Side", "dead_zone", "fit_esc", "fit_side"]

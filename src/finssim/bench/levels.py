@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.findings import Finding, finding
+from finssim.trials.findings import Finding, finding
 
 __all__ = ["Step", "find_steps", "levels", "settled_rows"]
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from finssim.bench.levels import find_steps
 from finssim.bench.solve import Solution, solve
-from finssim.calibration.findings import CalibrationError, Finding, finding
-from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.motion import without_spikes
-from finssim.calibration.report import finish, refuse_places, usable_trials
-from finssim.calibration.trials.trial import Trial
+from finssim.identification.fit import Curve, Estimate, Fit
+from finssim.identification.report import finish, refuse_places, usable_trials
+from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.trials.motion import without_spikes
+from finssim.trials.trial import Trial
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.thruster import Thruster
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
+from finssim.identification.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ def solve(
     """Minimise a sum of squares, and estimate intervals that hold for rows which are not independent.
 
     The interval of a parameter is the widest of those from the disagreement of each grouping's groups
-    (`finssim.calibration.uncertainty`).
+    (`finssim.identification.uncertainty`).
 
     Args:
         residual: Residuals of all rows as a function of the parameters, (P,) -> (N,).

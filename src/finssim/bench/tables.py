@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.bench.levels import settled_rows
-from finssim.calibration.findings import CalibrationError, Finding, finding
-from finssim.calibration.trials.conversion import UNITS
-from finssim.text_table import read_text_table
+from finssim.core.text_table import read_text_table
+from finssim.trials.conversion import UNITS
+from finssim.trials.findings import CalibrationError, Finding, finding
 
 __all__ = ["ThrustTable", "read_table"]
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from finssim.bench.curves import DeadZone, EscFit, Side, dead_zone, fit_esc, fit_side
 from finssim.bench.tables import QUANTITIES, STANDING, ThrustTable, read_table
-from finssim.calibration.findings import CalibrationError, Finding, finding, sentences
-from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.report import finish, refuse_places
+from finssim.identification.fit import Curve, Estimate, Fit
+from finssim.identification.report import finish, refuse_places
+from finssim.trials.findings import CalibrationError, Finding, finding, sentences
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.thruster import Thruster
 

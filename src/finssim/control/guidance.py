@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import (
+from finssim.core.rotations import (
     cross,
     quat_conjugate,
     quat_from_yaw,

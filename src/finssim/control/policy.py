@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from finssim.budget import SECONDS, limited_memory, read_bytes
-from finssim.files import atomic_directory
-from finssim.page import notebook_html
-from finssim.yaml_file import first_problem, read_mapping
+from finssim.core.budget import SECONDS, limited_memory, read_bytes
+from finssim.core.files import atomic_directory
+from finssim.core.page import notebook_html
+from finssim.core.yaml_file import first_problem, read_mapping
 
 # `policy.yaml`: its schema, and how two descriptions are compared.
 

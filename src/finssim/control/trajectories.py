@@ -14,11 +14,11 @@ import numpy.typing as npt
 
 from finssim.control import ControlError
 from finssim.control.guidance import Reference
-from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, wrap_angle
-from finssim.text_table import read_text_table
+from finssim.core.rotations import quat_from_yaw, quat_inverse_rotate, wrap_angle
+from finssim.core.text_table import read_text_table
+from finssim.core.yaml_file import read_mapping
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import room
-from finssim.yaml_file import read_mapping
 
 # Shapes that a trajectory can follow: position and its exact derivative as functions of time.
 #

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.agents.agents import NOWHERE, Agent, expert_for, restarted
 from finssim.control.guidance import Known
 from finssim.control.modes import action_mode
 from finssim.control.policy import plain_data
-from finssim.files import atomic_directory, refuse_unwritable
-from finssim.provenance import provenance
+from finssim.core.files import atomic_directory, refuse_unwritable
+from finssim.core.provenance import provenance
+from finssim.core.yaml_file import json_value
 from finssim.tasks import Environment, make
-from finssim.tasks.agents import NOWHERE, Agent, expert_for, restarted
-from finssim.yaml_file import json_value
 
 DATASET_FILE = "metadata.json"
 """File that marks a data set of Minari."""

@@ -19,7 +19,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from finssim.control.modes import MODES, action_mode
 from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE, Policy, PolicyDescription, VehicleIdentity
-from finssim.files import atomic_directory
+from finssim.core.files import atomic_directory
+from finssim.core.provenance import provenance
+from finssim.core.yaml_file import yaml_text
 from finssim.learning.network import (
     INTEGRAL_LIMIT,
     INTEGRAL_RATE,
@@ -31,10 +33,8 @@ from finssim.learning.network import (
     answer_of,
     first_memory,
 )
-from finssim.provenance import provenance
 from finssim.tasks.environment import Environment
 from finssim.tasks.sensing import seen_with
-from finssim.yaml_file import yaml_text
 
 if TYPE_CHECKING:
     from torch import nn

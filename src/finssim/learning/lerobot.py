@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.files import atomic_directory
+from finssim.core.files import atomic_directory
 from finssim.learning.demonstrations import OURS, DatasetError, Episode, about, read_episodes
 
 FORMAT = "v3.0"

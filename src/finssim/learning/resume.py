@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from finssim.files import OutputError
+from finssim.core.files import OutputError
 
 RESUME_FILE = "resume.npz"
 

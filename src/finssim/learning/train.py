@@ -14,10 +14,10 @@ from typing import Annotated, Any
 from rich.console import Console
 
 from finssim.control.policy import DESCRIPTION_FILE, PolicyDescription, plain_data
-from finssim.engine.randomize import Randomization
-from finssim.files import atomic_directory, refuse_unwritable
+from finssim.core.files import atomic_directory, refuse_unwritable
+from finssim.core.quiet import start_warp
 from finssim.learning.learners import learner_named
-from finssim.quiet import start_warp
+from finssim.sim.randomize import Randomization
 from finssim.tasks import Environment, Task, make, task_named
 from finssim.tasks.fitting import authority
 from finssim.vehicles import Vehicle, load_vehicle

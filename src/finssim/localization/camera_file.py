@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from finssim.files import atomic_write
-from finssim.geometry.optics import Lens, OpticsError, lens_model
+from finssim.core.files import atomic_write
+from finssim.core.optics import Lens, OpticsError, lens_model
+from finssim.core.yaml_file import read_mapping, yaml_text
 from finssim.localization import LocalizationError
-from finssim.yaml_file import read_mapping, yaml_text
 
 # Reading typed values out of a YAML mapping, each refusal one sentence with the place.
 

@@ -17,19 +17,19 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from finssim.files import atomic_write, refuse_unwritable
-from finssim.geometry.optics import Lens
+from finssim.core.files import atomic_write, refuse_unwritable
+from finssim.core.optics import Lens
+from finssim.core.provenance import provenance
+from finssim.core.text_table import write_csv
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame, read_detections
 from finssim.localization.detection.detector import Detector, RegionTracker, detector
 from finssim.localization.detection.families import family_named
 from finssim.localization.fusion.attitude import roll_pitch, up_of
 from finssim.localization.fusion.fuse_log import Series, counted, read_stream_table, series
-from finssim.localization.pool import Pool, load_pool
+from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.localization.poses import Constraints, Measurement, refused
 from finssim.localization.poses.methods import NEEDS_DEPTH, TagLocator
-from finssim.provenance import provenance
-from finssim.text_table import write_csv
 from finssim.vehicles import Vehicle, load_vehicle
 
 Array = npt.NDArray[np.float64]

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.files import atomic_write, refuse_unwritable
-from finssim.geometry.optics import Status, back_project, count_rejections, plane_jacobian, project
+from finssim.core.files import atomic_write, refuse_unwritable
+from finssim.core.optics import Status, back_project, count_rejections, plane_jacobian, project
+from finssim.core.text_table import csv_text, read_text, text_table, write_csv
 from finssim.localization import LocalizationError
-from finssim.localization.pool import load_pool
-from finssim.text_table import csv_text, read_text, text_table, write_csv
+from finssim.localization.overhead_camera import load_pool
 
 # Tables of points or pixels, one per row: named columns of numbers, and others that are carried along.
 

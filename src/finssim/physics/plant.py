@@ -84,7 +84,7 @@ def mass_matrix(mass: float, r_g: wp.vec3, inertia: wp.mat33, M_A: mat66) -> mat
 
 
 RELAXATION = 0.6
-"""Weight c of the damping that a substep of the midpoint rule takes implicitly (see `finssim.engine.midpoint`)."""
+"""Weight c of the damping that a substep of the midpoint rule takes implicitly (see `finssim.sim.midpoint`)."""
 
 DERIVED = ("M_inv", "G", "r_m", "relax", "relax_1", "relax_2", "relax_v", "alpha", "beta")
 """Fields of `VehicleParameters` that `refresh_plant` writes."""

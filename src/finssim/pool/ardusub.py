@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.control.ardusub import Mixer
-from finssim.geometry.frames import TO_FOSSEN
-from finssim.geometry.rotations import quat_rotate, quat_to_euler, quat_to_matrix, wrap_angle
+from finssim.core.frames import TO_FOSSEN
+from finssim.core.rotations import quat_rotate, quat_to_euler, quat_to_matrix, wrap_angle
 from finssim.pool.firmware import AttitudeFilter, Sample
 from finssim.pool.plant_spec import PlantSpec
-from finssim.robot.link.water_linked import encode_velocity
+from finssim.robot.links.water_linked import encode_velocity
 from finssim.robot.messages import HEADING, VELOCITY, NavigationAid
 from finssim.vehicles import Vehicle
 

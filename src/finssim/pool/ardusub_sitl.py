@@ -24,14 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.ardusub import motors_of
-from finssim.engine import Pool, Simulator, Water, Wave
-from finssim.geometry.frames import TO_FOSSEN, wxyz_from_xyzw
-from finssim.geometry.rotations import cross, quat_from_yaw, quat_to_euler, quat_to_matrix
+from finssim.core.frames import TO_FOSSEN, wxyz_from_xyzw
+from finssim.core.rotations import cross, quat_from_yaw, quat_to_euler, quat_to_matrix
 from finssim.pool.plant_spec import Battery, PlantSpecError
 from finssim.robot.goals import station_of
-from finssim.robot.link.frames import LinkError
-from finssim.robot.link.transports import host_port
-from finssim.robot.link.water_linked import DvlServer, encode_velocity
+from finssim.robot.links.frames import LinkError
+from finssim.robot.links.transports import host_port
+from finssim.robot.links.water_linked import DvlServer, encode_velocity
+from finssim.sim import Pool, Simulator, Water, Wave
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import POOL, SITES, with_navigation
 

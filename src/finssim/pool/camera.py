@@ -10,17 +10,17 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.optics import Camera, Interface, Lens
-from finssim.geometry.rotations import quat_from_rotvec, quat_multiply, quat_rotate, quat_to_matrix
+from finssim.core.optics import Camera, Interface, Lens
+from finssim.core.rotations import quat_from_rotvec, quat_multiply, quat_rotate, quat_to_matrix
 from finssim.localization.detection.families import bitmap, family_named
-from finssim.localization.pool import Pool
+from finssim.localization.overhead_camera import Pool
 from finssim.pool.plant_spec import Basin, PlantSpecError, Severity, basin_of, by_severity
 from finssim.pool.positioning import Exposure, Mail, PoseAt, Shutter
 from finssim.robot.messages import Picture, TagCorners
-from finssim.sensors import overhead_camera as oc
-from finssim.sensors.overhead_camera import Ripples
-from finssim.sensors.overhead_camera.scene import surface_frame
-from finssim.sensors.overhead_camera.surface import waves_of
+from finssim.sim import overhead_camera as oc
+from finssim.sim.overhead_camera import Ripples
+from finssim.sim.overhead_camera.scene import surface_frame
+from finssim.sim.overhead_camera.surface import waves_of
 from finssim.vehicles import Vehicle
 from finssim.vehicles.equipment import Mount, Tags
 
@@ -178,7 +178,7 @@ class RippledView:
         Args:
             camera: Above the water.
             interface: Still surface, without a window.
-            ripples: As in `sensors.overhead_camera.Scene`; None for a flat surface.
+            ripples: As in `sim.overhead_camera.Scene`; None for a flat surface.
         """
         self.camera = camera
         self._frame = surface_frame(camera, interface)

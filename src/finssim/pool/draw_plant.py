@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.geometry.mesh import face_geometry
+from finssim.core.mesh import face_geometry
 from finssim.pool.plant_spec import (
     HEADROOM,
     Basin,

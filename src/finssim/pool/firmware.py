@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from finssim.pool.plant import RPM, Plant, captured
 from finssim.pool.plant_spec import Instruments, PlantSpec
-from finssim.robot.link.frames import (
+from finssim.robot.links.frames import (
     DEBUG_ECHO,
     MCU,
     DebugConfig,
@@ -26,7 +26,7 @@ from finssim.robot.link.frames import (
     encode_navigation,
 )
 from finssim.robot.messages import HEADING, VELOCITY, CommandEcho, NavigationAid, Telemetry, ThrusterCommand
-from finssim.sensors import SensorSuite
+from finssim.sim.sensors import SensorSuite
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:

@@ -17,21 +17,21 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from finssim import realtime
-from finssim.localization.pool import Pool
+from finssim.core import realtime
+from finssim.core.quiet import start_warp
+from finssim.core.system import parent_runs
+from finssim.localization.overhead_camera import Pool
 from finssim.pool.camera import CameraSettings, PoolCamera
 from finssim.pool.plant_spec import Basin
 from finssim.pool.positioning import Exposure, PoseAt, Shutter
-from finssim.quiet import start_warp
-from finssim.robot.link.frames import LinkError
-from finssim.robot.link.transports import bound_socket
+from finssim.robot.links.frames import LinkError
+from finssim.robot.links.transports import bound_socket
 from finssim.robot.messages import Picture
 from finssim.robot.pictures import (
     LONGEST_FRAGMENT,
     encode_picture,
     fragments,
 )
-from finssim.system import parent_runs
 from finssim.vehicles import Vehicle
 
 Address = tuple[str, int]
@@ -68,8 +68,8 @@ class UdpSender:
         """Send a picture; one that cannot leave is counted and forgotten.
 
         Args:
-            picture: With its time on the clock of `finssim.realtime` [s].
-            now: the clock of `finssim.realtime` [s].
+            picture: With its time on the clock of `finssim.core.realtime` [s].
+            now: the clock of `finssim.core.realtime` [s].
         """
         # Small pictures of the vehicle's own sensors, which policies see, go as they are.
         compress = not picture.source or (
@@ -147,7 +147,7 @@ class PictureProcess:
         """
         self.dropped = 0
         self.start = 0.0
-        """When the pool's clock was 0, on the clock of `finssim.realtime` [s]."""
+        """When the pool's clock was 0, on the clock of `finssim.core.realtime` [s]."""
         self._shutters = [plan.shutter() for plan in plans]
         context = multiprocessing.get_context("spawn")
         self._undrawn: Any = context.Queue(UNDRAWN)

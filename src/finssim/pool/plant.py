@@ -9,17 +9,17 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.engine import Dock, Pool, Simulator, TetherLine, Water, Wave
-from finssim.engine.plant_arrays import NO_LIMIT
+from finssim.extensions.perception.layout import WorldLayout
 from finssim.physics.hydrostatics import submerged_fraction
 from finssim.physics.kinematics import up_in_body
 from finssim.physics.motors import thrust_of_speed
 from finssim.physics.terms.composed import layout
 from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
 from finssim.pool.plant_spec import HEADROOM, Basin, Circulation, PlantSpec, PlantSpecError, SlackTether
+from finssim.sim import Dock, Pool, Simulator, TetherLine, Water, Wave
+from finssim.sim.plant_arrays import NO_LIMIT
 from finssim.vehicles import Vehicle
 from finssim.vehicles.hydrodynamics import MeshSet
-from finssim.worlds.layout import WorldLayout
 
 # The pool's own circulation: eddies in a box, still at the walls, that come and go slowly.
 

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from finssim.engine.plant_arrays import twist_shift
-from finssim.files import atomic_write
-from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
+from finssim.core.files import atomic_write
+from finssim.core.rotations import quat_from_euler, quat_to_matrix
+from finssim.core.yaml_file import first_problem, read_mapping, yaml_text
+from finssim.sim.plant_arrays import twist_shift
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import POOL, room
-from finssim.yaml_file import first_problem, read_mapping, yaml_text
 
 __all__ = [
     "HEADROOM",

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_yaw
-from finssim.robot.link.frames import encode_navigation
+from finssim.core.rotations import quat_yaw
+from finssim.robot.links.frames import encode_navigation
 from finssim.robot.messages import POSE, POSITION, NavigationAid
 
 __all__ = ["Exposure", "POSITIONING", "PoseAt", "Positioning", "PositioningSettings", "Shutter"]

@@ -17,10 +17,11 @@ from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 
-from finssim import realtime
 from finssim.control.guidance import Station
-from finssim.geometry.rotations import quat_from_yaw, quat_yaw
-from finssim.localization.pool import Pool, write_pool
+from finssim.core import realtime
+from finssim.core.rotations import quat_from_yaw, quat_yaw
+from finssim.extensions.perception import load_world
+from finssim.localization.overhead_camera import Pool, write_pool
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
 from finssim.pool.fleet import Fleet, Medium, one_picture
@@ -31,8 +32,8 @@ from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
 from finssim.robot.goals import station_of
 from finssim.robot.interrupt import interruptible, interrupting
-from finssim.robot.link.frames import LinkError
-from finssim.robot.link.transports import (
+from finssim.robot.links.frames import LinkError
+from finssim.robot.links.transports import (
     Address,
     TcpServer,
     Transport,
@@ -41,14 +42,13 @@ from finssim.robot.link.transports import (
     host_port,
     resolved,
 )
-from finssim.robot.link.water_linked import DvlServer
+from finssim.robot.links.water_linked import DvlServer
 from finssim.robot.lockstep import LockstepError, decode_request, encode_delivery, encode_refusal, receive
 from finssim.robot.messages import Picture
 from finssim.robot.team import decode_track
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
-from finssim.worlds import load_world
 
 __all__ = [
     "GroundLinks", "LockstepServer", "MCU_PORT", "MediumServer", "Pace", "PoolPlan", "make_plan", "run",

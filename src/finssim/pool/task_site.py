@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured, Reference, Track
 from finssim.control.modes import action_mode
-from finssim.engine.launch import Pipeline
-from finssim.engine.state import State
-from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_yaw
-from finssim.localization.pool import Pool
+from finssim.core.rotations import quat_from_yaw, quat_inverse_rotate, quat_yaw
+from finssim.extensions.perception import WorldBatch
+from finssim.extensions.perception.sight import first_draw, put_goal
+from finssim.extensions.teams.communication import Communication
+from finssim.localization.overhead_camera import Pool
 from finssim.pool.draw_plant import positioning_of
 from finssim.pool.fleet import Fleet, Medium
 from finssim.pool.onboard import OnboardSensors
@@ -37,15 +38,14 @@ from finssim.robot.reading import Reading
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.team import Team, encode_track
+from finssim.sim.launch import Pipeline
+from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task, one_world, unscored
-from finssim.tasks.sight import first_draw, put_goal
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.terms import Terms
 from finssim.tasks.trajectory_tracking import fill_table
 from finssim.vehicles import Vehicle
-from finssim.worlds import WorldBatch
 
 __all__ = ["Referee", "ScriptedPilot", "TaskSite", "TrueState"]
 

@@ -18,20 +18,20 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.budget import read_bytes
+from finssim.core.budget import read_bytes
+from finssim.core.yaml_file import json_value
 from finssim.pool.firmware import Firmware, PoolSensors, Sample
 from finssim.pool.plant import RPM, Plant
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError
 from finssim.pool.positioning import Positioning
-from finssim.robot.link.frames import TELEMETRY, crc16_modbus, encode_telemetry, forms
+from finssim.robot.links.frames import TELEMETRY, crc16_modbus, encode_telemetry, forms
 from finssim.robot.messages import Delivery, Picture, Telemetry
 from finssim.vehicles import Vehicle
-from finssim.yaml_file import json_value
 
 if TYPE_CHECKING:
-    from finssim.engine import Dock
+    from finssim.extensions.perception import WorldLayout
     from finssim.pool.ardusub import ArduSub
-    from finssim.worlds import WorldLayout
+    from finssim.sim import Dock
 
 __all__ = [
     "Camera",

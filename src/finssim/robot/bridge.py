@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from finssim.control.allocation import Allocator
 from finssim.control.motor_map import MotorMap
-from finssim.geometry.rotations import quat_inverse_rotate, quat_to_matrix
-from finssim.robot.link.frames import StatusFlag
+from finssim.core.rotations import quat_inverse_rotate, quat_to_matrix
+from finssim.robot.links.frames import StatusFlag
 from finssim.robot.messages import CommandEcho, Telemetry, ThrusterCommand
 from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle

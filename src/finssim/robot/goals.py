@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from finssim.control import ControlError
 from finssim.control.guidance import Guide, Reference, Station, Track
-from finssim.geometry.rotations import quat_rotate, quat_yaw
+from finssim.core.rotations import quat_rotate, quat_yaw
+from finssim.core.yaml_file import read_mapping
 from finssim.vehicles import Vehicle
-from finssim.yaml_file import read_mapping
 
 
 class GoalError(ValueError):

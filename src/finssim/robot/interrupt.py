@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from finssim.system import handled
+from finssim.core.system import handled
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Messages on the wires of a robot, as plain values in SI units; `robot.link` encodes and decodes them."""
+"""Messages on the wires of a robot, as plain values in SI units; `robot.links` encodes and decodes them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Telemetry:
     pressure: float
     """Absolute [Pa]."""
     flags: int
-    """Status bits (see `robot.link`)."""
+    """Status bits (see `robot.links`)."""
     motor_rpm: tuple[float, ...] | None
     """Speed per motor output, with the controller's own signs [rpm]; None from a firmware that does not report it."""
 

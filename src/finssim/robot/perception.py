@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import (
+from finssim.core.rotations import (
     matrix_to_quat,
     quat_conjugate,
     quat_from_euler,
@@ -34,7 +34,7 @@ from finssim.localization.fusion.streams import (
     VelocitySample,
     VisionSample,
 )
-from finssim.localization.pool import Pool
+from finssim.localization.overhead_camera import Pool
 from finssim.localization.poses import axes_of_up
 from finssim.localization.poses.methods import TagLocator
 from finssim.robot.messages import (

@@ -16,11 +16,11 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from finssim import realtime
-from finssim.budget import decoded_picture
+from finssim.core import realtime
+from finssim.core.budget import decoded_picture
 from finssim.localization.detection.detector import RegionTracker, detector
-from finssim.robot.link.frames import LinkError
-from finssim.robot.link.transports import UdpTransport, host_port
+from finssim.robot.links.frames import LinkError
+from finssim.robot.links.transports import UdpTransport, host_port
 from finssim.robot.messages import Picture, TagCorners
 from finssim.vehicles import Vehicle
 from finssim.vehicles.equipment import SENSOR_NAME

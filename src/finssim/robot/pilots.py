@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from finssim.agents.controllers import CONTROLLERS
 from finssim.control import ControlError
 from finssim.control.allocation import Allocator
-from finssim.control.controllers import CONTROLLERS
 from finssim.control.guidance import Goal, Guide, Known, Measured, Track, goal_at
 from finssim.control.modes import action_mode, mode_from_dict
 from finssim.control.policy import PolicyError, read_description
-from finssim.geometry.rotations import quat_from_yaw, quat_multiply
+from finssim.core.rotations import quat_from_yaw, quat_multiply
 from finssim.robot.pictures import resized
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:
-    from finssim.tasks.agents import Agent
+    from finssim.agents.agents import Agent
     from finssim.tasks.observer import Observer
 
 
@@ -304,7 +304,7 @@ def make_pilot(
     Raises:
         PolicyError, ControlError: It does not fit the vehicle or the task, in one sentence.
     """
-    from finssim.tasks.agents import BASELINES, TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
+    from finssim.agents.agents import BASELINES, TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
     from finssim.tasks.observer import Observer
 
     controller = str(name_or_directory)

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from finssim.files import plain_name
-from finssim.localization.pool import Pool, load_pool
+from finssim.core.files import plain_name
+from finssim.core.yaml_file import read_mapping
+from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.robot.record_messages import RecordError
 from finssim.robot.record_reader import Record
 from finssim.vehicles import Vehicle, VehicleError, catalogue_vehicle, load_vehicle
-from finssim.yaml_file import read_mapping
 
 
 def vehicle_of(record: Record) -> Vehicle:

@@ -16,8 +16,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.optics import Lens
-from finssim.geometry.rotations import quat_conjugate, quat_from_yaw, quat_multiply, quat_to_matrix
+from finssim.core.optics import Lens
+from finssim.core.rotations import quat_conjugate, quat_from_yaw, quat_multiply, quat_to_matrix
+from finssim.extensions.perception.description import (
+    CameraDevice,
+    Device,
+    RangeDevice,
+    SonarDevice,
+    device_of,
+)
+from finssim.extensions.perception.rays import fan_picture
 from finssim.robot.messages import (
     HEADING,
     POSE,
@@ -34,8 +42,6 @@ from finssim.robot.pictures import jpeg
 from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import with_navigation
-from finssim.worlds.description import CameraDevice, Device, RangeDevice, SonarDevice, device_of
-from finssim.worlds.rays import fan_picture
 
 # Names, types, frames and policies of all data of a robot: one table, for topics, records and the page.
 
@@ -249,7 +255,7 @@ def types() -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    for package in (resources.files("finssim") / "ros2" / "interfaces").iterdir():
+    for package in (resources.files("finssim") / "robot" / "interfaces").iterdir():
         for file in sorted((package / "msg").iterdir(), key=lambda file: file.name):
             name = f"{package.name}/msg/{file.name.removesuffix('.msg')}"
             store.register(get_types_from_msg(file.read_text(encoding="utf-8"), name))

@@ -17,10 +17,10 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from finssim.files import atomic_write
-from finssim.mcap_files import MAGIC, intact_mcap
+from finssim.core.files import atomic_write
+from finssim.core.mcap_files import MAGIC, intact_mcap
+from finssim.core.yaml_file import json_value
 from finssim.robot.record_messages import METADATA, RecordError, types
-from finssim.yaml_file import json_value
 
 __all__ = ["Entry", "Record", "describe_record", "events_of", "open_record", "repair_record"]
 

@@ -19,10 +19,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from finssim import realtime
-from finssim.files import OutputError, atomic_write, refuse_unwritable
-from finssim.mcap_files import END
-from finssim.provenance import provenance
+from finssim.core import realtime
+from finssim.core.files import OutputError, atomic_write, refuse_unwritable
+from finssim.core.mcap_files import END
+from finssim.core.provenance import provenance
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry
 from finssim.robot.pictures import jpeg
 from finssim.robot.reading import Reading

@@ -19,22 +19,22 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from finssim.agents.controllers import CONTROLLERS
 from finssim.control import ControlError
-from finssim.control.controllers import CONTROLLERS
 from finssim.control.guidance import Station
 from finssim.control.policy import read_description
-from finssim.geometry.rotations import quat_yaw, wrap_angle
-from finssim.localization.pool import load_pool
+from finssim.core.rotations import quat_yaw, wrap_angle
+from finssim.core.system import PARENT, SEPARATE, follow_parent, interrupt
+from finssim.localization.overhead_camera import load_pool
 from finssim.robot.goals import HeardGoal, check_reachable, guide_of, place_of
 from finssim.robot.interrupt import interruptible
-from finssim.robot.link.transports import host_port
+from finssim.robot.links.transports import host_port
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, make_pilot
 from finssim.robot.recorder import Recorder, recording
 from finssim.robot.runtime import USED, Runtime
 from finssim.robot.team import Team
 from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
-from finssim.system import PARENT, SEPARATE, follow_parent, interrupt
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 

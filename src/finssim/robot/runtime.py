@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control.guidance import Guide
-from finssim.localization.pool import Pool
+from finssim.localization.overhead_camera import Pool
 from finssim.robot.bridge import Autopilot, Bridge
-from finssim.robot.link.clock import ClockMap
-from finssim.robot.link.frames import McuLink, Message
+from finssim.robot.links.clock import ClockMap
+from finssim.robot.links.frames import McuLink, Message
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry, ThrusterCommand
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot

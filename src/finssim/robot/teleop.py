@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control.guidance import Guide, Station
-from finssim.localization.pool import Pool, load_pool
+from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import check_reachable, station_of
 from finssim.robot.perception import Perception, Unlocated

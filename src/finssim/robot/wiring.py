@@ -11,11 +11,11 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from finssim import realtime
-from finssim.localization.pool import Pool
+from finssim.core import realtime
+from finssim.localization.overhead_camera import Pool
 from finssim.robot.interrupt import interruptible
-from finssim.robot.link.frames import LinkError, McuLink
-from finssim.robot.link.transports import (
+from finssim.robot.links.frames import LinkError, McuLink
+from finssim.robot.links.transports import (
     DEFAULT_BIND,
     MavlinkAddress,
     Transport,
@@ -158,7 +158,7 @@ def link_of(robot: str, vehicle: Vehicle) -> Link:
     if not robot.startswith("mavlink"):
         return McuLink(vehicle.mcu.outputs)
     try:
-        from finssim.robot.link.mavlink import MavlinkLink
+        from finssim.robot.links.mavlink import MavlinkLink
     except ModuleNotFoundError:
         raise LinkError(
             "mavlink needs pymavlink, which is not installed: pip install 'finssim[hardware]'"

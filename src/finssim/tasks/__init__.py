@@ -1,6 +1,6 @@
 """Tasks, and the batched environment that runs any of them."""
 
-from finssim.tasks.docking import Docking
+from finssim.extensions.perception.docking import Docking
 from finssim.tasks.environment import Environment, EnvironmentSetupError, Step
 from finssim.tasks.make import SEEING, TASKS, make, task_named
 from finssim.tasks.measurement import MeasurementNoise

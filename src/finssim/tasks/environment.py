@@ -11,17 +11,17 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
-from finssim.engine import Pool, Simulator, TetherLine, Water
-from finssim.engine.launch import Pipeline
-from finssim.engine.randomize import Draws, Randomization
+from finssim.extensions.perception.sight import Sight
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
+from finssim.sim import Pool, Simulator, TetherLine, Water
+from finssim.sim.launch import Pipeline
+from finssim.sim.randomize import Draws, Randomization
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
 from finssim.tasks.schedule import Schedule
 from finssim.tasks.sensing import Sensing, SensingBatch
-from finssim.tasks.sight import Sight
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 

@@ -10,8 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.control.pid import axis_model
-from finssim.engine import Pool
+from finssim.agents.pid import axis_model
+from finssim.sim import Pool
 from finssim.tasks.measurement import TRAINING, MeasurementNoise
 from finssim.tasks.task import Task
 from finssim.vehicles import HydrodynamicSet, Vehicle

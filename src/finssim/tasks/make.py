@@ -11,16 +11,16 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from finssim.engine.randomize import Randomization
-from finssim.tasks.docking import CameraDocking, Docking
+from finssim.extensions.perception.docking import CameraDocking, Docking
+from finssim.extensions.perception.gate import Gate
+from finssim.extensions.perception.net import Net
+from finssim.extensions.teams.formation import Formation
+from finssim.extensions.teams.pursuit import Pursuit, TeamPursuit
+from finssim.sim.randomize import Randomization
 from finssim.tasks.environment import Environment, EnvironmentSetupError
-from finssim.tasks.formation import Formation
-from finssim.tasks.gate import Gate
 from finssim.tasks.measurement import ESTIMATOR, MeasurementNoise
 from finssim.tasks.moving_target import MovingTarget
-from finssim.tasks.net import Net
 from finssim.tasks.pipeline import Pipeline
-from finssim.tasks.pursuit import Pursuit, TeamPursuit
 from finssim.tasks.sensing import Sensing, load_sensing
 from finssim.tasks.station_keeping import StationKeeping
 from finssim.tasks.task import Task

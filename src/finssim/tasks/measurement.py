@@ -6,10 +6,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 import warp as wp
 
-from finssim.engine.measured import Measurement
-from finssim.engine.packed import Packed
-from finssim.engine.state import HISTORY, State
 from finssim.physics.types import vec6
+from finssim.sim.measured import Measurement
+from finssim.sim.packed import Packed
+from finssim.sim.state import HISTORY, State
 from finssim.tasks.arrays import TaskArrays
 
 LONGEST_DELAY = 2.0

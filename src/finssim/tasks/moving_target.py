@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.engine.state import State
+from finssim.sim.state import State
 from finssim.tasks.arrays import TargetMotion, TaskArrays, allocated
 from finssim.tasks.fitting import PoolTask
 from finssim.tasks.terms import (

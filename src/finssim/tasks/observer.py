@@ -15,10 +15,10 @@ from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured, Reference, Track
 from finssim.control.modes import MODES
 from finssim.control.policy import ObservationSchema
-from finssim.engine.launch import Pipeline
-from finssim.engine.state import State
-from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate, quat_yaw
+from finssim.core.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate, quat_yaw
 from finssim.physics.types import vec6
+from finssim.sim.launch import Pipeline
+from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.make import task_named

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.geometry.rotations import quat_from_euler, quat_from_yaw, quat_rotate, quat_yaw
+from finssim.core.rotations import quat_from_euler, quat_from_yaw, quat_rotate, quat_yaw
 from finssim.tasks.environment import Environment
 from finssim.tasks.given import EnvironmentSetupError
 
@@ -42,8 +42,8 @@ class Onlooker:
         Raises:
             EnvironmentSetupError: Newton is not installed.
         """
-        from finssim.worlds import CameraBatch, WorldBatch, load_world
-        from finssim.worlds.description import CameraDevice, Object, Variation
+        from finssim.extensions.perception import CameraBatch, WorldBatch, load_world
+        from finssim.extensions.perception.description import CameraDevice, Object, Variation
 
         self._environment, self._index = environment, world
         sight, task = environment.sight, environment.task

@@ -9,10 +9,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.engine.state import State
+from finssim.extensions.perception.description import load_world
+from finssim.extensions.perception.docking import Hull
+from finssim.extensions.perception.seeing import SeeingTask, up
+from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.docking import Hull
-from finssim.tasks.seeing import SeeingTask, up
 from finssim.tasks.terms import (
     End,
     ObservationPart,
@@ -24,7 +25,6 @@ from finssim.tasks.terms import (
     world_velocity,
 )
 from finssim.vehicles import Vehicle
-from finssim.worlds.description import load_world
 
 AHEAD = (0.0, 1.2, 2.5)
 """The teacher sees where the pipe is so far ahead along it [m]."""

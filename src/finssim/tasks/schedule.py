@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import warp as wp
 
-from finssim.engine.launch import Pipeline
-from finssim.engine.randomize import Draws
-from finssim.engine.ranges_file import Curriculum, Success
-from finssim.engine.ranges_table import ENTRIES, INDEX
+from finssim.sim.launch import Pipeline
+from finssim.sim.randomize import Draws
+from finssim.sim.ranges_file import Curriculum, Success
+from finssim.sim.ranges_table import ENTRIES, INDEX
 from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Task

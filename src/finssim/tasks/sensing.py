@@ -18,19 +18,19 @@ from typing import Any
 
 import warp as wp
 
-from finssim.engine import Simulator
-from finssim.engine.launch import Pipeline
-from finssim.engine.measured import Measurement
-from finssim.engine.packed import Packed
-from finssim.engine.state import HISTORY, State
+from finssim.core.yaml_file import read_mapping
 from finssim.localization.fusion.attitude import TiltGains, YawNoise
 from finssim.localization.fusion.position_filter import Motion
 from finssim.physics.types import join
-from finssim.sensors import SensorSuite
-from finssim.sensors.depth import DepthArrays, DepthParameters
-from finssim.sensors.dvl import DvlArrays, DvlParameters
-from finssim.sensors.imu import ImuArrays, ImuParameters
-from finssim.sensors.sampling import (
+from finssim.sim import Simulator
+from finssim.sim.launch import Pipeline
+from finssim.sim.measured import Measurement
+from finssim.sim.packed import Packed
+from finssim.sim.sensors import SensorSuite
+from finssim.sim.sensors.depth import DepthArrays, DepthParameters
+from finssim.sim.sensors.dvl import DvlArrays, DvlParameters
+from finssim.sim.sensors.imu import ImuArrays, ImuParameters
+from finssim.sim.sensors.sampling import (
     DROPOUT,
     TURN_ON,
     TURN_ON_2,
@@ -44,11 +44,11 @@ from finssim.sensors.sampling import (
     sample_key,
     samples_until,
 )
+from finssim.sim.state import HISTORY, State
 from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import LONGEST_DELAY, MeasurementNoise
 from finssim.vehicles import Vehicle
-from finssim.yaml_file import read_mapping
 
 FIX = 100
 """Number of the fixes in the random key, different from those of the kinds of sensor."""

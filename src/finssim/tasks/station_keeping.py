@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from finssim.engine.state import State
+from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.fitting import PoolTask
 from finssim.tasks.measurement import MeasurementNoise
@@ -116,7 +116,7 @@ class StationKeeping(PoolTask):
     """T1. Lengths in metres, angles in radians, world frame with z up and 0 on the water.
 
     A longer vehicle has goals, starts and pool `fit.size` times as large; the tolerance stays. Success here is to hold
-    at the end of an episode; a trial of `finssim evaluate` is judged by `finssim.experiments.metrics`, as the paper's.
+    at the end of an episode; a trial of `finssim evaluate` is judged by `finssim.evaluation.metrics`, as the paper's.
     """
 
     succeeds: ClassVar[str] = "held"

@@ -16,14 +16,14 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.control.policy import ObservationEntry, ObservationSchema
-from finssim.engine import Dock, Pool
-from finssim.engine.launch import Pipeline
-from finssim.engine.state import State
+from finssim.extensions.perception.sight import Picture
+from finssim.sim import Dock, Pool
+from finssim.sim.launch import Pipeline
+from finssim.sim.state import State
 from finssim.tasks import terms as library
 from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.sight import Picture
 from finssim.tasks.terms import ObservationPart, Terms
 from finssim.vehicles import Vehicle
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import warp as wp
 
-from finssim.engine.state import State
 from finssim.physics.types import vec6
+from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 
 

@@ -10,8 +10,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from finssim.engine.launch import Pipeline
-from finssim.engine.state import State
+from finssim.sim.launch import Pipeline
+from finssim.sim.state import State
 from finssim.tasks.arrays import Answers, TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Batch, Task

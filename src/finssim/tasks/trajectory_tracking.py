@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from finssim.control.guidance import Guide, Reference
-from finssim.engine.state import State
-from finssim.geometry.rotations import quat_from_yaw
+from finssim.core.rotations import quat_from_yaw
+from finssim.sim.state import State
 from finssim.tasks.arrays import ReferenceTable, TaskArrays, allocated
 from finssim.tasks.environment import Environment, EnvironmentSetupError
 from finssim.tasks.fitting import FittedTask

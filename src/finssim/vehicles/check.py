@@ -180,7 +180,7 @@ def _stability(vehicle: Vehicle) -> Finding:
 def _hull(vehicle: Vehicle) -> Iterator[Finding]:
     if vehicle.hull is None:
         return
-    from finssim.geometry.mesh import mesh_centroid, mesh_volume
+    from finssim.core.mesh import mesh_centroid, mesh_volume
 
     try:
         vertices, faces = vehicle.hull_mesh()

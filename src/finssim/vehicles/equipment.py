@@ -115,7 +115,7 @@ class Compass(Sensor):
 
 
 OWN_SENSORS: dict[str, type[Sensor]] = {}
-"""Kind -> schema of sensors that `finssim.sensors.add_sensor` made known."""
+"""Kind -> schema of sensors that `finssim.sim.sensors.add_sensor` made known."""
 
 
 class Sensors(Part):

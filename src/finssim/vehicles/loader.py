@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from finssim.files import plain_name
+from finssim.core.files import plain_name
+from finssim.core.yaml_file import read_mapping
 from finssim.vehicles.part import VehicleError, did_you_mean, sentence_of
 from finssim.vehicles.vehicle import ORIGINS, Provenance, Vehicle
-from finssim.yaml_file import read_mapping
 
 GREATEST = 1e12
 """Magnitude of a number in a vehicle file; squares and products of greater ones leave double precision."""

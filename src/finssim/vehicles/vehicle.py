@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from finssim.page import notebook_html
+from finssim.core.page import notebook_html
 from finssim.vehicles.autopilot import Autopilot, refuse_misfit
 from finssim.vehicles.defaults import (
     DEFAULTS,
@@ -165,7 +165,7 @@ class Vehicle(Part):
     """Body point about which wrenches are commanded [m], (3,); the centre of gravity where the file gives none."""
     sensors: Sensors = Field(default_factory=default_sensors)
     perception: dict[str, RaySensor] = Field(default_factory=default_perception)
-    """Sensors of the site by name, such as cameras and sonars; see `finssim.worlds.device_of`."""
+    """Sensors of the site by name, such as cameras and sonars; see `finssim.extensions.perception.device_of`."""
     tags: Tags | None = Field(default_factory=default_tags)
     """None only where a file takes them off: `tags: null`."""
     mcu: Mcu = Field(default_factory=default_mcu)
@@ -324,7 +324,7 @@ class Vehicle(Part):
         Raises:
             VehicleError: The file gives no hull, or its mesh cannot be used.
         """
-        from finssim.geometry import mesh  # SciPy, which it uses, is slow to import
+        from finssim.core import mesh  # SciPy, which it uses, is slow to import
 
         hull, body = self.hull, self.body
         if hull is None:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from finssim.agents.agents import NOWHERE
 from finssim.control.guidance import Known
 from finssim.learning.demonstrations import Episode, collect, save
 from finssim.learning.learners import LearningError, learner_named
 from finssim.learning.resume import read_state, write_state
 from finssim.tasks import make, task_named
-from finssim.tasks.agents import NOWHERE
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

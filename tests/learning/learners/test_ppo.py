@@ -11,13 +11,13 @@ import warp as wp
 import finssim
 from finssim.control.guidance import Known
 from finssim.control.policy import Policy
-from finssim.engine.state import State
 from finssim.learning.episodes import HeldEvaluation
 from finssim.learning.layers import Arrays
 from finssim.learning.learners import learner_named
 from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.learners.ppo import Ppo
 from finssim.learning.network import Network, answer_of, first_memory
+from finssim.sim.state import State
 from finssim.tasks import ObservationPart, StationKeeping
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.terms import End, RewardTerm, Terms

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.geometry.rotations import quat_conjugate, quat_multiply, quat_to_euler, quat_to_rotvec
+from finssim.core.rotations import quat_conjugate, quat_multiply, quat_to_euler, quat_to_rotvec
 
 HINSDALE = Path(__file__).resolve().parents[2] / "data" / "hinsdale"
 CLEAN = ("traj005-1", "traj026-0", "traj_alt_009-0")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from finssim.geometry.rotations import (
+from finssim.core.rotations import (
     quat_conjugate,
     quat_from_euler,
     quat_multiply,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.geometry.rotations import quat_conjugate, quat_from_euler, quat_rotate, quat_to_euler
+from finssim.core.rotations import quat_conjugate, quat_from_euler, quat_rotate, quat_to_euler
 from finssim.localization.fusion.attitude import (
     Tilt,
     TiltGains,

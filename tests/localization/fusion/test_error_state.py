@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from finssim.geometry.rotations import (
+from finssim.core.rotations import (
     quat_conjugate,
     quat_from_euler,
     quat_from_rotvec,

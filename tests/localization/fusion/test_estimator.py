@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.geometry.rotations import wrap_angle
+from finssim.core.rotations import wrap_angle
 from finssim.localization import LocalizationError
 from finssim.localization.fusion import position_filter
 from finssim.localization.fusion.attitude import up_of

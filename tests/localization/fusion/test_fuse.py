@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.files import OutputError
-from finssim.geometry.optics import project
-from finssim.geometry.rotations import quat_conjugate, quat_rotate, quat_to_euler, quat_to_matrix, wrap_angle
+from finssim.core.files import OutputError
+from finssim.core.optics import project
+from finssim.core.rotations import quat_conjugate, quat_rotate, quat_to_euler, quat_to_matrix, wrap_angle
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection, Frame, write_detections
 from finssim.localization.detection.families import tag_corners_b
@@ -20,7 +20,7 @@ from finssim.localization.fusion.fuse_log import StreamTable, load_log
 from finssim.localization.fusion.fuse_settings import site_of
 from finssim.localization.fusion.streams import refusal
 from finssim.localization.localize import write_rows as write_localized
-from finssim.localization.pool import load_pool
+from finssim.localization.overhead_camera import load_pool
 from finssim.localization.poses import Constraints
 from finssim.localization.poses.methods import METHODS
 from finssim.vehicles import load_vehicle

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from finssim.geometry.rotations import quat_to_euler, wrap_angle
+from finssim.core.rotations import quat_to_euler, wrap_angle
 from finssim.localization.fusion.attitude import (
     YawNoise,
     YawState,

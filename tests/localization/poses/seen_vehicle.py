@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from finssim.geometry.optics import Camera, Interface, Layer, Lens, Status, project
-from finssim.geometry.rotations import matrix_to_quat, quat_from_euler, quat_to_matrix
+from finssim.core.optics import Camera, Interface, Layer, Lens, Status, project
+from finssim.core.rotations import matrix_to_quat, quat_from_euler, quat_to_matrix
 from finssim.localization.detection.detections import Detection
 from finssim.localization.detection.families import tag_corners_b
-from finssim.localization.pool import Pool
+from finssim.localization.overhead_camera import Pool
 from finssim.localization.poses import Constraints, axes_of_up
 from finssim.vehicles import load_vehicle
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.geometry.rotations import matrix_to_quat, quat_to_rotvec
+from finssim.core.rotations import matrix_to_quat, quat_to_rotvec
 from finssim.localization.poses import Constraints
 from finssim.localization.poses.methods import refractive_bundle
 from localization.poses.seen_vehicle import POOLS, TAGS, known, moved, pose, rotation, seen

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.geometry.optics import Camera
-from finssim.geometry.rotations import wrap_angle
+from finssim.core.optics import Camera
+from finssim.core.rotations import wrap_angle
 from finssim.localization.detection.detections import Detection
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from localization.poses.seen_vehicle import LENS, POOLS, TAGS, known, moved, pose, rotation, seen

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.geometry.optics import Camera, Interface
-from finssim.geometry.rotations import matrix_to_quat, wrap_angle
+from finssim.core.optics import Camera, Interface
+from finssim.core.rotations import matrix_to_quat, wrap_angle
 from finssim.localization.detection.detections import Detection
 from finssim.localization.poses import Constraints, tilt_matrix
 from finssim.localization.poses.methods import corner_points, planar_fit, rigid_fit

@@ -10,8 +10,8 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from finssim.command_line import read
-from finssim.ros2.up import launch_arguments, launched
+from finssim.cli.command_line import read
+from finssim.extensions.ros2.up import launch_arguments, launched
 
 OLDER = {"camera": {"true": "", "false": "none"}, "teleop": {"true": "joy", "false": ""}}
 """Words of earlier launch files, and what they are now."""
@@ -20,7 +20,7 @@ FILE = "params_file"
 
 def description(graph):
     """Return the launch description of a graph; an argument left empty leaves a parameter to the file."""
-    options = read("finssim.ros2.up:Options").options
+    options = read("finssim.extensions.ros2.up:Options").options
     meanings = {option.name: f"{option.metavar or 'NUMBER'}: {option.help}" for option in options}
     declared = {name: meanings[name] for name in launch_arguments(graph)}
     declared[FILE] = "FILE: Your own parameter file, in place of the package's."

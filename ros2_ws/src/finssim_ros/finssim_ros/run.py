@@ -3,9 +3,9 @@
 import sys
 from functools import partial
 
-from finssim.boundary import run
-from finssim.cli import app
-from finssim.ros2.up import NODES
+from finssim.cli.boundary import run
+from finssim.cli.commands import app
+from finssim.extensions.ros2.up import NODES
 
 
 def __getattr__(node):

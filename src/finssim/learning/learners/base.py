@@ -8,12 +8,12 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+from finssim.agents.agents import expert_for
 from finssim.control.modes import MODES
 from finssim.learning.episodes import EpisodeTally
 from finssim.learning.layers import Arrays
 from finssim.learning.resume import random_state, set_random_state
 from finssim.tasks import Environment, Task
-from finssim.tasks.agents import expert_for
 
 # What a learner's settings are for a task, where they are not the defaults: the one place for them.
 

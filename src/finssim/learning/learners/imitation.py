@@ -12,6 +12,7 @@ import torch
 import warp as wp
 from torch import nn
 
+from finssim.agents.agents import NOWHERE, memory_from, memory_leaves, restarted
 from finssim.control.guidance import Known
 from finssim.learning.demonstrations import Demonstrations, load
 from finssim.learning.learners.base import ActingLearner, expert_in
@@ -21,7 +22,6 @@ from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.learning.torch_networks import SeeingNetwork, stack
 from finssim.tasks import Environment
-from finssim.tasks.agents import NOWHERE, memory_from, memory_leaves, restarted
 
 
 @dataclass(frozen=True, kw_only=True)

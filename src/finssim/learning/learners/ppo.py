@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from finssim.agents.agents import NOWHERE, memory_from, memory_leaves, restarted
 from finssim.control.guidance import Known
 from finssim.learning.layers import Adam, Array, Arrays, Gru, Parameters, Row, Stack
 from finssim.learning.learners.base import ActingLearner, expert_in
@@ -33,7 +34,6 @@ from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.network import Activation, Cell, Linear, Network, advance_history, with_integrals
 from finssim.learning.served import age_episodes
 from finssim.tasks import Environment
-from finssim.tasks.agents import NOWHERE, memory_from, memory_leaves, restarted
 
 ROLLOUT_SAMPLES = 4096
 """Fewest samples between two updates: with few worlds, rollouts are longer."""

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from finssim.core.text_table import TextTable, read_text_table, write_csv
 from finssim.localization import LocalizationError
-from finssim.text_table import TextTable, read_text_table, write_csv
 
 Array = npt.NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_rotate
+from finssim.core.rotations import quat_rotate
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection
 from finssim.vehicles.equipment import Tags

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from finssim.budget import PIXELS, decoded_picture, read_bytes
-from finssim.files import atomic_write
+from finssim.core.budget import PIXELS, decoded_picture, read_bytes
+from finssim.core.files import atomic_write
+from finssim.core.text_table import read_text_table
 from finssim.localization import LocalizationError
-from finssim.text_table import read_text_table
 
 Image = npt.NDArray[np.uint8]
 Timed = tuple[float, str, Image]

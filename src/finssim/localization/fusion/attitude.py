@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_from_rotvec, quat_rotate, quat_to_matrix, skew
+from finssim.core.rotations import quat_from_rotvec, quat_rotate, quat_to_matrix, skew
 
 Array = npt.NDArray[np.float64]
 

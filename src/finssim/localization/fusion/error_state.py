@@ -21,7 +21,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import (
+from finssim.core.rotations import (
     cross,
     matrix_to_quat,
     quat_from_euler,

@@ -13,17 +13,17 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from finssim.files import atomic_write, refuse_unwritable
-from finssim.geometry.rotations import wrap_angle
+from finssim.core.files import atomic_write, refuse_unwritable
+from finssim.core.rotations import wrap_angle
+from finssim.core.text_table import write_csv
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame
 from finssim.localization.fusion.estimator import MODES, Estimator, Fixes, Health
 from finssim.localization.fusion.fuse_log import Log, NoFix, StreamTable, load_log, series
 from finssim.localization.fusion.fuse_settings import settings_of, site_of
 from finssim.localization.fusion.streams import Estimate, Sample
-from finssim.localization.pool import Pool, load_pool
+from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.localization.poses.methods import TagLocator, check_method
-from finssim.text_table import write_csv
 from finssim.vehicles import Vehicle, load_vehicle
 
 # The table that the fusion writes, and its summary.

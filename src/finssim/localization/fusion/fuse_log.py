@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_inverse_rotate
+from finssim.core.rotations import quat_inverse_rotate
+from finssim.core.text_table import EMPTY, TextTable, read_text_table
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame, read_detections
 from finssim.localization.fusion.attitude import in_body_axes, roll_pitch, up_of
 from finssim.localization.fusion.streams import DepthSample, ImuSample, Sample, VisionSample
-from finssim.text_table import EMPTY, TextTable, read_text_table
 from finssim.vehicles import Vehicle
 from finssim.vehicles.equipment import Imu
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from finssim.localization import LocalizationError
 from finssim.localization.fusion.attitude import YawNoise
 from finssim.localization.fusion.position_filter import Motion
-from finssim.localization.pool import Pool
+from finssim.localization.overhead_camera import Pool
 from finssim.vehicles import Vehicle
 
 Array = npt.NDArray[np.float64]

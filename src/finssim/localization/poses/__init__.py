@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import matrix_to_quat
+from finssim.core.rotations import matrix_to_quat
 from finssim.localization.detection.detections import Detection, best_detections
 
 __all__ = [

@@ -11,12 +11,12 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.optics import Camera, Lens, Status, back_project, count_rejections, projection_jacobians
-from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, quat_to_rotvec, skew
+from finssim.core.optics import Camera, Lens, Status, back_project, count_rejections, projection_jacobians
+from finssim.core.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, quat_to_rotvec, skew
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection
 from finssim.localization.detection.families import tag_corners_b
-from finssim.localization.pool import Pool
+from finssim.localization.overhead_camera import Pool
 from finssim.localization.poses import (
     Constraints,
     Correspondences,

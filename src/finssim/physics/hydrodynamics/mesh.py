@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.geometry.mesh import check_closed, face_geometry, mesh_centroid, mesh_volume
+from finssim.core.mesh import check_closed, face_geometry, mesh_centroid, mesh_volume
 from finssim.physics.hydrostatics import WaterWrench, hydrostatic_wrench
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.types import angular, join, linear, mat66, vec6, vec8

@@ -1,0 +1,476 @@
+"""The baseline controllers: a full-wrench PID with gains from the vehicle's identified model, and the published one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.control import ControlError
+from finssim.control.allocation import Allocator
+from finssim.control.guidance import Goal, Measured, tracking_error, velocity_at
+from finssim.core.frames import FROM_CONTROLLER, TO_CONTROLLER
+from finssim.core.rotations import cross, quat_inverse_rotate, quat_rotate, quat_yaw, wrap_angle
+from finssim.vehicles import HydrodynamicSet, Vehicle
+from finssim.vehicles.vehicle import moved_to_origin
+
+# PID gains that put the poles of an identified axis where they are wanted, the actuators' lag included.
+
+
+Array = npt.NDArray[np.float64]
+
+POLE_SHARE = 0.25
+"""The two working poles, as a part of the sum of all four: a quarter each leaves the rest to the fourth."""
+
+INTEGRAL_RATIO = 0.2
+"""The integral's pole, as a part of the working poles: slow enough that it hardly overshoots."""
+
+
+@dataclass(frozen=True)
+class AxisModel:
+    """Six uncoupled axes m x'' + (d1 + d2 |x'|) x' + k x = tau about the wrench reference, body frame."""
+
+    inertia: Array
+    """m, rigid body and added mass [kg, kg m^2], (6,)."""
+    linear_damping: Array
+    """d1 [N s/m, N m s], (6,)."""
+    quadratic_damping: Array
+    """d2 [N s^2/m^2, N m s^2], (6,)."""
+    stiffness: Array
+    """k of roll and pitch about level, zero elsewhere [N m/rad], (6,)."""
+
+    def damping(self, nu: npt.ArrayLike) -> Array:
+        """d1 + d2 |nu| [N s/m, N m s], (..., 6).
+
+        Args:
+            nu: Velocity of the wrench reference, body frame [m/s, rad/s], (..., 6).
+        """
+        return np.asarray(self.linear_damping + self.quadratic_damping * np.abs(np.asarray(nu, float)))
+
+    def terminal_speed(self, tau: Array) -> Array:
+        """Positive root of d1 v + d2 v^2 = tau, infinite without damping [m/s, rad/s], (6,).
+
+        Args:
+            tau: Magnitude of the wrench on every axis, body frame [N, N m], (6,).
+        """
+        d1, d2 = self.linear_damping, self.quadratic_damping
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(
+                np.where(d1 + d2 > 0.0, 2.0 * tau / (d1 + np.sqrt(d1**2 + 4.0 * d2 * tau)), np.inf)
+            )
+
+    def coriolis(self, nu: npt.ArrayLike) -> Array:
+        """C(nu) nu of the diagonal inertia, Munk moment included [N, N m], (..., 6).
+
+        omega x (m v), and omega x (I omega) + v x (m v)                                        (Fossen 2021, eq. 6.43)
+
+        Args:
+            nu: Velocity of the wrench reference, body frame [m/s, rad/s], (..., 6).
+        """
+        nu = np.asarray(nu, float)
+        v, omega, momentum = nu[..., :3], nu[..., 3:], self.inertia * nu
+        turning = cross(omega, momentum[..., 3:]) + cross(v, momentum[..., :3])
+        return np.concatenate([cross(omega, momentum[..., :3]), turning], axis=-1)
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Gains of tau = kp e + integral - kd x', with integral' = rate (the force that the model leaves unexplained), per
+    axis."""
+
+    kp: Array
+    """[N/m, N m/rad], (6,)."""
+    kd: Array
+    """[N s/m, N m s/rad], (6,)."""
+    rate: Array
+    """Rate at which the integral takes over an unknown force [1/s], (6,)."""
+
+
+def axis_model(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> AxisModel:
+    """The diagonal of a vehicle's model at its wrench reference.
+
+    Raises:
+        ControlError: The set has no coefficients (it is a mesh).
+        VehicleError: The vehicle has no set of that name.
+    """
+    chosen = vehicle.hydrodynamic_set(hydrodynamics)
+    if not isinstance(chosen, HydrodynamicSet):
+        raise ControlError(
+            f"hydrodynamic set '{hydrodynamics}' of {vehicle.name} has no damping coefficients to place poles with: "
+            "name one that does"
+        )
+    reference = np.asarray(vehicle.wrench_reference, float)
+    arm = np.asarray(chosen.reference_point, float) - reference
+    above = np.array([vehicle.body.center_of_buoyancy, vehicle.body.center_of_gravity])[:, 2] - reference[2]
+    tilt_stiffness = vehicle.buoyancy * above[0] - vehicle.weight * above[1]
+    return AxisModel(
+        inertia=np.diag(moved_to_origin(vehicle.mass_matrix(hydrodynamics), -reference)),
+        linear_damping=np.diag(moved_to_origin(np.asarray(chosen.linear_damping), arm)),
+        quadratic_damping=np.diag(np.asarray(chosen.quadratic_damping)),
+        stiffness=np.array([0.0, 0.0, 0.0, tilt_stiffness, tilt_stiffness, 0.0]),
+    )
+
+
+def place_poles(model: AxisModel, lag: float | Array, speed: npt.ArrayLike = 0.0) -> Gains:
+    """Gains for poles at -w, -w, -w/5 and -b of every axis behind a first-order lag.
+
+        lag m s^4 + (m + d lag) s^3 + (d + k lag + kd) s^2 + (k + Kp) s + Ki = lag m (s + w)^2 (s + w/5) (s + b)
+
+    The lag fixes the sum of the poles, 1/lag + d/m; w is a quarter of it. Kp and Ki are those of the textbook PID.
+    Here the integral follows
+
+        integral' = rate ((kp + k) e - (kd - m rate + d) x'),
+
+    the sum of forces a disturbance would show up in, so that a manoeuvre the model explains leaves nothing in it.
+    Both laws are the same feedback when kp + k = Ki / rate and
+
+        m rate^3 - (kd + d) rate^2 + (Kp + k) rate - Ki = 0.
+
+    Where the water's own stiffness is more than that, kp < 0 would soften it through the lag: such an axis gets a slow
+    integral and nothing else.
+
+    Args:
+        model: The axes.
+        lag: Of the actuators: time constant, delay and half a control period [s], one or (6,).
+        speed: Operating speed about which d = d1 + 2 d2 |speed| is taken, body frame [m/s, rad/s], (6,).
+    """
+    m, k = model.inertia, model.stiffness
+    d = model.linear_damping + 2.0 * model.quadratic_damping * np.abs(np.asarray(speed, float))
+    total = 1.0 / lag + d / m
+    w = POLE_SHARE * total
+    a = INTEGRAL_RATIO * w
+    b = total - 2.0 * w - a
+    Kp = lag * m * (w**2 * (a + b) + 2.0 * w * a * b) - k
+    Ki = lag * m * w**2 * a * b
+    kd = lag * m * (w**2 + 2.0 * w * (a + b) + a * b) - d - k * lag
+    rate = np.array([_slowest(*axis) for axis in zip(m, kd + d, Kp + k, Ki, strict=True)])
+
+    kp = Ki / rate - k
+    passive = kp <= 0.0
+    # A tenth of the axis' own decay rate, so that the integral cannot ring with the pendulum.
+    return Gains(
+        kp=np.where(passive, 0.0, kp),
+        kd=np.where(passive, 0.0, kd),
+        rate=np.where(passive, np.minimum(a, 0.1 * d / m), rate),
+    )
+
+
+def _slowest(m: float, damping: float, stiffness: float, integral: float) -> float:
+    """Smallest root of m r^3 - damping r^2 + stiffness r - integral = 0 [1/s]: the slow pole without the lag."""
+    roots = np.roots([m, -damping, stiffness, -integral])
+    return float(np.min(roots.real[np.abs(roots.imag) < 1e-9 * np.abs(roots)]))
+
+
+CRUISE = 0.7
+"""Speed at which a far goal is approached, as a part of the terminal speed at the wrench limit."""
+
+LEAST_LAG = 0.15
+"""Shortest lag of a position or heading loop [s]: exposure, wire and filter delay the measurement."""
+
+INTEGRAL_SHARE = 0.5
+"""Largest integral, as a part of the wrench limit."""
+
+
+class PidMemory(NamedTuple):
+    """Memory of the controller between two commands."""
+
+    force: Array
+    """Integral part of the force, WORLD frame [N], (..., 3): a current pushes the same way whatever the heading."""
+    moment: Array
+    """Integral part of the moment, body frame [N m], (..., 3)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pid:
+    """Position and attitude PID with weight and buoyancy fed forward.
+
+        tau = tau_goal + M a_goal + C(nu) nu + D nu_goal + kp clip(e) - kd (nu - nu_goal) + integral
+
+    about the vehicle's wrench reference. tau_goal holds the goal at rest against weight and buoyancy; e is clipped
+    where it would ask for more than the cruise speed; the derivative acts on the measured velocity. The integral
+    collects the force that the identified model cannot explain, with what the thrusters could not deliver taken out
+    of it (back-calculation), and is bounded (clamping): neither a long way nor saturation winds it up.
+    """
+
+    model: AxisModel
+    """Inertia, damping and stiffness at `reference`."""
+    gains: Gains
+    """Per axis, zero on axes without authority."""
+    error_limit: Array
+    """Largest error that is acted on, (6,) [m, rad]."""
+    wrench_limits: Array
+    """Largest wrench asked for, per axis, body frame [N, N m], (6,)."""
+    reference: Array
+    """Body point about which the wrench acts [m], (3,)."""
+    weight: float
+    """[N]"""
+    buoyancy: float
+    """Fully submerged [N]."""
+    center_of_gravity: Array
+    """Body frame [m], (3,)."""
+    center_of_buoyancy: Array
+    """Body frame [m], (3,)."""
+    allocator: Allocator = field(repr=False)
+    """Allocator that gives what the thrusters can deliver."""
+    period: float
+    """Time between two commands [s]."""
+
+    @classmethod
+    def from_vehicle(
+        cls,
+        vehicle: Vehicle,
+        hydrodynamics: str = "calibrated",
+        period: float = 0.05,
+        speed: npt.ArrayLike = 0.0,
+        least_lag: float = LEAST_LAG,
+    ) -> Pid:
+        """Controller of a vehicle, gains by pole placement.
+
+        Args:
+            vehicle: Its thrusters' lag, limits, weight and buoyancy are used too.
+            hydrodynamics: Set whose coefficients are the model.
+            period: Time between two commands [s].
+            speed: Operating speed about which damping is linearised, body frame [m/s, rad/s], (6,).
+            least_lag: Of the loops of place and heading [s]; 0 where nothing delays what is seen.
+
+        Raises:
+            ControlError: The set has no coefficients, or the period is not positive.
+        """
+        if not period > 0.0:
+            raise ControlError(f"period is {period}, expected a positive time in seconds")
+        model = axis_model(vehicle, hydrodynamics)
+        thrusters = vehicle.thrusters.values()
+        thruster_lag = float(np.mean([t.time_constant + t.delay for t in thrusters]))
+        lag = np.full(6, max(thruster_lag, least_lag))
+        lag[3:5] = thruster_lag  # roll and pitch come straight from the IMU
+        lag += 0.5 * period
+        placed = place_poles(model, lag, speed)
+        limits = np.asarray(vehicle.wrench_limits, float)
+        able = limits > 0.0
+        if np.any(able & (model.linear_damping + model.quadratic_damping <= 0.0)):
+            raise ControlError(
+                f"hydrodynamic set '{hydrodynamics}' of {vehicle.name} has no damping on a driven axis"
+            )
+        gains = Gains(*(np.where(able, gain, 0.0) for gain in (placed.kp, placed.kd, placed.rate)))
+
+        cruise = CRUISE * model.terminal_speed(limits)
+        braking = gains.kd - model.inertia * gains.rate + model.damping(cruise)
+        reach = np.divide(braking * cruise, gains.kp, out=np.full(6, np.inf), where=gains.kp > 0.0)
+        return cls(
+            model=model,
+            gains=gains,
+            error_limit=reach,
+            wrench_limits=limits,
+            reference=np.asarray(vehicle.wrench_reference, float),
+            weight=vehicle.weight,
+            buoyancy=vehicle.buoyancy,
+            center_of_gravity=np.asarray(vehicle.body.center_of_gravity, float),
+            center_of_buoyancy=np.asarray(vehicle.body.center_of_buoyancy, float),
+            allocator=Allocator.from_vehicle(vehicle),
+            period=period,
+        )
+
+    def reset(self, n: int | None = None) -> PidMemory:
+        """Memory without any integral, for one vehicle or for a batch of n."""
+        shape = (3,) if n is None else (n, 3)
+        return PidMemory(np.zeros(shape), np.zeros(shape))
+
+    def command(self, memory: PidMemory, measured: Measured, goal: Goal) -> tuple[Array, PidMemory]:
+        """Wanted wrench about `reference`, body frame [N, N m], (..., 6), and the memory for the next command."""
+        q = np.asarray(measured.quaternion, float)
+        error = tracking_error(measured, goal, self.reference)
+        clipped = np.clip(error.pose, -self.error_limit, self.error_limit)
+        nu = velocity_at(measured.nu, self.reference)
+        slip = nu - error.velocity
+        damping = self.model.damping(nu)
+        integral = np.concatenate([quat_inverse_rotate(q, memory.force), memory.moment], axis=-1)
+        steady = self.holding_wrench(q, goal.quaternion) + damping * error.velocity + self.model.coriolis(nu)
+        requested = (
+            steady
+            + self.accelerating_wrench(q, goal)
+            + self.gains.kp * clipped
+            - self.gains.kd * slip
+            + integral
+        )
+        tau = np.clip(requested, -self.wrench_limits, self.wrench_limits)
+
+        thrusts = self.allocator.allocate(tau)
+        undelivered = self.allocator.achieved(thrusts) - requested
+        braking = self.gains.kd - self.model.inertia * self.gains.rate + damping
+        residual = (self.gains.kp + self.model.stiffness) * clipped - braking * slip + undelivered
+        bound = INTEGRAL_SHARE * self.wrench_limits
+        integral = np.clip(integral + self.period * self.gains.rate * residual, -bound, bound)
+        return tau, PidMemory(quat_rotate(q, integral[..., :3]), integral[..., 3:])
+
+    def accelerating_wrench(self, quaternion: Array, goal: Goal) -> Array:
+        """Force that accelerates the vehicle as the goal is, body frame [N, N m], (..., 6); the moment is zero.
+
+        The inertia, water included, differs from axis to axis: what is left over on turning is for the feedback.
+        """
+        force = self.model.inertia[:3] * quat_inverse_rotate(quaternion, np.asarray(goal.acceleration, float))
+        return np.concatenate([force, np.zeros_like(force)], axis=-1)
+
+    def holding_wrench(self, quaternion: npt.ArrayLike, goal: npt.ArrayLike) -> Array:
+        """Wrench that holds the goal attitude at rest against weight and buoyancy, body frame [N, N m], (..., 6).
+
+        The moment is that of the goal attitude, not of the measured one: the pendulum's own righting moment stays in
+        the loop, where it acts without delay.
+
+        Args:
+            quaternion: Measured attitude, xyzw, (..., 4): the force is vertical in it.
+            goal: Wanted attitude, xyzw, (..., 4).
+
+        Note:
+            Assumes that the vehicle is submerged.
+        """
+        up, up_goal = (quat_inverse_rotate(q, [0.0, 0.0, 1.0]) for q in (quaternion, goal))
+        lever = self.buoyancy * (self.center_of_buoyancy - self.reference)
+        lever = lever - self.weight * (self.center_of_gravity - self.reference)
+        force, moment = np.broadcast_arrays((self.weight - self.buoyancy) * up, -cross(lever, up_goal))
+        return np.concatenate([force, moment], axis=-1)
+
+
+# The published controller of the paper's vehicle, as its configuration files state it: profile `pid-paper`.
+
+
+class PaperProfile(NamedTuple):
+    """Numbers as published: order depth, surge, sway, then yaw in degrees; a mixed system of units."""
+
+    kp: tuple[float, float, float, float]
+    ki: tuple[float, float, float, float]
+    kd: tuple[float, float, float, float]
+    output_limit: tuple[float, float, float, float]
+    """Bound of each PID's output."""
+    axis_range: tuple[float, float, float, float]
+    """Divisor that turns each output into an effort in [-1, 1]: smaller is stronger."""
+    integral_decay: float = 0.95
+    """Factor on the integral per period."""
+    integral_limit: float = 100.0
+    """Bound of the integral of the error."""
+    derivative_memory: float = math.exp(-4.0)
+    """Factor on the filtered derivative per period."""
+    yaw_dead_band: float = 5.0
+    """Heading error that is ignored [deg]."""
+    unit: float = 7.0
+    """Force at an effort of one [N], and moment [N m]."""
+
+
+PAPER_PROFILE = PaperProfile(
+    kp=(4.0, 8.0, 8.0, 0.0006),
+    ki=(0.005, 0.004, 0.004, 0.0),
+    kd=(0.1, 0.5, 0.5, 0.0),
+    output_limit=(250.0, 30.0, 30.0, 0.10),
+    axis_range=(10.0, 20.0, 20.0, 5.0),
+)
+"""'Position + yaw (hardware)' of the published configuration; what it leaves out is the published core's default."""
+
+TRAJECTORY_PROFILE = PaperProfile(
+    kp=(12.0, 20.0, 20.0, 0.0),
+    ki=(0.0, 0.1, 0.1, 0.0),
+    kd=(1.0, 0.8, 0.8, 0.0),
+    output_limit=(250.0, 30.0, 30.0, 0.10),
+    axis_range=(20.0, 20.0, 20.0, 200.0),
+    integral_decay=0.985,
+    unit=19.8,
+)
+"""'Trajectory (hardware)' of the published configuration: what T2's baseline ran with; it leaves the heading alone.
+
+An effort of one is read as all four slanted thrusters at their limit, 4 * 7 N * cos 45°: the errors in the simulator
+are then 0.12 to 0.19 m, near the published 0.17 to 0.21 m; with 7 N they would be twice as large.
+"""
+
+
+class PaperMemory(NamedTuple):
+    """Memory of the controller, in the order depth, surge, sway, yaw [m, deg]."""
+
+    integral: Array
+    """Decaying integral of the error, (..., 4)."""
+    error: Array
+    """Error at the last command; NaN before the first, (..., 4)."""
+    derivative: Array
+    """Filtered derivative of the error, (..., 4)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperPid:
+    """Three position loops in the body's axes and one heading loop, run in the paper's controller frame.
+
+    effort = clip((kp e + ki int(e) + kd de/dt) / axis range, +-1),   wrench = effort * unit
+
+    The published mixer is the pseudo-inverse of an idealised thruster matrix and acts on efforts; an effort of one on
+    a thruster is its full thrust. So we read one unit of effort as one thruster limit of force (7 N), or of moment at
+    one metre: nothing published states it outright.
+
+    Note:
+        The heading gain is per degree and the heading output is bounded by 0.10, a fiftieth of full effort: the
+        published controller turns the vehicle very slowly.
+    """
+
+    reference: Array
+    """Body point about which the wrench acts [m], (3,)."""
+    profile: PaperProfile = PAPER_PROFILE
+    unit: float = 7.0
+    """Thrust at an effort of one [N]."""
+    period: float = 1.0 / 60.0
+    """Time between two commands [s]."""
+
+    @classmethod
+    def from_vehicle(
+        cls,
+        vehicle: Vehicle,
+        hydrodynamics: str = "calibrated",
+        period: float = 1.0 / 60.0,
+        profile: PaperProfile = PAPER_PROFILE,
+    ) -> PaperPid:
+        """Controller of a vehicle; the published gains do not depend on its hydrodynamics.
+
+        Args:
+            vehicle: The vehicle.
+            hydrodynamics: Not used.
+            period: Time between two commands [s].
+            profile: Published numbers.
+
+        Raises:
+            ControlError: The period is not positive.
+        """
+        if not period > 0.0:
+            raise ControlError(f"period is {period}, expected a positive time in seconds")
+        reference = np.asarray(vehicle.wrench_reference, float)
+        return cls(reference=reference, period=period, profile=profile, unit=profile.unit)
+
+    def reset(self, n: int | None = None) -> PaperMemory:
+        """Memory before the first command, for one vehicle or for a batch of n."""
+        shape = (4,) if n is None else (n, 4)
+        return PaperMemory(np.zeros(shape), np.full(shape, np.nan), np.zeros(shape))
+
+    def command(self, memory: PaperMemory, measured: Measured, goal: Goal) -> tuple[Array, PaperMemory]:
+        """Wanted wrench about `reference`, body frame [N, N m], (..., 6), and the memory for the next command."""
+        profile = self.profile
+        error = self._error(measured, goal)
+        integral = profile.integral_decay * memory.integral + self.period * error
+        integral = np.clip(integral, -profile.integral_limit, profile.integral_limit)
+        slope = np.where(np.isnan(memory.error), 0.0, (error - memory.error) / self.period)
+        slope = profile.derivative_memory * memory.derivative + (1.0 - profile.derivative_memory) * slope
+
+        output = np.array(profile.kp) * error + np.array(profile.ki) * integral + np.array(profile.kd) * slope
+        output = np.clip(output, -np.array(profile.output_limit), profile.output_limit)
+        depth, surge, sway, yaw = np.moveaxis(
+            np.clip(output / np.array(profile.axis_range), -1.0, 1.0), -1, 0
+        )
+        zero = np.zeros_like(depth)
+        # Controller axes: surge x, depth y (up), sway z (left); heading about y, right positive.
+        effort = np.stack([surge, depth, sway, zero, yaw, zero], axis=-1)
+        return FROM_CONTROLLER.twist(self.unit * effort), PaperMemory(integral, error, slope)
+
+    def _error(self, measured: Measured, goal: Goal) -> Array:
+        """Depth, surge, sway errors [m] and heading error [deg] in the controller frame, (..., 4)."""
+        q = np.asarray(measured.quaternion, float)
+        away = np.asarray(goal.position, float) - np.asarray(measured.position, float)
+        x, y, z = np.moveaxis(TO_CONTROLLER.vector(quat_inverse_rotate(q, away)), -1, 0)
+        heading = TO_CONTROLLER.yaw(wrap_angle(quat_yaw(goal.quaternion) - quat_yaw(q)))
+        heading_deg = np.degrees(heading)
+        heading_deg = np.where(np.abs(heading_deg) < self.profile.yaw_dead_band, 0.0, heading_deg)
+        return np.stack(np.broadcast_arrays(y, x, z, heading_deg), axis=-1)

@@ -1,5 +1,0 @@
-"""Foreign logs to trial folders: tables, ArduSub logs, ROS 2 bags."""
-
-from finssim.calibration.importers.dispatch import FORMATS, import_trials
-
-__all__ = ["FORMATS", "import_trials"]

@@ -1,0 +1,102 @@
+"""The boundary where errors end: the sentence that a person at the command line reads in place of a traceback."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from types import TracebackType
+
+import typer
+
+from finssim.cli.doctor import EXTRA_OF_MODULE
+
+REFUSED = 2
+INTERRUPTED = 130
+
+
+def run(app: typer.Typer, arguments: Sequence[str], *, script: str | None = None) -> int:
+    """Run a command and turn what it refuses into one sentence on standard error.
+
+    A refusal is a usage error, an error of the system (OSError), too little memory, an extra that is not installed, or
+    an exception raised by FinsSim's own code to refuse an input (ValueError, with its families). Any other exception is
+    a fault of FinsSim and keeps its traceback. With FINSSIM_DEBUG=1 in the environment, every error keeps its
+    traceback.
+
+    Args:
+        app: The commands.
+        arguments: The words after the program's name; without any, `finssim` prints its help.
+        script: Module of a program other than `finssim`, whose ValueErrors are refusals too.
+
+    Returns:
+        The exit status: 0 well, 2 refused, 130 interrupted, or what the command itself gave.
+    """
+    try:
+        if script is None:
+            status = app(list(arguments) or ["--help"], prog_name="finssim", standalone_mode=False)
+        else:
+            status = app(list(arguments), standalone_mode=False)
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except KeyboardInterrupt:
+        status = INTERRUPTED
+    except Exception as error:
+        sentence = refusal(error, script or "finssim")
+        if sentence is None or os.environ.get("FINSSIM_DEBUG") == "1":
+            raise
+        _say(sentence)
+        return REFUSED
+    if status == INTERRUPTED:
+        _say("interrupted: nothing half-written is left")
+    return status if isinstance(status, int) else 0
+
+
+def refusal(error: Exception, script: str = "finssim") -> str | None:
+    """Return the sentence for an error of the input or the system, or None for a fault of FinsSim.
+
+    Args:
+        error: The error.
+        script: Module of the program that runs.
+    """
+    if hasattr(error, "format_message"):  # a usage error of the command line
+        return str(error.format_message())
+    if isinstance(error, ModuleNotFoundError):
+        return _missing_extra(error)
+    if isinstance(error, OSError):
+        return _system_error(error)
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {error or 'a requested size is too large'}: ask for less"
+    if isinstance(error, ValueError) and (
+        _is_ours(type(error).__module__, script) or _raised_by_us(error.__traceback__, script)
+    ):
+        return str(error)
+    return None
+
+
+def _missing_extra(error: ModuleNotFoundError) -> str | None:
+    module = (error.name or "").partition(".")[0]
+    extra = EXTRA_OF_MODULE.get(module)
+    return extra and f"{module} is not installed: pip install 'finssim[{extra}]'"
+
+
+def _system_error(error: OSError) -> str:
+    if error.strerror and error.filename is not None:
+        return f"{os.fsdecode(error.filename)}: {error.strerror}"
+    return error.strerror or str(error)
+
+
+def _raised_by_us(traceback: TracebackType | None, script: str) -> bool:
+    """Return whether the innermost frame is a `raise` of FinsSim or the script, and not a fault deep in a library."""
+    while traceback is not None and traceback.tb_next is not None:
+        traceback = traceback.tb_next
+    return traceback is not None and _is_ours(traceback.tb_frame.f_globals.get("__name__", ""), script)
+
+
+def _is_ours(module: str, script: str) -> bool:
+    return module.partition(".")[0] in ("finssim", script.partition(".")[0])
+
+
+def _say(sentence: str) -> None:
+    print(f"finssim: {' '.join(sentence.split())}", file=sys.stderr)

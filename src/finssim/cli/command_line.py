@@ -1,0 +1,398 @@
+"""A Python function as a command: its signature is the list of options, its docstring their help.
+
+There is no other list. A function is read from its source, without being imported, so that help and refusals answer at
+once:
+
+    def simulate(*, duration: Annotated[float, (0.0, None)], out: Path, device: str = "cpu") -> None:
+        \"\"\"Simulate a vehicle from rest.
+
+        Example: finssim simulate --duration 10 --out run.csv
+
+        Args:
+            duration: Simulated time [s].
+            out (FILE): Table to write.
+            device (DEVICE): Compute device: cpu or cuda.
+        \"\"\"
+
+What comes before `*` is typed by its place, the rest as `--name`; a bool is a flag, a `Sequence` may be given several
+times. A directory `out (DIR)` is written by one command at a time. `Annotated` adds bounds as `(low, high)`, another
+`"--name"`, or `","` where one option holds several words. What is no text, number, flag or path, or is annotated
+"python", is no option and keeps its default, but for the types of `MAKERS`. `**options`, "As of `module.function`,
+without rows, robot.", are those of that function but for some. What is returned is the exit status, or a result, whose
+`ok` makes it 0 or 3.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+import typer.core
+
+from finssim.cli import boundary
+from finssim.core.files import sole_writer
+from finssim.core.system import replace_unwritable
+
+ROOT = Path(__file__).parents[2]
+KINDS: Mapping[str, Any] = {
+    "str": str, "int": int, "float": float, "bool": bool, "Path": Path, "Literal": str, "Severity": str, "Format": str
+}  # fmt: skip
+"""Name of an annotation -> what the command line makes of a word."""
+MAKERS = {
+    "OnRobot": "finssim.evaluation.robot_trials:robot_or_none",
+    "Choice": "finssim.extensions.viewer.run:Choice",
+    "Options": "finssim.extensions.ros2.up:Options",
+}
+"""Name of an annotation -> function or dataclass that makes it, whose options replace the parameter."""
+SEEDS = (0, 2**31 - 1)
+LARGEST = 1e9
+"""Greatest magnitude of a number on the command line, in any unit."""
+CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
+SETTINGS: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
+WRITTEN = ("out", "lerobot")
+"""Options whose directories are written."""
+JSON = "Print one JSON object instead of tables."
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A command whose work returns a result, of which the module's `tables_of` makes tables."""
+
+    work: str
+    """module:function"""
+
+
+Work = str | Experiment
+"""Work of a command: module:function, or an experiment."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """Option of a command, made from a parameter of a function."""
+
+    name: str
+    kind: Any
+    many: bool
+    """May be repeated."""
+    positional: bool
+    default: Any
+    """`inspect.Parameter.empty` where it must be given."""
+    notes: tuple[Any, ...]
+    """Notes of `Annotated`: bounds, names, or ","."""
+    metavar: str | None
+    help: str
+
+    def parameter(self) -> inspect.Parameter:
+        """Return the option as Typer reads it."""
+        low, high = next((n for n in self.notes if isinstance(n, tuple)), (None, None))
+        if self.name == "seed" and self.kind is int:
+            low, high = SEEDS
+        kind, default = (list[self.kind] if self.many else self.kind), self.default  # type: ignore[name-defined]
+        if isinstance(default, tuple) and not self.many:
+            default = ",".join(default)
+        if default is None or (self.many and default is not inspect.Parameter.empty):
+            kind, default = kind | None, None
+        about: dict[str, Any] = {"help": self.help, "metavar": self.metavar, "min": low, "max": high}
+        named = [n for n in self.notes if isinstance(n, str) and n.startswith("--")]
+        if (self.positional and not named) or "argument" in self.notes:
+            info: Any = typer.Argument(**about)
+        else:
+            flag = "--json" if self.name == "as_json" else f"--{self.name.replace('_', '-')}"
+            info = typer.Option(*(named or [flag]), **about)
+        kind_of_parameter = inspect.Parameter.KEYWORD_ONLY
+        return inspect.Parameter(
+            self.name, kind_of_parameter, default=default, annotation=Annotated[kind, info]
+        )
+
+    def value(self, typed: Any) -> Any:
+        """Return the value that the function is called with.
+
+        Raises:
+            BadParameter: A number without bounds that is not finite, or beyond any quantity.
+        """
+        if typed is None:
+            return self.default
+        if isinstance(typed, float) and not abs(typed) <= LARGEST:
+            expected = f"{typed:g} is not a number from {-LARGEST:g} to {LARGEST:g}."
+            raise typer.BadParameter(expected, param_hint=f"'--{self.name.replace('_', '-')}'")
+        return tuple(word.strip() for word in typed.split(",")) if "," in self.notes else typed
+
+
+@dataclass(frozen=True)
+class Definition:
+    """Definition of a function, read from its source."""
+
+    path: str
+    help: str
+    options: tuple[Option, ...]
+    makers: Mapping[str, Definition]
+    """Parameter -> the function that makes its value of options."""
+    extra: bool
+    """Takes whatever words follow, as `*words`."""
+
+    def all_options(self) -> Iterator[Option]:
+        """Yield all options, those of the makers included, in the order of the help."""
+        yield from self.options
+        for maker in self.makers.values():
+            yield from maker.options
+
+    def values(self, typed: Mapping[str, Any]) -> dict[str, Any]:
+        """Parameter -> what it is called with, of what was typed."""
+        values = {option.name: option.value(typed[option.name]) for option in self.options}
+        return values | {name: maker.call(typed) for name, maker in self.makers.items()}
+
+    def call(self, typed: Mapping[str, Any], *extra: str) -> Any:
+        """Call it with what was typed."""
+        values = self.values(typed)
+        positional = [values.pop(option.name) for option in self.options if option.positional]
+        return loaded(self.path)(*positional, *extra, **values)
+
+
+def loaded(path: str) -> Callable[..., Any]:
+    """The function; Warp starts silently where its module needs it."""
+    module, _, name = path.partition(":")
+    function: Callable[..., Any] = getattr(import_module(module), name)
+    if "warp" in sys.modules:
+        from finssim.core.quiet import start_warp
+
+        start_warp()
+    return function
+
+
+@cache
+def read(path: str) -> Definition:
+    """Read a function, or a dataclass of settings, from its source."""
+    module, _, name = path.partition(":")
+    file = ROOT / (module.replace(".", "/") + ".py")
+    if not file.is_file():  # a module outside the package, such as __main__
+        file = Path(str(import_module(module).__file__))
+    source = file.read_text(encoding="utf-8")
+    start = re.search(rf"^(def {name}\(|class {name}[(:])", source, re.MULTILINE)
+    assert start is not None, path
+    text = re.split(r"\n(?=[^\s)#])", source[start.start() :], maxsplit=1)[0]
+    (node,) = ast.parse(text).body
+    assert isinstance(node, ast.FunctionDef | ast.ClassDef)
+    about = inspect.cleandoc(ast.get_docstring(node) or "")
+    helps = _helps(about)
+    arguments = _fields(node) if isinstance(node, ast.ClassDef) else _arguments(node, helps)
+    options, makers = [], {}
+    for argument, annotation, default, positional, (metavar, help_text) in arguments:
+        kind, many, notes = _kind(annotation)
+        if kind in MAKERS:
+            makers[argument] = read(MAKERS[kind])
+        elif kind is not None and "python" not in notes:
+            value = inspect.Parameter.empty if default is None else _literal(default, source)
+            help_text = help_text or (JSON if argument == "as_json" else "")
+            options.append(Option(argument, kind, many, positional, value, notes, metavar, help_text))
+    rest = node.args.kwarg.arg if isinstance(node, ast.FunctionDef) and node.args.kwarg else ""
+    reference = re.match(r"As of ([\w.]+)\.(\w+)(?:, without ([\w, ]+))?", helps.get(rest, (None, ""))[1])
+    if isinstance(node, ast.FunctionDef) and reference is not None:
+        further = read(f"finssim.{reference[1]}:{reference[2]}")
+        names = {argument.arg for argument in node.args.args + node.args.kwonlyargs}
+        names |= set((reference[3] or "").split(", "))
+        options += [option for option in further.options if option.name not in names]
+        makers |= {name: maker for name, maker in further.makers.items() if name not in names}
+    lines_of_help = re.split(r"\n(?:Args|Returns|Raises|Note):\n", about)[0].replace("`", "")
+    extra = isinstance(node, ast.FunctionDef) and node.args.vararg is not None
+    return Definition(path, lines_of_help, tuple(options), makers, extra)
+
+
+Help = tuple[str | None, str]
+"""METAVAR, and words."""
+Arguments = Iterator[tuple[str, ast.expr | None, ast.expr | None, bool, Help]]
+"""Name, annotation, default, whether it is known by its place, and help."""
+
+
+def _arguments(function: ast.FunctionDef, helps: Mapping[str, Help]) -> Arguments:
+    arguments = function.args
+    defaults = [
+        *[None] * (len(arguments.args) - len(arguments.defaults)),
+        *arguments.defaults,
+        *arguments.kw_defaults,
+    ]
+    for k, (a, default) in enumerate(zip([*arguments.args, *arguments.kwonlyargs], defaults, strict=True)):
+        yield a.arg, a.annotation, default, k < len(arguments.args), helps.get(a.arg, (None, ""))
+
+
+def _fields(settings: ast.ClassDef) -> Arguments:
+    """Fields, each with the text below it as help."""
+    for field, below in pairwise([*settings.body, ast.Pass()]):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+            text = ast.literal_eval(below.value) if isinstance(below, ast.Expr) else ""
+            match = re.match(r"(?:\((.*?)\) )?(.*)", text, re.DOTALL)
+            assert match is not None
+            help_text = " ".join(match[2].replace("`", "").split())
+            yield field.target.id, field.annotation, field.value, False, (match[1], help_text)
+
+
+def _helps(about: str) -> dict[str, Help]:
+    """Argument -> its METAVAR, if it has one, and its words."""
+    section = re.search(r"^Args:\n((?: .*\n?|\n(?= ))*)", about, re.MULTILINE)
+    entries = re.split(r"^ {4}(?=\w)", section[1], flags=re.MULTILINE)[1:] if section else []
+    helps = {}
+    for entry in entries:
+        match = re.match(r"(\w+)(?: \((.*?)\))?:\s+(.*)", entry, re.DOTALL)
+        assert match is not None, entry
+        helps[match[1]] = (match[2], " ".join(match[3].replace("`", "").split()))
+    return helps
+
+
+def _kind(annotation: ast.expr | None) -> tuple[Any, bool, tuple[Any, ...]]:
+    """Return a word's type, whether there may be several, and the notes of `Annotated`; None if it is no option."""
+    if isinstance(annotation, ast.BinOp):
+        sides = (_kind(annotation.left), _kind(annotation.right))
+        return next((side for side in sides if side[0] is not None), sides[0])
+    if isinstance(annotation, ast.Subscript):
+        head = ast.unparse(annotation.value)
+        if head == "Annotated" and isinstance(annotation.slice, ast.Tuple):
+            first, *others = annotation.slice.elts
+            kind, many, _ = _kind(first)
+            notes = tuple(map(ast.literal_eval, others))
+            return kind, many and "," not in notes, notes
+        if head in ("Sequence", "list"):
+            return _kind(annotation.slice)[0], True, ()
+        return KINDS.get(head), False, ()
+    name = annotation.id if isinstance(annotation, ast.Name) else ""
+    return KINDS.get(name, name if name in MAKERS else None), False, ()
+
+
+def _literal(default: ast.expr, source: str) -> Any:
+    """Return a default value; a name means a constant of the module."""
+    if isinstance(default, ast.Call) and ast.unparse(default.func) == "Path":
+        return Path(ast.literal_eval(default.args[0]))
+    if isinstance(default, ast.Name):
+        constant = re.search(rf"^{default.id}(?:: .*)? = (.+?)(?:  #.*)?$", source, re.MULTILINE)
+        assert constant is not None, default.id
+        return ast.literal_eval(constant[1])
+    return ast.literal_eval(default)
+
+
+def command_app(
+    sections: Mapping[str, Mapping[str, Work]], groups: Mapping[str, str], **settings: Any
+) -> typer.Typer:
+    """Return the command line with all commands.
+
+    Args:
+        sections: Heading of the help -> words after the program's name -> what is done. One of a group's own name is
+            what the group does when nothing follows it; other groups then print their help.
+        groups: Word -> help of a group that does nothing itself.
+        settings: Of the outermost `typer.Typer`.
+    """
+    commands = {name: work for section in sections.values() for name, work in section.items()}
+
+    class Sections(typer.core.TyperGroup):
+        """Lists commands by section, in the order in which they are given."""
+
+        def format_commands(self, context: Any, formatter: Any) -> None:
+            width = max(len(word) for word in self.commands)
+            for heading, section in sections.items():
+                words = dict.fromkeys(name.partition(" ")[0] for name in section)
+                room = formatter.width - width - 6
+                rows = [(f"{word:{width}}", self.commands[word].get_short_help_str(room)) for word in words]
+                with formatter.section(heading):
+                    formatter.write_dl(rows)
+
+    app = typer.Typer(**SETTINGS, **settings, cls=Sections)
+    apps: dict[str, typer.Typer] = {}
+    for name, work in commands.items():
+        first, _, last = name.partition(" ")
+        is_group = any(other.startswith(f"{name} ") for other in commands)
+        if is_group or (last and first not in apps):
+            apps[first] = typer.Typer(**SETTINGS, invoke_without_command=True)
+            app.add_typer(apps[first], name=first)
+            handler = _handler(name, work, group=True) if is_group else _group(groups[first])
+            apps[first].callback()(handler)
+        if not is_group:
+            handler = _handler(name, work)
+            extra = getattr(handler, "definition").extra  # noqa: B009
+            options = {"allow_extra_args": True, "ignore_unknown_options": True} if extra else None
+            (apps[first] if last else app).command(last or first, context_settings=options)(handler)
+    return app
+
+
+def run_script(work: Work) -> NoReturn:
+    """Run a function as a program whose options are those of its signature, and exit.
+
+    Args:
+        work: The function, module:function, or an experiment; the module may be `__main__`.
+    """
+    path = work.work if isinstance(work, Experiment) else work
+    app = typer.Typer(**SETTINGS, pretty_exceptions_enable=False, context_settings=CONTEXT)
+    app.command()(_handler(path.rpartition(":")[2], work))
+    replace_unwritable(sys.stdout, sys.stderr)
+    sys.exit(boundary.run(app, sys.argv[1:], script=path.partition(":")[0]))
+
+
+def _group(title: str) -> Callable[..., None]:
+    def show(context: typer.Context) -> None:
+        if context.invoked_subcommand is None:
+            typer.echo(context.get_help())
+
+    show.__doc__ = title
+    show.__annotations__ = {"context": typer.Context, "return": None}
+    return show
+
+
+def _handler(name: str, work: Work, *, group: bool = False) -> Callable[..., Any]:
+    """A function with the signature that Typer reads, which calls the one that is meant."""
+    experiment = work if isinstance(work, Experiment) else None
+    definition = read(experiment.work if experiment else str(work))
+    options = list(definition.all_options())
+    if experiment is not None:
+        options.append(Option("as_json", bool, False, False, False, (), None, JSON))
+
+    def handle(context: typer.Context, **typed: Any) -> Any:
+        if group and context.invoked_subcommand is not None:
+            return None
+        with ExitStack() as locks:
+            for place in _directories(options, typed):
+                locks.enter_context(sole_writer(place))
+            if experiment is not None:
+                return _experiment(name, definition, typed)
+            return _status(definition.call(typed, *(context.args if definition.extra else ())))
+
+    context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
+    parameters = [context, *(option.parameter() for option in options)]
+    handle.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    handle.__annotations__ = {p.name: p.annotation for p in parameters}
+    handle.__doc__ = definition.help
+    handle.definition = definition  # type: ignore[attr-defined]
+    return handle
+
+
+def _directories(options: Sequence[Option], typed: Mapping[str, Any]) -> list[Path]:
+    """Return the directories that a command writes into, which no other command may do at the same time."""
+    return [
+        typed[option.name] if typed[option.name] is not None else option.default
+        for option in options
+        if option.name in WRITTEN
+        and option.metavar in ("DIR", "DATASET")
+        and (typed[option.name] or option.default)
+    ]
+
+
+def _experiment(name: str, definition: Definition, typed: Mapping[str, Any]) -> int:
+    from finssim.evaluation.campaign import run_experiment
+
+    path = definition.path
+    work, tables = loaded(path), loaded(f"{path.partition(':')[0]}:tables_of")
+    options = {"bar": typed.get("robot") is None, "as_json": typed["as_json"]}
+    return _status(run_experiment(name, work, tables, **options, **definition.values(typed)))
+
+
+def _status(result: Any) -> int:
+    """Exit status: a number is it; a result that is not `ok` has 3."""
+    if isinstance(result, Mapping):
+        return 0 if result.get("ok", True) else 3
+    return result if type(result) is int else 0

@@ -1,0 +1,186 @@
+"""The `finssim` command: what each of its words does. Options and help are those of the functions named here."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from finssim import __version__
+from finssim.cli import boundary
+from finssim.cli.command_line import CONTEXT, Experiment, command_app
+from finssim.core.system import announce, replace_unwritable
+
+SECTIONS: dict[str, dict[str, str | Experiment]] = {
+    "Start": {
+        "demo": "finssim.studies.demo:demo",
+        "doctor": "finssim.cli.doctor:doctor",
+    },
+    "Describe and simulate": {
+        "vehicles": "finssim.cli.commands:vehicles",
+        "vehicles show": "finssim.cli.commands:show_vehicle",
+        "worlds": Experiment("finssim.extensions.perception.show:worlds_list"),
+        "worlds show": Experiment("finssim.extensions.perception.show:worlds_show"),
+        "simulate": "finssim.cli.simulate:simulate",
+        "view": "finssim.extensions.viewer.run:run",
+    },
+    "Identify a vehicle": {
+        "excite": "finssim.evaluation.excitation:excite",
+        "trials import": "finssim.trials.importers.dispatch:import_trials",
+        "trials check": "finssim.trials.check:check",
+        "calibrate hydrodynamics": "finssim.identification.hydrodynamics:calibrate_hydrodynamics",
+        "calibrate thruster": "finssim.bench.thruster:calibrate_thruster",
+        "calibrate motor": "finssim.bench.motor:calibrate_motor",
+        "calibrate camera": "finssim.survey.camera:run",
+        "calibrate pool": "finssim.survey.pool_fit:run",
+        "calibrate mounts": "finssim.survey.mounts:run",
+        "replay": "finssim.identification.replay:run_replay",
+    },
+    "Locate it": {
+        "localize": "finssim.localization.localize:run",
+        "fuse": "finssim.localization.fusion.fuse:run",
+        "project": "finssim.localization.points:run_project",
+        "backproject": "finssim.localization.points:run_backproject",
+    },
+    "Train and evaluate": {
+        "tasks": Experiment("finssim.cli.tasks_show:tasks_list"),
+        "tasks show": Experiment("finssim.cli.tasks_show:tasks_show"),
+        "train": "finssim.learning.train:train",
+        "evaluate": Experiment("finssim.evaluation.evaluate:evaluate"),
+        "sweep": Experiment("finssim.studies.sweep:sweep"),
+        "collect": Experiment("finssim.evaluation.records:collect"),
+        "datasets": Experiment("finssim.evaluation.records:datasets"),
+    },
+    "Deploy": {
+        "pool": "finssim.pool.run:run",
+        "run": "finssim.robot.run:run",
+        "teleop": "finssim.robot.teleop:run",
+        "record info": "finssim.robot.record_reader:info",
+        "record repair": "finssim.robot.record_reader:repair",
+        "play": "finssim.cli.playback:play",
+        "ros2 up": "finssim.extensions.ros2.up:up",
+        "ros2 node": "finssim.extensions.ros2.up:run_node",
+        "ardusub-sitl": "finssim.pool.ardusub_sitl:run",
+    },
+    "Prove": {
+        "experiment t1": Experiment("finssim.studies.transfer:t1"),
+        "experiment t2": Experiment("finssim.studies.transfer:t2"),
+        "experiment localization": Experiment("finssim.studies.localization:localization_experiment"),
+        "experiment replay": Experiment("finssim.studies.replay:replay_experiment"),
+    },
+}
+"""Section of the help -> words of a command -> what it does, in the order of a user's path."""
+COMMANDS = {words: work for section in SECTIONS.values() for words, work in section.items()}
+"""Words of every command -> what it does."""
+
+GROUPS = {
+    "trials": "Check trials, and import foreign logs as trials.\n\nExample: finssim trials check trials",
+    "calibrate": "Fit a vehicle's numbers to measurements and write a vehicle file with their 95 % intervals.\n\n"
+    "Example: finssim calibrate hydrodynamics --help",
+    "experiment": "Reproduce a table of the paper in simulation, beside the paper's own numbers.\n\n"
+    "Example: finssim experiment replay --help",
+    "record": "Inspect records of runs, and repair truncated ones.\n\nExample: finssim record info run.mcap",
+    "ros2": "Run ROS 2 nodes, with or without a ROS 2 installation.\n\nExample: finssim ros2 up pool",
+}
+"""Help of what only has commands below it."""
+
+PICTURES = (".png", ".svg", ".pdf")
+
+app = command_app(
+    SECTIONS,
+    GROUPS,
+    name="finssim",
+    help="Identify, locate and simulate underwater vehicles, train controllers, and deploy them.",
+    pretty_exceptions_enable=False,
+    context_settings=CONTEXT,
+)
+
+
+def main() -> None:
+    """Run the command line and exit.
+
+    Statuses: 0 well, 1 a fault of FinsSim, 2 a refused input, 3 a result that is negative, 130 interrupted.
+    """
+    replace_unwritable(sys.stdout, sys.stderr)
+    words = itertools.takewhile(lambda word: not word.startswith("-"), sys.argv[1:3])
+    announce(f"finssim {' '.join(words)}: starting")
+    sys.exit(boundary.run(app, sys.argv[1:]))
+
+
+def _version(requested: bool) -> None:
+    if requested:
+        typer.echo(f"finssim {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _finssim(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Units are SI and radians unless an option's name says otherwise; z is up, and 0 on the still water surface."""
+
+
+def vehicles(*, as_json: bool = False) -> None:
+    """List the vehicles in the catalogue; `show NAME` prints one in full.
+
+    Example: finssim vehicles
+
+    Args:
+        as_json: Print one JSON object instead of a table.
+    """
+    from rich.console import Console
+
+    from finssim.vehicles import catalogue, load_vehicle
+    from finssim.vehicles.show import print_catalogue, vehicle_data
+
+    if as_json:
+        print(json.dumps({name: vehicle_data(load_vehicle(name)) for name in catalogue()}))
+    else:
+        print_catalogue(Console())
+
+
+def show_vehicle(
+    name: str,
+    *,
+    picture: Path | None = None,
+    as_json: bool = False,
+) -> None:
+    """Print mass [kg], trim, terminal speeds, wrench capability [N, N m], time constants [s] and thrusters.
+
+    Example: finssim vehicles show finsrov --picture finsrov.png
+
+    Args:
+        name (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        picture: Also draw the thruster layout into this file (.png, .svg).
+        as_json: Print one JSON object instead of tables.
+    """
+    from rich.console import Console
+
+    from finssim.vehicles import load_vehicle
+    from finssim.vehicles.show import print_vehicle, vehicle_data
+
+    if picture is not None and picture.suffix not in PICTURES:
+        raise ValueError(f"{picture} ends in '{picture.suffix}', expected one of {' '.join(PICTURES)}")
+    vehicle = load_vehicle(name)
+    if "perception" not in vehicle.defaults:
+        from finssim.extensions.perception import device_of
+
+        for sensor in vehicle.perception:
+            device_of(vehicle, sensor)
+    if as_json:
+        print(json.dumps(vehicle_data(vehicle)))
+    else:
+        print_vehicle(vehicle, Console())
+    if picture is not None:
+        from finssim.core.files import atomic_write
+        from finssim.vehicles.show import draw_vehicle
+
+        with atomic_write(picture) as temporary:
+            draw_vehicle(vehicle, temporary)
+        typer.echo(f"thruster layout: {picture}", err=as_json)

@@ -1,0 +1,220 @@
+"""`finssim doctor`: what is installed, which devices compute, what each missing extra would enable."""
+
+# No postponed annotations here: Warp reads those of its kernels.
+import json
+import os
+import platform
+from dataclasses import dataclass
+from typing import Any
+
+from finssim.core.provenance import package_versions, revision
+
+CORE = ("numpy", "scipy", "warp-lang", "pydantic", "PyYAML", "typer", "rich", "onnxruntime")
+"""Distributions FinsSim cannot do without."""
+
+
+@dataclass(frozen=True)
+class Extra:
+    """One optional part of the installation."""
+
+    distributions: dict[str, str]
+    """Distribution that pip installs -> module that Python imports."""
+    enables: str
+    """Task that the package enables once it is installed."""
+
+
+EXTRAS = {
+    "learn": Extra(
+        {
+            "torch": "torch",
+            "stable-baselines3": "stable_baselines3",
+            "gymnasium": "gymnasium",
+            "tensorboard": "tensorboard",
+            "threadpoolctl": "threadpoolctl",
+            "onnx": "onnx",
+            "onnxscript": "onnxscript",
+            "matplotlib": "matplotlib",
+            "pandas": "pandas",
+            "pyarrow": "pyarrow",
+        },
+        "train policies, use the Gymnasium environments, record runs, draw figures and reports",
+    ),
+    "torchrl": Extra(
+        {"tensordict": "tensordict", "torchrl": "torchrl"},
+        "learn with TorchRL: PPO, IPPO, MAPPO, TensorDicts",
+    ),
+    "rsl-rl": Extra({"rsl-rl-lib": "rsl_rl", "tensordict": "tensordict"}, "learn with RSL-RL"),
+    "skrl": Extra({"skrl": "skrl"}, "learn with skrl"),
+    "pettingzoo": Extra(
+        {"pettingzoo": "pettingzoo"}, "use tasks of several agents as PettingZoo environments"
+    ),
+    "imitation": Extra({"minari": "minari"}, "collect demonstrations and learn from them"),
+    "sweep": Extra(
+        {"ray": "ray"},
+        "train over seeds and settings on many machines",
+    ),
+    "wandb": Extra({"wandb": "wandb"}, "send the curves of a training to Weights & Biases"),
+    "logs": Extra(
+        {
+            "matplotlib": "matplotlib",
+            "mcap": "mcap",
+            "pandas": "pandas",
+            "pyarrow": "pyarrow",
+            "pymavlink": "pymavlink",
+            "rosbags": "rosbags",
+        },
+        "read Parquet, ArduSub logs and ROS 2 bags, draw the report of a calibration and the figures of a replay",
+    ),
+    "view": Extra(
+        {"matplotlib": "matplotlib", "viser": "viser"},
+        "draw pictures of vehicles and figures of evaluations, show runs live in the browser",
+    ),
+    "mujoco": Extra({"mujoco": "mujoco"}, "place MJCF and URDF models in described worlds"),
+    "usd": Extra({"usd-core": "pxr"}, "place USD models in described worlds"),
+    "mpc": Extra({"casadi": "casadi"}, "control by nonlinear model prediction (nmpc)"),
+    "perception": Extra(
+        {"newton": "newton"}, "simulate cameras, sonars and altimeters in finssim.extensions.perception"
+    ),
+    "vision": Extra(
+        {"opencv-python-headless": "cv2", "pupil-apriltags": "pupil_apriltags", "matplotlib": "matplotlib"},
+        "detect tags, calibrate cameras and pools from pictures, locate a vehicle from pictures or video",
+    ),
+    "render": Extra(
+        {"mitsuba": "mitsuba"}, "let the tests compare the overhead camera's pictures with Mitsuba's"
+    ),
+    "ros2": Extra(
+        {"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "be ROS 2 nodes without an installed ROS 2"
+    ),
+    "hardware": Extra(
+        {
+            "mcap": "mcap",
+            "pygame": "pygame",
+            "pymavlink": "pymavlink",
+            "pyserial": "serial",
+            "rosbags": "rosbags",
+        },
+        "reach a vehicle over a serial line or MAVLink, steer it with a gamepad, record its runs",
+    ),
+}
+
+EXTRA_OF_MODULE = {
+    module: name for name, extra in reversed(EXTRAS.items()) for module in extra.distributions.values()
+}
+"""Module that Python could not import -> extra that installs it."""
+
+
+def doctor(*, as_json: bool = False) -> int:
+    """List installed packages and compute devices, and what each missing extra would enable.
+
+    Exit status 1: a core package or a working compute device is missing.
+
+    Example: finssim doctor
+    """
+    report = examine()
+    if as_json:
+        print(json.dumps(report, indent=2))
+    else:
+        _print(report)
+    return 0 if report["healthy"] else 1
+
+
+def examine() -> dict[str, Any]:
+    """Return what is installed and works, as plain values.
+
+    Returns:
+        `healthy`; `machine`; `core` (name -> version or None); `devices`, each with `name`, `works`, `detail`; `extras`
+        (name -> `complete`, `versions`, `missing`, `enables`).
+    """
+    core = package_versions(CORE)
+    devices = _devices() if "warp-lang" in core else []
+    extras = {}
+    for name, extra in EXTRAS.items():
+        versions = package_versions(tuple(extra.distributions))
+        missing = [distribution for distribution in extra.distributions if distribution not in versions]
+        extras[name] = {
+            "complete": not missing,
+            "versions": versions,
+            "missing": missing,
+            "enables": extra.enables,
+        }
+    works = any(device["name"] == "cpu" and device["works"] for device in devices)
+    return {
+        "healthy": works and len(core) == len(CORE),
+        "machine": {
+            "system": platform.platform(),
+            "python": platform.python_version(),
+            "cores": os.cpu_count(),
+            "revision": revision(),
+        },
+        "core": {name: core.get(name) for name in CORE},
+        "devices": devices,
+        "extras": extras,
+    }
+
+
+def _devices() -> list[dict[str, Any]]:
+    """Every device Warp knows, each tried with a real kernel."""
+    import numpy as np
+    import warp as wp
+
+    from finssim.core.quiet import start_warp
+
+    start_warp()
+
+    @wp.kernel
+    def square(x: wp.array(dtype=float), y: wp.array(dtype=float)):  # type: ignore[valid-type]
+        i = wp.tid()
+        y[i] = x[i] * x[i]
+
+    def attempt(device: Any) -> dict[str, Any]:
+        answer = {"name": device.alias, "works": True, "detail": device.name}
+        try:
+            x = wp.array(np.arange(100.0), dtype=float, device=device)
+            y = wp.zeros_like(x)
+            wp.launch(square, dim=100, inputs=[x, y], device=device)
+            if not np.array_equal(y.numpy(), np.arange(100.0) ** 2):
+                answer.update(works=False, detail="a kernel ran and gave a wrong answer")
+        except Exception as error:  # whatever a driver raises is the finding
+            answer.update(works=False, detail=" ".join(str(error).split()) or type(error).__name__)
+        return answer
+
+    attempts = [attempt(device) for device in wp.get_devices()]
+    if not wp.is_cuda_available():
+        attempts.append({"name": "cuda", "works": False, "detail": "no NVIDIA GPU or driver found"})
+    return attempts
+
+
+def _print(report: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    machine = report["machine"]
+    console.print(
+        f"Python {machine['python']} on {machine['system']}, {machine['cores']} cores", highlight=False
+    )
+    table = Table(box=None, pad_edge=False)
+    for heading in ("", "state", "what it is for, or found"):
+        table.add_column(heading, overflow="fold")
+    for name, version in report["core"].items():
+        table.add_row(
+            name, version or "[red]missing[/]", "needed: pip install finssim" if version is None else "core"
+        )
+    for device in report["devices"]:
+        absent = device["name"] == "cuda"
+        state = "[green]works[/]" if device["works"] else ("absent" if absent else "[red]fails[/]")
+        table.add_row(f"device {device['name']}", state, device["detail"].replace("[", r"\["))
+    for name, extra in report["extras"].items():
+        missing = "missing" if extra["missing"] else "[green]complete[/]"
+        table.add_row(f"extra {name}", missing, extra["enables"])
+        if extra["versions"]:
+            table.add_row(
+                "", "", "[dim]" + ", ".join(f"{k} {v}" for k, v in extra["versions"].items()) + "[/]"
+            )
+        if extra["missing"]:
+            missing_text = ", ".join(extra["missing"])
+            table.add_row("", "", f"without {missing_text}: pip install 'finssim\\[{name}]'")
+    console.print(table)
+    console.print(
+        "ready" if report["healthy"] else "[red]not ready: the core does not work[/]", highlight=False
+    )

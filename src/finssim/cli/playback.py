@@ -1,0 +1,108 @@
+"""`finssim play`: the messages of a record, or an episode of a policy as a film."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.agents.agents import NOWHERE, agent_for, rollout
+from finssim.control.policy import read_description
+from finssim.core.files import atomic_write
+from finssim.core.progress import progress_bar
+from finssim.core.quiet import start_warp
+from finssim.evaluation.plants import load_plant
+from finssim.robot.record_reader import play_record
+from finssim.tasks import Environment, task_named
+from finssim.tasks.onlooker import Onlooker, write_video
+from finssim.vehicles import catalogue_vehicle, load_vehicle
+
+
+class PlaybackError(ValueError):
+    """Something that cannot be played."""
+
+
+def play(
+    path: Path,
+    *,
+    speed: float = 1.0,
+    topics: Annotated[Sequence[str] | None, ","] = None,
+    start: Annotated[float, (0.0, None)] = 0.0,
+    video: Path | None = None,
+    task: str | None = None,
+    vehicle: str | None = None,
+    plant: str = "nominal",
+    seed: int = 1,
+) -> None:
+    """Print the messages of a record as JSON lines [SI units], or film an episode of a policy.
+
+    Example: finssim play run.mcap --topics odom,events
+
+    Example: finssim play runs/see --plant held_out --video see.mp4
+
+    Args:
+        path (FILE|DIR): Record of a run (.mcap), or directory of a policy.
+        speed (FACTOR): Speed factor of a film relative to the episode [-].
+        topics (NAMES): Topics of a record to print, separated by commas: odom,thruster_cmd.
+        start: Offset from the start of the record [s].
+        video (FILE): Film of an episode to write (.mp4).
+        task (TASK): Task of the episode; that of the policy's training if not given. Your own: FILE.py:CLASS.
+        vehicle (NAME|FILE): Vehicle in the episode; that of the policy's training if not given.
+        plant (FILE|NAME): Plant of the episode, as in finssim evaluate.
+        seed: Of the episode.
+
+    Raises:
+        RecordError: Not a record, or no such topic.
+        PlaybackError: A directory without a film to write, or a film or speed of a record.
+        PolicyError, PlantError, EnvironmentSetupError: As they say.
+    """
+    if not path.is_dir():
+        if video is not None:
+            raise PlaybackError(f"{path} is no directory of a policy: only an episode of a policy is filmed")
+        if speed != 1.0:
+            raise PlaybackError(
+                "--speed is of a film: the messages of a record are printed without waiting, leave it out"
+            )
+        play_record(path, topics=topics, start=start)
+        return
+    if video is None or video.suffix != ".mp4":
+        raise PlaybackError(f"{path} is a policy: give the film to write, --video FILE.mp4")
+    if not speed > 0.0:
+        raise PlaybackError(f"speed is {speed:g}, expected more than 0")
+    start_warp()
+    description = read_description(path)
+    the_task = task_named(task or description.task)
+    body = load_vehicle(vehicle) if vehicle else catalogue_vehicle(description.vehicle.name, str(path))
+    agent = agent_for(path, body, the_task)
+    environment = load_plant(plant).environment(agent, the_task, body, seed=seed, auto_reset=False)
+    with atomic_write(video) as temporary, progress_bar("episode") as show:
+        steps = round(the_task.time_limit / the_task.control_step)
+        onlooker, pictures = Onlooker(environment), []
+        for k, step in rollout(agent, environment, steps, lambda t: NOWHERE):
+            pictures.append(_with_observed(onlooker.picture(), environment))
+            show(k / steps)
+            if step is not None and (step.terminated[0] or step.truncated[0]):
+                break
+        write_video(temporary, pictures, speed / the_task.control_step)
+    outcome = environment.task.metrics(environment.arrays)
+    success = {1.0: ", success", 0.0: ", no success"}.get(float(outcome.get("success", [np.nan])[0]), "")
+    Console(stderr=True).print(
+        f"film: {video}  ({len(pictures)} pictures{success})", highlight=False, soft_wrap=True, markup=False
+    )
+
+
+def _with_observed(picture: NDArray[np.uint8], environment: Environment) -> NDArray[np.uint8]:
+    """The picture with what the vehicle sees in its corner, a quarter as wide or more."""
+    if environment.sight is None:
+        return picture
+    corner = 0
+    for small in environment.sight.shown(0).values():
+        factor = max(1, round(picture.shape[1] / 4 / small.shape[1]))
+        large = small.repeat(factor, 0).repeat(factor, 1)
+        picture[corner : corner + large.shape[0], : large.shape[1]] = large
+        corner += large.shape[0] + 2
+    return picture

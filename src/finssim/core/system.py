@@ -1,0 +1,143 @@
+"""Differences between Linux, macOS and Windows: signals between processes, their parents, peak memory, text streams.
+
+The branches for Windows and macOS are written from their documentation and run in tests only where these take away what
+the other systems lack; no one has run them on such a machine.
+"""
+
+from __future__ import annotations
+
+import _thread
+import os
+import platform
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO
+
+PARENT = "FINSSIM_PARENT"
+"""Environment variable: the process without which this one ends too."""
+ORPHANED = 0.5
+"""Time between two checks whether the parent is running [s]."""
+SEPARATE: dict[str, Any] = (
+    {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+    if os.name == "nt"
+    else {"start_new_session": True}
+)
+"""Options of `subprocess.Popen` for a child that the terminal's Ctrl-C does not reach; see `interrupt`."""
+
+
+def stop_signals() -> list[int]:
+    """Return the signals that end a command: Ctrl-C, SIGTERM, and SIGHUP or Windows' SIGBREAK where there is one.
+
+    SIGHUP stays ignored where it is, as under nohup.
+    """
+    numbers: list[int] = [signal.SIGINT, signal.SIGTERM]
+    for name in ("SIGHUP", "SIGBREAK"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            numbers.append(number)
+    return numbers
+
+
+@contextmanager
+def handled(handler: Any) -> Iterator[None]:
+    """Give all stop signals a handler for a while; only the main thread may call this."""
+    before = {number: signal.signal(number, handler) for number in stop_signals()}
+    try:
+        yield
+    finally:
+        for number, previous in before.items():
+            signal.signal(number, previous)
+
+
+def interrupt(process: subprocess.Popen[Any]) -> None:
+    """Ask a child that was started with `SEPARATE` to end, as Ctrl-C does."""
+    process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
+
+
+def follow_parent() -> None:
+    """End with the process that started this one, even if that was killed."""
+    parent = os.environ.get(PARENT, "")
+    if parent.isdecimal():
+        threading.Thread(target=_follow, args=(int(parent),), name="launcher", daemon=True).start()
+
+
+def _follow(parent: int) -> None:
+    while parent_runs(parent):
+        time.sleep(ORPHANED)
+    if os.name == "nt":  # where os.kill ends the process immediately
+        _thread.interrupt_main(signal.SIGTERM)
+    else:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def parent_runs(pid: int) -> bool:
+    """Return whether the process that started this one, `pid`, is still running."""
+    if os.name != "nt":
+        return os.getppid() == pid
+    import ctypes
+
+    synchronize, timeout = 0x00100000, 0x102
+    kernel: Any = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
+    handle = kernel.OpenProcess(synchronize, False, pid)
+    if not handle:
+        return False
+    try:
+        return bool(kernel.WaitForSingleObject(handle, 0) == timeout)
+    finally:
+        kernel.CloseHandle(handle)
+
+
+def processor_name() -> str:
+    """Return the model of this machine's processor, or its architecture where the system names none."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            return next(line.split(":")[1].strip() for line in file if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def peak_memory() -> float:
+    """Return the peak memory of this process [MiB]; NaN if the system does not report it (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return float("nan")
+    # Linux counts kibibytes, macOS bytes.
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / (
+        2**20 if sys.platform == "darwin" else 2**10
+    )
+
+
+def announce(text: str, after: float = 1.5) -> threading.Timer:
+    """Print a line on standard error unless something else is printed before.
+
+    Args:
+        text: The line.
+        after: From now [s].
+
+    Returns:
+        The timer that prints it, already started.
+    """
+    timer = threading.Timer(after, lambda: print(text, file=sys.stderr, flush=True))
+    timer.daemon = True
+    for stream in (sys.stdout, sys.stderr):
+
+        def write(characters: str, write: Any = stream.write) -> Any:
+            timer.cancel()
+            return write(characters)
+
+        stream.write = write  # type: ignore[method-assign]
+    timer.start()
+    return timer
+
+
+def replace_unwritable(*streams: TextIO) -> None:
+    """Write `?` for characters that a stream's encoding lacks, such as an arrow in a file of code page 1252."""
+    for stream in streams:
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")

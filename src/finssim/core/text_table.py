@@ -1,0 +1,170 @@
+"""Tables in text files as people and programs write them: one reader for all layers, with the line of each cell."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from finssim.core.budget import TEXT, read_bytes
+from finssim.core.files import atomic_write
+
+EMPTY = frozenset({"", "nan", "none", "null", "na", "n/a", "-", "--"})
+"""Words for "no value", in lower case."""
+
+COMMENT = ("#",)
+"""Beginnings of lines that are no rows."""
+
+
+@dataclass
+class TextTable:
+    """One table as text."""
+
+    names: list[str]
+    """Names of the columns."""
+    texts: list[str]
+    """Lines below the names."""
+    lines: list[int]
+    """Line number of each of them in the file, from 1."""
+    split: Callable[[str], list[str]]
+    """The cells of a line, without the blanks around them; there may be fewer or more than names."""
+    decimal_comma: bool
+    """True if a comma in a number is its decimal point, because something else separates the cells."""
+    comments: list[str] = field(default_factory=list)
+    """Lines that are no rows."""
+    zeros: bool = False
+    """True if the file ends in zero bytes, as after a crash; it was read up to them."""
+    unfinished: bool = False
+    """True if the last line has no end, so that its last cell may be cut."""
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """Cells of every line."""
+        return [self.split(text) for text in self.texts]
+
+    def number(self, cell: str) -> float | None:
+        """The number in a cell; NaN where it holds a word of `EMPTY`, None where it holds another."""
+        return number(cell, decimal_comma=self.decimal_comma)
+
+    def place(self, names: Sequence[str]) -> int | None:
+        """Index of the first of some columns that is there, whatever its case."""
+        lower = [name.lower() for name in self.names]
+        return next((lower.index(name) for name in names if name in lower), None)
+
+
+def number(cell: str, *, decimal_comma: bool = False) -> float | None:
+    """The number in a cell; NaN where it holds a word of `EMPTY`, None where it holds another."""
+    cell = cell.strip().replace("−", "-")
+    try:
+        return float(cell.replace(",", ".") if decimal_comma else cell)
+    except ValueError:
+        return math.nan if cell.lower() in EMPTY else None
+
+
+def read_text(path: str | os.PathLike[str], error: type[Exception]) -> tuple[str, bool]:
+    """The text of a file up to the zero bytes that a crash may leave, and whether there were any.
+
+    Args:
+        path: The file.
+        error: What is raised where it cannot be read.
+    """
+    raw = read_bytes(Path(path), error, limit=TEXT)
+    intact = raw.split(b"\0", 1)[0]
+    try:
+        text = intact.decode("utf-8-sig")
+    except UnicodeDecodeError:  # spreadsheets write µ and ± in one byte; what holds control bytes is no text
+        codec = "utf-8-sig" if re.search(rb"[\x01-\x08\x0e-\x1f\x7f]", intact) else "latin-1"
+        text = intact.decode(codec, errors="replace")
+    return text, len(intact) < len(raw)
+
+
+def read_text_table(
+    path: str | os.PathLike[str],
+    error: type[Exception],
+    *,
+    skip: int = 0,
+    names: Sequence[str] | None = None,
+    spaces: bool | None = False,
+    comment: tuple[str, ...] = COMMENT,
+) -> TextTable:
+    """Read a table with a line of names; see `text_table`.
+
+    Args:
+        path: The file.
+        error: What is raised where it cannot be read.
+        skip: Lines before the table.
+        names: Of the columns, where the file has no line of names.
+        spaces: Whether blanks separate the cells; None: where nothing else does.
+        comment: Beginnings of lines that are no rows.
+    """
+    text, zeros = read_text(path, error)
+    table = text_table(text, skip=skip, names=names, spaces=spaces, comment=comment)
+    table.zeros = zeros
+    return table
+
+
+def text_table(
+    text: str,
+    *,
+    skip: int = 0,
+    names: Sequence[str] | None = None,
+    spaces: bool | None = False,
+    comment: tuple[str, ...] = COMMENT,
+) -> TextTable:
+    """The cells of a text: separated by whichever of comma, semicolon and tab the first line has most of.
+
+    Args:
+        text: Of the whole file; blank lines are passed over.
+        skip: Lines before the table.
+        names: Of the columns, where there is no line of names.
+        spaces: Whether blanks separate the cells; None: where nothing else does.
+        comment: Beginnings of lines that are no rows.
+    """
+    every = [(i, line) for i, line in enumerate(text.splitlines(), start=1) if i > skip and line.strip()]
+    held = [(i, line) for i, line in every if not line.lstrip().startswith(comment)]
+    first = held[0][1] if held else ""
+    mark = max(",;\t", key=first.count)
+    blank = (spaces is None and mark not in first) or bool(spaces)
+    split: Callable[[str], list[str]] = str.split
+    if not blank:
+        # Quoted cells are rare, and the csv module is slow line by line.
+        def split(line: str) -> list[str]:
+            cells = next(csv.reader([line], delimiter=mark)) if '"' in line else line.split(mark)
+            return [cell.strip() for cell in cells]
+
+    head = list(names) if names is not None else split(first)
+    while head and not head[-1]:
+        head.pop()
+    below = held if names is not None else held[1:]
+    return TextTable(
+        names=head,
+        texts=[line for _, line in below],
+        lines=[i for i, _ in below],
+        split=split,
+        decimal_comma=not blank and mark != ",",
+        comments=[line.strip() for _, line in every if line.lstrip().startswith(comment)],
+        unfinished=not text.endswith(("\n", "\r")),
+    )
+
+
+def csv_text(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table as CSV with a line of names."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([names, *rows])
+    return text.getvalue()
+
+
+def write_csv(path: str | os.PathLike[str], names: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a table as CSV with a line of names.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(csv_text(names, rows), encoding="utf-8", newline="")

@@ -1,0 +1,534 @@
+"""`finssim evaluate`: trials of a controller, on published setpoints and trajectories or in a task's own episodes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+from finssim.agents.agents import agent_for
+from finssim.control.policy import read_description
+from finssim.core.files import atomic_directory, plain_name
+from finssim.core.progress import progress_bar
+from finssim.core.provenance import provenance
+from finssim.core.quiet import start_warp
+from finssim.evaluation import campaign
+from finssim.evaluation.campaign import write_json
+from finssim.evaluation.figures import draw_envelopes, draw_tracking, save_figure
+from finssim.evaluation.metrics import (
+    PAPER_T2,
+    T1_SETPOINTS,
+    paper_row,
+    paper_t2_row,
+    summarize,
+    summarize_tracking,
+)
+from finssim.evaluation.plants import Plant, load_plant
+from finssim.evaluation.tables import Columns, Table, cells, figure_text, html_of
+from finssim.evaluation.trials import (
+    EPISODES,
+    T2_TRAJECTORIES,
+    Trial,
+    guide_of,
+    run_episodes,
+    run_trials,
+    summarize_episodes,
+)
+from finssim.robot.record_files import vehicle_of
+from finssim.robot.record_reader import open_record
+from finssim.tasks import task_named
+from finssim.vehicles import Vehicle, catalogue, catalogue_vehicle, load_vehicle
+
+EVALUATION_FILE = "evaluation.json"
+TRAJECTORIES = "trajectories"
+
+T1_COLUMNS = {
+    "success": ("success", ""),
+    "e_p_m": ("e_p [m]", ".4f"),
+    "e_y_m": ("e_y [m]", ".4f"),
+    "e_psi_deg": ("e_psi [°]", ".2f"),
+    "t_s_s": ("t_s [s]", ".1f"),
+    "J_p_m": ("J_p [m]", ".3f"),
+    "J_psi_deg": ("J_psi [°]", ".2f"),
+}
+"""Key of a result -> its heading, with the paper's names (e_y is the vertical error), and its format."""
+T2_COLUMNS = {
+    "horizontal_rmse_m": ("horiz. [m]", ".4f"),
+    "vertical_rmse_m": ("vert. [m]", ".4f"),
+    "p95_m": ("P95 [m]", ".4f"),
+    "cross_track_rmse_m": ("across [m]", ".4f"),
+    "completion": ("way", ".0%"),
+    "max_tilt_deg": ("tilt [°]", ".1f"),
+}
+CAPTION = (
+    "errors: 40-60 s. success: 0.10 m on each axis and 10° for 10 s; t_s: when the first such 10 s begin."
+)
+T2_CAPTION = (
+    "horiz., vert.: RMSE against the reference at the same time. P95: its distance is less for 95 % of the time. "
+    "across: RMS distance to the way."
+)
+EPISODES_CAPTION = "means over episodes; in brackets 95 % of a bootstrap over them."
+
+
+def paper_name(result: Mapping[str, Any]) -> str:
+    """The row of the paper's table that is nearest to what was evaluated."""
+    controller = result["controller"]
+    if controller["kind"] == "pid":
+        return "PID"
+    randomized = " + DR" if controller.get("randomization") else ""
+    if result["task"] == "t2":
+        return f"calibrated{randomized}"
+    if result["plant"]["name"] == "noise" and controller["hydrodynamics"] == "calibrated":
+        return "calibrated, localisation noise"
+    return f"{controller['hydrodynamics']}{randomized}"
+
+
+class Form(NamedTuple):
+    """Summary and display of a task that is measured as in the paper."""
+
+    kind: str
+    """Kind of goal: the key of its name in a row."""
+    targets: Sequence[str]
+    columns: Columns
+    caption: str
+    summarize: Callable[[Sequence[Mapping[str, Any]]], dict[str, Any]]
+    paper: Callable[[str], dict[str, dict[str, Any]]]
+    """Name of the paper's row -> its rows by their names in our table."""
+    figure: str
+    """Name of its file."""
+    draw: Callable[[Mapping[str, Sequence[Trial]], str], Any]
+
+
+FORMS: Mapping[str, Form] = {
+    "t1": Form(
+        "setpoint", tuple(T1_SETPOINTS), T1_COLUMNS, CAPTION, summarize, lambda name: {"": paper_row(name)},
+        "error_envelope.png", draw_envelopes,
+    ),
+    "t2": Form(
+        "trajectory", T2_TRAJECTORIES, T2_COLUMNS, T2_CAPTION, summarize_tracking,
+        lambda name: {target: paper_t2_row(name, target) or {} for target in PAPER_T2[name]},
+        "trajectories.png", draw_tracking,
+    ),
+}  # fmt: skip
+"""Forms of the paper's tasks; every other task is measured in episodes as in training."""
+
+
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """A row for each target and plant, of several plants in T1 for each plant alone; and the paper's."""
+    results: Sequence[Mapping[str, Any]] = result.get("plants", [result])
+    first, several = results[0], len(results) > 1
+    title = f"{first['task']} · {first['controller']['name']} · {first['vehicle']['name']}"
+    if not several:
+        plant = first["plant"]
+        title += f", {first['hydrodynamics']} · plant {plant['name']}: {plant.get('title', '')}"
+    if first["task"] not in FORMS:
+        return [_episodes_table(results, title)]
+    form = FORMS[first["task"]]
+    rows: list[list[str] | None] = []
+    for result in results:
+        prefix, trials = f"{result['plant']['name']}, " if several else "", result["per_trial"]
+        names = () if several and form.kind == "setpoint" else dict.fromkeys(t[form.kind] for t in trials)
+        for name in names:
+            of_target = form.summarize([trial for trial in trials if trial[form.kind] == name])
+            rows.append([f"{prefix}{name}", *cells(of_target, form.columns)])
+        label = f"{prefix}all" if names else result["plant"]["name"]
+        rows += [[label, *cells(result, form.columns)], *([None] if names else [])]
+    papers = dict.fromkeys(paper_name(result) for result in results)
+    for paper in papers:
+        for name, row in form.paper(paper).items():
+            rows.append([f"paper, {name or paper}", *cells(row, form.columns)])
+    heads = [heading.replace(" [", "\n[") for heading, *_ in form.columns.values()]  # for 80 columns
+    note = f"{form.caption} paper: its vehicle in its pool, {', '.join(papers)}, for orientation."
+    sentences = [] if several else _remarks(first["per_trial"])
+    return [Table(title=title, heads=[form.kind, *heads], rows=rows, note=note, sentences=sentences)]
+
+
+def _remarks(trials: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return remarks on records: why one is not complete, and how far its estimate was from the truth."""
+
+    def name(trial: Mapping[str, Any]) -> str:
+        return str(next(trial[key] for key in ("record", "setpoint", "trajectory", "trial") if key in trial))
+
+    faults = [f"{name(trial)}: {trial['fault']}" for trial in trials if trial.get("fault")]
+    located = [(name(trial), trial["localization"]) for trial in trials if trial.get("localization")]
+    return faults + [
+        f"{label}: the robot's estimate was {off['position_m']:.3g} m, {off['heading_deg']:.2g}° off the truth (rms)"
+        for label, off in located
+    ]
+
+
+def _episodes_table(results: Sequence[Mapping[str, Any]], title: str) -> Table:
+    """A row for each measure of an episode, and a column for each plant."""
+    first = results[0]
+    complete = "" if results[1:] else f" · {first['valid']} of {first['trials']} episodes"
+    return Table(
+        title=title + complete,
+        heads=["measure", *(result["plant"]["name"] for result in results)],
+        rows=[
+            [name, *(figure_text(result["metrics"][name], ".4g") for result in results)]
+            for name in first["metrics"]
+        ],
+        note=EPISODES_CAPTION,
+        sentences=_remarks([trial for result in results for trial in result["per_trial"]]),
+        intervals=True,
+    )
+
+
+class EvaluationError(ValueError):
+    """An evaluation that cannot be run."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One controller in one plant."""
+
+    result: dict[str, Any]
+    """Result that `--json` prints: controller, place, measures over all trials, `per_trial`, provenance."""
+    trials: Sequence[Trial] = ()
+    """Trials of T1 and T2, for figures."""
+
+    def __repr__(self) -> str:
+        count = len(self.result.get("per_trial", ()))
+        return f"<Evaluation of {self.label} in {self.result['task']}: {count} trials>"
+
+    def _repr_html_(self) -> str:
+        return "".join(html_of(tables_of(self.result), Path()))
+
+    @property
+    def label(self) -> str:
+        """Name of the controller and, if not nominal, of the plant."""
+        plant = self.result["plant"]["name"]
+        name: str = self.result["controller"]["name"]
+        return name if plant == "nominal" else f"{name}, {plant}"
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """One controller in one plant or several."""
+
+    each: tuple[Evaluation, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the result as plain data; of several plants `plants`, one for each, in their order."""
+        results = [evaluation.result for evaluation in self.each]
+        return results[0] if len(results) == 1 else {"plants": results}
+
+    @property
+    def table(self) -> Table:
+        """Measures by target and plant, with the paper's rows where the task is the paper's."""
+        return tables_of(self.as_json())[0]
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """Measures over all trials of the first plant: keys as in `evaluation.json`, errors in m, rad or as named."""
+        result = self.each[0].result
+        skipped = ("controller", "task", "vehicle", "hydrodynamics", "plant", "provenance", "per_trial")
+        return {key: value for key, value in result.items() if key not in skipped}
+
+    def plot(self) -> Any:
+        """Return a Matplotlib figure: errors against time (t1), or trajectories from above (t2).
+
+        Raises:
+            EvaluationError: The task is measured in episodes, whose motion is not kept.
+        """
+        first = self.each[0].result
+        if first["task"] not in FORMS:
+            names = ", ".join(FORMS)
+            raise EvaluationError(f"task '{first['task']}' has no figure; tasks with one: {names}")
+        title = "" if self.each[1:] else first["plant"].get("title", "")
+        return FORMS[first["task"]].draw({e.label: e.trials for e in self.each}, title)
+
+    def __repr__(self) -> str:
+        return f"<Evaluations: {', '.join(map(repr, self.each))}>"
+
+    def _repr_html_(self) -> str:
+        return "".join(html_of(tables_of(self.as_json()), Path()))
+
+
+def evaluation(
+    controller: Mapping[str, Any],
+    task: str,
+    vehicle: Vehicle,
+    plant: Mapping[str, Any],
+    measures: Sequence[dict[str, Any]],
+    trials: Sequence[Trial] = (),
+    **about: Any,
+) -> Evaluation:
+    """The evaluation of trials that were measured.
+
+    Args:
+        controller: Who steered, as plain data.
+        task: Name; of T1 and T2 each trial has the name of what it went to.
+        vehicle: As the controller knows it.
+        plant: Where, as plain data.
+        measures: Of each trial.
+        trials: Of T1 and T2.
+        about: What else the result says.
+    """
+    form = FORMS.get(task)
+    if form is None:
+        summary = summarize_episodes(measures)
+    else:
+        pairs = enumerate(zip(trials, measures, strict=True))
+        rows = [{"trial": i, form.kind: trial.name, **row} for i, (trial, row) in pairs]
+        summary = {**form.summarize(rows), "per_trial": rows}
+    result = {
+        "controller": dict(controller),
+        "task": task,
+        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
+        "hydrodynamics": "calibrated",
+        "plant": dict(plant),
+        "provenance": provenance(),
+        **about,
+        **summary,
+    }
+    return Evaluation(result, trials)
+
+
+def evaluate(
+    controller: Sequence[str | Path] | str | Path,
+    *,
+    task: str | None = None,
+    vehicle: str | Vehicle | None = None,
+    hydrodynamics: str = "calibrated",
+    plant: Sequence[str | Path] | str | Path = ("nominal",),
+    observe: str | None = None,
+    trajectories: Annotated[Sequence[str | Path], "--trajectory"] = (),
+    trials: Annotated[int | None, (1, 100_000)] = None,
+    truth: Path | None = None,
+    seed: int = 1,
+    out: Path | None = None,
+) -> dict[str, Any]:
+    """Evaluate a controller: success, errors [m, deg], settling time [s]; or errors along trajectories [m].
+
+    Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
+
+    Example: finssim evaluate runs/hold --observe sensors
+
+    Example: finssim evaluate runs/track --task t2 --trajectory ellipse --trajectory my-way.csv
+
+    Example: finssim evaluate run.mcap --task t1 --truth mocap.csv
+
+    Args:
+        controller (DIR|pid|pid-paper|RECORD): A policy's directory, or pid, or pid-paper; or records of one controller
+            on a robot (.mcap).
+        task (TASK): Task; finssim tasks lists them. Your own: FILE.py:CLASS. For records, a task of one vehicle. The
+            policy's own if not given, and t1 of a controller that has none.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file. That of the policy or of the record if
+            not given, and finsrov of a controller that has none.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
+        plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), current, foreign, held_out, lag, mesh,
+            noise, randomised, sensors, simplified, waves, or a file. May be repeated.
+        observe (FILE|NAME): What is seen in every plant: truth, estimator, sensors or a file of fixes; what the plant
+            says if not given.
+        trajectories (FILE|NAME): What t2 follows: straight, broken, ellipse, lemniscate (all four if not given),
+            circle, figure_eight, helix, or a YAML or CSV file. May be repeated.
+        trials: Trials in each plant; if not given, t1's eight setpoints for 60 s, or each trajectory, once.
+        truth (TABLE): Truth for scoring records, instead of the robot's own estimate: a table (.csv, .parquet) of
+            motion capture, t [s], x, y, z [m] and qx, qy, qz, qw or yaw [rad], or the truth file of finssim pool.
+        seed: Seed of every random number; equal seeds give equal results.
+        out: Directory for evaluation.json, trajectories and, for t1 and t2, a figure.
+
+    Returns:
+        The result of the evaluation; of several plants `plants`, one for each, in their order.
+
+    Raises:
+        EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
+    """
+    return evaluate_in_plants(
+        controller, task=task, vehicle=vehicle, hydrodynamics=hydrodynamics, plant=plant, observe=observe,
+        trajectories=trajectories, trials=trials, truth=truth, seed=seed, out=out,
+    ).as_json()  # fmt: skip
+
+
+def evaluate_in_plants(
+    controller: Sequence[str | Path] | str | Path,
+    *,
+    task: str | None = None,
+    vehicle: str | Vehicle | None = None,
+    hydrodynamics: str = "calibrated",
+    plant: Sequence[str | Path] | str | Path = ("nominal",),
+    observe: str | None = None,
+    trajectories: Sequence[str | Path] = (),
+    trials: int | None = None,
+    truth: Path | None = None,
+    seed: int = 1,
+    out: Path | None = None,
+) -> Evaluations:
+    """Evaluate a controller in every plant; arguments and errors as `evaluate`."""
+    names = [controller] if isinstance(controller, str | Path) else controller
+    records = [Path(name) for name in names if str(name).endswith(".mcap")]
+    if len(names) > 1 and len(records) < len(names):
+        raise EvaluationError(
+            "one controller at a time, or records of one: give a single name, or .mcap files"
+        )
+    simulated = {"--observe": observe, "--trials": trials}
+    unheeded = [name for name, value in simulated.items() if value is not None]
+    unheeded += ["--plant"] if tuple(plant) != ("nominal",) and plant != "nominal" else []
+    unheeded += ["--hydrodynamics"] if hydrodynamics != "calibrated" else []
+    if records and unheeded:
+        raise EvaluationError(f"a record was made once and for all: leave {', '.join(unheeded)} out")
+    if truth is not None and not records:
+        raise EvaluationError("--truth is for records: a simulation has its own truth")
+    task, vehicle = _subject(Path(names[0]), task, vehicle)
+    task_named(task)  # which refuses one that does not exist
+    plants = [] if records else _plants([plant] if isinstance(plant, str | Path) else plant)
+    plants = plants if observe is None else [plant_file.with_view(observe) for plant_file in plants]
+    with atomic_directory(out, replaces=EVALUATION_FILE) if out is not None else nullcontext() as folder:
+        evaluations = [_recorded(records, task, vehicle, trajectories, truth)] if records else []
+        for plant_file in plants:
+            target = folder and folder / TRAJECTORIES / (plant_file.name if plants[1:] else "")
+            options = {"hydrodynamics": hydrodynamics, "trials": trials, "seed": seed, "record": target}
+            evaluations.append(
+                evaluate_controller(
+                    names[0], plant_file, task=task, vehicle=vehicle, trajectories=trajectories, **options
+                )
+            )
+        scored = Evaluations(tuple(evaluations))
+        if folder is not None:
+            write_json(folder / EVALUATION_FILE, scored.as_json())
+            if task in FORMS:
+                save_figure(scored.plot(), folder / FORMS[task].figure)
+    return scored
+
+
+def _subject(controller: Path, task: str | None, vehicle: str | Vehicle | None) -> tuple[str, str | Vehicle]:
+    """Return the task and the vehicle of an evaluation: as given, else those of the policy or of the record.
+
+    Raises:
+        EvaluationError: The policy was trained for a vehicle that is not in the catalogue.
+        PolicyError, RecordError, VehicleError: The policy or the record cannot be read.
+    """
+    if controller.suffix == ".mcap" and vehicle is None:
+        with open_record(controller) as record:
+            vehicle = vehicle_of(record) if "vehicle" in record.metadata else None
+    if controller.is_dir() and (task is None or vehicle is None):
+        trained = read_description(controller)
+        task = task or trained.task
+        if vehicle is None:
+            named = trained.vehicle
+            vehicle = catalogue_vehicle(named.name, str(controller)) if named.name in catalogue() else None
+            if vehicle is None or vehicle.sha256 != named.sha256:
+                raise EvaluationError(
+                    f"{controller} was trained for a vehicle '{named.name}' that is not the catalogue's: give its file "
+                    "with --vehicle"
+                )
+    return task or "t1", vehicle or "finsrov"
+
+
+def _recorded(
+    records: Sequence[Path],
+    task: str,
+    vehicle: str | Vehicle,
+    trajectories: Sequence[str | Path],
+    truth: Path | None,
+) -> Evaluation:
+    """The evaluation of records of one controller."""
+    from finssim.evaluation.records import read_record
+
+    if len(trajectories) > 1:
+        raise EvaluationError("records follow one trajectory each: give at most one --trajectory")
+    body = load_vehicle(vehicle)
+    guide = guide_of(trajectories[0], body) if trajectories else None
+    trials = [read_record(path, task, body, guide=guide, truth=truth) for path in records]
+    pilots = [trial.pilot for trial in trials]
+    if any(pilot != pilots[0] for pilot in pilots):
+        names = ", ".join(dict.fromkeys(str(pilot.get("name")) for pilot in pilots))
+        raise EvaluationError(
+            f"the records are of several controllers ({names}): evaluate those of one at a time"
+        )
+    measures = [
+        {"trial": i, "record": trial.path.name, **trial.scores(task, body)} for i, trial in enumerate(trials)
+    ]
+    controller = {"kind": "pid", "action": "wrench6", "hydrodynamics": "calibrated"} | pilots[0]
+    source = "its own estimate" if truth is None else truth.name
+    plant = {"name": "record", "title": f"as recorded, by {source}"}
+    files = [{"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in records]
+    about = {"records": files, "truth": truth and truth.name}
+    return evaluation(controller, task, body, plant, measures, trials, **about)
+
+
+def _plants(names: Sequence[str | Path]) -> list[Plant]:
+    """Return the plants; each must have a unique name, which separates its results."""
+    if not names:
+        raise EvaluationError("no plant is given: name at least one, such as 'nominal'")
+    plants = [load_plant(name) for name in names]
+    for i, plant in enumerate(plants):
+        if plant.name in (earlier.name for earlier in plants[:i]):
+            raise EvaluationError(f"two plants are named '{plant.name}': give each once, or rename one file")
+        if len(plants) > 1:
+            plain_name(plant.name, "plant", EvaluationError)
+    return plants
+
+
+def evaluate_controller(
+    controller: str | Path,
+    plant: Plant,
+    *,
+    task: str = "t1",
+    vehicle: str | Vehicle = "finsrov",
+    hydrodynamics: str = "calibrated",
+    trajectories: Sequence[str | Path] = (),
+    trials: int | None = None,
+    seed: int = 1,
+    record: Path | None = None,
+) -> Evaluation:
+    """Run the trials in one plant and measure them; arguments as `evaluate`.
+
+    Args:
+        hydrodynamics: Model, unless the plant names one.
+        trials: How many; the eight setpoints, or the four trajectories, once if None.
+        seed: Of what the plant draws.
+        record: New folder for every state, command and thrust; none if None.
+    """
+    if trajectories and task != "t2":
+        raise EvaluationError(f"task '{task}' follows no trajectory: omit it, or evaluate t2")
+    the_task = task_named(task)
+    count = len(trajectories) or (len(FORMS[task].targets) if task in FORMS else EPISODES)
+    trials = count if trials is None else trials
+    if trials < 1:
+        raise EvaluationError(f"trials is {trials}, expected 1 or more")
+    start_warp()
+    body = load_vehicle(vehicle)
+    agent = agent_for(controller, body, the_task)
+    played: list[Trial] = []
+    with progress_bar(f"{trials} trials") as show:
+        options: dict[str, Any] = {
+            "trials": trials, "hydrodynamics": hydrodynamics, "seed": seed, "record": record, "show": show,
+        }  # fmt: skip
+        if task in FORMS:
+            guides = [guide_of(x, body) for x in trajectories] or None
+            played = run_trials(agent, the_task, body, plant, guides=guides, **options)
+            limits = plant.changed(body).force_limits
+            measures = [trial.measures(task, limits) for trial in played]
+        else:
+            measures = run_episodes(agent, the_task, body, plant, **options)
+    plant_values = plant.model_dump(mode="json", exclude_defaults=True)
+    about = {
+        "hydrodynamics": plant.hydrodynamics or hydrodynamics,
+        "seed": seed,
+        **plant.observe_record(body),
+    }
+    return evaluation(agent.describe(), task, body, plant_values, measures, played, **about)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(campaign.Job):
+    """Trials of one controller in one plant, as a campaign plays them."""
+
+    controller: str
+    vehicle: str
+    water: Plant
+    trials: int | None
+    noise: int
+    """Seed of the trials."""
+    task: str = "t1"
+
+
+def play(job: Job, _: Path) -> dict[str, Any]:
+    """Run the trials of a job, and return the result of their evaluation."""
+    options: dict[str, Any] = {"vehicle": job.vehicle, "trials": job.trials, "seed": job.noise}
+    return evaluate_controller(job.controller, job.water, task=job.task, **options).result

@@ -1,0 +1,656 @@
+"""`finssim excite --pool` and `--robot`: programmes played by the robot's complete software, and their trials."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.agents.controllers import controller
+from finssim.control import ControlError
+from finssim.control.allocation import Allocator
+from finssim.control.guidance import Goal, Guide, Measured, Station, goal_at
+from finssim.core.files import atomic_directory
+from finssim.core.progress import Progress, progress_bar
+from finssim.core.quiet import start_warp
+from finssim.core.rotations import quat_inverse_rotate, quat_rotate
+from finssim.evaluation.campaign import Show, run_jobs
+from finssim.evaluation.robot_trials import (
+    Attendant,
+    OnRobot,
+    Outcome,
+    PoolJob,
+    RobotTrial,
+    check_starts,
+    noise_seed,
+    play_in_pool,
+    session,
+    take_folder,
+)
+from finssim.identification.programmes import Programme, programmes, write_programme
+from finssim.identification.synthetic import simulate_programme
+from finssim.pool import draw_plant
+from finssim.pool.draw_plant import site_of
+from finssim.pool.plant_spec import Basin
+from finssim.robot.perception import Perception
+from finssim.robot.recorder import Recorder
+from finssim.robot.runtime import Runtime
+from finssim.trials.findings import CalibrationError
+from finssim.trials.importers.dispatch import print_folders, read_trials
+from finssim.trials.trial import Trial
+from finssim.trials.trial_files import write_trial
+from finssim.vehicles import AXES, Vehicle, load_vehicle
+from finssim.vehicles.defaults import room
+
+Array = NDArray[np.float64]
+
+HELD = ("surge", "sway", "heave", "yaw")
+"""Axes that are held while others are excited; roll and pitch right themselves."""
+HELD_IN_TURNS = ("heave",)
+"""Axes that are held while the heading is excited: a position cannot be held in axes that turn."""
+
+
+class ProgrammePilot:
+    """Commands a programme open-loop on its axes. The other axes a PID keeps at the guide's pose.
+
+    Without that, propellers that are not alike turn a vehicle around on a way of two metres. What a fit needs is the
+    wrench that acted, whoever asked for it.
+    """
+
+    needs_state = True
+    name = "programme"
+
+    def __init__(
+        self,
+        programme: Programme,
+        vehicle: Vehicle,
+        *,
+        room: float | None = None,
+        hold: str | None = "pid",
+        period: float = 0.05,
+    ) -> None:
+        """
+        Args:
+            programme: What to command; rows of `excitation` may end early, see `room`, and a coast where the programme
+                says how fast the vehicle then rises.
+            vehicle: Whose thrusters; its model gives the gains of the PID.
+            room: Longest way from where the programme began, after which the excitation ends [m].
+            hold: Name of the PID; None leaves the other axes alone.
+            period: Time between two decisions [s].
+
+        Raises:
+            ControlError: Rows and phases differ in number, or an unknown axis or PID.
+        """
+        axes, phases = programme.axes, len(programme.phase)
+        unknown = [axis for axis in axes if axis not in AXES]
+        if programme.tau_desired.shape != (phases, 6) or not phases or unknown:
+            raise ControlError(
+                f"a programme of shape {programme.tau_desired.shape} with {phases} phases on {', '.join(axes)}: "
+                f"expected a wrench and a phase for every row, on axes of {', '.join(AXES)}"
+            )
+        self.period, self._programme, self._room = period, programme, room
+        self._allocator = Allocator.from_vehicle(vehicle)
+        self._limits = np.asarray(vehicle.wrench_limits, float)
+        held = HELD_IN_TURNS if "yaw" in axes else HELD
+        self._driven = [AXES.index(axis) for axis in axes]
+        self._held = [AXES.index(a) for a in held if hold is not None and a not in axes]  # type: ignore[arg-type]
+        self._hold = controller(hold, vehicle, period=period) if hold is not None else None
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin again."""
+        self._memory: Any = self._hold.reset() if self._hold is not None else None
+        self._skipped = 0
+        self._origin: Array | None = None
+        self._rising_since: float | None = None
+        self._recorded = ""
+        self.phase = ""
+        """The word of the row that was commanded last; empty before and after the programme."""
+        self.fastest = 0.0
+        """Highest speed along the programme's first axis so far, as the robot estimates it [m/s, rad/s]."""
+        self.finished = False
+        """Whether the programme is over."""
+
+    def describe(self) -> dict[str, Any]:
+        """Name, rate and length."""
+        length = self._programme.duration
+        return {"name": self.name, "kind": "programme", "period_s": self.period, "duration_s": length}
+
+    def act(self, reading: Measured, guide: Guide, t: float) -> Array:
+        """Wanted thrusts in canonical order [N], (n,); none after the end."""
+        row, phases = self._row(reading, t), self._programme.phase
+        self.finished = self.finished or row >= len(phases)
+        if self.finished:
+            self.phase = ""
+            return np.zeros(self._allocator.thrusters)
+        self.phase = str(phases[row])
+        tau = self._programme.tau_desired[row].copy()
+        if self._hold is not None:
+            goal = self._beside(goal_at(guide, t), reading)
+            corrected, self._memory = self._hold.command(self._memory, reading, goal)
+            tau[self._held] = corrected[self._held]
+        return self._allocator.allocate(np.clip(tau, -self._limits, self._limits))
+
+    def watch(self, runtime: Runtime) -> None:
+        """After every step: the record gets the phases, and the highest speed is kept."""
+        reading = runtime.reading
+        if reading is None:
+            return
+        if self._recorded:
+            self.fastest = max(self.fastest, abs(float(reading.nu[self._driven[0]])))
+        if self.phase != self._recorded and runtime.recorder is not None:
+            self._recorded = self.phase
+            runtime.recorder.event(reading.time, "phase", self.phase)
+
+    def _beside(self, goal: Goal, reading: Measured) -> Goal:
+        """The goal moved along the excited axes to where the vehicle is.
+
+        Left behind, a way of s metres and a heading error ψ would look like s sin ψ on an axis that is held, and
+        correcting that turns the vehicle further.
+        """
+        q = np.asarray(goal.quaternion, float)
+        away = quat_inverse_rotate(q, np.asarray(reading.position, float) - np.asarray(goal.position, float))
+        along = np.where([axis in self._driven for axis in range(3)], away, 0.0)
+        return replace(goal, position=np.asarray(goal.position, float) + quat_rotate(q, along))
+
+    def _row(self, reading: Measured, t: float) -> int:
+        """Return the row to play; excitations and coasts that have done their work are left early."""
+        phases, position = self._programme.phase, np.array(reading.position, float)
+        self._origin = position if self._origin is None else self._origin
+        row = int(t * self._programme.rate + 1e-6) + self._skipped
+        if row >= len(phases):
+            return row
+        way = float(np.linalg.norm(position - self._origin))
+        done = phases[row] == "excitation" and self._room is not None and way > self._room
+        if done or (phases[row] == "coast" and self._risen(reading, t)):
+            later = np.flatnonzero(phases[row:] != phases[row])
+            skipped = int(later[0]) if len(later) else len(phases) - row
+            self._skipped += skipped
+            row += skipped
+        return row
+
+    def _risen(self, reading: Measured, t: float) -> bool:
+        """Return whether the vehicle has risen steadily for long enough."""
+        if self._programme.ascent_speed is None:
+            return False
+        velocity = quat_rotate(reading.quaternion, np.asarray(reading.nu)[:3])
+        if float(velocity[2]) <= self._programme.ascent_speed:
+            self._rising_since = None
+            return False
+        self._rising_since = t if self._rising_since is None else self._rising_since
+        return t - self._rising_since >= self._programme.ascent_time
+
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Lower and upper corner of the water that a vehicle may be in, world frame [m]."""
+
+
+WALL, SURFACE, FLOOR = 0.35, 0.15, 0.12
+"""Water kept between the vehicle's envelope and these at the ends of a run [m]; these three grow with `room`."""
+STOPPING = {"surge": 0.35, "sway": 0.3, "heave": 0.06}
+"""Share of the room that is kept for the coast after an excitation [m]."""
+LEAST_ROOM = 0.15
+"""Way on which nothing can be learnt [m]."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """Start of a programme."""
+
+    position: tuple[float, float, float]
+    """Body origin, world frame [m]."""
+    yaw: float
+    """[rad]"""
+    room: float | None
+    """Way after which the excitation ends [m]; None where it goes nowhere."""
+
+
+def box_of(surroundings: Basin | Vehicle) -> Box:
+    """The water of a basin, or the workspace of a vehicle, which is taken for walls."""
+    if isinstance(surroundings, Basin):
+        half = 0.5 * surroundings.length, 0.5 * surroundings.width
+        return (-half[0], -half[1], -surroundings.depth), (*half, 0.0)
+    lower, upper = surroundings.safety.workspace_lower, surroundings.safety.workspace_upper
+    return tuple(map(float, lower)), tuple(map(float, upper))  # type: ignore[return-value]
+
+
+def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> Start:
+    """The start of a programme: its way then lies in the middle of the water, surge and sway along x.
+
+    One that goes both ways begins in the middle itself, and has half of the way to either side.
+
+    Args:
+        programme: On one axis; several at once begin in the middle.
+        vehicle: Whose envelope keeps off the walls.
+        box: The water.
+
+    Raises:
+        CalibrationError: The water has no room for it.
+    """
+    (x0, y0, z0), (x1, y1, z1) = box
+    length, width, height = vehicle.body.size
+    scale = room(vehicle.body.size)
+    top, bottom = z1 - 0.5 * height - scale * SURFACE, z0 + 0.5 * height + scale * FLOOR
+    x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (top + bottom)
+    axis = programme.axes[0]
+    if len(programme.axes) != 1 or axis in ("roll", "pitch", "yaw"):
+        return Start((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
+    column = programme.tau_desired[:, AXES.index(axis)]
+    sign = float(column.max() > 0.0) - float(column.min() < 0.0)  # 0 where it goes both ways
+    # Heading along x for surge; across it for sway, so that its left is where x falls.
+    yaw = 0.5 * math.pi if axis == "sway" else 0.0
+    if axis == "heave":
+        half = 0.5 * (top - bottom)
+        z -= sign * half
+    else:
+        half = 0.5 * (x1 - x0) - 0.5 * (length if axis == "surge" else width) - scale * WALL
+        x -= sign * half * (1.0 if axis == "surge" else -1.0)
+    way = half * (2.0 if sign else 1.0) - scale * STOPPING[axis]
+    if not way >= LEAST_ROOM:
+        raise CalibrationError(
+            f"{programme.name}: the pool leaves {way:.2f} m to go along {axis}, expected {LEAST_ROOM} m or more: use a "
+            "larger pool"
+        )
+    return Start((x, y, z), yaw, way)
+
+
+ESTIMATOR = "error-state"
+"""Mode of the estimator: it predicts with the accelerometer, so that its velocity does not lag behind the motion."""
+
+
+def programme_trial(
+    programme: Programme, vehicle: Vehicle, start: Start, *, hold: str | None = "pid"
+) -> RobotTrial:
+    """The trial that plays a programme, and ends with it; its record has the phases.
+
+    Args:
+        programme: What to play.
+        vehicle: As the robot knows it.
+        start: Where it begins, and how far it may go.
+        hold: PID that keeps the other axes; None leaves them alone.
+    """
+    pilot = ProgrammePilot(programme, vehicle, room=start.room, hold=hold)
+    return RobotTrial(
+        name=programme.name,
+        pilot=pilot,
+        guide=Station(start.position, start.yaw, name=programme.name),
+        duration=programme.duration,
+        over=lambda runtime: pilot.finished,
+        watch=pilot.watch,
+    )
+
+
+def about_programme(programme: Programme, label: str) -> dict[str, Any]:
+    """Return a record's description of the programme's trial."""
+    return {"trial": {"axis": list(programme.axes), "description": f"{label}: {programme.name}"}}
+
+
+def write_trial_of(record: Path, folder: Path, role: str) -> Trial:
+    """Write the trial of a record, from where its programme began, into a folder of its name.
+
+    Args:
+        record: MCAP of one programme.
+        folder: Of the trial.
+        role: fit or held-out.
+    """
+    trial = read_trials([record], split="phase")[0]
+    header = trial.header.model_copy(update={"role": role})
+    trial = replace(trial, name=folder.name, header=header)
+    write_trial(trial, folder, format="parquet")
+    return trial
+
+
+RECORDS = "records"
+"""Folder of the MCAPs beside the trials."""
+PLAN_FILE = "programmes.yaml"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoolRun(PoolJob):
+    """A programme, who plays it and where; the row is the role of its trial: fit or held-out."""
+
+    programme: Programme
+    camera: str = "corners"
+    hold: str | None = "pid"
+    """PID that keeps the other axes."""
+
+    @property
+    def water(self) -> Box:
+        """Return the water of the pool."""
+        standing = load_vehicle(self.pool_vehicle)
+        return box_of(site_of(self.site, draw_plant(standing, self.plant, self.severity)).basin)  # type: ignore[arg-type]
+
+
+def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
+    """Play a programme in its pool.
+
+    Args:
+        run: What, who and where; the target is the name of the programme.
+        path: Folder that takes TARGET, the trial, and TARGET.mcap, the record.
+
+    Returns:
+        `fault` (why the bridge ended it early, or empty), `text` (of `fastest_text`) and the `notes` of the import.
+    """
+    start_warp()
+    record = path / f"{run.target}.mcap"
+    record.parent.mkdir(parents=True, exist_ok=True)
+    record.unlink(missing_ok=True)
+    vehicle, seed = load_vehicle(run.vehicle), noise_seed(run.seed, run.row, run.target)
+    start = start_of(run.programme, vehicle, run.water)
+    trial = programme_trial(run.programme, vehicle, start, hold=run.hold)
+    about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
+    with Recorder(record, vehicle, about, pictures="none") as recorder:
+        outcome = play_in_pool(
+            trial, Station(start.position, start.yaw), run.equipped(), run.plan(seed), seed=seed, recorder=recorder,
+            mode=ESTIMATOR,
+        )  # fmt: skip
+    return {
+        "fault": outcome.fault,
+        "text": fastest_text(run.programme, outcome),
+        "notes": list(map(str, write_trial_of(record, path / run.target, run.row).findings)),
+    }
+
+
+Plans = Mapping[str, Sequence[Programme]]
+"""Role of the trials (fit, held-out) -> programmes."""
+
+
+def record_programmes(
+    plans: Plans,
+    folders: Mapping[str, Path],
+    vehicle: str,
+    robot: OnRobot | None = None,
+    *,
+    attendant: Attendant | None = None,
+    console: Console | None = None,
+    **pool: Any,
+) -> dict[str, list[Path]]:
+    """Make trials of programmes, played by the robot's complete software at the start that `start_of` gives each.
+
+    Args:
+        plans: What is played.
+        folders: By role: takes NAME, the trials, and records/NAME.mcap.
+        vehicle: Name or file, as the robot knows it.
+        robot: That plays what has no trial in its folder yet, within the workspace; not opened where nothing is left.
+            None: a virtual pool does.
+        attendant: Beside the robot, instead of the terminal's keyboard.
+        console: Where a robot's state is told; standard error if None.
+        pool: Arguments of `_in_pool`.
+
+    Returns:
+        Folders of the trials by role, in the order of the programmes, without those that were skipped or left out.
+
+    Raises:
+        RobotError: It may not be armed, or stopped with nobody there to help.
+        KeyboardInterrupt: Ctrl-C; of a robot the same call goes on.
+        CalibrationError: A programme that the water has no room for, or that the pool's bridge stopped.
+        GoalError, LinkError, VehicleError, OutputError: As they say.
+    """
+    if robot is None:
+        _in_pool(plans, folders, vehicle, **pool)
+    else:
+        _on_robot(plans, folders, load_vehicle(vehicle), robot, attendant, console)
+    planned = {role: [folders[role] / programme.name for programme in plan] for role, plan in plans.items()}
+    return {role: [path for path in paths if path.is_dir()] for role, paths in planned.items()}
+
+
+def _on_robot(
+    plans: Plans,
+    folders: Mapping[str, Path],
+    vehicle: Vehicle,
+    robot: OnRobot,
+    attendant: Attendant | None,
+    console: Console | None,
+) -> None:
+    remaining = [
+        (role, programme, folders[role] / programme.name)
+        for role, plan in plans.items()
+        for programme in plan
+        if not (folders[role] / programme.name).is_dir()
+    ]
+    places = {path: start_of(programme, vehicle, box_of(vehicle)) for _, programme, path in remaining}
+    starts = {path: Station(start.position, start.yaw) for path, start in places.items()}
+    check_starts({path.name: start for path, start in starts.items()}, vehicle)
+    if not remaining:
+        return
+    with session(robot, vehicle, attendant=attendant, console=console) as opened:
+        for role, programme, path in remaining:
+            record = folders[role] / RECORDS / f"{programme.name}.mcap"
+            if not record.is_file():
+                outcome = opened.trial(
+                    lambda programme=programme, path=path: programme_trial(programme, vehicle, places[path]),
+                    starts[path],
+                    record,
+                    counts=False,
+                    exact=False,
+                    perception=lambda: Perception(opened.equipped, opened.site, mode=ESTIMATOR),
+                    about={"command": "finssim excite", **about_programme(programme, robot.title)},
+                )
+                if outcome is None:
+                    continue
+                opened.notify(f"  {fastest_text(programme, outcome)}")
+            write_trial_of(record, path, role)
+
+
+def fastest_text(programme: Programme, outcome: Outcome) -> str:
+    """Return the greatest speed of a programme, and its duration, as text."""
+    pilot, t = outcome.trial.pilot, outcome.runtime.t
+    assert isinstance(pilot, ProgrammePilot)
+    unit = "m/s" if programme.axes[0] in AXES[:3] else "rad/s"
+    return f"up to {pilot.fastest:.2f} {unit} in {0.0 if math.isnan(t) else t:.0f} s"
+
+
+def _in_pool(
+    plans: Plans,
+    folders: Mapping[str, Path],
+    vehicle: str,
+    *,
+    leave_out: bool = False,
+    processes: int | None = None,
+    progress: Progress = lambda part, text: None,
+    show: Show = lambda job, result: None,
+    **settings: Any,
+) -> None:
+    """Make trials of programmes in a pool.
+
+    Args:
+        plans, folders, vehicle: As of `record_programmes`.
+        leave_out: Leave out the trials that the bridge stopped, instead of refusing all; `show` is given their fault.
+        processes: As many as there are processors if None.
+        progress: Told the share that is done and what is left.
+        show: Given each run and its result, of `play_programme`, as soon as there is one.
+        settings: Of every `PoolRun`.
+    """
+    runs = [
+        PoolRun(row=role, target=programme.name, programme=programme, vehicle=vehicle, **settings)
+        for role, plan in plans.items()
+        for programme in plan
+        if not (folders[role] / programme.name).is_dir()
+    ]
+    body = load_vehicle(vehicle)
+    for run in runs:  # what cannot be is refused before anything is played
+        start_of(run.programme, body, runs[0].water)
+    with tempfile.TemporaryDirectory() as scratch:
+        results = run_jobs(
+            runs, Path(scratch), play_programme, processes=processes, progress=progress, show=show
+        )
+        for run, result in zip(runs, results, strict=True):
+            if result["fault"] and leave_out:
+                continue
+            if result["fault"]:
+                raise CalibrationError(
+                    f"{run.target} in the virtual pool: {result['fault']}: give lower levels, or fewer axes"
+                )
+            source, folder = Path(scratch) / result["key"], folders[run.row]
+            (folder / RECORDS).mkdir(parents=True, exist_ok=True)
+            shutil.move(source / run.target, folder / run.target)
+            shutil.move(source / f"{run.target}.mcap", folder / RECORDS)
+    for role, plan in plans.items():
+        if not any((folders[role] / programme.name).is_dir() for programme in plan):
+            raise CalibrationError(
+                f"the bridge stopped every {role} trial in the virtual pool: {results[0]['fault']}: give lower levels"
+            )
+
+
+def excite(
+    axes: str,
+    *,
+    vehicle: str,
+    out: Path,
+    kind: str = "published",
+    levels: Sequence[str] | None = None,
+    repeats: Annotated[int, (1, 100)] = 1,
+    simulate: bool = False,
+    pool: Annotated[int | None, (0, None)] = None,
+    severity: str | None = None,
+    pool_vehicle: str | None = None,
+    inputs: Annotated[Sequence[str], ","] = ("rpm", "wrench"),
+    coast: float = 30.0,
+    duration: float = 60.0,
+    robot: OnRobot | None = None,
+    seed: int = 1,
+    as_json: bool = False,
+) -> list[Path]:
+    """Play excitation programmes on a robot or in simulation, or write them as tables (wrench [N, N m], 50 Hz).
+
+    Example: finssim excite surge,yaw --vehicle finsrov --pool 1 --out trials
+
+    Example: finssim excite all --vehicle finsrov --robot udp://10.0.0.2:58766 --pool-file pool.yaml --arm --out trials
+
+    Args:
+        axes (AXES): all, or of surge,sway,heave,roll,pitch,yaw separated by commas.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        out (DIR): Directory of the programmes or trials.
+        kind (KIND): published (steps, dive-and-coast, pulses), validation, or multisine.
+        levels (LEVELS): Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times.
+        repeats: Repeats of every programme.
+        simulate: Run them in the simulator and write the trials.
+        pool (SEED): Seed of a virtual pool, in which the robot's software plays them, records, and writes trials.
+        severity (NAME): Severity of that pool: nominal, realistic or hard; realistic if not given.
+        pool_vehicle (NAME|FILE): Vehicle around which that pool's plant is drawn; the robot's if not given.
+        inputs (NAMES): Inputs logged in simulated trials, of wrench,rpm,force,pwm,command.
+        coast: Longest coast after a dive [s].
+        duration: Duration of a multi-sine [s].
+        robot: The robot that plays them, in place of a simulation.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
+
+    Returns:
+        The folders of the trials or programmes.
+
+    Raises:
+        CalibrationError, RobotError, VehicleError, OutputError: As they say.
+    """
+    plan: dict[str, Any] = {
+        "kind": kind, "levels": _levels(levels or ()), "repeats": repeats, "coast": coast, "duration": duration,
+    }  # fmt: skip
+    of_pool = severity is not None or pool_vehicle is not None
+    if robot is not None and (simulate or pool is not None or of_pool):
+        raise CalibrationError("--robot excludes --simulate, --pool and their options")
+    if pool is not None and simulate:
+        raise CalibrationError("--pool excludes --simulate: give one of them")
+    if pool is None and of_pool:
+        raise CalibrationError("--severity and --pool-vehicle need a virtual pool: give --pool SEED")
+    if robot is not None:
+        folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, **plan)
+        print_folders(folders, as_json)
+        return folders
+    start_warp()
+    body, pool_vehicle, severity = load_vehicle(vehicle), pool_vehicle or vehicle, severity or "realistic"
+    played = programmes(axes, body, seed=seed, **plan)
+    with atomic_directory(out, replaces=PLAN_FILE) as folder:
+        if pool is not None:
+            about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
+            take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"pool": about}))
+            with progress_bar("playing programmes") as progress:
+                record_programmes(
+                    {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=pool_vehicle, plant=pool,
+                    severity=severity, seed=seed, progress=progress,
+                )  # fmt: skip
+        else:
+            take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"simulated": simulate}))
+            for trial in simulate_programme(played, body, seed=seed, inputs=inputs) if simulate else ():
+                write_trial(trial, folder / trial.name)
+            for programme in () if simulate else played:
+                write_programme(programme, body, folder / programme.name)
+    folders = [Path(out) / programme.name for programme in played]
+    print_folders(folders, as_json)
+    return folders
+
+
+def _levels(texts: Sequence[str]) -> dict[str, list[float]] | list[float] | None:
+    """Levels by axis from `surge=5,10`, or for every axis from `5,10`."""
+    named: dict[str, list[float]] = {}
+    for word in texts:
+        axis, _, numbers = word.rpartition("=")
+        try:
+            values = [float(number) for number in numbers.split(",")]
+        except ValueError:
+            values = [math.nan]
+        if not all(map(math.isfinite, values)):
+            raise CalibrationError(f"levels are '{word}', expected numbers such as 5,10 or surge=5,10")
+        named.setdefault(axis.strip(), []).extend(values)
+    if "" in named and len(named) > 1:
+        raise CalibrationError("levels are given for every axis and for single ones: give one of the two")
+    return named.get("", named) or None
+
+
+def excite_on_robot(
+    axes: str,
+    *,
+    vehicle: str,
+    out: Path,
+    robot: OnRobot,
+    seed: int = 0,
+    attendant: Attendant | None = None,
+    console: Console | None = None,
+    **plan: Any,
+) -> list[Path]:
+    """Play programmes on a robot, one after the other; what lies in the folder is not played again.
+
+    Args:
+        axes: As for `programmes`; so are seed and plan (kind, levels, repeats, coast, duration).
+        vehicle: Name or file of the vehicle; its workspace is where programmes go to and fro.
+        out: Takes a trial for each programme, `records/NAME.mcap`, and `programmes.yaml`.
+        robot: Which, and how.
+        attendant: Instead of the terminal's keyboard.
+        console: Where it is told how it stands; standard error if None.
+
+    Returns:
+        The folders of the trials, without those that were skipped.
+
+    Raises:
+        RobotError: The folder is of another plan; and as `record_programmes`.
+    """
+    start_warp()
+    body = load_vehicle(vehicle)
+    played = programmes(axes, body, seed=seed, **plan)
+    take_folder(
+        Path(out) / PLAN_FILE, _about(body, played, seed, str(plan.get("kind", "published")), {"robot": True})
+    )
+    folders = {"fit": Path(out)}
+    return record_programmes({"fit": played}, folders, vehicle, robot, attendant=attendant, console=console)[
+        "fit"
+    ]
+
+
+def _about(
+    vehicle: Vehicle, played: Sequence[Programme], seed: int, kind: str, place_values: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the description of the folder."""
+    return {
+        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
+        "kind": kind,
+        **place_values,
+        "seed": seed,
+        "programmes": [programme.name for programme in played],
+        "sha256": [programme.sha256 for programme in played],
+    }

@@ -1,0 +1,784 @@
+"""Motion of a vehicle from its record: demonstrations (`finssim collect RECORD.mcap`), or a trial that is measured as
+in simulation, by the robot's own estimate or by a truth (`finssim evaluate RECORD.mcap`)."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from finssim.control.ardusub import Mixer
+from finssim.control.guidance import Guide, Station, Track
+from finssim.control.modes import AXES, ActionMode, action_mode, axis_dead_band, before_dead_band
+from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, Trajectory, load_trajectory
+from finssim.core.provenance import provenance
+from finssim.core.rotations import quat_from_yaw
+from finssim.core.yaml_file import json_value
+from finssim.evaluation.campaign import Progress
+from finssim.evaluation.metrics import MAX_GAP, T1_SETPOINTS, in_room
+from finssim.evaluation.tables import Table
+from finssim.evaluation.trials import DURATION, Motion, Trial, follows, interpolated, localization_errors
+from finssim.extensions.viewer.frame import ViewError
+from finssim.extensions.viewer.series import PoseSeries, offset_between
+from finssim.learning.demonstrations import DatasetError, Episode, about, data_sets_in, save
+from finssim.learning.demonstrations import collect as collect_episodes
+from finssim.learning.lerobot import export_lerobot
+from finssim.pool.task_site import Referee
+from finssim.pool.virtual_pool import read_truth
+from finssim.robot.goals import station_of
+from finssim.robot.record_messages import STATES
+from finssim.robot.record_reader import Record, events_of, open_record
+from finssim.tasks import Task
+from finssim.tasks.observer import Observer, fitted_task
+from finssim.trials.trial_files import read_table
+from finssim.vehicles import Vehicle, load_vehicle
+
+Array = NDArray[np.float64]
+
+TOPICS = ("thruster_cmd", "odom", "policy_info", "goal", "estimator_status", "thruster_state")
+"""Topics of a demonstration; `events` are read if there are any."""
+REMEDY = "record a drive with --pool-file and pictures"
+LACKS = {
+    "thruster_cmd": f"nobody commanded: {REMEDY}",
+    "odom": f"it holds no estimate of where it was: {REMEDY}",
+}
+"""Topic -> message about a record without it."""
+TELEOP = "finssim teleop"
+PERSON = "person"
+"""Mode of a teleoperated vehicle in which its operator steers, and the one it begins in."""
+NO_GOAL = (0.0, 0.0, 0.0, 0.0)
+"""Goal in the record of a drive by hand without a goal."""
+
+
+class DriveError(ValueError):
+    """A record or a truth that cannot be learnt from or measured."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The N decisions of a record at which there was an estimate, in their order."""
+
+    path: Path
+    driver: str
+    """teleop, or the pilot's name."""
+    pilot: dict[str, Any]
+    """Pilot as the record describes it; empty if it does not."""
+    period: float
+    """Period of the decisions [s]."""
+    time: Array
+    """Robot's clock [s], (N,)."""
+    motion: Motion
+    """Estimated motion, with the thrusts and the pilot's actions, which have size 0 if the record lacks them, as of a
+    person; its times are NaN if the record lacks the guide's start."""
+    guide: str
+    """Name of the station or trajectory; empty if the record lacks it."""
+    goal: Array
+    """Goal of the vehicle: x, y, z [m], yaw [rad], world frame, (N, 4)."""
+    stretch: NDArray[np.int64]
+    """Number of the stretch a decision belongs to, (N,): all through it the robot was armed, the estimate ready and
+    the driver at the helm. Negative: in none."""
+
+    @property
+    def has_goal(self) -> bool:
+        """Return whether the record has a goal."""
+        return self.driver != "teleop" or bool(np.any(self.goal != NO_GOAL))
+
+
+def read_drive(path: Path, vehicle: Vehicle) -> Drive:
+    """Read a record of `finssim teleop` or `finssim run`; one that was cut is read up to the cut.
+
+    Args:
+        path: MCAP file.
+        vehicle: It must be the very one that was driven.
+
+    Raises:
+        RecordError: Not a record.
+        DriveError: Of another vehicle, without an estimate, or nobody commanded.
+    """
+    with open_record(path) as record:
+        _check(record, vehicle)
+        pilot = _mapping(record, "pilot")
+        teleop = record.metadata.get("command") == TELEOP
+        columns = {name: {e.time: e.message for e in record.messages((name,))} for name in TOPICS}
+        events = [(event["time"], event) for event in events_of(record)]
+    steps = np.array(sorted(columns["thruster_state"]))
+    numbers = dict(zip(steps.tolist(), _stretches(steps, columns, _helm(steps, events, teleop)), strict=True))
+    complete = [t for t in sorted(columns["thruster_cmd"]) if all(t in columns[name] for name in TOPICS)]
+    if not complete:
+        raise DriveError(f"{path}: no decision at which there was an estimate: no demonstration")
+    rows, time = {name: [columns[name][t] for t in complete] for name in TOPICS}, np.array(complete)
+    stretch = np.array([numbers[t] for t in complete])
+    first = rows["policy_info"][int(np.argmax(stretch >= 0))]
+    began, guide = next(
+        ((t, str(event["text"])) for t, event in events if event["kind"] == "trial_start"), (math.nan, "")
+    )
+    poses, twists = ([getattr(m, k) for m in rows["odom"]] for k in ("pose", "twist"))
+    goals = [message.pose for message in rows["goal"]]
+    actions = [np.asarray(message.action, dtype=float) for message in rows["policy_info"]]
+    alike = len({len(action) for action in actions}) == 1
+    motion = Motion(
+        t=time - began,
+        position=np.array([_xyz(p.pose.position) for p in poses]),
+        quaternion=np.array([(*_xyz(p.pose.orientation), p.pose.orientation.w) for p in poses]),
+        nu=np.array([(*_xyz(t.twist.linear), *_xyz(t.twist.angular)) for t in twists]),
+        thrust=np.array([message.force for message in rows["thruster_cmd"]], dtype=float),
+        action=np.array(actions) if alike else np.zeros((len(complete), 0)),
+    )
+    return Drive(
+        path=path,
+        driver="teleop" if teleop else str(first.pilot),
+        pilot=pilot,
+        period=float(first.period),
+        time=time,
+        motion=motion,
+        guide=guide,
+        # The goal is level: its quaternion turns about z alone.
+        goal=np.array(
+            [(*_xyz(g.position), 2.0 * math.atan2(g.orientation.z, g.orientation.w)) for g in goals]
+        ),
+        stretch=stretch,
+    )
+
+
+def _check(record: Record, vehicle: Vehicle) -> None:
+    about = record.metadata
+    if "vehicle_sha256" not in about:
+        raise DriveError(f"{record.path}: does not name its vehicle: not a record of FinsSim")
+    if about["vehicle_sha256"] != vehicle.sha256:
+        raise DriveError(
+            f"{record.path}: is of the vehicle {about['vehicle']} {about['vehicle_sha256'][:12]}, expected "
+            f"{vehicle.name} {vehicle.sha256[:12]}: name the file that was driven with --vehicle"
+        )
+    for name in TOPICS:
+        if record.topic(name) not in record.topics:
+            lacks = f"has no topic {name}: not a record of finssim teleop or run"
+            raise DriveError(f"{record.path}: {LACKS.get(name, lacks)}")
+
+
+def _mapping(record: Record, key: str) -> dict[str, Any]:
+    """A mapping of a record's metadata; empty where it has none."""
+    text = record.metadata.get(key, "{}")
+    try:
+        return dict(json_value(text, DriveError, str(record.path)))
+    except (ValueError, TypeError):
+        raise DriveError(
+            f"{record.path}: its '{key}' is '{text[:60]}', expected a mapping: not a record of ours"
+        ) from None
+
+
+def _helm(steps: Array, events: list[tuple[float, Any]], teleop: bool) -> NDArray[np.bool_]:
+    """Return whether the demonstrator steers at each step: in a drive by hand the person."""
+    if not teleop:
+        return np.ones(len(steps), dtype=np.bool_)
+    changes = [(t, event["text"] == PERSON) for t, event in events if event["kind"] == "mode"]
+    times = np.array([-math.inf, *(t for t, _ in changes)])
+    # A press changes who decides from the next step on.
+    index = np.searchsorted(times, steps, side="left") - 1
+    return np.array([True, *(person for _, person in changes)])[np.maximum(index, 0)]
+
+
+def _stretches(
+    steps: Array, columns: Mapping[str, Mapping[float, Any]], helm: NDArray[np.bool_]
+) -> list[int]:
+    """Number of each step's stretch, which every step that may not be learnt from ends; negative there."""
+    states, ready, poses = columns["thruster_state"], columns["estimator_status"], columns["odom"]
+    armed = STATES.index("armed")
+    fit = helm & np.array(
+        [
+            states[t].state == armed and t in poses and t in ready and bool(ready[t].ready)
+            for t in steps.tolist()
+        ],
+        dtype=np.bool_,
+    )
+    return [int(n) for n in np.where(fit, np.cumsum(~fit), -1)]
+
+
+def _xyz(v: Any) -> tuple[float, float, float]:
+    return float(v.x), float(v.y), float(v.z)
+
+
+NEAR_WRENCH = 0.05
+"""Greatest difference of a wrench from an action, per axis, as a share of the wrench limits, for the action to count as
+known."""
+FEW = 0.05
+"""Part of the decisions that may be off by more: those at the limits of the thrusters."""
+
+
+def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[np.float32]:
+    """Actions that ask for what was commanded, in [-1, 1], (N, size).
+
+    Args:
+        force: Commanded thrusts, along the thrusters' axes, canonical order [N], (N, n).
+        mode: Action mode of that vehicle.
+        vehicle: Its control matrix makes a wrench of thrusts.
+
+    Raises:
+        DriveError: More than a few of the commands are none that the mode can ask for.
+    """
+    f = np.asarray(force, float)
+    if mode.wrench:
+        parts = f @ vehicle.control_matrix.T
+    elif mode.pilot:
+        mixer = Mixer.of(vehicle)
+        parts = np.array([mixer.demands(thrusts) for thrusts in f])
+    else:
+        lower, upper = vehicle.force_limits
+        full = np.where(f >= 0.0, upper, -lower)
+        parts = np.divide(f, full, out=np.zeros_like(f), where=full > 0.0)
+    action = parts @ np.linalg.pinv(mode.columns)
+    if mode.pilot:
+        action = before_dead_band(action, axis_dead_band(vehicle, mode.scale))
+    action = np.clip(action, -1.0, 1.0)
+    # Compare the wrench that the actions would give with the one that was commanded.
+    limits = np.asarray(vehicle.wrench_limits, float)
+    off = np.abs((mode.to_thrusters(action) - f) @ vehicle.control_matrix.T)
+    off = np.divide(off, limits, out=np.zeros_like(off), where=limits > 0.0)
+    wrong = float(np.mean(off.max(axis=1) > NEAR_WRENCH))
+    if wrong > FEW:
+        worst = int(np.argmax(off.max(axis=0)))
+        raise DriveError(
+            f"{mode.name} cannot ask for what was commanded in {100.0 * wrong:.0f} % of the decisions ({AXES[worst]} "
+            f"is off by up to {off[:, worst].max():.2f} of its limit): give another --action"
+        )
+    return action.astype(np.float32)
+
+
+Indices = NDArray[np.int64]
+
+END = "end"
+"""Mark of the end of a stretch, in place of a goal."""
+NEAR = 0.25
+"""A decision may lie so far from the task's grid of times, in parts of its period."""
+SAME_GOAL = 1.0e-3
+"""Recorded goals that differ by no more are one, or lie on the trajectory [m, rad]."""
+
+
+def episodes_of(
+    drive: Drive, observer: Observer, mode: ActionMode, vehicle: Vehicle, *,
+    goal: Station | str | None = None,
+) -> list[Episode]:  # fmt: skip
+    """Demonstrations of a drive; none where it has no stretch of two decisions.
+
+    Rewards are not known: they are NaN. An episode is never `terminated`; its measures are its `length` in steps and
+    `began`, the robot's time of its first decision [s].
+
+    Args:
+        drive: What was done.
+        observer: How the task is observed.
+        mode: In which it is acted.
+        vehicle: Which was driven.
+        goal: In place of the recorded one: a station, or `END`; of a task that follows a trajectory its name or file.
+
+    Raises:
+        DriveError: Decisions further apart than the task's, no goal, or commands that the mode cannot ask for.
+    """
+    task, period = observer.task, observer.task.control_step
+    if drive.period > period * (1.0 + 1e-6):
+        raise DriveError(
+            f"{drive.path}: {drive.driver} decided every {drive.period:g} s, expected at most {period:g} s, the period "
+            f"of {task.name}, so it is not a controller of that task"
+        )
+    guide_of = _guides(drive, vehicle, task.moving, goal)
+    stretches = indices_of(drive, period, split_goals=not task.moving and goal is None)
+    if not stretches:
+        return []
+    motion = drive.motion
+    try:
+        assert motion.thrust is not None and motion.nu is not None
+        actions = actions_of(motion.thrust[np.concatenate(stretches)], mode, vehicle)
+    except DriveError as error:
+        raise DriveError(f"{drive.path}: {error}") from None
+    episodes, first = [], 0
+    for rows in stretches:
+        guide = guide_of(rows)
+        observer.restart()
+        tracks = [Track(motion.position[i], motion.quaternion[i], motion.nu[i]) for i in rows]
+        times = np.nan_to_num(motion.t[rows])
+        observation = [observer.observe(s, guide, float(t)) for s, t in zip(tracks, times, strict=True)]
+        episodes.append(
+            Episode(
+                observation=np.array(observation, dtype=np.float32),
+                action=actions[first : first + len(rows) - 1],
+                reward=np.full(len(rows) - 1, np.nan, dtype=np.float32),
+                terminated=False,
+                metrics={"length": float(len(rows) - 1), "began": float(drive.time[rows[0]])},
+            )
+        )
+        first += len(rows)
+    return episodes
+
+
+def indices_of(drive: Drive, period: float, *, split_goals: bool) -> list[Indices]:
+    """Decisions, one a period, of each stretch that has at least two.
+
+    Args:
+        drive: What was done.
+        period: [s]
+        split_goals: Whether another goal begins another stretch.
+    """
+    number = drive.stretch
+    changed = np.diff(number) != 0
+    if split_goals:
+        changed = changed | (np.abs(np.diff(drive.goal, axis=0)) > SAME_GOAL).any(axis=1)
+    runs = np.split(np.arange(len(number)), np.flatnonzero(changed) + 1)
+    pieces = [piece for run in runs if number[run[0]] >= 0 for piece in _on_grid(run, drive.time, period)]
+    return [piece for piece in pieces if len(piece) >= 2]
+
+
+def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
+    """The decisions nearest to a grid of times that begins with the first; a new grid after every gap."""
+    t = time[run]
+    pieces, piece = [], [0]
+    while (due := t[piece[0]] + len(piece) * period) <= t[-1] + 1e-6:
+        after = int(np.searchsorted(t, due))
+        near = max(after - 1, 0) if after == len(t) or due - t[after - 1] < t[after] - due else after
+        if abs(t[near] - due) <= NEAR * period:
+            piece.append(near)
+        else:
+            pieces.append(piece)
+            piece = [after]
+    return [run[p] for p in (*pieces, piece)]
+
+
+def _guides(
+    drive: Drive, vehicle: Vehicle, moving: bool, goal: Station | str | None
+) -> Callable[[Indices], Guide]:
+    """Return a function from the indices of decisions to the guide of a stretch."""
+    if moving:
+        trajectory = trajectory_of(drive, vehicle, None if goal is None else str(goal))
+        return lambda rows: trajectory
+    if isinstance(goal, Station):
+        return lambda rows: goal
+    if goal == END:
+        between = drive.motion.between
+        return lambda rows: station_at((*between(rows).position[-1], float(between(rows).yaw[-1])))
+    if not drive.has_goal:
+        raise DriveError(
+            f"{drive.path}: was driven by hand to no goal: give --goal x,y,z,yaw_deg, where to, or --goal {END}: where "
+            "each stretch ended"
+        )
+    return lambda rows: station_at(drive.goal[rows[0]])
+
+
+GIVE = "give the name or the file of what was followed (evaluate --trajectory, collect --goal)"
+
+
+def station_at(goal: Sequence[float] | Array) -> Station:
+    """The station of a goal: x, y, z [m], yaw [rad], world frame, (4,)."""
+    x, y, z, yaw = map(float, goal)
+    return Station((x, y, z), yaw)
+
+
+def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Guide:
+    """The trajectory that was followed, checked against the recorded goals.
+
+    Args:
+        drive: What was done.
+        vehicle: Which followed it: a published trajectory is as large as its room.
+        name: Name or file; the recorded name if None.
+
+    Raises:
+        DriveError: The record does not tell, or its goals are not on the trajectory.
+    """
+    name = name or drive.guide
+    named = name in TRAJECTORIES or name in PUBLISHED_NAMES
+    if name == drive.guide and not named:  # what a record names is no path
+        raise DriveError(
+            f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: {GIVE}"
+        )
+    if np.isnan(drive.motion.t).any():
+        raise DriveError(f"{drive.path}: has no start time of its trajectory: not a record of finssim run")
+    guide = load_trajectory(name, vehicle=vehicle)
+    off = float(np.linalg.norm(guide.at(drive.motion.t).position - drive.goal[:, :3], axis=1).max())
+    if off > SAME_GOAL:
+        raise DriveError(f"{drive.path}: its goals are up to {off:.3g} m off the trajectory '{name}': {GIVE}")
+    return guide
+
+
+def collect(
+    experts: Sequence[str],
+    *,
+    task: str,
+    out: Path,
+    episodes: Annotated[int | None, (1, 1_000_000)] = None,
+    vehicle: str = "finsrov",
+    hydrodynamics: str = "calibrated",
+    action: str | None = None,
+    randomize: str | None = None,
+    observe: str = "training",
+    disturb: float = 0.0,
+    goal: str | None = None,
+    seed: int = 1,
+    progress: Progress = lambda part, text: None,
+) -> dict[str, Any]:
+    """Store episodes of a task as a Minari data set, from an expert or from records of a driven vehicle.
+
+    Example: finssim collect pid --task t1 --episodes 200 --out demonstrations/hold
+
+    Args:
+        experts (DIR|NAME|RECORD...): A policy's directory or a baseline of the task; or records of driven vehicles
+            (.mcap).
+        task (TASK): Task of the demonstrations; finssim tasks lists them.
+        out (DATASET): Folder of the data set.
+        episodes: Number of episodes, counted per agent. Not for records.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
+        action: Action mode: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
+        randomize (FILE): Ranges of vehicle and water parameters, by name or file.
+        observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
+            through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
+        disturb: Noise on the executed but not on the stored action, as a fraction of full action: shows recoveries.
+        goal (GOAL): Goal for records, instead of the recorded one: x,y,z,yaw_deg [m, deg], or end for the final
+            pose of each interval; for t2 the trajectory.
+        seed: Seed of every random number; equal seeds give equal results.
+        progress: Told the share that is done.
+    """
+    records = [Path(word) for word in experts if word.endswith(".mcap")]
+    if records and (len(records) < len(experts) or episodes or randomize or disturb):
+        raise DriveError(
+            "records cannot be combined with other experts, --episodes, --randomize and --disturb"
+        )
+    if records:
+        return collect_records(records, task, out=out, vehicle=vehicle, action=action, goal=goal)
+    if len(experts) > 1 or episodes is None or goal is not None:
+        raise DriveError("give one expert and --episodes, and no --goal, which is of records")
+    return collect_episodes(
+        experts[0], task, episodes=episodes, out=out, vehicle=vehicle, hydrodynamics=hydrodynamics,
+        action=action, randomize=randomize, observe=observe, disturb=disturb, seed=seed, show=progress,
+    )  # fmt: skip
+
+
+def datasets(places: Sequence[Path], *, lerobot: Path | None = None) -> dict[str, Any]:
+    """List demonstrations: task, vehicle, expert, episodes, steps. With --lerobot, export one for LeRobot.
+
+    Example: finssim datasets demonstrations
+
+    Args:
+        places (PATH...): Data sets, or folders of them.
+        lerobot (DIR): Folder for the LeRobot data set (format 3.0), from a single data set.
+    """
+    paths = [path for location in places for path in data_sets_in(location)]
+    if lerobot is None:
+        return {str(path): about(path) for path in paths}
+    if len(paths) != 1:
+        raise DatasetError(f"--lerobot {lerobot}: {len(paths)} data sets are named, expected one")
+    return {
+        str(paths[0]): {
+            **about(paths[0]),
+            "lerobot": {"written": str(lerobot), **export_lerobot(paths[0], lerobot)},
+        }
+    }
+
+
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """Return a table of what was collected; or a row for each data set."""
+    if "task" in result:
+        means = {name: x for name, x in result.get("metrics", {}).items() if x is not None}
+        text = f"{result['episodes']} episodes, {result['steps']:,} steps{'; means: ' * bool(means)}"
+        sources = [
+            f"{record['file']}: {record['driver']}, {record['episodes']} episodes, {record['steps']:,} steps"
+            for record in result.get("records", ())
+        ]
+        title = text + ", ".join(f"{name} {x:.4g}" for name, x in means.items())
+        return [Table(title=title, sentences=sources)]
+    rows = [
+        [name, row["task"], row["vehicle"]["name"], row["expert"], row["observe"], str(row["episodes"]),
+         f"{row['steps']:,}"]
+        for name, row in result.items()
+    ]  # fmt: skip
+    heads = ("data set", "task", "vehicle", "expert", "observes", "episodes", "steps")
+    written = [
+        f"{row['lerobot']['written']}: LeRobot, {row['lerobot']['frames']:,} frames at {row['lerobot']['fps']} Hz"
+        for row in result.values()
+        if "lerobot" in row
+    ]
+    return [Table(title="", heads=heads, rows=rows, left=range(5), sentences=written)]
+
+
+def collect_records(
+    records: Sequence[Path],
+    task: str,
+    *,
+    out: Path,
+    vehicle: str = "finsrov",
+    action: str | None = None,
+    goal: str | None = None,
+) -> dict[str, Any]:
+    """Make demonstrations of records and write them.
+
+    Args:
+        records: MCAP files of `finssim teleop` or `finssim run`.
+        task: Its name, or FILE.py:CLASS of one's own.
+        out: Folder of the data set; an earlier one there is replaced.
+        vehicle: Name or file; the very one that was driven.
+        action: Mode; the task's own if None.
+        goal: Where the vehicle should have been, in place of what was recorded: "x,y,z,yaw_deg" or a file, "end" (where
+            each stretch ended); of t2 the trajectory, by name or file.
+
+    Returns:
+        What the data set says of itself, with `episodes` and `steps`.
+
+    Raises:
+        DriveError: A record does not fit, or nothing in it can be learnt from.
+        RecordError, ControlError, GoalError, VehicleError, OutputError: As they say.
+    """
+    body = load_vehicle(vehicle)
+    watch = Observer(task, body)
+    the_task = watch.task
+    mode = action_mode(action or the_task.action, body)
+    to = station_of(goal) if goal is not None and not the_task.moving and goal != END else goal
+    demonstrations, sources = [], []
+    for path in records:
+        drive = read_drive(path, body)
+        episodes = episodes_of(drive, watch, mode, body, goal=to)
+        demonstrations += episodes
+        steps = sum(len(e.action) for e in episodes)
+        sources.append(
+            {
+                "file": path.name,
+                "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+                "driver": drive.driver,
+                "episodes": len(episodes),
+                "steps": steps,
+            }  # fmt: skip
+        )
+    if not demonstrations:
+        names = ", ".join(str(path) for path in records)
+        raise DriveError(
+            f"{names}: the robot was never armed, its estimate ready and its driver active for two decisions "
+            f"{the_task.control_step:g} s apart towards one goal: no demonstration"
+        )
+    described = {
+        "task": the_task.name,
+        "title": the_task.title,
+        "period": the_task.control_step,
+        "expert": " and ".join(dict.fromkeys(str(source["driver"]) for source in sources)),
+        "observation": the_task.schema.model_dump(mode="json"),
+        "action": mode.describe(),
+        "vehicle": {"name": body.name, "sha256": body.sha256},
+        "observe": "record",
+        "goal": goal,
+        "records": sources,
+        "provenance": provenance(),
+    }
+    save(out, demonstrations, described)
+    return {**described, "episodes": len(demonstrations), "steps": sum(len(e.action) for e in demonstrations)}
+
+
+# A record as a trial, and its scores.
+
+
+PUBLISHED = ("t1", "t2")
+"""Tasks that are measured as in the paper; every other one measures itself."""
+EARLY = 0.5
+"""A trial that lacks more than this of its end was stopped [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedTrial(Trial):
+    """Content of one record."""
+
+    path: Path
+    pilot: dict[str, Any]
+    """Pilot as the record describes it."""
+    estimate: Motion
+    """The robot's estimate at its decisions; the motion is the truth, if there is one, or the estimate."""
+    stopped: bool
+    """True if it ended before its time."""
+    duration: float
+    """Up to when it is measured [s]."""
+    offset: float | None
+    """Added to the truth's times to put them on the robot's clock [s]; None without a truth."""
+
+    def scores(self, task: str, vehicle: Vehicle) -> dict[str, Any]:
+        """`measures` of T1 and T2 or what the task measures of itself, and how far the estimate was from the truth.
+
+        Raises:
+            ControlError: The task cannot score what was played elsewhere.
+        """
+        if task in PUBLISHED:
+            fault = "ended early" if self.stopped else ""
+            row = self.measures(task, vehicle.force_limits, stopped=self.stopped)
+        else:
+            row, fault = self._scored(fitted_task(task, vehicle), vehicle)
+        return {
+            **row,
+            "fault": fault,
+            "localization": None if self.offset is None else localization_errors(self.motion, self.estimate),
+            "clock_offset_s": self.offset,
+        }
+
+    def _scored(self, task: Task, vehicle: Vehicle) -> tuple[dict[str, float | None], str]:
+        """Return the task's measures of an episode of one vehicle that was played elsewhere.
+
+        Returns:
+            Its metrics, None where there is none; and why there are none, in a sentence, which counts without success.
+        """
+        motion, actions = self.motion, self.estimate.action
+        size = 0 if actions is None else actions.shape[1]
+        referee = Referee(task, [vehicle], guide=self.guide, start=motion.at(0.0), action_size=size or None)
+        (name,), fault = task.agents, ""
+        times = np.concatenate([[0.0], motion.t, [self.duration]])
+        widest = int(np.argmax(np.diff(times)))
+        if times[widest + 1] - times[widest] > MAX_GAP:
+            fault = f"no position from {times[widest]:.1f} to {times[widest + 1]:.1f} s"
+        for k in range(round(self.duration / task.control_step) if not fault else 0):
+            action = {name: self.estimate.action_at(k * task.control_step)}
+            referee.look({name: motion.at((k + 1) * task.control_step)}, action)
+            if referee.over:
+                break
+        if not referee.over:
+            unknown: dict[str, float | None] = dict.fromkeys(referee.metrics())
+            return unknown | ({"success": 0.0} if "success" in unknown else {}), fault or "ended early"
+        return {key: x if math.isfinite(x) else None for key, x in referee.metrics().items()}, ""
+
+
+def read_record(
+    path: Path,
+    task: str,
+    vehicle: Vehicle,
+    *,
+    guide: Guide | None = None,
+    truth: Path | None = None,
+    duration: float = DURATION,
+) -> RecordedTrial:
+    """The trial of a record, from the start of its guide's time.
+
+    Args:
+        path: MCAP file of `finssim run`, `experiment --robot` or the ROS 2 graph.
+        task: Of one vehicle: its name, or FILE.py:CLASS of one's own.
+        vehicle: The very one that was driven.
+        guide: What was followed, of a task that follows a reference; by the record's own words if None.
+        truth: Truth file of a virtual pool, or a table (.csv, .parquet) of motion capture, world frame: columns t [s],
+            x, y, z of the body origin [m], and qx, qy, qz, qw or yaw [rad]. Its clock may be any: it is laid over the
+            robot's where the distance between the two motions is least.
+        duration: Of a trial of t1 [s].
+
+    Raises:
+        DriveError: A task of several vehicles, a record of a drive by hand, of several goals, without what the task
+            needs, or a truth of another run.
+        RecordError, ControlError: The record or the task cannot be used.
+        CalibrationError, TruthError: The truth cannot be read.
+    """
+    fitted = fitted_task(task, vehicle)
+    if len(fitted.vehicles) > 1:
+        raise DriveError(
+            f"task '{task}' has {len(fitted.vehicles)} vehicles and {path} is of one: finssim pool --task and "
+            "python -m studies.stack score it during the run"
+        )
+    drive = read_drive(path, vehicle)
+    steered = drive.stretch >= 0
+    t = drive.motion.t
+    if not (steered & (t >= 0.0)).any():
+        raise DriveError(f"{path}: the robot was never armed with its state known: nothing was done in it")
+    if task not in PUBLISHED and not np.size(drive.motion.action):
+        raise DriveError(
+            f"{path}: lacks the pilot's actions in [-1, 1], which '{task}' scores: record a run of this version"
+        )
+    longest = {"t1": duration, "t2": math.inf}.get(task, fitted.time_limit)
+    if follows(fitted):
+        the_guide = guide or trajectory_of(drive, vehicle)
+    else:
+        the_guide = (
+            _goal_history(drive, steered, longest) if fitted.moving else _station(drive, steered, task)
+        )
+    full = min(the_guide.duration, longest)
+    estimate = drive.motion.between(steered & (t >= 0.0) & (t <= full + 1e-6))
+    stopped = float(estimate.t[-1]) < full - EARLY
+    until = float(estimate.t[-1]) if stopped else full
+    motion, offset = (estimate, None) if truth is None else _truth(truth, drive, until)
+    return RecordedTrial(
+        name=_setpoint(the_guide, vehicle) if task == "t1" else the_guide.name,
+        guide=the_guide,
+        motion=motion,
+        path=path,
+        pilot=drive.pilot or {"name": drive.driver},
+        estimate=estimate,
+        stopped=stopped,
+        duration=until,
+        offset=offset,
+    )
+
+
+def _goal_history(drive: Drive, steered: NDArray[np.bool_], duration: float) -> Trajectory:
+    """Return the course of a moving goal by the record; held after its end, up to a time [s].
+
+    Raises:
+        DriveError: There was no goal.
+    """
+    goals, t = _goals(drive, steered), drive.motion.t[steered & (drive.motion.t >= 0.0)]
+    position, yaw = goals[:, :3], np.unwrap(goals[:, 3])
+    rates = np.gradient(position, t, axis=0) if len(t) > 1 else np.zeros_like(position)
+    return Trajectory(
+        name="recorded",
+        duration=duration,
+        motion=lambda at: (interpolated(at, t, position), interpolated(at, t, rates)),
+        turning=lambda at: np.interp(at, t, yaw),
+    )
+
+
+def _goals(drive: Drive, steered: NDArray[np.bool_]) -> Array:
+    """Return the goals of the vehicle, by decision."""
+    if not drive.has_goal:
+        raise DriveError(f"{drive.path}: was driven by hand to no goal: a record of finssim run has one")
+    return drive.goal[steered & (drive.motion.t >= 0.0)]
+
+
+def _station(drive: Drive, steered: NDArray[np.bool_], task: str) -> Guide:
+    """The one goal that was held, or the dock."""
+    goals = _goals(drive, steered)
+    if float(np.abs(goals - goals[0]).max()) > SAME_GOAL:
+        raise DriveError(
+            f"{drive.path}: its goal moves, and '{task}' has one: measure it with --task t2 or t3, or record each "
+            "station separately"
+        )
+    return station_at(goals[0])
+
+
+def _setpoint(guide: Guide, vehicle: Vehicle) -> str:
+    """Name of the published setpoint that a station is, else its numbers."""
+    start = guide.at(0.0)
+    goal = np.array([*start.position, float(start.yaw)])
+    published = {name: in_room(pose, vehicle) for name, pose in T1_SETPOINTS.items()}
+    near = (name for name, pose in published.items() if np.abs(pose - goal).max() <= SAME_GOAL)
+    return next(near, ",".join(f"{x:.3g}" for x in (*goal[:3], math.degrees(goal[3]))))
+
+
+def _truth(path: Path, drive: Drive, until: float) -> tuple[Motion, float]:
+    """The true motion from the guide's start to a time after it [s], and what was added to its times."""
+    motion = _table(path)
+    try:
+        robot = PoseSeries(drive.time, drive.motion.position, drive.motion.quaternion)
+        offset = offset_between(robot, motion.t, motion.position)
+    except ViewError as error:
+        raise DriveError(f"{path}: {error}") from None
+    t = motion.t + offset - (drive.time[0] - drive.motion.t[0])
+    return replace(motion, t=t).between((t >= 0.0) & (t <= until + 1e-6)), offset
+
+
+def _table(path: Path) -> Motion:
+    """A truth, by its own clock."""
+    if path.suffix.lower() not in (".csv", ".txt", ".tsv", ".parquet"):
+        truth = read_truth(path)
+        return Motion(t=truth.time, position=truth.position, quaternion=truth.quaternion, nu=truth.nu)
+    columns = read_table(path).numbers
+    attitude = ("qx", "qy", "qz", "qw")
+    turned = set(attitude) <= set(columns)
+    if not {"t", "x", "y", "z"} <= set(columns) or not (turned or "yaw" in columns):
+        raise DriveError(
+            f"{path}: columns {', '.join(columns)[:80]}, expected t [s], x, y, z [m] (world frame, body origin) and "
+            "qx, qy, qz, qw or yaw [rad]"
+        )
+    names = ("t", "x", "y", "z", *(attitude if turned else ("yaw",)))
+    rows = np.stack([columns[name] for name in names], axis=1)
+    rows = rows[np.isfinite(rows).all(axis=1)]  # a body that the cameras did not see has empty cells
+    if len(rows) < 2 or np.any(np.diff(rows[:, 0]) <= 0.0):
+        raise DriveError(f"{path}: {len(rows)} rows with all numbers, expected 2 or more with t increasing")
+    quaternion = rows[:, 4:8] if turned else quat_from_yaw(rows[:, 4])
+    return Motion(t=rows[:, 0], position=rows[:, 1:4], quaternion=quaternion, heading_only=not turned)

@@ -1,0 +1,940 @@
+"""Trials by the robot's complete software, on a robot or in the virtual pool: waiting, way to the start, trial, record
+and measures."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+from rich.console import Console
+from rich.status import Status
+
+from finssim.control.guidance import Guide, Station
+from finssim.control.modes import action_mode
+from finssim.core.files import atomic_write
+from finssim.core.provenance import provenance
+from finssim.core.quiet import start_warp
+from finssim.core.rotations import quat_yaw, wrap_angle
+from finssim.core.yaml_file import yaml_text
+from finssim.evaluation import campaign
+from finssim.evaluation.metrics import SITE_SIZES, T1_SETPOINTS, T1_START, in_room
+from finssim.evaluation.records import DriveError, read_record
+from finssim.evaluation.trials import PERIOD, Motion, Trial, guide_of, localization_errors
+from finssim.localization.overhead_camera import Pool, load_pool
+from finssim.pool import read_truth
+from finssim.pool.run import PoolPlan, make_plan
+from finssim.robot.goals import check_reachable, place_of
+from finssim.robot.links.transports import DEFAULT_BIND
+from finssim.robot.lockstep import run_lockstep
+from finssim.robot.perception import Perception
+from finssim.robot.pilots import Pilot, WrenchPilot, make_pilot
+from finssim.robot.reading import Reading
+from finssim.robot.recorder import Recorder, recording
+from finssim.robot.runtime import Runtime
+from finssim.robot.teleop import Keyboard
+from finssim.robot.wiring import Drive, Wiring, connected, link_of
+from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import room, vehicle_at
+
+GETTING_READY = 10.0
+"""Longest time until the estimator knows where the vehicle is, and it is armed [s]."""
+NEAR, TURNED = 0.10, math.radians(10.0)
+EXACTLY = (NEAR, TURNED, 0.05, math.radians(5.0), 2.0)
+"""A vehicle is at its start within this of it [m, rad] and no faster than this [m/s, rad/s] for so long [s]."""
+ROUGHLY = (0.15, math.radians(20.0), 0.1, math.inf, 10.0)
+"""Bounds if the start need not be exact: a PID tuned from guesses may circle its goal forever."""
+AFLOAT = (0.30, math.radians(20.0), 0.4, math.inf, 2.0)
+"""Bounds in open water, where waves leave nothing at rest."""
+APPROACH = 60.0
+"""Longest way to a start, and longest wait for the vehicle without an attendant [s]."""
+
+
+def start_bounds(site: str, exact: bool) -> tuple[tuple[float, ...], ...]:
+    """Return the bounds that are near enough to a start, any of them: `EXACTLY`, in open water `AFLOAT`; `ROUGHLY`
+    unless exact."""
+    near = AFLOAT if site == "open-water" else EXACTLY
+    return (near,) if exact else (near, ROUGHLY)
+
+
+Ended = Literal["over", "fault", "skipped", "interrupted", "not there"]
+"""End of a trial: by itself, by the bridge, by the operator, by Ctrl-C, or before its start was reached."""
+
+
+class Attendant(Protocol):
+    """The person beside the water."""
+
+    def keys(self) -> Sequence[str]:
+        """Return the keys pressed since the last call: enter continues, x or space stops the thrusters, s skips, q
+        ends; never waits."""
+
+    def line(self, text: str) -> None:
+        """Show the current state; called at every step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotTrial:
+    """A trial to play. A new one for every attempt, since pilots have memory."""
+
+    name: str
+    pilot: Pilot
+    guide: Guide
+    duration: float
+    """Longest, from arming [s]."""
+    over: Callable[[Runtime], bool]
+    """Function that returns whether it has reached its end."""
+    watch: Callable[[Runtime], None] = lambda runtime: None
+    """Looks on after every step of the trial itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """Result of a trial."""
+
+    trial: RobotTrial
+    runtime: Runtime
+    fault: str
+    """Reason why it ended before its time, or never began; empty if it did neither."""
+    ended: Ended = "over"
+    begun: bool = True
+    """True if the trial was started, not only the way to its start."""
+
+
+def fault_of(trial: RobotTrial, runtime: Runtime) -> str:
+    """Return why a started trial ended before its time; empty if it did not."""
+    if runtime.bridge.state == "fault":
+        return runtime.bridge.reason
+    if math.isnan(runtime.started):
+        return f"never armed: {runtime.refusal or 'no state'}"
+    return "" if trial.over(runtime) else "not finished"
+
+
+class Stages:
+    """Waits for the vehicle and its attendant, sees it to the start, hands over to the trial, and ends it."""
+
+    def __init__(
+        self,
+        trial: RobotTrial,
+        vehicle: Vehicle,
+        start: Station,
+        bounds: Sequence[tuple[float, ...]],
+        *,
+        by_hand: bool = False,
+        attendant: Attendant | None = None,
+        recorder: Recorder | None = None,
+    ) -> None:
+        """
+        Args:
+            trial: What to do.
+            vehicle: As the robot knows it.
+            start: Where the trial begins.
+            bounds: Of `start_bounds`, any of which is near enough.
+            by_hand: Somebody carries it there, and presses enter. False: the tuned PID steers it there.
+            attendant: Nobody is asked if None: the way to the start begins as soon as the state is known.
+            recorder: Takes down the trial itself, not the way to its start.
+        """
+        self._trial, self._vehicle, self._start, self._bounds = trial, vehicle, start, bounds
+        self._by_hand, self._attendant, self._recorder = by_hand, attendant, recorder
+        self._stage: Callable[[Runtime, Reading, float], bool] = self._wait
+        self._since = math.nan
+        """When the stage began [s]."""
+        self._near_since: dict[tuple[float, ...], float] = {}
+        self._ended: Ended = "interrupted"
+        self._reason = ""
+        self._begun = False
+
+    def play(self, drive: Drive, site: Pool | None, perception: Perception | None = None) -> Outcome:
+        """Play the trial.
+
+        Args:
+            drive: Runs the robot's software on its wires, or in lock-step with a world.
+            site: Camera, water and frames, as calibrated; None: no camera looks.
+            perception: Otherwise than by default.
+        """
+        idle = WrenchPilot(lambda: np.zeros(6), self._vehicle, name="idle")
+        runtime = Runtime(self._vehicle, site, idle, self._start, arm=False, perception=perception)
+        drive(runtime, duration=math.inf, show=self._look, until=self._over)
+        fault = self._reason or (fault_of(self._trial, runtime) if self._begun else runtime.bridge.reason)
+        fault = fault or ("" if self._ended == "over" else "not finished")
+        return Outcome(trial=self._trial, runtime=runtime, fault=fault, ended=self._ended, begun=self._begun)
+
+    def _look(self, runtime: Runtime) -> None:
+        """After every step."""
+        if self._begun:
+            self._trial.watch(runtime)
+
+    def _over(self, runtime: Runtime) -> bool:
+        """Return whether to end, and change from stage to stage."""
+        assert runtime.reading is not None  # a step has been made
+        now = runtime.reading.time
+        self._since = now if math.isnan(self._since) else self._since
+        if runtime.bridge.state == "fault":
+            return self._end("fault")
+        return self._stage(runtime, runtime.reading, now)
+
+    def _end(self, kind: Ended, reason: str = "") -> bool:
+        self._ended, self._reason = kind, reason
+        return True
+
+    def _keys(self) -> Sequence[str]:
+        return self._attendant.keys() if self._attendant else ()
+
+    def _stopped(self, runtime: Runtime, now: float) -> bool:
+        """Return whether the operator stops the thrusters now."""
+        if not {"x", " "} & set(self._keys()):
+            return False
+        runtime.bridge.stop(now, "stopped by the operator")
+        return self._end("fault")
+
+    def _line(self, text: str) -> None:
+        if self._attendant is not None:
+            self._attendant.line(text)
+
+    def _wait(self, runtime: Runtime, reading: Reading, now: float) -> bool:
+        """Wait with disabled thrusters until the state is known and the attendant starts the trial."""
+        keys = self._keys()
+        if now == self._since:
+            return False  # what was pressed before anybody was asked means nothing
+        if "s" in keys:
+            return self._end("skipped", "skipped by the operator")
+        if "q" in keys:
+            return self._end("interrupted")
+        if not reading.ready:
+            self._line(f"waiting for the vehicle: {reading.reason}")
+            if self._attendant is None and now - self._since > APPROACH:
+                return self._end(
+                    "not there", f"its state is not known after {APPROACH:g} s: {reading.reason}"
+                )
+        elif not self.there(reading, now) and self._by_hand:
+            self._line(f"bring it to its start: {self._way(reading)}")
+        elif self._attendant is not None and not {"\r", "\n"} & set(keys):
+            action = "play" if self._by_hand else "let it go to its start and play"
+            self._line(f"enter: {action}; s: skip; q: end; {self._way(reading)}")
+        elif self._by_hand:
+            self._begin(runtime, now)
+        else:
+            runtime.hand_over(now, make_pilot("pid", self._vehicle), self._start, arm=True)
+            self._stage, self._since = self._approach, now
+            self._near_since.clear()
+        return False
+
+    def _approach(self, runtime: Runtime, reading: Reading, now: float) -> bool:
+        """The PID steers to the start."""
+        if self._stopped(runtime, now):
+            return True
+        self._line(f"on the way to its start: {self._way(reading)}; x: stop")
+        if self.there(reading, now):
+            self._begin(runtime, now)
+        elif now - self._since > APPROACH:
+            reason = runtime.refusal or self._way(reading)
+            return self._end(
+                "not there",
+                f"not at its start after {APPROACH:g} s: {reason}; is something in its way, or was it let in "
+                "elsewhere?",
+            )
+        return False
+
+    def _begin(self, runtime: Runtime, now: float) -> None:
+        """Hand over to the trial: disarmed, and armed again for its pilot."""
+        runtime.hand_over(now, self._trial.pilot, self._trial.guide, arm=True, recorder=self._recorder)
+        self._stage, self._since, self._begun = self._play, now, True
+
+    def _play(self, runtime: Runtime, reading: Reading, now: float) -> bool:
+        if self._stopped(runtime, now):
+            return True
+        if self._trial.over(runtime):
+            return self._end("over")
+        t = 0.0 if math.isnan(runtime.t) else runtime.t
+        self._line(f"{t:.0f} s of {self._trial.duration:.0f} s; x: stop")
+        late = math.isnan(runtime.started) and now - self._since > GETTING_READY
+        return (late or t > self._trial.duration + GETTING_READY) and self._end("not there")
+
+    def there(self, reading: Reading, now: float) -> bool:
+        """Return whether the vehicle has been at its start, at rest, for long enough."""
+        off = (
+            float(np.abs(reading.position - self._start.position).max()),
+            abs(self._turn(reading)),
+            float(np.linalg.norm(reading.nu[:3])),
+            float(np.linalg.norm(reading.nu[3:])),
+        )
+        for bounds in self._bounds:
+            if not reading.ready or any(x > limit for x, limit in zip(off, bounds[:4], strict=True)):
+                self._near_since.pop(bounds, None)
+            elif now - self._near_since.setdefault(bounds, now) >= bounds[4]:
+                return True
+        return False
+
+    def _turn(self, reading: Reading) -> float:
+        return float(wrap_angle(self._start.yaw - quat_yaw(reading.quaternion)))
+
+    def _way(self, reading: Reading) -> str:
+        """The remaining way."""
+        x, y, z = self._start.position - reading.position
+        return f"({x:+.2f}, {y:+.2f}, {z:+.2f}) m and {math.degrees(self._turn(reading)):+.0f}° to go"
+
+
+ABORTED = "aborted"
+"""Folder of the records of trials that were stopped and do not count."""
+
+
+class RobotError(ValueError):
+    """Trials on a robot cannot be made, or cannot continue."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnRobot:
+    """A robot, and how trials are made on it."""
+
+    wiring: Wiring
+    """Connection of the robot; a virtual pool in a separate process is another one."""
+    pool_file: Path | None
+    """Camera, water and frames; None: no camera looks, position fixes come by wire."""
+    site: str = "pool"
+    """Site that determines its equipment: pool, tank or open-water."""
+    arm: bool = False
+    """Thrusters may turn; trials are refused without it."""
+    by_hand: bool = False
+    """True if a person carries the vehicle to every start; False: the tuned PID steers it there."""
+    unattended: bool = False
+    """True without an attendant: trials begin as soon as the state is known, and a fault ends the session."""
+    let_in: tuple[float, float] | None = None
+    """Position of the vehicle when the session begins, x and y, world frame [m]: dead reckoning continues from there
+    through all trials. None: a camera or position fixes locate it."""
+
+    @property
+    def title(self) -> str:
+        """The robot's address."""
+        return f"{self.wiring.robot}{', lock-step' if self.wiring.lockstep else ''}"
+
+    def equipped(self, vehicle: Vehicle) -> Vehicle:
+        """The vehicle as it is there, where its file does not say more."""
+        return vehicle_at(self.site, vehicle, navigation=self.wiring.robot.startswith("mavlink"))
+
+    @property
+    def options(self) -> str:
+        """Words of a command line that name it."""
+        wiring = self.wiring
+        tokens = ["--robot", wiring.robot, "--pool-file", str(self.pool_file or "none")]
+        tokens += ["--site", self.site] if self.site != "pool" else []
+        tokens += ["--let-in", ",".join(f"{x:g}" for x in self.let_in)] if self.let_in is not None else []
+        tokens += ["--bind", wiring.bind] if wiring.bind != DEFAULT_BIND else []
+        tokens += ["--pictures", wiring.pictures] if wiring.pictures else []
+        return shlex.join([*tokens, *(["--lockstep"] if wiring.lockstep else [])])
+
+
+def robot_or_none(
+    *,
+    robot: str | None = None,
+    pool_file: str | None = None,
+    site: str | None = None,
+    bind: str = "127.0.0.1:54321",
+    pictures: str | None = None,
+    lockstep: bool = False,
+    arm: bool = False,
+    by_hand: bool = False,
+    unattended: bool = False,
+    let_in: str | None = None,
+) -> OnRobot | None:
+    """Return the robot that options name; None without a robot and without options of one.
+
+    Args:
+        robot (ADDRESS): Run on this robot: its motor controller's udp://HOST:PORT or serial:DEVICE, its autopilot's
+            mavlink://KIND:ADDRESS, or pool or mavlink for the virtual pool on this machine. With --lockstep:
+            pool, mavlink, or HOST:PORT.
+        pool_file (FILE|none): Pool file of that robot: camera, water plane and frames (.yaml); none if position
+            fixes arrive over the link.
+        site (NAME): Site of that robot, which sets its sensors: pool (default), tank or open-water.
+        bind (ADDRESS:PORT): Local address and port for udp; images arrive at the next port. Loopback if not given.
+        pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
+            otherwise none, if not given.
+        lockstep: Run in lock-step with finssim pool --lockstep, as fast as possible.
+        arm: Arm, as soon as the state is known. Without it the thrusters never turn.
+        by_hand: The vehicle is carried to the start of each trial by hand; by default the tuned PID steers it
+            there.
+        unattended: Start each trial without waiting for enter; a fault ends the session.
+        let_in (X,Y): Position of the vehicle at the start of the command, world frame [m], known to 5 cm: start of
+            dead reckoning by DVL and compass through all trials. With --pool-file none.
+
+    Raises:
+        GoalError: --let-in is no place.
+        RobotError: Something tells of a robot and none is named, or it has no pool file.
+    """
+    if robot is None:
+        stated = (arm, by_hand, unattended, lockstep, pool_file, pictures, site, let_in)
+        if any(x is not None and x is not False for x in stated):
+            raise RobotError(
+                "--arm, --by-hand, --unattended, --lockstep, --pool-file, --site, --let-in and "
+                "--pictures need a robot: give --robot"
+            )
+        return None
+    if pool_file is None:
+        raise RobotError(
+            "a robot needs its pool file: give --pool-file, or none if position fixes arrive over the link"
+        )
+    wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep)
+    file = None if pool_file == "none" else Path(pool_file)
+    if let_in is not None and file is not None:
+        raise RobotError(
+            "--let-in is for dead reckoning, and a camera locates the vehicle: give --pool-file none"
+        )
+    return OnRobot(
+        wiring=wiring, pool_file=file, site=site or "pool", arm=arm, by_hand=by_hand, unattended=unattended,
+        let_in=None if let_in is None else place_of(let_in),
+    )  # fmt: skip
+
+
+class _Screen:
+    """A terminal: one line that changes, and keys."""
+
+    def __init__(self, keyboard: Keyboard, status: Status) -> None:
+        self._keyboard, self._status, self._newest = keyboard, status, -math.inf
+
+    def keys(self) -> Sequence[str]:
+        return self._keyboard.pressed()
+
+    def line(self, text: str) -> None:
+        now = time.monotonic()
+        if now - self._newest >= 0.25:
+            self._newest = now
+            self._status.update(text)
+
+
+@dataclass(frozen=True)
+class Session:
+    """An open robot; made by `session`."""
+
+    robot: OnRobot
+    vehicle: Vehicle
+    site: Pool | None
+    drive: Drive
+    attendant: Attendant | None
+    console: Console
+
+    @property
+    def equipped(self) -> Vehicle:
+        """The vehicle as it is equipped where it is."""
+        return self.robot.equipped(self.vehicle)
+
+    @cached_property
+    def _reckoning(self) -> Perception:
+        """Return the perception of a robot with dead reckoning: one for all trials, so that its state is carried from
+        each to the next."""
+        return Perception(self.equipped, None, mode="error-state", let_in=self.robot.let_in)
+
+    def notify(self, text: str) -> None:
+        """Print a message for the attendant."""
+        self.console.print(text, highlight=False, markup=False)
+
+    def trial(
+        self,
+        make: Callable[[], RobotTrial],
+        start: Station,
+        record: Path,
+        *,
+        counts: bool,
+        exact: bool = True,
+        perception: Callable[[], Perception] | None = None,
+        about: Mapping[str, Any] | None = None,
+    ) -> Outcome | None:
+        """Play a trial until it is done, the operator skips it, or it cannot be.
+
+        Args:
+            make: The trial, anew for every attempt.
+            start: Where it begins.
+            record: File of its record, made once it is done; records of attempts that do not count go to `aborted/`.
+            counts: Whether a trial that the bridge stopped counts as it is; it is played again if not. One that the
+                operator stopped never counts.
+            exact: Whether the vehicle must be at its start and at rest, however long that takes: to 10 cm, in open
+                water to 30 cm and at a speed of waves.
+            perception: Otherwise than by default, made anew for every attempt; not of a robot that was let in.
+            about: Metadata of the record.
+
+        Returns:
+            How it went; None if it was skipped.
+
+        Raises:
+            RobotError: It cannot be played, and nobody is there to help.
+            KeyboardInterrupt: Ctrl-C, or the operator ended the session.
+        """
+        while True:
+            trial = make()
+            x, y, z = start.position
+            self.notify(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {round(math.degrees(start.yaw))}°")
+            partial = record.with_name(f".{record.stem}.partial.mcap")
+            partial.parent.mkdir(parents=True, exist_ok=True)
+            partial.unlink(missing_ok=True)
+            wiring = self.robot.wiring
+            meta = {
+                "pilot": trial.pilot.describe(), "guide": trial.guide.name, "armed": True, "robot": wiring.robot,
+                "site": self.robot.site, **({"pool_sha256": self.site.sha256} if self.site else {}), **(about or {}),
+            }  # fmt: skip
+            context = recording(
+                partial, self.vehicle, meta, pool_file=self.robot.pool_file, lockstep=wiring.lockstep, pictures="none"
+            )  # fmt: skip
+            with context as recorder:
+                stages = Stages(
+                    trial, self.equipped, start, start_bounds(self.robot.site, exact), by_hand=self.robot.by_hand,
+                    attendant=self.attendant, recorder=recorder,
+                )  # fmt: skip
+                prior = self._reckoning if self.robot.let_in is not None else perception and perception()
+                outcome = stages.play(self.drive, self.site, prior)
+            if recorder is not None and recorder.problem and outcome.ended == "over":
+                raise RobotError(f"{record}: {recorder.problem}")
+            stopped = (
+                outcome.begun and outcome.ended == "fault" and outcome.fault != "stopped by the operator"
+            )
+            if outcome.ended == "over" or (counts and stopped):
+                partial.replace(record)
+                return outcome
+            self._put_away(partial, record, outcome)
+            if outcome.ended == "skipped":
+                self.notify(f"{trial.name}: skipped")
+                return None
+            if outcome.ended == "interrupted":
+                raise KeyboardInterrupt
+            if self.attendant is None:
+                raise RobotError(
+                    f"{trial.name}: {outcome.fault}: check the vehicle, then repeat the command, which continues here"
+                )
+            self.notify(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
+
+    def _put_away(self, partial: Path, record: Path, outcome: Outcome) -> None:
+        """Keep the record of a started trial; nothing was recorded of one that was not."""
+        if not outcome.begun:
+            partial.unlink(missing_ok=True)
+            return
+        folder = record.parent / ABORTED
+        folder.mkdir(exist_ok=True)
+        number = 1 + sum(1 for _ in folder.glob(f"{record.stem}_*.mcap"))
+        partial.replace(folder / f"{record.stem}_{number}.mcap")
+
+
+@contextmanager
+def session(
+    robot: OnRobot, vehicle: Vehicle, *, attendant: Attendant | None = None, console: Console | None = None
+) -> Iterator[Session]:
+    """Open a robot for trials.
+
+    Args:
+        robot: Which, and how.
+        vehicle: As its file has it.
+        attendant: Instead of the terminal's keyboard.
+        console: Where it is told how it stands; standard error if None.
+
+    Raises:
+        RobotError: It may not be armed, or nobody is there to press keys.
+        LinkError, LockstepError, LocalizationError: It cannot be reached, or its pool file cannot be used.
+        VehicleError: There is no such site.
+    """
+    if not robot.arm:
+        raise RobotError("trials turn thrusters: give --arm when the water is clear of people and cables")
+    if robot.unattended and robot.by_hand:
+        raise RobotError("--by-hand waits for enter at every start: omit --unattended or --by-hand")
+    console = console or Console(stderr=True)
+    site = None if robot.pool_file is None else load_pool(robot.pool_file)
+    with ExitStack() as stack:
+        drive = stack.enter_context(connected(robot.wiring, robot.equipped(vehicle), site))
+        if attendant is None and not robot.unattended:
+            if not sys.stdin.isatty():
+                raise RobotError(
+                    "standard input is not a terminal, so enter cannot be pressed: use one, or give --unattended"
+                )
+            keyboard = Keyboard()
+            stack.enter_context(keyboard)
+            attendant = _Screen(keyboard, stack.enter_context(console.status("waiting for the vehicle")))
+        yield Session(robot, vehicle, site, drive, attendant, console)
+
+
+def take_folder(file: Path, about: Mapping[str, Any]) -> None:
+    """Start a folder in which results stay as they are made, or continue one with equal settings.
+
+    Args:
+        file: In the folder, which may be new: takes the settings.
+        about: Plain data.
+
+    Raises:
+        RobotError: It holds somebody's files, or is of other settings.
+    """
+    text, out = yaml_text(dict(about)), file.parent
+    if not out.exists() or not any(out.iterdir()):
+        with atomic_write(file) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    elif not file.is_file() or file.read_text(encoding="utf-8") != text:
+        raise RobotError(
+            f"{out}: holds other files, or results of other settings: give a new --out, or the same "
+            "settings, such as vehicle and seed, to continue"
+        )
+
+
+def check_starts(starts: Mapping[str, Station], vehicle: str | Vehicle) -> None:
+    """Refuse starts outside the workspace of a vehicle before anything is armed.
+
+    Raises:
+        GoalError: One is; says which.
+    """
+    body = load_vehicle(vehicle)
+    for name, start in starts.items():
+        check_reachable(Station(start.position, start.yaw, name=f"the start of {name}"), body)
+
+
+# Jobs of experiments: a controller from the start to the goal, in a pool or on a robot.
+
+
+HARDWARE = "hardware"
+"""Replacement of the severity of a pool and of its camera's mode, on a robot."""
+
+
+class Firmware(NamedTuple):
+    """Trials of a vehicle with a kind of firmware."""
+
+    action: str | None
+    """Action mode of policies; the task's own if None."""
+    site: str
+    camera: str
+
+
+FIRMWARES = {"mcu": Firmware(None, "pool", "corners"), "ardusub": Firmware("pilot6", "tank", "none")}
+"""Firmwares: a controller that takes shaft speeds, in the pool under a camera, or an autopilot that takes axes, in a
+tank by Doppler log, depth and compass."""
+
+
+def firmware_of(name: str, vehicle: Vehicle, robot: OnRobot | None = None) -> str:
+    """Return the name of the firmware, or that of a robot's address.
+
+    Raises:
+        ValueError: There is no such firmware.
+        ControlError: The vehicle has no autopilot.
+    """
+    campaign.check_choices([name], FIRMWARES, "firmware", ValueError)
+    name = "ardusub" if robot is not None and robot.wiring.robot.startswith("mavlink") else name
+    action = FIRMWARES[name].action
+    if action is not None:
+        action_mode(action, vehicle)
+    return name
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoolJob(campaign.Job):
+    """A trial of the robot's complete software in a pool, whose vehicle it knows only approximately."""
+
+    vehicle: str | Vehicle = "finsrov"
+    """The vehicle, its name or file, as controller and localization know it."""
+    pool_vehicle: str | Vehicle = "finsrov"
+    """The vehicle, its name or file, around which the pool's own is drawn."""
+    severity: str = "realistic"
+    """nominal, realistic or hard."""
+    camera: str = "pictures"
+    """pictures (drawn and searched for tags) or corners (of the tags, with noise)."""
+    site: str = "pool"
+    """pool, tank or open-water."""
+    firmware: str = "mcu"
+    """mcu or ardusub: an autopilot, on whose vehicle a Doppler log and a compass take the camera's place."""
+
+    def plan(self, seed: int) -> PoolPlan:
+        """Return the plan of its pool, with a seed for noise."""
+        camera: Any = "none" if self.firmware == "ardusub" else self.camera
+        return make_plan(
+            self.pool_vehicle, str(self.plant), self.severity, camera=camera, seed=seed, site=self.site,
+            firmware=self.firmware,
+        )  # type: ignore[arg-type]  # fmt: skip
+
+    def equipped(self) -> Vehicle:
+        """The vehicle as the robot knows it there."""
+        return vehicle_at(self.site, load_vehicle(self.vehicle), navigation=self.firmware == "ardusub")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(PoolJob):
+    """A controller and what it is to do: a setpoint of T1 or a trajectory of T2."""
+
+    controller: str
+    """Policy directory, or the name of a PID."""
+    fusion: bool = True
+    """True if the controller observes the fused state, False: the latest reading of each sensor."""
+    position_noise: float = 0.0
+    """Added to what the controller sees, per axis [m]."""
+    yaw_noise: float = 0.0
+    """Added to what the controller sees [rad]."""
+    estimator: str = "error-state"
+    """Model of the filter: error-state, with the IMU's accelerations, or constant-velocity, the paper's."""
+    duration: float = 60.0
+    """[s]; of T2 the trajectory's own."""
+
+    @property
+    def task(self) -> str:
+        """t1 or t2."""
+        return "t1" if self.target in T1_SETPOINTS else "t2"
+
+
+def noise_seed(*labels: Any) -> int:
+    """A seed of what a trial is called: trials of other names never share noise."""
+    return zlib.crc32(" ".join(map(str, labels)).encode()) & 0x7FFFFFFF
+
+
+def play_in_pool(
+    trial: RobotTrial,
+    start: Station,
+    vehicle: Vehicle,
+    plan: PoolPlan,
+    *,
+    seed: int,
+    truth: Path | None = None,
+    recorder: Recorder | None = None,
+    **estimator: Any,
+) -> Outcome:
+    """Play a trial by the robot's complete software in lock-step with a pool.
+
+    Args:
+        trial: What to do.
+        start: Where the vehicle is, at rest.
+        vehicle: As the robot knows it.
+        plan: Of the pool and the vehicle in it.
+        seed: Of the noise.
+        truth: File of the truth; none if None.
+        recorder: Takes it down.
+        estimator: Options of `Perception`.
+    """
+    world = plan.standing(start, seed=seed, truth=truth)
+    if plan.firmware == "ardusub":
+        # Dead reckoning counts from the start, whose position is exact.
+        estimator = {"mode": "error-state", "let_in": start.position[:2], **estimator}
+    perception = Perception(vehicle, plan.calibrated, **estimator)
+    runtime = Runtime(
+        vehicle, plan.calibrated, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
+    )
+    runtime.attach(link_of("mavlink" if plan.firmware == "ardusub" else "pool", vehicle))
+    longest = GETTING_READY + trial.duration
+    with closing(world):
+        run_lockstep(
+            runtime, world, longest, show=trial.watch, until=lambda r: r.bridge.state == "fault" or trial.over(r)
+        )  # fmt: skip
+    return Outcome(trial=trial, runtime=runtime, fault=fault_of(trial, runtime))
+
+
+def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial, Station]:
+    """The trial of a job, which ends when its time is over, and where it starts.
+
+    Args:
+        job: Who, and to what.
+        vehicle: As the robot knows it.
+        seed: Of noise on what the pilot sees.
+
+    Raises:
+        PolicyError, ControlError: The controller does not fit the vehicle or the task.
+    """
+    standing = load_vehicle(job.pool_vehicle)
+    guide = guide_of(job.target, standing, site=job.site)
+    first = guide.at(0.0)
+    *position, yaw = (
+        in_room(T1_START, standing, job.site) if job.task == "t1" else (*first.position, float(first.yaw))
+    )
+    duration = guide.duration if math.isfinite(guide.duration) else job.duration
+    pilot = make_pilot(job.controller, vehicle, task=job.task)
+    if job.position_noise or job.yaw_noise:
+        pilot.disturb_input(position_std=job.position_noise, yaw_std=job.yaw_noise, seed=seed)
+    trial = RobotTrial(
+        name=f"{job.row}, {job.target}",
+        pilot=pilot,
+        guide=guide,
+        duration=duration,
+        over=lambda runtime: runtime.t >= duration,
+        watch=_Estimates(),
+    )
+    return trial, Station(tuple(map(float, position)), float(yaw))  # type: ignore[arg-type]
+
+
+class _Estimates:
+    """Estimates of the robot, at the period of the series."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, Any, Any]] = []
+
+    def __call__(self, runtime: Runtime) -> None:
+        reading, t = runtime.reading, runtime.t
+        if reading is None or math.isnan(t) or (self._rows and t < self._rows[-1][0] + PERIOD - 1e-6):
+            return
+        self._rows.append((t, reading.position, reading.quaternion))
+
+    def motion(self) -> Motion:
+        """All of it."""
+        t, position, quaternion = zip(*self._rows, strict=True) if self._rows else ((), (), ())
+        columns = (np.reshape(x, (-1, n)) for x, n in ((position, 3), (quaternion, 4)))
+        return Motion(t=np.array(t), **dict(zip(("position", "quaternion"), columns, strict=True)))
+
+
+def play(job: Job, path: Path) -> dict[str, Any]:
+    """Play a job in its pool.
+
+    Args:
+        job: Who, where and what.
+        path: PATH.npz takes the true motion.
+
+    Returns:
+        The measures as of `play_trial`.
+    """
+    result, trial = play_trial(job)
+    trial.motion.write(path)
+    return result
+
+
+def play_trial(job: Job) -> tuple[dict[str, Any], Trial]:
+    """Play a job in its pool and measure it by the true motion.
+
+    Args:
+        job: Who, where and what.
+
+    Returns:
+        The measures of its task, `fault` (why the bridge stopped it, or empty), `localization` (errors of the estimate
+        against the truth, rms) and how the robot's loop did; and the trial with its motion.
+    """
+    start_warp()
+    began, seed = time.perf_counter(), noise_seed(job.seed, job.target)
+    trial, start = job_trial(job, load_vehicle(job.vehicle), seed=seed)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "truth"
+        outcome = play_in_pool(
+            trial,
+            start,
+            job.equipped(),
+            job.plan(seed),
+            seed=seed,
+            truth=file,
+            fusion=job.fusion,
+            mode=job.estimator,
+        )
+        truth = read_truth(file)
+    t = truth.time - outcome.runtime.started
+    rows = np.flatnonzero((t >= 0.0) & (t <= trial.duration + 1e-6))
+    rows = rows[:: max(1, round(PERIOD / np.median(np.diff(t))))]
+    states = {name: getattr(truth, name) for name in ("position", "quaternion", "nu", "thrust")}
+    motion = Motion(t=t, **states).between(rows)
+    assert isinstance(trial.watch, _Estimates)
+    localization = localization_errors(motion, trial.watch.motion())
+    result, played = _measured(job, motion, outcome, began)
+    return result | {"localization": localization}, played
+
+
+def _measured(job: Job, motion: Motion, outcome: Outcome, began: float) -> tuple[dict[str, Any], Trial]:
+    """Return the measures of a trial and the trial with its motion."""
+    trial = Trial(name=job.target, guide=outcome.trial.guide, motion=motion)
+    limits = load_vehicle(job.vehicle).force_limits
+    result = {
+        **trial.measures(job.task, limits, stopped=bool(outcome.fault)),
+        "fault": outcome.fault,
+        "room": room(load_vehicle(job.pool_vehicle).body.size) * SITE_SIZES[job.site],
+        "localization": None,
+        "missed_decisions": outcome.runtime.counters.missed,
+        "seconds": time.perf_counter() - began,
+        "provenance": provenance(),
+    }
+    return result, trial
+
+
+def played_trial(result: Mapping[str, Any], folder: Path) -> Trial:
+    """The trial of a result, with its motion.
+
+    Args:
+        result: As `run_jobs` returns it.
+        folder: Where `run_jobs` left the motions.
+    """
+    target = result["job"]["target"]
+    guide = guide_of(target, size=result.get("room", 1.0))
+    return Trial(name=target, guide=guide, motion=Motion.read(folder / result["key"]))
+
+
+def play_jobs(
+    jobs: Sequence[Job],
+    folder: Path,
+    robot: OnRobot | None = None,
+    *,
+    attendant: Attendant | None = None,
+    console: Console | None = None,
+    **options: Any,
+) -> list[dict[str, Any]]:
+    """Play in their pools, or on a robot, what has no result yet, scored by the truth or by the robot's own estimate.
+
+    Of a robot: a trial that the bridge stopped counts; with nobody beside the water nothing is played after it. Those
+    that are skipped are left out.
+
+    Args:
+        jobs: On a robot of one vehicle; plant 0, severity and camera `HARDWARE`.
+        folder: Takes KEY.json, KEY.npz and, of a robot, KEY.mcap of each, made if missing.
+        robot: Which, and how; not opened where nothing is left to play. None: in pools.
+        attendant: Instead of the terminal's keyboard.
+        console: Where it is told how it stands; standard error if None.
+        options: Of `run_jobs`, for pools.
+
+    Raises:
+        RobotError: A trial was stopped, and nobody is there to look at the vehicle; the next call goes on. Or every
+            trial was skipped.
+        GoalError: A start or a goal lies outside the workspace.
+        PolicyError, ControlError: A controller does not fit the vehicle.
+        KeyboardInterrupt: Ctrl-C, or the operator ended the session.
+    """
+    if robot is None:
+        return campaign.run_jobs(jobs, folder, play, **options)
+    vehicle, console = load_vehicle(jobs[0].vehicle), console or Console(stderr=True)
+    trials = {job.target: job_trial(job, vehicle) for job in jobs}
+    equipped = robot.equipped(vehicle)
+    check_starts({target: start for target, (_, start) in trials.items()}, equipped)
+    for trial, _ in trials.values():
+        check_reachable(trial.guide, equipped)
+
+    def show(job: Job, result: Mapping[str, Any]) -> None:
+        held = "done" if result["success"] else result["fault"] or "not held"
+        console.print(f"  {held}", highlight=False, markup=False)
+        if result["fault"] and robot.unattended:
+            raise RobotError(
+                f"{job.row}, {job.target}: stopped, which counts: {result['fault']}: check the "
+                "vehicle, then repeat the command, which continues with the next trial"
+            )
+
+    with ExitStack() as stack:
+        opened: list[Session] = []
+
+        def play_next(job: Job, path: Path) -> dict[str, Any] | None:
+            if not opened:
+                opened.append(
+                    stack.enter_context(session(robot, vehicle, attendant=attendant, console=console))
+                )
+            return _play_on_robot(job, path, opened[0])
+
+        results = campaign.run_jobs(jobs, folder, play_next, processes=1, show=show)
+    if not results:
+        raise RobotError("every trial was skipped: there is nothing to report")
+    return results
+
+
+def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | None:
+    """One job; PATH.mcap takes the record, PATH.npz the estimate of the motion. None if it was skipped."""
+    began, vehicle, record = time.perf_counter(), opened.vehicle, path.with_name(f"{path.name}.mcap")
+    trial, start = job_trial(job, vehicle, seed=job.seed)
+    outcome = opened.trial(
+        lambda: job_trial(job, vehicle, seed=job.seed)[0],
+        start,
+        record,
+        counts=True,
+        perception=lambda: Perception(opened.equipped, opened.site, mode=job.estimator, fusion=job.fusion),
+        about={"command": f"finssim experiment {job.task}", "row": job.row},
+    )
+    if outcome is None:
+        return None
+    try:
+        motion = read_record(record, job.task, vehicle, guide=trial.guide, duration=trial.duration).estimate
+    except DriveError:  # stopped before its first decision
+        nowhere = np.full((2, 4), np.nan)
+        motion = Motion(t=np.array([0.0, 0.1]), position=nowhere[:, :3], quaternion=nowhere)
+    origin = {"robot": opened.robot.title, "record": record.name}
+    result, played = _measured(job, motion, outcome, began)
+    played.motion.write(path)
+    return result | origin

@@ -1,0 +1,60 @@
+"""Worlds as data, and the sensors that observe them: cameras, imaging sonars, altimeters, DVL beams.
+
+`WorldLayout`, `description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
+(`pip install 'finssim[perception]'`). What computes is imported when it is first named: a robot that
+reads what its devices are starts without Warp.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from finssim.extensions.perception.description import (
+    World,
+    WorldError,
+    device_of,
+    devices,
+    load_device,
+    load_world,
+    sites,
+)
+
+if TYPE_CHECKING:
+    from finssim.extensions.perception.delivery import Delivery
+    from finssim.extensions.perception.layout import WorldLayout
+    from finssim.extensions.perception.model import WorldBatch
+    from finssim.extensions.perception.sensors import (
+        CameraBatch,
+        DopplerBatch,
+        Headlight,
+        RangeBatch,
+        SonarBatch,
+        poses_of,
+        sensor_of,
+    )
+
+__all__ = [
+    "CameraBatch",
+    "Delivery",
+    "DopplerBatch",
+    "Headlight",
+    "RangeBatch",
+    "SonarBatch",
+    "World",
+    "WorldBatch",
+    "WorldError",
+    "WorldLayout",
+    "device_of",
+    "devices",
+    "load_device",
+    "load_world",
+    "poses_of",
+    "sensor_of",
+    "sites",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = {"Delivery": "delivery", "WorldBatch": "model", "WorldLayout": "layout"}.get(name, "sensors")
+    return getattr(import_module(f"finssim.extensions.perception.{home}"), name)

@@ -1,0 +1,192 @@
+"""When ray sensors measure and how late their readings arrive: rate, latency and loss, by the clocks of the worlds."""
+# mypy: ignore-errors
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import warp as wp
+
+from finssim.extensions.perception.description import WorldError
+from finssim.extensions.perception.sensors import RayBatch
+from finssim.sim.sensors.sampling import (
+    Sampling,
+    arrival,
+    begin_update,
+    lost,
+    new_sampling,
+    restart,
+    sample_due,
+    sample_key,
+    slot_of,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+STREAM = wp.constant(1000)
+"""Stream of the keys of lost readings, separate from those of the sensors of `finssim.sim.sensors`."""
+
+
+@wp.kernel(enable_backward=False)
+def _schedule(
+    steps: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    begun: wp.array2d(dtype=int),
+    sampling: Sampling,
+    loss: float,
+    seed: int,
+    due: wp.array(dtype=int),
+    stored: wp.array(dtype=int),
+    arrived: wp.array(dtype=int),
+    age: wp.array2d(dtype=float),
+):
+    """Write which sensors measure in this step, into which slot of their ring, and which slot's reading arrives; -1:
+    none."""
+    w, v = wp.tid()
+    step = steps[w]
+    view = w * age.shape[1] + v
+    due[view] = 0
+    stored[view] = -1
+    arrived[view] = -1
+    restarting = bool(episode[w] != begun[w, v])
+    if restarting:
+        begun[w, v] = episode[w]
+        restart(sampling, w, v, step)
+    if begin_update(sampling, w, v, step):
+        if restarting or sample_due(sampling, w, v, step):
+            key = sample_key(seed, STREAM, w, v, episode[w], step)
+            slot = slot_of(sampling, step)
+            due[view] = 1
+            stored[view] = slot
+            sampling.sent[w, v, slot] = restarting or not lost(key, loss)
+            sampling.last[w, v] = step
+        arrived[view] = arrival(sampling, w, v, step, restarting)
+    stamp = sampling.stamp[w, v]
+    age[w, v] = wp.where(stamp < 0.0, float(wp.inf), float(step) * sampling.control_step - stamp)
+
+
+@wp.kernel(enable_backward=False)
+def _pass_on(
+    measured: wp.array2d(dtype=wp.uint8),
+    stored: wp.array(dtype=int),
+    arrived: wp.array(dtype=int),
+    span: int,
+    ring: wp.array3d(dtype=wp.uint8),
+    reading: wp.array2d(dtype=wp.uint8),
+):
+    """Put what was measured on its way, and on display what arrives; a thread moves `span` bytes."""
+    view, block = wp.tid()
+    last = wp.min(block * span + span, measured.shape[1])
+    slot = stored[view]
+    if slot >= 0:
+        for k in range(block * span, last):
+            ring[view, slot, k] = measured[view, k]
+    slot = arrived[view]
+    if slot >= 0:
+        for k in range(block * span, last):
+            reading[view, k] = ring[view, slot, k]
+
+
+class Delivery:
+    """A sensor that measures at its own rate, whose readings arrive late or not at all.
+
+        camera = Delivery(CameraBatch(batch, device), control_step=0.1, rate=5.0, latency=0.2, loss=0.02)
+        picture = camera.update(poses, simulator.state.steps, simulator.state.episode)
+
+    As with the sensors of `finssim.sim.sensors`: the first reading of an episode arrives at once, and a sensor
+    measures at ends of control steps alone. Call `update` after every control step.
+
+    Args:
+        sensor: A `CameraBatch`, `SonarBatch` or `RangeBatch`.
+        control_step: Between updates [s].
+        rate: At which it measures [Hz]; at most once in a control step.
+        latency: Between measurement and arrival, to the nearest control step [s].
+        loss: Probability with which a reading never arrives.
+        seed: Of the sensor's noise and of what is lost.
+
+    Raises:
+        WorldError: A number is out of range.
+    """
+
+    reading: wp.array
+    """Reading that arrived last; zero before the first. Its type and shape are the sensor's."""
+    age: wp.array
+    """Time since that was measured [s], infinite before the first; float (worlds, vehicles)."""
+
+    def __init__(
+        self,
+        sensor: RayBatch,
+        *,
+        control_step: float,
+        rate: float,
+        latency: float = 0.0,
+        loss: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        good = 0.0 < control_step < math.inf and 0.0 < rate < math.inf
+        if not (good and 0.0 <= latency < math.inf and 0.0 <= loss <= 1.0):
+            raise WorldError(
+                f"control_step {control_step} s, rate {rate} Hz, latency {latency} s, loss {loss}: expected finite "
+                "numbers, the first two above 0, the latency 0 or more, the loss from 0 to 1"
+            )
+        self.sensor, self.loss, self.seed = sensor, loss, seed
+        self.device = sensor.device
+        worlds = sensor.batch.worlds
+        vehicles = sensor.count // worlds
+        self.sampling = new_sampling(
+            [rate] * vehicles, [latency] * vehicles, worlds, control_step, self.device
+        )
+        self.updates = 0
+        """So far: noise differs from one to the next."""
+        source, slots = sensor.reading, self.sampling.sent.shape[2]
+        width = source.size * source.strides[-1] // sensor.count
+        self.reading = wp.zeros_like(source)
+        with wp.ScopedDevice(self.device):
+            self.age = wp.full((worlds, vehicles), math.inf, dtype=float)
+            self._begun = wp.full((worlds, vehicles), -1, dtype=int)
+            self._due, self._stored, self._arrived = (wp.zeros(sensor.count, dtype=int) for _ in range(3))
+            self._ring = wp.zeros((sensor.count, slots, width), dtype=wp.uint8)
+        self._bytes = [
+            wp.array(ptr=array.ptr, dtype=wp.uint8, shape=(sensor.count, width), device=self.device)
+            for array in (source, self.reading)
+        ]
+
+    def update(self, poses: wp.array, steps: wp.array, episode: wp.array) -> wp.array:
+        """Measure what is due, and let arrive what has come.
+
+        Args:
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            steps: Control steps since each world's reset, as a simulator's `state.steps`; int (worlds,).
+            episode: Resets of each world so far, as its `state.episode`; int (worlds,).
+
+        Returns:
+            `reading`, which the next update overwrites.
+        """
+        inputs = [steps, episode, self._begun, self.sampling, self.loss, self.seed]
+        inputs += [self._due, self._stored, self._arrived, self.age]
+        wp.launch(_schedule, self.age.shape, inputs, device=self.device)
+        self.updates += 1
+        self.sensor.update(poses, seed=self.seed, time=float(self.updates), mask=self._due)
+        source, reading = self._bytes
+        span = 16 if self.device.is_cuda else source.shape[1]
+        inputs = [source, self._stored, self._arrived, span, self._ring, reading]
+        wp.launch(_pass_on, (len(source), -(-source.shape[1] // span)), inputs, device=self.device)
+        return self.reading
+
+    def restart(self, seed: int) -> None:
+        """Start noise and losses over with a seed; the next update is the first of an episode in every world."""
+        self.seed, self.updates = seed, 0
+        self._begun.fill_(-1)
+
+    def arrays(self) -> Iterator[tuple[str, wp.array]]:
+        """The arrays that decide what arrives next, by name; with `updates`, and the sensor's own, they are all."""
+        yield from (("measured", self.sensor.reading), ("reading", self.reading), ("age", self.age))
+        yield from (("begun", self._begun), ("ring", self._ring))
+        fields = ((name, getattr(self.sampling, name)) for name in self.sampling._cls.vars)
+        yield from ((name, x) for name, x in fields if isinstance(x, wp.array) and name != "timing")
+
+    def numpy(self) -> np.ndarray:
+        """A copy of `reading`."""
+        return self.reading.numpy().copy()

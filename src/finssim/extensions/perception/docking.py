@@ -1,0 +1,393 @@
+"""Docking: enter a funnel nose first, gently, and stay in its tube; its pose is given, or found in a picture."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import warp as wp
+
+from finssim.agents.pid import axis_model
+from finssim.extensions.perception.seeing import SeeingTask
+from finssim.physics.types import vec6
+from finssim.sim import Dock, Pool
+from finssim.sim.state import State
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.fitting import coefficients_of
+from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.measurement import TRAINING, MeasurementNoise
+from finssim.tasks.task import Task
+from finssim.tasks.terms import End, ObservationPart, RewardTerm, Terms, Total, own_velocity, tilted, uniform3
+from finssim.vehicles import Vehicle
+from finssim.vehicles.capability import terminal_speeds
+
+DISTANCE_SCALE = 3.0
+"""Distances are divided by this in the observation [m]."""
+
+
+@wp.func
+def in_dock(arrays: TaskArrays, p: Any, w: int, x: wp.vec3, q: wp.quat) -> wp.vec3:
+    """The nose of a vehicle with its origin at x and attitude q, in dock axes, from the throat [m]."""
+    nose = x + wp.quat_rotate(q, wp.vec3(0.5 * p.hull.length, 0.0, 0.0))
+    return wp.quat_rotate_inv(arrays.goal_quaternion[w], nose - arrays.goal_position[w])
+
+
+@wp.func
+def berth_offset(arrays: TaskArrays, p: Any, w: int, nose: wp.vec3) -> wp.vec3:
+    """Return the way from the nose to its berth, body frame [m]."""
+    R = wp.quat_to_matrix(wp.quat_inverse(arrays.quaternion[w, 0]) * arrays.goal_quaternion[w])
+    return R * (wp.vec3(p.berth * p.funnel.tube_length, 0.0, 0.0) - nose)
+
+
+OBSERVATION = (
+    ObservationPart("nose to its berth, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset"),
+    ObservationPart("dock rotation relative to the body, first two columns", 6, "1", term="goal_columns"),
+    *own_velocity(clip=2.0),
+    ObservationPart("nose from the throat, dock axes", 3, "m", scale=DISTANCE_SCALE, term="nose"),
+    ObservationPart(
+        "distance of the nose to its berth", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term="wp.length(offset)"
+    ),
+)
+
+BRISK = 0.9
+"""Docks are built for this many vehicle lengths a second, or the vehicle's greatest speed if that is less [1/s]."""
+
+
+@dataclass(frozen=True)
+class Hull:
+    """Numbers of the vehicle that the task uses; the environment sets it. The defaults are FinsROV's, rounded."""
+
+    length: float = 0.56
+    """[m]"""
+    girth: float = 0.2444
+    """Distance from the body's x axis to a corner of its envelope [m]."""
+    inertia: float = 27.1
+    """Inertia in surge, with added mass [kg]."""
+    speed: float = 0.476
+    """Forward speed that the dock is built for [m/s]."""
+    thrust: float = 19.8
+    """Greatest, forwards [N]."""
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> "Hull":
+        """Return the numbers of a vehicle's file."""
+        length, width, height = map(float, vehicle.body.size)
+        model = coefficients_of(vehicle)
+        return cls(
+            length,
+            0.5 * math.hypot(width, height),
+            float(axis_model(vehicle, model).inertia[0]),
+            min(float(terminal_speeds(vehicle, model)[0]), BRISK * length),
+            float(vehicle.wrench_limits[0]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DockingReward:
+    """Weights of the reward; each term has one reason.
+
+    e: from the nose to its berth; off: how far the nose is outside the cone that leads there; both in vehicle
+    lengths. θ: attitude error [rad].
+
+    r = position · exp(-e / position_scale)      a slope that does not vanish at the berth
+      - distance · e                             a slope everywhere: the dock is approached
+      - corridor · off                           from the front: the straight way may end at the block's outside
+      + heading · exp(-θ / heading_scale) - turn · θ     nose first, and straight
+      - contact · min(force / limit, 1)          touching is allowed, pushing is not the way
+      - action · mean(a²)                        the cheapest thrusts that do it
+      - change · mean(Δa²)                       commands that a motor can follow, no chatter
+      - rate · min(|ω|², 4)                      no spinning on the way
+      - loss                                     once, on a crash or on getting lost: more than a bad episode costs
+    """
+
+    position: float = 1.0
+    position_scale: float = 0.3
+    distance: float = 0.4
+    corridor: float = 0.6
+    heading: float = 0.4
+    heading_scale: float = 0.20
+    turn: float = 0.15
+    contact: float = 0.5
+    action: float = 0.03
+    change: float = 0.05
+    rate: float = 0.02
+    loss: float = 20.0
+
+
+@wp.func
+def off_corridor(p: Any, x: wp.vec3) -> float:
+    """off: how far the nose is outside the cone that leads to the berth, in vehicle lengths."""
+    room = p.gap + wp.tan(p.cone) * wp.max(-x[0], 0.0)
+    return wp.max(wp.length(wp.vec2(x[1], x[2])) - room, 0.0) / p.hull.length
+
+
+@wp.func
+def nose(state: State, arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
+    """The nose in dock axes [m]."""
+    return in_dock(arrays, p, w, state.position[w, 0], state.quaternion[w, 0])
+
+
+@wp.func
+def seen_nose(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
+    """The nose in dock axes, as measured [m]."""
+    return in_dock(arrays, p, w, arrays.position[w, 0], arrays.quaternion[w, 0])
+
+
+@wp.func
+def is_lost(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
+    """Half a length out of the water, or farther from the dock than the tank is wide."""
+    x = state.position[w, 0]
+    away = wp.length(x - arrays.goal_position[w])
+    return x[2] > 0.5 * p.hull.length or away > p.tank[0] * p.hull.length
+
+
+@wp.func
+def is_docked(state: State, p: Any, w: int, x: wp.vec3) -> bool:
+    """The nose far enough in the tube, and slow."""
+    nu = state.velocity[w, 0]
+    still = wp.length(wp.vec3(nu[0], nu[1], nu[2])) <= p.slow * p.hull.speed
+    deep = x[0] >= p.inside * p.funnel.tube_length
+    return deep and wp.length(wp.vec2(x[1], x[2])) <= 2.0 * p.gap and still
+
+
+@wp.func
+def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """A dock somewhere, and a vehicle at rest before its mouth."""
+    length = p.hull.length
+    rng = wp.rand_init(key, 4 * w + 3)
+    q_d = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), wp.randf(rng, -3.14159265, 3.14159265))
+    middle = wp.vec3(0.0, 0.0, -0.5 * p.tank[1])
+    low, high = length * (middle - p.dock_spread), length * (middle + p.dock_spread)
+    arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), low, high)
+    arrays.goal_quaternion[w] = q_d
+    arrays.funnel.force[w, 0] = 0.0
+    arrays.funnel.impulse[w, 0] = 0.0
+    roll = wp.randf(rng, -p.tilt, p.tilt)
+    pitch = wp.randf(rng, -p.tilt, p.tilt)
+    q = q_d * tilted(roll, pitch, wp.randf(rng, -p.turn, p.turn))
+    near = p.funnel.cone_length + length * p.start[0]
+    far = p.funnel.cone_length + length * p.start[1]
+    across = length * p.start_aside[0]
+    up = length * p.start_aside[1]
+    x = uniform3(wp.rand_init(key, 4 * w + 1), wp.vec3(-far, -across, -up), wp.vec3(-near, across, up))
+    state.position[w, 0] = (
+        arrays.goal_position[w] + wp.quat_rotate(q_d, x) - wp.quat_rotate(q, wp.vec3(0.5 * length, 0.0, 0.0))
+    )
+    state.quaternion[w, 0] = q
+    state.velocity[w, 0] = vec6()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Docking(Task):
+    """Docking. Lengths are in vehicle lengths, unless stated otherwise; the dock's section in shares of the vehicle's
+    girth.
+
+    An episode goes on when it has succeeded: staying in is what pays. Sizes are ours: nothing is published.
+    """
+
+    succeeds: ClassVar[str] = "once"
+    fails: ClassVar[tuple[str, ...]] = ("crash",)
+    title: ClassVar[str] = "enter a funnel nose first, gently"
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
+    name: str = "docking"
+    observation: tuple[ObservationPart, ...] = OBSERVATION
+    time_limit: float = 40.0
+    hull: Hull = Hull()
+    """Hull of the vehicle; the environment sets it."""
+    throat: float = 1.2
+    """Radius of the tube, in girths."""
+    mouth: float = 2.0
+    """Radius of the cone's wide end, in girths."""
+    cone: float = math.radians(35.0)
+    """Half angle of the cone [rad]."""
+    tube: float = 0.5
+    """Length of the tube."""
+    rim: float = 0.5
+    """Thickness of the block, in girths."""
+    give: float = 0.15
+    """Depth to which a hull point sinks in at the speed that the dock is built for, in girths."""
+    damping: float = 0.2
+    """Damping of a contact point that carries the vehicle's mass, as a share of the critical damping."""
+    berth: float = 0.75
+    """Final place of the nose, as a share of the tube from the throat."""
+    inside: float = 0.5
+    """Place from which it counts as inside, as a share of the tube."""
+    dock_spread: tuple[float, float, float] = (1.5, 1.5, 0.8)
+    """Greatest distance of the dock from the middle of the tank."""
+    start: tuple[float, float] = (1.5, 4.0)
+    """The nose starts this far before the mouth, ..."""
+    start_aside: tuple[float, float] = (1.5, 0.8)
+    """... this far beside the axis and above or below it at most, ..."""
+    turn: float = math.radians(60.0)
+    """... turned away from it by this at most [rad]."""
+    tilt: float = math.radians(10.0)
+    """Largest roll and pitch at the start [rad]."""
+    tank: tuple[float, float] = (18.0, 6.0)
+    """Width and depth of the tank."""
+    slow: float = 0.1
+    """Success: the nose inside, at most this fast, in parts of the speed the dock is built for, ..."""
+    hold: float = 2.0
+    """... for this long [s]."""
+    hard: float = 0.5
+    """A contact force ends the episode above that of a hit at this part of the speed the dock is built for, and of a
+    press with all the vehicle's thrust on top."""
+    reward: DockingReward = field(default_factory=DockingReward)
+    training_noise: MeasurementNoise = TRAINING
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "Docking":
+        """Return the task with a dock that fits the vehicle."""
+        return replace(self, hull=Hull.of(vehicles[0]))
+
+    @property
+    def force_limit(self) -> float:
+        """Contact force above which an episode ends [N]: a spring stops a mass m at speed v with √(k m) v."""
+        hit = self.hard * self.hull.speed * math.sqrt(self.dock().stiffness * self.hull.inertia)
+        return self.hull.thrust + hit
+
+    def dock(self) -> Dock:
+        """The dock's shape and stiffness [m, N/m, N s/m]."""
+        girth, length, inertia = self.hull.girth, self.hull.length, self.hull.inertia
+        # m v² = k give²: all the energy of the greatest speed in one point's spring.
+        stiffness = inertia * (self.hull.speed / (self.give * girth)) ** 2
+        return Dock(
+            mouth_radius=self.mouth * girth,
+            throat_radius=self.throat * girth,
+            cone_length=(self.mouth - self.throat) * girth / math.tan(self.cone),
+            tube_length=self.tube * length,
+            rim=self.rim * girth,
+            stiffness=stiffness,
+            damping=2.0 * self.damping * math.sqrt(stiffness * inertia),
+            slip=0.1 * self.hull.speed,
+        )
+
+    def arena(self) -> Pool:
+        """A tank with walls as stiff as the dock."""
+        dock, (width, depth) = self.dock(), self.tank
+        return Pool(
+            length=width * self.hull.length, width=width * self.hull.length, depth=depth * self.hull.length,
+            stiffness=dock.stiffness, damping=dock.damping,
+        )  # fmt: skip
+
+    @property
+    def funnel(self) -> Dock:
+        """The dock, for the terms."""
+        return self.dock()
+
+    @property
+    def gap(self) -> float:
+        """Between the envelope's corners and the tube [m]."""
+        return self.dock().throat_radius - self.hull.girth
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"nose in the tube, slow, for {self.hold:g} s, without a crash"
+
+    def terms(self) -> Terms:
+        """See `DockingReward`."""
+        r = self.reward
+        return Terms(
+            start=start,
+            shared={
+                "x": nose,
+                "e": "wp.length(wp.vec3(p.berth * p.funnel.tube_length - x[0], x[1], x[2])) / p.hull.length",
+                "theta": "attitude_error",
+                "force": "arrays.funnel.force[w, 0]",
+                "docked": is_docked,
+            },
+            seen={"nose": seen_nose, "offset": berth_offset},
+            meanings={
+                "position": f"1 with the nose in its berth, 1/e at {r.position_scale:.3g} vehicle lengths from it.",
+                "distance": "From the nose to its berth, in vehicle lengths.",
+                "heading": f"1 in the dock's attitude, 1/e at {r.heading_scale:.3g} rad from it.",
+                "contact": "Greatest contact force in the step as a part of the one that ends the episode, at most 1.",
+                "crash": f"A contact force above {self.force_limit:.3g} N.",
+                "contact_impulse": "Contact force, integrated over the episode [N s].",
+                "peak_force": "Greatest contact force so far [N].",
+            },
+            rewards=(
+                RewardTerm("position", "wp.exp(-e / p.reward.position_scale)", r.position),
+                RewardTerm("distance", "e", -r.distance),
+                RewardTerm("corridor", off_corridor, -r.corridor),
+                RewardTerm("heading", "wp.exp(-theta / p.reward.heading_scale)", r.heading),
+                RewardTerm("turn", "theta", -r.turn),
+                RewardTerm("contact", "wp.min(force / p.force_limit, 1.0)", -r.contact),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
+                RewardTerm("rate", "turning", -r.rate),
+            ),
+            ends=(End("crash", "force > p.force_limit", -r.loss), End("lost", is_lost, -r.loss)),
+            inside="docked and not force > p.force_limit",
+            totals=(
+                Total("contact_impulse", "was + arrays.funnel.impulse[w, 0]"),
+                Total("peak_force", "wp.max(was, force)"),
+            ),
+        )
+
+
+# The same by camera: find a dock in the picture.
+
+
+MOUTH, THROAT, CONE, TUBE = 0.745, 0.32, 0.75, 0.93
+"""Inner radii of the funnel of the site `dock`, its length, and that of its tube up to the plate [m]."""
+
+
+@wp.func
+def start_at_site(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """The dock where the world has it, or where `Docking` draws it, and a vehicle at rest before its mouth."""
+    x = arrays.goal_position[w]
+    q = arrays.goal_quaternion[w]
+    start(state, arrays, p, key, w)
+    if p.placed:
+        back = wp.quat_inverse(arrays.goal_quaternion[w])
+        state.position[w, 0] = x + wp.quat_rotate(q * back, state.position[w, 0] - arrays.goal_position[w])
+        state.quaternion[w, 0] = q * back * state.quaternion[w, 0]
+        arrays.goal_position[w] = x
+        arrays.goal_quaternion[w] = q
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraDocking(SeeingTask, Docking):
+    """Docking into the dock of the site `dock`, whose pose, look and light differ in each episode.
+
+    The row of numbers holds attitude, velocity and depth alone: where the dock is, the picture shows. What `docking`
+    observes is `teacher`, for who may know it in training.
+    """
+
+    title: ClassVar[str] = "dock by camera"
+    landmark: ClassVar[str] = "dock"
+    teacher: ClassVar[tuple[ObservationPart, ...]] = OBSERVATION
+    name: str = "camera-docking"
+    world: str = "dock"
+    time_limit: float = 30.0
+    cone: float = math.atan((MOUTH - THROAT) / CONE)
+    berth: float = 0.55
+    inside: float = 0.3
+    start: tuple[float, float] = (2.0, 4.5)
+    start_aside: tuple[float, float] = (1.2, 0.6)
+    turn: float = math.radians(15.0)
+    tank: tuple[float, float] = (10.0, 6.0)
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "CameraDocking":
+        """For the vehicle, if it fits into the dock."""
+        fitted = replace(self, hull=Hull.of(vehicles[0]))
+        if fitted.hull.girth > 0.95 * THROAT:
+            raise EnvironmentSetupError(
+                f"vehicle '{vehicles[0].name}' is {2.0 * fitted.hull.girth:.2f} m across its corners, and the dock of "
+                f"site 'dock' takes {2.0 * 0.95 * THROAT:.2f} m: take a slimmer one, such as finsrov"
+            )
+        return fitted
+
+    def dock(self) -> Dock:
+        """The funnel that the picture shows, with stiffness and damping as of `Docking`."""
+        return replace(
+            super().dock(),
+            mouth_radius=MOUTH, throat_radius=THROAT, cone_length=CONE, tube_length=TUBE, rim=0.06,
+        )  # fmt: skip
+
+    def arena(self) -> Pool:
+        """Up to the quay and the bottom; without the world, where the dock looks any way, as wide as long."""
+        return replace(Docking.arena(self), length=24.0, width=7.8 if self.placed else 24.0, depth=4.95)
+
+    def terms(self) -> Terms:
+        """Return the terms of `Docking`."""
+        return replace(super().terms(), start=start_at_site)

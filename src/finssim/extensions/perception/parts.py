@@ -1,0 +1,277 @@
+"""Rigid models of other programs as parts of a world: MJCF and URDF, read by MuJoCo, and USD, read by OpenUSD."""
+# mypy: ignore-errors
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from finssim.core.budget import DEPTH, FILE, NODES, in_child, read_bytes
+from finssim.core.mesh import FARTHEST
+from finssim.core.rotations import matrix_to_quat, quat_multiply, quat_rotate
+
+SUFFIXES = (".xml", ".mjcf", ".urdf", ".usd", ".usda", ".usdc", ".usdz")
+Y_UP = np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
+"""Rotation from axes with y up to axes with z up, xyzw."""
+
+
+USD_KINDS = {"Cube": "box", "Sphere": "sphere", "Capsule": "capsule", "Cylinder": "cylinder", "Mesh": "mesh"}
+FROM_Z = {
+    "X": [0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)],
+    "Y": [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)],
+    "Z": [0.0, 0.0, 0.0, 1.0],
+}
+"""Turns the z axis to another, xyzw."""
+
+
+class PartsError(ValueError):
+    """A model file that cannot be used, in one sentence without the file's name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelPart:
+    """One shape of a model, in the model's axes, z up."""
+
+    kind: str
+    """box, sphere, capsule, cylinder, plane or mesh."""
+    position: np.ndarray
+    """[m], (3,)"""
+    quaternion: np.ndarray
+    """Shape to model, xyzw, (4,)."""
+    size: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Half extents of a box; radius and half length of the round ones [m]."""
+    vertices: np.ndarray | None = None
+    """Vertices of a mesh, shape axes [m], (n, 3)."""
+    faces: np.ndarray | None = None
+    """(m, 3)"""
+    colour: np.ndarray | None = None
+    """Diffuse reflectance of red, green and blue; None if the file gives none, (3,)."""
+
+
+def parts_of(path: Path) -> list[ModelPart]:
+    """The shapes of a model file at rest, all joints at zero.
+
+    Args:
+        path: MJCF (`.xml`, `.mjcf`) or URDF (`.urdf`), which need `finssim[mujoco]`, or USD (`.usd`, `.usda`, `.usdc`,
+            `.usdz`), which needs `usd-core`. Files that it names must be in its folder or below.
+
+    Raises:
+        PartsError: It cannot be read, or has a shape that worlds do not have.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise PartsError(f"ends in '{path.suffix}', expected one of {', '.join(SUFFIXES)}")
+    model = str(path.resolve()) if suffix.startswith(".usd") else (path.name, _files_of(path))
+    parts = [ModelPart(**part) for part in in_child(_shapes, model, PartsError)]
+    if not parts:
+        raise PartsError("has no shapes")
+    for part in parts:
+        numbers = np.concatenate(
+            [part.position, part.size, np.ravel(0.0 if part.vertices is None else part.vertices)]
+        )
+        if not np.abs(numbers).max() < FARTHEST:
+            raise PartsError(
+                f"has a {part.kind} at or of {np.abs(numbers).max():.3g} m, expected less than {FARTHEST:g}"
+            )
+    return parts
+
+
+def _shapes(model: str | tuple[str, dict[str, bytes]]) -> list[dict[str, Any]]:
+    """The shapes of a model as plain data, in the child process: a USD file's path, or a name and MuJoCo's files."""
+    parts = _usd(Path(model)) if isinstance(model, str) else _mujoco(*model)
+    return [dict(vars(part)) for part in parts]
+
+
+def _mujoco(name: str, files: dict[str, bytes]) -> Iterator[ModelPart]:
+    try:
+        import mujoco
+    except ImportError:
+        raise PartsError("needs mujoco: pip install 'finssim[mujoco]'") from None
+    try:
+        text = files.pop(name).decode("utf-8", "replace")
+        model = mujoco.MjModel.from_xml_string(text, assets=files)  # a file system of these files alone
+    except ValueError as error:
+        raise PartsError(f"is not a model: {' '.join(str(error).split())[:160]}") from None
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    kinds = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind for kind in
+             ("box", "sphere", "capsule", "cylinder", "plane", "mesh")}  # fmt: skip
+    for g in range(model.ngeom):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or f"{g}"
+        kind = kinds.get(int(model.geom_type[g]))
+        if kind is None:
+            raise PartsError(f"geom '{name}' is neither {', '.join(kinds.values())}: replace it")
+        mesh = {}
+        if kind == "mesh":
+            m = model.geom_dataid[g]
+            v, f = model.mesh_vertadr[m], model.mesh_faceadr[m]
+            mesh["vertices"] = model.mesh_vert[v : v + model.mesh_vertnum[m]].astype(float)
+            mesh["faces"] = model.mesh_face[f : f + model.mesh_facenum[m]].astype(int)
+        size = (0.0, 0.0, 0.0) if kind in ("plane", "mesh") else tuple(map(float, model.geom_size[g]))
+        material = model.geom_matid[g]
+        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[g]
+        yield ModelPart(
+            kind=kind, position=data.geom_xpos[g].copy(), size=size, colour=rgba[:3].astype(float),
+            quaternion=matrix_to_quat(data.geom_xmat[g].reshape(3, 3)), **mesh,
+        )  # fmt: skip
+
+
+def _files_of(path: Path) -> dict[str, bytes]:
+    """The model and the files of its folder that it may name, by their paths below that folder.
+
+    Raises:
+        PartsError: A file names one outside the folder, or too much is included.
+    """
+    folder, files, sizes = path.parent, dict[str, bytes](), dict[str, int]()
+
+    def add(name: str) -> bool:
+        if name in files or not (folder / name).is_file():
+            return name in files
+        if name != path.name and not (folder / name).resolve().is_relative_to(folder.resolve()):
+            raise PartsError(
+                f"names the file '{name}', which is a link: put it into the model's folder or below"
+            )
+        files[name] = read_bytes(folder / name, PartsError, "has a file that")
+        if sum(map(len, files.values())) > FILE:
+            raise PartsError(f"has files of more than {FILE >> 20} MiB: make them smaller")
+        return True
+
+    def elements_of(name: str, including: tuple[str, ...]) -> int:
+        """Elements of a model file, with those of the files that it includes; 0 if it is no model."""
+        if name in including or len(including) > DEPTH:
+            raise PartsError(f"includes '{name}' in itself or more than {DEPTH} deep: include each file once")
+        if name in sizes:
+            return sizes[name]
+        try:
+            tree = ElementTree.fromstring(files[name])
+        except ElementTree.ParseError as error:
+            if including:
+                return 0
+            raise PartsError(f"cannot be read: {error}") from None
+        elements = list(tree.iter())
+        if len(elements) > NODES:
+            raise PartsError(f"has more than {NODES} elements: make it smaller")
+        named = [(element, key, value) for element in elements for key, value in element.items()
+                 if key.startswith("file") or key.endswith("dir")]  # fmt: skip
+        for _, _, value in named:
+            if value.startswith(("/", "\\", "~")) or re.search(r"^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)", value):
+                raise PartsError(f"names the file '{value}': put it into the model's folder or below")
+        places = ["", *(value for _, key, value in named if key.endswith("dir")), str(Path(name).parent)]
+        count = len(elements)
+        for _, key, value in named:
+            for place in () if key.endswith("dir") else dict.fromkeys(places):
+                for below in dict.fromkeys((value.removeprefix("package://"), Path(value).name)):
+                    found = (Path(place) / below).as_posix()
+                    if add(found) and _is_model(files[found]):
+                        count += elements_of(found, (*including, name))
+                        if count > NODES:
+                            raise PartsError(f"includes more than {NODES} elements: include each file once")
+        sizes[name] = count
+        return count
+
+    if not add(path.name):
+        raise PartsError("cannot be read: no such file")
+    elements_of(path.name, ())
+    return files
+
+
+def _is_model(data: bytes) -> bool:
+    """Return whether a file may be XML: meshes and pictures are not."""
+    return data[:64].lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+
+
+def _usd(path: Path) -> Iterator[ModelPart]:
+    try:
+        from pxr import Tf, Usd, UsdGeom
+    except ImportError:
+        raise PartsError("needs OpenUSD: pip install usd-core") from None
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise PartsError(f"is not a USD stage: {' '.join(str(error).split())[:160]}") from None
+    folder = path.resolve().parent
+    for layer in stage.GetUsedLayers():
+        if layer.realPath and not Path(layer.realPath).resolve().is_relative_to(folder):
+            raise PartsError(f"names the file '{layer.realPath}': put it into the model's folder or below")
+    unit = UsdGeom.GetStageMetersPerUnit(stage)
+    upright = Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.array([0.0, 0.0, 0.0, 1.0])
+    poses = UsdGeom.XformCache()
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        if not prim.IsA(UsdGeom.Gprim) or (
+            UsdGeom.Imageable(prim).ComputeVisibility() == UsdGeom.Tokens.invisible
+        ):
+            continue
+        part = _usd_part(prim, unit, np.array(poses.GetLocalToWorldTransform(prim)).T)
+        turned = quat_multiply(upright, part.quaternion)
+        yield replace(part, position=quat_rotate(upright, part.position), quaternion=turned)
+
+
+def _usd_part(prim: Any, unit: float, matrix: np.ndarray) -> ModelPart:
+    """One geometric prim in the stage's own axes; `matrix` is prim to stage, (4, 4), `unit` the stage's in metres."""
+    from pxr import UsdGeom
+
+    name, kind = prim.GetPath(), USD_KINDS.get(prim.GetTypeName())
+    if kind is None:
+        raise PartsError(
+            f"{name} is a {prim.GetTypeName()}, expected one of {', '.join(USD_KINDS)}: replace it"
+        )
+    shape = getattr(UsdGeom, prim.GetTypeName())(prim)
+    colours = shape.GetDisplayColorAttr().Get()
+    colour, position = np.array(colours[0], float) if colours else None, unit * matrix[:3, 3]
+    if kind == "mesh":
+        points, counts, corners = (
+            attribute.Get()
+            for attribute in (
+                shape.GetPointsAttr(),
+                shape.GetFaceVertexCountsAttr(),
+                shape.GetFaceVertexIndicesAttr(),
+            )
+        )
+        if not points or not counts or not corners:
+            raise PartsError(f"{name} has no faces: remove it")
+        vertices, faces = (
+            unit * np.array(points, float) @ matrix[:3, :3].T,
+            _triangles(np.array(counts), np.array(corners)),
+        )
+        upright = np.array([0.0, 0.0, 0.0, 1.0])
+        return ModelPart(
+            kind=kind, position=position, quaternion=upright, vertices=vertices, faces=faces, colour=colour
+        )
+    scale = np.linalg.norm(matrix[:3, :3], axis=0)
+    rotation = matrix[:3, :3] / np.maximum(scale, 1e-12)
+    if np.linalg.det(rotation) < 0.0 or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4:
+        raise PartsError(f"{name} is mirrored, sheared or flat: give it as a mesh")
+    if kind != "box" and np.ptp(scale) > 1e-4 * scale.max():
+        raise PartsError(f"{name} is scaled by {scale.tolist()}, expected equal factors: give it as a mesh")
+    q = matrix_to_quat(rotation)
+    if kind == "box":
+        size = tuple(float(0.5 * unit * s * shape.GetSizeAttr().Get()) for s in scale)
+    else:
+        length = 0.0 if kind == "sphere" else shape.GetHeightAttr().Get()
+        size = (
+            float(unit * scale[0] * shape.GetRadiusAttr().Get()),
+            float(0.5 * unit * scale[0] * length),
+            0.0,
+        )
+        if kind != "sphere":
+            q = quat_multiply(q, np.array(FROM_Z[shape.GetAxisAttr().Get()]))
+    return ModelPart(kind=kind, position=position, quaternion=q, size=size, colour=colour)
+
+
+def _triangles(counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Polygons as fans of triangles, (m, 3)."""
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    return np.array(
+        [
+            (corners[a], corners[a + k], corners[a + k + 1])
+            for a, n in zip(first, counts, strict=True)
+            for k in range(1, n - 1)
+        ]
+    ).reshape(-1, 3)

@@ -1,0 +1,135 @@
+"""Bundles of rays, one for each reading of a sensor, in the sensor's axes: x along the view, y left, z up.
+
+Each is (rows, columns, 2, 3): where a ray enters the water [m], and its unit direction; a zero direction is no ray.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.frames import FROM_OPTICAL
+from finssim.core.optics import Camera, Interface, Layer, Lens, back_project
+from finssim.extensions.perception.description import Port, RangeDevice, SonarDevice
+
+Array = NDArray[np.float64]
+
+WATER_INDEX = 1.333
+ELEVATION_SPAN = 1.5
+"""Vertical extent of a sonar's rays over its beam width: the two-way pattern is 17 dB down at its ends."""
+
+
+def camera_rays(lens: Lens, port: Port | None = None, samples: int = 1) -> Array:
+    """Rays of a picture, row 0 at the top, (height · samples, width · samples, 2, 3).
+
+    Args:
+        lens: Pinhole, with distortion, or fisheye; in the water itself, or behind a dome centred on it.
+        port: A flat window before it, at which the rays are refracted (Snell).
+        samples: Rays per pixel along each axis, evenly over it.
+    """
+    u, v = (
+        (np.arange(n * samples) + 0.5) / samples - 0.5 for n in (lens.width, lens.height)
+    )  # pixel centres are integers
+    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    if port is None:
+        directions, valid = lens.rays(pixels)
+        origins = np.zeros_like(directions)
+    else:
+        interface = Interface(
+            np.array([0.0, 0.0, -1.0]),
+            port.distance,
+            index_far=WATER_INDEX,
+            window=(Layer(port.thickness, port.index),),
+        )
+        water = back_project(Camera(lens, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])), interface, pixels)
+        origins, directions, valid = water.origin, water.direction, water.status == 0
+    bundle = np.stack([FROM_OPTICAL.vector(origins), FROM_OPTICAL.vector(directions)], axis=2)
+    return np.where(valid[..., None, None], bundle, 0.0)
+
+
+def fan(device: SonarDevice, beams: int | None = None) -> Array:
+    """Rays of an imaging sonar, (elevations, beams, 2, 3): beam 0 at the left, elevation 0 at the bottom.
+
+    Args:
+        device: The sonar.
+        beams: Over its sector, in place of its own.
+    """
+    count = beams or device.beams
+    azimuth = device.sector * (0.5 - (np.arange(count) + 0.5) / count)
+    if device.mode == "side_scan":
+        azimuth = np.array([0.5, -0.5]) * math.pi
+    elevation = ray_elevations(device)[:, None]
+    directions = np.stack(
+        np.broadcast_arrays(
+            np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+        ),
+        axis=-1,
+    )
+    return np.stack([np.zeros_like(directions), directions], axis=2)
+
+
+def fan_picture(levels: NDArray[Any], sector: float, side: int = 720) -> NDArray[Any]:
+    """A sonar's picture as a fan seen from above, the sonar at the bottom, ahead upwards; NaN outside.
+
+    Args:
+        levels: By beam, 0 at the left, and range cell, (beams, bins).
+        sector: Field of view [rad].
+        side: Rows of the result, one range long [-].
+
+    Returns:
+        (side, columns).
+    """
+    rows, columns, inside = _fan_cells(*levels.shape, sector, side)
+    return np.where(inside, levels[rows, columns], np.nan)
+
+
+@cache
+def _fan_cells(beams: int, bins: int, sector: float, side: int) -> tuple[NDArray[Any], ...]:
+    """Beam and range cell of each pixel of a fan, and whether it lies in it, (side, columns) each."""
+    half = min(1.0, math.sin(min(0.5 * sector, 0.5 * math.pi)))
+    x = np.linspace(-half, half, round(2.0 * half * side))
+    y = np.linspace(1.0, 0.0, side)[:, None]
+    radius, azimuth = np.hypot(x, y), np.arctan2(-x, y)
+    beam = (0.5 - azimuth / sector) * beams
+    cell = radius * bins
+    inside = (beam >= 0.0) & (beam < beams) & (cell < bins)
+    rows, columns = (np.where(inside, index, 0).astype(int) for index in (beam, cell))
+    return rows, columns, inside
+
+
+def ray_elevations(device: SonarDevice) -> Array:
+    """Return the elevations of a beam's rays above the sonar's x-y plane [rad], (elevations,)."""
+    return -device.depression + ELEVATION_SPAN * device.vertical_beam_width * (
+        (np.arange(device.elevations) + 0.5) / device.elevations - 0.5
+    )
+
+
+def cones(device: RangeDevice) -> tuple[Array, Array]:
+    """Rays of an altimeter or a DVL, (beams, rays, 2, 3), and how much of a beam's echo each one carries, (rays,).
+
+    The rays of a beam share its solid angle evenly, out to twice its half-power angle, and weigh as its two-way pattern
+    exp(-2 · 4 ln 2 (angle / width)²). Beam k of several is turned by 2 pi (k + 1/2) / beams about x, from y (left)
+    towards z.
+    """
+    n = device.rays if device.beam_width > 0.0 else 1
+    share = (np.arange(n) + 0.5) / n if n > 1 else np.zeros(1)
+    angle = np.arccos(1.0 - share * (1.0 - math.cos(device.beam_width)))
+    turn = np.arange(n) * math.pi * (3.0 - math.sqrt(5.0))  # the golden angle: an even spiral
+    around = np.stack([np.cos(angle), np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn)], axis=-1)
+    weight = np.exp(-8.0 * math.log(2.0) * (angle / max(device.beam_width, 1e-9)) ** 2)
+    beam = 2.0 * math.pi * (np.arange(device.beams)[:, None] + 0.5) / device.beams
+    c, s = math.cos(device.beam_angle), math.sin(device.beam_angle)
+    x, out, side = c * around[:, 0] - s * around[:, 1], s * around[:, 0] + c * around[:, 1], around[:, 2]
+    directions = np.stack(
+        [
+            np.broadcast_to(x, (device.beams, n)),
+            np.cos(beam) * out - np.sin(beam) * side,
+            np.sin(beam) * out + np.cos(beam) * side,
+        ],
+        axis=-1,
+    )
+    return np.stack([np.zeros_like(directions), directions], axis=2), weight / weight.sum()

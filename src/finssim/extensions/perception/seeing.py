@@ -1,0 +1,54 @@
+"""Common parts of tasks whose vehicle observes a site, whose pose, look and light differ in each episode."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import warp as wp
+
+from finssim.extensions.perception.sight import Picture
+from finssim.sim import Pool
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.measurement import TRAINING, MeasurementNoise
+from finssim.tasks.task import Task
+from finssim.tasks.terms import ObservationPart, own_velocity
+
+DEPTH_SCALE = 5.0
+"""The depth is divided by this in the observation [m]."""
+
+
+@wp.func
+def up(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """The world's up, body frame."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], wp.vec3(0.0, 0.0, 1.0))
+
+
+OWN = (
+    ObservationPart("up, body frame", 3, "1", term=up),
+    *own_velocity(clip=2.0),
+    ObservationPart("depth", 1, "m", scale=DEPTH_SCALE, term="-arrays.position[w, a][2]"),
+)
+"""Parts of the observation from the vehicle's own sensors, in any place."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeeingTask(Task):
+    """Base of those tasks: in open water, by a front camera, unless they say otherwise."""
+
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
+    observation: tuple[ObservationPart, ...] = OWN
+    pictures: tuple[Picture, ...] = (Picture("front_camera", 48),)
+    held_out: bool = False
+    """Draw the looks of the site that are held out of training."""
+    tilt: float = math.radians(4.0)
+    """Largest roll and pitch at the start [rad]."""
+    training_noise: MeasurementNoise = TRAINING
+
+    @property
+    def placed(self) -> bool:
+        """Return whether a world gives the place of the observed object; without one it is drawn."""
+        return bool(self.world)
+
+    def arena(self) -> Pool | None:
+        """Open water: an episode ends before floor and walls."""
+        return None

@@ -1,0 +1,200 @@
+"""Hardware bridge node: the one process that talks to motor controller or autopilot, with arming and every watchdog."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from finssim.extensions.ros2.nodes.conversions import force_of, ros_type
+from finssim.extensions.ros2.nodes.remote import Readings
+from finssim.extensions.ros2.nodes.robot_node import RobotNode, matched_callbacks
+from finssim.extensions.ros2.topics import SERVICES
+from finssim.robot.bridge import Bridge, BridgeSettings
+from finssim.robot.links.transports import DEFAULT_BIND, open_transport
+from finssim.robot.messages import CommandEcho, NavigationAid, Telemetry
+from finssim.robot.perception import Unlocated
+from finssim.robot.reading import Reading
+from finssim.robot.runtime import Counters, Intake
+from finssim.robot.wiring import POOL_ADDRESS, link_of
+
+LOOK = 0.5
+"""Between two counts of those who publish commands [s]."""
+
+
+class BridgeTopics:
+    """Arming, stops and acknowledgements are topics, so that they work with every middleware."""
+
+    def __init__(self, node: RobotNode, bridge: Bridge, *, readings: bool = True) -> None:
+        """
+        Args:
+            node: That hears and sends.
+            bridge: It is for.
+            readings: Whether to hear the estimator; False where the node knows the state itself.
+        """
+        self._node, self._bridge = node, bridge
+        self._publishers = self._matched = 0
+        self._label = ""
+        node.sends("thrusters", "event", "diagnostics")
+        matched = matched_callbacks(self._on_match)
+        self._tells = matched is not None
+        self._commands = node.hears("command", self._on_command, event_callbacks=matched)
+        node.hears("arm", lambda message: self._arm(bool(message.data)))
+        node.hears("stop", lambda message: bridge.stop(node.now(), "emergency stop by topic"))
+        node.hears("acknowledge", lambda message: bridge.acknowledge(node.now()))
+        if readings:
+            Readings(node, self._on_reading)
+        node.create_timer(LOOK, self._count)
+        service = SERVICES["set_armed"]
+        node.create_service(ros_type(service.type), node.below(service.name), self._on_service)
+
+    def tell(self, now: float, **values: Any) -> None:
+        """Publish state and events; `values` are further fields of ThrusterState."""
+        bridge, node = self._bridge, self._node
+        state_values = {
+            "reason": bridge.reason,
+            "source": self._label if bridge.source else "",
+            "requested": bridge.requested,
+            "force": bridge.force,
+            "achieved": bridge.force,
+        }
+        node.send("thrusters", node.make.thrusters(node.ns(now), bridge.state, {**state_values, **values}))
+        for event in bridge.drain():
+            node.event(event.kind, event.text, event.time)
+
+    def _arm(self, requested: bool) -> str:
+        """Arm or disarm; "" or why it is refused."""
+        now = self._node.now()
+        if not requested:
+            self._bridge.disarm(now)
+            return ""
+        self._count()
+        if self._publishers > 1:
+            reason = f"{self._publishers} publishers on {self._node.topic('command')}: leave one"
+            self._bridge.log.repeat(now, "refused", f"topic may not arm: {reason}")
+            return reason
+        return self._bridge.arm(now, "topic")
+
+    def _on_command(self, message: Any) -> None:
+        if not self._tells:
+            self._count()
+        now, source = self._node.now(), str(message.source) or "unnamed"
+        force = force_of(message, self._node.make.names)
+        if isinstance(force, str):
+            self._bridge.log.repeat(now, "command refused", f"{source}: {force}")
+            return
+        stamp = self._node.seconds(message.header.stamp)
+        # Who commands is a node; what it names after a slash, its mode, may change.
+        self._bridge.command(now, force, source.partition("/")[0], stamp=stamp)
+        self._label = source
+
+    def _on_reading(self, reading: Reading) -> None:
+        self._bridge.reading(self._node.now(), reading)
+
+    def _on_match(self, info: Any) -> None:
+        """Note that publishers came or went: two are a fault immediately, even if one has left again before."""
+        highest = self._matched + info.total_count_change
+        self._matched = info.current_count
+        self._judge(highest)
+
+    def _count(self) -> None:
+        """Count publishers twice a second; all that Humble has, whose rclpy searches the complete graph for it."""
+        count = getattr(self._commands, "get_publisher_count", None)
+        topic = self._node.topic("command")
+        self._publishers = int(count() if count else self._node.count_publishers(topic))
+        self._judge(self._publishers)
+
+    def _judge(self, publishers: int) -> None:
+        """Two that publish commands are a fault, even under one name."""
+        if publishers > 1 and self._bridge.state in ("armed", "hold"):
+            reason = f"two publishers command the thrusters: {publishers} on {self._node.topic('command')}"
+            self._bridge.stop(self._node.now(), reason)
+
+    def _on_service(self, request: Any, response: Any) -> Any:
+        reason = self._arm(bool(request.data))
+        response.success, response.message = not reason, reason
+        return response
+
+
+# Hardware bridge node: the one process that talks to the motor controller, with arming and every watchdog.
+
+
+LAST_FRAMES = 3
+"""Frames without thrust at the end."""
+RPM = 2.0 * math.pi / 60.0
+
+
+class HardwareBridge(RobotNode):
+    """Frames to and from the motor controller; disarmed until the topic `arm` is true."""
+
+    def __init__(self) -> None:
+        super().__init__("hardware_bridge")
+        located, bind = self.parameter("need_reading", True), self.parameter("bind", DEFAULT_BIND)
+        address = POOL_ADDRESS if self.robot == "pool" else self.robot
+        self.transport, link = open_transport(address, bind), link_of(address, self.vehicle)
+        self.bridge = Bridge(self.vehicle, BridgeSettings.of(self.vehicle, need_reading=located))
+        self.bridge.autopilot = link
+        self.counters, self.shafts = Counters(), np.zeros(0)
+        self.intake = Intake(Unlocated(self.vehicle), self.bridge, self.counters, self, link)
+        self.sends("imu", "pressure", "telemetry", "shafts", "echo", "positioning", "dvl", "compass")
+        self.topics = BridgeTopics(self, self.bridge)
+        self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
+        self.create_timer(1.0, self._tell)
+        self.event("start", self.transport.describe())
+
+    def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
+        """Publish a snapshot, as `robot.runtime.Intake` gives it to a recorder; stamps are of the measurement.
+
+        Args:
+            now: When it came [s].
+            telemetry: The snapshot.
+            time: When it was measured [s].
+        """
+        stamp, received = self.ns(time), self.ns(now)
+        self.send("telemetry", self.make.telemetry(stamp, received, telemetry))
+        if self.heard("imu"):
+            self.send("imu", self.make.imu(stamp, telemetry))
+        if self.heard("pressure"):
+            self.send("pressure", self.make.pressure(stamp, telemetry))
+        self.send("shafts", self._speeds(stamp, telemetry.motor_rpm))
+
+    def echo(self, now: float, echo: CommandEcho) -> None:
+        """Publish a command as executed by the motor controller."""
+        self.send("echo", self.make.echo(self.ns(now), echo))
+
+    def aid(self, now: float, aid: NavigationAid) -> None:
+        """Publish what a navigation instrument measured, stamped with its measurement."""
+        message = self.make.aid(self.ns(now - aid.age), aid)
+        if message is not None:
+            self.send(*message)
+
+    def _speeds(self, stamp: int, rpm: Sequence[float] | None) -> Any:
+        message = None if rpm is None else self.make.shafts(stamp, rpm)
+        if message is not None:
+            self.shafts = np.asarray(message.velocity, float)
+        return message
+
+    def _turn(self) -> None:
+        now = self.now()
+        self.intake.take(now, [(now, data) for data in self.transport.receive()])
+        command = self.bridge.tick(now)
+        if self.now() - now < self.bridge.settings.command_timeout:  # else the process stood still meanwhile
+            for data in self.intake.link.encode(now, command, self.bridge.state):
+                self.transport.send(data)
+        self.topics.tell(now, normalised=command.normalised, shaft_speed=self.shafts)
+
+    def _tell(self) -> None:
+        state = self.bridge.state
+        counts = {"telemetry": self.counters.telemetry, "wire": self.transport.describe()}
+        level = {"fault": "error", "hold": "warn"}.get(state, "ok")
+        self.diagnose(level, state + (f": {self.bridge.reason}" if self.bridge.reason else ""), counts)
+
+    def close(self) -> None:
+        """Disarm, send that to the motor controller, and release the wire."""
+        self.bridge.disarm(self.now())
+        for _ in range(LAST_FRAMES):
+            for data in self.intake.link.encode(self.now(), self.bridge.tick(self.now()), self.bridge.state):
+                self.transport.send(data)
+        self.transport.close()

@@ -1,0 +1,78 @@
+"""Recorder node: every topic of a vehicle to one MCAP, byte for byte as it came, that rosbag2 and Foxglove open."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from finssim.extensions.ros2.nodes.robot_node import RobotNode
+from finssim.robot.recorder import Recorder
+from finssim.vehicles import Vehicle
+
+LEFT_OUT, RAW = ("clock",), "sensor_msgs/msg/Image"
+"""Raw pictures fill disks, and their compressed ones are kept; simulated time is in every stamp."""
+
+
+class RecorderNode(RobotNode):
+    """Records from its start to its end; a full disk ends the record, not the node."""
+
+    urgent = False
+
+    def __init__(self) -> None:
+        super().__init__("recorder")
+        path, pool_file = self.parameter("record", ""), self.parameter("pool_file", "")
+        pictures = self.parameter("pictures", True)
+        self.sends("diagnostics", "event")
+        self.mcap: _WireRecord | None = None
+        if not path:
+            self.get_logger().info("nothing is recorded: give a file by the parameter record")
+            return
+        files = {"pool.yaml": pool_file} if pool_file not in ("", "none") else {}
+        names = {key: self.resolve_topic_name(self.topic(key)) for key in self.table}
+        self.mcap = _WireRecord(Path(path), self.filed, {"command": "ros2 recorder"}, files, names)
+        for key, topic in self.table.items():
+            if key not in LEFT_OUT and topic.type != RAW and (pictures or not key.endswith("picture")):
+                with suppress(ImportError):  # a ROS 2 without marine_acoustic_msgs
+                    self.hears(key, self._taker(key), raw=True)
+        self.create_timer(1.0, self._tell)
+
+    def _taker(self, key: str) -> Any:
+        record, clock = self.mcap, self.get_clock()
+        assert record is not None
+        return lambda data: record.message(key, clock.now().nanoseconds, bytes(data))
+
+    def _tell(self) -> None:
+        if self.mcap is not None:
+            problem = self.mcap.problem
+            self.diagnose(
+                "error" if problem else "ok", problem or "recording", {"dropped": self.mcap.dropped}
+            )
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self.mcap is not None:
+            self.mcap.close()
+
+
+class _WireRecord(Recorder):
+    """A record whose messages come ready from the wire, under the names they have there."""
+
+    def __init__(
+        self,
+        path: Path,
+        vehicle: Vehicle,
+        meta: Mapping[str, Any],
+        files: Mapping[str, Path | str],
+        names: Mapping[str, str],
+    ) -> None:
+        self._names = names
+        super().__init__(path, vehicle, meta, files=files)
+
+    def message(self, key: str, at: int, data: bytes) -> None:
+        """One message that came at a time [ns]."""
+        self._sink.put(key, at, data, len(data))
+
+    def _topic_name(self, key: str) -> str:
+        return self._names[key]

@@ -1,0 +1,237 @@
+"""Common parts of a robot's nodes: a vehicle, a clock in seconds, the topics of the table, and an orderly end."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+from finssim.core.system import follow_parent
+from finssim.extensions.ros2.nodes.conversions import RosMessages, nanoseconds, ros_type
+from finssim.extensions.ros2.topics import TOPICS, own_topics, quality_profile
+from finssim.vehicles import load_vehicle
+from finssim.vehicles.defaults import numbered, vehicle_at
+
+URGENCY = -10
+"""Niceness of a node that others wait for; only a privileged user may have it, others do without."""
+LISTENING = 1.0
+"""Time for which a started node listens for another of its name [s]."""
+FORGOTTEN = 11.0
+"""When the wire has forgotten a node that was killed [s]: its lease of ten, and one to spare."""
+REFUSED = 2
+"""Exit status of a node that refuses its arguments."""
+
+
+class TwinError(ValueError):
+    """Another node of the same name is on the wire."""
+
+
+class RobotNode(Node):
+    """A node of one vehicle.
+
+    Topics stand below the node's namespace, or below the vehicle's name where it has none. The robot's clock counts
+    seconds of the node's ROS clock from its start, so that no digits are lost; simulated time counts from 0.
+    """
+
+    listening = 0.0
+    """Time for which a new node listens for another of its name before it publishes [s]; `run` sets it."""
+    urgent = True
+    """True for nodes between a sensor and a thruster, which have priority over other programs if permitted."""
+
+    def __init__(self, name: str, others: Sequence[str] = ()) -> None:
+        """
+        Args:
+            name: Of the node.
+            others: Of nodes that there must not be yet, besides one of its own name.
+
+        Raises:
+            VehicleError: The parameters `vehicle` or `site` name none.
+            TwinError: There is one of those nodes.
+        """
+        super().__init__(name)
+        self.filed = load_vehicle(self.parameter("vehicle", "finsrov"))
+        """The vehicle as its file has it, which policies are trained for."""
+        self.robot = self.parameter("robot", "pool")
+        """Address of the motor controller, or of an autopilot, whose vehicle has a Doppler log and a compass."""
+        equipped = vehicle_at(
+            self.parameter("site", "pool"), self.filed, navigation=self.robot.startswith("mavlink")
+        )
+        self.vehicle = numbered(equipped, self.parameter("number", 0))
+        """The same as it is equipped for the site, with the tags of its number among several."""
+        self.table = TOPICS | own_topics(self.vehicle)
+        """Those of every robot, and of this vehicle's own cameras, sonars and altimeters."""
+        self.make = RosMessages(self.vehicle, self.parameter("frame_prefix", ""))
+        self._below = "" if self.get_namespace() != "/" else f"{self.vehicle.name.replace('-', '_')}/"
+        simulated = self.get_parameter("use_sim_time").value
+        self.base = 0 if simulated else self.get_clock().now().nanoseconds // 10**9 * 10**9
+        """What the ROS clock shows when the robot's shows 0 [ns]."""
+        self.add_on_set_parameters_callback(partial(_keep_clock, bool(simulated)))
+        self._out: dict[str, Any] = {}
+        self._listen_for({self.get_name(), *others})
+
+    def _listen_for(self, names: set[str]) -> None:
+        """Listen whether there are other nodes of these names in the namespace; ones that were killed fade out."""
+        begun, here, warned = time.monotonic(), self.get_namespace(), False
+        while self.listening:
+            there, passed = self.get_node_names_and_namespaces(), time.monotonic() - begun
+            twins = sorted(n for n in names if there.count((n, here)) > (n == self.get_name()))
+            if not twins and (warned or passed > self.listening):
+                return
+            if twins and passed > FORGOTTEN:
+                raise TwinError(
+                    f"another node {here.rstrip('/')}/{twins[0]} is on ROS domain {self.context.get_domain_id()}: "
+                    "set ROS_DOMAIN_ID or another namespace, for two graphs in one command one vehicle"
+                )
+            if twins and not warned:
+                self.get_logger().warning(f"there is another {twins[0]} in {here}: waiting until it has gone")
+                warned = True
+            time.sleep(0.05)
+
+    # -- parameters and time ------------------------------------------------------------------------------------
+
+    def parameter(self, name: str, default: Any) -> Any:
+        """Declare a parameter that is set at the start only, for nothing looks at it again; its value."""
+        return self.declare_parameter(name, default, ParameterDescriptor(read_only=True)).value
+
+    def now(self) -> float:
+        """The robot's clock [s]."""
+        return (self.get_clock().now().nanoseconds - self.base) * 1e-9
+
+    def seconds(self, stamp: Any) -> float:
+        """A message's stamp on the robot's clock [s]."""
+        return (nanoseconds(stamp) - self.base) * 1e-9
+
+    def ns(self, seconds: float) -> int:
+        """A time of the robot's clock as a stamp [ns]; times before 1970 are no stamps."""
+        return max(self.base + round(seconds * 1e9), 0)
+
+    # -- topics -------------------------------------------------------------------------------------------------
+
+    def topic(self, key: str) -> str:
+        """Name of a topic."""
+        return self.below(self.table[key].name)
+
+    def below(self, name: str) -> str:
+        """A name below the vehicle's, unless it begins with a slash."""
+        return name if name.startswith("/") else self._below + name
+
+    def sends(self, *keys: str) -> None:
+        """Make publishers, before there is something to say: peers need time to find them."""
+        for key in keys:
+            kind, quality = ros_type(self.table[key].type), quality_profile(self.table[key].quality)
+            self._out[key] = self.create_publisher(kind, self.topic(key), quality)
+
+    def withdraw(self, key: str) -> None:
+        """Remove a publisher, if there is one."""
+        if key in self._out:
+            self.destroy_publisher(self._out.pop(key))
+
+    def send(self, key: str, message: Any) -> None:
+        """Publish; None is nothing to say."""
+        if message is not None:
+            self._out[key].publish(message)
+
+    def heard(self, key: str) -> bool:
+        """Return whether our topic has a subscriber."""
+        return key in self._out and bool(self._out[key].get_subscription_count())
+
+    def hears(self, key: str, take: Callable[[Any], None], **options: Any) -> Any:
+        """Listen to a topic; the subscription. Commands are taken from publishers of any durability, as they come."""
+        kind, quality = ros_type(self.table[key].type), quality_profile(self.table[key].quality)
+        return self.create_subscription(kind, self.topic(key), take, quality, **options)
+
+    # -- what every node says of itself ---------------------------------------------------------------------------
+
+    def event(self, kind: str, text: str, at: float | None = None) -> None:
+        """Something that happened, on the topic `events` and in the log."""
+        now = self.now() if at is None else at
+        values = {"stamp_ns": self.ns(now), "time": now, "kind": kind, "text": text, "node": self.get_name()}
+        self.send("event", self.make.words(values))
+        # Two lines: rclpy raises where one line of code logs now with this severity and now with that.
+        if kind in ("fault", "refused", "error"):
+            self.get_logger().warning(f"{kind}: {text}")
+        else:
+            self.get_logger().info(f"{kind}: {text}")
+
+    def diagnose(self, level: str, text: str, values: dict[str, Any]) -> None:
+        """Health, on the topic `diagnostics`; level is ok, warn, error or stale."""
+        name = f"{self.vehicle.name}: {self.get_name()}"
+        self.send("diagnostics", self.make.diagnostics(self.ns(self.now()), name, level, text, values))
+
+    # -- a process of its own -------------------------------------------------------------------------------------
+
+    @classmethod
+    def run(cls) -> int:
+        """Be this node until SIGINT, SIGTERM, or the end of the launcher.
+
+        Returns:
+            Exit status: 0, or `REFUSED` with a sentence on standard error.
+        """
+        follow_parent()
+        if cls.urgent:
+            with suppress(PermissionError):
+                os.nice(URGENCY)
+        try:
+            rclpy.init()
+        except (RuntimeError, ValueError) as error:  # the command line, or a setting of the wire
+            return _refused(error)
+        RobotNode.listening = LISTENING
+        node: RobotNode | None = None
+        try:
+            node = cls()
+            node.spin()
+        except (KeyboardInterrupt, ExternalShutdownException):
+            pass
+        except (ValueError, ParameterException) as error:
+            return _refused(error)
+        except Exception:
+            if rclpy.ok():  # else a signal shut the context down during a call, as the real rclpy does
+                raise
+        finally:
+            if node is not None:
+                node.close()
+            rclpy.try_shutdown()
+        return 0
+
+    def spin(self) -> None:
+        """Run callbacks."""
+        rclpy.spin(self)
+
+    def close(self) -> None:
+        """Put in order what is not the middleware's; called once at the end, however it came."""
+
+
+def matched_callbacks(matched: Callable[[Any], None]) -> Any:
+    """Return event callbacks that report publishers of a subscription; None on Humble, which lacks them."""
+    try:
+        from rclpy.event_handler import SubscriptionEventCallbacks
+    except ImportError:
+        return None
+    return SubscriptionEventCallbacks(matched=matched)
+
+
+def _keep_clock(simulated: bool, parameters: Sequence[Any]) -> SetParametersResult:
+    """Refuse another clock than that of the start, from which the node counts its seconds."""
+    changed = any(p.name == "use_sim_time" and p.value != simulated for p in parameters)
+    return SetParametersResult(
+        successful=not changed,
+        reason="its clock counts from the start of the node: start it again with this value"
+        if changed
+        else "",
+    )
+
+
+def _refused(error: Exception) -> int:
+    """Say in one sentence what cannot be done."""
+    print(f"finssim: {' '.join(str(error).split())}", file=sys.stderr)
+    return REFUSED

@@ -1,0 +1,234 @@
+"""Sim node: any vehicle of the engine as a ROS 2 robot, with the bridge and the topics of a real one, and /clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from rclpy.clock import Clock, ClockType
+
+from finssim.core.rotations import (
+    quat_conjugate,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+    quat_to_matrix,
+)
+from finssim.extensions.ros2.nodes.conversions import ros_type
+from finssim.extensions.ros2.nodes.frames import Frames
+from finssim.extensions.ros2.nodes.hardware_bridge import BridgeTopics
+from finssim.extensions.ros2.nodes.robot_node import RobotNode
+from finssim.extensions.ros2.topics import SERVICES
+from finssim.robot.bridge import Bridge, BridgeSettings
+from finssim.robot.goals import station_of
+from finssim.robot.messages import Telemetry
+from finssim.robot.reading import Reading
+from finssim.sim import Simulator
+from finssim.sim.sensors.depth import ATMOSPHERE
+from finssim.vehicles import Vehicle
+
+__all__ = ["Sim"]
+
+STEP = 1.0 / 60.0
+"""Between commands, states and ticks of /clock [s]."""
+SUBSTEPS = 3
+MOST_BEHIND = 5
+"""Steps made up for at a time; a computer that is slower lets simulated time be slower."""
+
+
+IDENTITY = (0.0, 0.0, 0.0, 1.0)
+
+
+class IdealSensors:
+    """Inertial unit and pressure port at their mounts, without noise; velocities at the IMU are those of the origin."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        imu, depth = vehicle.sensors.imu, vehicle.sensors.depth
+        self._q_bs = np.array(imu.orientation if imu is not None else IDENTITY)
+        self._port = np.array(depth.position if depth is not None else (0.0, 0.0, 0.0))
+        self._water = vehicle.water
+        self.reset()
+
+    def reset(self) -> None:
+        """The vehicle was put elsewhere."""
+        self._velocity: np.ndarray | None = None
+        self._count = 0
+
+    def sample(self, reading: Reading, step: float) -> Telemetry:
+        """The instruments after a step [s]; the specific force is the mean over the step."""
+        q, gravity = reading.quaternion, self._water.gravity
+        velocity = np.asarray(quat_rotate(q, reading.nu[:3]))
+        before, self._velocity = self._velocity, velocity
+        force = np.array([0.0, 0.0, gravity])
+        if before is not None:
+            force = force + (velocity - before) / step
+        R_sw = quat_to_matrix(quat_multiply(q, self._q_bs)).T
+        R_sb = quat_to_matrix(quat_conjugate(self._q_bs))
+        depth = -float(reading.position[2] + np.asarray(quat_rotate(q, self._port))[2])
+        self._count += 1
+        return Telemetry(
+            sequence=self._count & 0xFFFF,
+            mcu_ms=round(1e3 * reading.time) & 0xFFFFFFFF,
+            quaternion=tuple(np.asarray(quat_multiply(q, self._q_bs), float).tolist()),
+            gyro=tuple((R_sb @ reading.nu[3:]).tolist()),
+            accel=tuple((R_sw @ force).tolist()),
+            depth=depth,
+            pressure=ATMOSPHERE + self._water.density * gravity * depth,
+            flags=0,
+            motor_rpm=None,
+        )
+
+
+CLAIMING = 1.0
+"""Time in which simulators that started together find each other [s]."""
+LOOK = 0.5
+"""Between two looks at who publishes /clock [s]."""
+
+
+class SharedClock:
+    """Topic /clock of a domain: one simulator publishes it and every other one follows it.
+
+    A simulator that finds another publisher follows it. Of simulators that began to publish within `CLAIMING` of each
+    other, the first by name continues. One that follows takes over, without a jump, when the publisher has left.
+    """
+
+    def __init__(self, node: RobotNode, follow: Callable[[float], None], lead: Callable[[], None]) -> None:
+        """
+        Args:
+            node: Node of the simulator.
+            follow: Takes each time of the other's clock [s].
+            lead: Called when time becomes the node's own.
+        """
+        self._node, self._follow, self._lead = node, follow, lead
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.ours = False
+        self._claimed = 0.0
+        self._heard: Any = None
+        self.look()
+        node.create_timer(LOOK, self.look, clock=self._steady)
+
+    def look(self) -> None:
+        """Claim /clock, or give way to another publisher."""
+        node, now = self._node, 1e-9 * self._steady.now().nanoseconds
+        own = node.get_fully_qualified_name()
+        infos = node.get_publishers_info_by_topic(node.topic("clock"))
+        others = sorted({f"{i.node_namespace.rstrip('/')}/{i.node_name}" for i in infos} - {own})
+        if self.ours:
+            if others and others[0] < own and now - self._claimed < CLAIMING:
+                self._give_way(others[0])
+        elif not others:
+            self._claim(now)
+        elif self._heard is None:
+            self._give_way(others[0])
+
+    def _claim(self, now: float) -> None:
+        self.ours, self._claimed = True, now
+        if self._heard is not None:
+            self._node.destroy_subscription(self._heard)
+            self._node.event("clock", "no other node publishes /clock any more: this simulator does")
+        self._node.sends("clock")
+        self._lead()
+
+    def _give_way(self, other: str) -> None:
+        node, self.ours = self._node, False
+        node.withdraw("clock")
+        self._heard = node.hears("clock", lambda message: self._follow(node.seconds(message.clock)))
+        node.event("clock", f"{other} publishes /clock: this simulator follows it, at its pace")
+
+
+class Sim(RobotNode):
+    """Simulator node. Its time begins at 0, or follows /clock if another node publishes it already; the state is the
+    truth."""
+
+    def __init__(self) -> None:
+        super().__init__("sim")
+        self.base, self.time = 0, 0.0
+        self.sends("odometry", "estimator", "imu", "pressure", "event", "diagnostics")
+        hydrodynamics, seed = self.parameter("hydrodynamics", "calibrated"), self.parameter("seed", 1)
+        self.sim = Simulator(
+            self.vehicle, hydrodynamics=hydrodynamics, control_step=STEP, substeps=SUBSTEPS, seed=seed
+        )
+        self.start = station_of(self.parameter("start", "0,0,-0.5,0"))
+        self.sensors = IdealSensors(self.vehicle)
+        limits = BridgeSettings.of(self.vehicle, telemetry_timeout=math.inf)
+        self.bridge = Bridge(self.vehicle, limits)
+        self.topics = BridgeTopics(self, self.bridge, readings=False)
+        service = SERVICES["reset"]
+        self.create_service(ros_type(service.type), self.below(service.name), self._on_reset)
+        self._reset()
+        self.frames = Frames(self)
+        self._factor, self._steady = (
+            self.parameter("real_time_factor", 1.0),
+            Clock(clock_type=ClockType.STEADY_TIME),
+        )
+        self.clock = SharedClock(self, self._follow, self._lead)
+        self.create_timer(STEP / self._factor if self._factor > 0.0 else 0.0, self._turn, clock=self._steady)
+
+    def now(self) -> float:
+        """Simulated time [s]."""
+        return self.time
+
+    def _lead(self) -> None:
+        """Count steps from now on."""
+        self._began, self._made = self._steady.now().nanoseconds, 0
+
+    def _follow(self, now: float) -> None:
+        """Step up to a time of another's clock [s]; no more than a few steps, the rest is left out."""
+        if now < self.time - MOST_BEHIND * STEP:  # that clock restarted
+            self.time = now
+        due = int((now - self.time) / STEP + 0.01)
+        steps = min(due, MOST_BEHIND)
+        self.time += (due - steps) * STEP
+        for _ in range(steps):
+            self._step()
+
+    def _turn(self) -> None:
+        """Make as many steps as are due, but no more than a few."""
+        if not self.clock.ours:
+            return
+        passed = (self._steady.now().nanoseconds - self._began) * 1e-9 * self._factor / STEP
+        due = int(passed) - self._made if self._factor > 0.0 else 1
+        for _ in range(min(due, MOST_BEHIND)):
+            self._step()
+        self._made += due
+
+    def _step(self) -> None:
+        self.bridge.reading(self.time, self._reading())
+        command = self.bridge.tick(self.time)
+        self.sim.set_thrust(self.bridge.force)
+        self.sim.step()
+        self.time += STEP
+        self._publish(command.normalised)
+
+    def _publish(self, normalised: Any) -> None:
+        stamp, reading, make = self.ns(self.time), self._reading(), self.make
+        if self.clock.ours:
+            self.send("clock", make.clock(stamp))
+        self.send("odometry", make.odometry(stamp, reading))
+        self.frames.tell(stamp, reading)
+        self.send("estimator", make.estimator(stamp, reading, {}))
+        sample = self.sensors.sample(reading, STEP)
+        self.send("imu", make.imu(stamp, sample))
+        self.send("pressure", make.pressure(stamp, sample))
+        self.topics.tell(self.time, normalised=normalised)
+
+    def _reading(self) -> Reading:
+        position, q, nu = (
+            np.array(self.sim.numpy(name)[0, 0], float) for name in ("position", "quaternion", "velocity")
+        )
+        valid = bool(np.isfinite([*position, *q, *nu]).all())
+        reason = "" if valid else "the simulation has come to grief: reset it"
+        return Reading(self.time, position, q / np.linalg.norm(q), nu, valid, "fresh", reason, np.zeros(7))
+
+    def _reset(self) -> None:
+        self.sim.place(self.start.position, quat_from_yaw(self.start.yaw))
+        self.sensors.reset()
+
+    def _on_reset(self, request: Any, response: Any) -> Any:
+        """Return to the start, disarmed; time continues."""
+        self.bridge.disarm(self.time)
+        self._reset()
+        response.success, response.message = True, f"at {self.start.position}"
+        return response

@@ -1,0 +1,1 @@
+"""Teams: tasks of several vehicles, and what they communicate."""

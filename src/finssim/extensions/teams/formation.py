@@ -1,0 +1,401 @@
+"""Formation keeping: three vehicles hold a triangular net between them, catch something that drifts, and carry it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import warp as wp
+
+from finssim.extensions.teams.communication import (
+    exchange_messages,
+    key_messages,
+    mate_position,
+    open_messages,
+)
+from finssim.extensions.teams.pursuit import (
+    PI,
+    VELOCITY_CLIP,
+    Team,
+    any_outside,
+    bumps,
+    gap_to,
+    mate,
+    motion_of,
+    slowest,
+)
+from finssim.sim.state import State
+from finssim.tasks.arrays import NetTable, TaskArrays, allocated
+from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.terms import (
+    End,
+    ObservationPart,
+    RewardTerm,
+    Terms,
+    Total,
+    level_direction,
+    measured_velocity,
+    own_velocity,
+    place_at_rest,
+    uniform3,
+    world_velocity,
+)
+from finssim.vehicles import Vehicle
+
+AGENTS = 3
+NEAR = 3.0
+"""Distances to target, goal and net are divided by this in the observation [m]."""
+REACH = 4.0
+"""Scaled distances are clipped here."""
+SETTLE = 0.5
+"""Rate at which a held target slides to the middle of the net [1/s]."""
+DEPTH_SCALE = 5.0
+"""The depth is divided by this [m]."""
+
+ROOM = 2.1
+"""The net's side is at least this many lengths of a vehicle: with that of FinsROV, 1.2 m."""
+
+
+@wp.func
+def triangle_distance(x: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
+    """Distance from a point to a triangle [m].
+
+    The nearest point by the region of the triangle that the point lies before: a corner, an edge or the inside
+    (Ericson, Real-Time Collision Detection, section 5.1.5).
+    """
+    ab = b - a
+    ac = c - a
+    d1 = wp.dot(ab, x - a)
+    d2 = wp.dot(ac, x - a)
+    d3 = wp.dot(ab, x - b)
+    d4 = wp.dot(ac, x - b)
+    d5 = wp.dot(ab, x - c)
+    d6 = wp.dot(ac, x - c)
+    va = d3 * d6 - d5 * d4
+    vb = d5 * d2 - d1 * d6
+    vc = d1 * d4 - d3 * d2
+    if d1 <= 0.0 and d2 <= 0.0:
+        return wp.length(x - a)
+    if d3 >= 0.0 and d4 <= d3:
+        return wp.length(x - b)
+    if d6 >= 0.0 and d5 <= d6:
+        return wp.length(x - c)
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        return wp.length(x - a - (d1 / (d1 - d3)) * ab)
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        return wp.length(x - a - (d2 / (d2 - d6)) * ac)
+    if va <= 0.0 and d4 >= d3 and d5 >= d6:
+        return wp.length(x - b - ((d4 - d3) / ((d4 - d3) + (d5 - d6))) * (c - b))
+    total = va + vb + vc
+    return wp.length(x - a - (vb / total) * ab - (vc / total) * ac)
+
+
+@wp.func
+def sorted_edges(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
+    """Lengths of a triangle's edges, the shortest first [m]."""
+    ab = wp.length(b - a)
+    bc = wp.length(c - b)
+    ca = wp.length(a - c)
+    least = wp.min(ab, wp.min(bc, ca))
+    longest = wp.max(ab, wp.max(bc, ca))
+    return wp.vec3(least, ab + bc + ca - least - longest, longest)
+
+
+@wp.func
+def spanned(x: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec4:
+    """A net's distance from a point [m], and the lengths of its edges, the shortest first [m]."""
+    edges = sorted_edges(a, b, c)
+    return wp.vec4(triangle_distance(x, a, b, c), edges[0], edges[1], edges[2])
+
+
+@wp.func
+def corner_gap(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
+    """Return the way from the agent to its k-th next corner, body frame [m]."""
+    return gap_to(arrays, w, a, (a + k) % AGENTS)
+
+
+@wp.func
+def corner_motion(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
+    """Velocity of the k-th next corner less one's own, body frame [m/s]."""
+    return motion_of(arrays, w, a, (a + k) % AGENTS)
+
+
+@wp.func
+def target_slip(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """The target's velocity less the agent's own, body frame [m/s]."""
+    slip = arrays.net.motion[w] - measured_velocity(arrays, w, a)
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], slip)
+
+
+@wp.func
+def next_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Return the position of the next corner as the agent knows it, world frame [m]."""
+    return mate_position(arrays, w, a, (a + 1) % AGENTS)
+
+
+@wp.func
+def last_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Return the position of the corner after that as the agent knows it, world frame [m]."""
+    return mate_position(arrays, w, a, (a + 2) % AGENTS)
+
+
+@wp.func
+def outward(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> float:
+    """Bearing of the way out from the net's middle, seen from the agent [rad]."""
+    away = wp.quat_rotate_inv(arrays.quaternion[w, a], 2.0 * arrays.position[w, a] - left - right)
+    return wp.atan2(away[1], away[0])
+
+
+@wp.func
+def seen_net(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> wp.vec4:
+    """`spanned` of the target, as far as the agent has heard."""
+    return spanned(arrays.net.target[w], arrays.position[w, a], left, right)
+
+
+@wp.func
+def edge_errors(p: Any, net: wp.vec4) -> wp.vec3:
+    """Lengths of the edges less the side, in sides, the shortest first."""
+    side = wp.vec3(p.side, p.side, p.side)
+    return (wp.vec3(net[1], net[2], net[3]) - side) / p.side
+
+
+OBSERVATION = (
+    *own_velocity(clip=VELOCITY_CLIP),
+    ObservationPart(
+        "target from here, body frame",
+        3,
+        "m",
+        NEAR,
+        REACH,
+        "wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.net.target[w] - arrays.position[w, a])",
+    ),
+    ObservationPart("target's velocity less one's own, body frame", 3, "m/s", clip=REACH, term=target_slip),
+    ObservationPart("depth", 1, "m", DEPTH_SCALE, REACH, "-arrays.position[w, a][2]"),
+    ObservationPart("bearing of the way out from the net's middle", 1, "rad", PI, 1.0, outward),
+    *mate(1, corner_gap, corner_motion),
+    *mate(2, corner_gap, corner_motion),
+    ObservationPart("goal from here, body frame", 3, "m", NEAR, REACH, "goal_offset"),
+    ObservationPart(
+        "lengths of the edges less the side, in sides, the shortest first",
+        3,
+        "1",
+        clip=REACH,
+        term=edge_errors,
+    ),
+    ObservationPart("distance from the target to the net", 1, "m", NEAR, REACH, "net[0]"),
+    ObservationPart(
+        "what the longest edge may still stretch, in sides",
+        1,
+        "1",
+        clip=REACH,
+        term="p.stretch - net[3] / p.side",
+    ),
+)
+"""34 numbers of each agent. Team-mates follow in the order of the triangle: each sees its next one first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FormationReward:
+    """Weights of the reward; each term has one reason.
+
+    team: net · (way of the net to the target) + goal · (way of the target to the goal)     adds up to the whole way [m]
+                                                          small weights are lost beside what success is worth
+        - shape · (mean error of an edge, in sides)       a triangle with equal sides
+        - step                                            sooner is better
+        + success, once                                   more than all the rest
+        - loss, once                                      for a net that tears, or a vehicle out of bounds
+    each: - bump, nearer than `collision` to another      - action · mean(a²) - change · mean(Δa²)
+
+    Published are bonuses for holding and for the shape in every step; with them it pays to hold for ever.
+    """
+
+    net: float = 4.0
+    goal: float = 4.0
+    shape: float = 0.05
+    step: float = 0.005
+    bump: float = 0.02
+    action: float = 0.001
+    change: float = 0.0015
+    success: float = 20.0
+    loss: float = 20.0
+
+
+@wp.func
+def true_net(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
+    """`spanned` of the target."""
+    return spanned(arrays.net.target[w], state.position[w, 0], state.position[w, 1], state.position[w, 2])
+
+
+@wp.func
+def holds(p: Any, net: wp.vec4) -> bool:
+    """Return whether the net holds the target: near enough, and neither stretched too far nor slack."""
+    return net[0] <= p.reach and net[1] >= p.slack * p.side and net[3] <= p.stretch * p.side
+
+
+@wp.func
+def move_target(state: State, arrays: TaskArrays, p: Any, w: int):
+    """Messages; then the target goes along with the net and into its middle while it is held, else it drifts."""
+    exchange_messages(state, arrays, w)
+    v = arrays.net.drift[w]
+    if holds(p, true_net(state, arrays, w)):
+        middle = (state.position[w, 0] + state.position[w, 1] + state.position[w, 2]) / 3.0
+        v = (world_velocity(state, w, 0) + world_velocity(state, w, 1) + world_velocity(state, w, 2)) / 3.0
+        v += SETTLE * (middle - arrays.net.target[w])
+    arrays.net.motion[w] = v
+    arrays.net.target[w] = arrays.net.target[w] + p.control_step * v
+
+
+@wp.func
+def misshape(p: Any, net: wp.vec4) -> float:
+    """Mean error of an edge, in sides."""
+    error = float(0.0)
+    for i in range(3):
+        error += wp.abs(net[i + 1] - p.side) / (3.0 * p.side)
+    return error
+
+
+@wp.func
+def shape_error(state: State, p: Any, w: int, net: wp.vec4, was: float) -> float:
+    """Mean of the error of an edge, in sides."""
+    return was + (misshape(p, net) - was) / float(state.steps[w])
+
+
+STRETCHED = "wp.where(net[3] > p.stretch * p.side, stretched + p.control_step, 0.0)"
+"""Time that the net has been too long [s]."""
+
+
+@wp.func
+def away_from(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
+    """A place at a level distance from x that is drawn, up to 0.5 m higher or lower."""
+    level = x + wp.randf(rng, p.nearest, p.farthest) * level_direction(wp.randf(rng, -PI, PI))
+    return wp.vec3(level[0], level[1], wp.clamp(x[2] + wp.randf(rng, -0.5, 0.5), p.low, p.high))
+
+
+@wp.func
+def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """The team in its triangle, the target some way off, the goal beyond."""
+    rng = wp.rand_init(key, 4 * w)
+    turn = wp.randf(rng, -PI, PI)
+    away = p.spawn_radius * wp.sqrt(wp.randf(rng)) * level_direction(wp.randf(rng, -PI, PI))
+    middle = wp.vec3(away[0], away[1], wp.randf(rng, p.low, p.high))
+    bound = wp.vec3(p.jitter, p.jitter, p.jitter)
+    for a in range(AGENTS):
+        angle = turn + float(a) * 2.0 * PI / 3.0
+        shift = uniform3(wp.rand_init(wp.randi(rng)), -bound, bound)
+        x = middle + p.side / wp.sqrt(3.0) * level_direction(angle) + shift
+        place_at_rest(state, w, a, x, angle + wp.randf(rng, -0.5, 0.5))
+    target = away_from(p, wp.rand_init(wp.randi(rng)), middle)
+    arrays.goal_position[w] = away_from(p, wp.rand_init(wp.randi(rng)), target)
+    arrays.net.target[w] = target
+    arrays.net.drift[w] = p.speed * level_direction(wp.randf(rng, -PI, PI))
+    arrays.net.motion[w] = arrays.net.drift[w]
+    key_messages(arrays, key, w)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Formation(Team):
+    """Carry a virtual net. It is a triangle between the three vehicles, without weight or drag, and it can tear.
+
+    The target is held while the net's surface is within `reach` of it, no edge is longer than `stretch` sides and none
+    shorter than `slack`; then it moves along and slides to the net's middle. Success: held within `goal_radius` of the
+    goal for `hold` seconds. An edge that stays too long for more than `grace` seconds tears.
+    """
+
+    agents: ClassVar[tuple[str, ...]] = ("corner_1", "corner_2", "corner_3")
+    succeeds: ClassVar[str] = "delivered"
+    title: ClassVar[str] = "catch what drifts in a net and carry it, three together"
+    name: str = "formation"
+    observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
+    spawn_radius: float = 1.0
+    bounds: float = 8.0
+    side: float = 1.2
+    """Side of the triangle between vehicles [m] (published: 0.6 m), larger for longer vehicles: see `ROOM`."""
+    stretch: float = 1.215
+    """[sides]: the published net of 0.6 m has 0.7288 m when it is pulled taut."""
+    slack: float = 0.5
+    """[sides]"""
+    reach: float = 0.10
+    """[m]"""
+    goal_radius: float = 0.30
+    """[m]"""
+    hold: float = 1.0
+    """[s]"""
+    grace: float = 1.0
+    """[s]"""
+    drift: float = 0.05
+    """Speed of a target that is not held, as a share of the speed that the slowest vehicle can hold."""
+    jitter: float = 0.05
+    """Largest shift of a vehicle from its corner at the start, per axis [m]."""
+    nearest: float = 1.0
+    """The target starts this far from the net's middle, and the goal from the target ..."""
+    farthest: float = 2.0
+    """... to this far [m]."""
+    reward: FormationReward = field(default_factory=FormationReward)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.slack < 1.0 < self.stretch or self.side <= 0.0:
+            raise EnvironmentSetupError(
+                f"net: side is {self.side} m, slack {self.slack}, stretch {self.stretch}; expected a side above 0 and "
+                "0 < slack < 1 < stretch"
+            )
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "Formation":
+        """The net's side and the drift's speed from the vehicles."""
+        longest = max(float(max(vehicle.body.size[:2])) for vehicle in vehicles)
+        return replace(self, side=max(self.side, ROOM * longest), speed=self.drift * slowest(vehicles))
+
+    def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
+        """Room for the target and for messages, if there are any."""
+        super().allocate(arrays, worlds, device)
+        arrays.net = allocated(NetTable, worlds, device)
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"the target held within {self.goal_radius:g} m of the goal for {self.hold:g} s"
+
+    def terms(self) -> Terms:
+        """See `FormationReward`."""
+        r = self.reward
+        return Terms(
+            start=start,
+            begin=open_messages,
+            advance=move_target,
+            shared={
+                "net": true_net,
+                "away": "wp.length(arrays.goal_position[w] - arrays.net.target[w])",
+                "holding": holds,
+            },
+            seen={"left": next_place, "right": last_place, "net": seen_net},
+            meanings={
+                "net": "How much nearer the net came to the target in the step [m].",
+                "goal": "How much nearer the target came to the goal in the step [m].",
+                "step": "1 in every step: sooner is better.",
+                "delivered": f"Success: {self.success_rule()}.",
+                "torn": f"An edge longer than {self.stretch:g} sides for more than {self.grace:g} s.",
+                "held_time": "For how long the net held the target [s].",
+                "to_net": "From the target to the net [m].",
+                "to_goal": "From the target to the goal [m].",
+                "stretched": "For how long an edge has been too long [s].",
+            },
+            rewards=(
+                RewardTerm("net", "to_net - net[0]", r.net),
+                RewardTerm("goal", "to_goal - away", r.goal),
+                RewardTerm("shape", misshape, -r.shape),
+                RewardTerm("step", "1.0", -r.step),
+                RewardTerm("bump", bumps, -r.bump),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
+            ),
+            ends=(
+                End("delivered", "held > 0.0 and held >= p.hold - 0.1 * p.control_step", r.success),
+                End("torn", f"{STRETCHED} > p.grace + 0.1 * p.control_step", -r.loss),
+                End("left", any_outside, -r.loss),
+            ),
+            inside="holding and away <= p.goal_radius",
+            totals=(
+                Total("held_time", "was + wp.where(holding, p.control_step, 0.0)"),
+                Total("shape_error", shape_error),
+                Total("to_net", "net[0]", first="net[0]"),
+                Total("to_goal", "away", first="away"),
+                Total("stretched", STRETCHED),
+            ),
+        )

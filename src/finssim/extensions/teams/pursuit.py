@@ -1,0 +1,941 @@
+"""Pursuit: come up to a prey that flees with a vehicle like one's own, and stay with it.
+
+Or, of three, a herder drives it into the net that two netters hold between them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from finssim.extensions.teams.communication import (
+    Communication,
+    exchange_messages,
+    key_messages,
+    mate_position,
+    mate_velocity,
+    message_table,
+    open_messages,
+)
+from finssim.physics.types import vec6
+from finssim.sim.state import State
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.task import Task
+from finssim.tasks.terms import (
+    End,
+    ObservationPart,
+    RewardTerm,
+    Terms,
+    Total,
+    level_direction,
+    measured_velocity,
+    own_velocity,
+    place_at_rest,
+    world_velocity,
+)
+from finssim.vehicles import HydrodynamicSet, Vehicle
+from finssim.vehicles.capability import level_speed, terminal_speeds
+
+# Following a wanted velocity with a vehicle's own thrust: for vehicles that a script commands, and for baselines.
+
+
+Array = NDArray[Any]
+
+RATE = 1.2
+"""Rate at which an error of the velocity decays [1/s]: as fast as motors and a control step of 0.1 s allow."""
+YAW_RATE = 3.0
+"""Rate at which an error of the yaw rate decays [1/s]: three times that of the heading, or the heading oscillates."""
+TURN = 1.0
+"""Yaw rate asked for at a heading error of 1 rad [1/s]."""
+MOST_TURN = 0.8
+"""Largest yaw rate asked for [rad/s]."""
+ROWS = [0, 1, 2, 5]
+"""Places in a wrench of the axes that these tasks need: surge, sway, heave, yaw."""
+
+
+@wp.func
+def drive(d: Any, q: wp.quat, nu: vec6, target: wp.vec4) -> wp.vec4:
+    """Return the action that brings the velocity to a wanted one.
+
+    tau = d1 v* + d2 |v*| v* + RATE m (v* - v) + (weight - buoyancy) up,  action = shared(tau / limit)
+
+    Args:
+        d: The vehicle's `DriveNumbers`.
+        q: Body to world.
+        nu: Velocity, body frame [m/s, rad/s].
+        target: v*: surge, sway, heave and yaw rate, body frame [m/s, rad/s].
+
+    Returns:
+        Parts of the limits on surge, sway, heave and yaw, each in [-1, 1].
+    """
+    v = wp.vec4(nu[0], nu[1], nu[2], nu[5])
+    up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
+    tau = d.sink * wp.vec4(up[0], up[1], up[2], 0.0)
+    a = wp.vec4()
+    for i in range(4):
+        tau[i] = tau[i] + (d.d1[i] + d.d2[i] * wp.abs(target[i])) * target[i]
+        tau[i] = tau[i] + wp.where(i == 3, YAW_RATE, RATE) * d.mass[i] * (target[i] - v[i])
+        a[i] = tau[i] / d.limit[i]
+    return shared(a)
+
+
+@wp.func
+def shared(a: wp.vec4) -> wp.vec4:
+    """Surge, sway and yaw limited together, for the same thrusters give them: yaw up to half, the others the rest."""
+    yaw = wp.clamp(a[3], -0.5, 0.5)
+    part = wp.min(1.0, (1.0 - wp.abs(yaw)) / wp.max(wp.abs(a[0]) + wp.abs(a[1]), 1.0e-6))
+    return wp.vec4(part * a[0], part * a[1], wp.clamp(a[2], -1.0, 1.0), yaw)
+
+
+@wp.func
+def towards(q: wp.quat, velocity: wp.vec3) -> wp.vec4:
+    """A velocity of the world as one of the body, with a yaw rate that turns the body's x axis along it.
+
+    Returns:
+        Surge, sway, heave and yaw rate [m/s, rad/s].
+    """
+    v = wp.quat_rotate_inv(q, velocity)
+    ahead = wp.quat_rotate_inv(q, wp.vec3(velocity[0], velocity[1], 0.0))
+    moving = ahead[0] * ahead[0] + ahead[1] * ahead[1] > 1.0e-8
+    error = wp.where(moving, wp.atan2(ahead[1], ahead[0]), 0.0)
+    return wp.vec4(v[0], v[1], v[2], wp.clamp(TURN * error, -MOST_TURN, MOST_TURN))
+
+
+@wp.func
+def write_scripted(arrays: TaskArrays, w: int, action: wp.vec4):
+    """Write the action of the only vehicle that the task commands, as wrench4 or as wrench6 without roll and pitch."""
+    size = arrays.scripted.shape[1]
+    for i in range(size):
+        arrays.scripted[w, i] = 0.0
+    for i in range(3):
+        arrays.scripted[w, i] = action[i]
+    arrays.scripted[w, size - 1] = action[3]
+
+
+@dataclass(frozen=True)
+class DriveNumbers:
+    """Numbers for following a velocity; rows are surge, sway, heave, yaw."""
+
+    d1: tuple[float, float, float, float]
+    """Linear damping [N s/m, N m s]."""
+    d2: tuple[float, float, float, float]
+    """Quadratic damping."""
+    mass: tuple[float, float, float, float]
+    """Inertia with added mass [kg, kg m²]."""
+    limit: tuple[float, float, float, float]
+    """Wrench of an action of 1 [N, N m]."""
+    terminal: tuple[float, float, float, float]
+    """Steady speed at the limit [m/s, rad/s]."""
+    sink: float
+    """Weight less buoyancy [N]."""
+    level: float
+    """Speed ahead up to which the vehicle's stiffness in pitch outweighs the Munk moment [m/s]; see `level_speed`."""
+
+    @property
+    def top(self) -> float:
+        """Speed ahead that the vehicle can hold, by thrust and without pitching over [m/s]."""
+        return min(self.terminal[0], self.level)
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> "DriveNumbers":
+        """The numbers of a vehicle, from its first hydrodynamic set with coefficients.
+
+        Raises:
+            EnvironmentSetupError: It has no coefficients.
+        """
+        sets = [name for name, model in vehicle.hydrodynamics.items() if isinstance(model, HydrodynamicSet)]
+        if not sets:
+            raise EnvironmentSetupError(
+                f"vehicle '{vehicle.name}' has no damping coefficients, which pursuit and formation need: take another "
+                "vehicle"
+            )
+        hydro: Any = vehicle.hydrodynamics[sets[0]]
+        columns = (
+            np.diag(hydro.linear_damping), hydro.axis_drag, np.diag(vehicle.mass_matrix(sets[0])),
+            vehicle.wrench_limits, terminal_speeds(vehicle, sets[0]),
+        )  # fmt: skip
+        rows = (tuple(column[ROWS].tolist()) for column in columns)
+        return cls(*rows, sink=vehicle.weight - vehicle.buoyancy, level=level_speed(vehicle, sets[0]))
+
+    def action(self, velocity: Array, target: Array) -> NDArray[np.float32]:
+        """Return the result of `drive` for a level vehicle.
+
+        Args:
+            velocity: Surge, sway, heave, yaw rate [m/s, rad/s], (n, 4).
+            target: The same, wanted.
+
+        Returns:
+            Parts of the limits on the four axes, (n, 4), each in [-1, 1].
+        """
+        d1, d2, mass, limit = (np.array(row) for row in (self.d1, self.d2, self.mass, self.limit))
+        rate = np.array([RATE, RATE, RATE, YAW_RATE])
+        tau = (d1 + d2 * np.abs(target)) * target + rate * mass * (target - velocity)
+        tau[:, 2] += self.sink
+        a = tau / limit
+        a[:, 2:] = np.clip(a[:, 2:], [-1.0, -0.5], [1.0, 0.5])
+        remaining = 1.0 - np.abs(a[:, 3])
+        a[:, :2] *= np.minimum(1.0, remaining / np.maximum(np.abs(a[:, :2]).sum(axis=1), 1e-6))[:, None]
+        return a.astype(np.float32)
+
+    def turned(self, error: Array) -> Array:
+        """Yaw rate that takes a heading error away [rad/s], from the error [rad]."""
+        return np.clip(TURN * error, -MOST_TURN, MOST_TURN)
+
+
+def slowest(vehicles: Sequence[Vehicle]) -> float:
+    """The smallest speed ahead that vehicles can hold [m/s]: what the speed of their prey is tied to."""
+    return min(DriveNumbers.of(vehicle).top for vehicle in vehicles)
+
+
+# What a pursuer sees of itself, of its prey and of its team-mates, all in its body frame.
+
+
+DISTANCE_SCALE = 6.0
+"""Distances are divided by this [m]."""
+REACH = 4.0
+"""Scaled distances are clipped here."""
+VELOCITY_CLIP = 4.0
+"""Velocities are clipped here [m/s, rad/s]."""
+PI = 3.14159265
+
+
+@wp.func
+def prey_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Return the way from agent a to the vehicle after the agents, body frame [m]."""
+    prey = arrays.agent_reward.shape[1]
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.position[w, prey] - arrays.position[w, a])
+
+
+@wp.func
+def prey_motion(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Its velocity less the agent's own, body frame [m/s]."""
+    relative = measured_velocity(arrays, w, arrays.agent_reward.shape[1]) - measured_velocity(arrays, w, a)
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
+
+
+@wp.func
+def gap_to(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
+    """Return the way from agent a to agent b, as far as a has received, body frame of a [m]."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], mate_position(arrays, w, a, b) - arrays.position[w, a])
+
+
+@wp.func
+def motion_of(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
+    """Velocity of agent b less that of agent a, as far as a has heard, body frame of a [m/s]."""
+    relative = mate_velocity(arrays, w, a, b) - measured_velocity(arrays, w, a)
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
+
+
+CHASE = (
+    *own_velocity(clip=VELOCITY_CLIP),
+    ObservationPart("prey from here, body frame", 3, "m", DISTANCE_SCALE, REACH, term="gap"),
+    ObservationPart(
+        "prey's velocity less one's own, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=prey_motion
+    ),
+    ObservationPart("distance to the prey", 1, "m", DISTANCE_SCALE, REACH, term="wp.length(gap)"),
+    ObservationPart(
+        "bearing of the prey, positive to the left", 1, "rad", PI, 1.0, term="wp.atan2(gap[1], gap[0])"
+    ),
+)
+"""14 numbers of one pursuer, for a task that shares `prey_gap` as `gap`."""
+
+
+def mate(k: int, gap: Any, motion: Any) -> tuple[ObservationPart, ...]:
+    """Return the 6 numbers of the k-th team-mate: its relative position and velocity."""
+    moves = "team-mate's velocity less one's own, body frame"
+    return (
+        ObservationPart("team-mate from here, body frame", 3, "m", DISTANCE_SCALE, REACH, gap, k),
+        ObservationPart(moves, 3, "m/s", clip=VELOCITY_CLIP, term=motion, index=k),
+    )
+
+
+# The scripted prey: a vehicle that wanders, keeps straight on or flees, by its own thrusters, up to a given speed.
+
+
+PREY_MODES = ("random", "straight", "hybrid", "line-of-sight", "mixed")
+"""Behaviours of a prey:
+
+random: a new direction and speed every few seconds. straight: one direction, drawn for the episode, at full speed.
+hybrid: flees from everybody near, askance, and wanders while nobody is. line-of-sight: flees straight away from the
+nearest, always. mixed: one of the four, drawn for the episode.
+"""
+
+RESERVE = 0.9
+"""Greatest demanded speed of a prey, as a share of the speed it can hold: the rest is for steering."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prey:
+    """Behaviour of the prey. Its speed is a share of what the slowest pursuer can hold, never an absolute number."""
+
+    mode: str = "mixed"
+    """One of `PREY_MODES`."""
+    alarm: float = 3.0
+    """A hybrid prey flees from pursuers nearer than this [m]."""
+    retarget: float = 4.0
+    """Time between two draws of a direction, or of the side to flee to [s]."""
+    range: float = 9.0
+    """Distance from the origin at which it turns along the border [m]."""
+    low: float = -5.0
+    """It stays above this height ..."""
+    high: float = -1.0
+    """... and below this one [m]."""
+
+    def __post_init__(self) -> None:
+        if self.mode not in PREY_MODES:
+            raise EnvironmentSetupError(
+                f"unknown prey mode '{self.mode}'; available: {', '.join(PREY_MODES)}"
+            )
+        if not (self.retarget > 0.0 and self.range > 0.0 and self.low < self.high < 0.0):
+            raise EnvironmentSetupError(
+                f"prey: retarget is {self.retarget} s, range {self.range} m, heights {self.low} to {self.high} m; "
+                "expected times and ranges above 0 and heights below the surface, the lower one first"
+            )
+
+    @property
+    def kind(self) -> int:
+        """Number of the mode."""
+        return PREY_MODES.index(self.mode)
+
+
+@wp.func
+def most_climb(p: Any) -> float:
+    """Up or down [m/s]."""
+    return wp.min(0.5 * p.speed, RESERVE * p.prey_drive.terminal[2])
+
+
+@wp.func
+def wander(p: Any, key: int, w: int, draw: int) -> wp.vec3:
+    """Velocity of a random walk in its n-th stretch [m/s]."""
+    rng = wp.rand_init(wp.randi(wp.rand_init(key, 4 * w + 2)), draw)
+    direction = level_direction(wp.randf(rng, -3.14159265, 3.14159265))
+    pace = wp.randf(rng, 0.3, 1.0) * p.speed
+    return pace * direction + wp.vec3(0.0, 0.0, wp.randf(rng, -1.0, 1.0) * most_climb(p))
+
+
+@wp.func
+def flight(state: State, arrays: TaskArrays, w: int, reach: float) -> wp.vec3:
+    """Away from all pursuers within reach, each weighted by 1/d²; zero where there is none."""
+    pursuers = arrays.agent_reward.shape[1]
+    x = state.position[w, pursuers]
+    away = wp.vec3()
+    for a in range(pursuers):
+        gap = x - state.position[w, a]
+        d = wp.max(wp.length(gap), 1.0e-3)
+        if d < reach:
+            away += gap / (d * d * d)
+    return away
+
+
+@wp.func
+def nearest_pursuer(state: State, arrays: TaskArrays, w: int) -> float:
+    """Distance from the prey to the nearest pursuer [m]."""
+    pursuers = arrays.agent_reward.shape[1]
+    x = state.position[w, pursuers]
+    d = wp.length(x - state.position[w, 0])
+    for a in range(1, pursuers):
+        d = wp.min(d, wp.length(x - state.position[w, a]))
+    return d
+
+
+@wp.func
+def kept_inside(p: Any, x: wp.vec3, v: wp.vec3) -> wp.vec3:
+    """The velocity without what leads out of the prey's range: it slides along the border, at the same speed."""
+    pace = wp.sqrt(v[0] * v[0] + v[1] * v[1])
+    r = wp.sqrt(x[0] * x[0] + x[1] * x[1])
+    out = wp.vec3(x[0], x[1], 0.0) / wp.max(r, 1.0e-6)
+    radial = v[0] * out[0] + v[1] * out[1]
+    inside = v
+    if r > p.prey.range and radial > 0.0:
+        around = wp.vec3(-out[1], out[0], 0.0)
+        side = wp.where(wp.dot(around, v) < 0.0, -1.0, 1.0)
+        inside = pace * wp.normalize(side * around - 0.2 * out) + wp.vec3(0.0, 0.0, v[2])
+    climb = wp.clamp(inside[2], -most_climb(p), most_climb(p))
+    climb = wp.where(x[2] > p.prey.high, -0.5 * most_climb(p), climb)
+    climb = wp.where(x[2] < p.prey.low, 0.5 * most_climb(p), climb)
+    return wp.vec3(inside[0], inside[1], climb)
+
+
+@wp.func
+def prey_velocity(state: State, arrays: TaskArrays, p: Any, key: int, w: int) -> wp.vec3:
+    """Velocity that the prey wants, world frame; its level part is no faster than `speed` [m/s]."""
+    pi = 3.14159265
+    rng = wp.rand_init(key, 4 * w + 3)
+    heading = wp.randf(rng, -pi, pi)
+    mode = wp.where(p.prey.kind == 4, wp.randi(rng, 0, 4), p.prey.kind)
+    draw = int(float(state.steps[w]) * p.control_step / p.prey.retarget + 1.0e-4)
+    v = wander(p, key, w, draw)
+    if mode == 1:
+        v = p.speed * level_direction(heading)
+    if mode == 3:
+        v = flight(state, arrays, w, nearest_pursuer(state, arrays, w) * 1.0001 + 1.0e-3)
+    if mode == 2:
+        away = flight(state, arrays, w, p.prey.alarm)
+        if wp.length(away) > 0.0:
+            turn = wp.where(wp.randf(wp.rand_init(key + draw, 4 * w + 1)) < 0.5, -0.6, 0.6)
+            v = wp.quat_rotate(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), turn), away)
+    if mode >= 2 and (mode == 3 or nearest_pursuer(state, arrays, w) < p.prey.alarm):
+        pace = wp.sqrt(v[0] * v[0] + v[1] * v[1])
+        v = v * (p.speed / wp.max(pace, 1.0e-6))
+    return kept_inside(p, state.position[w, arrays.agent_reward.shape[1]], v)
+
+
+@wp.func
+def command_prey(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """Write the action of the prey, which is the vehicle after the pursuers; it sees the truth."""
+    pursuers = arrays.agent_reward.shape[1]
+    q = state.quaternion[w, pursuers]
+    target = towards(q, prey_velocity(state, arrays, p, key + 7, w))
+    write_scripted(arrays, w, drive(p.prey_drive, q, state.velocity[w, pursuers], target))
+
+
+# What the tasks in open water have in common: where episodes start and end, the prey, and the team.
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenWater(Task):
+    """Base of the tasks in open water: where episodes start and end. Lengths in metres, world frame with z up."""
+
+    action: ClassVar[str] = "wrench4"
+    pool: ClassVar[None] = None
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
+
+    time_limit: float = 60.0
+    spawn_radius: float = 2.5
+    """Agents start this near to the origin."""
+    low: float = -4.0
+    """Everybody starts between this height ..."""
+    high: float = -2.0
+    """... and this one."""
+    bounds: float = 12.0
+    """Going farther from the origin than this ends the episode."""
+    ceiling: float = 0.3
+    """So does rising above this height."""
+    depth: float = 8.0
+    """And sinking below this depth."""
+    nearest: float = 2.0
+    """Least distance of what is to be caught from the agents at the start ..."""
+    farthest: float = 5.0
+    """... to this far."""
+    speed: float = 0.0
+    """Speed of what is to be caught [m/s]: follows from the vehicles."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chase(OpenWater):
+    """Base of the tasks with a prey, which is the vehicle after the agents."""
+
+    others: ClassVar[tuple[str, ...]] = ("prey",)
+    succeeds: ClassVar[str] = "captured"
+    moving: ClassVar[bool] = True
+
+    prey: Prey = field(default_factory=Prey)
+    """Behaviour of the prey; it sees all agents."""
+    prey_drive: DriveNumbers | None = field(default=None, repr=False)
+    """Thrusters of the prey: follows from its vehicle."""
+
+    def chased(self, part: float, vehicles: Sequence[Vehicle], **changes: Any) -> Any:
+        """The task with the prey's thrust from its vehicle, and its speed.
+
+        Args:
+            part: Of what the slowest agent can hold.
+            vehicles: Agents, then the prey.
+            changes: Of other settings.
+        """
+        if not 0.0 <= part <= 1.0:
+            raise EnvironmentSetupError(
+                f"prey_speed is {part}, expected 0 to 1: a part of the slowest pursuer's speed"
+            )
+        drive = DriveNumbers.of(vehicles[-1])
+        speed = min(part * slowest(vehicles[:-1]), RESERVE * drive.top)
+        return replace(self, speed=speed, prey_drive=drive, **changes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Team(OpenWater):
+    """Base of the tasks of several agents."""
+
+    collision: float = 0.6
+    """Agents nearer to each other than this bump [m]; nothing stops them."""
+    communication: Communication | None = None
+    """Messages between agents; None: every agent sees every other."""
+
+    def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
+        """Room for the messages, if there are any."""
+        arrays.messages = message_table(
+            self.communication, worlds, len(self.agents), self.control_step, 2.0 * self.bounds, device
+        )
+
+
+@wp.func
+def any_outside(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
+    """An agent is out of bounds."""
+    out = bool(False)
+    for a in range(arrays.agent_reward.shape[1]):
+        x = state.position[w, a]
+        if x[0] * x[0] + x[1] * x[1] > p.bounds * p.bounds or x[2] > p.ceiling or x[2] < -p.depth:
+            out = True
+    return out
+
+
+@wp.func
+def bumps(state: State, arrays: TaskArrays, p: Any, w: int, a: int) -> float:
+    """Agents nearer than `collision`."""
+    count = float(0.0)
+    for b in range(arrays.agent_reward.shape[1]):
+        if b != a and wp.length(state.position[w, b] - state.position[w, a]) < p.collision:
+            count += 1.0
+    return count
+
+
+@wp.func
+def prey_start(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
+    """A place for the prey: at a distance from x that is drawn, in any direction, at about the same height."""
+    angle = wp.randf(rng, -3.14159265, 3.14159265)
+    away = wp.randf(rng, p.nearest, p.farthest)
+    height = wp.clamp(x[2] + wp.randf(rng, -0.5, 0.5), p.low, p.high)
+    level = x + away * level_direction(angle)
+    return wp.vec3(level[0], level[1], height)
+
+
+# The task of one pursuer.
+
+
+@dataclass(frozen=True, kw_only=True)
+class PursuitReward:
+    """Weights of the reward; each term has one reason.
+
+    r = progress · (closing speed) · dt          nearer is better; over an episode it adds up to the way gained [m]
+      - distance · min(d / 8 m, 1)               a slope everywhere, also behind a prey that keeps its distance
+      + heading · cos(angle to the prey)         the bow, where thrust and camera are best, points at the prey
+      + near, within near_radius                 staying with it is worth something before it counts as captured
+      - spin · r²                                no turning on the spot
+      - action · mean(a²) - change · mean(Δa²)   the cheapest thrusts that do it; commands that a motor can follow
+      - step                                     sooner is better
+      + capture                                  once; more than all the rest of an episode (published: 50)
+      - loss                                     once, on leaving the bounds (published: 1, cheaper than going on)
+
+    Time running out costs nothing (published: 5): the time is not observed, so that nothing could be learnt from it.
+    """
+
+    progress: float = 0.9
+    distance: float = 0.08
+    heading: float = 0.01
+    near: float = 0.03
+    near_radius: float = 1.2
+    spin: float = 0.002
+    action: float = 0.001
+    change: float = 0.0015
+    step: float = 0.0005
+    capture: float = 20.0
+    loss: float = 20.0
+
+
+@wp.func
+def relative_motion(state: State, w: int) -> wp.vec3:
+    """The prey's velocity less the pursuer's, world frame [m/s]."""
+    return world_velocity(state, w, 1) - world_velocity(state, w, 0)
+
+
+@wp.func
+def facing(state: State, w: int, way: wp.vec3, d: float) -> float:
+    """Cosine of the angle from the bow to the prey."""
+    ahead = wp.quat_rotate(state.quaternion[w, 0], wp.vec3(1.0, 0.0, 0.0))
+    return wp.dot(ahead, way) / d
+
+
+@wp.func
+def start(state: State, p: Any, key: int, w: int):
+    """Pursuer near the origin, prey some way off, both at rest."""
+    pi = 3.14159265
+    rng = wp.rand_init(key, 4 * w)
+    away = p.spawn_radius * wp.sqrt(wp.randf(rng)) * level_direction(wp.randf(rng, -pi, pi))
+    x = wp.vec3(away[0], away[1], wp.randf(rng, p.low, p.high))
+    place_at_rest(state, w, 0, x, wp.randf(rng, -pi, pi))
+    heading = wp.randf(rng, -pi, pi)
+    place_at_rest(state, w, 1, prey_start(p, wp.rand_init(wp.randi(rng)), x), heading)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pursuit(Chase):
+    """1-v-1 pursuit. Captured: within `radius` at a relative speed of at most `relative_speed`, for `hold` seconds."""
+
+    agents: ClassVar[tuple[str, ...]] = ("pursuer",)
+    title: ClassVar[str] = "catch a prey, one against one"
+    name: str = "pursuit"
+    observation: tuple[ObservationPart, ...] = field(default=CHASE, repr=False)
+    prey_speed: float = 0.6
+    """Speed of the prey, as a part of what the pursuer can hold (published: 2 m/s, four times that speed)."""
+    radius: float = 0.8
+    relative_speed: float = 0.35
+    """[m/s]"""
+    hold: float = 0.5
+    """[s]"""
+    reward: PursuitReward = field(default_factory=PursuitReward)
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "Pursuit":
+        """The prey's speed and thrust from the vehicles: pursuer, prey."""
+        return self.chased(self.prey_speed, vehicles)
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"within {self.radius:g} m at no more than {self.relative_speed:g} m/s for {self.hold:g} s"
+
+    def terms(self) -> Terms:
+        """See `PursuitReward`."""
+        r = self.reward
+        return Terms(
+            start=start,
+            command=command_prey,
+            shared={
+                "way": "state.position[w, 1] - state.position[w, 0]",
+                "d": "wp.max(wp.length(way), 1.0e-6)",
+                "motion": relative_motion,
+                "spin": "state.velocity[w, 0][5]",
+            },
+            seen={"gap": prey_gap},
+            meanings={
+                "progress": "How much nearer the prey came: closing speed times the length of the step [m].",
+                "distance": "Distance to the prey over 8 m, at most 1.",
+                "near": f"1 within {r.near_radius:g} m of the prey, otherwise 0.",
+                "spin": "Square of the yaw rate [rad²/s²].",
+                "step": "1 in every step: sooner is better.",
+                "captured": f"The prey {self.success_rule()}.",
+                "closest": "Least distance to the prey so far [m].",
+            },
+            rewards=(
+                RewardTerm("progress", "-wp.dot(way, motion) / d * p.control_step", r.progress),
+                RewardTerm("distance", "wp.min(d / 8.0, 1.0)", -r.distance),
+                RewardTerm("heading", facing, r.heading),
+                RewardTerm("near", "wp.where(d < p.reward.near_radius, 1.0, 0.0)", r.near),
+                RewardTerm("spin", "spin * spin", -r.spin),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
+                RewardTerm("step", "1.0", -r.step),
+            ),
+            ends=(
+                End("captured", "held > 0.0 and held >= p.hold - 0.1 * p.control_step", r.capture),
+                End("left", any_outside, -r.loss),
+            ),
+            inside="d <= p.radius and wp.length(motion) <= p.relative_speed",
+            totals=(Total("closest", "wp.min(was, d)", first="d"),),
+        )
+
+
+# The task of three: a herder drives the prey into the net that two netters hold between them.
+
+
+AGENTS = 3
+PREY = 3
+
+CAPTURE_MODES = ("net", "touch", "proximity", "either")
+"""Published modes 0 to 3.
+
+net: the prey is within `net_reach` of the net for `hold` seconds. touch: its hull touches the net. proximity: a vehicle
+is within `proximity` of it. either: net or proximity.
+"""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One step of the published curriculum. Speeds were 0.25, 0.30 and 0.40 m/s, where a pursuer reaches 0.5 m/s."""
+
+    capture: str
+    """One of `CAPTURE_MODES`."""
+    proximity: float
+    """[m]"""
+    net_reach: float
+    """[m]"""
+    hold: float
+    """[s]"""
+    prey_speed: float
+    """Part of the speed that the slowest agent can hold."""
+    stake: float
+    """Reward for a capture, and what an agent out of bounds costs everybody."""
+    from_step: int
+    """Agent-steps of training after which it was taken up."""
+
+    @property
+    def mode(self) -> int:
+        """Number of the capture mode."""
+        return CAPTURE_MODES.index(self.capture)
+
+
+LEVELS = (
+    Level("proximity", 1.5, net_reach=1.0, hold=0.10, prey_speed=0.5, stake=25.0, from_step=0),
+    Level("net", 1.0, net_reach=1.0, hold=0.10, prey_speed=0.6, stake=25.0, from_step=1_500_000),
+    Level("net", 1.0, net_reach=0.8, hold=0.25, prey_speed=0.8, stake=30.0, from_step=4_000_000),
+    Level("touch", 1.0, net_reach=0.8, hold=0.25, prey_speed=0.8, stake=30.0, from_step=7_000_000),
+)
+"""The published curriculum in three levels, all of which the formation baseline masters, and the task: one more."""
+
+
+@wp.func
+def other(a: int, k: int) -> int:
+    """Number of the k-th team-mate of agent a, the lowest number first."""
+    return wp.where(k == 1, wp.where(a == 0, 1, 0), wp.where(a == 2, 1, 2))
+
+
+@wp.func
+def mate_role(a: int, k: int) -> wp.vec2:
+    """(1, 0): the k-th team-mate is the herder; (0, 1): it is a netter."""
+    herds = other(a, k) == 0
+    return wp.vec2(wp.where(herds, 1.0, 0.0), wp.where(herds, 0.0, 1.0))
+
+
+@wp.func
+def mate_gap(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
+    """Return the way from the agent to its k-th team-mate, body frame [m]."""
+    return gap_to(arrays, w, a, other(a, k))
+
+
+@wp.func
+def mate_motion(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
+    """Velocity of the k-th team-mate less one's own, body frame [m/s]."""
+    return motion_of(arrays, w, a, other(a, k))
+
+
+TEAM = (
+    *CHASE,
+    *(
+        part
+        for k in (1, 2)
+        for part in (
+            ObservationPart("team-mate's role: herder, netter", 2, "1", term=mate_role, index=k),
+            *mate(k, mate_gap, mate_motion),
+        )
+    ),
+)
+"""30 numbers of each agent."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeamReward:
+    """Weights of the reward besides the level's stake; each term has one reason.
+
+    team: progress · (way gained towards a capture)       by the rule of the level; over an episode it adds up to the
+                                                          whole way [m]; a small weight is lost beside the stake
+        - distance · min(gap / 8 m, 1) - step             a slope everywhere, and sooner is better
+    herder: + drive · cos(angle between the way to the prey and the way on to the net)     it stands behind the prey
+            - stray · min(d / 8 m, 1)                     near the prey: one far away drives nothing, and gets lost
+    netters: - spread · | span - 0.7 net_length |         an open net, which is not torn
+    each: - bump, nearer than `collision` to another      - action · mean(a²) - change · mean(Δa²)
+    """
+
+    progress: float = 4.0
+    distance: float = 0.05
+    step: float = 0.005
+    drive: float = 0.01
+    stray: float = 0.05
+    spread: float = 0.005
+    bump: float = 0.05
+    action: float = 0.001
+    change: float = 0.0015
+
+
+@wp.func
+def net_distance(x: wp.vec3, left: wp.vec3, right: wp.vec3, height: float) -> float:
+    """Distance from a point to the net's surface [m].
+
+    The net reaches from one netter to the other; half its height lies above that line and half below, along the
+    direction across the line that is nearest to upright; with the netters one above the other it shrinks to the line.
+
+    Args:
+        x: The point, world frame [m].
+        left: One netter.
+        right: The other.
+        height: Of the net [m].
+    """
+    span = right - left
+    length = wp.max(wp.length(span), 1.0e-6)
+    along = span / length
+    up = wp.vec3(0.0, 0.0, 1.0) - along[2] * along
+    rise = wp.length(up)
+    up = up / wp.max(rise, 1.0e-3)
+    gap = x - left
+    s = wp.clamp(wp.dot(gap, along), 0.0, length)
+    t = wp.clamp(wp.dot(gap, up), -0.5 * height, 0.5 * height)
+    return wp.length(gap - s * along - t * up)
+
+
+@wp.func
+def net_gap(state: State, p: Any, w: int) -> float:
+    """Distance from the prey to the net [m]; a net stretched beyond its length does not catch: the excess is added."""
+    left = state.position[w, 1]
+    right = state.position[w, 2]
+    excess = wp.max(wp.length(right - left) - p.net_length, 0.0)
+    return net_distance(state.position[w, PREY], left, right, p.net_height) + 2.0 * excess
+
+
+@wp.func
+def missing(p: Any, net: float, near: float) -> float:
+    """Return how much nearer the prey must come to be captured, by the mode's rule [m]; 0: it is near enough."""
+    by_net = net - p.rules.net_reach
+    by_vehicle = near - p.rules.proximity
+    gap = by_net
+    if p.rules.mode == 1:
+        gap = net - p.prey_radius - p.touch
+    if p.rules.mode == 2:
+        gap = by_vehicle
+    if p.rules.mode == 3:
+        gap = wp.min(by_net, by_vehicle)
+    return wp.max(gap, 0.0)
+
+
+@wp.func
+def driving(state: State, w: int, a: int) -> float:
+    """Herder: cosine of the angle between the way to the prey and the way on to the net's middle."""
+    prey = state.position[w, PREY]
+    middle = 0.5 * (state.position[w, 1] + state.position[w, 2])
+    ahead = wp.normalize(prey - state.position[w, a])
+    return wp.where(a == 0, wp.dot(ahead, wp.normalize(middle - prey)), 0.0)
+
+
+@wp.func
+def straying(state: State, w: int, a: int) -> float:
+    """Herder: min(d / 8 m, 1), d its distance to the prey."""
+    away = wp.length(state.position[w, PREY] - state.position[w, a])
+    return wp.where(a == 0, wp.min(away / 8.0, 1.0), 0.0)
+
+
+@wp.func
+def misfit(state: State, p: Any, w: int, a: int) -> float:
+    """Netters: |span - 0.7 net_length|, up to the net's length [m]."""
+    span = wp.length(state.position[w, 2] - state.position[w, 1])
+    return wp.where(a == 0, 0.0, wp.min(wp.abs(span - 0.7 * p.net_length), p.net_length))
+
+
+@wp.func
+def is_captured(p: Any, net: float, near: float, held: float) -> bool:
+    """Return whether it is captured by the mode's rule; the net of modes net and either must have it for `hold`,
+    without a break."""
+    netted = held > 0.0 and held >= p.rules.hold - 0.1 * p.control_step
+    caught = netted and (p.rules.mode == 0 or p.rules.mode == 3)
+    if p.rules.mode == 1:
+        caught = net - p.prey_radius <= p.touch
+    if p.rules.mode >= 2 and near <= p.rules.proximity:
+        caught = True
+    return caught
+
+
+@wp.func
+def start_team(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """The team around the origin, the prey some way off."""
+    pi = 3.14159265
+    rng = wp.rand_init(key, 4 * w)
+    turn = wp.randf(rng, -pi, pi)
+    height = wp.randf(rng, p.low, p.high)
+    for a in range(AGENTS):
+        angle = turn + (float(a) + wp.randf(rng, -0.2, 0.2)) * 2.0 * pi / 3.0
+        away = wp.randf(rng, 0.5, 1.0) * p.spawn_radius
+        x = away * level_direction(angle) + wp.vec3(0.0, 0.0, height + wp.randf(rng, -0.3, 0.3))
+        place_at_rest(state, w, a, x, wp.randf(rng, -pi, pi))
+    heading = wp.randf(rng, -pi, pi)
+    prey = prey_start(p, wp.rand_init(wp.randi(rng)), wp.vec3(0.0, 0.0, height))
+    place_at_rest(state, w, PREY, prey, heading)
+    key_messages(arrays, key, w)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeamPursuit(Team, Chase):
+    """3-v-1 pursuit. What counts as a capture, the prey's speed and the stake are the level's, unless given here."""
+
+    agents: ClassVar[tuple[str, ...]] = ("herder", "left_netter", "right_netter")
+    title: ClassVar[str] = "drive a prey into a net, three against one"
+    name: str = "team-pursuit"
+    observation: tuple[ObservationPart, ...] = field(default=TEAM, repr=False)
+    spawn_radius: float = 1.5
+    level: int = 3
+    """Index of `LEVELS`."""
+    capture: str | None = None
+    """One of `CAPTURE_MODES`; the level's if None. So are the next five."""
+    proximity: float | None = None
+    net_reach: float | None = None
+    hold: float | None = None
+    prey_speed: float | None = None
+    stake: float | None = None
+    touch: float = 0.02
+    """Mode touch: the net touches a hull that is within this [m]."""
+    net_length: float = 4.0
+    """A net stretched farther than this does not catch [m]."""
+    net_height: float = 1.0
+    """[m]"""
+    prey: Prey = field(default_factory=lambda: Prey(mode="hybrid"))
+    nearest: float = 3.5
+    reward: TeamReward = field(default_factory=TeamReward)
+    prey_radius: float = 0.0
+    """Radius of its hull, level [m]: follows from its vehicle."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.level < len(LEVELS):
+            raise EnvironmentSetupError(f"level is {self.level}, expected 0 to {len(LEVELS) - 1}")
+        if self.rules.capture not in CAPTURE_MODES:
+            raise EnvironmentSetupError(
+                f"unknown capture mode '{self.rules.capture}'; available: {', '.join(CAPTURE_MODES)}"
+            )
+
+    @property
+    def rules(self) -> Level:
+        """Return the level's rules, with this task's own changes."""
+        stated = {setting.name: getattr(self, setting.name, None) for setting in fields(Level)}
+        return replace(
+            LEVELS[self.level], **{name: value for name, value in stated.items() if value is not None}
+        )
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "TeamPursuit":
+        """The prey's speed, size and thrust from the vehicles: herder, netters, prey."""
+        size = vehicles[-1].body.size
+        return self.chased(self.rules.prey_speed, vehicles, prey_radius=float(0.25 * (size[0] + size[1])))
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        rules = self.rules
+        net = f"the prey within {rules.net_reach:g} m of the net for {rules.hold:g} s"
+        near = f"a vehicle within {rules.proximity:g} m of the prey"
+        return {
+            "net": net,
+            "touch": f"the net touches the prey, to {self.touch:g} m",
+            "proximity": near,
+            "either": f"{net}, or {near}",
+        }[rules.capture]
+
+    def terms(self) -> Terms:
+        """See `TeamReward`."""
+        r, stake = self.reward, self.rules.stake
+        return Terms(
+            start=start_team,
+            begin=open_messages,
+            advance=exchange_messages,
+            command=command_prey,
+            seen={"gap": prey_gap},
+            shared={"net": net_gap, "near": nearest_pursuer, "gap_now": missing},
+            meanings={
+                "progress": "By how much the step shortened the distance left to a capture [m].",
+                "distance": "Distance left to a capture over 8 m, at most 1.",
+                "step": "1 in every step: sooner is better.",
+                "closest": "Least distance of an agent to the prey so far [m].",
+                "closest_to_net": "Least distance of the prey to the net so far [m].",
+            },
+            rewards=(
+                RewardTerm("progress", "gap - gap_now", r.progress),
+                RewardTerm("distance", "wp.min(gap_now / 8.0, 1.0)", -r.distance),
+                RewardTerm("step", "1.0", -r.step),
+                RewardTerm("drive", driving, r.drive),
+                RewardTerm("stray", straying, -r.stray),
+                RewardTerm("spread", misfit, -r.spread),
+                RewardTerm("bump", bumps, -r.bump),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
+            ),
+            ends=(End("captured", is_captured, stake), End("left", any_outside, -stake)),
+            inside="net <= p.rules.net_reach",
+            totals=(
+                Total("closest", "wp.min(was, near)", first="near"),
+                Total("closest_to_net", "wp.min(was, net)", first="net"),
+                Total("gap", "gap_now", first="gap_now"),
+            ),
+        )

@@ -1,0 +1,647 @@
+"""The view's page and its loop."""
+
+from __future__ import annotations
+
+import http
+import ipaddress
+import math
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import viser
+import websockets.asyncio.server
+
+from finssim.extensions.viewer.frame import Curve, Frame, Picture, Pose, Source, Stage, ViewError
+from finssim.extensions.viewer.shapes import (
+    box_edges,
+    force_arrows,
+    hull_of,
+    line_of,
+    tag_plates,
+    wall_mesh,
+    wxyz,
+)
+from finssim.localization.overhead_camera import Pool
+
+__all__ = ["LONGEST_TURN", "Playback", "View", "blank", "draw_own", "draw_picture", "legend_of", "plots_of"]
+
+# The three-dimensional part of a view: the stage is built once, and every frame moves what moves.
+
+Colour = tuple[int, int, int]
+
+COLOURS: dict[str, Colour] = {
+    "truth": (240, 140, 20),
+    "estimate": (40, 110, 235),
+    "goal": (20, 160, 80),
+    "force": (215, 30, 60),
+    "trail": (200, 110, 10),
+    "wall": (214, 228, 236),
+    "water": (70, 150, 205),
+    "box": (90, 110, 125),
+}
+"""Object -> its colour."""
+PICTURE_HEIGHT = 0.16
+"""Size of the camera's frustum [m]."""
+
+
+class Scene:
+    """Draws frames of one stage."""
+
+    def __init__(self, server: viser.ViserServer, stage: Stage) -> None:
+        """
+        Args:
+            server: Of the page.
+            stage: What stands still.
+        """
+        self._scene, self.stage = server.scene, stage
+        self._scene.set_up_direction("+z")
+        self._scene.configure_default_lights(True, cast_shadow=False)
+        self._water()
+        self._bodies = {name: self._vehicle(name) for name in ("truth", "estimate")}
+        size = float(np.max(stage.vehicle.body.size))
+        self._goal = self._scene.add_frame(
+            "/goal",
+            axes_length=0.6 * size,
+            axes_radius=0.02 * size,
+            origin_radius=0.05 * size,
+            origin_color=COLOURS["goal"],
+            visible=False,
+        )
+        self._arrows = self._scene.add_arrows(
+            "/forces",
+            np.zeros((1, 2, 3)),
+            COLOURS["force"],
+            shaft_radius=0.02 * size,
+            head_radius=0.05 * size,
+            head_length=0.1 * size,
+            visible=False,
+        )
+        self._trail = self._line("/trail", np.zeros((1, 2, 3)), "trail", 2.5)
+        self._trail.visible = False
+        path = line_of(stage.path)
+        if len(path):
+            self._line("/path", path, "goal", 2.0)
+        if stage.site is not None:
+            self._camera(stage.site)
+        for thing in stage.bodies:
+            self._scene.add_mesh_simple(
+                f"/world/{thing.name}", thing.vertices, thing.faces, color=thing.colour, flat_shading=True,
+                side="double", cast_shadow=False,
+            )  # fmt: skip
+        self._look(server)
+
+    def draw(self, frame: Frame) -> None:
+        """Move everything to where it is in a frame."""
+        self._place("truth", frame.truth, ghost=False)
+        self._place("estimate", frame.estimate, ghost=frame.truth is not None)
+        self._show(self._goal, frame.goal)
+        pose = frame.truth or frame.estimate
+        arrows = force_arrows(self.stage.vehicle, frame.force, pose) if pose else np.zeros((0, 2, 3))
+        _set_points(self._arrows, arrows)
+        _set_points(self._trail, line_of(frame.trail))
+
+    def _place(self, name: str, pose: Pose | None, *, ghost: bool) -> None:
+        """Put a body where it is; a ghost is a net of lines, which hides nothing of the body that it lies upon."""
+        body, hull = self._bodies[name]
+        self._show(body, pose)
+        if hull.wireframe != ghost:
+            hull.wireframe = ghost
+
+    def _show(self, node: Any, pose: Pose | None) -> None:
+        visible = pose is not None and bool(np.isfinite(pose.position).all())
+        if visible and pose is not None:
+            node.position, node.wxyz = tuple(pose.position), wxyz(pose.quaternion)
+        node.visible = visible
+
+    def _vehicle(self, name: str) -> tuple[Any, Any]:
+        """The body's node and its hull."""
+        vehicle = self.stage.vehicle
+        body = self._scene.add_frame(f"/{name}", show_axes=False, visible=False)
+        mesh = hull_of(vehicle)
+        hull = self._scene.add_mesh_simple(
+            f"/{name}/hull", mesh.vertices, mesh.faces, color=COLOURS[name], flat_shading=True, side="double"
+        )
+        plates = tag_plates(vehicle)
+        for part, plate, colour in zip(
+            ("plates", "tags"), plates or (), ((250,) * 3, (25,) * 3), strict=False
+        ):
+            self._scene.add_mesh_simple(
+                f"/{name}/{part}", plate.vertices, plate.faces, color=colour, side="double"
+            )
+        nose = np.array([[[0.0, 0.0, 0.0], [0.75 * float(vehicle.body.size[0]), 0.0, 0.0]]])
+        self._line(f"/{name}/nose", nose, name, 3.0)
+        return body, hull
+
+    def _water(self) -> None:
+        """Walls and floor, or the edges of a box, and the surface."""
+        lower, upper = self.stage.lower, self.stage.upper
+        if self.stage.walls:
+            walls = wall_mesh(lower, upper)
+            self._scene.add_mesh_simple(
+                "/pool/walls", walls.vertices, walls.faces, color=COLOURS["wall"], flat_shading=True
+            )
+            width, length = float(upper[0] - lower[0]), float(upper[1] - lower[1])
+            middle = (*(0.5 * (lower + upper)[:2]).tolist(), float(lower[2]) + 0.003)
+            self._scene.add_grid(
+                "/pool/floor", width, length, cell_size=0.25, section_size=1.0, position=middle
+            )
+        self._line("/pool/edges", box_edges(lower, upper), "box", 1.5)
+        x0, y0, x1, y1 = *lower[:2], *upper[:2]
+        surface = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+        self._scene.add_mesh_simple(
+            "/pool/surface",
+            surface,
+            np.array([[0, 1, 2], [0, 2, 3]]),
+            color=COLOURS["water"],
+            opacity=0.16,
+            side="double",
+            cast_shadow=False,
+        )
+
+    def _camera(self, site: Pool) -> None:
+        """The overhead camera where its calibration has it."""
+        lens, T = site.camera.lens, site.T_wp
+        T_pc = np.eye(4)
+        T_pc[:3, 3] = site.camera.position
+        rotation = viser.transforms.SO3.from_quaternion_xyzw(np.asarray(site.camera.orientation, float))
+        T_pc[:3, :3] = rotation.as_matrix()
+        pose = viser.transforms.SE3.from_matrix(T @ T_pc)
+        self._scene.add_camera_frustum(
+            "/camera",
+            fov=2.0 * math.atan(0.5 * lens.height / lens.fy),
+            aspect=lens.width / lens.height,
+            scale=PICTURE_HEIGHT,
+            thickness=0.008,
+            color=COLOURS["box"],
+            position=pose.translation(),
+            wxyz=pose.rotation().wxyz,
+        )
+
+    def _line(self, name: str, points: Array, colour: str, width: float) -> Any:
+        return self._scene.add_line_segments(
+            name, points, COLOURS[colour], thickness=width, thickness_units="screen"
+        )
+
+    def _look(self, server: viser.ViserServer) -> None:
+        """Place the first viewpoint beside and above the water."""
+        lower, upper = self.stage.lower, self.stage.upper
+        middle, reach = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
+        server.initial_camera.look_at = tuple(middle)
+        server.initial_camera.position = tuple(middle + reach * np.array([-0.31, -0.56, 0.52]))
+        server.initial_camera.up = (0.0, 0.0, 1.0)
+
+
+def _set_points(node: Any, points: Array) -> None:
+    if len(points):
+        node.points = points.astype(np.float32)
+    node.visible = bool(len(points))
+
+
+# Curves as the browser's plots take them.
+
+LINES = ("#d9480f", "#1c6ef2", "#2b8a3e", "#862e9c")
+"""Colours, in the order of the curves."""
+
+
+class Plot:
+    """Curves of one title, over the same times."""
+
+    def __init__(self, title: str, curves: Sequence[Curve]) -> None:
+        self.title, self.curves = title, list(curves)
+
+    def data(self, now: float) -> tuple[Array, ...]:
+        """Time, and for every curve all of it and the part up to a time [s]; from where each has a value.
+
+        The browser's plot takes its scales from the first values, and draws nothing where one of these is NaN.
+        """
+        finite = np.all([np.isfinite(curve.value) for curve in self.curves], axis=0)
+        begin = int(np.argmax(finite))
+        time = self.curves[0].time[begin:]
+        past = time <= max(now, float(time[0])) + 1e-9
+        columns = [time]
+        for curve in self.curves:
+            columns += [curve.value[begin:], np.where(past, curve.value[begin:], np.nan)]
+        return tuple(np.ascontiguousarray(column, float) for column in columns)
+
+    def series(self) -> tuple[Any, ...]:
+        """Return the lines: a complete curve faintly, and its past in full."""
+        drawn: list[Any] = [{"label": "t [s]"}]
+        for curve, colour in zip(self.curves, LINES, strict=False):
+            drawn += [{"label": "", "stroke": f"{colour}40", "width": 1}]
+            drawn += [{"label": curve.label, "stroke": colour, "width": 2}]
+        return tuple(drawn)
+
+
+def plots_of(curves: Sequence[Curve]) -> list[Plot]:
+    """Curves by title, in the order in which titles first appear."""
+    order = list(dict.fromkeys(curve.plot for curve in curves))
+    sorted_curves = sorted(curves, key=lambda curve: order.index(curve.plot))
+    return [Plot(title, list(same)) for title, same in groupby(sorted_curves, key=lambda curve: curve.plot)]
+
+
+def legend_of(plots: Sequence[Plot]) -> str:
+    """Return the colours of the curves, as markup; curves of the same place in their plots share label and colour."""
+    labels = dict.fromkeys(
+        (colour, curve.label) for plot in plots for colour, curve in zip(LINES, plot.curves, strict=False)
+    )
+    return " · ".join(f'<span style="color:{colour}">■</span> {label}' for colour, label in labels)
+
+
+# The clock of a view: it runs, pauses, runs faster, and is set.
+
+SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""Times as fast as real."""
+LONGEST_TURN = 0.1
+"""Greatest advance of one turn of the loop at single speed [s]: a world slower than real time slows the clock."""
+
+NEARLY = 0.05
+"""So near to its end a recording is over [s]: a slider need not reach it to the last digit."""
+
+
+class Playback:
+    """Position of the view in a source's time."""
+
+    def __init__(self, duration: float, *, speed: float = 1.0, playing: bool = True) -> None:
+        """
+        Args:
+            duration: Of the source [s]; infinite for a live one.
+            speed: Times as fast as real.
+            playing: Whether it runs from the start.
+        """
+        self.duration, self.speed, self.playing = duration, speed, playing
+        self.time = 0.0
+        """[s]"""
+
+    @property
+    def live(self) -> bool:
+        """Return whether there is no end, and no way back."""
+        return math.isinf(self.duration)
+
+    def advance(self, elapsed: float) -> float:
+        """Let so much real time go by [s]; returns the new time [s]. A recording stops at its end."""
+        if self.playing:
+            self.time += min(elapsed, LONGEST_TURN) * self.speed
+            if self.time >= self.duration:
+                self.time, self.playing = self.duration, False
+        return self.time
+
+    def play(self, playing: bool) -> None:
+        """Run or pause; from the end, run from the beginning."""
+        if playing and self.time >= self.duration - NEARLY:
+            self.time = 0.0
+        self.playing = playing
+
+    def seek(self, time: float) -> None:
+        """Go to a time [s], within the source's; a live source has no other than its own."""
+        if not self.live:
+            self.time = min(max(time, 0.0), self.duration)
+
+
+# The camera's picture with the tags outlined, in the panel's size, and the tags enlarged in a corner.
+
+Image = npt.NDArray[np.uint8]
+Array = npt.NDArray[np.float64]
+
+WIDTH = 480
+"""Least width of the drawn picture, if the camera has so many pixels [px]."""
+DARK, LINE, FIRST = (30, 45, 58), (40, 230, 90), (255, 70, 60)
+"""Ground without a picture, the outline of a tag, and its first edge."""
+COPPER = np.array([1.25, 0.78, 0.5])
+"""Shades of a sonar's fan, by red, green, blue."""
+INSET = 70
+"""Half the edge of the part that is enlarged [px of the camera]."""
+ENLARGED = 1.5
+"""Magnification of that part of the camera's picture."""
+
+
+def blank() -> Image:
+    """Return the picture before the first one, (h, w, 3)."""
+    return np.full((WIDTH * 9 // 16, WIDTH, 3), DARK, np.uint8)
+
+
+def draw_picture(picture: Picture) -> Image:
+    """Return a picture in colours, reduced by an integer factor, (h, w, 3)."""
+    rows, columns = picture.size if picture.image is None else picture.image.shape[:2]
+    every = max(1, columns // WIDTH)
+    if picture.image is None:
+        full = np.full((rows, columns, 3), DARK, np.uint8)
+    else:
+        full = np.repeat(picture.image[:, :, None], 3, axis=2)
+    canvas = np.ascontiguousarray(full[::every, ::every])
+    outlines = [np.asarray(tag.corners, float) for tag in picture.tags]
+    for corners in outlines:
+        _outline(canvas, corners / every, reach=0)
+    if outlines:
+        _inset(canvas, full, outlines)
+    return canvas
+
+
+def draw_own(image: Image) -> Image:
+    """Return a picture of an own camera, or a sonar's fan in copper, enlarged by an integer factor, (h, w, 3)."""
+    if image.ndim == 2:
+        image = np.clip(image[..., None] * COPPER, 0, 255).astype(np.uint8)
+    times = max(1, -(-WIDTH // image.shape[1]))
+    return np.ascontiguousarray(image.repeat(times, axis=0).repeat(times, axis=1))
+
+
+def _inset(canvas: Image, full: Image, outlines: list[Array]) -> None:
+    """Put the surroundings of the tags, enlarged, into the lower left corner."""
+    middle = np.concatenate(outlines).mean(axis=0)
+    size = min(round(2 * INSET * ENLARGED), canvas.shape[0], canvas.shape[1])
+    first = middle - 0.5 * size / ENLARGED
+    x, y = ((first[:, None] + (np.arange(size) + 0.5) / ENLARGED).round().astype(int)).clip(0)
+    part = full[np.minimum(y, full.shape[0] - 1)][:, np.minimum(x, full.shape[1] - 1)].copy()
+    for corners in outlines:
+        _outline(part, (corners - first) * ENLARGED, reach=1)
+    part[:2], part[:, -2:] = 255, 255
+    canvas[-size:, :size] = part
+
+
+def _outline(image: Image, corners: Array, reach: int) -> None:
+    """Draw a tag's edges, lines `reach` pixels to either side; what lies outside is left out."""
+    for i in range(4):
+        a, b = corners[i], corners[(i + 1) % 4]
+        if not np.isfinite([a, b]).all():
+            continue
+        steps = int(np.ceil(np.abs(b - a).max())) + 1
+        x, y = np.linspace(a, b, min(steps, 4000)).round().astype(int).T
+        for dx in range(-reach, reach + 1):
+            for dy in range(-reach, reach + 1):
+                u, v = x + dx, y + dy
+                inside = (u >= 0) & (v >= 0) & (u < image.shape[1]) & (v < image.shape[0])
+                image[v[inside], u[inside]] = FIRST if i == 0 else LINE
+
+
+# The side of a view: clock, health, the camera's picture, events and plots.
+
+SLIDER_STEP = 0.02
+"""Step of the time slider [s]."""
+
+
+class Panel:
+    """Controls and figures of one stage."""
+
+    def __init__(self, server: viser.ViserServer, stage: Stage, playback: Playback) -> None:
+        """
+        Args:
+            server: Of the page.
+            stage: What is looked at.
+            playback: The clock that the controls set.
+        """
+        self._server, self._gui, self._playback = server, server.gui, playback
+        self._gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        self._gui.set_panel_label("FinsSim")
+        self._gui.main_panel.dock_right()
+        self._gui.add_markdown(f"**{stage.title}**  \n{_legend()}")
+        self._slider: Any = None
+        self._button: Any = None
+        self._speed: Any = None
+        self._shown = 0.0
+        self._controls(playback)
+        self._status = self._gui.add_markdown("")
+        self._image: Any = None
+        if stage.site is not None:
+            with self._gui.add_folder("camera"):
+                self._image = self._gui.add_image(blank(), jpeg_quality=70)
+        self._seen: Picture | None = None
+        self._eyes = {}
+        for name in stage.eyes:
+            with self._gui.add_folder(name):
+                self._eyes[name] = self._gui.add_image(blank(), jpeg_quality=80)
+        self._own: dict[str, Image] = {}
+        with self._gui.add_folder("errors") as self._figures:
+            self._named = self._gui.add_markdown("")
+        self._plots: dict[tuple[str, ...], Any] = {}
+        with self._gui.add_folder("events"):
+            self._events = self._gui.add_markdown("none yet")
+        self._last_events: tuple[str, ...] = ()
+
+    def read(self) -> None:
+        """Do what the person at the controls wants."""
+        playback = self._playback
+        playback.speed = float(self._speed.value.removesuffix("x"))
+        label = "pause" if playback.playing else "play"
+        if self._button.label != label:
+            self._button.label = label
+        if self._slider is not None and abs(self._slider.value - self._shown) > 0.5 * SLIDER_STEP:
+            playback.seek(float(self._slider.value))
+            self._shown = float(self._slider.value)
+
+    def show(self, frame: Frame) -> None:
+        """Put a frame's figures on the panel."""
+        playback = self._playback
+        if self._slider is None:
+            self._clock.content = f"{frame.time:.1f} s"
+        elif self._shown != playback.time:
+            self._slider.value = self._shown = min(round(playback.time, 2), self._slider.max)
+        rows = "".join(f"| {name} | {text} |\n" for name, text in frame.status.items())
+        content = f"| | |\n|---|---|\n{rows}" if rows else ""
+        if content != self._status.content:
+            self._status.content = content
+        if self._image is not None and frame.picture is not self._seen:
+            self._seen = frame.picture
+            self._image.image = blank() if frame.picture is None else draw_picture(frame.picture)
+        for name, eye in self._eyes.items():
+            image = frame.pictures.get(name)
+            if image is not None and image is not self._own.get(name):
+                self._own[name] = image
+                eye.image = draw_own(image)
+        events = tuple(frame.events)
+        if events != self._last_events:
+            self._last_events = events
+            self._events.content = "  \n".join(_plain(line) for line in reversed(events)) or "none yet"
+
+    def plot(self, curves: Any, now: float) -> None:
+        """Draw curves, up to a time in full [s]."""
+        plots = plots_of(curves)
+        named = legend_of(plots)
+        if named != self._named.content:
+            self._named.content = named
+        for plot in plots:
+            key = (plot.title, *(curve.label for curve in plot.curves))
+            if key not in self._plots:
+                for old in [k for k in self._plots if k[0] == plot.title]:
+                    self._plots.pop(old).remove()
+                with self._figures:
+                    self._plots[key] = self._gui.add_uplot(
+                        plot.data(now),
+                        plot.series(),
+                        title=plot.title,
+                        scales={"x": {"time": False}},
+                        legend={"show": False},
+                        aspect=2.0,
+                    )
+            else:
+                self._plots[key].data = plot.data(now)
+
+    def _controls(self, playback: Playback) -> None:
+        gui = self._gui
+        if playback.live:
+            self._clock = gui.add_markdown("0.0 s")
+        else:
+            steps = max(1, math.floor(playback.duration / SLIDER_STEP))
+            self._slider = gui.add_slider("time [s]", 0.0, round(steps * SLIDER_STEP, 2), SLIDER_STEP, 0.0)
+        self._button = gui.add_button("pause" if playback.playing else "play")
+        speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
+        first = f"{playback.speed:g}x"
+        options = speeds if first in speeds else (first, *speeds)
+        self._speed = gui.add_dropdown("speed", options, initial_value=first)
+        self._button.on_click(lambda _: playback.play(not playback.playing))
+
+
+def _legend() -> str:
+    names = ("truth", "estimate", "goal", "force")
+    return " · ".join(
+        f'<span style="color:rgb{COLOURS[name]}">■</span> {name}'.replace(", ", ",") for name in names
+    )
+
+
+def _plain(text: str) -> str:
+    """A line in which nothing is markup."""
+    return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|" else c for c in text)
+
+
+RATE = 20.0
+"""Frames a second [Hz]."""
+PLOT_PERIOD = 0.5
+"""Between drawings of the plots [s]."""
+
+
+def _check_address(bind: str) -> None:
+    """Refuse an address that is not this machine's, at which viser would wait for ever."""
+    try:
+        family, *_, address = socket.getaddrinfo(bind, 0, type=socket.SOCK_STREAM)[0]
+        socket.create_server(address[:2], family=family).close()
+    except (OSError, UnicodeError) as error:
+        reason = (getattr(error, "strerror", None) or str(error)).partition(" (")[0]
+        raise ViewError(f"--bind {bind}: {reason}: give an address of this machine") from None
+
+
+def _own_guests(bind: str) -> Callable[[Any, Any], Any]:
+    """Answer requests of other pages with 403.
+
+    A page of another site may open a WebSocket to any address, and its name may be made to lead here. So the host that
+    a browser asks for must be an address, `localhost` or this machine's name, and a WebSocket's origin the page there.
+
+    Args:
+        bind: Where the page is served.
+    """
+    own = socket.gethostname().lower()
+    names = {"localhost", own, f"{own}.local", bind.lower()}
+
+    def check(connection: Any, request: Any) -> Any:
+        host, upgrade = request.headers.get("Host", ""), request.headers.get("Upgrade", "")
+        name = re.sub(r":\d*$", "", host).strip("[]").lower()
+        if name not in names and not _is_address(name):
+            return connection.respond(http.HTTPStatus.FORBIDDEN, f"{host[:80]} is no name of this page\n")
+        if upgrade and request.headers.get("Origin", "").lower() != f"http://{host}".lower():
+            return connection.respond(http.HTTPStatus.FORBIDDEN, "only the page itself may connect\n")
+        return None
+
+    return check
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+@contextmanager
+def _only_own_pages(bind: str) -> Iterator[None]:
+    """Have the server that viser starts meanwhile check who connects: viser has no setting for it."""
+    serve, check = websockets.asyncio.server.serve, _own_guests(bind)
+
+    def checked(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            refusal = check(connection, request)
+            return process_request(connection, request) if refusal is None and process_request else refusal
+
+        return serve(*arguments, process_request=answer, **options)
+
+    with _STARTING:
+        websockets.asyncio.server.serve = checked  # type: ignore[assignment, misc]
+        try:
+            yield
+        finally:
+            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+_STARTING = threading.Lock()
+
+
+class View:
+    """A page that shows a source. `run` is its loop; `turn` one pass of it."""
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        bind: str = "127.0.0.1",
+        port: int = 8080,
+        speed: float = 1.0,
+        playing: bool = True,
+    ) -> None:
+        """Serve the page.
+
+        Args:
+            source: What is shown; it belongs to the view from now on.
+            bind: Address to serve at; this machine alone by default.
+            port: To serve at, or the next one that is free.
+            speed: Times as fast as real.
+            playing: Whether it runs from the start.
+        """
+        self.source, self.playback = source, Playback(source.duration, speed=speed, playing=playing)
+        _check_address(bind)
+        with (
+            redirect_stdout(StringIO()),
+            _only_own_pages(bind),
+        ):  # viser prints messages at start and end even if verbosity is off
+            self.server = viser.ViserServer(host=bind, port=port, label="FinsSim", verbose=False)
+        self.scene = Scene(self.server, source.stage)
+        self.panel = Panel(self.server, source.stage, self.playback)
+        self._drawn, self._plotted, self._since_plot = math.nan, math.nan, math.inf
+        host = "localhost" if bind in ("0.0.0.0", "::") else bind
+        self.url = f"http://{host}:{self.server.get_port()}"
+        """Of the page."""
+
+    def turn(self, elapsed: float) -> None:
+        """Let so much real time go by [s], and draw what that changes."""
+        self.panel.read()
+        now = self.playback.advance(elapsed)
+        self._since_plot += elapsed
+        if now != self._drawn:
+            frame = self.source.frame(now)
+            with self.server.atomic():
+                self.scene.draw(frame)
+                self.panel.show(frame)
+            self._drawn = now
+        if now != self._plotted and self._since_plot >= PLOT_PERIOD:
+            self.panel.plot(self.source.curves(), now)
+            self._plotted, self._since_plot = now, 0.0
+
+    def run(self, until: Callable[[], bool], *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Show the source until a function asks to stop."""
+        before = clock()
+        while not until():
+            now = clock()
+            self.turn(now - before)
+            before = now
+            time.sleep(max(0.0, 1.0 / RATE - (clock() - now)))
+
+    def close(self) -> None:
+        """Take the page down."""
+        with redirect_stdout(StringIO()):
+            self.server.stop()
+        self.source.close()

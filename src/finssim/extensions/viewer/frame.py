@@ -1,0 +1,175 @@
+"""Content of a view: the stage, which does not change, and a frame for every moment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.extensions.perception import World
+from finssim.localization.overhead_camera import Pool
+from finssim.robot.messages import TagCorners
+from finssim.vehicles import Vehicle
+
+Array = npt.NDArray[np.float64]
+
+
+class ViewError(ValueError):
+    """Something that cannot be shown."""
+
+
+class Body(NamedTuple):
+    """A fixed body of a world."""
+
+    name: str
+    vertices: Array
+    """World frame [m], (v, 3)."""
+    faces: npt.NDArray[np.int64]
+    """(f, 3)"""
+    colour: tuple[int, int, int]
+    """Red, green, blue, 0 to 255."""
+
+
+class Pose(NamedTuple):
+    """Pose of the body."""
+
+    position: Array
+    """World frame [m], (3,)."""
+    quaternion: Array
+    """Body to world, xyzw, (4,)."""
+
+
+def nowhere() -> Array:
+    """No points, (0, 3)."""
+    return np.zeros((0, 3))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """The part of a view that does not change."""
+
+    vehicle: Vehicle
+    title: str
+    lower: Array
+    """Corner of the water's box, world frame [m], (3,)."""
+    upper: Array
+    """The opposite corner [m], (3,)."""
+    walls: bool = True
+    """True if the box is a pool; otherwise it is the space in which the vehicle may move."""
+    site: Pool | None = None
+    """Camera, if one looks on."""
+    path: Array = field(default_factory=nowhere)
+    """Trajectory to follow, world frame [m], (k, 3)."""
+    bodies: Sequence[Body] = ()
+    """Bodies of the world around the vehicle."""
+    eyes: Sequence[str] = ()
+    """Names of the vehicle's own cameras and sonars, whose pictures frames have."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The camera's latest picture."""
+
+    image: npt.NDArray[np.uint8] | None
+    """Grey values; None where only tags are known."""
+    tags: Sequence[TagCorners] = ()
+    size: tuple[int, int] = (720, 1280)
+    """Rows and columns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One moment."""
+
+    time: float
+    """Since the source's beginning [s]."""
+    truth: Pose | None = None
+    estimate: Pose | None = None
+    goal: Pose | None = None
+    force: Array = field(default_factory=lambda: np.zeros(0))
+    """Forces of the thrusters, canonical order [N], (n,), or none."""
+    trail: Array = field(default_factory=nowhere)
+    """Recent positions of the vehicle, world frame [m], (k, 3)."""
+    picture: Picture | None = None
+    pictures: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
+    """Latest pictures of the vehicle's own cameras, (rows, columns, 3), and of its sonars as fans from above, gray; by
+    name."""
+    status: Mapping[str, str] = field(default_factory=dict)
+    """Name -> a few words or a number with its unit."""
+    events: Sequence[str] = ()
+    """The latest, newest last."""
+
+
+class Curve(NamedTuple):
+    """One line of a plot."""
+
+    plot: str
+    """Title of the plot, with the unit."""
+    label: str
+    time: Array
+    """[s], (k,)"""
+    value: Array
+    """NaN where there is none, (k,)."""
+
+
+class Source(Protocol):
+    """Source of frames. A recorded one gives any time; a live one advances to the time, and never goes back."""
+
+    stage: Stage
+    duration: float
+    """[s]; infinite for a live one."""
+
+    def frame(self, time: float) -> Frame:
+        """The moment at a time since the beginning [s]."""
+
+    def curves(self) -> Sequence[Curve]:
+        """Errors over time, as far as they are known. Curves of one plot have the same times."""
+
+    def close(self) -> None:
+        """Let go of what it holds."""
+
+
+# The box of water that is drawn.
+
+AROUND = 4.0
+"""The viewpoint of a world, to each side [m]."""
+MARGIN = 0.5
+"""Around a motion that nothing bounds [m]."""
+
+
+def box_of(
+    vehicle: Vehicle, basin: tuple[float, float, float] | None, positions: Array
+) -> tuple[Array, Array]:
+    """Lower and upper corner of a pool; without one of the vehicle's workspace, or of the motion [m], (3,).
+
+    Args:
+        vehicle: Its file may bound where it moves.
+        basin: Length, width and depth [m], centred on the world's z axis under z = 0.
+        positions: That are to be seen, world frame [m], (k, 3).
+    """
+    if basin is not None:
+        half = np.array([0.5 * basin[0], 0.5 * basin[1]])
+        return np.array([*-half, -basin[2]]), np.array([*half, 0.0])
+    if "safety" not in vehicle.defaults:
+        lower = np.array(vehicle.safety.workspace_lower, float)
+        upper = np.array(vehicle.safety.workspace_upper, float)
+        if np.isfinite([lower, upper]).all():
+            upper[2] = 0.0
+            return lower, upper
+    finite = positions[np.isfinite(positions).all(axis=1)] if len(positions) else np.zeros((1, 3))
+    lower, upper = finite.min(axis=0) - MARGIN, finite.max(axis=0) + MARGIN
+    upper[2] = 0.0
+    return lower, upper
+
+
+def box_of_world(world: World) -> tuple[Array, Array]:
+    """Lower and upper corner of a world: its basin, or about its viewpoint down to the seabed [m], (3,)."""
+    if world.basin is not None:
+        length, width, depth = world.basin.size
+        return np.array([-0.5 * length, -0.5 * width, -depth]), np.array([0.5 * length, 0.5 * width, 0.0])
+    x, y, z = world.viewpoint.position
+    depth = 2.0 * abs(z) if world.seabed is None else world.seabed.depth
+    return np.array([x - AROUND, y - AROUND, -depth]), np.array([x + AROUND, y + AROUND, 0.0])

@@ -1,0 +1,201 @@
+"""`finssim view`: make a source, serve its page, and end with Ctrl-C."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from finssim.extensions.perception import load_world
+from finssim.extensions.viewer.frame import Source, ViewError
+from finssim.extensions.viewer.sources import guide_for
+from finssim.robot.interrupt import interruptible
+from finssim.vehicles import load_vehicle
+from finssim.vehicles.defaults import vehicle_at
+
+_DRIVEN = {"policy", "task", "goal", "trajectory", "seed"}
+HEEDED = {
+    "pool": _DRIVEN | {"plant", "severity", "camera", "world"},
+    "sim": _DRIVEN | {"hydrodynamics"},
+    "record": {"truth", "truth_offset", "basin", "world", "seed"},
+    "folder": {"world"},
+}
+"""Kind of source -> options, besides the vehicle, that it uses."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """Source that a person wants to view."""
+
+    source: Annotated[str, "argument"] = "pool"
+    """(pool|sim|FILE|FOLDER) Source: pool (the virtual pool with a robot in it), sim (the simulator), a record
+    (.mcap), or a folder written by the engine's recorder."""
+    vehicle: str | None = None
+    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file; finsrov, or that of the record, if not
+    given."""
+    policy: str = "pid"
+    """(DIR|pid|pid-paper) Controller in pool and sim: a policy's directory, pid or pid-paper."""
+    task: str | None = None
+    """(TASK) Task that the policy must have been trained for: t1 or t2; t2 follows a default trajectory if none is
+    given."""
+    goal: str | None = None
+    """(X,Y,Z,YAW|FILE) Station to keep in pool and sim: x,y,z [m] in the world frame and heading [deg], or a file."""
+    trajectory: str | None = None
+    """(NAME|FILE) Trajectory to follow instead of a goal: a name or a file."""
+    plant: str = "1"
+    """(SEED|FILE) Plant in the pool: a seed to draw it from, or a plant file."""
+    severity: str = "realistic"
+    """(NAME) Severity of a drawn plant: nominal, realistic or hard."""
+    camera: str = "corners"
+    """(KIND) Output of the pool's camera: pictures, or corners (of the tags)."""
+    hydrodynamics: str = "calibrated"
+    """(MODEL) Hydrodynamic model: calibrated, simplified or mesh."""
+    truth: Path | None = None
+    """(FILE) Truth file of the pool, to show beside a record."""
+    truth_offset: float | None = None
+    """Robot's clock at time 0 of the pool's clock [s]; estimated from both motions if not given."""
+    basin: str | None = None
+    """(L,W,D) Pool to show around a record: length,width,depth [m]; the vehicle's workspace if not given."""
+    world: str | None = None
+    """(SITE|FILE|NUMBER) For pool, the world of the vehicle's own cameras and sonars (a site of finssim worlds or a
+    file), located by motion capture; for a record, the world to show, drawn from --seed; for a folder, the index of
+    the run's world, the first if not given."""
+    seed: int = 1
+    """Seed of every random number; equal seeds give equal results."""
+
+
+def open_source(choice: Choice) -> Source:
+    """The source that was asked for.
+
+    Raises:
+        ViewError: There is none of that name.
+        ValueError: What it is made of is refused, in one sentence.
+    """
+    _refuse_strangers(choice)
+    if choice.source == "pool":
+        return _pool(choice)
+    if choice.source == "sim":
+        return _simulator(choice)
+    path = Path(choice.source)
+    if path.is_dir():
+        from finssim.extensions.viewer.sources import RunSource
+
+        if choice.world is not None and not choice.world.isdecimal():
+            raise ViewError(f"--world {choice.world}: expected the number of a world of the folder's run")
+        number = None if choice.world is None else int(choice.world)
+        return RunSource(path, world=number, vehicle=choice.vehicle)
+    if not path.is_file():
+        raise ViewError(
+            f"{choice.source}: no such file or folder; give pool, sim, a record (.mcap) or a run's folder"
+        )
+    from finssim.extensions.viewer.sources import RecordSource
+
+    return RecordSource(
+        path,
+        truth=choice.truth,
+        offset=choice.truth_offset,
+        basin=None if choice.basin is None else _size(choice.basin),
+        vehicle=choice.vehicle,
+        world=choice.world,
+        seed=choice.seed,
+    )
+
+
+def run(
+    choice: Choice,
+    *,
+    speed: Annotated[float, (0.01, 100.0)] = 1.0,
+    port: Annotated[int, (1, 65535)] = 8080,
+    bind: str = "127.0.0.1",
+    no_browser: bool = False,
+    duration: Annotated[float | None, (0.0, None)] = None,
+) -> None:
+    """Show a vehicle in the browser, live or recorded: poses, goal, forces, camera, health, errors [m, deg].
+
+    Example: finssim view run.mcap --truth truth.fst --basin 4,2,1
+
+    Example: finssim view pool --policy pid --trajectory ellipse --severity hard --camera pictures
+
+    Args:
+        choice: What to look at.
+        speed: Speed factor relative to real time [-].
+        port: Port of the page; the next free one if it is in use.
+        bind (ADDRESS): Address to serve at; only this machine if not given.
+        no_browser: Print the page's address without opening it.
+        duration: Duration [s]; until Ctrl-C if not given.
+    """
+    from finssim.extensions.viewer.app import View
+
+    view = View(open_source(choice), bind=bind, port=port, speed=speed)
+    print(f"{view.source.stage.title}\nview: {view.url}   (Ctrl-C ends)")
+    sys.stdout.flush()
+    if not no_browser:
+        webbrowser.open(view.url)
+    end = time.monotonic() + (math.inf if duration is None else duration)
+    try:
+        with interruptible() as interrupted:
+            view.run(lambda: interrupted() or time.monotonic() >= end)
+    finally:
+        view.close()
+
+
+def _refuse_strangers(choice: Choice) -> None:
+    """Refuse options that the source would not use."""
+    path = Path(choice.source)
+    kind = choice.source if choice.source in HEEDED else "folder" if path.is_dir() else "record"
+    usual = Choice()
+    for name in sorted(set().union(*HEEDED.values()) - HEEDED[kind]):
+        if getattr(choice, name) != getattr(usual, name):
+            takers = " and ".join(other for other in HEEDED if name in HEEDED[other])
+            raise ViewError(f"--{name.replace('_', '-')} is for {takers}, not for a {kind}: omit it")
+
+
+def _pool(choice: Choice) -> Source:
+    from finssim.extensions.viewer.sources import PoolSource
+
+    name = choice.vehicle or "finsrov"
+    goal = choice.goal
+    if choice.world is not None and goal is None and choice.trajectory is None:
+        view = load_world(choice.world).viewpoint
+        goal = ",".join(f"{x:g}" for x in (*view.position, math.degrees(view.yaw)))
+    room = load_vehicle(name) if choice.world is None else vehicle_at("open-water", load_vehicle(name))
+    guide = guide_for(goal, choice.trajectory, choice.task, room)
+    kinds: Any = {"severity": choice.severity, "camera": choice.camera}  # checked where they are used
+    return PoolSource(
+        guide,
+        vehicle=name,
+        policy=choice.policy,
+        task=choice.task,
+        plant=choice.plant,
+        seed=choice.seed,
+        world=choice.world,
+        **kinds,
+    )
+
+
+def _simulator(choice: Choice) -> Source:
+    from finssim.extensions.viewer.sources import SimulatorSource
+
+    vehicle = load_vehicle(choice.vehicle or "finsrov")
+    return SimulatorSource(
+        vehicle,
+        guide_for(choice.goal, choice.trajectory, choice.task, vehicle),
+        policy=choice.policy,
+        task=choice.task,
+        hydrodynamics=choice.hydrodynamics,
+        seed=choice.seed,
+    )
+
+
+def _size(text: str) -> tuple[float, float, float]:
+    try:
+        length, width, depth = (float(part) for part in text.split(","))
+    except ValueError:
+        length = width = depth = math.nan
+    if not (min(length, width, depth) > 0.0 and math.isfinite(length + width + depth)):
+        raise ViewError(f"basin '{text}': expected length,width,depth [m], such as 4,2,1")
+    return length, width, depth

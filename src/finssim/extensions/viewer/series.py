@@ -1,0 +1,186 @@
+"""Values over time: looked up in what is recorded, or kept of what goes by."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.core.rotations import quat_yaw
+from finssim.extensions.viewer.frame import Curve, Pose, ViewError, nowhere
+
+__all__ = ["Errors", "HEADING", "POSITION", "PoseSeries", "Series", "errors_between"]
+
+
+Array = npt.NDArray[np.float64]
+
+POSITION, HEADING = "position error [m]", "heading error [deg]"
+"""Titles of the plots."""
+
+TRAIL = 30.0
+"""Duration of the displayed trail [s]."""
+TRAIL_POINTS = 150
+KEPT = 1200
+"""Points that a live curve has at most."""
+SAMPLE = 0.1
+"""Between the points of a live curve [s]."""
+
+
+class Series:
+    """Values in the order of their times."""
+
+    def __init__(self, time: npt.ArrayLike = (), values: Sequence[Any] | Array = ()) -> None:
+        self.time = np.asarray(time, float)
+        self.values = values
+
+    def at(self, time: float) -> Any:
+        """The newest value that is not later than a time [s]; None before the first."""
+        i = int(np.searchsorted(self.time, time, side="right")) - 1
+        return None if i < 0 else self.values[i]
+
+
+class PoseSeries:
+    """A recorded motion."""
+
+    def __init__(self, time: npt.ArrayLike, position: npt.ArrayLike, quaternion: npt.ArrayLike) -> None:
+        self.time = np.asarray(time, float)
+        self.position = np.asarray(position, float).reshape(-1, 3)
+        self.quaternion = np.asarray(quaternion, float).reshape(-1, 4)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def at(self, time: float) -> Pose | None:
+        """The newest pose that is not later than a time [s]; None before the first."""
+        i = int(np.searchsorted(self.time, time, side="right")) - 1
+        return None if i < 0 else Pose(self.position[i], self.quaternion[i])
+
+    def trail(self, time: float) -> Array:
+        """Return the positions in the half minute before a time [s], world frame [m], (k, 3)."""
+        first, last = np.searchsorted(self.time, (time - TRAIL, time))
+        return self.position[first:last][:: max(1, (last - first) // TRAIL_POINTS)] if last else nowhere()
+
+    def on(self, time: Array) -> tuple[Array, Array]:
+        """Positions (k, 3) and unwrapped headings (k,) [rad] at other times; NaN outside its own."""
+        if not len(self):
+            return np.full((len(time), 3), np.nan), np.full(len(time), np.nan)
+        columns = [*self.position.T, np.unwrap(quat_yaw(self.quaternion))]
+        interpolated = [np.interp(time, self.time, column, np.nan, np.nan) for column in columns]
+        return np.stack(interpolated[:3], axis=1), interpolated[3]
+
+
+def errors_between(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Distances [m] and turns [deg], (k,), between positions and headings (k, 3), (k,)."""
+    turn = np.degrees(np.abs((a[1] - b[1] + math.pi) % (2.0 * math.pi) - math.pi))
+    return np.linalg.norm(a[0] - b[0], axis=1), turn
+
+
+class Errors:
+    """Errors of a vehicle that is alive, and its trail."""
+
+    def __init__(self) -> None:
+        self._rows: deque[tuple[float, ...]] = deque(maxlen=KEPT)
+        self._trail: deque[Array] = deque(maxlen=round(TRAIL / SAMPLE))
+
+    def add(self, time: float, true: Pose | None, estimate: Pose | None, goal: Pose | None) -> None:
+        """Keep a moment, its time in [s], if the last one that was kept is old enough."""
+        if self._rows and time < self._rows[-1][0] + SAMPLE - 1e-9:
+            return
+        pose = true or estimate
+        if pose is not None:
+            self._trail.append(np.array(pose.position, float))
+        self._rows.append((time, *_error(pose, goal), *_error(estimate, true)))
+
+    @property
+    def trail(self) -> Array:
+        """Return the recent positions, (k, 3) [m]."""
+        return np.array(self._trail).reshape(-1, 3)
+
+    @property
+    def latest(self) -> tuple[float, ...]:
+        """Errors to the goal [m, deg] and of the estimate [m, deg]; NaN where not known."""
+        return self._rows[-1][1:] if self._rows else (math.nan,) * 4
+
+    @property
+    def to_goal(self) -> str:
+        """Distance and turn to the goal, in words."""
+        distance, turn, *_ = self.latest
+        return "-" if math.isnan(distance) else f"{100.0 * distance:.1f} cm, {turn:.1f}°"
+
+    @property
+    def of_estimate(self) -> str:
+        """Distance of the estimate from the truth, in words."""
+        return "-" if math.isnan(self.latest[2]) else f"{100.0 * self.latest[2]:.1f} cm"
+
+    def curves(self) -> list[Curve]:
+        """Return the errors that have a value."""
+        rows = np.array(self._rows).reshape(-1, 5)
+        time = rows[:, 0]
+        curves = [
+            Curve(POSITION, "to the goal", time, rows[:, 1]),
+            Curve(POSITION, "of the estimate", time, rows[:, 3]),
+            Curve(HEADING, "to the goal", time, rows[:, 2]),
+            Curve(HEADING, "of the estimate", time, rows[:, 4]),
+        ]
+        return [curve for curve in curves if np.isfinite(curve.value).any()]
+
+
+def _error(a: Pose | None, b: Pose | None) -> tuple[float, float]:
+    if a is None or b is None:
+        return math.nan, math.nan
+    of_a, of_b = ((p.position[None], np.atleast_1d(quat_yaw(p.quaternion))) for p in (a, b))
+    distance, turn = errors_between(of_a, of_b)
+    return float(distance[0]), float(turn[0])
+
+
+# The clocks of a record and of a truth file, laid over each other by the motion that both show.
+
+COARSE, FINE = 0.2, 0.01
+"""Steps of the search [s]."""
+SAMPLES = 400
+"""Number of samples of the estimate that are compared."""
+LONGEST = 86_400.0
+"""Longest duration of truth and estimate together [s]; the search takes 0.1 ms for each of its steps."""
+OVERLAP = 0.5
+"""Part of the estimate that the truth must cover."""
+
+
+def offset_between(estimate: PoseSeries, time: Array, position: Array) -> float:
+    """Return the time to add to the truth's times so that it matches the estimate [s].
+
+    The one with the least mean square distance, of all under which at least half of the estimate is covered.
+
+    Args:
+        estimate: As recorded, robot's clock.
+        time: Of the truth, pool's clock [s], (k,).
+        position: Of the truth [m], (k, 3).
+
+    Raises:
+        ViewError: The truth is too short, or too long to be searched.
+    """
+    chosen = np.unique(np.linspace(0, len(estimate) - 1, SAMPLES).round().astype(int))
+    t, x = estimate.time[chosen], estimate.position[chosen]
+    finite = np.isfinite(x).all(axis=1)
+    t, x = t[finite], x[finite]
+    first, last = t[0] - time[-1], t[-1] - time[0]
+    if last - first > LONGEST:
+        raise ViewError(
+            f"it lasts {last - first:g} s, expected at most {LONGEST:g} s with the record: give times in s"
+        )
+
+    def error(offset: float) -> float:
+        inside = (t - offset >= time[0]) & (t - offset <= time[-1])
+        if inside.mean() < OVERLAP:
+            return np.inf
+        there = np.stack([np.interp(t[inside] - offset, time, column) for column in position.T], axis=1)
+        return float(np.mean(np.sum((there - x[inside]) ** 2, axis=1)))
+
+    best = min(np.arange(first, last + COARSE, COARSE), key=error)
+    best = min(np.arange(best - COARSE, best + COARSE, FINE), key=error)
+    if not np.isfinite(error(float(best))):
+        raise ViewError("the truth covers less than half of the record: it is not of this run")
+    return float(best)

@@ -1,0 +1,164 @@
+"""Results of a calibration: estimates with intervals, their basis, and what could not be determined."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.page import notebook_html
+from finssim.trials.findings import CalibrationError, Finding, plain
+from finssim.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Correlation", "Curve", "Estimate", "Fit"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """One parameter."""
+
+    name: str
+    """`surge.m_eff`, `surge.added_mass`, `surge.d1`, `surge.d2`, `surge.bias`, `roll.k`, `buoyancy_excess`,
+    `thrust_scale`, `thrust_lag`, `thrust_delay`, `CC.c_plus`, ...; coupled terms `added_mass.surge.pitch`,
+    `d1.sway.yaw`."""
+    estimate: float
+    ci95: tuple[float, float]
+    """95 % interval; infinite or NaN ends where the data say nothing."""
+    unit: str
+    identifiable: bool
+    """True if the data determine it; False also if it rests on a bound."""
+    note: str = ""
+    """Reason why it is not identifiable, or basis of the number."""
+    path: str | None = None
+    """Dotted path of the number in the vehicle file, where it has one."""
+
+    @classmethod
+    def within(cls, name: str, value: float, half: float, unit: str, sure: bool, note: str = "") -> Estimate:
+        """An estimate with an interval of `half` to each side, and a note where it is not `sure`."""
+        ci95 = (float(value - half), float(value + half))
+        note = "" if sure else note
+        return cls(name=name, estimate=float(value), ci95=ci95, unit=unit, identifiable=bool(sure), note=note)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; a number that is not finite becomes None."""
+        values = {key: getattr(self, key) for key in ("estimate", "ci95", "unit", "identifiable", "note")}
+        return dict(plain(values))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correlation:
+    """Correlation of the errors of the estimates."""
+
+    names: tuple[str, ...]
+    matrix: Array
+    """(n, n)"""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"names": list(self.names), "matrix": plain(self.matrix)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """Measured and fitted values along one abscissa, for the report's figures."""
+
+    title: str
+    x_label: str
+    y_label: str
+    x: Array
+    measured: Array
+    fitted: Array
+    kind: str = "line"
+    """`line` (against time) or `scatter`."""
+
+    @classmethod
+    def joined(cls, title: str, y_label: str, parts: Sequence[tuple[Array, Array, Array]]) -> Curve:
+        """Stretches of time [s], measured and fitted values, (k,) each, one after the other with a second between."""
+        x, start = [], 0.0
+        for t, _, _ in parts:
+            x += [t - t[0] + start, [np.nan]]
+            start = float(x[-2][-1]) + 1.0
+        measured, fitted = (np.concatenate([y for p in parts for y in (p[k], [np.nan])]) for k in (1, 2))
+        label = "time, one after the other [s]"
+        return cls(
+            title=title, x_label=label, y_label=y_label, x=np.concatenate(x), measured=measured, fitted=fitted
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """A finished calibration."""
+
+    kind: str
+    """thruster, motor or hydrodynamics"""
+    method: str
+    before: Vehicle
+    """The vehicle that the fit started from."""
+    estimates: dict[str, Estimate]
+    """Estimates by name, in the order of a report."""
+    changes: dict[str, Any]
+    """For `Vehicle.replace`: dotted path -> value, only of what the data determine."""
+    quality: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Axis or thruster -> figures of the fit: r2, rmse, nrmse, samples, rejected, ..."""
+    correlation: Correlation | None = None
+    findings: tuple[Finding, ...] = ()
+    """Bounds, degeneracies, speeds of less than a decade, trials left out."""
+    curves: tuple[Curve, ...] = ()
+    trials: dict[str, str] = field(default_factory=dict)
+    """Name of a trial or table -> SHA-256 of its numbers."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Method options, seed."""
+    interrupted: bool = False
+    """True if Ctrl-C ended it before it converged; the estimates are the best until then."""
+
+    @cached_property
+    def vehicle(self) -> Vehicle:
+        """The calibrated vehicle: everything that the fit did not determine keeps its number and its origin.
+
+        Raises:
+            CalibrationError: The estimates make no vehicle that can be simulated.
+        """
+        from finssim.identification.vehicle_file import calibrated
+
+        return calibrated(self)
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % interval of each estimate by its name, in the estimate's unit; infinite ends where it is unknown."""
+        return {name: estimate.ci95 for name, estimate in self.estimates.items()}
+
+    def plot(self) -> Figure:
+        """Return a Matplotlib figure of measured and fitted values and their differences, of up to six curves.
+
+        Raises:
+            CalibrationError: The fit holds no curves.
+        """
+        from finssim.identification.report import draw_curves
+
+        figure = next(draw_curves(self.curves), None)
+        if figure is None:
+            raise CalibrationError("the fit holds no curves to draw")
+        return figure
+
+    def __repr__(self) -> str:
+        counts = (
+            f"{len(self.estimates)} estimates, {len(self.changes)} changes, {len(self.findings)} findings"
+        )
+        return f"<Fit {self.kind} ({self.method}) of {self.before.name}: {counts}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (e.name, f"{e.estimate:.4g}", f"{e.ci95[0]:.4g} to {e.ci95[1]:.4g}", e.unit, e.note)
+            for e in self.estimates.values()
+        ]
+        title = f"{self.kind} of {self.before.name} ({self.method})"
+        return notebook_html(title, ("", "estimate", "95 % interval", "unit", "note"), rows)

@@ -1,0 +1,447 @@
+"""The hydrodynamics of a vehicle from its trials: which method, what scale of thrust, and whether it helps.
+
+Two methods share trials, damping models and reports: the regression of each axis (`regression.regress`), and
+simulation error over all of them (`simulation.fit`). `auto` begins with the first, and takes the second where that
+replays the trials better.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from finssim.core.progress import progress_bar
+from finssim.identification.fit import Estimate, Fit
+from finssim.identification.regression.axis_estimates import CERTAIN
+from finssim.identification.regression.plant_terms import matrices
+from finssim.identification.regression.regress import regress
+from finssim.identification.report import finish, refuse_places, usable_trials
+from finssim.identification.vehicle_file import calibrated, scaled_thrust
+from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.trials.inputs import drive, require_axes
+from finssim.trials.trial import Trial
+from finssim.vehicles import AXES, Vehicle, load_vehicle
+
+METHODS = ("auto", "regression", "simulation")
+
+ENOUGH = 0.03
+"""NRMSE of the replay of every fitted axis up to which a regression is not tried to be bettered."""
+
+PREFERRED = 1.1
+"""Factor on the regression's NRMSE up to which simulation error is preferred: it fits what a replay scores, and carries
+further to speeds that no trial had."""
+
+WORSE = 1.05
+"""Factor on the vehicle file's NRMSE above which the fit replays an axis worse than the file."""
+
+CLEARLY = 0.7
+"""Factor on the vehicle file's NRMSE of the fitted trials below which other trials are not replayed worse either."""
+
+FEWEST_LEFT, MOST_LEFT_OUT = 2, 8
+"""Trials that a fit without one needs, and trials up to which one fit for each is cheap."""
+
+LIKELY_SCALE, SCALE_STD = 0.88, 0.17
+"""Thrust of a battery on its way from full to empty, to that at the voltage of the thruster's table, and the standard
+deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4.2 V a cell (0.14), and propellers of
+one make differ by a tenth."""
+
+ADDED_MASS_STD = 0.7
+"""Standard deviation of the logarithm of a catalogue's added mass, a factor of two: published sets of one vehicle
+differ by as much."""
+
+INERTIA_STD = 0.5
+"""Standard deviation of the logarithm of a catalogue's effective moment of inertia."""
+
+GIVEN_STD = 0.03
+"""Standard deviation of the logarithm of a given inertia."""
+
+MULTIPLIED = ("m_eff", "added_mass", "d1", "d2", "bias", "k")
+"""Estimates of an axis that a thrust scale multiplies."""
+
+Progress = Callable[[float, str], None]
+
+
+def fit_hydrodynamics(
+    trials: Sequence[Trial],
+    vehicle: Vehicle,
+    *,
+    axes: Sequence[str] | None = None,
+    method: str = "auto",
+    estimate: Sequence[str] = (),
+    damping: str = "auto",
+    known: Mapping[str, float] | None = None,
+    horizon: float | None = None,
+    held_out: Sequence[Trial] = (),
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit added mass, damping, buoyancy and stiffness.
+
+    Where every driven trial is of pulse widths without a battery voltage, nobody knows the thrust: its scale is then
+    estimated from what voltages a battery has and what added mass the vehicle file expects, goes to the file with the
+    rest, and its uncertainty is in every interval.
+
+    Args:
+        trials: None of them held out.
+        vehicle: Gives the rigid body, the motors and what is not fitted.
+        axes: Axes to fit; those that the trials excite if None.
+        method: One of `METHODS`.
+        estimate: Further parameters, of `EXTRAS` and of the vehicle's terms; simulation only.
+        damping: `auto`, `linear`, `quadratic` or `both`.
+        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²]; regression only.
+        horizon: Longest stretch that is simulated without a restart [s]; simulation only.
+        held_out: Further trials that show whether the calibrated vehicle replays worse than the file. Without any, a
+            regression that does not replay the fitted trials much better is judged by trials left out in turn.
+        progress: Called with the part done and a few words.
+
+    Raises:
+        CalibrationError: No trial can be used, or an option is not the method's.
+    """
+    known = dict(known or {})
+    only_simulation = {"--estimate": bool(estimate), "--horizon": horizon is not None}
+    asked = [name for name, given in only_simulation.items() if given]
+    if method not in METHODS:
+        raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
+    if asked and (method == "regression" or known):
+        raise CalibrationError(
+            f"{asked[0]} needs --method simulation: the regression fits one axis at a time"
+        )
+    if known and method == "simulation":
+        raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")
+
+    tell = progress or (lambda part, text: None)
+
+    def regression(
+        body: Vehicle, own: Sequence[Trial] = trials, span: tuple[float, float] = (0.1, 0.3), **given: Any
+    ) -> Fit:
+        settings = {"known": known} | given
+        return regress(own, body, axes=axes, damping=damping, progress=_within(tell, *span), **settings)
+
+    def simulation(body: Vehicle, begin: Fit | None = None) -> Fit:
+        from finssim.identification.simulation.fit import fit_by_simulation
+
+        begin = begin or _or_none(lambda body: regression(body, known={}, file_prior=False), body)
+        return fit_by_simulation(
+            trials, body, axes=axes, estimate=estimate, damping=damping, horizon=horizon, begin=begin,
+            progress=_within(tell, 0.3, 0.95),
+        )  # fmt: skip
+
+    scale, std = 1.0, 0.0
+    if "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle):
+        free = _or_none(lambda body: regression(body, span=(0.0, 0.1), known={}, file_prior=False), vehicle)
+        scale, std = _thrust_scale(free, vehicle, known)
+    body = vehicle.replace(scaled_thrust(vehicle, scale)) if std else vehicle
+    tell(0.1, "replay by the vehicle file")
+    before = _scores(vehicle, trials)
+    driven = [trial for trial in trials if not trial.header.passive]
+    if method == "simulation" or asked:
+        fit = simulation(body)
+    elif method == "regression" or known or not driven:
+        fit = regression(body)
+    else:
+        fit = _better(regression, simulation, body, trials, before)
+    if std:
+        fit = _with_scale(fit, vehicle, scale, std, known)
+    if fit.interrupted:
+        return fit
+    tell(0.95, "replay by the calibrated vehicle")
+
+    def without(k: int) -> Fit:
+        part = 0.95 + 0.05 * k / len(trials)
+        return regression(body, [*trials[:k], *trials[k + 1 :]], (part, part))
+
+    judge = without if fit.method == "regression" else None
+    return replace(fit, findings=(*fit.findings, *_worse(fit, vehicle, trials, held_out, before, judge)))
+
+
+def _within(progress: Progress, low: float, high: float) -> Progress:
+    """Return the progress of a part of the work."""
+    return lambda part, text: progress(low + (high - low) * part, text)
+
+
+def _or_none(fit: Callable[[Vehicle], Fit], vehicle: Vehicle) -> Fit | None:
+    try:
+        return fit(vehicle)
+    except CalibrationError:
+        return None
+
+
+def _better(
+    regression: Callable[[Vehicle], Fit],
+    simulation: Callable[..., Fit],
+    body: Vehicle,
+    trials: Sequence[Trial],
+    before: Mapping[str, float],
+) -> Fit:
+    """The regression where it replays every axis very well and better than the file; else simulation error, unless that
+    replays worse."""
+    first = _or_none(regression, body)
+    if first is None:
+        return simulation(body)
+    after = _scores(calibrated(first), trials)
+    if after and all(
+        value <= ENOUGH and value <= before.get(axis, math.inf) for axis, value in after.items()
+    ):
+        return first
+    second = _or_none(lambda body: simulation(body, first), body)
+    if second is None:
+        return first
+    other = _scores(calibrated(second), trials)
+    means = [_mean(scores, {*after, *other}) for scores in (after, other)]
+    return second if means[1] <= PREFERRED * means[0] else replace(first, interrupted=second.interrupted)
+
+
+def _mean(scores: Mapping[str, float], axes: set[str]) -> float:
+    """Over the axes; an axis without a score, or one that is further off than no model, counts 1."""
+    return float(np.mean([min(scores.get(axis, 1.0), 1.0) for axis in axes])) if axes else 1.0
+
+
+def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
+    """NRMSE of the replay by axis, the median over the trials; none where nothing can be replayed."""
+    return {axis: float(np.median(found)) for axis, found in _values(vehicle, trials).items()}
+
+
+def _values(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, list[float]]:
+    """NRMSE of the replay of each trial by axis."""
+    from finssim.identification.replay import replay
+
+    try:
+        rows = replay(trials, vehicle).scores["calibrated"]
+    except CalibrationError:
+        return {}
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        for axis, score in row.items():
+            if score.value is not None:
+                values.setdefault(str(axis), []).append(
+                    score.value if math.isfinite(score.value) else math.inf
+                )
+    return values
+
+
+def _worse(
+    fit: Fit,
+    vehicle: Vehicle,
+    trials: Sequence[Trial],
+    held_out: Sequence[Trial],
+    before: Mapping[str, float],
+    without: Callable[[int], Fit] | None,
+) -> list[Finding]:
+    """A finding for each axis that the calibrated vehicle replays worse than the file it came from.
+
+    Args:
+        fit: The fit.
+        vehicle: The file.
+        trials: That were fitted.
+        held_out: That were not, which judge alone where there are any.
+        before: NRMSE of the fitted trials by the file.
+        without: The fit without one of the trials, where that is cheap.
+    """
+    if not fit.changes:
+        return []
+    if held_out:
+        judged, before = "the held-out trials", _scores(vehicle, held_out)
+        after = dict.fromkeys(before, math.inf) | _scores(calibrated(fit), held_out)
+    else:
+        judged, after = "the fitted trials", dict.fromkeys(before, math.inf)  # where it cannot be replayed
+        after |= _scores(calibrated(fit), trials)
+        doubtful = [axis for axis, value in after.items() if value > CLEARLY * before.get(axis, math.inf)]
+        if without is not None and doubtful and FEWEST_LEFT < len(trials) <= MOST_LEFT_OUT:
+            judged, after = "trials left out of the fit in turn", _left_out(without, trials)
+    other = "simulation" if fit.method == "regression" else "regression"
+    return [
+        finding("replays_worse", axis, judged=judged, after=value, before=before[axis], method=other)
+        for axis, value in after.items()
+        if axis in before and value > WORSE * before[axis] + 0.01
+    ]
+
+
+def _left_out(without: Callable[[int], Fit], trials: Sequence[Trial]) -> dict[str, float]:
+    """NRMSE by axis, the median over the trials, each replayed by the fit of the others."""
+    values: dict[str, list[float]] = {}
+    for k, trial in enumerate(trials):
+        try:
+            fit = without(k)
+        except CalibrationError:
+            continue  # the others excite nothing
+        for axis, found in _values(calibrated(fit), [trial]).items():
+            values.setdefault(axis, []).extend(found)
+    return {axis: float(np.median(found)) for axis, found in values.items()}
+
+
+# -- the scale of thrust --------------------------------------------------------------------------------------------
+
+
+def _unknown_voltage(trials: Sequence[Trial], vehicle: Vehicle) -> bool:
+    """Return whether only pulse widths are known of the thrust, without the battery's voltage."""
+    driven = [trial for trial in trials if not trial.header.passive]
+    try:
+        sources = {drive(trial, vehicle).source for trial in driven}
+    except CalibrationError:
+        return False
+    silent = all(trial.header.voltage is None and not trial.has("voltage") for trial in driven)
+    return sources == {"pwm"} and silent
+
+
+def _thrust_scale(fit: Fit | None, vehicle: Vehicle, known: Mapping[str, float]) -> tuple[float, float]:
+    """Thrust over that of the file, and the standard deviation of its logarithm.
+
+    Motion shows inertia over thrust; the vehicle file expects an inertia, and batteries have a voltage:
+    ln s is the mean of ln(m_file / m_fit) over the axes and of ln `LIKELY_SCALE`, weighted by their certainty.
+    """
+    plant = matrices(vehicle)
+    said, weight = [math.log(LIKELY_SCALE)], [SCALE_STD**-2]
+    for i, axis in enumerate(AXES):
+        found = fit.estimates.get(f"{axis}.m_eff") if fit is not None else None
+        if found is None or not found.estimate > 0.0 or (axis in ("roll", "pitch") and axis not in known):
+            continue  # an unknown stiffness is confounded with the inertia of roll and pitch
+        expected = known.get(axis, float(plant.M_RB[i, i] + plant.M_A[i, i]))
+        std = INERTIA_STD if i > 2 else ADDED_MASS_STD * float(plant.M_A[i, i]) / expected
+        std = GIVEN_STD if axis in known else std
+        value = found.estimate
+        half = 0.5 * (found.ci95[1] - found.ci95[0]) / value
+        if math.isfinite(half) and half < 0.5:
+            said.append(math.log(expected / value))
+            weight.append(1.0 / (std**2 + (0.5 * half) ** 2 + 1e-4))
+    total = sum(weight)
+    return math.exp(sum(w * x for w, x in zip(weight, said, strict=True)) / total), total**-0.5
+
+
+def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float, known: Mapping[str, float]) -> Fit:
+    """The fit with the scale among its estimates and in its intervals."""
+    low, high = math.exp(-1.96 * std), math.exp(1.96 * std)
+    fitted = fit.settings.get("axes", ())
+    found = dict(fit.estimates)
+    for name, e in fit.estimates.items():
+        axis, _, kind = name.partition(".")
+        if axis in known and kind in ("m_eff", "added_mass"):
+            continue
+        in_term = e.path == f"hydrodynamics.calibrated.{name}"
+        if name == "buoyancy_excess" or in_term or (axis in fitted and kind in MULTIPLIED):
+            rigid = found[f"{axis}.m_eff"].estimate - e.estimate if kind == "added_mass" else 0.0
+            found[name] = _widened(e, rigid, low, high)
+    found["thrust_scale"] = Estimate(
+        name="thrust_scale", estimate=scale, ci95=(scale * low, scale * high), unit="-", identifiable=False,
+        note="no battery voltage: from what batteries have and the added mass that the vehicle file expects; it is in "
+        "every interval",
+    )  # fmt: skip
+    return replace(
+        fit,
+        before=vehicle,
+        estimates=found,
+        changes={**scaled_thrust(vehicle, scale), **fit.changes},
+        findings=(finding("voltage_unknown", percent=100.0 * (high - 1.0)), *fit.findings),
+    )
+
+
+def _widened(e: Estimate, rigid: float, low: float, high: float) -> Estimate:
+    """An estimate whose interval also holds a factor between `low` and `high` on estimate + rigid."""
+    whole, (a, b) = e.estimate + rigid, e.ci95
+    if not (math.isfinite(a) and math.isfinite(b)):
+        return e
+    down, up = (1.0 - low, high - 1.0) if whole >= 0.0 else (high - 1.0, 1.0 - low)
+    a = whole - math.hypot(e.estimate - a, down * abs(whole)) - rigid
+    b = whole + math.hypot(b - e.estimate, up * abs(whole)) - rigid
+    kind = e.name.partition(".")[2]
+    if kind in ("d1", "d2", "k"):
+        a = max(a, 0.0)
+    sure = e.identifiable and (kind in ("bias", "") or 0.5 * (b - a) <= CERTAIN * abs(e.estimate))
+    return replace(e, ci95=(a, b), identifiable=sure)
+
+
+def calibrate_hydrodynamics(
+    trials: Sequence[Path],
+    *,
+    vehicle: str,
+    out: Path,
+    axes: str | None = None,
+    method: str = "auto",
+    estimate: str = "",
+    damping: str = "auto",
+    fix: str = "",
+    horizon: float | None = None,
+    report: Path | None = None,
+    ranges: Path | None = None,
+    as_json: bool = False,
+) -> Vehicle:
+    """Fit added mass [kg, kg m²] and damping [N s/m, N s²/m², ...] to trials, axis by axis or by simulation.
+
+    Example: finssim calibrate hydrodynamics trials/fit --vehicle mine.yaml --out fitted.yaml --report report
+
+    Args:
+        trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        out (FILE): Vehicle file to write (.yaml).
+        axes (AXES): Axes to fit, of surge,sway,heave,roll,pitch,yaw; the excited ones if not given.
+        method (METHOD): regression: each axis by its equation of motion; simulation: least simulation error; auto:
+            regression if it replays the trials very well, otherwise simulation unless that replays them worse.
+        estimate (NAMES): Further parameters to fit, of thrust_scale,thrust_lag,thrust_delay,buoyancy_excess,k or the
+            parameters of the vehicle's terms, such as lift.coefficient (simulation method).
+        damping (KIND): Drag: linear, quadratic, both, or auto to choose.
+        fix (AXIS.m=N): Known inertias, including added mass [kg, kg m²]: yaw.m=0.6,surge.m=24 (regression).
+        horizon: Longest segment simulated without a restart [s] (simulation method).
+        report (DIR): Directory for report.html, report.md, figures and fit.json.
+        ranges (FILE): Ranges file to write from the 95 % intervals, for `finssim train --randomize`.
+        as_json: Print one JSON object instead of tables.
+
+    Returns:
+        The calibrated vehicle.
+
+    Raises:
+        CalibrationError, VehicleError, OutputError: As they say; nothing is written then.
+        KeyboardInterrupt: After Ctrl-C, when the best until then, if there is any, has been written.
+    """
+    options = dict(locals())
+    further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
+    chosen = _axes(axes)
+    known = _known(fix)
+    refuse_places(out, report, "vehicle")
+    if ranges is not None:
+        refuse_places(ranges, None, "ranges")
+    body = load_vehicle(vehicle)
+    used, held_out = usable_trials(trials)
+    with progress_bar("calibrate hydrodynamics") as progress:
+        fit = fit_hydrodynamics(
+            used,
+            body,
+            axes=chosen,
+            method=method,
+            estimate=further,
+            damping=damping,
+            known=known,
+            horizon=horizon,
+            held_out=held_out,
+            progress=progress,
+        )
+    return finish("hydrodynamics", fit, options)
+
+
+def _axes(words: str | None) -> tuple[str, ...] | None:
+    if words is None or words == "all":
+        return None
+    names = [word.strip() for word in words.split(",")]
+    require_axes(names)
+    return tuple(axis for axis in AXES if axis in names)
+
+
+def _known(words: str) -> dict[str, float]:
+    """Axis -> effective inertia, of `yaw.m=0.6,surge.m=24`."""
+    found = {}
+    for word in filter(None, (part.strip() for part in words.split(","))):
+        name, _, value = word.partition("=")
+        axis, _, letter = name.strip().partition(".")
+        try:
+            size = float(value)
+        except ValueError:
+            size = math.nan
+        if axis not in AXES or letter not in ("m", "m_eff") or not 1e-6 <= size <= 1e9:
+            raise CalibrationError(
+                f"--fix is '{word}', expected AXIS.m=NUMBER with an axis of {', '.join(AXES)} and the mass with added "
+                "mass in kg, or the inertia with added inertia in kg m², as in yaw.m=0.6"
+            )
+        found[axis] = size
+    return found

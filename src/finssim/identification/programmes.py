@@ -1,0 +1,377 @@
+"""Excitation programmes: wrenches whose motion determines a vehicle's hydrodynamics."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.agents.pid import axis_model
+from finssim.control.allocation import Allocator
+from finssim.core.files import atomic_write
+from finssim.core.quiet import start_warp
+from finssim.core.text_table import write_csv
+from finssim.core.yaml_file import yaml_text
+from finssim.trials.findings import CalibrationError
+from finssim.trials.trial import TAU
+from finssim.vehicles import AXES, Vehicle
+from finssim.vehicles.capability import level_speed
+from finssim.vehicles.vehicle import Axis
+
+__all__ = ["Programme", "RATE", "programmes", "which_axes", "write_programme"]
+
+
+Array = NDArray[np.float64]
+
+# Multi-sines: all axes together, each with separate frequencies, for fits of coupled dynamics.
+
+DRAWS = 30
+"""Random phases tried; those with the lowest peaks are taken."""
+
+
+def multisine(
+    peaks: Mapping[Axis, float],
+    vehicle: Vehicle,
+    *,
+    index: int = 1,
+    seed: int = 0,
+    duration: float = 60.0,
+    band: tuple[float, float] = (0.05, 1.0),
+) -> Programme:
+    """One programme that drives several axes with interleaved harmonics of 1/duration.
+
+    tau_i(t) = a_i Σ_k k^(-1/2) cos(2π k t / duration + φ_k),   k = i-th, (i+n)-th, ... harmonic in the band
+
+    No two axes share a frequency, so their responses can be told apart; amplitudes fall with the root of frequency, so
+    that both speeds (damping) and accelerations (mass) are excited. Phases are the random ones, of a few draws, with
+    the lowest peaks.
+
+    Args:
+        peaks: Axis -> largest wrench [N, N m]; all are scaled down together until the thrusters can give the sum.
+        vehicle: Whose thrusters and damping count.
+        index: Number in the name.
+        seed: Of the phases.
+        duration: Of the excitation [s].
+        band: Lowest and highest frequency [Hz].
+
+    Raises:
+        CalibrationError: The band is too narrow for so many axes in this time, or too fast for the commands.
+    """
+    low, high = band
+    if not (0.0 < low < high <= 0.2 * RATE):
+        raise CalibrationError(
+            f"band is {low:g} to {high:g} Hz, expected rising, above 0 and up to {0.2 * RATE:g} Hz"
+        )
+    if not 0.0 < duration <= LONGEST:
+        raise CalibrationError(f"duration is {duration:g} s, expected above 0 and at most {LONGEST:g} s")
+    harmonics = np.arange(math.ceil(low * duration - 1e-9), math.floor(high * duration + 1e-9) + 1)
+    if len(harmonics) < 3 * len(peaks):
+        raise CalibrationError(
+            f"{len(harmonics)} frequencies between {low:g} and {high:g} Hz in {duration:g} s are too few for "
+            f"{len(peaks)} axes: give a longer duration or a wider band"
+        )
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(duration * RATE)) / RATE
+    tau = np.zeros((len(t), 6))
+    for i, (axis, peak) in enumerate(peaks.items()):
+        shape = _lowest_peak(harmonics[i :: len(peaks)], t / duration, rng)
+        tau[:, AXES.index(axis)] = peak * shape / np.abs(shape).max()
+    tau *= _feasible(tau, vehicle)
+    parts = (("rest", 50), ("baseline", 50), ("excitation", len(t)), ("coast", 100), ("rest", 50))
+    phase = np.concatenate([np.full(count, word) for word, count in parts])
+    full = np.zeros((len(phase), 6))
+    full[phase == "excitation"] = tau
+    return Programme(name=f"multisine_{index}", axes=tuple(peaks), rate=RATE, tau_desired=full, phase=phase)
+
+
+def _lowest_peak(harmonics: NDArray[np.int64], turns: Array, rng: np.random.Generator) -> Array:
+    """The sum of cosines whose random phases give the lowest peak."""
+    draws = (rng.uniform(0.0, 2.0 * math.pi, len(harmonics)) for _ in range(DRAWS))
+    waves = (
+        np.cos(2.0 * math.pi * turns[:, None] * harmonics + phases) @ harmonics**-0.5 for phases in draws
+    )
+    return min(waves, key=lambda wave: float(np.abs(wave).max()))
+
+
+def _feasible(tau: Array, vehicle: Vehicle) -> float:
+    """Return the largest factor up to 1 at which the thrusters give the wrench at every time."""
+    start_warp()
+    allocator = Allocator.from_vehicle(vehicle)
+    weights = np.where(vehicle.wrench_limits > 0.0, 1.0 / np.maximum(vehicle.wrench_limits, 1e-9), 0.0)
+
+    low, high = 0.0, 1.0
+    factor = high
+    for _ in range(11):
+        thrust = allocator.allocate(factor * tau)
+        missing = np.abs(allocator.achieved(thrust) - factor * tau) * weights
+        low, high = (factor, high) if missing.max() < 2e-3 else (low, factor)
+        if low == 1.0:
+            break
+        factor = 0.5 * (low + high)
+    return low
+
+
+KINDS = ("published", "validation", "multisine")
+
+RATE = 50.0
+"""Rate of the commands [Hz]."""
+LONGEST = 3600.0
+"""Duration of a multi-sine [s]."""
+
+STEP_SEQUENCE = (("rest", 1.0), ("baseline", 1.0), ("excitation", 9.0), ("coast", 2.0), ("rest", 1.0))
+"""Pre-zero, baseline, hold, rest, post-zero of the published procedure, by our phase words [s]."""
+
+PULSE_SEQUENCE = (("rest", 1.0), ("baseline", 1.0), ("excitation", 0.6), ("coast", 3.0), ("rest", 1.0))
+"""A pulse and its ring-down [s]."""
+
+PUBLISHED_LEVELS: dict[Axis, tuple[float, ...]] = {
+    "surge": (6.0, 12.0, 18.0),
+    "sway": (4.5, 9.0, 13.5),
+    "heave": (4.5, 9.0, 13.5),
+    "roll": (0.18, 0.36),
+    "pitch": (0.18, 0.36),
+    "yaw": (0.6, 1.2, 1.8),
+}
+"""FinsROV's identification procedure [N, N m]."""
+
+VALIDATION_LEVELS: dict[Axis, tuple[float, ...]] = {
+    "surge": (3.0, 6.0, 9.0, 12.0, 18.0),
+    "sway": (3.0, 6.0, 9.0, 12.0, 18.0),
+    "heave": (6.0, 9.0, 10.0, 12.0),
+    "roll": (0.5, 0.8, 1.0, 1.5),
+    "pitch": (1.0, 2.0, 3.0),
+    "yaw": (1.0, 2.0, 4.0, 6.0, 8.0),
+}
+"""FinsROV's validation sweeps [N, N m]."""
+
+STEADY = 0.8
+"""Fastest surge and sway, part of `level_speed` [-]."""
+FINSROV_LIMITS = (18.586585, 18.068824, 25.636077, 3.791353, 2.535180, 6.947713)
+"""Wrench limits of the vehicle that the published levels are for, order of `AXES` [N, N m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Programme:
+    """Commands over time. Row k is held over [t_k, t_k + 1/rate)."""
+
+    name: str
+    """Unique among the programmes made together; good as the name of a folder."""
+    axes: tuple[Axis, ...]
+    """Axes that it excites."""
+    rate: float
+    """[Hz]"""
+    tau_desired: Array
+    """Wrench about the vehicle's `wrench_reference`, body frame [N, N m], (n, 6)."""
+    phase: NDArray[np.str_]
+    """A word of `finssim.trials.trial.PHASES` for every row, (n,)."""
+    ascent_speed: float | None = None
+    """Speed at which the coast may end early, once the vehicle has risen faster for `ascent_time` [m/s]."""
+    ascent_time: float = 2.0
+    """[s]"""
+
+    @property
+    def t(self) -> Array:
+        """Times of the rows from 0 [s], (n,)."""
+        return np.arange(len(self.phase)) / self.rate
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return len(self.phase) / self.rate
+
+    @property
+    def sha256(self) -> str:
+        """Return the digest of its commands and times."""
+        return hashlib.sha256(self.tau_desired.tobytes() + "".join(self.phase).encode()).hexdigest()
+
+
+def which_axes(names: str | Sequence[str], vehicle: Vehicle) -> tuple[Axis, ...]:
+    """Axes from words.
+
+    Args:
+        names: `all`, a comma-separated list such as `surge,yaw`, or a sequence of names.
+        vehicle: Its `controlled_axes` are what `all` means.
+
+    Raises:
+        CalibrationError: A word is no axis, is given twice, or the vehicle cannot control it.
+    """
+    requested = [w.strip() for w in names.split(",")] if isinstance(names, str) else list(names)
+    if requested == ["all"]:
+        return vehicle.controlled_axes
+    for word in requested:
+        if word not in AXES:
+            raise CalibrationError(f"unknown axis '{word}'; available: all, {', '.join(AXES)}")
+        if word not in vehicle.controlled_axes:
+            able = ", ".join(vehicle.controlled_axes)
+            raise CalibrationError(f"{vehicle.name} cannot control {word}: its thrusters control {able}")
+    if len(set(requested)) < len(requested) or not requested:
+        raise CalibrationError(f"axes are '{','.join(requested)}', expected each axis once")
+    return tuple(axis for axis in AXES if axis in requested)
+
+
+def programmes(
+    axes: str | Sequence[str],
+    vehicle: Vehicle,
+    *,
+    levels: Mapping[str, Sequence[float]] | Sequence[float] | None = None,
+    kind: str = "published",
+    repeats: int = 1,
+    seed: int = 0,
+    coast: float = 30.0,
+    duration: float = 60.0,
+    band: tuple[float, float] = (0.05, 1.0),
+) -> list[Programme]:
+    """Programmes that excite some axes of a vehicle, in the order in which to run them.
+
+    `published` follows FinsROV's identification procedure: on every axis and in both directions, steps of 9 s on surge,
+    sway, heave and yaw, and pulses of 0.6 s with ring-down on roll and pitch. Downward heave steps are followed by a
+    coast of up to `coast` seconds, which shows buoyancy without thrust. `validation` are the finer steps with which
+    FinsROV was validated. `multisine` drives all axes at once, for coupled fits; see `multisine`.
+
+    Levels are FinsROV's, times the ratio of this vehicle's wrench limit to FinsROV's on that axis (two digits), and
+    never above the limit; steps on surge and sway of a vehicle that hovers stay below what tilts it.
+
+    Args:
+        axes: As for `which_axes`.
+        vehicle: Whose limits count.
+        levels: Magnitudes for every axis, or by axis [N, N m]; for a multi-sine the peak. Both directions are driven.
+        kind: One of `KINDS`.
+        repeats: Repeats of every programme.
+        seed: Of a multi-sine's phases.
+        coast: Longest coast after a dive [s].
+        duration: Of one multi-sine [s].
+        band: Of a multi-sine [Hz].
+
+    Raises:
+        CalibrationError: An axis, level, kind or count that cannot be.
+    """
+    chosen = which_axes(axes, vehicle)
+    if kind not in KINDS:
+        raise CalibrationError(f"unknown kind of programme '{kind}'; available: {', '.join(KINDS)}")
+    if repeats < 1:
+        raise CalibrationError(f"repeats is {repeats}, expected at least 1")
+    by_axis = {axis: _levels(axis, vehicle, levels, kind) for axis in chosen}
+    if kind == "multisine":
+        peaks = {axis: values[-1] for axis, values in by_axis.items()}
+        return [
+            multisine(peaks, vehicle, index=r + 1, seed=seed + r, duration=duration, band=band)
+            for r in range(repeats)
+        ]
+    if not (math.isfinite(coast) and coast > 0.0):
+        raise CalibrationError(f"coast is {coast} s, expected a time above 0 s")
+    out = []
+    for axis in chosen:
+        for level in by_axis[axis]:
+            for sign in (1.0, -1.0):
+                out += [_step(axis, sign * level, kind, coast, r, repeats) for r in range(repeats)]
+    return out
+
+
+def _level_limit(axis: Axis, vehicle: Vehicle) -> float:
+    """Return the drag of surge or sway at `STEADY` of the speed at which a hovering vehicle begins to tilt [N]."""
+    i = AXES.index(axis)
+    if i > 1 or not min(vehicle.wrench_limits[:2]) > 0.0:
+        return math.inf
+    model, v = axis_model(vehicle), STEADY * level_speed(vehicle, axis=i)
+    return float(model.linear_damping[i] * v + model.quadratic_damping[i] * v * v) if v < math.inf else v
+
+
+def _levels(
+    axis: Axis, vehicle: Vehicle, levels: Mapping[str, Sequence[float]] | Sequence[float] | None, kind: str
+) -> tuple[float, ...]:
+    """Magnitudes for one axis, ascending."""
+    limit = float(vehicle.wrench_limits[AXES.index(axis)])
+    unit = "N" if AXES.index(axis) < 3 else "N m"
+    requested = levels.get(axis) if isinstance(levels, Mapping) else levels
+    if requested is None:
+        if kind == "multisine":
+            return (0.5 * limit,)
+        limit = min(limit, _level_limit(axis, vehicle))
+        table = VALIDATION_LEVELS if kind == "validation" else PUBLISHED_LEVELS
+        scale = limit / FINSROV_LIMITS[AXES.index(axis)]
+        if abs(scale - 1.0) < 0.01:
+            scale = 1.0
+        return tuple(sorted({min(_two_digits(scale * x), limit) for x in table[axis]}))
+    if not requested:
+        raise CalibrationError(f"levels of {axis}: none given, expected at least one in {unit}")
+    for value in requested:
+        if not (math.isfinite(value) and value > 0.0):
+            raise CalibrationError(
+                f"levels of {axis}: {value:g} {unit} cannot be, expected magnitudes above 0 {unit} "
+                "(both directions are driven)"
+            )
+        if value > limit * (1.0 + 1e-6):
+            raise CalibrationError(
+                f"levels of {axis}: {value:g} {unit} is beyond {vehicle.name}'s limit of {limit:.4g} {unit}"
+            )
+    return tuple(sorted({float(x) for x in requested}))
+
+
+def _two_digits(x: float) -> float:
+    """x rounded to two significant digits, three where it starts with 1."""
+    digits = 2 if f"{x:e}"[0] == "1" else 1
+    return float(f"{x:.{digits}e}")
+
+
+def _step(axis: Axis, level: float, kind: str, coast: float, repeat: int, repeats: int) -> Programme:
+    """One step or pulse."""
+    pulse = kind == "published" and axis in ("roll", "pitch")
+    dive = kind == "published" and axis == "heave" and level < 0.0
+    sequence = PULSE_SEQUENCE if pulse else STEP_SEQUENCE
+    if dive:
+        sequence = (*STEP_SEQUENCE[:3], ("coast", coast), STEP_SEQUENCE[4])
+    counts = [round(seconds * RATE) for _, seconds in sequence]
+    phase = np.repeat(np.array([word for word, _ in sequence]), counts)
+    tau = np.zeros((len(phase), 6))
+    tau[phase == "excitation", AXES.index(axis)] = level
+    word = "dive" if dive else ("plus" if level > 0.0 else "minus")
+    name = f"{axis}_{word}_{abs(level):.4g}" + (f"_{repeat + 1}" if repeats > 1 else "")
+    return Programme(
+        name=name,
+        axes=(axis,),
+        rate=RATE,
+        tau_desired=tau,
+        phase=phase,
+        ascent_speed=0.01 if dive else None,
+    )
+
+
+def write_programme(programme: Programme, vehicle: Vehicle, folder: Path) -> None:
+    """Write what a robot needs to run one programme: `programme.csv` and `programme.yaml`.
+
+    The table has `t` [s], the wrench wanted about `wrench_reference` [N, N m], the thrust of every thruster that the
+    exact allocator gives for it, `force_NAME` [N], and the phase. A row holds until the next.
+
+    Args:
+        programme: What to run.
+        vehicle: Whose thrusters.
+        folder: To write into; made if missing.
+
+    Raises:
+        OutputError: The system refused to write.
+    """
+    thrust = Allocator.from_vehicle(vehicle).allocate(programme.tau_desired)
+    numbers = np.column_stack([programme.t, programme.tau_desired, thrust]).round(6) + 0.0
+    rows = ([*(f"{x:g}" for x in row), word] for row, word in zip(numbers, programme.phase, strict=True))
+    names = ["t", *TAU, *(f"force_{name}" for name in vehicle.thruster_names), "phase"]
+    write_csv(folder / "programme.csv", names, rows)
+    peaks = np.abs(programme.tau_desired).max(axis=0).tolist()
+    about: dict[str, Any] = {
+        "name": programme.name,
+        "vehicle": vehicle.name,
+        "axis": list(programme.axes),
+        "rate": programme.rate,
+        "duration": programme.duration,
+        "wrench_at": [float(x) for x in vehicle.wrench_reference],
+        "peak": {axis: peak for axis, peak in zip(TAU, peaks, strict=True) if peak > 0.0},
+    }
+    if programme.ascent_speed is not None:
+        about["end_coast_early"] = {"ascent_speed": programme.ascent_speed, "after": programme.ascent_time}
+    with atomic_write(folder / "programme.yaml") as path:
+        path.write_text(yaml_text(about), encoding="utf-8")

@@ -1,0 +1,1814 @@
+"""Hydrodynamics by simulation error: numbers with which the simulator, driven as the vehicle was, moves as it did."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.rotations import (
+    quat_conjugate,
+    quat_from_rotvec,
+    quat_multiply,
+    quat_rotate,
+    wrap_angle,
+)
+from finssim.identification.fit import Curve, Estimate, Fit
+from finssim.identification.regression.axis_estimates import (
+    CERTAIN,
+    SET,
+    UNITS,
+    AxisResult,
+    Number,
+    drag_known,
+    hydrostatics,
+)
+from finssim.identification.regression.axis_fit import DAMPING, SIGNIFICANT
+from finssim.identification.regression.plant_terms import matrices
+from finssim.identification.simulation.rollout import (
+    CHANNELS,
+    Response,
+    Rollouts,
+    Segment,
+    Streams,
+    segments,
+    streams,
+)
+from finssim.identification.uncertainty import Covariance, Evidence, degeneracy, intervals, trial_covariance
+from finssim.identification.vehicle_file import scaled_thrust
+from finssim.physics.terms.composed import parameter_row, term_wrenches
+from finssim.sim.plant_arrays import twist_shift
+from finssim.survey.least_squares import (
+    Block,
+    arrow_reduced,
+    block_of,
+    boxed,
+    huber_cost,
+    huber_weight,
+)
+from finssim.trials.conversion import EULER
+from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.trials.inputs import require_axes, require_fittable
+from finssim.trials.motion import Motion
+from finssim.trials.trial import COLUMNS, Trial
+from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
+from finssim.vehicles.terms import TERMS, unit_of
+
+__all__ = ["EXTRAS", "fit_by_simulation"]
+
+Array = NDArray[np.float64]
+
+
+# The fit of simulations to segments; finite differences are worlds.
+
+EXTRAS = ("thrust_scale", "thrust_lag", "thrust_delay", "buoyancy_excess", "k")
+"""Parameters that can be estimated besides the axes' own numbers and the parameters of the vehicle's terms."""
+
+MARGIN = 0.95
+"""Part of the rigid-body inertia that a negative added mass may take away."""
+
+FELT, USUAL_SPEED = 0.02, 0.5
+"""Part of the weight, and speed on each axis [m/s, rad/s]."""
+
+LONGEST_DELAY = 1.0
+"""[s]"""
+
+SHORTEST_LAG = 0.005
+"""Time constant below which a step of the simulation shows no lag [s]."""
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One number that a fit moves."""
+
+    name: str
+    unit: str
+    start: float
+    low: float
+    high: float
+    scale: float
+    """Size of a large change; finite differences take a small share of it as step."""
+
+
+@dataclass(frozen=True)
+class Plants:
+    """Simulator's parameters for W vectors."""
+
+    fields: dict[str, Array]
+    """Fields of `VehicleParameters`, (W, 1, ...)."""
+    bias: Array
+    """Constant wrench that acts, about the body origin, body frame [N, N m], (W, 1, 6)."""
+    lag: Array | None
+    """Time constant of the motors [s], (W,)."""
+    delay: Array | None
+    """[s], (W,)"""
+
+
+def term_coordinate(chosen: HydrodynamicSet, vehicle: Vehicle, path: str) -> Coordinate:
+    """A parameter of a term; a large change of it makes a force of `FELT` of the weight at `USUAL_SPEED`."""
+    terms = tuple(TERMS[name] for name in sorted(chosen.terms))
+    numbers = chosen.term_parameters
+    start = float(numbers[path])
+    rows = [parameter_row(terms, numbers | {path: x}) for x in (start, start + 1.0)]
+    nu = USUAL_SPEED * np.array([[1.0, 1.0, 1.0, 1.0, 1.0, 1.0]])
+    tau = term_wrenches(terms, rows, nu, [[0.0, 0.0, 1.0]], 1.0, vehicle.water.density)[0]
+    change = float(np.abs(tau[1] - tau[0]).max())
+    scale = max(abs(start), FELT * vehicle.weight / change if change > 0.0 else 1.0)
+    return Coordinate(path, unit_of(path), start, *chosen.term_scalars[path], scale)
+
+
+class Parameters:
+    """The free numbers of a fit.
+
+    Every coordinate lies in a box, and every vector of the box gives a plant with positive definite M_RB + M_A and
+    damping that takes energy out: the bounds of a diagonal fit are d1, d2 >= 0 and an added mass that leaves M_RB
+    positive definite even if all axes are at their bounds. A box, because damping
+    may well be exactly zero: a logarithm never reaches it and would make its interval look like an estimate's.
+
+    Attributes:
+        coordinates: In the order of a vector.
+        expected: The vehicle file's numbers, (P,).
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        axes: Sequence[str],
+        damping: dict[str, str],
+        extras: Sequence[str] = (),
+        biases: Sequence[str] = (),
+        start: Mapping[str, float] | None = None,
+        imposed: Sequence[str] = (),
+        unseen: Sequence[str] = (),
+        retained: Sequence[str] = (),
+    ) -> None:
+        """Choose what is free.
+
+        Args:
+            vehicle: Gives the start and everything that is not free.
+            axes: Whose added mass and damping are free.
+            damping: `linear`, `quadratic` or `both` by axis; what is left out is zero.
+            extras: Of `EXTRAS`, and parameters of the vehicle's terms, such as `lift.coefficient`.
+            biases: Axes with a constant wrench b, about the set's reference point and on the side of the damping:
+                M nu_dot + D nu + b = tau.
+            start: Coordinate -> where it starts, in place of the vehicle file's number.
+            imposed: Axes that are not fitted: their added mass alone is free, for its momentum turns and pushes the
+                others. Their coordinates come last.
+            unseen: Those of `imposed` that no trial measured, and that therefore are simulated: their drag is free too.
+            retained: Damping that is not free and stays the vehicle file's, such as `pitch.d2`.
+
+        Raises:
+            CalibrationError: The calibrated set holds no coefficients.
+        """
+        plant, chosen = matrices(vehicle), vehicle.hydrodynamics["calibrated"]
+        assert isinstance(chosen, HydrodynamicSet)
+        self.vehicle, self.set = vehicle, chosen
+        self.axes = tuple(a for a in AXES if a in axes)
+        self.imposed = tuple(a for a in AXES if a in imposed)
+        self.unseen = tuple(a for a in self.imposed if a in unseen)
+        self.index = np.array([AXES.index(a) for a in self.axes], int)
+        self.damping, self.extras, self.retained = damping, tuple(extras), tuple(retained)
+        self.terms = tuple(path for path in self.set.term_scalars if path in extras)
+        self.biases = tuple(a for a in AXES if a in biases)
+        self.r_h = np.asarray(self.set.reference_point, float)
+        self.H, self.M_RB, self.M_A = plant.H, plant.M_RB, plant.M_A
+        self.D1, self.D2 = plant.D1, plant.D2
+        for a, i in zip(self.axes, self.index, strict=True):
+            if damping[a] == "linear" and f"{a}.d2" not in retained:
+                self.D2[i, :] = self.D2[:, i] = 0.0
+            elif damping[a] == "quadratic" and f"{a}.d1" not in retained:
+                self.D1[i, :] = self.D1[:, i] = 0.0
+        self.coordinates = tuple(self._coordinates())
+        self.names = tuple(c.name for c in self.coordinates)
+        self.start, self.low, self.high, self.scale = (
+            np.array([getattr(c, name) for c in self.coordinates], float)
+            for name in ("start", "low", "high", "scale")
+        )
+        self.expected = np.clip(self.start, self.low, self.high)
+        self._at = {name: i for i, name in enumerate(self.names)}
+        for name, value in (start or {}).items():
+            if name in self._at:
+                self.start[self._at[name]] = value
+        self.start = np.clip(self.start, self.low, self.high)
+
+    # -- coordinates --------------------------------------------------------------------------------------------
+
+    def _coordinates(self) -> list[Coordinate]:
+        kinds = {"linear": ("d1",), "quadratic": ("d2",), "both": ("d1", "d2")}
+        out = []
+        for axis, floor in zip(self.axes, self.mass_floor().tolist(), strict=True):
+            out += [self._of_axis(axis, "added_mass", floor)]
+            out += [self._of_axis(axis, kind) for kind in kinds[self.damping[axis]]]
+        w, inf = self.vehicle, np.inf
+        weight, B = w.weight, w.buoyancy
+        z = self.r_h[2]
+        k = B * (w.body.center_of_buoyancy[2] - z) - weight * (w.body.center_of_gravity[2] - z)
+        tc = float(np.mean([t.time_constant for t in w.thrusters.values()]))
+        late = float(np.mean([t.delay for t in w.thrusters.values()]))
+        table = {
+            "thrust_scale": ("-", 1.0, 0.05, 20.0, 1.0),
+            "thrust_lag": ("s", max(tc, 0.02), SHORTEST_LAG, 5.0, 2.0),
+            "thrust_delay": ("s", late, 0.0, LONGEST_DELAY, 0.2),
+            "buoyancy_excess": ("N", B - weight, -0.9 * weight, 10.0 * weight, 0.02 * weight),
+            "k": ("N m/rad", max(float(k), 1e-3), 0.0, inf, max(float(k), 0.02 * B)),
+        }
+        out += [Coordinate(name, *numbers) for name, numbers in table.items() if name in self.extras]
+        out += [term_coordinate(self.set, w, path) for path in self.terms]
+        out += [self._of_axis(axis, "bias", -inf) for axis in self.biases]
+        for axis in self.imposed:
+            i = AXES.index(axis)
+            out.append(self._of_axis(axis, "added_mass", min(float(self.M_A[i, i]), 0.0)))
+        return out + [self._of_axis(axis, kind) for axis in self.unseen for kind in ("d1", "d2")]
+
+    def _of_axis(self, axis: str, kind: str, low: float = 0.0) -> Coordinate:
+        """An axis' own added mass, d1, d2 or bias, from the vehicle file's number on."""
+        i = AXES.index(axis)
+        m, bias = float((self.M_RB + self.M_A)[i, i]), np.zeros((6, 6))
+        own, size = {
+            "added_mass": (self.M_A, m),
+            "d1": (self.D1, m),
+            "d2": (self.D2, 3.0 * m),
+            "bias": (bias, max(0.5 * m, 1e-3)),
+        }[kind]
+        unit = UNITS["m_eff" if kind == "added_mass" else kind][i > 2]
+        return Coordinate(f"{axis}.{kind}", unit, float(own[i, i]), low, np.inf, size)
+
+    @property
+    def nuisances(self) -> int:
+        """Return the number of nuisance coordinates, which are the last ones."""
+        return len(self.imposed) + 2 * len(self.unseen)
+
+    def mass_floor(self) -> Array:
+        """Lowest added mass of each free axis, (n,): M stays positive definite with all of them there.
+
+        M_RB (or, where the file couples axes, all of M) less κ diag(c), c = 1/diag(M⁻¹), is positive definite for κ
+        below the smallest eigenvalue of M scaled by c.
+        """
+        couplings = self.M_A - np.diag(np.diag(self.M_A))
+        M, base = (
+            (self.M_RB, np.zeros(6)) if not couplings.any() else (self.M_RB + self.M_A, np.diag(self.M_A))
+        )
+        c = 1.0 / np.diag(np.linalg.inv(M))
+        kappa = MARGIN * float(np.linalg.eigvalsh(M / np.sqrt(np.outer(c, c)))[0])
+        return np.asarray((base - kappa * c)[self.index])
+
+    # -- plants -------------------------------------------------------------------------------------------------
+
+    def value(self, x: Array, name: str, default: float | None = None) -> Any:
+        """Column of a coordinate in vectors (W, P), or a default."""
+        return x[:, self._at[name]] if name in self._at else default
+
+    def matrices(self, x: Array) -> tuple[Array, Array, Array]:
+        """M_A, D1 and D2 at the set's reference point, (W, 6, 6) each."""
+        x = np.clip(np.atleast_2d(x), self.low, self.high)
+        M_A, D1, D2 = (np.repeat(m[None], len(x), axis=0) for m in (self.M_A, self.D1, self.D2))
+        for name, c in self._at.items():
+            axis, _, kind = name.partition(".")
+            if axis in AXES and kind != "bias":
+                i = AXES.index(axis)
+                {"added_mass": M_A, "d1": D1, "d2": D2}[kind][:, i, i] = x[:, c]
+        return M_A, D1, D2
+
+    def buoyancy_height(self, k: Any, volume: Any) -> Any:
+        """z of the centre of buoyancy [m] that gives a stiffness k about the set's reference point [N m/rad]."""
+        water, z = self.vehicle.water, self.r_h[2]
+        gravity_part = self.vehicle.weight * (self.vehicle.body.center_of_gravity[2] - z)
+        return z + (k + gravity_part) / (water.density * water.gravity * volume)
+
+    def plants(self, x: Array) -> Plants:
+        """Return the simulator's parameters.
+
+        Args:
+            x: Vectors, (W, P); numbers outside the box count as on its edge.
+        """
+        x = np.clip(np.atleast_2d(x), self.low, self.high)
+        W = len(x)
+        M_A, D1, D2 = self.matrices(x)
+        fields: dict[str, Array] = {}
+        if self.axes or self.imposed:
+            M_A = self.H.T @ M_A @ self.H
+            fields |= {"M_A": M_A[:, None], "D1": D1[:, None], "D2": D2[:, None]}
+        water, body = self.vehicle.water, self.vehicle.body
+        volume = np.full(W, body.displaced_volume)
+        if "buoyancy_excess" in self._at:
+            weight = self.vehicle.weight
+            volume = (weight + self.value(x, "buoyancy_excess")) / (water.density * water.gravity)
+            fields["volume"] = volume[:, None]
+        if "k" in self._at:
+            r_b = np.tile(np.asarray(body.center_of_buoyancy, float), (W, 1, 1))
+            r_b[:, 0, 2] = self.buoyancy_height(self.value(x, "k"), volume)
+            fields["r_b"] = r_b
+        for path in self.terms:
+            fields[path] = self.value(x, path)[:, None]
+        if "thrust_scale" in self._at:
+            fields["gain"] = np.repeat(self.value(x, "thrust_scale")[:, None, None], 8, axis=-1)
+        bias = np.zeros((W, 1, 6))
+        for axis in self.biases:
+            bias[:, 0, AXES.index(axis)] = -self.value(x, f"{axis}.bias")
+        return Plants(
+            fields=fields,
+            bias=bias @ self.H,
+            lag=self.value(x, "thrust_lag"),
+            delay=self.value(x, "thrust_delay"),
+        )
+
+
+CUT = 2.5
+"""Whitened residual above which Huber's loss grows linearly."""
+
+CLOSE = 0.25
+"""Part of a standard error (of independent noise) that a converged estimate may still be off."""
+
+DAMPINGS = np.array([1e-2, 1e-1, 1.0, 1e1, 1e2, 1e4])
+"""Factors on the damping that are tried together."""
+
+SMALL = 0.05
+"""Decrease of half the sum of losses below which iteration ends: an error of a third of a standard error."""
+
+
+class Point(NamedTuple):
+    """Values of all unknowns; with a leading axis of candidates where several are evaluated together."""
+
+    theta: Array
+    """Shared by all segments, (P,)."""
+    z: Array
+    """Coordinates of each segment, as deviations from the prior's mean, (S, q)."""
+
+
+class Linear(NamedTuple):
+    """Residuals at a point, sorted by segment, and derivatives of the predictions."""
+
+    residual: Array
+    """Measured minus predicted, (N,)."""
+    shared: Array
+    """d predicted / d theta, (N, P)."""
+    own: Array
+    """d predicted / d z of the sample's own segment, (N, q)."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """End of a fit."""
+
+    point: Point
+    std: Array
+    """Standard deviation of every sample, (N,)."""
+    cost: float
+    """Half the sum of the losses."""
+    linear: Linear
+    iterations: int
+    converged: bool
+    """True if the last step is negligible relative to the error that independent noise would leave."""
+    step: Array
+    """Change of theta by an undamped step, (P,)."""
+    interrupted: bool = False
+
+
+def weights_of(residual: Array, std: Array, cut: float = CUT) -> Array:
+    """Huber's weights over the variance of the samples, (N,)."""
+    return huber_weight(np.abs(residual / std), cut) / std**2
+
+
+def blocks_of(problem: Shooting, linear: Linear, std: Array, point: Point, cut: float = CUT) -> list[Block]:
+    """Weighted normal equations of every segment with the prior of z; that of theta is in the first."""
+    root = np.sqrt(weights_of(linear.residual, std, cut))
+    shared, own, residual = linear.shared * root[:, None], linear.own * root[:, None], linear.residual * root
+    blocks = []
+    for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
+        block, stiff = block_of(shared[a:b], own[a:b], residual[a:b]), problem.prior_std[s] ** -2.0
+        blocks.append(block._replace(bb=block.bb + np.diag(stiff), b=block.b - stiff * point.z[s]))
+    known, first = problem.prior_precision, blocks[0]
+    blocks[0] = first._replace(
+        aa=first.aa + np.diag(known), a=first.a - known * (point.theta - problem.prior_mean)
+    )
+    return blocks
+
+
+def step_of(
+    problem: Shooting, reduced: tuple[Array, Array, list[Array]], point: Point, damping: float
+) -> tuple[Array, Array, Array]:
+    """Steps of theta (P,) inside the box and of z (S, q), and standard errors of theta, (P,).
+
+    Args:
+        problem: For its box.
+        reduced: Normal equations of theta alone at the point, and how z follows; of `arrow_reduced`.
+        point: Where the step begins.
+        damping: What the diagonal of theta's grows by, as a part of itself [-].
+    """
+    total, right, inners = reduced
+    scale = np.sqrt(np.maximum(np.diagonal(total), 1e-30 + 1e-12 * np.diagonal(total).max()))
+    A = total / np.outer(scale, scale) + (damping + 1e-9) * np.eye(len(scale))
+    low, high = problem.low - point.theta, problem.high - point.theta
+    step = boxed(A, right / scale, np.minimum(low * scale, -1e-12), np.maximum(high * scale, 1e-12)) / scale
+    z = np.array([inner[:, -1] - inner[:, :-1] @ step for inner in inners])
+    return step, z, np.sqrt(np.diagonal(np.linalg.inv(A))) / scale
+
+
+def costs_of(problem: Shooting, residual: Array, std: Array, points: Point, cut: float = CUT) -> Array:
+    """Half the losses of several points with residuals (N, C), (C,); infinite where one has no answer."""
+    prior = np.square(points.z / problem.prior_std).sum(axis=(1, 2))
+    prior = prior + (points.theta - problem.prior_mean) ** 2 @ problem.prior_precision
+    loss = np.array([huber_cost(np.abs(column / std), cut) for column in residual.T])
+    return np.asarray(np.where(np.isfinite(loss), 0.5 * (loss + prior), np.inf))
+
+
+def solve(
+    problem: Shooting,
+    start: Point,
+    *,
+    iterations: int = 30,
+    std: Array | None = None,
+    rough: bool = False,
+    report: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """Fit; noise and robust weights are estimated along the way.
+
+    Converged where the undamped step moves no judged parameter by more than `CLOSE` of its standard error and grain
+    together, and the noise no longer changes.
+
+    Args:
+        problem: What to fit.
+        start: Where to begin.
+        iterations: At most.
+        std: Of every sample at the start, (N,); from the residuals there if None.
+        rough: Far from a solution: keep `std`, and let no residual count as an outlier, for that is what a wrong
+            parameter looks like too. Ends as soon as an iteration gains less than a hundredth.
+        report: Called with each iteration and the root mean square of the whitened residuals.
+
+    Returns:
+        The best point; after Ctrl-C the best until then, with `interrupted`.
+    """
+    point, damping, done = start, 1e-2, 0
+    linear = problem.linearise(point)
+    if not np.isfinite(linear.residual).all():
+        return Solution(
+            point, np.ones(len(linear.residual)), np.inf, linear, 0, False, np.full(len(point.theta), np.inf)
+        )
+    std = problem.noise(linear.residual) if std is None else std
+    converged, interrupted, settled, cut = False, False, rough, np.inf if rough else CUT
+    step = np.full(len(point.theta), np.inf)
+
+    def cost_at(std: Array) -> float:
+        one = Point(point.theta[None], point.z[None])
+        return float(costs_of(problem, linear.residual[:, None], std, one, cut)[0])
+
+    cost = cost_at(std)
+    try:
+        for done in range(1, iterations + 1):
+            if report:
+                report(done, float(np.sqrt(2.0 * cost / max(len(std), 1))))
+            reduced = arrow_reduced(blocks_of(problem, linear, std, point, cut), 0.0)
+            step, _, error = step_of(problem, reduced, point, 0.0)
+            near = error + problem.grain(point.theta)
+            remaining = float(np.max(np.abs(step / near)[: problem.judged], initial=0.0))
+            if settled and remaining < CLOSE:
+                converged = True
+                break
+            steps = [step_of(problem, reduced, point, damping * factor) for factor in DAMPINGS]
+            points = Point(
+                np.clip(point.theta + np.array([theta for theta, _, _ in steps]), problem.low, problem.high),
+                point.z + np.array([z for _, z, _ in steps]),
+            )
+            costs = costs_of(problem, problem.residuals(points), std, points, cut)
+            best = int(np.argmin(costs))
+            if costs[best] < cost:
+                damping = float(np.clip(damping * DAMPINGS[best], 1e-9, 1e9))
+                stuck = cost - costs[best] < (1e-2 * cost if rough else SMALL)
+                point = Point(points.theta[best], points.z[best])
+                linear = problem.linearise(point)
+            else:
+                damping = min(damping * 1e5, 1e12)
+                stuck = damping >= 1e12
+            new = std if rough else problem.noise(linear.residual)
+            settled = rough or bool(np.all(np.abs(np.log(new / std)) < 0.01)) or done > 12
+            if stuck and settled:
+                converged = remaining < 1.0
+                break
+            if not settled:
+                std, damping = new, min(damping, 1e-2)
+            cost = cost_at(std)
+    except KeyboardInterrupt:
+        interrupted = True
+    return Solution(point, std, cost, linear, done, converged, step, interrupted)
+
+
+# What a simulation would have measured, against what was measured.
+
+
+class Residuals:
+    """Samples of all segments in one list, sorted by segment, then by channel.
+
+    Attributes:
+        names: Channels in use.
+        channel: Index into `names` of each sample, (N,).
+        segment: Index of its segment, (N,).
+        edges: First sample of each segment, and N, (S + 1,).
+        value: Measured, (N,).
+        time: Since the segment's start [s], (N,).
+    """
+
+    def __init__(self, segments: Sequence[Segment], channels: Sequence[str]) -> None:
+        """Collect the samples of some channels."""
+        self.segments = tuple(segments)
+        self.names = tuple(c for c in CHANNELS if c in channels and any(c in s.measured for s in segments))
+        rows: dict[str, list[Array]] = {k: [] for k in ("segment", "channel", "time", "value")}
+        for i, s in enumerate(segments):
+            for j, name in enumerate(self.names):
+                t, values = s.measured.get(name, (np.empty(0), np.empty(0)))
+                rows["segment"].append(np.full(len(t), i))
+                rows["channel"].append(np.full(len(t), j))
+                rows["time"].append(t / s.step)
+                rows["value"].append(values)
+        joined = {k: np.concatenate(v) if v else np.empty(0) for k, v in rows.items()}
+        self.segment, self.channel = joined["segment"].astype(int), joined["channel"].astype(int)
+        self.value, time = joined["value"], joined["time"]
+        self.time = time * segments[0].step
+        self._steps = np.array([s.steps for s in segments])[self.segment]
+        self.edges = np.searchsorted(self.segment, np.arange(len(segments) + 1))
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    def predicted(self, response: Response, late: Array) -> tuple[Array, Array]:
+        """Return the readings of every candidate's sensors at the samples' times, and their rate of change.
+
+        Args:
+            response: Of the candidates.
+            late: By how much each sample lags what it shows [s], (N, C) or (N, 1).
+
+        Returns:
+            (N, C) each [unit of the channel, and the same per second]; NaN where a candidate diverged. Before a
+            segment's start it is extrapolated in a straight line.
+        """
+        step = self.segments[0].step
+        candidates = response.nu.shape[1]
+        value, rate = (np.empty((len(self), candidates)) for _ in range(2))
+        for j, name in enumerate(self.names):
+            which = np.flatnonzero(self.channel == j)
+            grid = channel(name, response, self.segments)
+            for c in range(late.shape[1]):
+                those = slice(None) if late.shape[1] == 1 else slice(c, c + 1)
+                at = (self.time[which] - late[which, c]) / step
+                row = np.clip(np.floor(at).astype(int), 0, self._steps[which] - 1)
+                segment = self.segment[which]
+                a = grid[row, those, segment].astype(float)
+                rise = grid[row + 1, those, segment].astype(float) - a
+                if name in EULER:
+                    rise = wrap_angle(rise)
+                value[which, those] = a + (at - row)[:, None] * rise
+                rate[which, those] = rise / step
+        return value, rate
+
+    def difference(self, predicted: Array) -> Array:
+        """Measured minus predicted, angles the short way round, (N, C)."""
+        out = self.value[:, None] - predicted
+        for j, name in enumerate(self.names):
+            if name in EULER:
+                which = self.channel == j
+                out[which] = wrap_angle(out[which])
+        return np.asarray(out)
+
+    def noise(self, residual: Array, floor: Array) -> Array:
+        """Standard deviation of each channel from clipped residuals, (channels,).
+
+        Args:
+            residual: Measured minus predicted, (N,).
+            floor: Smallest per channel, (channels,).
+        """
+        out = np.array(floor, float)
+        for j in range(len(self.names)):
+            r = residual[self.channel == j]
+            r = np.abs(r[np.isfinite(r)])
+            sigma = 1.4826 * float(np.median(r)) if len(r) else 0.0
+            sigma = sigma or float(np.sqrt(np.mean(r**2))) if len(r) else floor[j]
+            for _ in range(10):
+                # The factor undoes the clipping for a normal distribution at 2.5 standard deviations.
+                sigma = (
+                    1.011 * float(np.sqrt(np.mean(np.minimum(r, CUT * sigma) ** 2))) if sigma > 0.0 else 0.0
+                )
+            out[j] = max(sigma, floor[j])
+        return out
+
+    def spread(self) -> Array:
+        """Range from the 2nd to the 98th percentile of each channel, the largest of the segments, (channels,)."""
+        out = np.zeros(len(self.names))
+        for a, b in zip(self.edges, self.edges[1:], strict=False):
+            for j in np.unique(self.channel[a:b]):
+                values = self.value[a:b][self.channel[a:b] == j]
+                out[j] = max(out[j], float(np.ptp(np.percentile(values, [2.0, 98.0]))))
+        return out
+
+    def roughness(self) -> Array:
+        """Noise of each channel from third differences of successive samples, robust, (channels,)."""
+        out = np.zeros(len(self.names))
+        for j in range(len(self.names)):
+            parts = [
+                np.diff(self.value[a:b][self.channel[a:b] == j], 3)
+                for a, b in zip(self.edges, self.edges[1:], strict=False)
+            ]
+            d = np.abs(np.concatenate(parts)) if parts else np.empty(0)
+            out[j] = (
+                float(np.sqrt(np.mean(np.minimum(d, 3.0 * 1.4826 * np.median(d) + 1e-12) ** 2) / 20.0))
+                if len(d)
+                else 0.0
+            )
+        return out
+
+
+def channel(name: str, response: Response, segments: Sequence[Segment]) -> NDArray[np.float32]:
+    """A measured column on the simulation's grid.
+
+    Args:
+        name: Of `CHANNELS`.
+        response: Of every candidate over these segments.
+        segments: Give the sensors' places.
+
+    Returns:
+        (n + 1, C, S)
+    """
+    nu, q = response.nu, response.quaternion
+    if name in ("p", "q", "r"):
+        return nu[..., 3 + "pqr".index(name)]
+    if name in ("u", "v", "w"):
+        i = "uvw".index(name)
+        at = np.stack([s.velocity_at for s in segments]).astype(np.float32)
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out = nu[..., i] + (nu[..., 3 + j] * at[:, k] - nu[..., 3 + k] * at[:, j] if at.any() else 0.0)
+        in_water = np.array([s.velocity_in_water for s in segments])
+        if in_water.any():
+            flow = np.stack([s.current for s in segments])
+            body = quat_rotate(quat_conjugate(q), np.broadcast_to(flow, (*q.shape[1:3], 3)))[..., i]
+            out = out - np.where(in_water, body, 0.0)
+        return np.asarray(out, np.float32)
+    if name in EULER:
+        return euler_angle(name, q)
+    sensor = "depth_at" if name == "depth" else "position_at"
+    at = np.stack([getattr(s, sensor) for s in segments])
+    i = 2 if name == "depth" else "xyz".index(name)
+    out = response.position[..., i] + (quat_rotate(q, at)[..., i] if at.any() else 0.0)
+    return np.asarray(-out if name == "depth" else out, np.float32)
+
+
+def euler_angle(name: str, q: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Roll, pitch or yaw of unit quaternions, in their own precision, (..., 4) -> (...)."""
+    x, y, z, w = (q[..., i] for i in range(4))
+    if name == "roll":
+        return np.asarray(np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)))
+    if name == "yaw":
+        return np.asarray(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    return np.asarray(np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0)))
+
+
+# Errors of sensors that a fit allows for: offsets of a stretch, and streams that come late.
+
+STREAMS = {
+    "velocity": ("u", "v", "w"),
+    "rates": ("p", "q", "r"),
+    "attitude": ("roll", "pitch", "yaw"),
+    "position": ("x", "y", "z"),
+    "depth": ("depth",),
+}
+"""Channels that share a clock."""
+
+OFFSETS = {"p": 0.02, "q": 0.02, "r": 0.02, "roll": 0.03, "pitch": 0.03, "depth": 0.1}
+"""Channels with an offset that is constant over a segment, and its standard deviation: biases of gyroscopes [rad/s],
+levels that were mounted askew [rad], pressure at the surface [m]."""
+
+LATEST = 0.3
+"""Greatest lag or lead of a stream relative to the inputs [s]."""
+
+LATE_STD = 0.05
+"""Prior standard deviation of the lag of streams [s]: noisy data do not distinguish a lag from inertia."""
+
+
+# Where each segment begins: what was measured there, and how far a fit may move it.
+
+STATES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
+"""Numbers of an initial state: nu, a small turn about the body axes [rad], a world displacement [m]."""
+
+UNKNOWN = np.array([0.5, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 1e-6, 1e-6, 1e-6, 1e-6])
+"""Standard deviation of unmeasured values; heading and place do not matter then."""
+
+LOOSE = np.array([0.2, 0.2, 0.2, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
+"""Standard deviation of measured and compared values: wide, for the same measurements count as residuals."""
+
+TIGHT = np.array([0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.02, 0.02, 0.02, 0.03, 0.03, 0.03])
+"""Standard deviation of measured values that are not compared."""
+
+SHOWN_BY = (
+    *(("u", "x", "y"), ("v", "x", "y"), ("w", "z", "depth"), ("p", "roll"), ("q", "pitch"), ("r", "yaw")),
+    *(("roll",), ("pitch",), ("yaw",), ("x",), ("y",), ("z", "depth")),
+)
+"""Channels that show a state, in the order of `STATES`."""
+
+STEPS = np.array([0.002] * 9 + [0.005] * 3)
+"""Steps of the finite differences: small, for instability multiplies them."""
+
+
+RELATIVE_STEP = 0.006
+"""Step of the finite differences, relative to a coordinate's size: single precision leaves them three digits."""
+
+GRAIN = 0.004
+"""Share of a number that is negligible."""
+
+COARSE = 0.05
+"""Size of residuals relative to a channel's range that counts as small while the parameters are far off."""
+
+VAGUE = 8.0
+"""Prior standard deviation of a fitted number: the file's value within so many times its scale."""
+
+EXACT_CLOCK = 1e-3
+"""Greatest lag of the stream that serves as the clock [s]."""
+
+FLOOR = 1e-4
+"""Smallest noise of a channel, against the range it covers: below it are the simulation's own errors."""
+
+
+class Shooting:
+    """Residuals of segments under parameters and initial states.
+
+    Attributes:
+        streams: Names of the streams in use; each may lag the inputs.
+        offsets: Names of the channels with an offset of their own in every segment.
+        free: Which of `STATES` a fit moves from the measured ones, indices (q,): velocities and tilt everywhere,
+            heading and place where some segment knows them.
+        edges: First sample of each segment, and N, (S + 1,).
+        low: Least theta, (P,).
+        high: Largest theta, (P,).
+        prior_std: Of z around zero, (S, q).
+        prior_mean: What is known of theta beforehand, (P,).
+        prior_precision: One over its variance; 0 where nothing is known, (P,).
+        judged: How many of theta, from the first, have to be accurate; the rest are there for their sake.
+    """
+
+    def __init__(
+        self,
+        segments: Sequence[Segment],
+        parameters: Parameters,
+        channels: Sequence[str],
+        *,
+        lagged: NDArray[np.bool_] | None = None,
+        few: bool = False,
+    ) -> None:
+        """Set up.
+
+        Args:
+            segments: What to fit.
+            parameters: What is free.
+            channels: Measured columns to compare.
+            lagged: Which segments' inputs an estimated lag or delay acts on, (S,); the commanded ones if None.
+            few: Whether some axis is excited by too few trials to show how trials differ.
+        """
+        self.segments, self.parameters = tuple(segments), parameters
+        self.measured = Residuals(segments, channels)
+        names = self.measured.names
+        known = np.stack([s.known for s in segments])
+        self.free = np.concatenate([np.arange(8), 8 + np.flatnonzero(known[:, 8:].any(axis=0))])
+        seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
+        states_std = np.where(known, np.where(seen, LOOSE, TIGHT), UNKNOWN)[:, self.free]
+        self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(names))
+        # The initial height already takes up an offset of the depth, unless z is measured too.
+        self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
+        stream_of = {c: i for i, stream in enumerate(self.streams) for c in STREAMS[stream]}
+        self._stream = np.array([stream_of[c] for c in names], int)[self.measured.channel]
+        rows = [names.index(name) for name in self.offsets]
+        self._offset = (self.measured.channel[:, None] == np.array(rows, int)).astype(float)
+        self.rollouts = Rollouts(
+            parameters.vehicle,
+            segments,
+            max_delay=LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5,
+        )
+        self.edges = self.measured.edges
+        self.groups = np.array([s.index for s in segments])
+        self.few = few
+        self.judged = len(parameters.names) - parameters.nuisances
+        far = np.full(len(self.streams), LATEST)
+        self.low = np.concatenate([parameters.low, -far])
+        self.high = np.concatenate([parameters.high, far])
+        # Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a
+        # solution, over short segments, nothing else keeps them finite. Streams agree on the time to hundredths
+        # of a second.
+        self.prior_mean = np.concatenate([parameters.expected, 0.0 * far])
+        imposed = np.arange(len(parameters.low)) >= self.judged
+        wide = [VAGUE * (name != "thrust_scale") for name in parameters.names]
+        size = np.where(imposed, 1.0, np.array(wide, float)) * parameters.scale
+        known = np.where(size > 0.0, np.maximum(size, 1e-150) ** -2.0, 0.0)
+        self.prior_precision = np.concatenate([known, 0.0 * far + LATE_STD**-2.0])
+        if "thrust_delay" in parameters.names:
+            # A common lag of all streams is a delay of the thrust: the first stream is the clock then.
+            self.prior_precision[len(parameters.names)] = EXACT_CLOCK**-2.0
+        offsets_std = np.tile([OFFSETS[c] for c in self.offsets], (len(segments), 1))
+        self.prior_std = np.concatenate([states_std, offsets_std], axis=1)
+        self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
+        self._floor = FLOOR * self.measured.spread() + 1e-12
+        self.first_noise = np.maximum(self.measured.roughness(), self._floor)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of theta: the parameters, then the lags of the streams [s]."""
+        return self.parameters.names + tuple(f"{stream}.late" for stream in self.streams)
+
+    def start(self) -> Point:
+        """The vehicle file's numbers, the measured initial states, no errors of sensors."""
+        rest = np.zeros(len(self.low) - len(self.parameters.names))
+        return Point(np.concatenate([self.parameters.start, rest]), np.zeros(self.prior_std.shape))
+
+    def cost(self, point: Point) -> float:
+        """Half the loss of one point, with what counts as large residuals far from a solution; clocks agree."""
+        one = Point(point.theta[None], point.z[None])
+        return float(costs_of(self, self.residuals(one), self.size(), one)[0])
+
+    def residuals(self, points: Point) -> Array:
+        """Measured minus predicted of several points, (N, C)."""
+        return self._residual(points, self._predicted(points)[0])
+
+    def _residual(self, points: Point, value: Array) -> Array:
+        offset, out = points.z[..., len(self.free) :], np.zeros((len(self.measured), len(points.z)))
+        for k in range(offset.shape[2]):
+            out += self._offset[:, k : k + 1] * offset[:, self.measured.segment, k].T
+        return self.measured.difference(value + out)
+
+    def _predicted(self, points: Point) -> tuple[Array, Array]:
+        """Return the readings of sensors without offsets and their rate of change, (N, C) each."""
+        P, C = len(self.parameters.names), len(points.theta)
+        p = self.parameters.plants(points.theta[:, :P])
+        fields = dict(p.fields)
+        own = self.rollouts.own
+        for name, values in (("time_constant", p.lag), ("delay", p.delay)):
+            if values is not None:
+                tail = (1,) * (own[name].ndim - 1)
+                mask = self.lagged.reshape(-1, *tail)
+                fields[name] = np.where(mask, values.reshape(-1, 1, *tail), own[name])
+        full = np.zeros((*points.z.shape[:2], 12))
+        full[..., self.free] = points.z[..., : len(self.free)]
+        nu, quaternion, position = (
+            np.stack([getattr(s, name) for s in self.segments]) for name in ("nu", "quaternion", "position")
+        )
+        initial = {
+            "nu": nu + full[..., :6],
+            "quaternion": quat_multiply(quaternion, quat_from_rotvec(full[..., 6:9])),
+            "position": position + full[..., 9:],
+        }
+        response = self.rollouts.run(fields, initial=initial, disturbance=p.bias, candidates=C)
+        late = points.theta[:, P:]
+        same = bool((late == late[:1]).all())
+        return self.measured.predicted(response, (late[:1] if same else late).T[self._stream])
+
+    def linearise(self, point: Point) -> Linear:
+        """Residuals and derivatives: central differences for what moves the vehicle, exact for what sensors add."""
+        points, wide = self._neighbours(point)
+        value, rate = self._predicted(points)
+        rise = value[:, 1::2] - value[:, 2::2]
+        for j, name in enumerate(self.measured.names):
+            if name in EULER:
+                which = self.measured.channel == j
+                rise[which] = wrap_angle(rise[which])
+        slopes = np.nan_to_num(rise / wide)
+        rate = np.nan_to_num(rate[:, :1])
+        late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -rate, 0.0)
+        P = len(self.parameters.names)
+        one = Point(*(part[:1] for part in points))
+        return Linear(
+            self._residual(one, value[:, :1])[:, 0],
+            np.concatenate([slopes[:, :P], late], axis=1),
+            np.concatenate([slopes[:, P:], self._offset], axis=1),
+        )
+
+    def _neighbours(self, point: Point) -> tuple[Point, Array]:
+        """The point, one on either side of it for every unknown that moves the vehicle, and their distances."""
+        P = len(self.parameters.names)
+        count, steps = P + len(self.free), STEPS[self.free]
+        theta, z = (np.repeat(part[None], 1 + 2 * count, axis=0) for part in point)
+        up, down = 1 + 2 * np.arange(count), 2 + 2 * np.arange(count)
+        i = np.arange(P)
+        step = RELATIVE_STEP * np.maximum(np.abs(point.theta[:P]), 0.25 * self.parameters.scale)
+        theta[up[:P], i] = np.minimum(point.theta[:P] + step, self.high[:P])
+        theta[down[:P], i] = np.maximum(point.theta[:P] - step, self.low[:P])
+        wide = theta[up[:P], i] - theta[down[:P], i]
+        for k, step_k in enumerate(steps):
+            z[up[P + k], :, k] += step_k
+            z[down[P + k], :, k] -= step_k
+        return Point(theta, z), np.concatenate([wide, 2.0 * steps])
+
+    def growth(self, point: Point) -> Array:
+        """Largest factor by which a small change of the initial velocity grows within each segment, (S,)."""
+        own = np.abs(self.linearise(point).own[:, :6])
+        speeds = [
+            i for i, name in enumerate(self.measured.names) if name in STREAMS["velocity"] + STREAMS["rates"]
+        ]
+        own[~np.isin(self.measured.channel, speeds)] = 0.0
+        return np.asarray(np.maximum.reduceat(own.max(axis=1), self.edges[:-1]))
+
+    def grain(self, theta: Array) -> Array:
+        """Return negligible differences of theta, (P,)."""
+        P = len(self.parameters.names)
+        size = np.maximum(np.abs(theta[:P]), 0.1 * self.parameters.scale)
+        return GRAIN * np.append(size, np.full(len(theta) - P, 1.0))
+
+    def hold_clocks(self, hold: bool) -> None:
+        """Keep the lags of all streams at zero, or let them go: far from a solution they imitate inertia."""
+        late, far = slice(len(self.parameters.names), None), 0.0 if hold else LATEST
+        self.low[late], self.high[late] = -far, far
+
+    def size(self) -> Array:
+        """Return the size of a large residual of every sample far from a solution, (N,)."""
+        size = np.maximum(3.0 * self.first_noise, COARSE * self.measured.spread())
+        return np.asarray(size[self.measured.channel])
+
+    def noise(self, residual: Array) -> Array:
+        """Standard deviation of every sample: that of its channel."""
+        return np.asarray(self.measured.noise(residual, self._floor)[self.measured.channel])
+
+
+# The fit of a vehicle with them: first, the evidence of each trial, or block of a few trials, on its parameters.
+
+FEWEST_TRIALS = 4
+"""Trials below which they are cut into blocks to estimate the spread."""
+
+BLOCKS = 24
+"""Number of blocks of all trials together."""
+
+
+class Confidence(NamedTuple):
+    """Uncertainty of theta at a solution."""
+
+    evidence: Evidence
+    covariance: Covariance
+    free: Array
+    """Result of the last step without bounds, (P,)."""
+    interval: Array
+    """95 %, around `free` and containing theta, (P, 2)."""
+
+
+def confidence(problem: Shooting, solution: Solution) -> Confidence:
+    """Evidence of theta, after initial states and offsets are eliminated, and what follows from it."""
+    evidence = evidence_of(problem, solution)
+    covariance = trial_covariance(evidence)
+    theta, low, high = solution.point.theta, problem.low, problem.high
+    free = theta
+    if ((theta <= low) | (theta >= high)).any():
+        normal, score = evidence.normal.sum(axis=0), evidence.score.sum(axis=0)
+        scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+        free = theta + np.linalg.lstsq(normal / np.outer(scale, scale), score / scale, rcond=1e-10)[0] / scale
+    ends = intervals(free, covariance)
+    ends[:, 0], ends[:, 1] = np.minimum(ends[:, 0], theta), np.maximum(ends[:, 1], theta)
+    ends = np.clip(ends, low[:, None], high[:, None])
+    if np.isfinite(solution.step).all():  # the truth may be where one step more would go
+        goes = np.clip(theta + solution.step, low, high)
+        ends[:, 0], ends[:, 1] = np.minimum(ends[:, 0], goes), np.maximum(ends[:, 1], goes)
+    unknown = ~np.isfinite(np.diagonal(covariance.local))
+    ends[unknown] = [-np.inf, np.inf]
+    return Confidence(evidence, covariance, free, ends)
+
+
+def evidence_of(problem: Shooting, solution: Solution) -> Evidence:
+    """Normal matrices and scores by trial, or by blocks of rows where fewer than `FEWEST_TRIALS` excite an axis."""
+    linear = solution.linear
+    weight = weights_of(linear.residual, solution.std)
+    # Derivatives without what each segment's own unknowns take up of every sample.
+    slopes = linear.shared.copy()
+    for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
+        own, weighted = linear.own[a:b], linear.own[a:b].T * weight[a:b]
+        normal = weighted @ own + np.diag(problem.prior_std[s] ** -2.0)
+        slopes[a:b] -= own @ np.linalg.solve(normal, weighted @ slopes[a:b])
+    trial = problem.groups[problem.measured.segment]
+    unit, group = "trials", trial
+    if problem.few or len(np.unique(trial)) < FEWEST_TRIALS:
+        unit, group = "blocks", _blocks(problem, trial)
+    parts = [np.flatnonzero(group == label) for label in np.unique(group)]
+    # Prior knowledge is one more group.
+    known = problem.prior_precision
+    pull = known * (problem.prior_mean - solution.point.theta)
+    normal = [(slopes[rows].T * weight[rows]) @ slopes[rows] for rows in parts]
+    score = [(slopes[rows].T * weight[rows]) @ linear.residual[rows] for rows in parts]
+    return Evidence(
+        names=problem.names,
+        normal=np.array([*normal, np.diag(known)]),
+        score=np.array([*score, pull]),
+        unit=unit,
+    )
+
+
+def _blocks(problem: Shooting, trial: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Block of every sample: each trial in equal spans of time, the longer the trial the more of them."""
+    start = np.array([s.t0 for s in problem.segments])[problem.measured.segment]
+    t = start + problem.measured.time
+    present = np.unique(trial)
+    span = {g: (float(t[trial == g].min()), float(np.ptp(t[trial == g]))) for g in present}
+    total = sum(length for _, length in span.values())
+    out = np.zeros(len(t), int)
+    for g in present:
+        begin, length = span[g]
+        pieces = max(2, round(BLOCKS * length / max(total, 1e-9)))
+        rows = trial == g
+        part = (t[rows] - begin) / max(length, 1e-9)
+        out[rows] = 1000 * g + np.minimum((part * pieces).astype(int), pieces - 1)
+    return out
+
+
+LAG_CERTAIN = 0.05
+"""Half width of the interval of a delay up to which it counts as identifiable [s]."""
+
+PATHS = {
+    "buoyancy_excess": "body.displaced_volume",
+    "thrust_scale": None,
+    "thrust_lag": "thrusters.*.time_constant",
+    "thrust_delay": "thrusters.*.delay",
+}
+"""Reported coordinates besides those of the axes, and their places in the vehicle file."""
+
+
+def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> dict[str, Number]:
+    """Every coordinate with its 95 % interval, by name.
+
+    Args:
+        p: What was free.
+        x: Where it ended, (P,).
+        found: Evidence there.
+        own_error: Of the simulation itself, as a part of an estimate; intervals hold it too.
+    """
+    local, out = np.diagonal(found.covariance.local), {}
+    half = intervals(np.zeros(len(local)), found.covariance)[:, 1]
+    for c, name in enumerate(p.names):
+        low, high, value = -np.inf, np.inf, float(x[c])
+        if np.isfinite(local[c]):
+            free = value + float(np.clip(found.free[c] - value, -1e6, 1e6))
+            width = float(np.hypot(half[c], own_error * abs(value + rigid_part(p, name))))
+            low, high = max(min(free - width, value), p.low[c]), max(free + width, value)
+        out[name] = Number(value, (low, high), float(found.free[c]) if value <= p.low[c] else None)
+    return out
+
+
+def rigid_part(p: Parameters, name: str) -> float:
+    """Rigid inertia of the axis of an added mass [kg, kg m²]; 0 of any other coordinate."""
+    axis, _, kind = name.partition(".")
+    return float(p.M_RB[AXES.index(axis), AXES.index(axis)]) if kind == "added_mass" else 0.0
+
+
+def axis_result(
+    p: Parameters, numbers: Mapping[str, Number], first: Mapping[str, Number], axis: str, **known: Any
+) -> AxisResult:
+    """The result of one axis.
+
+    Args:
+        p: What was free.
+        numbers: Of `numbers_of`.
+        first: The same of the fuller model from which this one was chosen: damping that was left out has its interval.
+        axis: Which.
+        known: Further fields of `AxisResult`.
+    """
+    mass, rigid = numbers[f"{axis}.added_mass"], rigid_part(p, f"{axis}.added_mass")
+    free = None if mass.free is None else mass.free + rigid
+    own = {"m_eff": Number(mass.value + rigid, (mass.ends[0] + rigid, mass.ends[1] + rigid), free)}
+    own |= {n: numbers[f"{axis}.{n}"] for n in ("d1", "d2", "bias") if f"{axis}.{n}" in numbers}
+    if "k" in numbers and axis in ("roll", "pitch"):
+        own["k"] = numbers["k"]
+    dropped = {
+        n: (0.0, first[f"{axis}.{n}"].ends[1])
+        for n in ("d1", "d2")
+        if n not in own and f"{axis}.{n}" in first
+    }
+    retained = {n for n in dropped if f"{axis}.{n}" in p.retained}
+    return AxisResult(
+        axis=axis, numbers=own, file=matrices(p.vehicle), dropped=dropped, retained=retained, **known
+    )
+
+
+def other_estimates(
+    p: Parameters, numbers: Mapping[str, Number]
+) -> tuple[dict[str, Estimate], list[Finding]]:
+    """Return the estimates that belong to no axis, and findings on those that rest on a bound."""
+    out, bounds = dict[str, Estimate](), list[Finding]()
+    units = {c.name: c.unit for c in p.coordinates if c.name in PATHS} | {
+        path: unit_of(path) for path in p.terms
+    }
+    for name, unit in units.items():
+        value, (low, high), free = numbers[name]
+        half, note = 0.5 * (high - low), ""
+        # An excess may well be zero: it is determined wherever it has an interval.
+        limits = {"thrust_delay": LAG_CERTAIN, "buoyancy_excess": np.inf}
+        limit = limits.get(name, CERTAIN * abs(value))
+        if free is not None:
+            note = f"held at its bound; free, it would be {free:.3g} {unit}"
+            bounds.append(finding("at_bound", name, free=free, unit=unit))
+        elif not np.isfinite(half):
+            note = "the trials do not determine it"
+        elif half > limit:
+            note = f"uncertain by ±{half:.2g} {unit}"
+        path = PATHS[name] if name in PATHS else f"{SET}.{name}"
+        out[name] = Estimate(
+            name=name,
+            estimate=value,
+            ci95=(low, high),
+            unit=unit,
+            identifiable=not note,
+            note=note,
+            path=path,
+        )
+    return out, bounds
+
+
+# Content of the trials: excited axes, measurements of each axis, response time of the vehicle.
+
+TELL = {
+    "surge": ("u", "x", "y"),
+    "sway": ("v", "x", "y"),
+    "heave": ("w", "z", "depth"),
+    "roll": ("p", "roll"),
+    "pitch": ("q", "pitch"),
+    "yaw": ("r", "yaw"),
+}
+"""Measured columns that determine an axis, the most direct first."""
+
+DRIFTING = {"x": "u", "y": "v", "z": "w", "depth": "w", "yaw": "r"}
+"""Integrals without a restoring force: where the rate is measured they add drift, not knowledge."""
+
+SEEN = 0.9
+"""Part of a segment for which a velocity has to be known to be imposed."""
+
+PUSH = 0.03
+"""Range of a wrench, as part of the vehicle's limit, below which an axis is not driven."""
+
+ANSWER = (0.02, 0.02, 0.02, 0.04, 0.04, 0.04)
+"""Range of a velocity below which an axis does not answer [m/s, rad/s]."""
+
+
+def compared(segment: Segment, motion: Motion, axes: Sequence[str]) -> Segment:
+    """The segment as a fit of some axes uses it.
+
+    Axes that are not fitted move as they were seen to, where they were seen: their numbers in the vehicle file may be
+    wrong, and couplings would carry that into the others. They are not compared, nor are integrals that add drift.
+    """
+    held = np.full((segment.steps + 1, 6), np.nan)
+    t = segment.t0 + segment.step * np.arange(segment.steps + 1)
+    drop = {column for column, rate in DRIFTING.items() if rate in segment.measured}
+    inside = (motion.t >= t[0] - 0.1) & (motion.t <= t[-1] + 0.1)
+    for i, axis in enumerate(AXES):
+        good = inside & np.isfinite(motion.nu[:, i])
+        if axis not in axes and good.sum() >= max(2.0, SEEN * inside.sum()):
+            held[:, i] = np.interp(t, motion.t[good], motion.nu[good, i])
+            drop |= {TELL[axis][0]}
+    if not np.isnan(held[:, 3:5]).any():
+        drop |= {"roll", "pitch"}
+    measured = {c: pair for c, pair in segment.measured.items() if c not in drop}
+    return replace(segment, measured=measured, held=held)
+
+
+def observable(trials: Sequence[Streams]) -> tuple[str, ...]:
+    """Axes that some trial measures anything of."""
+    columns = {c for s in trials for c in s.measured}
+    return tuple(a for a in AXES if columns & set(TELL[a]))
+
+
+def excited(trials: Sequence[Streams], vehicle: Vehicle) -> tuple[str, ...]:
+    """Axes that the trials excite: those their headers name, else those that were driven, or moved while passive, and
+    answered."""
+    found = {axis for s in trials for axis in excites(s, vehicle)}
+    return tuple(a for a in AXES if a in found and a in observable(trials))
+
+
+def telling(trials: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str]) -> list[Streams]:
+    """Trials that excite one of some axes; all of them where none does.
+
+    In the others the vehicle moves on axes that are not fitted, maybe not even measured, and couplings carry that over.
+    """
+    return [s for s in trials if set(excites(s, vehicle)) & set(axes)] or list(trials)
+
+
+def excites(s: Streams, vehicle: Vehicle) -> set[str]:
+    """Axes that one trial excites: those its header names, else those that were driven, or moved while passive."""
+    return set(s.trial.header.axis) or _moved(s, vehicle)
+
+
+def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
+    try:
+        limits = vehicle.wrench_limits
+    except VehicleError:
+        limits = np.zeros(6)
+    tau = s.motion.tau @ np.linalg.inv(twist_shift(list(vehicle.wrench_reference)))
+    out: set[str] = set()
+    for i, axis in enumerate(AXES):
+        nu = s.motion.nu[:, i]
+        noise = s.motion.noise_std[i]
+        answers = _range(nu) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
+        pushed = limits[i] > 0.0 and _range(tau[:, i]) > PUSH * limits[i]
+        # Weight rights roll and pitch: a small swing determines them, whatever started it. If they were not
+        # fitted, the file's stiffness, which may be a guess, would determine the later course of surge and sway.
+        swings = i in (3, 4)
+        if answers and (pushed or swings or s.drive.source == "passive"):
+            out.add(axis)
+    return out
+
+
+def _range(values: Array) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(np.percentile(finite, [2.0, 98.0]))) if len(finite) else 0.0
+
+
+def speeds(motions: Sequence[Motion], axis: str) -> tuple[float, float]:
+    """Range of speeds at which an axis was seen moving, from the 20th to the 99th percentile [m/s or rad/s]."""
+    i = AXES.index(axis)
+    values = np.concatenate([np.abs(m.nu[:, i]) for m in motions] or [np.empty(0)])
+    values = values[np.isfinite(values)]
+    moving = values[values > max(0.02 * values.max(initial=0.0), 1e-9)]
+    return (
+        (float(np.percentile(moving, 20.0)), float(np.percentile(moving, 99.0)))
+        if len(moving)
+        else (0.0, 0.0)
+    )
+
+
+def horizon(vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str]) -> float:
+    """Length of segments that shows steady motion and yet forgets what no model knows [s]: five of the slowest time
+    constant, at least forty samples, between 5 and 12 s."""
+    chosen = vehicle.hydrodynamic_set("calibrated")
+    M = np.diag(vehicle.mass_matrix("calibrated"))
+    slowest = 0.5
+    if isinstance(chosen, HydrodynamicSet):
+        for axis in axes:
+            i = AXES.index(axis)
+            top = speeds([s.motion for s in trials], axis)[1]
+            drag = chosen.linear_damping[i, i] + chosen.quadratic_damping[i, i] * top
+            slowest = max(slowest, float(M[i] / drag) if drag > 0.0 else 3.0)
+    return float(np.clip(max(5.0 * slowest, 40.0 * sampling(trials)), 5.0, 12.0))
+
+
+def sampling(trials: Sequence[Streams]) -> float:
+    """Usual time between the samples of a channel [s]."""
+    steps = [float(np.median(np.diff(t))) for s in trials for t, _ in s.measured.values() if len(t) > 2]
+    return float(np.median(steps or [0.02]))
+
+
+# What a simulation-error fit shows besides its estimates: figures by axis, curves, findings.
+
+LATE = 0.03
+"""Lag of a stream that leads to a warning [s]."""
+
+SHOWN = 4
+"""Trials in the curve of an axis."""
+
+
+def _shown_by(
+    problem: Shooting, axis: str
+) -> tuple[str, NDArray[np.int64], NDArray[np.int64], dict[int, float]]:
+    """Return the most direct used channel that determines an axis, its samples (n,), their trials (n,), and the range
+    of the channel in each trial, from the 5th to the 95th percentile; no samples without such a channel."""
+    m = problem.measured
+    name = next((c for c in TELL[axis] if c in m.names), "")
+    rows = np.flatnonzero(m.channel == m.names.index(name)) if name else np.empty(0, int)
+    trial = problem.groups[m.segment][rows]
+    spans = {
+        int(g): float(np.ptp(np.percentile(m.value[rows][trial == g], [5.0, 95.0]))) for g in np.unique(trial)
+    }
+    return name, rows, trial, spans
+
+
+def quality(
+    problem: Shooting, solution: Solution, axes: Sequence[str], used: Sequence[Streams]
+) -> dict[str, dict[str, float]]:
+    """Figures of each axis over the trials that move it: the simulated against the measured channel."""
+    out = {}
+    for axis in axes:
+        name, rows, trial, spans = _shown_by(problem, axis)
+        if not name:
+            continue
+        moving = [g for g, span in spans.items() if span > 0.2 * max(spans.values())]
+        inside = np.isin(trial, moving)
+        rows, trial = rows[inside], trial[inside]
+        residual, value = solution.linear.residual[rows], problem.measured.value[rows]
+        rms = {g: float(np.sqrt(np.mean(residual[trial == g] ** 2))) for g in moving}
+        low, high = speeds([s.motion for s in used], axis)
+        out[axis] = {
+            "r2": 1.0 - float(np.mean(residual**2)) / max(float(np.var(value)), 1e-300),
+            "rmse": float(np.sqrt(np.mean(residual**2))),
+            "nrmse": float(np.mean([rms[g] / max(spans[g], 1e-12) for g in moving])),
+            "samples": float(len(rows)),
+            "rejected": float(np.sum(np.abs(residual) > 2.0 * CUT * solution.std[rows])),
+            "trials": float(len(moving)),
+            "speed_low": low,
+            "speed_high": high,
+            "noise": float(np.median(solution.std[rows])),
+        }
+    return out
+
+
+def pictures(problem: Shooting, solution: Solution, axes: Sequence[str]) -> tuple[Curve, ...]:
+    """Measured and simulated channel of each axis, over the trials that move it most."""
+    m, out = problem.measured, []
+    clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
+    for axis in axes:
+        name, rows, trial, spans = _shown_by(problem, axis)
+        parts = []
+        for g in sorted(sorted(spans, key=lambda g: -spans[g])[:SHOWN]):
+            those = rows[trial == g]
+            those = those[np.argsort(clock[those], kind="stable")]
+            value = m.value[those]
+            parts.append((clock[those], value, value - solution.linear.residual[those]))
+        if name:
+            title = f"{axis}: {name}, simulated from the inputs alone"
+            out.append(Curve.joined(title, f"{name} [{COLUMNS[name].unit}]", parts))
+    return tuple(out)
+
+
+def fit_findings(
+    problem: Shooting,
+    solution: Solution,
+    found: Confidence,
+    used: Sequence[Streams],
+) -> list[Finding]:
+    """Return findings that a reader needs before using the numbers."""
+    out = []
+    if solution.interrupted:
+        out.append(finding("interrupted"))
+    elif not (solution.converged or _close(solution, found, problem.judged)):
+        out.append(finding("not_converged", iterations=solution.iterations))
+    P = len(problem.parameters.names)
+    for stream, late, (low, high) in zip(
+        problem.streams, solution.point.theta[P:], found.interval[P:], strict=True
+    ):
+        if abs(late) > LATE and (low > 0.0 or high < 0.0):
+            sense = "lags" if late > 0.0 else "leads"
+            out.append(finding("motion_late", stream, sense=sense, lag=abs(late), low=low, high=high))
+    if found.evidence.unit == "blocks":
+        out.append(finding("block_intervals", trials=len(used)))
+    return out
+
+
+def _close(solution: Solution, found: Confidence, judged: int) -> bool:
+    """Return whether one step more would keep every parameter within its 95 % interval.
+
+    Trials differ by more than independent noise, so that a step far above the error that such noise leaves may still be
+    far below what can be known.
+    """
+    low, high = intervals(solution.point.theta, found.covariance).T
+    return bool(np.all(np.abs(solution.step[:judged]) <= 0.5 * (high - low)[:judged]))
+
+
+class Clock:
+    """Progress over several stages: iteration, cost, rate and remaining time."""
+
+    def __init__(self, progress: Callable[[float, str], None] | None) -> None:
+        self.progress, self.begin, self.part = progress, time.perf_counter(), 0.0
+
+    def __call__(self, words: str, toward: float = 1.0) -> None:
+        # The number of remaining iterations is unknown; each takes a share of the rest.
+        self.part += 0.2 * max(toward - self.part, 0.0)
+        spent = time.perf_counter() - self.begin
+        if self.progress:
+            self.progress(self.part, f"{words}, {spent:.0f} s")
+
+
+# From a simulation-error fit to changes of the vehicle file: only what the trials determine.
+
+
+def changes(
+    p: Parameters, x: Array, found: Mapping[str, Estimate], axes: dict[str, Any], scaled: bool
+) -> dict[str, Any]:
+    """Changes of the vehicle file.
+
+    Args:
+        p: What was free.
+        x: Where it ended, (P,).
+        found: All estimates.
+        axes: Changes of the axes' own numbers.
+        scaled: Whether a thrust scale belongs to the thrusters' curves.
+    """
+    out = dict(axes)
+    for path, matrix in _matrices(p, x).items():
+        old = np.asarray(getattr(p.set, path.rpartition(".")[2]), float)
+        for i, axis in enumerate(AXES):
+            # Axes without measurements were simulated: the others hold with their numbers.
+            if f"{path}.{i}.{i}" in axes or axis in p.unseen:
+                for j in range(6):
+                    # Couplings are written where the fit did away with them.
+                    if i == j or matrix[i, j] != old[i, j]:
+                        out[f"{path}.{i}.{j}"] = float(matrix[i, j])
+    out |= hydrostatics(found, p.vehicle)[0]
+    for name, path in (("thrust_lag", "time_constant"), ("thrust_delay", "delay")):
+        if name in found and found[name].identifiable:
+            out[f"thrusters.*.{path}"] = max(found[name].estimate, 1e-4 if path == "time_constant" else 0.0)
+    for path in p.terms:
+        if found[path].identifiable:
+            out[str(found[path].path)] = found[path].estimate
+    if "thrust_scale" in found and found["thrust_scale"].identifiable and scaled:
+        out |= scaled_thrust(p.vehicle, found["thrust_scale"].estimate)
+    return out
+
+
+def _drag_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: float) -> bool:
+    """`drag_known` at one speed."""
+    i, names = AXES.index(axis), [f"{axis}.{name}" for name in ("d1", "d2")]
+    at = [p.names.index(name) for name in names if name in p.names]
+    free = np.isin(names, p.names)
+    C = found.covariance
+    C = (C.local if C.alone[at].any() else C.trials)[np.ix_(at, at)]
+    before = float(p.set.linear_damping[i][i]), float(p.set.quadratic_damping[i][i])
+    d = np.where(np.isin(names, p.retained), before, 0.0)
+    d[free] = x[at]
+    return drag_known(d, free, [C], 2.0, [speed], before)
+
+
+STEP = 0.02
+"""Step of the simulation [s]."""
+
+SHORT = 2.5
+"""Initial length of the segments [s]: over so short a time every problem is nearly linear."""
+
+OWN_ERROR, BETWEEN = 0.003, 0.05
+"""Error of the simulation itself, as a part of an estimate; and how it grows with the time between samples of the
+inputs [1/s], for nobody recorded what happened in between."""
+
+GROWTH = 12.0
+"""Growth of a disturbance of the initial velocity over a segment above which its trial is cut into shorter ones.
+
+A fast vehicle without fins turns broadside by itself, and derivatives over a long run of that mean little."""
+
+HALVINGS = 2
+
+
+@dataclass
+class Stage:
+    """One fit of one set of parameters."""
+
+    problem: Shooting
+    solution: Solution
+    found: Confidence
+
+    @property
+    def x(self) -> Array:
+        """Return the final parameters, (P,)."""
+        return self.solution.point.theta[: len(self.problem.parameters.names)]
+
+
+class Stages:
+    """The stages of one fit: they share trials and segments."""
+
+    def __init__(
+        self,
+        prepared: Sequence[Streams],
+        vehicle: Vehicle,
+        axes: tuple[str, ...],
+        estimate: tuple[str, ...],
+        length: float | None,
+        starts: Sequence[dict[str, float]],
+        say: Clock,
+    ) -> None:
+        self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
+        self.given, self.starts = length, starts
+        self.excites = [excites(s, vehicle) for s in prepared]
+        # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does.
+        self.imposed = tuple(a for a in ("surge", "sway", "heave", "yaw") if a not in axes)
+        measured = observable(prepared)
+        self.unseen = tuple(a for a in self.imposed if a not in measured)
+        apart = [float(np.median(np.diff(s.drive.t))) for s in prepared if not s.drive.held]
+        self.own_error = OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
+        self.shorter: dict[str, float] = {}
+        self.retained: tuple[str, ...] = ()
+        self.used: list[Streams] = []
+        self.segments: list[Segment] = []
+        self.extras = set(estimate)
+        if "heave" in axes:
+            self.extras.add("buoyancy_excess")
+        if {"roll", "pitch"} & set(axes):
+            self.extras.add("k")
+        self.biases = [a for a in axes if a != "heave"]
+
+    def first(self, kinds: dict[str, str]) -> Stage:
+        """Short segments from the better of the starts, then segments of the length that the answer calls for."""
+        short = max(SHORT, 15.0 * sampling(self.prepared))
+        self.cut(min(short, self.given or short))
+        problem = min(
+            (self.problem(kinds, start) for start in self.starts), key=lambda one: one.cost(one.start())
+        )
+        point = problem.start()
+        problem.hold_clocks(True)
+        rough = solve(
+            problem, point, iterations=12, std=problem.size(), rough=True, report=self.report("start", 0.3)
+        )
+        if not np.isfinite(rough.cost):
+            raise CalibrationError(
+                "the simulation diverges with the vehicle file's numbers: give better ones, or shorter segments "
+                f"(now {self.length:.3g} s)"
+            )
+        p, x = problem.parameters, rough.point.theta[: len(problem.parameters.names)]
+        if rough.interrupted:
+            problem.hold_clocks(False)
+            return Stage(problem, rough, confidence(problem, rough))
+        self.cut(self.given or horizon(self.vehicle.replace(_matrices(p, x)), self.prepared, self.axes))
+        problem = self.problem(kinds, dict(zip(p.names, x, strict=True)))
+        for _ in range(0 if self.given else HALVINGS):
+            growth = problem.growth(problem.start())
+            wild = {self.used[g].trial.name for g in np.unique(problem.groups[growth > GROWTH])}
+            if not wild:
+                break
+            for name in wild:
+                self.shorter[name] = 0.5 * self.shorter.get(name, 1.0)
+            self.cut(self.length)
+            problem = self.problem(kinds, dict(zip(p.names, x, strict=True)))
+        return self.finish(problem, problem.start(), 0.6)
+
+    def next(self, kinds: dict[str, str], before: Stage) -> Stage:
+        """Another set of parameters, from where a fit ended."""
+        old, x = before.problem.parameters, before.x
+        problem = self.problem(kinds, dict(zip(old.names, x, strict=True)))
+        rest = before.solution.point.theta[len(old.names) :]
+        point = Point(np.concatenate([problem.parameters.start, rest]), before.solution.point.z)
+        return self.finish(problem, point, 0.95, before.solution.std)
+
+    def finish(self, problem: Shooting, point: Point, toward: float, std: Array | None = None) -> Stage:
+        """Fit with robust weights and clocks let go, after a first approach without."""
+        if std is None:
+            problem.hold_clocks(True)
+            rough = solve(
+                problem,
+                point,
+                iterations=6,
+                std=problem.size(),
+                rough=True,
+                report=self.report("fit", toward),
+            )
+            problem.hold_clocks(False)
+            point = rough.point
+            if rough.interrupted:
+                return Stage(problem, rough, confidence(problem, rough))
+        solution = solve(problem, point, std=std, report=self.report("fit", toward))
+        return Stage(problem, solution, confidence(problem, solution))
+
+    def numbers(self, stage: Stage) -> dict[str, Number]:
+        """Return the numbers of a stage."""
+        return numbers_of(stage.problem.parameters, stage.x, stage.found, self.own_error)
+
+    def report(self, words: str, toward: float) -> Callable[[int, float], None]:
+        return lambda i, rms: self.say(f"{words}: iteration {i}, residual {rms:.4g} σ", toward)
+
+    def cut(self, length: float) -> None:
+        """Cut the trials into segments of about a length [s]."""
+        tells = {column for axis in self.axes for column in TELL[axis]}
+        cut = [
+            [
+                compared(s, one.motion, self.axes)
+                for s in segments(one, self.vehicle, length=length * self._part(one), step=STEP)
+            ]
+            for one in self.prepared
+        ]
+        kept = [[s for s in stretch if tells & set(s.measured)] for stretch in cut]
+        self.length = length
+        self.used = [one for one, stretch in zip(self.prepared, kept, strict=True) if stretch]
+        self.segments = [replace(s, index=g) for g, stretch in enumerate(filter(None, kept)) for s in stretch]
+        if not self.segments:
+            raise CalibrationError(
+                f"no interval of these trials has both inputs and measurements of {', '.join(self.axes)}"
+            )
+        commanded = np.array([s.commanded for s in self.segments])
+        # If every input is stated to have acted, a request for a lag doubts that.
+        self.lagged = commanded if commanded.any() else np.ones_like(commanded)
+
+    def _part(self, one: Streams) -> float:
+        return self.shorter.get(one.trial.name, 1.0)
+
+    def problem(self, kinds: dict[str, str], start: dict[str, float]) -> Shooting:
+        """Return the problem of the free parameters, over the segments."""
+        parameters = Parameters(
+            self.vehicle,
+            axes=self.axes,
+            damping=kinds,
+            extras=tuple(self.extras),
+            biases=self.biases,
+            start=start,
+            imposed=self.imposed,
+            unseen=self.unseen,
+            retained=self.retained,
+        )
+        return Shooting(
+            self.segments,
+            parameters,
+            sorted({c for s in self.segments for c in s.measured}),
+            lagged=self.lagged,
+            few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
+        )
+
+    def result(
+        self,
+        stage: Stage,
+        first: Mapping[str, Number],
+        remarks: list[Finding],
+        *,
+        damping: str,
+    ) -> Fit:
+        """The finished fit; intervals hold those of the fuller model `first` from which this one was chosen."""
+        p, x = stage.problem.parameters, stage.x
+        numbers = self.numbers(stage)
+        for name in numbers.keys() & first.keys():
+            (low, high), (a, b) = numbers[name].ends, first[name].ends
+            numbers[name] = numbers[name]._replace(ends=(min(low, a), max(high, b)))
+        found, axes, bounds = dict[str, Estimate](), dict[str, Any](), list[Finding]()
+        for axis in self.axes:
+            own = speeds([s.motion for s in self.used], axis)
+            known = _drag_known(p, x, stage.found, axis, own[1])
+            result = axis_result(p, numbers, first, axis, speeds=own, drag_known=known)
+            found |= result.estimates
+            axes |= result.changes
+            bounds += result.findings
+        others, held = other_estimates(p, numbers)
+        found |= others
+        sources = {s.drive.source for s in self.used}
+        new = changes(p, x, found, axes, scaled=sources <= {"rpm", "pwm"})
+        P, local = stage.problem.judged, stage.found.covariance.local
+        correlation, traded = degeneracy(p.names[:P], local[:P, :P], stage.found.free[:P])
+        left_out = [one.trial.name for one in self.prepared if one not in self.used]
+        remarks = [
+            *remarks,
+            *(finding("trial_left_out", name) for name in left_out),
+            *fit_findings(stage.problem, stage.solution, stage.found, self.used),
+            *bounds,
+            *held,
+            *traded,
+        ]
+        settings: dict[str, Any] = {
+            "axes": list(self.axes),
+            "damping": damping,
+            "estimate": sorted(self.extras),
+            "horizon": round(self.length, 3),
+            "step": STEP,
+            "segments": len(self.segments),
+            "iterations": stage.solution.iterations,
+        }
+        self.say("done")
+        return Fit(
+            kind="hydrodynamics",
+            method="simulation",
+            before=self.vehicle,
+            estimates=found,
+            changes=new,
+            quality=quality(stage.problem, stage.solution, self.axes, self.used),
+            correlation=correlation,
+            findings=tuple(dict.fromkeys(remarks)),
+            curves=pictures(stage.problem, stage.solution, self.axes),
+            trials={one.trial.name: one.trial.sha256 for one in self.used},
+            settings=settings,
+            interrupted=stage.solution.interrupted,
+        )
+
+
+def _matrices(p: Parameters, x: Array) -> dict[str, Any]:
+    """Changes of the vehicle file to the matrices of a vector."""
+    names = ("added_mass", "linear_damping", "quadratic_damping")
+    return {f"{SET}.{name}": m[0] for name, m in zip(names, p.matrices(x), strict=True)}
+
+
+Progress = Callable[[float, str], None]
+
+
+def fit_by_simulation(
+    trials: Sequence[Trial],
+    vehicle: Vehicle,
+    *,
+    axes: Sequence[str] | None = None,
+    estimate: Sequence[str] = (),
+    damping: str = "auto",
+    horizon: float | None = None,
+    begin: Fit | None = None,
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit by simulation error over all trials together.
+
+    Trials are cut into segments with an initial state each; Levenberg-Marquardt moves the parameters, the initial
+    states, offsets of the sensors and lags of their streams, with derivatives from parallel worlds. All numbers hold at
+    the reference point of the vehicle's calibrated set.
+
+    Args:
+        trials: Of any inputs, rates and measured columns.
+        vehicle: Gives the rigid body, the motors and everything that is not fitted.
+        axes: Axes to fit; those that the trials excite if None.
+        estimate: Of `EXTRAS`, and parameters of the vehicle's terms, such as `lift.coefficient`. Buoyancy comes
+            with heave, stiffness with roll and pitch, a bias with the others.
+        damping: `auto`, `linear`, `quadratic` or `both`.
+        horizon: Length of the segments [s]; from the data if None.
+        begin: Of another method: it begins with its numbers where these simulate the trials better than the file's.
+        progress: Called with the part done and a few words.
+
+    Returns:
+        After Ctrl-C the best until then, with `interrupted`.
+
+    Raises:
+        CalibrationError: No trial can be used, one is held out, or a word is unknown.
+    """
+    _check(trials, vehicle, axes, damping, estimate)
+    prepared = [streams(trial, vehicle) for trial in trials]
+    chosen, remarks = _axes(prepared, vehicle, axes)
+    say = Clock(progress)
+    starts = [{}] if begin is None else [{}, {name: e.estimate for name, e in begin.estimates.items()}]
+    fit = Stages(telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, starts, say)
+    kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)
+    stage = fit.first(kinds)
+    first: dict[str, Number] = {}
+    if damping == "auto" and not stage.solution.interrupted:
+        chosen_kinds = _select(kinds, stage)
+        if chosen_kinds != kinds:
+            first = fit.numbers(stage)
+            tops = {axis: speeds([t.motion for t in fit.used], axis)[1] for axis in chosen}
+            fit.retained = _retained(chosen_kinds, first, stage.problem.parameters, tops)
+            stage = fit.next(chosen_kinds, stage)
+    return fit.result(stage, first, remarks, damping=damping)
+
+
+def _check(
+    trials: Sequence[Trial],
+    vehicle: Vehicle,
+    axes: Sequence[str] | None,
+    damping: str,
+    estimate: Sequence[str],
+) -> None:
+    require_fittable(trials, vehicle)
+    require_axes(axes)
+    if damping not in DAMPING:
+        raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
+    chosen = vehicle.hydrodynamics.get("calibrated")
+    known = [*EXTRAS, *(chosen.term_scalars if isinstance(chosen, HydrodynamicSet) else ())]
+    for word in estimate:
+        if word not in known:
+            raise CalibrationError(
+                f"cannot estimate '{word}'; available: {', '.join(known)}"
+                + ("; a term's parameter only where the vehicle file has the term" if "." in word else "")
+            )
+
+
+def _axes(
+    prepared: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str] | None
+) -> tuple[tuple[str, ...], list[Finding]]:
+    """Axes to fit, and why some that were asked for are not."""
+    moved, seen = excited(prepared, vehicle), observable(prepared)
+    if axes is None:
+        if not moved:
+            raise CalibrationError(
+                f"no trial excites an axis of {vehicle.name}: name the axes, or give trials with larger inputs"
+            )
+        return moved, []
+    remarks = [finding("axis_untold", axis) for axis in axes if axis not in seen]
+    remarks += [finding("axis_doubtful", axis) for axis in axes if axis in seen and axis not in moved]
+    chosen = tuple(a for a in AXES if a in axes and a in seen)
+    if not chosen:
+        raise CalibrationError(f"no measurement that determines {', '.join(axes)} is in these trials")
+    return chosen, remarks
+
+
+def _select(kinds: dict[str, str], stage: Stage) -> dict[str, str]:
+    """Damping of each axis: the weaker term goes where it is not `SIGNIFICANT`."""
+    from scipy.stats import norm
+
+    names, new = stage.problem.parameters.names, dict(kinds)
+    std = np.sqrt(np.diagonal(stage.found.covariance.local))
+    for axis in kinds:
+        p_value = {}
+        for name in ("d1", "d2"):
+            c = names.index(f"{axis}.{name}")
+            known = bool(np.isfinite(std[c]))
+            p_value[name] = (
+                2.0 * norm.sf(max(stage.found.free[c], 0.0) / max(std[c], 1e-300)) if known else 1.0
+            )
+        weakest = max(p_value, key=lambda name: p_value[name])
+        if p_value[weakest] > SIGNIFICANT:
+            new[axis] = "quadratic" if weakest == "d1" else "linear"
+    return new
+
+
+NEGLIGIBLE = 0.1
+"""Share of the drag at top speed."""
+
+
+def _retained(
+    kinds: dict[str, str], first: Mapping[str, Number], p: Parameters, tops: Mapping[str, float]
+) -> tuple[str, ...]:
+    """Damping that was left out and stays the vehicle file's, because the data exclude that no more than zero.
+
+    Slow swings show no quadratic drag, and a vehicle without any would tumble at speeds that no trial had. None where
+    the scale of thrust is free: the file's number would decide that; nor where the interval holds no more than
+    `NEGLIGIBLE` of the drag at the top speed: there the axis was seen to have one shape alone.
+
+    Args:
+        kinds: Damping of each axis.
+        first: Estimates with both dampings.
+        p: What is free.
+        tops: Top speed of each axis [m/s, rad/s].
+    """
+    if "thrust_scale" in p.names:
+        return ()
+    absent = {"linear": ("d2", p.set.quadratic_damping), "quadratic": ("d1", p.set.linear_damping)}
+    out = []
+    for axis, kind in kinds.items():
+        if kind in absent:
+            name, D = absent[kind]
+            i = AXES.index(axis)
+            high, other = (
+                first[f"{axis}.{name}"].ends[1],
+                first[f"{axis}.{'d1' if name == 'd2' else 'd2'}"].value,
+            )
+            drag, rest = (high * tops[axis], other) if name == "d2" else (high, other * tops[axis])
+            if 0.0 < D[i][i] <= high and drag > NEGLIGIBLE * rest:
+                out.append(f"{axis}.{name}")
+    return tuple(out)

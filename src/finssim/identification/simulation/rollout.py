@@ -1,0 +1,546 @@
+"""Many candidate plants over many segments, as parallel worlds of one simulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from finssim.core.rotations import quat_rotate, quat_to_euler
+from finssim.physics.types import MAX_THRUSTERS
+from finssim.sim.plant_arrays import NO_LIMIT, vehicle_parameters
+from finssim.sim.simulator import Simulator
+from finssim.sim.site import Water
+from finssim.trials.conversion import EULER
+from finssim.trials.findings import CalibrationError
+from finssim.trials.inputs import Drive, drive
+from finssim.trials.motion import Motion, attitude_samples, depth_place, motion
+from finssim.trials.trial import Trial
+from finssim.vehicles import Vehicle
+
+Array = NDArray[np.float64]
+
+CHANNELS = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z", "depth")
+"""Measured columns that a simulation is compared with."""
+
+MEMORY = 1.0
+"""Commands before a segment that are kept, for delay and lag of the motors [s]."""
+
+DEEP = -30.0
+"""Added to the height of a vehicle that never came near the surface [m]: deep enough for its drift, not so deep that
+single precision would lose slow motion. Where nobody measured the depth that does not matter, and it is much deeper."""
+
+FLIES = 0.15
+"""Height of the origin above the reach of a floating vehicle that is no height above the surface any more [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """One stretch of a trial on a uniform grid of `steps` steps."""
+
+    trial: str
+    """Name of the trial."""
+    index: int
+    """Index of its trial in the fit."""
+    t0: float
+    """Its start on the trial's clock [s]."""
+    step: float
+    """[s]"""
+    force: Array
+    """Command of the motors in each step [N, N m]: the mean of a held command; of an applied force, which is linear
+    between samples, the value at the step's end. (steps, k)"""
+    before: Array
+    """Command in the steps before, the newest last; repeats the first value before the trial began. (m, k)"""
+    B: Array
+    """Wrench about the body origin per unit force, (6, k)."""
+    commanded: bool
+    """True if delay, dead zone, lag, slew and limits lie between `force` and what acts."""
+    thrusters: bool
+    """True if the k forces are the vehicle's thrusters in canonical order."""
+    position: Array
+    """Position at the start, world frame [m], (3,); 0 if unknown."""
+    quaternion: Array
+    """Rotation at the start, body to world, (4,); level and heading 0 if unknown."""
+    nu: Array
+    """Velocity of the body origin at the start [m/s, rad/s], (6,); 0 if unknown."""
+    known: NDArray[np.bool_]
+    """Flags of nu (6), roll, pitch, yaw, x, y, z at the start that come from measurements, (12,)."""
+    sink: float
+    """Added to the height while simulating [m], so that a vehicle that stayed wholly submerged cannot surface."""
+    density: float
+    """Density of the water [kg/m³]."""
+    current: Array
+    """World frame [m/s], (3,)."""
+    measured: dict[str, tuple[Array, Array]]
+    """Column of `CHANNELS` -> times since t0 [s] and values."""
+    velocity_at: Array
+    """Body point whose velocity u, v, w are [m]."""
+    velocity_in_water: bool
+    """True if u, v, w are relative to the water."""
+    position_at: Array
+    """Body point whose position x, y, z are [m]."""
+    depth_at: Array
+    """Body point of the pressure sensor [m]."""
+    held: Array | None = None
+    """nu that is imposed at the start and after every step, (steps + 1, 6); NaN where the simulation is free."""
+
+    @property
+    def steps(self) -> int:
+        """Length of the grid."""
+        return len(self.force)
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return self.steps * self.step
+
+
+@dataclass(frozen=True, kw_only=True)
+class Streams:
+    """A trial prepared for cutting: its drive, its motion and its comparable columns."""
+
+    trial: Trial
+    drive: Drive
+    motion: Motion
+    measured: dict[str, tuple[Array, Array]]
+    """Column of `CHANNELS` -> times on the trial's clock [s] and values."""
+
+
+def streams(trial: Trial, vehicle: Vehicle) -> Streams:
+    """Prepare a trial once, to cut it in several ways."""
+    measured = {c: trial.series(c) for c in CHANNELS}
+    t, q, given = attitude_samples(trial)
+    for name, angle in zip(EULER, quat_to_euler(q), strict=True):
+        if name in given and not len(measured[name][0]):
+            measured[name] = (t, angle)
+    measured = {c: pair for c, pair in measured.items() if len(pair[0])}
+    return Streams(trial=trial, drive=drive(trial, vehicle), motion=motion(trial, vehicle), measured=measured)
+
+
+def segments(
+    s: Streams,
+    vehicle: Vehicle,
+    *,
+    length: float | None = None,
+    step: float = 0.02,
+    start: float = 0.0,
+    index: int = 0,
+) -> list[Segment]:
+    """Cut a trial into stretches of about equal length; a gap in the recording always ends one.
+
+    Args:
+        s: The trial.
+        vehicle: Whose it is.
+        length: Of each [s]; the whole trial, up to its gaps, if None.
+        step: Of the simulation [s].
+        start: Left out at the beginning [s].
+        index: Which of several trials this is.
+
+    Returns:
+        In order of time; none where nothing measured lies inside.
+
+    Raises:
+        CalibrationError: the step or length is not above zero.
+    """
+    if not step > 0.0 or (length is not None and not length > 0.0):
+        raise CalibrationError(
+            f"segments of {length} s in steps of {step} s, expected times above 0 s", s.trial.name
+        )
+    out, begin = list[Segment](), float(s.trial.t[0]) + start
+    for a, b in ((max(float(a), begin), float(b)) for a, b in s.drive.spans):
+        steps = int(round((b - a) / step - 1e-6))
+        parts = 1 if length is None else max(1, round(steps * step / length))
+        edges = [steps * i // parts for i in range(parts + 1)]
+        for low, high in zip(edges, edges[1:], strict=False):
+            if high - low >= 2:
+                segment = _segment(s, vehicle, a + low * step, high - low, step, index)
+                if segment.measured:
+                    out.append(segment)
+    return out
+
+
+def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, index: int) -> Segment:
+    header, d = s.trial.header, s.drive
+    memory = max(1, int(round(MEMORY / step)))
+    force = _told(d, np.asarray(t0 + step * np.arange(-memory, steps + 1)))
+    position, quaternion, nu, known = _start(s.motion, t0)
+    measured = {}
+    for column, (t, values) in s.measured.items():
+        # The first sample is where the segment begins, so that neighbours do not share it.
+        inside = (t >= t0 - 1e-9) & (t < t0 + steps * step - 1e-9)
+        if inside.any():
+            measured[column] = (np.maximum(t[inside] - t0, 0.0), values[inside])
+    water = header.water
+    return Segment(
+        trial=s.trial.name,
+        index=index,
+        t0=t0,
+        step=step,
+        force=force[memory:],
+        before=force[:memory],
+        B=np.asarray(d.B, float),
+        commanded=d.commanded,
+        thrusters=d.thrusters,
+        position=position,
+        quaternion=quaternion,
+        nu=nu,
+        known=known,
+        sink=_sink(s.motion, vehicle, t0, t0 + steps * step),
+        density=water.density or vehicle.water.density,
+        current=np.asarray(water.current or (0.0, 0.0, 0.0), float),
+        measured=measured,
+        velocity_at=np.asarray(header.velocity_at, float),
+        velocity_in_water=header.velocity == "water",
+        position_at=np.asarray(header.position_at, float),
+        depth_at=depth_place(s.trial, vehicle),
+    )
+
+
+def _told(d: Drive, edges: Array) -> Array:
+    """Return the command of the motors in each step between `edges` [s], (steps, k); see `Segment.force`."""
+    if d.commanded:
+        return _means(d, edges)
+    # An actuator without lag ramps from one value to the next: each is the value at its step's end, or the mean around
+    # it where values jump or come faster than the steps.
+    half = 0.5 * np.diff(edges)
+    if not d.held and float(np.median(np.diff(d.t))) > 0.7 * float(edges[1] - edges[0]):
+        return d.at(edges[1:])
+    return _means(d, np.concatenate([edges[:1] + half[:1], edges[1:] + half]))
+
+
+def _means(d: Drive, edges: Array) -> Array:
+    """Mean force between successive times [s], (m + 1,) -> (m, k); before and after the recording the nearest value."""
+    span = np.diff(d.t)[:, None]
+    area = span * (d.force[:-1] if d.held else 0.5 * (d.force[:-1] + d.force[1:]))
+    total = np.concatenate([np.zeros((1, d.force.shape[1])), np.cumsum(area, axis=0)])
+    i = np.clip(np.searchsorted(d.t, edges, side="right") - 1, 0, len(d.t) - 1)
+    inside = np.clip(edges, d.t[0], d.t[-1])
+    now = d.force[i] if d.held else 0.5 * (d.force[i] + d.at(inside))
+    integral = total[i] + (inside - d.t[i])[:, None] * now
+    integral += np.minimum(edges - d.t[0], 0.0)[:, None] * d.force[0]
+    integral += np.maximum(edges - d.t[-1], 0.0)[:, None] * d.force[-1]
+    return np.asarray(np.diff(integral, axis=0) / np.diff(edges)[:, None])
+
+
+def _start(m: Motion, t0: float) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """State at a time and which of its twelve numbers are known."""
+    i = int(np.argmin(np.abs(m.t - t0)))
+    near = slice(max(i - 3, 0), i + 4)
+
+    def nearest(values: Array) -> Array:
+        rows = np.flatnonzero(np.isfinite(values[near]))
+        if not len(rows):
+            return np.asarray(np.nan)
+        return np.asarray(values[near][rows[np.argmin(np.abs(m.t[near][rows] - t0))]])
+
+    nu = np.array([nearest(column) for column in m.nu.T])
+    position = np.array([nearest(column) for column in m.position.T])
+    quaternion = np.array([nearest(column) for column in m.quaternion.T])
+    attitude = bool(np.isfinite(quaternion).all())
+    known = np.concatenate([np.isfinite(nu), np.full(3, attitude), np.isfinite(position)])
+    level = np.array([0.0, 0.0, 0.0, 1.0])
+    return np.nan_to_num(position), quaternion if attitude else level, np.nan_to_num(nu), known
+
+
+def _sink(m: Motion, vehicle: Vehicle, a: float, b: float) -> float:
+    """Return how far down to shift the simulation [m]: not at all if the vehicle came near the surface.
+
+    No vehicle flies: heights well above 0 have another zero than the surface, such as a motion capture's on the floor,
+    and then the vehicle counts as submerged.
+    """
+    reach = max(vehicle.body.surface_half_height, 0.5 * float(vehicle.body.size[2]))
+    height = m.position[np.isfinite(m.position[:, 2]), 2]
+    if len(height) and np.percentile(height, 99.0) > reach + FLIES:
+        return DEEP - float(height.max())
+    rows = (m.t >= a - 1e-9) & (m.t <= b + 1e-9) & np.isfinite(m.position[:, 2])
+    if not rows.any():
+        return 50.0 * DEEP
+    level = np.isfinite(m.quaternion[rows]).all(axis=1, keepdims=True)
+    q = np.where(level, m.quaternion[rows], [0.0, 0.0, 0.0, 1.0])
+    center = m.position[rows, 2] + quat_rotate(q, vehicle.body.center_of_buoyancy)[:, 2]
+    return DEEP if float(center.max()) < -reach else 0.0
+
+
+# Many candidate plants over many segments.
+
+Single = NDArray[np.float32]
+
+BUDGET = 300e6
+"""Memory for the worlds and responses of one pass [bytes]; more candidates take several passes."""
+
+WORLD = 6000.0
+"""Bytes of one world: plant, state, history, delay line."""
+
+LONGEST_STEP = 0.025
+"""Physics step above which a simulation step is divided [s]."""
+
+OPEN = 1.0e6
+"""Force limit of an actuator that has none [N]."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """Response of every candidate on every segment; rows from a world's end, or its divergence, on are NaN."""
+
+    t: NDArray[np.float64]
+    """Since the segment's start [s], (n + 1,)."""
+    nu: Single
+    """Velocity of the body origin, body frame [m/s, rad/s], (n + 1, C, S, 6)."""
+    position: Single
+    """Position of the body origin, world frame [m], (n + 1, C, S, 3)."""
+    quaternion: Single
+    """Body to world, (n + 1, C, S, 4)."""
+    finite: NDArray[np.bool_]
+    """True if a world reached its segment's end, (C, S)."""
+
+
+class Rollouts:
+    """Simulates segments under candidate plants."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        segments: Sequence[Segment],
+        *,
+        hydrodynamics: str = "calibrated",
+        substeps: int | None = None,
+        max_delay: float = 0.5,
+    ) -> None:
+        """Set up.
+
+        Args:
+            vehicle: Gives every number that a candidate does not.
+            segments: All of one step; they may be of different lengths and drives.
+            hydrodynamics: Key of the vehicle's hydrodynamic sets.
+            substeps: Physics steps in a step; enough for `LONGEST_STEP` if None. Applied forces are linear between
+                samples with one, which is what the default step has; with more they lead by up to half a step.
+            max_delay: Longest delay that a candidate may have [s].
+
+        Raises:
+            CalibrationError: no segments, steps that differ, or a drive with more than eight channels.
+        """
+        steps = {round(s.step, 9) for s in segments}
+        if len(steps) != 1:
+            raise CalibrationError(
+                "nothing to simulate: no trial has a usable interval"
+                if not steps
+                else f"segments have steps of {sorted(steps)} s, expected one step for all"
+            )
+        wide = [s.trial for s in segments if s.B.shape[1] > MAX_THRUSTERS]
+        if wide:
+            raise CalibrationError(f"{wide[0]}: more than {MAX_THRUSTERS} input channels cannot be simulated")
+        self.vehicle, self.segments, self.hydrodynamics = vehicle, tuple(segments), hydrodynamics
+        self.step = segments[0].step
+        self.nominal = vehicle_parameters(vehicle, hydrodynamics)
+        self._current = np.stack([s.current for s in segments])[None]
+        self._options: dict[str, Any] = {
+            "hydrodynamics": hydrodynamics,
+            "control_step": self.step,
+            "substeps": substeps or max(1, math.ceil(self.step / LONGEST_STEP - 1e-9)),
+            "integrator": "rk4",
+            "max_delay": max(max_delay, float(self.nominal["delay"])),
+            "water_moves": bool(self._current.any()),
+        }
+        self._simulators: dict[int, Simulator] = {}
+        self._lengths = np.array([s.steps for s in segments])
+        n = int(self._lengths.max())
+        self._force = np.zeros((n, len(segments), MAX_THRUSTERS), np.float32)
+        memory = max(len(s.before) for s in segments)
+        self._before = np.zeros((memory, len(segments), MAX_THRUSTERS), np.float32)
+        for i, s in enumerate(segments):
+            k = s.force.shape[1]
+            self._force[: s.steps, i, :k] = s.force
+            self._force[s.steps :, i, :k] = s.force[-1]
+            self._before[:, i, :k] = s.before[:1]
+            self._before[memory - len(s.before) :, i, :k] = s.before
+        self.own = self._own_fields()
+        self._held = self._imposed()
+
+    def _imposed(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], Single]]:
+        """Axes that are imposed together, the segments that do so, and their values by (n + 1, segments, axes)."""
+        patterns: dict[tuple[int, ...], list[int]] = {}
+        for i, s in enumerate(self.segments):
+            axes = () if s.held is None else tuple(np.flatnonzero(np.isfinite(s.held).all(axis=0)).tolist())
+            if axes:
+                patterns.setdefault(axes, []).append(i)
+        n, out = int(self._lengths.max()), []
+        for axes, those in patterns.items():
+            columns = [np.asarray(self.segments[i].held)[:, axes] for i in those]
+            values = [np.pad(c, ((0, n + 1 - len(c)), (0, 0)), mode="edge") for c in columns]
+            out.append((np.array(axes), np.array(those), np.stack(values, axis=1).astype(np.float32)))
+        return out
+
+    def _own_fields(self) -> dict[str, NDArray[np.float64]]:
+        """Plant fields in which segments differ: how forces reach the body, and the water's density. (S, ...)"""
+        out: dict[str, list[Any]] = {}
+        for s in self.segments:
+            B = np.zeros((6, MAX_THRUSTERS))
+            B[:, : s.B.shape[1]] = s.B
+            field: dict[str, Any] = {"B": B}
+            names = ("force_min", "force_max", "dead_minus", "dead_plus", "time_constant", "slew")
+            lagged = s.commanded and s.thrusters
+            if lagged:
+                field |= {name: self.nominal[name] for name in (*names, "delay", "speed_lag")}
+            else:
+                # Wrenches that were asked for pass through the motors too, as if through six equal ones.
+                n = len(self.vehicle.thrusters)
+                tc = float(np.mean(self.nominal["time_constant"][:n])) if s.commanded else 0.0
+                values = (-OPEN, OPEN, 0.0, 0.0, tc, NO_LIMIT)
+                field |= {
+                    name: np.full(MAX_THRUSTERS, value) for name, value in zip(names, values, strict=True)
+                }
+                field |= {"delay": self.nominal["delay"] if s.commanded else 0.0, "speed_lag": 0}
+            for name, value in field.items():
+                out.setdefault(name, []).append(np.asarray(value, float))
+        return {name: np.stack(values) for name, values in out.items()}
+
+    def run(
+        self,
+        plant: Mapping[str, ArrayLike] | None = None,
+        *,
+        initial: Mapping[str, ArrayLike] | None = None,
+        disturbance: ArrayLike | None = None,
+        candidates: int | None = None,
+    ) -> Response:
+        """Simulate every candidate over every segment.
+
+        Args:
+            plant: Field of `VehicleParameters` -> values by (C, S, ...); either axis may be 1. Volume and mesh drag are
+                those in the vehicle file's water: a trial's own density scales them.
+            initial: `nu`, `quaternion`, `position` at the start where they are not the segments' own, (C, S, ...).
+            disturbance: Extra wrench about the body origin, body frame [N, N m], (C, S, 6).
+            candidates: C; the longest first axis among the arrays if None.
+
+        Returns:
+            Responses of all of them.
+        """
+        arrays = {f"plant.{k}": np.asarray(v) for k, v in (plant or {}).items()}
+        arrays |= {f"initial.{k}": np.asarray(v) for k, v in (initial or {}).items()}
+        arrays |= {} if disturbance is None else {"tau": np.asarray(disturbance)}
+        C = candidates or max([1, *(a.shape[0] for a in arrays.values())])
+        n, S = self._force.shape[:2]
+        out = {
+            name: np.empty((n + 1, C, S, width), np.float32)
+            for name, width in (("nu", 6), ("position", 3), ("quaternion", 4))
+        }
+        finite = np.ones((C, S), bool)
+        for low, high in self._passes(C):
+            part = {k: a if a.shape[0] == 1 else a[low:high] for k, a in arrays.items()}
+            finite[low:high] = self._pass(high - low, part, {k: v[:, low:high] for k, v in out.items()})
+        return Response(t=np.asarray(self.step * np.arange(n + 1)), finite=finite, **out)
+
+    def _passes(self, candidates: int) -> Iterator[tuple[int, int]]:
+        n, S = self._force.shape[:2]
+        most = max(1, int(BUDGET / (S * (WORLD + 52.0 * (n + 1)))))
+        size = math.ceil(candidates / math.ceil(candidates / most))
+        for low in range(0, candidates, size):
+            yield low, min(low + size, candidates)
+
+    def _simulator(self, candidates: int) -> Simulator:
+        if candidates not in self._simulators:
+            if len(self._simulators) > 3:
+                self._simulators.clear()
+            worlds = candidates * len(self.segments)
+            self._simulators[candidates] = Simulator(
+                self.vehicle, worlds=worlds, water=Water(), **self._options
+            )
+        return self._simulators[candidates]
+
+    def _pass(self, C: int, given: dict[str, NDArray[Any]], out: dict[str, Single]) -> NDArray[np.bool_]:
+        """Simulate candidates that fit in memory; write their responses and return which reached the end."""
+        sim, S = self._simulator(C), len(self.segments)
+        shape = (C, S)
+
+        def write(target: Any, values: NDArray[Any]) -> None:
+            view = target.numpy().reshape(*shape, *target.numpy().shape[target.ndim :])
+            view[...] = values
+
+        plant = {k.removeprefix("plant."): a for k, a in given.items() if k.startswith("plant.")}
+        fields = {k: np.asarray(v)[None, None] for k, v in self.nominal.items()}
+        fields |= {k: v[None] for k, v in self.own.items()} | plant
+        density = np.array([s.density for s in self.segments]) / self.vehicle.water.density
+        for name in ("volume", "form_drag", "skin_drag"):
+            fields[name] = fields[name] * density
+        if self._current.any():
+            write(sim.water.current, self._current)
+        write(sim.command.disturbance, given.get("tau", np.zeros((1, 1, 6))))
+        start = {k.removeprefix("initial."): a for k, a in given.items() if k.startswith("initial.")}
+        self._place(sim, write, {})
+        sim.reset()
+        # Motors without lag come to the first command in one step; with theirs they then follow the others.
+        lagged = any(np.any(fields[name]) for name in ("time_constant", "delay"))
+        swift = fields | {"time_constant": 0.0, "delay": 0.0, "slew": NO_LIMIT}
+        for own, commands in ((swift, self._before[:1]), (fields, self._before[1:] if lagged else ())):
+            for name, values in own.items():
+                write(sim.plant.fields[name], values)
+            sim.refresh()
+            for command in commands:
+                self._command(sim, C)[...] = command
+                sim.step()
+            if own is swift:
+                ring = sim.state.commands.numpy().reshape(C, S, -1, MAX_THRUSTERS)
+                ring[...] = sim.state.actuator.numpy().reshape(C, S, 1, MAX_THRUSTERS)
+        self._place(sim, write, start)
+        return self._march(sim, C, out)
+
+    def _place(
+        self, sim: Simulator, write: Callable[[Any, NDArray[Any]], None], start: dict[str, NDArray[Any]]
+    ) -> None:
+        """Set every world to the state `start`, if it gives one, otherwise to its segment's own."""
+        for name, own in (("nu", "velocity"), ("quaternion", "quaternion"), ("position", "position")):
+            values = start.get(name, np.stack([getattr(s, name) for s in self.segments])[None])
+            if name == "position":
+                values = values + np.array([s.sink for s in self.segments])[:, None] * [0.0, 0.0, 1.0]
+            write(getattr(sim.state, own), values)
+
+    def _command(self, sim: Simulator, C: int) -> Single:
+        return np.asarray(sim.command.thrust.numpy().reshape(C, len(self.segments), MAX_THRUSTERS))
+
+    def _impulses(self, sim: Simulator, C: int) -> list[Single]:
+        """Change of nu for a unit change of the imposed axes by an impulse on these alone, (C, segments, 6, axes)."""
+        inverse = sim.plant.M_inv.numpy().reshape(C, len(self.segments), 6, 6)
+        out = []
+        for axes, those, _ in self._held:
+            columns = inverse[:, those][..., axes]
+            out.append(columns @ np.linalg.inv(columns[..., axes, :]))
+        return out
+
+    def _impose(self, nu: Single, impulses: list[Single], row: int) -> None:
+        """Let imposed axes move as given; what they push on the others by inertia, they do."""
+        for (axes, those, values), impulse in zip(self._held, impulses, strict=True):
+            now = nu[:, those]
+            now += (impulse @ (values[row] - now[..., axes])[..., None])[..., 0]
+            nu[:, those] = now
+
+    def _march(self, sim: Simulator, C: int, out: dict[str, Single]) -> NDArray[np.bool_]:
+        """Simulate the segments; write the response of every world and return which reached the end."""
+        n, S = self._force.shape[:2]
+        command, begin = self._command(sim, C), sim.state.steps.numpy().reshape(C, S).copy()
+        views = {
+            name: getattr(sim.state, own).numpy().reshape(C, S, -1)
+            for name, own in (("nu", "velocity"), ("position", "position"), ("quaternion", "quaternion"))
+        }
+        impulses = self._impulses(sim, C)
+        for axes, those, values in self._held:
+            views["nu"][:, those[:, None], axes] = values[0]
+        for name, view in views.items():
+            out[name][0] = view
+        for k in range(n):
+            command[...] = self._force[k]
+            sim.step()
+            self._impose(views["nu"], impulses, k + 1)
+            for name, view in views.items():
+                out[name][k + 1] = view
+        out["position"][..., 2] -= np.array([s.sink for s in self.segments], np.float32)
+        # A frozen world has counted the step in which it broke.
+        frozen = sim.state.frozen.numpy().reshape(C, S) != 0
+        reached = np.where(frozen, sim.state.steps.numpy().reshape(C, S) - 1 - begin, n)
+        last = np.minimum(reached, self._lengths)
+        late = np.arange(n + 1)[:, None, None] > last
+        for values in out.values():
+            values[late] = np.nan
+        return np.asarray(reached >= self._lengths)

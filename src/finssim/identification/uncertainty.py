@@ -1,0 +1,285 @@
+"""Uncertainty of estimates: the evidence of every trial, and the agreement of the trials.
+
+Notation: a fit minimises Σ_g |W_g^½ r_g(theta)|² over trials g. Trial g contributes N_g = J_gᵀ W J_g to the normal
+matrix and s_g = J_gᵀ W r_g to the score, r = measured - predicted, both at the solution, where Σ s_g = 0. Nothing else
+is needed, so this serves linear regressions and simulation-error fits alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.identification.fit import Correlation
+from finssim.trials.findings import CalibrationError, Finding, finding
+
+__all__ = [
+    "Covariance",
+    "Evidence",
+    "correlated_samples",
+    "correlation",
+    "degeneracy",
+    "intervals",
+    "trial_covariance",
+]
+
+Array = NDArray[np.float64]
+
+FLOOR = 1e-13
+"""Eigenvalue of the scaled normal matrix (unit diagonal) below which a direction counts as unknown."""
+
+ALONE = 0.9
+"""Share of the information on a parameter above which it rests on one trial."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """Evidence of each trial on the parameters, linearised at the solution."""
+
+    names: tuple[str, ...]
+    """(P,)"""
+    normal: Array
+    """N_g with W the inverse variance of the residuals, (G, P, P)."""
+    score: Array
+    """s_g, (G, P); they add up to zero where no bound is active."""
+    unit: str = "trials"
+    """Unit of the groups: `trials`, or `blocks` of consecutive samples if there are too few trials."""
+    prior: Array | None = None
+    """Inverse covariance of what was known before any trial, (P, P); None without."""
+
+    @property
+    def information(self) -> Array:
+        """Σ_g N_g and the prior's, (P, P)."""
+        total = np.asarray(self.normal, float).sum(axis=0)
+        return total if self.prior is None else total + self.prior
+
+
+@dataclass(frozen=True, kw_only=True)
+class Covariance:
+    """Two answers to one question; where they differ much, the model or the noise is not as assumed."""
+
+    names: tuple[str, ...]
+    local: Array
+    """Inverse information Σ_g N_g: errors independent and of the stated variance, (P, P)."""
+    trials: Array
+    """Covariance from the disagreement of the trials, (P, P): valid for any noise within a trial."""
+    dof: Array
+    """Degrees of freedom of each variance in `trials`, (P,); infinite where `local` has to serve."""
+    alone: NDArray[np.bool_]
+    """True if a parameter rests on one trial, so that no disagreement can show, (P,)."""
+
+    @property
+    def std(self) -> Array:
+        """Standard errors, (P,): from the trials, from `local` for what rests on one trial."""
+        local, trials = np.diagonal(self.local), np.diagonal(self.trials)
+        return np.asarray(np.sqrt(np.where(self.alone, np.maximum(local, trials), trials)))
+
+
+def _whitener(normal: Array) -> tuple[Array, Array]:
+    """T (P, K) with Tᵀ N T = 1 on the K known directions, and the parameters that touch unknown ones, (P,) bool."""
+    if not np.isfinite(normal).all():
+        raise CalibrationError(
+            "the trials hold numbers that cannot be computed with: check the units of their columns"
+        )
+    scale = np.sqrt(np.maximum(np.diagonal(normal), 0.0))
+    safe = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(normal / np.outer(safe, safe))
+    determined = values > FLOOR
+    T = vectors[:, determined] / np.sqrt(values[determined]) / safe[:, None]
+    unknown = (np.abs(vectors[:, ~determined]) > 1e-6).any(axis=1) | (scale == 0.0)
+    return T, unknown
+
+
+def trial_covariance(evidence: Evidence) -> Covariance:
+    """Local and trial-based covariance of the estimates.
+
+    V = N⁻¹ [Σ_g A_g s_g s_gᵀ A_gᵀ + N_0] N⁻¹,  A_g = (1 - N_g N⁻¹)⁻¹           (CR3; Bell and McCaffrey 2002)
+
+    with N = Σ_g N_g + N_0 and the information N_0 of a prior, whose variance is taken as stated.
+
+    N⁻¹ A_g s_g is what leaving trial g out changes: V is the jackknife over trials. The power -½ would be exact for
+    independent errors, and too small where few trials with much weight differ as a whole, as they do. The degrees of
+    freedom are Satterthwaite's for independent errors, so that few or unequal trials give wide intervals.
+
+    Args:
+        evidence: Contributions of G trials; with one, `local` has to serve for all.
+
+    Returns:
+        Infinite variances where the information matrix is singular.
+    """
+    N_g, s_g = np.asarray(evidence.normal, float), np.asarray(evidence.score, float)
+    P = len(evidence.names)
+    T, unknown = _whitener(evidence.information)
+    local = T @ T.T
+    local[unknown, unknown] = np.inf
+    if len(N_g) < 2 or T.shape[1] == 0:
+        return Covariance(
+            names=evidence.names,
+            local=local,
+            trials=local.copy(),
+            dof=np.full(P, np.inf),
+            alone=np.ones(P, bool),
+        )
+    B = T.T @ N_g @ T  # leverage of each trial: the shares of the information, they add up to 1
+    share, axes = np.linalg.eigh(B)
+    remaining = 1.0 - np.clip(share, 0.0, 1.0)
+    root = np.where(remaining > 1e-3, 1.0 / np.maximum(remaining, 1e-3), 0.0)
+    A = np.einsum("gij,gj,gkj->gik", axes, root, axes)
+    errors = np.einsum("pk,gkl,gl->gp", T, A, s_g @ T)
+    trials = errors.T @ errors
+    stated = np.zeros((P, P))
+    if evidence.prior is not None:
+        stated = T @ (T.T @ evidence.prior @ T) @ T.T
+        trials = trials + stated
+
+    a = np.einsum("pk,gkl->gpl", T, A)  # A_gᵀ N⁻¹ e_p, whitened
+    Ba = np.einsum("gkl,gpl->gpk", B, a)
+    gram = -np.einsum("gpk,hpk->pgh", Ba, Ba)
+    index = np.arange(len(N_g))
+    gram[:, index, index] += np.einsum("gpk,gpk->pg", a, Ba)
+    trace = np.trace(gram, axis1=1, axis2=2)
+    # In units of the largest entry: squares of the variance of a parameter that is hardly known would overflow.
+    unit = gram / np.maximum(np.abs(gram).max(axis=(1, 2), keepdims=True), 1e-300)
+    square = np.einsum("pgh,pgh->p", unit, unit)
+    dof = np.where(square > 0.0, np.trace(unit, axis1=1, axis2=2) ** 2 / np.maximum(square, 1e-300), 1.0)
+    # A stated variance has infinitely many degrees of freedom; Satterthwaite's sum of both.
+    mixed = (1.0 + np.diagonal(stated) / np.maximum(trace, 1e-300)) ** 2
+
+    variance = np.maximum(np.diagonal(T @ T.T), 1e-300)
+    alone = (np.einsum("pk,gkl,pl->gp", T, B, T) / variance).max(axis=0) > ALONE
+    trials[unknown, unknown] = np.inf
+    return Covariance(
+        names=evidence.names,
+        local=local,
+        trials=trials,
+        dof=np.where(alone, np.inf, np.clip(dof, 1.0, len(N_g) - 1.0) * mixed),
+        alone=alone | unknown,
+    )
+
+
+def intervals(theta: Array, covariance: Covariance) -> Array:
+    """Student's 95 % intervals of the estimates.
+
+    Args:
+        theta: Estimates, (P,).
+        covariance: Theirs.
+
+    Returns:
+        Lower and upper ends, (P, 2); infinite where nothing is known.
+    """
+    from scipy.stats import norm, t
+
+    finite = np.isfinite(covariance.dof)
+    quantile = np.where(finite, t.ppf(0.975, np.where(finite, covariance.dof, 1.0)), norm.ppf(0.975))
+    half = quantile * covariance.std
+    return np.stack([theta - half, theta + half], axis=-1)
+
+
+def correlated_samples(residual: Array, breaks: Sequence[int] = ()) -> float:
+    """Return the number of samples per independent one: 1 + 2 Σ ρ_k up to the first pair with negative sum (Geyer
+    1992).
+
+    Args:
+        residual: Equally spaced, (n,).
+        breaks: Indices at which a new stretch begins; no product runs across.
+
+    Returns:
+        At least 1.
+    """
+    stretches = [part - np.mean(residual) for part in np.split(residual, list(breaks)) if len(part)]
+    longest = max(len(part) for part in stretches)
+    size = 2 ** int(np.ceil(np.log2(2 * longest)))
+    power = sum(np.abs(np.fft.rfft(part, size)) ** 2 for part in stretches)
+    rho = np.fft.irfft(power, size)[:longest]
+    if rho[0] <= 0.0:
+        return 1.0
+    pairs = rho[: longest // 2 * 2].reshape(-1, 2).sum(axis=1) / rho[0]
+    ends = np.flatnonzero(pairs <= 0.0)
+    return float(max(1.0, 2.0 * pairs[: ends[0] if len(ends) else None].sum() - 1.0))
+
+
+TIGHT = 0.98
+"""Multiple correlation of a parameter with the others above which it counts as traded off."""
+
+LOOSE = 0.1
+"""Relative standard error below which a trade-off does not matter."""
+
+
+def correlation(names: Sequence[str], covariance: Array) -> Correlation:
+    """Correlation of the errors; zero for parameters without a finite variance.
+
+    Args:
+        names: (P,)
+        covariance: (P, P)
+    """
+    variance = np.diagonal(covariance)
+    good = np.isfinite(variance) & (variance > 0.0)
+    std = np.sqrt(np.where(good, variance, 1.0))
+    matrix = np.where(np.outer(good, good), covariance / np.outer(std, std), 0.0)
+    np.fill_diagonal(matrix, 1.0)
+    return Correlation(names=tuple(names), matrix=np.clip(matrix, -1.0, 1.0))
+
+
+def degeneracy(
+    names: Sequence[str], covariance: Array, theta: Array | None = None
+) -> tuple[Correlation, list[Finding]]:
+    """Correlation of the errors, and a finding for each group of parameters that trade off.
+
+    The groups are the weak directions of the scaled information: eigenvectors of the errors' correlation with large
+    eigenvalues. A trade-off among parameters that are all known well is left out.
+
+    Args:
+        names: (P,)
+        covariance: Of the estimates, best the local one, (P, P); infinite variances name unknown parameters.
+        theta: Estimates, to tell which are known well; all count as loose where not given, (P,).
+
+    Returns:
+        Correlation, and what trades off and what would settle it.
+    """
+    correlations = correlation(names, covariance)
+    variance = np.diagonal(covariance)
+    unknown = [name for name, v in zip(names, variance, strict=True) if not np.isfinite(v)]
+    findings = [finding("undetermined", parameters=tuple(unknown))] if unknown else []
+    std = np.sqrt(np.where(np.isfinite(variance), np.maximum(variance, 0.0), 0.0))
+    loose = np.isfinite(variance) & (variance > 0.0)
+    if theta is not None:
+        loose &= std > LOOSE * np.abs(theta)
+    index = np.flatnonzero(np.isfinite(variance) & (variance > 0.0))
+    if len(index) < 2:
+        return correlations, findings
+    R = correlations.matrix[np.ix_(index, index)]
+    values, vectors = np.linalg.eigh(R)
+    inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
+    multiple = np.sqrt(np.clip(1.0 - 1.0 / np.maximum(np.diagonal(inverse), 1.0), 0.0, 1.0))
+    traded = (multiple > TIGHT) & loose[index]
+    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        # Trade-offs appear as directions whose error is larger than that of independent parameters.
+        if value < 1.5:
+            break
+        large = (np.abs(vector) > 0.4 * np.abs(vector).max()) & traded
+        if large.sum() < 2:
+            continue
+        traded &= ~large
+        group = [names[i] for i in index[large]]
+        ratio = 1.0 / np.sqrt(1.0 - multiple[large].max() ** 2 + 1e-24)
+        findings.append(_traded(group, float(ratio)))
+    return correlations, findings
+
+
+def _traded(group: list[str], ratio: float) -> Finding:
+    kinds = {name.rpartition(".")[2] for name in group}
+    axes = {name.rpartition(".")[0] for name in group if "." in name}
+    masses = {"m_eff", "added_mass"}
+    if "thrust_scale" in kinds:
+        return finding("thrust_traded", parameters=tuple(name for name in group if name != "thrust_scale"))
+    fields = {"parameters": tuple(group), "ratio": ratio}
+    if kinds <= {"thrust_lag", "thrust_delay"}:
+        return finding("lag_traded", **fields)
+    if kinds <= {"d1", "d2"} and len(axes) == 1:
+        return finding("damping_traded", **fields)
+    if kinds & masses and kinds & {"d1", "d2", "k"} and len(axes) == 1:
+        return finding("inertia_traded", **fields)
+    return finding("stiffness_traded", **fields) if "k" in kinds else finding("traded", **fields)

@@ -1,0 +1,773 @@
+"""A calibration as files: the vehicle with a fit's changes, origins and comments, and ranges to draw from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+import shutil
+import textwrap
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from finssim.core.files import atomic_write
+from finssim.core.provenance import provenance
+from finssim.identification.fit import Estimate, Fit
+from finssim.trials.findings import CalibrationError, Finding, finding, plain
+from finssim.vehicles import (
+    AXES,
+    CalibrationRecord,
+    HydrodynamicSet,
+    Provenance,
+    Vehicle,
+    VehicleError,
+    check_vehicle,
+    load_vehicle,
+)
+from finssim.vehicles.terms import TERMS
+
+__all__ = [
+    "all_findings", "calibrated", "estimate_at", "file_tree", "folded", "retained_values", "leaves",
+    "number_in", "number_origins", "scaled_thrust", "write_vehicle",
+]  # fmt: skip
+
+Key = tuple[str, ...]
+
+
+def file_tree(vehicle: Vehicle) -> dict[str, Any]:
+    """The values that the vehicle's file gives, with diagonal matrices by their diagonals."""
+    return dict(_shortened(vehicle.values()))
+
+
+def leaves(node: Any, path: Key = ()) -> Iterator[tuple[Key, float]]:
+    """Path and value of every number below a node of plain values."""
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            yield from leaves(value, (*path, str(key)))
+    elif isinstance(node, list):
+        for i, value in enumerate(node):
+            yield from leaves(value, (*path, str(i)))
+    elif isinstance(node, (int, float)) and not isinstance(node, bool):
+        yield path, node
+
+
+def number_origins(vehicle: Vehicle) -> dict[Key, Provenance]:
+    """Origin of every number of `file_tree(vehicle)`, by path; calibration records are not numbers of the vehicle."""
+    return {path: vehicle.origin_of(".".join(full_path)) for path, full_path, _ in numbers(vehicle)}
+
+
+def numbers(vehicle: Vehicle) -> Iterator[tuple[Key, Key, float]]:
+    """Every number of `file_tree(vehicle)`: its path there, its path in `vehicle.values()`, and its value.
+
+    The two paths differ in a diagonal matrix, where the tree has one row; calibration records are left out.
+    """
+    tree, values = file_tree(vehicle), vehicle.values()
+    tree.pop("calibrations", None)
+    for path, value in leaves(tree):
+        yield path, (*path, path[-1]) if isinstance(_at(values, path), list) else path, value
+
+
+def folded(tree: Any, origins: Mapping[Key, Provenance]) -> dict[str, Provenance]:
+    """Origins by dotted path, as reading the file gives them: one entry for a list whose numbers share theirs."""
+    folded_origins: dict[str, Provenance] = {}
+    _fold(tree, (), origins, folded_origins)
+    return folded_origins
+
+
+def _fold(
+    node: Any, path: Key, origins: Mapping[Key, Provenance], result: dict[str, Provenance]
+) -> Provenance | None:
+    """Record what lies below; returns the common origin of a number or list, which the caller records."""
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            common = _fold(value, (*path, str(key)), origins, result)
+            if common is not None:
+                result[".".join((*path, str(key)))] = common
+        return None
+    if isinstance(node, list):
+        parts = [_fold(value, (*path, str(i)), origins, result) for i, value in enumerate(node)]
+        if parts and parts[0] is not None and all(part == parts[0] for part in parts):
+            return parts[0]
+        for i, part in enumerate(parts):
+            if part is not None:
+                result[".".join((*path, str(i)))] = part
+        return None
+    return origins.get(path)
+
+
+def _shortened(node: Any) -> Any:
+    if isinstance(node, dict):
+        return {key: value if key == "calibrations" else _shortened(value) for key, value in node.items()}
+    square = isinstance(node, list) and len(node) in (3, 6)
+    if square and all(isinstance(row, list) and len(row) == len(node) for row in node):
+        matrix = np.array(node)
+        if not np.any(matrix - np.diag(np.diag(matrix))):
+            return np.diag(matrix).tolist()
+    return list(node) if isinstance(node, tuple) else node
+
+
+def _at(tree: Any, path: Key) -> Any:
+    for key in path:
+        tree = tree[int(key)] if isinstance(tree, list) else tree[key if key in tree else int(key)]
+    return tree
+
+
+# The text of a vehicle file: sections in the catalogue's order, origins at the highest level they hold for, units.
+
+WIDTH = 118
+"""Longest line of prose."""
+LONG = 180
+"""Longest line of a section of `ONE_LINE`."""
+
+UNITS = {
+    "mass": "kg",
+    "inertia": "kg m²",
+    "center_of_gravity": "m",
+    "center_of_buoyancy": "m",
+    "displaced_volume": "m³",
+    "size": "m",
+    "surface_half_height": "m",
+    "reference_point": "m",
+    "wrench_reference": "m",
+    "added_mass": "kg, kg m²: surge, sway, heave, roll, pitch, yaw",
+    "linear_damping": "N s/m, N m s",
+    "quadratic_damping": "N s²/m², N m s²",
+    "c_plus": "N s²/rad²",
+    "c_minus": "N s²/rad²",
+    "rpm_min": "rpm",
+    "rpm_max": "rpm",
+    "dead_rpm_minus": "rpm",
+    "dead_rpm_plus": "rpm",
+    "force_min": "N",
+    "force_max": "N",
+    "time_constant": "s",
+    "delay": "s",
+    "rate": "Hz",
+    "latency": "s",
+    "gyro_noise_density": "rad/s/√Hz",
+    "accel_noise_density": "m/s²/√Hz",
+    "edge": "m",
+    "rpm_full_scale": "rpm",
+    "command_timeout": "s",
+    "command_rate": "Hz",
+    "max_tilt": "rad",
+    "max_tilt_duration": "s",
+}
+"""Key -> unit of its value, written behind it."""
+
+SINGLE_LINE = (("water",), ("hull",), ("thrusters", "*"), ("tags", "mounts", "*"), ("perception", "*"))
+"""Sections that are written on one line where they fit."""
+
+
+def vehicle_text(tree: Mapping[str, Any], origins: Mapping[Key, Provenance]) -> str:
+    """YAML of a vehicle file.
+
+    Args:
+        tree: Plain values by section; `title`, `description` and `calibrations` included.
+        origins: Origin of every number of it, by path.
+    """
+    prose = ("title", "description", "calibrations")
+    body = {key: value for key, value in tree.items() if key not in prose}
+    sections = Counter(_common(node, (key,), origins, None) for key, node in body.items())
+    del sections[None]
+    common = sections.most_common(1)[0][0] if sections else None
+    lines = [f"title: {_word(tree['title'])}", *_prose(str(tree["description"]))]
+    lines += [f"{key}: {_word(text)}" for key, text in _marks(common, None).items()]
+    for key, node in body.items():
+        lines += ["", *_lines(key, _annotated(node, (key,), common, origins), (key,), "")]
+    text = "\n".join(lines) + "\n"
+    if tree.get("calibrations"):
+        text += "\n# How numbers above were fitted, oldest first: trial -> SHA-256 of what it holds.\n"
+        text += _yaml({"calibrations": tree["calibrations"]}, flow=False)
+    return text
+
+
+def _annotated(node: Any, path: Key, inherited: Provenance | None, origins: Mapping[Key, Provenance]) -> Any:
+    """Return a node with the marks that give the origins of its numbers to a reader who inherits one."""
+    if isinstance(node, Mapping):
+        common = _common(node, path, origins, inherited)
+        inner = {key: _annotated(v, (*path, str(key)), common, origins) for key, v in node.items()}
+        return _marks(common, inherited) | inner
+    origin, value = origins.get(path, inherited), node
+    if isinstance(node, list):
+        each = {origins.get(leaf) for leaf, _ in leaves(node, path)}
+        origin = inherited if len(each) > 1 else next(iter(each), None)
+        value = [_annotated(item, (*path, str(i)), origin, origins) for i, item in enumerate(node)]
+    marks = _marks(origin, inherited)
+    return {"value": value} | marks if marks else value
+
+
+def _lines(key: Any, node: Any, path: Key, pad: str) -> Iterator[str]:
+    """Lines of `key: node`: sections in blocks, numbers and rows of them on one line each."""
+    head = f"{pad}{_word(key)}:"
+    flow = f"{head} {_word(node)}"
+    unit = f"  # [{_unit(path)}]" if _unit(path) else ""
+    short = not node or (_on_single_line(path) and len(flow) <= LONG)
+    if isinstance(node, Mapping) and not short and not ("value" in node and not _rows(node["value"])):
+        yield head + unit
+        for inner, value in node.items():
+            yield from _lines(inner, value, (*path, str(inner)), pad + "  ")
+    elif _rows(node):
+        yield head + unit
+        yield from _items(node, pad + "  ")
+    else:
+        yield flow + unit
+
+
+def _items(rows: list[Any], pad: str) -> Iterator[str]:
+    """An item of a list on one line; a row whose entries have long notes on a line for each."""
+    for item in rows:
+        flow = f"{pad}- {_word(item)}"
+        if _rows(item) and len(flow) > LONG:
+            yield f"{pad}-"
+            yield from _items(item, pad + "  ")
+        else:
+            yield flow
+
+
+def _rows(node: Any) -> bool:
+    """Return whether a node is a list of more than plain values."""
+    return isinstance(node, list) and any(isinstance(item, (list, Mapping)) for item in node)
+
+
+def _unit(path: Key) -> str:
+    """Return the unit of the value at a path; empty if there is none to write."""
+    term = TERMS.get(path[2]) if path[0] == "hydrodynamics" and len(path) > 2 else None
+    return UNITS.get(path[-1], "") if term is None else term.units.get(path[-1], "")
+
+
+def _common(
+    node: Any, path: Key, origins: Mapping[Key, Provenance], inherited: Provenance | None
+) -> Provenance | None:
+    """The origin to state for a section: that of most of its values, counting a list once.
+
+    Values of one origin and source that differ in their notes share the section's, each with its note alone.
+    """
+    values = dict.fromkeys(
+        (leaf[:-1] if leaf[-1].isdigit() else leaf, origins[leaf])
+        for leaf, _ in leaves(node, path)
+        if leaf in origins
+    )
+    counts = Counter(origin[:2] for _, origin in values)
+    if not counts:
+        return inherited
+    best = max(counts, key=lambda pair: (counts[pair], inherited is not None and pair == inherited[:2]))
+    notes = Counter(origin.note for _, origin in values if origin[:2] == best)
+    if inherited is not None and inherited[:2] == best and inherited.note in notes:
+        return inherited
+    # A value without a note under one would need its origin and source again.
+    return Provenance(*best, "" if "" in notes else notes.most_common(1)[0][0])
+
+
+def _marks(origin: Provenance | None, inherited: Provenance | None) -> dict[str, str]:
+    """Return what must be written so that a reader who inherits one origin finds the other."""
+    if origin is None or origin == inherited:
+        return {}
+    if inherited is not None and origin.origin == inherited.origin:
+        if origin.source == inherited.source and origin.note:
+            return {"note": origin.note}
+        if origin.source and origin.source != inherited.source:
+            return {"source": origin.source} | ({"note": origin.note} if origin.note else {})
+    marks = {"origin": str(origin.origin), "source": origin.source, "note": origin.note}
+    return {mark: text for mark, text in marks.items() if text}
+
+
+def _on_single_line(path: Key) -> bool:
+    return any(
+        len(path) == len(pattern) and all(p in ("*", q) for p, q in zip(pattern, path, strict=True))
+        for pattern in SINGLE_LINE
+    )
+
+
+def _word(value: Any) -> str:
+    """Return a value as YAML on one line, as allowed inside a list or mapping."""
+    return _yaml([value], flow=True).strip()[1:-1]
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes digests and other words that are numbers to our reader, as 1e5 is in YAML 1.2."""
+
+
+_Dumper.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+$"), list("-+0123456789.")
+)
+
+
+def _yaml(value: Any, *, flow: bool) -> str:
+    text = yaml.dump(
+        value, Dumper=_Dumper, default_flow_style=flow, sort_keys=False, allow_unicode=True, width=math.inf
+    )
+    return str(text)
+
+
+def _prose(text: str) -> list[str]:
+    """The description as a folded block, or in quotes where folding would change it."""
+    body = text.rstrip("\n")
+    lines = textwrap.wrap(body, WIDTH - 2, break_long_words=False, break_on_hyphens=False)
+    if not lines or " ".join(lines) != body or len(text) - len(body) > 1 or not body.isprintable():
+        return [f"description: {json.dumps(text, ensure_ascii=False)}"]
+    return [f"description: {'>' if text.endswith(chr(10)) else '>-'}", *(f"  {line}" for line in lines)]
+
+
+PER_THRUSTER = ("position", "axis", "group", "motor_index", "motor_sign")
+"""Keys of a single thruster; the rest is written for its group if all its members agree."""
+
+
+def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
+    """Write a self-contained vehicle file: every number, its origin, and the calibrations behind it.
+
+    It reads back with the same `sha256` and the same origins. A hull mesh and sensors' files are copied beside it,
+    under names that end with a part of their digest, unless they lie there already; the notice of a mesh's licence,
+    `NAME.NOTICE`, goes with it.
+
+    Args:
+        vehicle: Any vehicle.
+        path: File to write, .yaml; an earlier file is replaced.
+
+    Raises:
+        CalibrationError: Another suffix.
+        OutputError: The place cannot be written.
+    """
+    target = yaml_path(path, "vehicle")
+    tree, origins = file_tree(vehicle), number_origins(vehicle)
+    tree, origins = _grouped(tree, origins)
+    with atomic_write(target) as temporary:
+        if vehicle.hull is not None and vehicle.hull.file is not None:
+            tree["hull"]["file"] = _beside(vehicle.hull.file, target)
+        for entry in tree.get("perception", {}).values():
+            if Path(entry["device"]).is_absolute():
+                entry["device"] = _beside(Path(entry["device"]), target)
+        temporary.write_text(vehicle_text(tree, origins), encoding="utf-8")
+        if load_vehicle(temporary).sha256 != vehicle.sha256:
+            raise RuntimeError(f"{path}: the file would not hold the same vehicle; nothing was written")
+
+
+def yaml_path(path: str | os.PathLike[str], kind: str) -> Path:
+    """The path of a vehicle, ranges, pool or camera file to write.
+
+    Raises:
+        CalibrationError: It does not end in .yaml or .yml.
+    """
+    target = Path(path)
+    if target.suffix not in (".yaml", ".yml"):
+        raise CalibrationError(
+            f"{path} ends in '{target.suffix}', expected .yaml: name a {kind} file to write"
+        )
+    return target
+
+
+def _beside(mesh: Path, target: Path) -> str:
+    """Name of a mesh, or of a sensor's file, beside the target, copied there if need be; never over another file."""
+    folder = Path(os.path.realpath(target)).parent
+    if mesh.resolve().parent == folder:
+        return mesh.name
+    data = mesh.read_bytes()
+    name = f"{mesh.stem}-{hashlib.sha256(data).hexdigest()[:8]}"
+    copy = folder / f"{name}{mesh.suffix}"
+    if not (copy.is_file() and copy.read_bytes() == data):
+        with atomic_write(copy) as temporary:
+            temporary.write_bytes(data)
+    notice = mesh.with_suffix(".NOTICE")
+    if notice.is_file():
+        with atomic_write(folder / f"{name}.NOTICE") as temporary:
+            shutil.copyfile(notice, temporary)
+    return copy.name
+
+
+def _grouped(
+    tree: dict[str, Any], origins: dict[tuple[str, ...], Provenance]
+) -> tuple[dict[str, Any], dict[tuple[str, ...], Provenance]]:
+    """Numbers that all thrusters of a group share, with one origin, move to `thruster_groups`."""
+    groups: dict[str, dict[str, Any]] = {}
+    origins = dict(origins)
+    thrusters = {name: dict(values) for name, values in tree["thrusters"].items()}
+    for group in dict.fromkeys(t["group"] for t in thrusters.values() if t.get("group")):
+        members = [name for name, values in thrusters.items() if values.get("group") == group]
+        first = members[0]
+        shared = [
+            key
+            for key in thrusters[first]
+            if key not in PER_THRUSTER
+            and all(_same(key, first, member, thrusters, origins) for member in members[1:])
+        ]
+        groups[group] = {key: thrusters[first][key] for key in shared}
+        for key in shared:
+            for path, _ in leaves(thrusters[first][key], ("thrusters", first, key)):
+                origins[("thruster_groups", group, *path[2:])] = origins[path]
+            for member in members:
+                del thrusters[member][key]
+    result: dict[str, Any] = {}
+    for section, values in tree.items():
+        if section == "thrusters":
+            if groups:
+                result["thruster_groups"] = groups
+            result["thrusters"] = {name: _group_first(values) for name, values in thrusters.items()}
+        else:
+            result[section] = dict(values) if isinstance(values, dict) else values
+    return result, origins
+
+
+def _same(
+    key: str,
+    first: str,
+    member: str,
+    thrusters: Mapping[str, Any],
+    origins: Mapping[tuple[str, ...], Provenance],
+) -> bool:
+    """Return whether two thrusters hold the same under a key, of the same origin."""
+    if key not in thrusters[member] or thrusters[first][key] != thrusters[member][key]:
+        return False
+    paths = [path for path, _ in leaves(thrusters[first][key], (key,))]
+    return all(origins[("thrusters", first, *p)] == origins[("thrusters", member, *p)] for p in paths)
+
+
+def _group_first(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys of a thruster as a person writes them: the group, the place, then the rest."""
+    return {key: values[key] for key in ("group", "position", "axis") if key in values} | dict(values)
+
+
+# From a fit to a vehicle: the numbers that the data determine, each with its origin and interval, and the record.
+
+
+SCALED = ("c_plus", "c_minus", "force_min", "force_max")
+"""Numbers of a thruster that `thrust_scale` multiplies."""
+
+
+def scaled_thrust(vehicle: Vehicle, scale: float) -> dict[str, float]:
+    """Changes of the vehicle file that multiply every thrust by a scale [-]."""
+    return {
+        f"thrusters.{name}.{key}": scale * float(getattr(thruster, key))
+        for name, thruster in vehicle.thrusters.items()
+        for key in SCALED
+    }
+
+
+def calibrated(fit: Fit) -> Vehicle:
+    """The vehicle with what the fit determined; everything else keeps its number and its origin.
+
+    A number that the fit changed is `measured`, its note is its 95 % interval. The record of the calibration, with the
+    digests of its trials, comes after those that the vehicle had.
+
+    Raises:
+        CalibrationError: The estimates make no vehicle that can be simulated.
+    """
+    before = fit.before
+    number = len(before.calibrations) + 1
+    record = _calibration_record(fit)
+    source = f"calibration {number}: {record.sentence()}"
+    try:
+        # Seven digits: far more than any interval needs, and a readable file.
+        changes = plain(fit.changes, 7)
+        after = before.replace(changes, Provenance("measured", source)) if changes else before
+    except VehicleError as error:
+        raise CalibrationError(
+            f"the estimates make no vehicle: {error}: use fewer axes, or trials that excite them more"
+        ) from None
+    old_values = dict(leaves(before.values()))
+    changed = [tuple(path.split(".")) for path in fit.changes]
+    origins = {}
+    for path, full_path, value in numbers(after):
+        estimate = _estimate_of(path, fit.estimates, after) or _scale_of(path, fit.estimates)
+        determined = estimate is not None and estimate.identifiable and _covers(changed, path, after)
+        if old_values.get(full_path) == value and not determined:
+            origins[path] = before.origin_of(".".join(full_path))
+        else:
+            origins[path] = Provenance("measured", source, _note(estimate, value))
+    tree = file_tree(after)
+    tree.pop("calibrations", None)
+    return after.model_copy(
+        update={
+            "provenance": folded(tree, origins),
+            "calibrations": (*before.calibrations, record),
+        }
+    )
+
+
+def retained_values(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
+    """Parameters with a place in the vehicle file that the fit left as they were, with the number they keep.
+
+    Args:
+        fit: The fit.
+        vehicle: `calibrated(fit)`.
+    """
+    retained = {}
+    for name, estimate in fit.estimates.items():
+        if estimate.path is None:
+            continue
+        before, after = number_in(fit.before, estimate.path), number_in(vehicle, estimate.path)
+        if before is not None and before == after and not estimate.identifiable:
+            retained[name] = before
+    return retained
+
+
+def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
+    """Return the findings of a fit, and those against its vehicle: checks that it fails and its parent did not, and
+    fits without use.
+
+    Args:
+        fit: The fit.
+        vehicle: `calibrated(fit)`.
+    """
+    passed = {check.name for check in check_vehicle(fit.before) if check.passed}
+    findings = [*fit.findings]
+    findings += [
+        finding("check_failed", check=check.name, sentence=check.sentence)
+        for check in check_vehicle(vehicle)
+        if not check.passed and check.name in passed
+    ]
+    for subject, figures in fit.quality.items():
+        r2 = figures.get("r2", math.nan)
+        if r2 < 0.0:
+            findings.append(finding("further_than_mean", subject, r2=r2))
+    return findings if fit.changes else [*findings, finding("nothing_determined")]
+
+
+def number_in(vehicle: Vehicle, path: str) -> float | None:
+    """The number at a dotted path of the vehicle file, `*` and groups by their first thruster; None where none is."""
+    keys = tuple(path.split("."))
+    for leaf, full_path, value in numbers(vehicle):
+        if _same_number(keys, leaf, vehicle) or keys == full_path:
+            return value
+    return dict(leaves(vehicle.values())).get(keys)  # a coupling of a matrix whose file gives the diagonal
+
+
+def estimate_at(path: str, fit: Fit, vehicle: Vehicle) -> Estimate | None:
+    """The estimate that is of the number at a dotted path, or None; an entry of a matrix by row and column."""
+    leaf = tuple(path.split("."))
+    return _estimate_of(leaf, fit.estimates, vehicle) or (
+        _estimate_of(leaf[:-1], fit.estimates, vehicle) if leaf[-1] == leaf[-2] else None
+    )
+
+
+def _calibration_record(fit: Fit) -> CalibrationRecord:
+    origin = provenance()
+    return CalibrationRecord(
+        kind=fit.kind,  # type: ignore[arg-type]
+        method=fit.method,
+        trials=dict(fit.trials),
+        settings=json.loads(json.dumps(dict(fit.settings), default=_plain_value)),
+        start=fit.before.sha256,
+        finssim=origin["finssim"],
+        revision=origin["revision"],
+        interrupted=fit.interrupted,
+    )
+
+
+def _plain_value(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    if isinstance(value, (set, frozenset)):
+        return sorted(value)
+    return str(value)
+
+
+def _covers(changes: Sequence[Key], leaf: Key, vehicle: Vehicle) -> bool:
+    """Return whether one of the changes set this number, or a list or section that holds it."""
+    return any(
+        _same_number(change, leaf[: len(change)], vehicle) or _same_number(change, leaf, vehicle)
+        for change in changes
+    )
+
+
+def _same_number(pattern: Key, leaf: Key, vehicle: Vehicle) -> bool:
+    """Return whether a path of an estimate or change means a number of the file's tree.
+
+    `*` is any name; `thruster_groups.G.x` is x of every thruster of G; an entry of a diagonal matrix may be given by
+    row and column or by row alone.
+    """
+    if pattern[0] == "thruster_groups" and leaf[0] == "thrusters" and len(leaf) > 1:
+        thruster = vehicle.thrusters.get(leaf[1])
+        if thruster is None or thruster.group != pattern[1]:
+            return False
+        pattern = ("thrusters", leaf[1], *pattern[2:])
+    shapes = [leaf]
+    if leaf[-1].isdigit():
+        shapes.append((*leaf, leaf[-1]))
+    return any(
+        len(pattern) == len(shape) and all(p in ("*", q) for p, q in zip(pattern, shape, strict=True))
+        for shape in shapes
+    )
+
+
+def _estimate_of(leaf: Key, estimates: Mapping[str, Estimate], vehicle: Vehicle) -> Estimate | None:
+    for estimate in estimates.values():
+        if estimate.path is not None and _same_number(tuple(estimate.path.split(".")), leaf, vehicle):
+            return estimate
+    return None
+
+
+def _scale_of(leaf: Key, estimates: Mapping[str, Estimate]) -> Estimate | None:
+    """The common scale of all thrusts, for the numbers that it multiplies."""
+    return estimates.get("thrust_scale") if leaf[0] == "thrusters" and leaf[-1] in SCALED else None
+
+
+def _note(estimate: Estimate | None, value: float) -> str:
+    """`95 % interval 37.9 to 40.2`, with the estimate itself where the file holds something else of it."""
+    if estimate is None:
+        return ""
+    low, high = estimate.ci95
+    text = f"95 % interval {low:.4g} to {high:.4g}" if math.isfinite(low) and math.isfinite(high) else ""
+    if text and not math.isclose(estimate.estimate, value, rel_tol=1e-6):
+        text = f"from {estimate.name} {estimate.estimate:.4g} {estimate.unit}, {text}"
+    return "; ".join(filter(None, [text, estimate.note]))
+
+
+# Ranges of domain randomisation from the intervals of a calibration.
+
+NARROWEST = 0.02
+"""Least variation of a determined parameter to either side: intervals cover noise, not a wrong model."""
+WIDEST = (0.0, 5.0)
+"""Factors beyond these are cut."""
+UNTOLD = (0.5, 2.0)
+"""Range of what the trials could not determine, and of what the vehicle file guesses."""
+OTHER = (0.9, 1.1)
+"""For what was not asked of the trials, and the vehicle file has from somewhere."""
+
+FAMILIES = ("added_mass", "linear_damping", "quadratic_damping")
+
+
+class Factor(NamedTuple):
+    """Range of a factor, and why."""
+
+    low: float
+    high: float
+    why: str
+
+
+def write_ranges(fit: Fit, path: str | os.PathLike[str], vehicle: Vehicle | None = None) -> None:
+    """Write a ranges file for `finssim train --randomize`, around the calibrated vehicle.
+
+    A factor on a number of the vehicle file is drawn uniformly between
+
+    - the ends of its 95 % interval over the estimate, where the trials tell it; at least 2 % to either side;
+    - 0.5 and 2, where they do not, or where the vehicle file guesses it;
+    - 0.9 and 1.1, where it was not asked for and the file has it from somewhere.
+
+    The numbers are drawn one by one, though the errors of linear and quadratic damping go against each other: the drag
+    varies by more than the data allow, never by less.
+
+    Args:
+        fit: The fit.
+        path: File to write, .yaml.
+        vehicle: `calibrated(fit)`, where it is at hand.
+
+    Raises:
+        CalibrationError: Another suffix, or a vehicle without a calibrated set.
+        OutputError: The place cannot be written.
+    """
+    from finssim.sim.ranges_file import load_ranges  # Warp, which other fits need not
+
+    target = yaml_path(path, "ranges")
+    vehicle = calibrated(fit) if vehicle is None else vehicle
+    text = _ranges_text(fit, vehicle)
+    with atomic_write(target) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+        load_ranges(temporary)
+
+
+def range_factors(fit: Fit, vehicle: Vehicle) -> dict[str, Factor]:
+    """Every factor by its place in the ranges file, `linear_damping.surge` or `delay`.
+
+    Args:
+        fit: The fit.
+        vehicle: `calibrated(fit)`.
+    """
+    chosen = vehicle.hydrodynamics.get("calibrated")
+    if not isinstance(chosen, HydrodynamicSet):
+        raise CalibrationError(f"{vehicle.name} has no coefficients named 'calibrated' to vary")
+    factors = {}
+    for family in FAMILIES:
+        matrix = getattr(chosen, family)
+        for i, axis in enumerate(AXES):
+            if matrix[i, i] != 0.0:  # a factor on nothing is nothing
+                path = f"hydrodynamics.calibrated.{family}.{i}.{i}"
+                factors[f"{family}.{axis}"] = _factor(path, fit, vehicle)
+    for path in chosen.term_scalars:
+        if chosen.term_parameters[path] != 0.0:
+            factors[path] = _factor(f"hydrodynamics.calibrated.{path}", fit, vehicle)
+    excess = fit.estimates.get("buoyancy_excess")
+    if excess is not None and excess.identifiable:
+        low, high = ((vehicle.weight + x) / (vehicle.weight + excess.estimate) for x in excess.ci95)
+        factors["volume"] = Factor(low, high, "told")
+    scale = fit.estimates.get("thrust_scale")
+    if scale is not None:
+        factors["thrust.all"] = _of_estimate(scale)
+    names = list(vehicle.thrusters)
+    factors["thrust.each"] = _around(
+        _factor(f"thrusters.{name}.{key}", fit, vehicle) for name in names for key in ("c_plus", "c_minus")
+    )
+    for key in ("time_constant", "delay"):
+        paths = [f"thrusters.{name}.{key}" for name in names if getattr(vehicle.thrusters[name], key) > 0.0]
+        if paths and all(_stated(vehicle, path) for path in paths):
+            factors[key] = _around(_factor(path, fit, vehicle) for path in paths)
+    return factors
+
+
+def _factor(path: str, fit: Fit, vehicle: Vehicle) -> Factor:
+    estimate = estimate_at(path, fit, vehicle)
+    if estimate is not None:
+        return _of_estimate(estimate)
+    if vehicle.origin_of(path).origin == "guessed":
+        return Factor(*UNTOLD, "guessed")
+    return Factor(*OTHER, "not asked for")
+
+
+def _of_estimate(estimate: Estimate) -> Factor:
+    """The range that an estimate allows."""
+    low, high = estimate.ci95
+    if not (
+        estimate.identifiable and math.isfinite(low) and math.isfinite(high) and estimate.estimate != 0.0
+    ):
+        return Factor(*UNTOLD, "not told")
+    low, high = sorted((low / estimate.estimate, high / estimate.estimate))
+    low, high = min(low, 1.0 - NARROWEST), max(high, 1.0 + NARROWEST)
+    return Factor(max(low, WIDEST[0]), min(high, WIDEST[1]), "told")
+
+
+def _around(factors: Iterable[Factor]) -> Factor:
+    """The range that holds all of them."""
+    every = list(factors)
+    reason = ", ".join(dict.fromkeys(factor.why for factor in every))
+    return Factor(min(f.low for f in every), max(f.high for f in every), reason)
+
+
+def _stated(vehicle: Vehicle, path: str) -> bool:
+    return any(path == stated or stated.startswith(f"{path}.") for stated in vehicle.provenance)
+
+
+def _ranges_text(fit: Fit, vehicle: Vehicle) -> str:
+    record, tree = vehicle.calibrations[-1], dict[str, Any]()
+    for entry, factor in range_factors(fit, vehicle).items():
+        _insert(tree, entry, factor)
+    lines = [
+        "# Factors on the numbers of the calibrated vehicle. told: 95 % interval over the estimate, at least",
+        "# 2 % to either side; not told by the trials, or guessed: half to double; not asked for: 0.9 to 1.1.",
+        f'source: "95 % intervals, {record.sentence()}; vehicle {vehicle.sha256[:16]}"',
+        *_factor_lines(tree),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _factor_lines(tree: Mapping[str, Any], pad: str = "") -> Iterator[str]:
+    """YAML of factors, each with its reason."""
+    for key, node in tree.items():
+        if isinstance(node, Factor):
+            yield f"{pad}{key}: [{node.low:.4g}, {node.high:.4g}]  # {node.why}"
+        else:
+            yield f"{pad}{key}:"
+            yield from _factor_lines(node, pad + "  ")
+
+
+def _insert(tree: dict[str, Any], entry: str, drawn: Any) -> None:
+    """Put what is drawn where a ranges file has it: `linear_damping.surge` under `axes` of its family."""
+    *above, key = entry.split(".")
+    for name in [*above, "axes"] if key in AXES else above:
+        tree = tree.setdefault(name, {})
+    tree[key] = drawn

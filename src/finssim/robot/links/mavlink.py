@@ -1,0 +1,469 @@
+"""The link to an autopilot: ArduSub's MAVLink 2 for the robot's own messages, thrusts as the axes of its mixer.
+
+What goes out are the axes of MANUAL_CONTROL, or pulses of RC_CHANNELS_OVERRIDE where the firmware is older than 4.5 or
+its pilot gain less than the vehicle file's. The bridge stays in charge: the vehicle is armed only for a bridge that may
+be armed, and somebody else who arms, steers or changes the mode ends it; who steers by hand wins at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from finssim.control.ardusub import FULL, NEUTRAL, Mixer
+from finssim.control.motor_map import MotorMap
+from finssim.core.frames import FROM_FOSSEN
+from finssim.core.rotations import quat_from_euler, quat_inverse_rotate
+from finssim.robot.links.frames import LinkError, Message
+from finssim.robot.links.water_linked import decode_line
+from finssim.robot.messages import HEADING, VELOCITY, NavigationAid, Telemetry, ThrusterCommand
+from finssim.vehicles import Vehicle
+
+__all__ = ["MODES", "MavlinkLink"]
+
+MODES = {
+    0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 7: "CIRCLE", 9: "SURFACE", 16: "POSHOLD",
+    19: "MANUAL", 20: "MOTOR_DETECT", 21: "SURFTRAK",
+}  # fmt: skip
+"""ArduSub's modes by the number in HEARTBEAT.custom_mode."""
+MANUAL = 19
+VEHICLE, GROUND = (1, 1), 255
+"""System and component of the autopilot, and of a ground station that ArduSub takes a pilot from."""
+
+INTERVALS = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 0.2,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: 0.02,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: 0.02,
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE2: 0.05,
+    mavlink.MAVLINK_MSG_ID_RC_CHANNELS: 0.05,
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.2,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 0.5,
+}
+"""Message -> time between two that is asked for [s]."""
+PARAMETERS = ("JS_GAIN_DEFAULT", "JS_THR_GAIN", "BARO1_GND_PRESS", "BARO2_GND_PRESS")
+
+MANUAL_PERIOD, HEARTBEAT_PERIOD, ASK_AGAIN = 0.03, 1.0, 0.5
+"""Between two frames of axes, two heartbeats, and two attempts at the same request [s]."""
+REQUEST_LASTS = 3.0
+"""Time for which a request to arm is still waited for, at neutral axes, before the autopilot is disarmed again [s]: a
+person presses a key twice, and `ros2 service call` takes some time."""
+SELDOM, SMOOTH = 2.0, 0.2
+"""Mean time between two messages, part of that asked for, at which they come too seldom; how much the newest counts."""
+PATIENCE = 3.0
+"""Longest wait for version and parameters before arming [s]; without them axes go out as overrides."""
+HEARTBEAT_LOST = 3.0
+"""Longest silence of the autopilot's heartbeat [s]."""
+REMEMBERED = 1.0
+"""Inputs that were sent so long ago may still be reported as received [s]."""
+STRANGE, STRANGERS, OF = 12.0, 2, 4
+"""Difference from every sent input at which an input is another pilot's [µs], and how many of the last reports confirm
+it: two pilots take turns."""
+OTHERS = (
+    "manual control from elsewhere, or our frames are lost: the autopilot receives other inputs than ours"
+)
+HEADING_PERIOD = 0.2
+"""Between headings that are taken from the autopilot's attitude [s]."""
+DVL_FRESH = 1.0
+"""Age of a report of the Doppler log up to which the autopilot's own velocity is not used [s]."""
+CRITICAL = 5
+"""HEARTBEAT.system_status of a failsafe."""
+AIDED, NOT_AIDED = 2, 128
+"""EKF_STATUS_REPORT.flags: horizontal velocity is known; position is held by assumption."""
+ACCELEROMETER_RANGE = 16000
+"""Greatest acceleration of the autopilots' instruments [mg]: of damaged frames one in 65 536 passes, and the estimator
+trusts it."""
+STANDARD_ATMOSPHERE = 101325.0
+"""Pressure at the surface, until the autopilot reports its own [Pa]."""
+G = 9.80665
+
+
+class MavlinkLink:
+    """One vehicle's autopilot, as the other end of a wire. Knows no clock and no wire; nothing that arrives can raise.
+
+    Attributes:
+        counts: Messages by name, and `bad` for what is none.
+        mode: Number of the autopilot's mode; None before its first heartbeat.
+        armed: Whether the autopilot is armed.
+        says: Its newest sentence of a severity that matters.
+    """
+
+    peer = "autopilot"
+
+    def __init__(self, vehicle: Vehicle, *, key: bytes = b"") -> None:
+        """
+        Args:
+            vehicle: With an `autopilot`; its IMU's axes are the autopilot's, forward, left, up.
+            key: Of 32 bytes: frames are signed, and unsigned ones refused. Empty: none are.
+
+        Raises:
+            ControlError: It has no autopilot, or thrusters without `esc`.
+            LinkError: A key of another length.
+        """
+        self._mixer, self._motors, self.vehicle = Mixer.of(vehicle), MotorMap.from_vehicle(vehicle), vehicle
+        imu = vehicle.sensors.imu
+        if imu is not None and abs(imu.orientation[3]) < 1.0 - 1e-6:
+            raise LinkError(
+                f"{vehicle.name}: sensors.imu.orientation is {imu.orientation.tolist()}, expected 0, 0, 0, 1: an "
+                "autopilot reports attitude and rates in the vehicle's own axes (set AHRS_ORIENTATION there)"
+            )
+        self._wire: Any = mavlink.MAVLink(
+            None, srcSystem=GROUND, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER
+        )
+        self._wire.robust_parsing = True
+        if key:
+            if len(key) != 32:
+                raise LinkError(f"the signing key has {len(key)} bytes, expected 32")
+            self._wire.signing.secret_key, self._wire.signing.sign_outgoing = key, True
+            self._wire.signing.allow_unsigned_callback = None
+        self.counts: Counter[str] = Counter()
+        self._handlers: dict[str, Callable[[float, Any], list[Message]]] = {
+            "HEARTBEAT": self._heartbeat,
+            "ATTITUDE": self._attitude,
+            "RAW_IMU": self._raw_imu,
+            "SCALED_PRESSURE2": self._pressure2,
+            "RC_CHANNELS": self._inputs,
+            "LOCAL_POSITION_NED": self._velocity,
+            "EKF_STATUS_REPORT": self._filter,
+            "PARAM_VALUE": self._parameter,
+            "NAMED_VALUE_FLOAT": self._value,
+            "AUTOPILOT_VERSION": self._software,
+            "COMMAND_ACK": self._answered,
+            "STATUSTEXT": self._said,
+        }
+        self._forget()
+
+    def _forget(self) -> None:
+        """Reset to the state before the autopilot's first message."""
+        self.mode: int | None = None
+        self.armed, self.says, self._failing = False, "", False
+        self._alive = self._boot_ms = -math.inf
+        self._accel: tuple[float, float, float] | None = None
+        self._q = np.array([0.0, 0.0, 0.0, 1.0])
+        self._pressure, self._surface = math.nan, STANDARD_ATMOSPHERE
+        self._sequence = self._aids = 0
+        self._heading_at = self._dvl_at = self._aided_at = -math.inf
+        self._parameters: dict[str, float] = {}
+        self._version: tuple[int, int] | None = None
+        self._gain = math.nan
+        self._asked: dict[Any, float] = {}
+        self._seen: dict[int, float] = {}
+        self._gap: dict[int, float] = {}
+        self._refused = ""
+        self._ours = self._others = False
+        self._wanted = self._released = -math.inf
+        self._sent: deque[tuple[float, tuple[float, ...]]] = deque(maxlen=128)
+        self._strange: deque[bool] = deque(maxlen=OF)
+        self._manual_at = self._heartbeat_at = -math.inf
+
+    # -- what comes in ----------------------------------------------------------------------------------------
+
+    def feed(self, now: float, data: bytes) -> list[Message]:
+        """Messages that bytes complete: MAVLink, or a line of a Water Linked log, which begins with a brace.
+
+        Args:
+            now: When they came [s].
+            data: A datagram, a piece of a stream, or a line.
+        """
+        if data[:1] == b"{":
+            report = decode_line(data, self.counts)
+            if report is None:
+                return []
+            self._dvl_at = now
+            return [self._numbered(report.kind, report.age, report.values)]
+        completed: list[Message] = []
+        try:
+            messages = self._wire.parse_buffer(data) or []
+        except Exception:  # pymavlink raises whatever it stumbles over
+            self.counts["bad"] += 1
+            return completed
+        for message in messages:
+            kind = message.get_type()
+            if kind == "BAD_DATA" or kind.startswith("UNKNOWN"):
+                self.counts["bad"] += 1
+                continue
+            self.counts[kind] += 1
+            if (message.get_srcSystem(), message.get_srcComponent()) == VEHICLE and kind in self._handlers:
+                number = message.get_msgId()
+                gap = now - self._seen.get(number, -math.inf)
+                before = self._gap.get(number, gap)
+                self._gap[number] = gap if not math.isfinite(before) else before + SMOOTH * (gap - before)
+                self._seen[number] = now
+                completed += self._handlers[kind](now, message)
+        return completed
+
+    def _numbered(self, kind: int, age: float, values: Any) -> NavigationAid:
+        self._aids += 1
+        return NavigationAid(self._aids & 0xFFFF, kind, age, values, (0.0, 0.0))
+
+    def _heartbeat(self, now: float, m: Any) -> list[Message]:
+        self._alive, self.mode = now, int(m.custom_mode)
+        self.armed = bool(m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        self._failing = m.system_status >= CRITICAL
+        return []
+
+    def _attitude(self, now: float, m: Any) -> list[Message]:
+        """A snapshot, with the newest specific force and pressure; and now and then the heading."""
+        values = (m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
+        if self._accel is None or not all(map(math.isfinite, (*values, self._pressure))):
+            return []
+        if m.time_boot_ms < self._boot_ms - 1000:  # it restarted: what was agreed with it is forgotten
+            self._asked.clear()
+            self._seen.clear()
+            self._gap.clear()
+            self._boot_ms = -math.inf
+        self._boot_ms = max(self._boot_ms, m.time_boot_ms)
+        q = self._q = quat_from_euler(m.roll, -m.pitch, -m.yaw)
+        gyro = FROM_FOSSEN.vector([m.rollspeed, m.pitchspeed, m.yawspeed])
+        x, y, z, w = q.tolist()
+        self._sequence = self._sequence + 1 & 0xFFFF
+        depth = (self._pressure - self._surface) / (self.vehicle.water.density * self.vehicle.water.gravity)
+        p, r, s = gyro.tolist()
+        messages: list[Message] = [
+            Telemetry(
+                sequence=self._sequence,
+                mcu_ms=int(m.time_boot_ms),
+                quaternion=(x, y, z, w),
+                gyro=(p, r, s),
+                accel=self._accel,
+                depth=depth,
+                pressure=self._pressure,
+                flags=0,
+                motor_rpm=None,
+            )
+        ]
+        if self.vehicle.sensors.compass is not None and now - self._heading_at >= HEADING_PERIOD:
+            self._heading_at = now
+            messages.append(self._numbered(HEADING, 0.0, (-float(m.yaw), 0.0, 0.0)))
+        return messages
+
+    def _raw_imu(self, now: float, m: Any) -> list[Message]:
+        if max(abs(m.xacc), abs(m.yacc), abs(m.zacc)) > ACCELEROMETER_RANGE:
+            self.counts["implausible"] += 1
+            return []
+        x, y, z = (0.001 * G * FROM_FOSSEN.vector([m.xacc, m.yacc, m.zacc])).tolist()
+        self._accel = (x, y, z)
+        return []
+
+    def _pressure2(self, now: float, m: Any) -> list[Message]:
+        self._pressure = 100.0 * m.press_abs
+        return []
+
+    def _inputs(self, now: float, m: Any) -> list[Message]:
+        """Return a message if the inputs that the autopilot received are another pilot's."""
+        if not self._sent or now - self._sent[-1][0] > REMEMBERED:
+            return []
+        inputs = np.array([getattr(m, f"chan{i}_raw") for i in range(1, 7)], float)
+        ours = [
+            np.abs(inputs - pulses).max() < STRANGE for at, pulses in self._sent if now - at <= REMEMBERED
+        ]
+        self._strange.append(not any(ours))
+        self._others = self._others or sum(self._strange) >= STRANGERS
+        return []
+
+    def _velocity(self, now: float, m: Any) -> list[Message]:
+        """Return the autopilot's own velocity, if it has one and no Doppler log reports."""
+        v = (m.vx, m.vy, m.vz)
+        if now - self._dvl_at < DVL_FRESH or now - self._aided_at > 2.0 or not all(map(math.isfinite, v)):
+            return []
+        return [
+            self._numbered(VELOCITY, 0.0, tuple(quat_inverse_rotate(self._q, FROM_FOSSEN.vector(v)).tolist()))
+        ]
+
+    def _filter(self, now: float, m: Any) -> list[Message]:
+        if m.flags & AIDED and not m.flags & NOT_AIDED:
+            self._aided_at = now
+        return []
+
+    def _parameter(self, now: float, m: Any) -> list[Message]:
+        if math.isfinite(m.param_value):
+            self._parameters[m.param_id] = float(m.param_value)
+        if m.param_id.endswith("_GND_PRESS") and 5e4 < m.param_value < 1.2e5:
+            # The second barometer is the Bar30 where there are two; the first of a vehicle that has one.
+            first = "BARO2_GND_PRESS" not in self._parameters or m.param_id == "BARO2_GND_PRESS"
+            self._surface = float(m.param_value) if first else self._surface
+        return []
+
+    def _value(self, now: float, m: Any) -> list[Message]:
+        if m.name == "PilotGain" and 0.0 < m.value <= 1.0:
+            self._gain = float(m.value)
+        return []
+
+    def _software(self, now: float, m: Any) -> list[Message]:
+        self._version = (m.flight_sw_version >> 24 & 0xFF, m.flight_sw_version >> 16 & 0xFF)
+        return []
+
+    def _answered(self, now: float, m: Any) -> list[Message]:
+        if m.command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM and m.result != mavlink.MAV_RESULT_ACCEPTED:
+            self._refused = self.says or f"result {m.result}"
+        return []
+
+    def _said(self, now: float, m: Any) -> list[Message]:
+        if m.severity <= mavlink.MAV_SEVERITY_WARNING:
+            self.says = " ".join(str(m.text).split())[:100]
+        return []
+
+    # -- what is asked of it ----------------------------------------------------------------------------------
+
+    def prepare(self, now: float) -> str:
+        """Bring the autopilot to where commands count: mode MANUAL, armed. Call it only to arm.
+
+        Returns:
+            "" once it is; until then in a sentence what is waited for.
+        """
+        if now - self._alive > HEARTBEAT_LOST:
+            return "the autopilot has sent no heartbeat yet"
+        unknown = self._version is None or "JS_GAIN_DEFAULT" not in self._parameters
+        if unknown and now - self._first(now, "known") < PATIENCE:
+            return "waiting for the autopilot's version and parameters"
+        if now - self._released < ASK_AGAIN:  # its heartbeats may be older than what was asked
+            return "waiting for it to disarm first"
+        if now - self._wanted > ASK_AGAIN:  # a new attempt: what ended the last one is history
+            self._others, self._refused = False, ""
+            self._strange.clear()
+        self._wanted = now
+        if self._others:
+            return OTHERS
+        if self.mode != MANUAL:
+            return f"waiting for the autopilot to leave {_mode(self.mode)} for MANUAL"
+        if not self.armed:
+            return (
+                f"the autopilot does not arm: {self._refused}" if self._refused else "waiting for it to arm"
+            )
+        self._wanted, self.says = -math.inf, ""
+        return ""
+
+    def alarm(self, now: float) -> str:
+        """Return why the vehicle is no longer under our control, in a sentence; "" while it is. Called while it is
+        armed."""
+        if now - self._alive > HEARTBEAT_LOST:
+            return f"no heartbeat from the autopilot for {HEARTBEAT_LOST:g} s"
+        if self._others:
+            return OTHERS
+        if self._failing:
+            return f"the autopilot is in failsafe: {self.says or 'it gives no reason'}"
+        if not self.armed:
+            return f"the autopilot was disarmed: {self.says or 'it gives no reason'}"
+        if self.mode != MANUAL:
+            self._others = True
+            return f"the autopilot's mode was changed to {_mode(self.mode)}"
+        return ""
+
+    # -- what goes out ----------------------------------------------------------------------------------------
+
+    def encode(self, now: float, command: ThrusterCommand, state: str) -> list[bytes]:
+        """Frames to send now: axes while we steer, and what has to be asked.
+
+        Args:
+            now: [s]
+            command: Of the bridge.
+            state: Of the bridge; disarmed and fault disarm the autopilot, if it was armed for us.
+        """
+        frames: list[bytes] = []
+        if now - self._heartbeat_at >= HEARTBEAT_PERIOD - 1e-6:
+            self._heartbeat_at = now
+            frames.append(self._pack(_HEARTBEAT))
+        if self._alive == -math.inf:
+            return frames
+        frames += self._questions(now)
+        running, requested = state in ("armed", "hold"), now - self._wanted < REQUEST_LASTS
+        if self._others or not (running or requested or self._ours):
+            return frames  # another pilot controls the vehicle, or it was not requested
+        if now - self._manual_at >= MANUAL_PERIOD - 1e-6 or not running:
+            self._manual_at = now
+            frames.append(self._axes(now, command))
+        arming = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+        if running:
+            self._ours = True
+        elif requested and state == "disarmed":
+            if self.mode != MANUAL:
+                custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
+                mode = self._command(mavlink.MAV_CMD_DO_SET_MODE, custom, float(MANUAL))
+                frames += self._ask(now, "mode", ASK_AGAIN, mode)
+            elif not self.armed:
+                self._ours = True
+                frames += self._ask(now, "arm", ASK_AGAIN, self._command(arming, 1.0))
+        elif self.armed:
+            self._released = now
+            frames += self._ask(now, "disarm", 0.1, self._command(arming, 0.0))
+        else:
+            self._ours = False
+        return frames
+
+    def _axes(self, now: float, command: ThrusterCommand) -> bytes:
+        """The frame of axes whose thrusts come nearest to a command's."""
+        demand = np.zeros(6)
+        if command.enable:
+            speeds = self._motors.canonical_rpm(np.array(command.normalised)) * self._motors.full_scale
+            demand = self._mixer.demands(self._motors.force(speeds))
+        gain = self._mixer.autopilot.gain
+        roll, pitch, yaw, throttle, forward, lateral = np.clip(demand, -gain, gain).tolist()
+        # As the autopilot's inputs: pitch, roll, throttle, yaw, forward, lateral.
+        current_gain = (
+            self._gain if math.isfinite(self._gain) else self._parameters.get("JS_GAIN_DEFAULT", 0.0)
+        )
+        if self._version is not None and self._version >= (4, 5) and current_gain >= gain:
+            lift = current_gain * self._parameters.get("JS_THR_GAIN", 1.0)
+            x, y, r = (round(1000.0 * part / current_gain) for part in (forward, lateral, yaw))
+            z, s, t = round(500.0 + 500.0 * throttle / lift), round(FULL * pitch), round(FULL * roll)
+            z = min(max(z, 0), 1000)
+            pulses = (
+                NEUTRAL + s, NEUTRAL + t, NEUTRAL + 0.8 * lift * (z - 500), NEUTRAL + 0.4 * current_gain * r,
+                NEUTRAL + 0.4 * current_gain * x, NEUTRAL + 0.4 * current_gain * y,
+            )  # fmt: skip
+            message = mavlink.MAVLink_manual_control_message(VEHICLE[0], x, y, z, r, 0, 0, 3, s, t)
+        else:
+            pulses = tuple(round(NEUTRAL + FULL * d) for d in (pitch, roll, throttle, yaw, forward, lateral))
+            message = mavlink.MAVLink_rc_channels_override_message(*VEHICLE, *pulses, 65535, 65535)
+        self._sent.append((now, tuple(map(float, pulses))))
+        return self._pack(message)
+
+    def _questions(self, now: float) -> list[bytes]:
+        """Requests whose answers have not come, each now and then."""
+        frames: list[bytes] = []
+        for message, interval in INTERVALS.items():
+            # Another ground station may ask for its own rates: what comes too seldom is asked for again.
+            gap = max(self._gap.get(message, math.inf), now - self._seen.get(message, -math.inf))
+            if gap > SELDOM * interval:
+                ask = self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message), 1e6 * interval)
+                frames += self._ask(now, ("interval", message), 1.0, ask)
+        if self._version is None:
+            version = float(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+            frames += self._ask(now, "version", 1.0, self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, version))
+        for name in PARAMETERS:
+            if name not in self._parameters and now - self._first(now, name) < 10.0:
+                read = mavlink.MAVLink_param_request_read_message(*VEHICLE, name.encode(), -1)
+                frames += self._ask(now, ("read", name), 1.0, read)
+        return frames
+
+    def _first(self, now: float, key: str) -> float:
+        """When this was looked at first [s]."""
+        return self._asked.setdefault(("first", key), now)
+
+    def _ask(self, now: float, key: Any, period: float, message: Any) -> list[bytes]:
+        if now - self._asked.get(key, -math.inf) < period - 1e-6:
+            return []
+        self._asked[key] = now
+        return [self._pack(message)]
+
+    def _command(self, command: int, *parameters: float) -> Any:
+        values = [*parameters, *[0.0] * (7 - len(parameters))]
+        return mavlink.MAVLink_command_long_message(*VEHICLE, command, 0, *values)
+
+    def _pack(self, message: Any) -> bytes:
+        packed = bytes(message.pack(self._wire))
+        self._wire.seq = (self._wire.seq + 1) % 256
+        return packed
+
+
+_HEARTBEAT = mavlink.MAVLink_heartbeat_message(
+    mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+)
+
+
+def _mode(number: int | None) -> str:
+    return "an unknown mode" if number is None else MODES.get(number, f"mode {number}")

@@ -1,0 +1,704 @@
+"""Domain randomisation: parameters drawn for every episode, inside the batch."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from finssim.physics.plant import VehicleParameters
+from finssim.physics.terms.composed import layout
+from finssim.physics.tether import Tether
+from finssim.physics.types import MAX_THRUSTERS, mat66, vec6, vec8
+from finssim.physics.water import WaterArrays
+from finssim.sim.distributions import KINDS, Distribution, bounds_of
+from finssim.sim.launch import Pipeline
+from finssim.sim.measured import SENSORS, Measurement
+from finssim.sim.packed import Packed
+from finssim.sim.plant_arrays import build_plant, twist_shift, vehicle_parameters
+from finssim.sim.ranges_file import MAX_WAVES, Ranges, load_ranges
+from finssim.sim.ranges_table import ENTRIES, INDEX, TETHER, WORLD, WORLD_END, added_entry, drawn_entries
+from finssim.sim.site import TetherLine
+from finssim.sim.state import State
+
+# The table of distributions that the kernel draws from, and one draw.
+
+
+UNIFORM, LOG_UNIFORM, NORMAL, CHOICE = range(len(KINDS))
+
+
+@wp.struct
+class DrawTable:
+    """Distribution of every entry of the table; rows of entries that never vary are not read."""
+
+    count: int
+    drawn: wp.array(dtype=int)  # the entries that vary
+    kind: wp.array(dtype=int)
+    ends: wp.array(dtype=wp.vec4)  # low, high, mean, standard deviation
+    probability: wp.array(dtype=float)  # of being drawn at all
+    nominal: wp.array(dtype=float)
+    stream: wp.array(dtype=int)
+    first_choice: wp.array(dtype=int)
+    choices: wp.array(dtype=int)
+    choice: wp.array(dtype=float)
+    cumulative: wp.array(dtype=float)
+    first_tie: wp.array(dtype=int)
+    ties: wp.array(dtype=int)  # number of normal numbers that its own is a sum of; 0: it is independent
+    tied: wp.array(dtype=int)  # entries of these
+    tie_weight: wp.array(dtype=float)
+
+
+@wp.func
+def normal_part(x: float) -> float:
+    """Share of a standard normal distribution below x."""
+    return 0.5 + 0.5 * wp.erf(0.70710678 * x)
+
+
+@wp.func
+def quantile(t: DrawTable, k: int, u: float) -> float:
+    """The number of entry k below which a share u in [0, 1) of its distribution lies."""
+    e = t.ends[k]
+    kind = t.kind[k]
+    x = e[0] + u * (e[1] - e[0])
+    if kind == LOG_UNIFORM:
+        x = e[0] * wp.exp(u * wp.log(e[1] / e[0]))
+    if kind == NORMAL:
+        x = e[2]
+        if e[3] > 0.0:
+            a = normal_part((e[0] - e[2]) / e[3])
+            b = normal_part((e[1] - e[2]) / e[3])
+            p = wp.clamp(a + u * (b - a), 3.0e-7, 1.0 - 3.0e-7)
+            x = wp.clamp(e[2] + e[3] * 1.41421356 * wp.erfinv(2.0 * p - 1.0), e[0], e[1])
+    if kind == CHOICE:
+        i = t.first_choice[k]
+        last = i + t.choices[k] - 1
+        while i < last and u >= t.cumulative[i]:
+            i += 1
+        x = t.choice[i]
+    return x
+
+
+@wp.func
+def draw_entry(t: DrawTable, k: int, key: int) -> float:
+    """Return entry k from its own stream of a key, which does not depend on other entries."""
+    rng = wp.rand_init(key, 2 * t.stream[k])
+    u = wp.randf(rng)
+    gate = wp.randf(rng)
+    if t.ties[k] > 0:
+        z = float(0.0)
+        for i in range(t.first_tie[k], t.first_tie[k] + t.ties[k]):
+            other = wp.rand_init(key, 2 * t.stream[t.tied[i]] + 1)
+            z += t.tie_weight[i] * wp.randn(other)
+        u = normal_part(z)
+    x = quantile(t, k, u)
+    if gate >= t.probability[k]:
+        x = t.nominal[k]
+    return x
+
+
+def widened(distribution: Distribution, nominal: float, part: float) -> tuple[list[float], float]:
+    """Ends [low, high, mean, standard deviation] and probability of a distribution at a part of its width.
+
+    Widths grow from the number of the range that lies nearest to the nominal one. What is drawn from with a
+    probability, and a choice, keep their numbers, and the probability grows.
+
+    Args:
+        distribution: At its full width.
+        nominal: Where nothing is drawn.
+        part: Of the way to both ends, of the standard deviation and of probabilities, in [0, 1].
+    """
+    low, high = distribution.bounds()
+    mean, std = distribution.normal or (0.0, 0.0)
+    if distribution.choice is not None or distribution.probability < 1.0:
+        return [low, high, mean, std], distribution.probability * part
+    anchor = min(max(nominal, low), high)
+    if distribution.log_uniform is not None:
+        down, up = (math.log(end / anchor) for end in (low, high))
+        return [anchor * math.exp(part * down), anchor * math.exp(part * up), 0.0, 0.0], 1.0
+    ends = [anchor + part * (low - anchor), anchor + part * (high - anchor)]
+    if distribution.normal is None:
+        return [*ends, 0.0, 0.0], 1.0
+    return [*ends, anchor + part * (mean - anchor), part * std], 1.0
+
+
+def ties_of(ranges: Ranges) -> dict[int, list[tuple[int, float]]]:
+    """Entry -> the entries whose normal numbers its own is a sum of, with their weights: rows of a square root of R."""
+    rows = {}
+    for group in ranges.correlated:
+        values, vectors = np.linalg.eigh(np.array(group.correlation))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        members = [INDEX[name] for name in group.entries]
+        for k, row in zip(members, root, strict=True):
+            rows[k] = list(zip(members, (row / np.linalg.norm(row)).tolist(), strict=True))
+    return rows
+
+
+def draw_table(
+    drawn: Mapping[str, Distribution], nominal: NDArray[np.float64], ranges: Ranges, device: wp.Device
+) -> DrawTable:
+    """The table at full width.
+
+    Args:
+        drawn: Entry -> distribution, of those that vary.
+        nominal: Of every entry, (len(ENTRIES),).
+        ranges: For the correlations.
+        device: Where.
+    """
+    n = len(ENTRIES)
+    kind, first, choices = np.zeros((3, n), np.int32)
+    ends, probability = np.zeros((n, 4)), np.ones(n)
+    choice, cumulative = list[float](), list[float]()
+    for name, distribution in drawn.items():
+        k = INDEX[name]
+        kind[k] = KINDS.index(distribution.kind)
+        ends[k], probability[k] = widened(distribution, float(nominal[k]), 1.0)
+        first[k], choices[k] = len(choice), len(distribution.choice or ())
+        choice += distribution.choice or ()
+        cumulative += distribution.cumulative()
+    first_tie, ties, tied, weights = _flat(ties_of(ranges), n)
+    t = DrawTable()
+    t.count = len(drawn)
+    integer = {"drawn": [INDEX[name] for name in drawn], "kind": kind, "first_choice": first, "choices": choices,
+             "stream": [e.stream for e in ENTRIES],
+             "first_tie": first_tie, "ties": ties, "tied": tied}  # fmt: skip
+    real = {"probability": probability, "nominal": nominal, "choice": choice, "cumulative": cumulative,
+            "tie_weight": weights}  # fmt: skip
+    for fields, dtype, plain in ((integer, wp.int32, np.int32), (real, wp.float32, np.float32)):
+        for name, values in fields.items():
+            # No kernel reads beyond the counts: one element keeps empty columns valid.
+            column = np.asarray(values if len(values) else [0], dtype=plain)
+            setattr(t, name, wp.array(column, dtype=dtype, device=device))
+    t.ends = wp.array(ends.astype(np.float32), dtype=wp.vec4, device=device)
+    return t
+
+
+def _flat(rows: Mapping[int, list[tuple[int, float]]], n: int) -> tuple[Any, Any, list[int], list[float]]:
+    first, count = np.zeros((2, n), np.int32)
+    tied, weights = list[int](), list[float]()
+    for k, row in rows.items():
+        first[k], count[k] = len(tied), len(row)
+        tied += [other for other, _ in row]
+        weights += [weight for _, weight in row]
+    return first, count, tied, weights
+
+
+# Where drawn numbers go: body, thrusters, water, tether and sensors.
+
+
+COLUMN = INDEX
+"""Entry -> column of the drawn values."""
+
+
+@wp.struct
+class Nominal:
+    """The vehicles as their files have them, by vehicle; and the given water."""
+
+    plant: wp.array2d(dtype=VehicleParameters)  # one world
+    M_A: wp.array(dtype=mat66)  # added mass about the point where its coefficients hold
+    H: wp.array(dtype=mat66)  # twist at that point from the twist at the body origin
+    current: wp.vec3  # of the given water; what is drawn adds to it [m/s]
+    waves: int  # waves of the given water stay in the first slots
+    extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms, one world
+    factor: wp.array(dtype=int)  # entry that multiplies each of them, -1 for none
+    added: wp.array(dtype=int)  # entry that is added to it
+
+
+@wp.func
+def scaled_matrix(M: mat66, factor: vec6) -> mat66:
+    """S M S with S = diag(sqrt(factor)): scales the diagonal by the factors and keeps symmetry and definiteness."""
+    out = mat66()
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = M[i, j] * wp.sqrt(factor[i] * factor[j])
+    return out
+
+
+@wp.func
+def factors(x: wp.array3d(dtype=float), w: int, v: int, column: int) -> vec6:
+    """Return the common factor in `column` times the factors of the axes, which follow it."""
+    out = vec6()
+    for i in range(6):
+        out[i] = x[w, v, column] * x[w, v, column + 1 + i]
+    return out
+
+
+@wp.func
+def offset(x: wp.array3d(dtype=float), w: int, v: int, column: int) -> wp.vec3:
+    """Three numbers that follow each other."""
+    return wp.vec3(x[w, v, column], x[w, v, column + 1], x[w, v, column + 2])
+
+
+@wp.func
+def drawn_delay(x: wp.array3d(dtype=float), w: int, v: int, nominal: float) -> float:
+    """Command delay of the episode, without jitter [s]."""
+    return nominal * x[w, v, wp.static(COLUMN["delay"])] + x[w, v, wp.static(COLUMN["added_delay"])]
+
+
+@wp.func
+def write_body(
+    plant: wp.array2d(dtype=VehicleParameters), n: Nominal, x: wp.array3d(dtype=float), w: int, v: int
+):
+    """Mass, centres, inertia, added mass and damping."""
+    mass = x[w, v, wp.static(COLUMN["mass"])] * n.plant[0, v].mass
+    r_n = n.plant[0, v].r_g
+    r_g = r_n + offset(x, w, v, wp.static(COLUMN["center_of_gravity.x"]))
+    # The factor is on the inertia about the centre of gravity; Steiner's part follows mass and centre.
+    I_n = n.plant[0, v].inertia - n.plant[0, v].mass * (
+        wp.dot(r_n, r_n) * wp.identity(3, dtype=float) - wp.outer(r_n, r_n)
+    )
+    steiner = wp.dot(r_g, r_g) * wp.identity(3, dtype=float) - wp.outer(r_g, r_g)
+    plant[w, v].mass = mass
+    plant[w, v].volume = (
+        x[w, v, wp.static(COLUMN["volume"])] * x[w, v, wp.static(COLUMN["buoyancy"])] * n.plant[0, v].volume
+    )
+    plant[w, v].r_g = r_g
+    plant[w, v].r_b = n.plant[0, v].r_b + offset(x, w, v, wp.static(COLUMN["center_of_buoyancy.x"]))
+    plant[w, v].inertia = x[w, v, wp.static(COLUMN["inertia"])] * I_n + mass * steiner
+    H = n.H[v]
+    M_A = scaled_matrix(n.M_A[v], factors(x, w, v, wp.static(COLUMN["added_mass.all"])))
+    plant[w, v].M_A = wp.transpose(H) * M_A * H
+    plant[w, v].D1 = scaled_matrix(
+        n.plant[0, v].D1, factors(x, w, v, wp.static(COLUMN["linear_damping.all"]))
+    )
+    plant[w, v].D2 = scaled_matrix(
+        n.plant[0, v].D2, factors(x, w, v, wp.static(COLUMN["quadratic_damping.all"]))
+    )
+    drag = x[w, v, wp.static(COLUMN["mesh_drag"])]
+    plant[w, v].form_drag = drag * n.plant[0, v].form_drag
+    plant[w, v].skin_drag = drag * n.plant[0, v].skin_drag
+
+
+@wp.func
+def write_terms(extra: wp.array3d(dtype=float), n: Nominal, x: wp.array3d(dtype=float), w: int, v: int):
+    """The parameters of the vehicle's terms."""
+    for i in range(n.factor.shape[0]):
+        y = n.extra[0, v, i]
+        if n.factor[i] >= 0:
+            y = y * x[w, v, n.factor[i]]
+        if n.added[i] >= 0:
+            y = y + x[w, v, n.added[i]]
+        extra[w, v, i] = y
+
+
+@wp.func
+def write_thrusters(
+    plant: wp.array2d(dtype=VehicleParameters), n: Nominal, x: wp.array3d(dtype=float), w: int, v: int
+):
+    """Gain, lag, delay, slew and dead zone."""
+    gain = vec8()
+    lag = vec8()
+    added = vec8()
+    nominal_lag = n.plant[0, v].time_constant
+    for k in range(MAX_THRUSTERS):
+        gain[k] = (
+            x[w, v, wp.static(COLUMN["thrust.all"])]
+            * x[w, v, wp.static(COLUMN["thrust.each.0"]) + k]
+            * x[w, v, wp.static(COLUMN["thrust.failure.0"]) + k]
+        )
+        each = (
+            x[w, v, wp.static(COLUMN["time_constant.all"])]
+            * x[w, v, wp.static(COLUMN["time_constant.each.0"]) + k]
+        )
+        lag[k] = nominal_lag[k] * each + x[w, v, wp.static(COLUMN["added_time_constant"])]
+        added[k] = x[w, v, wp.static(COLUMN["added_dead_zone"])]
+    plant[w, v].gain = gain
+    plant[w, v].time_constant = lag
+    plant[w, v].delay = drawn_delay(x, w, v, n.plant[0, v].delay)
+    plant[w, v].slew = x[w, v, wp.static(COLUMN["slew"])] * n.plant[0, v].slew
+    wider = x[w, v, wp.static(COLUMN["dead_zone"])]
+    plant[w, v].dead_minus = wider * n.plant[0, v].dead_minus - added
+    plant[w, v].dead_plus = wider * n.plant[0, v].dead_plus + added
+
+
+@wp.func
+def write_water(water: WaterArrays, n: Nominal, x: wp.array3d(dtype=float), w: int, drift: int):
+    """Current, drift and waves of a world."""
+    water.current[w] = n.current + wp.vec3(
+        x[w, 0, wp.static(COLUMN["current.x"])],
+        x[w, 0, wp.static(COLUMN["current.y"])],
+        x[w, 0, wp.static(COLUMN["vertical_current"])],
+    )
+    if drift != 0:
+        deviation = x[w, 0, wp.static(COLUMN["current_drift.deviation"])]
+        water.drift_std[w] = wp.vec3(deviation, deviation, 0.0)
+        water.drift_time[w] = x[w, 0, wp.static(COLUMN["current_drift.time"])]
+        water.drift[w] = wp.vec3()
+        water.drift_rate[w] = wp.vec3()
+    for i in range(n.waves, water.n_waves):
+        column = wp.static(COLUMN["waves.0.amplitude"]) + 4 * (i - n.waves)
+        k = 6.2831853 / wp.max(x[w, 0, column + 1], 0.1)
+        water.wave_amplitude[w, i] = x[w, 0, column]
+        water.wave_number[w, i] = k
+        water.wave_frequency[w, i] = wp.sqrt(water.gravity * k * wp.tanh(k * water.depth))
+        water.wave_heading[w, i] = x[w, 0, column + 2]
+        water.wave_phase[w, i] = x[w, 0, column + 3]
+
+
+@wp.func
+def write_tether(tether: wp.array2d(dtype=Tether), x: wp.array3d(dtype=float), w: int, v: int):
+    """The line to a vehicle."""
+    tether[w, v].diameter = x[w, v, wp.static(COLUMN["tether.diameter"])]
+    tether[w, v].drag_coefficient = x[w, v, wp.static(COLUMN["tether.drag_coefficient"])]
+    tether[w, v].wet_weight = x[w, v, wp.static(COLUMN["tether.wet_weight"])]
+
+
+@wp.func
+def write_sensors(measurement: wp.array2d(dtype=Measurement), x: wp.array3d(dtype=float), w: int, v: int):
+    """Write noise, delay and dropouts of what a controller observes of a vehicle."""
+    measurement[w, v].position_std = x[w, v, wp.static(COLUMN["sensors.position_std"])]
+    measurement[w, v].yaw_std = x[w, v, wp.static(COLUMN["sensors.yaw_std"])]
+    measurement[w, v].velocity_std = x[w, v, wp.static(COLUMN["sensors.velocity_std"])]
+    measurement[w, v].rate_std = x[w, v, wp.static(COLUMN["sensors.rate_std"])]
+    measurement[w, v].position_bias = x[w, v, wp.static(COLUMN["sensors.position_bias"])]
+    measurement[w, v].yaw_bias = x[w, v, wp.static(COLUMN["sensors.yaw_bias"])]
+    measurement[w, v].velocity_bias = x[w, v, wp.static(COLUMN["sensors.velocity_bias"])]
+    measurement[w, v].rate_bias = x[w, v, wp.static(COLUMN["sensors.rate_bias"])]
+    measurement[w, v].dropout = x[w, v, wp.static(COLUMN["sensors.dropout"])]
+    measurement[w, v].delay = x[w, v, wp.static(COLUMN["sensors.delay"])]
+
+
+if TYPE_CHECKING:
+    from finssim.sim.simulator import Simulator
+
+
+# The kernels that draw: an episode's vehicle, water and sensors, and when each command arrives.
+
+VEHICLE = wp.constant(122949823)
+"""Distance between the streams of two vehicles of a world, larger than the distance of any two seeds in use."""
+
+
+@wp.struct
+class DrawnArrays:
+    """Drawn numbers, and the arrays that they are written to."""
+
+    values: wp.array3d(dtype=float)  # (worlds, vehicles, entries)
+    volume_with_mass: int
+    water: int  # 1: write the water's numbers
+    drift: int
+    tether: int
+    sensors: int
+    agents: int  # vehicles whose privileged numbers are observed
+    told: wp.array(dtype=int)  # columns of these numbers
+    told_nominal: wp.array(dtype=float)
+    told_scale: wp.array(dtype=float)
+    privileged: wp.array2d(dtype=float)  # (worlds, agents * observed), (value - nominal) * scale
+    final_privileged: wp.array2d(dtype=float)  # the same of the episode before
+
+
+@wp.func
+def stream(seed: int, w: int) -> int:
+    """The seed of a world's or vehicle's own streams."""
+    rng = wp.rand_init(seed, w)
+    return wp.randi(rng)
+
+
+@wp.func
+def draw_values(t: DrawTable, d: DrawnArrays, w: int, v: int, vehicle_key: int, shared: int):
+    """Every entry that varies."""
+    for i in range(t.count):
+        k = t.drawn[i]
+        key = vehicle_key
+        if k >= WORLD and k < WORLD_END:
+            key = shared
+        d.values[w, v, k] = draw_entry(t, k, key)
+
+
+@wp.func
+def finish_values(d: DrawnArrays, w: int, v: int):
+    """Compute what follows from other entries: a volume that keeps the trim, the parts of the current, the waves in
+    use."""
+    x = d.values
+    if d.volume_with_mass != 0:
+        x[w, v, wp.static(COLUMN["volume"])] = x[w, v, wp.static(COLUMN["mass"])]
+    speed = x[w, v, wp.static(COLUMN["current"])]
+    direction = x[w, v, wp.static(COLUMN["current.direction"])]
+    x[w, v, wp.static(COLUMN["current.x"])] = speed * wp.cos(direction)
+    x[w, v, wp.static(COLUMN["current.y"])] = speed * wp.sin(direction)
+    if d.water != 0:
+        count = wp.floor(x[w, v, wp.static(COLUMN["waves.count"])])
+        x[w, v, wp.static(COLUMN["waves.count"])] = count
+        for i in range(MAX_WAVES):
+            if float(i) >= count:
+                x[w, v, wp.static(COLUMN["waves.0.amplitude"]) + 4 * i] = 0.0
+
+
+@wp.func
+def write_privileged(d: DrawnArrays, w: int, v: int):
+    """The privileged numbers of an agent; those of the episode that ended move aside."""
+    size = d.told.shape[0]
+    for i in range(size):
+        column = v * size + i
+        d.final_privileged[w, column] = d.privileged[w, column]
+        d.privileged[w, column] = (d.values[w, v, d.told[i]] - d.told_nominal[i]) * d.told_scale[i]
+
+
+@wp.kernel(enable_backward=False)
+def draw_episode(
+    plant: wp.array2d(dtype=VehicleParameters),
+    extra: wp.array3d(dtype=float),
+    tether: wp.array2d(dtype=Tether),
+    measurement: wp.array2d(dtype=Measurement),
+    water: WaterArrays,
+    nominal: Nominal,
+    table: DrawTable,
+    d: DrawnArrays,
+    state: State,
+    seed: int,
+    mask: wp.array(dtype=int),
+    world_offset: int,
+):
+    """Draw what the episode that starts has, where mask is not 0; refresh the plant afterwards.
+
+    The draw depends on seed, world, vehicle, episode and entry alone.
+    """
+    i, v = wp.tid()
+    w = world_offset + i
+    if mask[w] == 0:
+        return
+    episode = state.episode[w]
+    draw_values(
+        table,
+        d,
+        w,
+        v,
+        stream(seed + 32452843 * episode + VEHICLE * v, w),
+        stream(seed + 49979687 * episode - 1, w),
+    )
+    finish_values(d, w, v)
+    write_body(plant, nominal, d.values, w, v)
+    write_terms(extra, nominal, d.values, w, v)
+    write_thrusters(plant, nominal, d.values, w, v)
+    if d.tether != 0:
+        write_tether(tether, d.values, w, v)
+    if d.sensors != 0:
+        write_sensors(measurement, d.values, w, v)
+    if d.water != 0 and v == 0:
+        write_water(water, nominal, d.values, w, d.drift)
+    if v < d.agents:
+        write_privileged(d, w, v)
+
+
+@wp.kernel(enable_backward=False)
+def jitter_commands(
+    plant: wp.array2d(dtype=VehicleParameters),
+    nominal: Nominal,
+    values: wp.array3d(dtype=float),
+    state: State,
+    seed: int,
+    world_offset: int,
+):
+    """The delay of the coming step's command: the episode's, and a part of the jitter drawn for this step."""
+    i, v = wp.tid()
+    w = world_offset + i
+    rng = wp.rand_init(stream(seed + 86028121 * state.episode[w] + VEHICLE * v, w), state.steps[w])
+    late = wp.randf(rng) * values[w, v, wp.static(COLUMN["command_jitter"])]
+    plant[w, v].delay = drawn_delay(values, w, v, nominal.plant[0, v].delay) + late
+
+
+# What a simulation is given to draw with.
+
+
+class Randomization:
+    """Draws a new vehicle and new water for every episode."""
+
+    def __init__(self, ranges: Ranges | str | Path) -> None:
+        """Take ranges, or the name or file of ranges."""
+        self.ranges = ranges if isinstance(ranges, Ranges) else load_ranges(ranges)
+        self.drawn = drawn_entries(self.ranges)
+        """Entry of the table -> its distribution, of those that vary."""
+
+    def at_full_width(self) -> "Randomization":
+        """Return the same ranges without a schedule, at their full width, for an evaluation."""
+        return Randomization(self.ranges.model_copy(update={"curriculum": None}))
+
+    def _draws(self, *beginnings: str) -> bool:
+        return any(name.startswith(beginnings) for name in self.drawn)
+
+    @property
+    def moves_water(self) -> bool:
+        """True if currents or waves are drawn."""
+        return self._draws("current", "vertical_current", "waves.")
+
+    @property
+    def changes_sensors(self) -> bool:
+        """True if the noise of what the controller observes is drawn."""
+        return self._draws("sensors.")
+
+    @property
+    def changes_velocities(self) -> bool:
+        """True if errors of the velocities that the controller observes are drawn."""
+        return self._draws("sensors.velocity_", "sensors.rate_")
+
+    def simulator_arguments(self, vehicle_delay: float, tether: TetherLine | None = None) -> dict[str, Any]:
+        """Return the arguments that make room in a simulator for what is drawn.
+
+        Args:
+            vehicle_delay: Longest command delay of the vehicles [s].
+            tether: The line that is given; where lines are drawn and none is, each vehicle gets the usual one.
+        """
+        r = self.ranges
+        factor, added, jitter = (bounds_of(x)[1] for x in (r.delay, r.added_delay, r.command_jitter))
+        return {
+            "max_delay": vehicle_delay * max(factor, 1.0) + added + jitter,
+            "max_waves": r.waves.count[1] if r.waves else 0,
+            "water_moves": self.moves_water,
+            "water_drifts": self._draws("current_drift."),
+            "tether": TetherLine() if tether is None and self._draws("tether.") else tether,
+        }
+
+    def draws(
+        self,
+        simulator: "Simulator",
+        measurement: Packed | None = None,
+        *,
+        agents: int = 0,
+        privileged: tuple[wp.array, wp.array] | None = None,
+    ) -> "Draws":
+        """Return the draws in the worlds of one simulator, which was made with `simulator_arguments`.
+
+        Args:
+            simulator: The worlds.
+            measurement: What the controllers see of the vehicles, by (world, vehicle), as it is without randomisation.
+            agents: The first vehicles, which are told what was drawn.
+            privileged: Where they are told it, and where that of the episode before is kept: (worlds, agents * P) with
+                P = `len(told(...))`.
+        """
+        return Draws(self, simulator, measurement, agents, privileged)
+
+    def told(self, thrusters: int) -> list[str]:
+        """Names of the privileged numbers of an agent: the entries that vary, without directions and phases.
+
+        Args:
+            thrusters: Of the vehicle that has most.
+        """
+        names = set(drawn_entries(self.ranges, thrusters))
+        names |= {"current.x", "current.y"} if "current" in names else set()
+        return [e.name for e in ENTRIES if e.told and e.name in names]
+
+
+class Draws:
+    """Draws of a randomisation in the worlds of one simulator.
+
+    Attributes:
+        names: Entries that vary, in the order of the table.
+        values: All entries, Warp array (worlds, vehicles, len(ENTRIES)); those that never vary are nominal.
+        nominal: Of all entries, (len(ENTRIES),).
+    """
+
+    def __init__(
+        self,
+        randomization: Randomization,
+        simulator: "Simulator",
+        measurement: Packed | None,
+        agents: int,
+        privileged: tuple[wp.array, wp.array] | None,
+    ) -> None:
+        """See `Randomization.draws`."""
+        self.randomization, self.simulator = randomization, simulator
+        thrusters = max(len(vehicle.thrusters) for vehicle in simulator.vehicles)
+        self.distributions = drawn_entries(randomization.ranges, thrusters)
+        self.names = list(self.distributions)
+        device, shape = simulator.device, (simulator.worlds, len(simulator.vehicles))
+        self.nominal = _nominal_values(simulator, measurement)
+        self.table = draw_table(self.distributions, self.nominal, randomization.ranges, device)
+        full = np.broadcast_to(self.nominal.astype(np.float32), (*shape, len(ENTRIES)))
+        self.values = wp.array(np.ascontiguousarray(full), dtype=wp.float32, device=device)
+        self._seen = measurement.array if measurement else wp.zeros((1, 1), dtype=Measurement, device=device)
+        self._nominal = _nominal_vehicles(simulator)
+        self._arrays = self._drawn_arrays(agents, privileged)
+
+    def _drawn_arrays(self, agents: int, privileged: tuple[wp.array, wp.array] | None) -> DrawnArrays:
+        randomization, device = self.randomization, self.simulator.device
+        d = DrawnArrays()
+        d.values = self.values
+        d.volume_with_mass = int(randomization.ranges.volume == "with_mass")
+        d.water, d.sensors = int(randomization.moves_water), int(randomization.changes_sensors)
+        d.drift, d.tether = (int(randomization._draws(f"{name}.")) for name in ("current_drift", "tether"))
+        d.agents = agents if privileged else 0
+        names = self.told if privileged else []
+        columns = [INDEX[name] for name in names]
+        d.told = wp.array(np.array(columns, np.int32), dtype=wp.int32, device=device)
+        for field, values in (
+            ("told_nominal", self.nominal[columns]),
+            ("told_scale", [self._scale(n) for n in names]),
+        ):
+            setattr(d, field, wp.array(np.asarray(values, np.float32), dtype=wp.float32, device=device))
+        none = wp.zeros((self.simulator.worlds, 0), dtype=wp.float32, device=device)
+        d.privileged, d.final_privileged = privileged or (none, none)
+        return d
+
+    @property
+    def told(self) -> list[str]:
+        """Names of the privileged numbers of an agent."""
+        return self.randomization.told(max(len(v.thrusters) for v in self.simulator.vehicles))
+
+    def _scale(self, name: str) -> float:
+        """One over the farthest that an entry may be from its nominal number."""
+        distribution = self.distributions["current" if name in ("current.x", "current.y") else name]
+        nominal = float(self.nominal[INDEX[name]])
+        return 1.0 / (max(abs(end - nominal) for end in distribution.bounds()) or 1.0)
+
+    def set_width(self, part: float, names: Sequence[str]) -> None:
+        """Draw entries from a part of their full ranges from now on, in [0, 1]."""
+        ends, probability = self.table.ends.numpy().copy(), self.table.probability.numpy().copy()
+        for name in names:
+            k = INDEX[name]
+            ends[k], probability[k] = widened(self.distributions[name], float(self.nominal[k]), part)
+        self.table.ends.assign(ends)
+        self.table.probability.assign(probability)
+
+    def add(self, pipeline: Pipeline, mask: wp.array, seed: int) -> None:
+        """Append the draw for the worlds where mask (by world, int32) is not 0; refresh the plant afterwards."""
+        s = self.simulator
+        places = [s.plant.array, s.plant.extra, s.tether.array, self._seen, s.water]
+        inputs = [*places, self._nominal, self.table, self._arrays, s.state, seed, mask]
+        pipeline.add(draw_episode, inputs, vehicles=len(s.vehicles))
+
+    def add_step(self, pipeline: Pipeline, seed: int) -> None:
+        """Append what is drawn for every control step, before the simulator's step: when the command arrives."""
+        if "command_jitter" in self.distributions:
+            s = self.simulator
+            inputs = [s.plant.array, self._nominal, self.values, s.state, seed]
+            pipeline.add(jitter_commands, inputs, vehicles=len(s.vehicles))
+
+    def numpy(self, names: Sequence[str] | None = None) -> NDArray[np.float32]:
+        """Return a copy of some entries of the running episodes, or of all that vary if None: (worlds, vehicles, n)."""
+        columns = [INDEX[name] for name in (self.names if names is None else names)]
+        return np.asarray(self.values.numpy()[..., columns])
+
+
+def _nominal_values(simulator: "Simulator", measurement: Packed | None) -> NDArray[np.float64]:
+    """Every entry where nothing is drawn: the given tether's and sensors' numbers among them."""
+    out = np.array([entry.nominal for entry in ENTRIES])
+    line = simulator.surroundings[2]
+    for name in TETHER if line else ():
+        out[INDEX[f"tether.{name}"]] = getattr(line, name)
+    for name in SENSORS if measurement else ():
+        out[INDEX[f"sensors.{name}"]] = measurement.fields[name].numpy()[0, 0]  # type: ignore[union-attr]
+    return out
+
+
+def _nominal_vehicles(simulator: "Simulator") -> Nominal:
+    device, vehicles = simulator.device, simulator.vehicles
+    out = Nominal()
+    plant = build_plant(vehicles, simulator.hydrodynamics, 1, [0] * len(vehicles), device)
+    out.plant, out.extra = plant.array, plant.extra
+    slots = layout(plant.terms)
+    for field, name_of in (("factor", str), ("added", added_entry)):
+        columns = [INDEX.get(name_of(slot.path), -1) for slot in slots for _ in range(slot.size)]
+        setattr(out, field, wp.array(np.array(columns, np.int32), dtype=wp.int32, device=device))
+    H, M_A = [], []
+    for vehicle in vehicles:
+        values = vehicle_parameters(vehicle, simulator.hydrodynamics)
+        shift = twist_shift(values["r_h"])
+        back = np.linalg.inv(shift)
+        H.append(shift)
+        M_A.append(back.T @ values["M_A"] @ back)
+    out.H = wp.array(np.array(H), dtype=mat66, device=device)
+    out.M_A = wp.array(np.array(M_A), dtype=mat66, device=device)
+    nominal = simulator.surroundings[0]
+    out.current, out.waves = wp.vec3(*nominal.current), len(nominal.waves)
+    return out

@@ -1,0 +1,397 @@
+"""Ranges of domain randomisation: one YAML file, checked when it is read."""
+
+import difflib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
+
+from finssim.core.yaml_file import read_mapping
+from finssim.sim.distributions import (
+    Above0,
+    Distribution,
+    Interval,
+    Part,
+    Scale,
+    Share,
+    bounds_of,
+    checked,
+    sentence,
+    unknown,
+)
+from finssim.sim.site import SurroundingsError, Wave
+from finssim.vehicles.terms import Term, find_term
+
+SHIPPED = Path(__file__).parent / "ranges"
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+MAX_WAVES = 8
+"""Most waves that may be drawn for a world: every one costs time in every step."""
+LONGEST = 2.0
+"""Longest delay that may be drawn, of a command or of what is seen [s]."""
+FASTEST_WATER = 10.0
+"""[m/s]"""
+
+
+class RangesError(ValueError):
+    """A ranges file that cannot be used."""
+
+
+def _either(part: type[BaseModel]) -> Callable[[Any], Any]:
+    """Reads a mapping that has a key of `part` as that part; leaves everything else to the distributions."""
+
+    def read(value: Any) -> Any:
+        named = isinstance(value, Mapping) and not set(value) & set(Distribution.model_fields)
+        return checked(part, value) if named else value
+
+    return read
+
+
+def _factor_or_with_mass(value: Any) -> Any:
+    if isinstance(value, str) and value != "with_mass":
+        raise ValueError(f"is '{value}', expected two numbers [low, high] or with_mass")
+    return value
+
+
+def _count(pair: tuple[int, int]) -> tuple[int, int]:
+    if not 0 <= pair[0] <= pair[1] <= MAX_WAVES:
+        raise ValueError(
+            f"is {list(pair)}, expected two integers [low, high] with 0 <= low <= high <= {MAX_WAVES}"
+        )
+    return pair
+
+
+def _short(drawn: Any) -> Any:
+    if bounds_of(drawn)[1] > LONGEST:
+        raise ValueError(f"reaches {bounds_of(drawn)[1]:g} s, expected at most {LONGEST:g} s")
+    return drawn
+
+
+def _swimmable(drawn: Any) -> Any:
+    if max(map(abs, bounds_of(drawn))) > FASTEST_WATER:
+        raise ValueError(
+            f"reaches {max(map(abs, bounds_of(drawn))):g} m/s, expected at most {FASTEST_WATER:g} m/s"
+        )
+    return drawn
+
+
+Time = Annotated[Scale, AfterValidator(_short)]
+ONE, NONE = (1.0, 1.0), (0.0, 0.0)
+
+
+class AxisScales(Part):
+    """A common factor and one factor per axis; an axis not named keeps its own factor at 1."""
+
+    all: Scale = ONE
+    axes: dict[Literal["surge", "sway", "heave", "roll", "pitch", "yaw"], Scale] = Field(default_factory=dict)
+
+    def bounds(self) -> tuple[list[float], list[float]]:
+        """Low and high factor of each axis, six each."""
+        pairs = [bounds_of(self.axes.get(axis, ONE)) for axis in AXES]  # type: ignore[call-overload]
+        return [p[0] for p in pairs], [p[1] for p in pairs]
+
+
+class Offsets(Part):
+    """An offset along each axis [m]."""
+
+    x: Interval = NONE
+    y: Interval = NONE
+    z: Interval = NONE
+
+
+class EachScales(Part):
+    """A factor common to all thrusters and one for each."""
+
+    all: Scale = ONE
+    each: Scale = ONE
+
+
+class ThrustScales(EachScales):
+    """Factors on the thrust; and thrusters that fail."""
+
+    failure: Scale = ONE
+    """Remaining share of a thruster's thrust; give it a probability, with which each thruster fails independently."""
+
+
+class WaveRanges(Part):
+    """Waves of random number, size and direction; the period follows from the length and the depth."""
+
+    count: Annotated[tuple[int, int], AfterValidator(_count)]
+    amplitude: Scale
+    """[m]"""
+    wavelength: Above0
+    """[m]"""
+
+    @model_validator(mode="after")
+    def _unbroken(self) -> "WaveRanges":
+        highest, shortest = bounds_of(self.amplitude)[1], bounds_of(self.wavelength)[0]
+        try:
+            Wave(amplitude=highest, wavelength=shortest)
+        except SurroundingsError:
+            raise ValueError(
+                f"amplitude is {list(bounds_of(self.amplitude))}, expected less than 0.07 of the shortest wavelength, "
+                f"{0.07 * shortest:.3g} m here: a linear wave breaks above it"
+            ) from None
+        return self
+
+
+class DriftRanges(Part):
+    """A slow random part of the current, along each horizontal axis."""
+
+    deviation: Scale
+    """Its standard deviation [m/s]."""
+    time: Above0 = (15.0, 15.0)
+    """Its correlation time [s]."""
+
+
+class TetherRanges(Part):
+    """The line to the vehicle; a line of the environment's own keeps what is not named here."""
+
+    diameter: Above0 | None = None
+    """[m]"""
+    drag_coefficient: Scale | None = None
+    wet_weight: Interval | None = None
+    """Weight in water per length [N/m]; negative floats."""
+
+
+class SensorRanges(Part):
+    """Noise, delay and dropouts of what the controller observes; omitted keys keep the environment's values."""
+
+    position_std: Scale | None = None
+    """Standard deviation of the noise, per axis [m]."""
+    yaw_std: Scale | None = None
+    """[rad]"""
+    velocity_std: Scale | None = None
+    """[m/s]"""
+    rate_std: Scale | None = None
+    """[rad/s]"""
+    position_bias: Scale | None = None
+    """Standard deviation of an offset that lasts an episode, per axis [m]."""
+    yaw_bias: Scale | None = None
+    """[rad]"""
+    velocity_bias: Scale | None = None
+    """[m/s]"""
+    rate_bias: Scale | None = None
+    """[rad/s]"""
+    dropout: Share | None = None
+    """Probability that a control step has no new sample."""
+    delay: Time | None = None
+    """Age of what is seen [s]."""
+
+
+class Correlated(Part):
+    """Entries whose draws are correlated by rank, so that each keeps its distribution."""
+
+    entries: tuple[str, ...] = Field(min_length=2)
+    """Names as in the table of entries, such as linear_damping.surge."""
+    correlation: tuple[tuple[float, ...], ...]
+    """Correlation of the normal numbers behind them, (n, n); of the draws themselves if these are normal and hardly
+    cut."""
+
+    @model_validator(mode="after")
+    def _positive(self) -> "Correlated":
+        n = len(self.entries)
+        if any(len(row) != n for row in self.correlation) or len(self.correlation) != n:
+            raise ValueError(f"correlation is not {n} by {n}, expected a row and a column for every entry")
+        R = np.array(self.correlation)
+        if not np.isfinite(R).all() or abs(R - R.T).max() > 1e-6 or abs(np.diag(R) - 1.0).max() > 1e-6:
+            raise ValueError("correlation: expected a symmetric matrix with 1 on its diagonal")
+        if np.linalg.eigvalsh(R).min() < -1e-6:
+            raise ValueError(
+                "correlation: expected a matrix without negative eigenvalues: these cannot go together"
+            )
+        if len(set(self.entries)) != n:
+            raise ValueError("entries: one is named twice")
+        return self
+
+
+class Success(Part):
+    """When an episode counts as a success: exactly one of the two."""
+
+    held: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    """The task's tolerance was kept for so long when the episode ended [s]."""
+    episode_return: float | None = Field(default=None, allow_inf_nan=False)
+    """The return was at least this."""
+
+    @model_validator(mode="after")
+    def _single(self) -> "Success":
+        if (self.held is None) == (self.episode_return is None):
+            raise ValueError("expected either held [s] or episode_return")
+        return self
+
+
+class Curriculum(Part):
+    """Schedule by which all ranges grow together from a part of their width to the full width."""
+
+    by: Literal["progress", "steps", "success"] = "progress"
+    """The share of the training done, the environment's own control steps, or the share of successes."""
+    start: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Part of the width at the start; 0 is the vehicle of the file."""
+    over: tuple[float, float] = (0.0, 1.0)
+    """Start and end of the growth, as shares of the training or as control steps of all worlds together."""
+    success: Success | None = None
+    """The task's own hold time if None."""
+    episodes: int = Field(default=400, ge=1)
+    """After so many the share of successes is looked at."""
+    widen_at: float = Field(default=0.8, ge=0.0, le=1.0)
+    """A share of at least this widens."""
+    narrow_at: float = Field(default=0.4, ge=0.0, le=1.0)
+    """A share below this narrows."""
+    step: float = Field(default=0.1, gt=0.0, le=1.0)
+    """Growth of each step, as a share of the full width."""
+
+    @model_validator(mode="after")
+    def _possible(self) -> "Curriculum":
+        if self.narrow_at > self.widen_at:
+            raise ValueError(f"narrow_at is {self.narrow_at}, expected at most widen_at, {self.widen_at}")
+        low, high = self.over
+        if not 0.0 <= low < high < float("inf") or (self.by == "progress" and high > 1.0):
+            limit = "1" if self.by == "progress" else "any number of steps"
+            raise ValueError(
+                f"over is {[low, high]}, expected [low, high] with 0 <= low < high up to {limit}"
+            )
+        return self
+
+    def width(self, done: float) -> float:
+        """Part of the full width when so much is done, in [0, 1]."""
+        low, high = self.over
+        part = min(max((done - low) / (high - low), 0.0), 1.0)
+        return self.start + part * (1.0 - self.start)
+
+
+class Ranges(Part):
+    """Distributions drawn for every episode: factors on the vehicle file's numbers, unless a unit is given."""
+
+    name: str
+    source: str = ""
+    mass: Above0 = ONE
+    volume: Annotated[Above0 | Literal["with_mass"], BeforeValidator(_factor_or_with_mass)] = ONE
+    """A factor, or `with_mass`: the volume follows the mass, so that the trim is kept."""
+    buoyancy: Above0 = ONE
+    """Factor on the displaced volume, on top of `volume`'s."""
+    inertia: Above0 = ONE
+    center_of_gravity: Annotated[Interval | Offsets, BeforeValidator(_either(Offsets))] = NONE
+    """Offset along each axis [m]."""
+    center_of_buoyancy: Annotated[Interval | Offsets, BeforeValidator(_either(Offsets))] = NONE
+    """Offset along each axis [m]."""
+    added_mass: AxisScales = AxisScales()
+    linear_damping: AxisScales = AxisScales()
+    quadratic_damping: AxisScales = AxisScales()
+    terms: dict[str, Interval] = Field(default_factory=dict)
+    """Distributions of the vehicle's terms by entry (see `term_entries`); in a file under the term's name."""
+    mesh_drag: Scale = ONE
+    """Factor on form and skin drag of the mesh model."""
+    thrust: ThrustScales = ThrustScales()
+    time_constant: Annotated[Scale | EachScales, BeforeValidator(_either(EachScales))] = ONE
+    added_time_constant: Time = NONE
+    """[s]"""
+    delay: Scale = ONE
+    added_delay: Time = NONE
+    """[s]"""
+    command_jitter: Time = NONE
+    """Longest additional delay of a command, drawn every control step [s]."""
+    slew: Scale = ONE
+    dead_zone: Scale = ONE
+    added_dead_zone: Scale = NONE
+    """To either side [N]."""
+    current: Annotated[Scale, AfterValidator(_swimmable)] = NONE
+    """Horizontal speed [m/s], in a random direction."""
+    vertical_current: Annotated[Interval, AfterValidator(_swimmable)] = NONE
+    """Upwards [m/s]."""
+    current_drift: DriftRanges | None = None
+    waves: WaveRanges | None = None
+    tether: TetherRanges | None = None
+    sensors: SensorRanges | None = None
+    correlated: tuple[Correlated, ...] = ()
+    curriculum: Curriculum | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _terms_by_entry(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        out, terms = dict(data), {}
+        for entry, drawn in dict(out.pop("terms", {})).items():  # as a record of a training has them
+            name, _, parameter = entry.partition(".")
+            out[name] = {**out.get(name, {}), parameter: drawn} if parameter else drawn
+        for name in [name for name in out if name not in cls.model_fields]:
+            term = find_term(str(name))
+            if term is not None:  # another is refused as an unknown entry
+                terms |= _of_term(term, out.pop(name))
+        return {**out, "terms": terms} if terms else out
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Ranges":
+        from finssim.sim.ranges_table import check_correlated  # the table imports this module
+
+        check_correlated(self)
+        return self
+
+
+def _of_term(term: Term, stated: Any) -> dict[str, Any]:
+    """Return the distributions of a term by entry.
+
+    Raises:
+        ValueError: An entry that it does not have, or a range that cannot be; one sentence.
+    """
+    from finssim.sim.ranges_table import term_entries  # the table imports this module
+
+    entries = {entry.name: entry for entry in term_entries(term)}
+    if term.name in entries:
+        stated = {term.name: stated}
+    elif isinstance(stated, Mapping):
+        stated = {f"{term.name}.{key}": drawn for key, drawn in stated.items()}
+    else:
+        raise ValueError(f"{term.name}: is {stated!r}, expected ranges of {', '.join(entries)}")
+    out = {}
+    for name, drawn in stated.items():
+        if name not in entries:
+            raise ValueError(f"{term.name}: {unknown(name, entries)}")
+        try:
+            kind: Any = Scale if entries[name].unit == "1" else Interval
+            out[name] = TypeAdapter(kind).validate_python(drawn)
+        except ValidationError as error:
+            raise ValueError(f"{name}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
+    return out
+
+
+def available() -> list[str]:
+    """Names of the ranges that ship with FinsSim."""
+    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
+
+
+def load_ranges(name_or_path: str | Path) -> Ranges:
+    """Read ranges by name or from a file.
+
+    Args:
+        name_or_path: One of `available()`, or a YAML file.
+
+    Raises:
+        RangesError: no such file, or a key or number in it is wrong; names file, key, value and expectation.
+    """
+    path = Path(name_or_path)
+    if not path.is_file() and str(name_or_path) in available():
+        path = SHIPPED / f"{name_or_path}.yaml"
+    if not path.is_file():
+        close = difflib.get_close_matches(str(name_or_path), available(), n=1)
+        hint = f"; did you mean '{close[0]}'?" if close else ""
+        raise RangesError(
+            f"no ranges '{name_or_path}': give a YAML file or one of {', '.join(available())}{hint}"
+        )
+    data = read_mapping(path, RangesError, such_as="mass: [0.98, 1.02]")
+    if not all(isinstance(key, str) for key in data):
+        key = next(key for key in data if not isinstance(key, str))
+        raise RangesError(f"{path}: {key}: expected the name of an entry, such as mass")
+    try:
+        return Ranges.model_validate({"name": path.stem, **data})
+    except ValidationError as error:
+        raise RangesError(f"{path}: {sentence(error, Ranges)}") from None

@@ -1,0 +1,139 @@
+"""Common Python part of the sensors of all vehicles of all worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import warp as wp
+from numpy.typing import NDArray
+
+from finssim.sim.sensors.sampling import SensedState, new_sampling
+
+
+class SensorError(ValueError):
+    """A sensor refuses its arguments; the message states what to change."""
+
+
+class Surroundings(NamedTuple):
+    """Surroundings that a sensor's parameters may depend on, besides the vehicle's file."""
+
+    gravity: float
+    """[m/s²]"""
+    density: float
+    """Density of the water [kg/m³]."""
+    floor_depth: float
+    """Depth of the flat floor [m]; infinite if not known."""
+
+
+class SensorBatch:
+    """One kind of sensor, for every vehicle of every world.
+
+    Its readings are Warp arrays (W, V) that stay in place. `stamp` and `fresh` say how old they are. Where a vehicle
+    lacks the sensor they stay zero, never fresh, with the stamp -1.
+    """
+
+    kind: ClassVar[str]
+    """Its key under `sensors` in a vehicle file."""
+    schema: ClassVar[Any] = None
+    """Schema of its section in a vehicle file, a `vehicles.equipment.Sensor`; for `add_sensor`."""
+    kernel: ClassVar[Any]
+    """Kernel made by `sampling.sampling_kernel`."""
+    parameter_struct: ClassVar[Any]
+    """Struct made by `sampling.parameters_of`."""
+    array_struct: ClassVar[Any]
+    """Warp struct of readings, by (world, vehicle), and of rings, which have one more index."""
+    readings: ClassVar[tuple[str, ...]]
+    """Names of the arrays that `numpy` returns beside `stamp` and `fresh`."""
+
+    def __init__(
+        self, entries: Sequence[Any], worlds: int, control_step: float, seed: int, device: Any
+    ) -> None:
+        """Lay out the memory.
+
+        Args:
+            entries: What each vehicle's file says about this sensor, or None; only rate and latency are read here.
+            worlds: Number of worlds W.
+            control_step: [s]
+            seed: Of all random numbers.
+            device: Warp device.
+        """
+        self.device = device
+        self.seed = seed
+        self.shape = (worlds, len(entries))
+        self.sampling = new_sampling(
+            [0.0 if entry is None else entry.rate for entry in entries],
+            [0.0 if entry is None else entry.latency for entry in entries],
+            worlds,
+            control_step,
+            device,
+        )
+        self.stamp: wp.array[Any] = self.sampling.stamp
+        """Time since reset at which the reading on display was taken [s], -1 before the first; float (W, V)."""
+        self.fresh: wp.array[Any] = self.sampling.fresh
+        """Whether that reading arrived in the last update; bool (W, V)."""
+        self.arrays = self._new_arrays()
+        self.parameters: wp.array[Any] = wp.zeros(self.shape, dtype=self.parameter_struct, device=device)
+        """Parameter structs (W, V); change them with `set`."""
+
+    def _new_arrays(self) -> Any:
+        """Zeroed readings and rings, each also an attribute of this object."""
+        arrays = self.array_struct()
+        for name, variable in self.array_struct.vars.items():
+            shape = self.shape if variable.type.ndim == 2 else self.sampling.sent.shape
+            array = wp.zeros(shape, dtype=variable.type.dtype, device=self.device)
+            setattr(arrays, name, array)
+            setattr(self, name, array)
+        return arrays
+
+    def inputs(self, state: SensedState, water_velocity: Any, mask: Any, restarting: bool) -> list[Any]:
+        """All arguments of the kernel but its last, `world_offset`.
+
+        Args:
+            state: What to measure.
+            water_velocity: World frame [m/s], vec3 (W, V), or None.
+            mask: Worlds to look at, int (W,).
+            restarting: Whether these worlds have just been reset.
+        """
+        truth = [state.position, state.quaternion, state.velocity, state.acceleration, water_velocity]
+        memory = [self.parameters, self.arrays, self.sampling]
+        return [*truth, state.steps, state.episode, *memory, mask, restarting, self.seed]
+
+    def use(self, vehicle: int, entry: Any, site: Surroundings) -> None:
+        """Take one vehicle's parameters from its file.
+
+        Args:
+            vehicle: Index.
+            entry: `vehicle.sensors.KIND`.
+            site: What else they depend on.
+        """
+        names = self.parameter_struct.vars
+        values = {name: getattr(entry, name) for name in names if hasattr(entry, name)}
+        self.set(vehicle, **{**values, **self.derived(entry, site)})
+
+    def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
+        """Parameters that the file does not give as they are, or that replace what it gives; none by default."""
+        return {}
+
+    def numpy(self) -> dict[str, NDArray[Any]]:
+        """Copies of the readings with `stamp` and `fresh`, each (W, V, ...)."""
+        return {name: getattr(self, name).numpy().copy() for name in (*self.readings, "stamp", "fresh")}
+
+    def set(self, vehicle: int | slice = slice(None), **values: Any) -> None:
+        """Change parameters: how worlds get sensors that differ.
+
+        Args:
+            vehicle: Which vehicle; all of them if not given.
+            values: By field of the parameter struct, each broadcast over (W, V) or, for one vehicle, (W,); a vector
+                has its components last. Rate and latency cannot change, since they size the memory.
+
+        Raises:
+            SensorError: There is no such field.
+        """
+        table = self.parameters.numpy()  # type: ignore[no-untyped-call]
+        for name, value in values.items():
+            if name not in table.dtype.names:
+                available = ", ".join(table.dtype.names)
+                raise SensorError(f"no {self.kind} parameter '{name}'; available: {available}")
+            table[name][:, vehicle] = value
+        self.parameters.assign(table)  # type: ignore[no-untyped-call]

@@ -1,0 +1,74 @@
+"""Compass: heading of the body's x axis about the vertical, tilt compensated."""
+# mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
+
+from typing import Any
+
+import warp as wp
+
+from finssim.sim.sensors.batch import SensorBatch
+from finssim.sim.sensors.sampling import (
+    TURN_ON,
+    WHITE,
+    Truth,
+    digitised,
+    normal,
+    parameters_of,
+    sampling_kernel,
+)
+from finssim.vehicles.equipment import Compass
+
+CompassParameters = parameters_of(Compass)
+
+
+@wp.struct
+class CompassArrays:
+    """Readings and memory of all compasses, by (world, vehicle); the ring has one more index."""
+
+    heading: wp.array2d(dtype=float)  # left positive from world x [rad]
+    bias: wp.array2d(dtype=float)  # true offset [rad]
+    ring: wp.array3d(dtype=float)  # samples on their way
+
+
+@wp.func
+def heading_of(q_wb: wp.quat) -> float:
+    """Angle of the body's x axis from world x about the vertical, in [-π, π] [rad].
+
+    Args:
+        q_wb: Attitude, body to world, xyzw.
+    """
+    ahead = wp.quat_rotate(q_wb, wp.vec3(1.0, 0.0, 0.0))
+    return wp.atan2(ahead[1], ahead[0])
+
+
+@wp.func
+def measure_heading(
+    truth: Truth, p: CompassParameters, key: wp.uint32, root: float, restarting: bool, compass: CompassArrays, w: int,
+    v: int, slot: int,
+) -> bool:  # fmt: skip
+    """One sample of a compass; arguments as `sampling_kernel` has them."""
+    if restarting:
+        compass.bias[w, v] = p.bias_initial * normal(key, TURN_ON)
+    heading = heading_of(truth.quaternion) + compass.bias[w, v] + p.noise_std * normal(key, WHITE)
+    compass.ring[w, v, slot] = digitised(heading, p.quantisation, wp.inf)
+    return True
+
+
+@wp.func
+def display_heading(p: CompassParameters, compass: CompassArrays, w: int, v: int, slot: int):
+    """The heading of a sample that arrived."""
+    compass.heading[w, v] = compass.ring[w, v, slot]
+
+
+class CompassBatch(SensorBatch):
+    """The compasses of all vehicles of all worlds."""
+
+    kind = "compass"
+    parameter_struct = CompassParameters
+    array_struct = CompassArrays
+    kernel = sampling_kernel(4, CompassParameters, CompassArrays, measure_heading, display_heading)
+    readings = ("heading",)
+
+    heading: "wp.array[Any]"
+    """Heading of the body's x axis from world x, left positive [rad]; float (W, V)."""
+    bias: "wp.array[Any]"
+    """Truth: the offset in it [rad]; float (W, V)."""

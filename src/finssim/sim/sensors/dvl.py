@@ -1,0 +1,124 @@
+"""Doppler velocity log: velocity of its mount over the floor or through the water."""
+# mypy: disable-error-code="valid-type,misc,index,return-value,no-any-return,no-untyped-def,untyped-decorator"
+
+import math
+from typing import Any
+
+import warp as wp
+
+from finssim.physics.types import angular, linear, vec6
+from finssim.sim.sensors.batch import SensorBatch, Surroundings
+from finssim.sim.sensors.sampling import (
+    TURN_ON,
+    TURN_ON_2,
+    WALK,
+    WHITE,
+    Truth,
+    digitised3,
+    normal,
+    normal3,
+    parameters_of,
+    sampling_kernel,
+)
+from finssim.vehicles.equipment import Dvl
+
+# Cosine of the largest tilt with an echo [-], and depth of the flat floor [m].
+DvlParameters = parameters_of(Dvl, tilt_cosine=float, floor_depth=float)
+
+
+@wp.struct
+class DvlArrays:
+    """Readings and memory of all DVLs, by (world, vehicle); the ring has one more index."""
+
+    velocity: wp.array2d(dtype=wp.vec3)  # sensor frame [m/s]
+    bias: wp.array2d(dtype=wp.vec3)  # true bias, sensor frame [m/s]
+    scale_error: wp.array2d(dtype=float)  # true scale error
+    lock: wp.array2d(dtype=int)  # whether the beams find the bottom of a described world
+    ring: wp.array3d(dtype=wp.vec3)  # samples on their way
+
+
+@wp.func
+def sensed_velocity(nu: vec6, q_wb: wp.quat, water: wp.vec3, r: wp.vec3, q_bs: wp.quat) -> wp.vec3:
+    """Return the reading of an ideal DVL: velocity of its point relative to the floor or to the water.
+
+    v = R_bsᵀ [ v + ω × r - R_wbᵀ v_w ]
+
+    Args:
+        nu: Velocity of the body origin, body frame [m/s, rad/s].
+        q_wb: Attitude, body to world, xyzw.
+        water: Velocity v_w of the water for water track, zero for bottom track; world frame [m/s].
+        r: Sensor from the body origin, body frame [m].
+        q_bs: Orientation, sensor to body, xyzw.
+
+    Returns:
+        Velocity, sensor frame [m/s].
+    """
+    over_floor = linear(nu) + wp.cross(angular(nu), r)
+    return wp.quat_rotate_inv(q_bs, over_floor - wp.quat_rotate_inv(q_wb, water))
+
+
+@wp.func
+def has_echo(position: wp.vec3, q_wb: wp.quat, p: DvlParameters) -> bool:
+    """Return whether the beams find the floor: the vehicle is not tilted too far, nor too close, nor too high.
+
+    Args:
+        position: Body origin, world frame [m].
+        q_wb: Attitude, body to world, xyzw.
+        p: Mount and reach.
+    """
+    up = wp.quat_rotate(q_wb, wp.vec3(0.0, 0.0, 1.0))
+    point = position + wp.quat_rotate(q_wb, p.position)
+    altitude = p.floor_depth + point[2]
+    return up[2] >= p.tilt_cosine and altitude >= p.altitude_min and altitude <= p.altitude_max
+
+
+@wp.func
+def measure_velocity(
+    truth: Truth, p: DvlParameters, key: wp.uint32, root: float, restarting: bool, dvl: DvlArrays, w: int, v: int,
+    slot: int,
+) -> bool:  # fmt: skip
+    """One sample of a DVL; arguments as `sampling_kernel` has them."""
+    if restarting:
+        dvl.bias[w, v] = p.bias_initial * normal3(key, TURN_ON)
+        dvl.scale_error[w, v] = p.scale_error * normal(key, TURN_ON_2)
+    bias = dvl.bias[w, v] + p.bias_walk * root * normal3(key, WALK)
+    exact = sensed_velocity(truth.velocity, truth.quaternion, truth.water, p.position, p.orientation)
+    reading = (1.0 + dvl.scale_error[w, v]) * exact + bias + p.noise_std * normal3(key, WHITE)
+    dvl.ring[w, v, slot] = digitised3(reading, p.quantisation, p.velocity_range)
+    dvl.bias[w, v] = bias
+    return truth.water_known or (dvl.lock[w, v] != 0 and has_echo(truth.position, truth.quaternion, p))
+
+
+@wp.func
+def display_velocity(p: DvlParameters, dvl: DvlArrays, w: int, v: int, slot: int):
+    """The velocity of a sample that arrived."""
+    dvl.velocity[w, v] = dvl.ring[w, v, slot]
+
+
+class DvlBatch(SensorBatch):
+    """The DVLs of all vehicles of all worlds."""
+
+    kind = "dvl"
+    parameter_struct = DvlParameters
+    array_struct = DvlArrays
+    kernel = sampling_kernel(3, DvlParameters, DvlArrays, measure_velocity, display_velocity)
+    readings = ("velocity",)
+
+    velocity: "wp.array[Any]"
+    """Over the floor, or through the water where the water's velocity was given; sensor frame [m/s]; vec3 (W, V)."""
+    bias: "wp.array[Any]"
+    """Truth: the bias in it, sensor frame [m/s]; vec3 (W, V)."""
+    scale_error: "wp.array[Any]"
+    """Truth: the scale error in it; float (W, V)."""
+    lock: "wp.array[Any]"
+    """Flag of the beams finding the bottom, int (W, V): 1, unless beams of a described world write it."""
+
+    def _new_arrays(self) -> Any:
+        arrays = super()._new_arrays()
+        arrays.lock.fill_(1)
+        return arrays
+
+    def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
+        """Reach of the beams; without a known floor it is always near."""
+        tilt = {"tilt_cosine": math.cos(min(entry.max_tilt, math.pi)), "floor_depth": site.floor_depth}
+        return tilt if math.isfinite(site.floor_depth) else {**tilt, "altitude_max": math.inf}

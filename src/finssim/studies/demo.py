@@ -1,0 +1,672 @@
+"""`finssim demo`: the complete loop on one machine, from an unmeasured vehicle to a policy in a pool."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import sys
+import time
+import webbrowser
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
+from html import escape
+from os import environ
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.agents.pid import axis_model
+from finssim.control.policy import Policy
+from finssim.core.files import atomic_write
+from finssim.core.page import html_page
+from finssim.core.quiet import start_warp
+from finssim.evaluation.campaign import Progress
+from finssim.evaluation.evaluate import T1_COLUMNS
+from finssim.evaluation.excitation import record_programmes
+from finssim.evaluation.figures import COLORS, clean, legend_below, new_figure, save_figure
+from finssim.evaluation.metrics import T1_SETPOINTS
+from finssim.evaluation.robot_trials import (
+    FIRMWARES,
+    Attendant,
+    Job,
+    OnRobot,
+    firmware_of,
+    played_trial,
+    take_folder,
+)
+from finssim.evaluation.tables import Table, cells, html_of, print_tables
+from finssim.evaluation.trials import Trial
+from finssim.identification.fit import Fit
+from finssim.identification.programmes import RATE, STEADY, Programme, programmes, which_axes
+from finssim.identification.regression.regress import regress
+from finssim.identification.replay import Replay, draw_response_envelopes, replay
+from finssim.identification.report import interval_text, number_text, state_text, write_report
+from finssim.identification.vehicle_file import all_findings, calibrated, number_in, write_vehicle
+from finssim.pool import draw_plant
+from finssim.pool.draw_plant import site_of
+from finssim.sim import Pool
+from finssim.studies.transfer import T1, Spec, transfer_experiment
+from finssim.trials.findings import Finding, sentences
+from finssim.trials.trial_files import load_trials
+from finssim.vehicles import AXES, Provenance, Vehicle, load_vehicle
+from finssim.vehicles.capability import level_speed
+from finssim.vehicles.defaults import SITES, room
+
+__all__ = ["demo"]
+
+SHARE = 0.9
+"""Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""
+BALLASTED = 0.25
+"""Weight minus buoyancy of a vehicle that floats well enough [N]."""
+
+
+def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str, list[float]]:
+    """Levels that take a vehicle as fast as given ones take FinsROV, in its own lengths, and tilt it as far.
+
+    A linear axis comes to FinsROV's terminal speed times the vehicle's `room`, yaw to FinsROV's rate, roll and pitch to
+    FinsROV's angle at rest. Surge and sway stay slower where the vehicle's own righting moment would not hold it: see
+    `level_speed`. Programmes then last as long and go as far, in a pool that is `room` times as large.
+
+    Args:
+        levels: Axis -> levels for FinsROV [N, N m].
+        vehicle: Whose file gives damping, stiffness and limits; axes that it does not control are left out.
+
+    Returns:
+        Axis -> levels, to three digits and at most `SHARE` of the limit; FinsROV's own as they are.
+    """
+    published = load_vehicle("finsrov")
+    if vehicle.name == published.name:
+        return {axis: list(values) for axis, values in levels.items()}
+    ours, theirs, size = axis_model(vehicle), axis_model(published), room(vehicle.body.size)
+    scaled = {}
+    for axis, values in levels.items():
+        i = AXES.index(axis)  # type: ignore[arg-type]
+        if axis not in vehicle.controlled_axes or not vehicle.wrench_limits[i] > 0.0:
+            continue
+        level = np.asarray(values, float)
+        scale = size if i < 3 else 1.0
+        if i < 2:  # all levels of the axis equally, so that those of different trials stay different
+            fastest = size * float(theirs.terminal_speed(published.wrench_limits)[i])
+            scale *= min(1.0, STEADY * level_speed(vehicle, axis=i) / fastest)
+        if min(ours.stiffness[i], theirs.stiffness[i]) > 0.0:
+            level = level * ours.stiffness[i] / theirs.stiffness[i]
+        else:
+            speed = scale * theirs.terminal_speed(level[:, None])[:, i, None]
+            level = (ours.damping(speed) * speed)[:, i]
+        limit = SHARE * float(vehicle.wrench_limits[i])
+        scaled[axis] = list(dict.fromkeys(float(f"{min(x, limit):.3g}") for x in level))
+    return scaled
+
+
+def trimmed(programme: Programme, vehicle: Vehicle) -> Programme:
+    """The programme with the vehicle's weight less its buoyancy carried by the thrusters, where it is not ballasted.
+
+    A BlueROV2 that rises with 2 N is out of a shallow pool before its first step; the fit takes what acted.
+
+    Args:
+        programme: On any axis.
+        vehicle: Whose weight and displaced volume are known.
+    """
+    net = vehicle.weight - vehicle.buoyancy
+    if abs(net) < BALLASTED:
+        return programme
+    tau = programme.tau_desired.copy()
+    tau[:, 2] += net
+    return replace(programme, tau_desired=tau)
+
+
+PERIODS = {"surge": 4.0, "sway": 4.0, "heave": 2.4, "roll": 2.0, "pitch": 2.0, "yaw": 4.0}
+"""Period of the wave, some five time constants of a small vehicle [s]."""
+WAVES = 2.5
+"""The first and the last half of a half wave, so that the middle of the way is where it began."""
+
+
+def shuttles(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> list[Programme]:
+    """Square waves, two and a half periods each, which begin with half of a push.
+
+    Steps tell the drag, for most of a step is steady; mass is told by what is not, and the propellers of the two
+    directions, which differ, average out within a trial.
+
+    Args:
+        levels: Axis -> magnitudes [N, N m].
+        vehicle: Must control the axes.
+
+    Raises:
+        CalibrationError: An axis that the vehicle does not control.
+    """
+    plan = []
+    for axis in which_axes(list(levels), vehicle):
+        counts = [round(s * RATE) for s in (1.0, 1.0, WAVES * PERIODS[axis], 2.0, 1.0)]
+        phase = np.repeat(np.array(["rest", "baseline", "excitation", "coast", "rest"]), counts)
+        turns = (np.arange(counts[2]) / RATE + 1e-6) / PERIODS[axis]
+        tau = np.zeros((len(phase), 6))
+        # A cosine's sign: a quarter of the period forward, half of it back, and so on.
+        tau[phase == "excitation", AXES.index(axis)] = np.sign(np.cos(2.0 * math.pi * turns))
+        for level in levels[axis]:
+            name = f"{axis}_shuttle_{level:.4g}"
+            plan.append(Programme(name=name, axes=(axis,), rate=RATE, tau_desired=level * tau, phase=phase))
+    return plan
+
+
+# An unmeasured vehicle, trials, and what they determine.
+
+
+TRIALS = "trials"
+VEHICLE_FILES = ("{}_rough.yaml", "{}_identified.yaml")
+"""Files of the vehicle before and after."""
+SET = "hydrodynamics.calibrated"
+
+HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [7.0], "yaw": [1.0]}
+"""Levels that no trial of the fit has [N, N m]."""
+
+Record = Callable[[Mapping[str, Path], str], Mapping[str, Sequence[Path]]]
+"""Makes trials: folders by role (fit, held-out), file of the rough vehicle -> folders of the trials by role."""
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Result of the trials."""
+
+    vehicle: Vehicle
+    """Vehicle as read back from its file."""
+    fit: Fit
+    replay: Replay
+    """Replay of the held-out trials by the identified vehicle."""
+    truth: Vehicle
+    """The vehicle of the catalogue that made the trials, or around which the pool's own was drawn."""
+    findings: tuple[Finding, ...]
+    seconds: float
+
+
+def rough_vehicle(truth: Vehicle) -> Vehicle:
+    """Return what is known of a vehicle before any trial: its weight and size, and thrusters from a bench.
+
+    Its hydrodynamics are guesses: added mass of half the displaced water on every linear axis, damping of the order of
+    other small vehicles, forces growing with the square of the length, moments with its fourth power and moments of
+    inertia with its fifth. Moments are guessed low: a controller that counts on damping which is not there rings.
+    """
+    half = 0.5 * truth.water.density * truth.body.displaced_volume
+    size = room(truth.body.size)
+    force, moment, inertia = size**2, size**4, 0.1 * size**5
+    guess = {
+        f"{SET}.added_mass": [half, half, half, inertia, inertia, inertia],
+        f"{SET}.linear_damping": [20.0 * force] * 3 + [0.5 * moment] * 3,
+        f"{SET}.quadratic_damping": [50.0 * force] * 3 + [moment] * 3,
+    }
+    origin = Provenance("guessed", "", "the order of other small vehicles, before any trial")
+    description = "Hydrodynamics are guesses; the rest is the catalogue's."
+    return _named(truth.replace(guess, origin), f"{truth.name} before any trial", description)
+
+
+def _named(vehicle: Vehicle, title: str, description: str) -> Vehicle:
+    """Return the same vehicle with another name and description."""
+    return vehicle.model_copy(update={"title": title, "description": description})
+
+
+def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identification:
+    """Make trials of a vehicle, identify it from some, replay the others; write all of it.
+
+    Into the folder go `NAME_rough.yaml` (the vehicle before), `trials/fit` and `trials/held-out`,
+    `NAME_identified.yaml`, `calibration` (the report), and `replay.json` with `replay.png`.
+
+    Args:
+        folder: Existing directory.
+        name: Name or file of a vehicle.
+        seed: Of initial conditions and noise of the trials.
+        record: Makes the trials.
+
+    Returns:
+        What was found.
+    """
+    began = time.perf_counter()
+    truth = load_vehicle(name)
+    name = truth.name
+    start_file, vehicle_file = (file.format(name) for file in VEHICLE_FILES)
+    write_vehicle(rough_vehicle(truth), folder / start_file)
+    folders = record({role: folder / TRIALS / role for role in ("fit", "held-out")}, str(folder / start_file))
+    recorded = {role: load_trials(paths) for role, paths in folders.items()}
+    fit = regress(recorded["fit"], load_vehicle(folder / start_file))
+    identified = calibrated(fit)
+    findings = tuple(all_findings(fit, identified))
+    identified = _named(
+        identified,
+        f"{name} as identified",
+        "Hydrodynamics from trials where these determine them, otherwise guesses.",
+    )
+    write_vehicle(identified, folder / vehicle_file)
+    vehicle = load_vehicle(folder / vehicle_file)
+    write_report(
+        fit,
+        folder / "calibration",
+        vehicle,
+        command=commands(folder, name)[1],
+        findings=findings,
+        out=folder / vehicle_file,
+    )
+    scored = replay(recorded["held-out"], vehicle, seed=seed)
+    text = json.dumps(scored.as_json(), indent=2, allow_nan=False) + "\n"
+    (folder / "replay.json").write_text(text, encoding="utf-8")
+    save_figure(draw_response_envelopes(scored.pairs), folder / "replay.png")
+    return Identification(vehicle, fit, scored, truth, findings, time.perf_counter() - began)
+
+
+def commands(folder: Path, name: str) -> list[str]:
+    """Command lines that identify and replay from the trials again."""
+    start, vehicle = (folder / file.format(name) for file in VEHICLE_FILES)
+    trials = folder / TRIALS
+    return [
+        f"finssim trials check {trials / 'fit'} --vehicle {start}",
+        f"finssim calibrate hydrodynamics {trials / 'fit'} --vehicle {start} --out {vehicle}",
+        f"finssim replay {trials / 'held-out'} --vehicle {vehicle}",
+    ]
+
+
+BLUE, ORANGE = COLORS[:2]
+ARROW = 0.18
+"""Length of an arrow that shows a heading [m]."""
+
+HEADS = ("parameter", "estimate", "95 % interval", "catalogue", "unit", "state")
+UNSURE = (
+    "unsure: determined only jointly with another number, such as a part of the drag. file kept: the trials do not "
+    "determine the number, and the vehicle keeps its guess."
+)
+POOL_VEHICLE = (
+    " The catalogue's vehicle is the one around which the pool drew its own: the plant's coefficients are known to the "
+    "pool alone. Its propellers push up to 15 % more or less than the bench said, so the estimates "
+    "are effective masses and dampings: those for the nominal thrust of the vehicle file."
+)
+
+
+def _paths(trials: Sequence[Trial], site: str) -> Any:
+    """The paths of all trials from above and from the side, in the water; start and goals with their headings."""
+    size = SITES[site]
+    pool = Pool() if size is None else Pool(length=size[0], width=size[1], depth=size[2])
+    figure = new_figure(7.2, 6.0, layout="compressed")
+    panels = figure.subplots(2, 1, sharex=True, height_ratios=(pool.width, pool.depth))
+    spans = ((1, -pool.width / 2, pool.width), (2, -pool.depth, pool.depth))
+    goals = np.array([trial.goal for trial in trials])
+    for axes, (vertical, low, height) in zip(panels, spans, strict=True):
+        axes.fill_between([-pool.length / 2, pool.length / 2], low, low + height, color="#eaf3f8")
+        for trial in trials:
+            axes.plot(*trial.motion.position[:, [0, vertical]].T, color=BLUE, linewidth=1.2)
+        axes.plot(*goals[:, [0, vertical]].T, "o", mfc="none", mec=ORANGE, ms=9, label="goal")
+        axes.plot(*trials[0].motion.position[0, [0, vertical]], "s", color="0.2", ms=5, label="start")
+        axes.set(aspect="equal", ylim=(low - 0.05, low + height + 0.05))
+        axes.spines[["top", "right"]].set_visible(False)
+    above, side = panels
+    for x, y, _, yaw in goals:
+        tip = (x + ARROW * np.cos(yaw), y + ARROW * np.sin(yaw))
+        above.annotate("", tip, (x, y), arrowprops={"arrowstyle": "->", "color": ORANGE})
+    above.set_ylabel("y, left [m]")
+    side.set(ylabel="z, up [m]", xlabel="x, forward [m]")
+    legend_below(figure, above, 2)
+    return figure
+
+
+CURVES = {
+    "evaluation_success": "success, evaluated",
+    "evaluation_return": "return, evaluated",
+    "held": "share that held at the end",
+    "mean_return": "return in training",
+}
+"""Columns of a training's `curves.csv` and their titles."""
+
+
+def _training(curves: NDArray[Any]) -> Any:
+    """Draw the first two of `CURVES` that a training measured, over its control steps."""
+    names = [
+        name for name in CURVES if name in (curves.dtype.names or ()) and np.isfinite(curves[name]).any()
+    ]
+    figure = new_figure(7.2, 3.0)
+    for axes, name in zip(figure.subplots(1, 2), names, strict=False):
+        measured = np.isfinite(curves[name])  # no value before the first episode ended
+        axes.plot(curves["steps"][measured] / 1e6, curves[name][measured], color=BLUE)
+        axes.set_xlabel("control steps [million]", fontsize=8)
+        axes.set_title(CURVES[name], fontsize=10)
+        clean(axes)
+    return figure
+
+
+def _identification(result: Identification, hardware: bool) -> list[Table]:
+    """Return tables of what the trials determined, and of the replay of other trials."""
+    score = result.replay.aggregate(result.replay.models[0]).value
+    source, same = ("a robot", "on the same robot") if hardware else ("the virtual pool", "in the same pool")
+    lead = (
+        f"Identified in {result.seconds:.0f} s from {len(result.fit.trials)} trials of {source}, beginning with "
+        "guessed hydrodynamics: the robot's own software played each programme, and its record became a trial. "
+        f"{len(result.replay.pairs)} other trials, at levels that were not fitted, are replayed with an NRMSE of "
+        f"{'unknown' if score is None else f'{score:.3f}'}. What follows was trained and tuned in the identified "
+        f"vehicle, and tried {same}."
+    )
+    estimates = {name: e for name, e in result.fit.estimates.items() if e.path is not None}
+    rows = [
+        [
+            name, number_text(e.estimate), interval_text(e), number_text(number_in(result.truth, str(e.path))), e.unit,
+            state_text(e, result.fit, result.vehicle),
+        ]
+        for name, e in estimates.items() if str(e.path).startswith("hydrodynamics.")
+    ]  # fmt: skip
+    return [
+        Table(
+            title="Identification",
+            headline=lead,
+            heads=HEADS,
+            rows=rows,
+            note=UNSURE + ("" if hardware else POOL_VEHICLE),
+            sentences=sentences(result.findings),
+            pictures={"replay.png": "Held-out trials: measured and replayed by the identified vehicle"},
+        )
+    ]
+
+
+def _lead(result: Mapping[str, Any], spec: Spec, seconds: float) -> str:
+    rows = result["rows"]
+    texts = {
+        name: f"{row['success']} of {row['trials']}" for name, row in rows.items() if name != WITH_PICTURES
+    }
+    errors, policy = "", rows.get(POLICY)
+    if policy and policy["e_p_m"]:
+        e_p, e_psi = (policy[key]["value"] for key in ("e_p_m", "e_psi_deg"))
+        errors = f", with {100.0 * e_p:.1f} cm and {e_psi:.1f}° of error once settled"
+    others = "; ".join(f"{spec.rows[name].title}: {text}" for name, text in texts.items() if name != POLICY)
+    return (
+        f"A policy trained here in {seconds:.0f} s, from nothing to a file that runs "
+        f"on the vehicle, holds {texts.get(POLICY, 'none')} published setpoints "
+        f"{'on hardware' if result['robot'] else 'in the virtual pool'}{errors}. On the same trials: {others}."
+    )
+
+
+def _setpoints(result: Mapping[str, Any], spec: Spec) -> Table:
+    """Every setpoint of every controller."""
+    rows = [
+        [f"{spec.rows[name].title}, {target}", *cells(figures, T1_COLUMNS)]
+        for name, row in result["rows"].items()
+        for target, figures in row["by_target"].items()
+    ]
+    return Table(
+        title="Every setpoint", heads=["", *(heading for heading, *_ in T1_COLUMNS.values())], rows=rows
+    )
+
+
+PLANT_FILE = "pool.yaml"
+"""The plant, for `finssim pool --plant`."""
+REPORT_FILE = "report.html"
+SEVERITY, RANGES = "realistic", "pool"
+POLICY, WITH_PICTURES = "calibrated-pool", "with-pictures"
+"""Rows of station keeping: the policy that is trained here; and the same, with pictures drawn and searched for tags."""
+COAST = 4.0
+"""Longest, after a dive [s]: the pool is shallow, and this vehicle hardly rises."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scope:
+    """Extent of a demonstration."""
+
+    levels: dict[str, list[float]]
+    """Axis -> levels of the steps and pulses that the fit is made from, for FinsROV [N, N m]."""
+    shuttles: dict[str, list[float]]
+    """Levels of the square waves."""
+    held_out: dict[str, list[float]]
+    """Levels of the replayed trials."""
+    setpoints: tuple[str, ...]
+    """Tried by every controller, with the tags' corners computed."""
+    pictures: tuple[str, ...]
+    """Tried by the policy with pictures drawn and searched."""
+    duration: float = 60.0
+    """Duration of a trial [s]."""
+
+
+FULL = Scope(
+    levels={
+        "surge": [6.0, 18.0],
+        "sway": [4.5, 13.5],
+        "heave": [4.5, 13.5],
+        "roll": [0.5, 1.0],
+        "pitch": [0.5, 1.0],
+        "yaw": [0.6, 1.8],
+    },
+    shuttles={"surge": [12.0, 18.0], "sway": [9.0, 13.5], "heave": [9.0, 13.5]},
+    held_out=HELD_OUT,
+    setpoints=tuple(T1_SETPOINTS),
+    pictures=("P02",),
+)
+"""Scope of `finssim demo`."""
+
+
+def demo(
+    out: Annotated[Path, "--out"] = Path("demo"),
+    *,
+    vehicle: str = "finsrov",
+    seed: int = 1,
+    steps: Annotated[int | None, (1, None)] = None,
+    console: Console | None = None,
+    scope: Scope | None = None,
+    processes: Annotated[int | None, "python"] = None,
+    firmware: str = "mcu",
+    robot: OnRobot | None = None,
+    attendant: Attendant | None = None,
+    as_json: bool = False,
+) -> Path:
+    """Identify a vehicle in the virtual pool or on a robot, train and deploy a policy, write a report.
+
+    Trials are recorded and controllers deployed through the robot's complete software: camera, localization,
+    fusion,
+    controller, allocation, bridge and the motor controller's protocol. For comparison, `pid` (tuned from the
+    identified vehicle) and `pid-paper` run the same setpoints in the same pool.
+
+    Example: finssim demo --vehicle bluerov2_heavy --out demo
+
+    Example: finssim demo --vehicle bluerov2_heavy --firmware ardusub --out demo
+
+    Example: finssim demo --robot udp://10.0.0.2:58766 --pool-file pool.yaml --arm --out demo
+
+    Args:
+        out (DIR): Directory of trials, vehicle, policy, results and report.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        seed: Seed of every random number; equal seeds give equal results.
+        steps: Control steps of the training, summed over all worlds; the task's default if not given.
+        console: Where progress is shown; standard error if None.
+        scope: How much of it; `FULL` if None.
+        processes: As many as there are processors if None.
+        firmware (NAME): Firmware of the vehicle: mcu (FinsROV's motor controller) or ardusub (an autopilot over
+            MAVLink: the policy uses its axes, `pilot6`, in a tank with a DVL and a compass instead of the pool and
+            its camera, with setpoints three times as far).
+        robot: Where trials are made and setpoints held, in place of the virtual pool.
+        attendant: The person beside that robot, instead of the terminal's keyboard.
+        as_json: Print one JSON object instead of tables.
+
+    Returns:
+        Path of the report.
+
+    Raises:
+        RobotError: The folder is of another demonstration.
+        KeyboardInterrupt: After Ctrl-C; the same command goes on.
+    """
+    console, standing = console or Console(stderr=True), load_vehicle(vehicle)
+    firmware = firmware_of(firmware, standing, robot)
+    start_warp()
+    about = {
+        "vehicle": {"name": standing.name, "sha256": standing.sha256}, "seed": seed, "steps": steps,
+        "firmware": firmware, "robot": robot is not None,
+    }  # fmt: skip
+    take_folder(Path(out) / "demo.yaml", about)
+    demonstration = _Demonstration(
+        out=Path(out), name=vehicle, standing=standing, seed=seed, steps=steps, scope=scope or FULL, console=console,
+        processes=processes, robot=robot, attendant=attendant, firmware=firmware,
+    )  # fmt: skip
+    tables, report = demonstration.run(), Path(out) / REPORT_FILE
+    if as_json:
+        rows = [
+            {"title": t.title, "heads": list(t.heads), "rows": [list(r) for r in t.rows if r]} for t in tables
+        ]
+        print(json.dumps({"report": str(report), "tables": rows}))
+        return report
+    print_tables(tables, Console())
+    print(f"report: {report}")
+    display = environ.get("DISPLAY") or environ.get("WAYLAND_DISPLAY") or sys.platform in ("darwin", "win32")
+    if sys.stdout.isatty() and display:
+        webbrowser.open(report.resolve().as_uri())
+    return report
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Demonstration:
+    """A demonstration: its steps, with their arguments and places."""
+
+    out: Path
+    """Directory of the results."""
+    name: str
+    """Name or file of the vehicle, as the catalogue has it."""
+    standing: Vehicle
+    seed: int
+    """Also of the pool."""
+    steps: int | None
+    scope: Scope
+    console: Console
+    processes: int | None
+    robot: OnRobot | None
+    attendant: Attendant | None
+    firmware: str
+
+    def run(self) -> list[Table]:
+        """Identify, train, deploy and report; returns the tables of what was held."""
+        identification, spec = self._identified(), self._spec()
+        held = self.out / "t1"
+        with self._working("training and holding setpoints") as progress:
+            result = transfer_experiment(
+                spec, out=held, seeds=1, seed=self.seed, rows=list(spec.rows), firmware=self.firmware,
+                vehicle=str(self.out / VEHICLE_FILES[1].format(self.standing.name)), steps=self.steps,
+                processes=self.processes, robot=self.robot, attendant=self.attendant, console=self.console,
+                progress=progress, show=self._show,
+                **({} if self.robot else {"plants": 1, "severity": SEVERITY, "pool_vehicle": self.name}),
+            )  # fmt: skip
+        policy, tables = self.out / "policy", spec.tables(result)
+        shutil.copytree(held / "policies" / f"{POLICY}-seed{self.seed}", policy, dirs_exist_ok=True)
+        curves = np.genfromtxt(policy / "curves.csv", delimiter=",", names=True, ndmin=1)
+        save_figure(_training(curves), self.out / "training.png")
+        trials = [played_trial(r, held / "trials") for r in result["trials"] if r["job"]["row"] == POLICY]
+        learnt = {"training.png": "Mean return and share of episodes held while training"}
+        drawn = [Table(title="Training", pictures=learnt), _setpoints(result, spec)]
+        if trials:
+            save_figure(_paths(trials, self.site), self.out / "paths.png")
+            paths = {"paths.png": "Paths of the trials from above and from the side"}
+            drawn.insert(0, Table(title="Paths of the policy", pictures=paths))
+        title = f"Station keeping of {self.standing.name}"
+        files = dict(Policy.load(policy).description.files)
+        origin = {"vehicle": result["vehicle"], "seed": self.seed, "policy": files, **result["provenance"]}
+        sections = [
+            f"<h1>{escape(title)}</h1>",
+            f'<p class="lead">{escape(_lead(result, spec, float(curves["seconds"][-1])))}</p>',
+            *html_of(_identification(identification, self.robot is not None), self.out),
+            *html_of(tables, held),
+            *html_of(drawn, self.out),
+            "<h2>How to repeat it</h2>",
+            f"<pre>{escape(chr(10).join(self._commands()))}</pre>",
+            "<h2>Provenance</h2>",
+            f"<pre>{escape(json.dumps(origin, indent=2))}</pre>",
+        ]
+        with atomic_write(self.out / REPORT_FILE) as temporary:
+            temporary.write_text(html_page(title, sections), encoding="utf-8")
+        return tables
+
+    def _spec(self) -> Spec:
+        """Station keeping by the policy and two PIDs; one setpoint with pictures, which takes longest, first."""
+        names = (POLICY, "pid", "pid-paper")
+        rows = {name: replace(T1.rows[name], changes={"duration": self.scope.duration}) for name in names}
+        if self.robot is None and self.firmware == "mcu":
+            title, changes = "The same, by pictures", {"duration": self.scope.duration, "camera": "pictures"}
+            with_pictures = replace(rows[POLICY], title=title, changes=changes, targets=self.scope.pictures)
+            rows = {WITH_PICTURES: with_pictures, **rows}
+        return replace(T1, rows=rows, targets=self.scope.setpoints, bases=(POLICY,))
+
+    @property
+    def site(self) -> str:
+        """Return the place of the trials."""
+        return FIRMWARES[self.firmware].site if self.robot is None else self.robot.site
+
+    def report(self, text: str) -> None:
+        """Show a line of progress."""
+        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    @contextmanager
+    def _working(self, doing: str) -> Iterator[Progress]:
+        """Show the current work and its progress; a robot's session has a separate line."""
+        text = f"{doing} {'in the virtual pool' if self.robot is None else 'on the robot'}"
+        self.report(text)
+        with nullcontext() if self.robot is not None else self.console.status(text) as status:
+            yield lambda part, detail: status.update(f"{text}: {detail}") if status else None
+
+    def _identified(self) -> Identification:
+        """Trials, and the vehicle that they make identifiable."""
+        standing, scope = self.standing, self.scope
+        levels = {
+            role: matched(x, standing) for role, x in (("fit", scope.levels), ("held-out", scope.held_out))
+        }
+        plans = {
+            role: programmes(tuple(of_role), standing, levels=of_role, coast=COAST)
+            for role, of_role in levels.items()
+        }
+        plans["fit"] += shuttles(matched(scope.shuttles, standing), standing) if scope.shuttles else []
+        plans = {role: [trimmed(programme, standing) for programme in plan] for role, plan in plans.items()}
+        person: dict[str, Any] = {"attendant": self.attendant, "console": self.console}
+        if self.robot is None:
+            spec = site_of(self.site, draw_plant(standing, self.seed, SEVERITY))
+            spec.write(self.out / PLANT_FILE)
+        with self._working("recording trials") as progress:
+            record = partial(
+                record_programmes, plans, robot=self.robot, **person, pool_vehicle=self.name, plant=self.seed,
+                severity=SEVERITY, seed=self.seed, site=self.site, firmware=self.firmware, leave_out=True,
+                processes=self.processes, progress=progress,
+                show=lambda run, result: self.report(
+                    f"  {run.target}: {'left out: ' if result['fault'] else ''}{result['fault'] or result['text']}"
+                ),
+            )  # fmt: skip
+            result = identify(self.out, self.name, seed=self.seed, record=record)
+        identifiable = sum(e.identifiable for e in result.fit.estimates.values())
+        self.report(
+            f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
+            f"{len(result.fit.estimates)} parameters told, NRMSE on {len(result.replay.pairs)} other trials "
+            f"{result.replay.aggregate('calibrated').value:.3f}"
+        )
+        return result
+
+    def _show(self, job: Job, result: Mapping[str, Any]) -> None:
+        held = "held" if result["success"] else result["fault"] or "not held"
+        if result["e_p_m"] is not None:
+            held += f", {result['e_p_m']:.3f} m and {result['e_psi_deg']:.1f}° off"
+        self.report(f"  {job.row} at {job.target}: {held}")
+
+    def _commands(self) -> list[str]:
+        """Command lines that repeat the demonstration's steps by hand."""
+        out, seed, name = self.out, self.seed, self.standing.name
+        rough, identified = (out / file.format(name) for file in VEHICLE_FILES)
+        steps = Policy.load(out / "policy").description.training["steps"]
+        options = f"--randomize {RANGES} --seed {seed} --steps {steps}"
+        action = FIRMWARES[self.firmware].action
+        options += f" --action {action}" if action else ""
+        learn = f"finssim train t1 --vehicle {identified} {options} --out policy"
+        drive = f"finssim run --policy policy --vehicle {identified} --goal 1,0.3,-0.5,90"
+        excite = f"finssim excite all --vehicle {rough} --coast {COAST:g} --out more-trials"
+        middle = [*commands(out, name), learn]
+        if self.robot is not None:
+            robot = f"{self.robot.options} --arm"
+            evaluated = f"finssim evaluate run.mcap --task t1 --vehicle {identified}"
+            return [f"{excite} {robot}", *middle, f"{drive} {robot} --record run.mcap", evaluated]
+        if self.firmware == "ardusub":
+            tank = f"finssim pool --vehicle {self.name} --plant {out / PLANT_FILE} --firmware ardusub"
+            robot = f"--robot mavlink --site {self.site} --pool-file none --let-in 0,0 --arm"
+            tank += f" --site {self.site} --truth truth.fst"
+            return [tank, f"{excite} {robot}", *middle, f"{drive} {robot}"]
+        return [
+            f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
+            f"{excite} --pool {seed} --severity {SEVERITY} --pool-vehicle {self.name}",
+            *middle,
+            f"finssim pool --vehicle {self.name} --plant {out / PLANT_FILE} --pool-file site.yaml --truth truth.fst",
+            f"{drive} --robot pool --pool-file site.yaml --arm",
+        ]

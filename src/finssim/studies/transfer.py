@@ -1,0 +1,593 @@
+"""Experiments of the virtual pool: what their rows need is trained, every trial played, and a table written."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Generator, Hashable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from rich.console import Console
+
+from finssim.agents.controllers import COSTLY
+from finssim.control.policy import DESCRIPTION_FILE, Policy, PolicyError
+from finssim.control.trajectories import TRAJECTORIES
+from finssim.core.files import atomic_directory, plain_name
+from finssim.core.provenance import provenance
+from finssim.evaluation.campaign import Progress, Show, check_choices, spread, write_json
+from finssim.evaluation.evaluate import T1_COLUMNS
+from finssim.evaluation.figures import draw_envelopes, draw_tracking, save_figure
+from finssim.evaluation.metrics import T1_SETPOINTS, paper_row, paper_t2_row
+from finssim.evaluation.robot_trials import (
+    FIRMWARES,
+    HARDWARE,
+    Attendant,
+    Job,
+    OnRobot,
+    firmware_of,
+    play_jobs,
+    played_trial,
+)
+from finssim.evaluation.statistics import Statistic, paired_difference, with_interval
+from finssim.evaluation.tables import Columns, Table, cells
+from finssim.evaluation.trials import T2_TRAJECTORIES
+from finssim.learning.train import train
+from finssim.localization.fusion.estimator import MODELS
+from finssim.vehicles import Vehicle, load_vehicle
+
+Results = Mapping[str, Sequence[Mapping[str, Any]]]
+"""Row -> results of its trials."""
+
+TRAINING_SHARE = 0.4
+"""Width of the progress bar."""
+DIFFERENCES_NOTE = (
+    "Each figure is the mean of row less reference, over pairs of trials with the same pool, seed and target; in "
+    "brackets 95 % from a bootstrap of plants and seeds. paper: the difference of its rows, on hardware, single runs."
+)
+FORGETFUL = {"integral": False, "history": 0, "last_action": False}
+"""Settings of the learner, for policies as the paper's."""
+
+MEASURES: Columns = {
+    "success_rate": ("held [points]", "+.0f", 100.0),
+    "e_p_m": ("e_p [cm]", "+.1f", 100.0),
+    "e_psi_deg": ("e_psi [°]", "+.1f"),
+    "t_s_s": ("t_s [s]", "+.1f"),
+    "horizontal_rmse_m": ("horizontal [cm]", "+.1f", 100.0),
+    "vertical_rmse_m": ("vertical [cm]", "+.1f", 100.0),
+    "p95_m": ("P95 [cm]", "+.1f", 100.0),
+    "energy": ("energy [N^1.5 s]", "+.0f"),
+}
+"""Key in which rows are compared, for the table of differences."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One row of a table: who steers and what is taken from it; see `rows.yaml`."""
+
+    title: str
+    training: Mapping[str, Any] | None = None
+    """Training of its policy, as in `rows.yaml`; None for a PID."""
+    controller: str = ""
+    """Name of the PID."""
+    paper: str | None = None
+    """Row of the paper's table; None where it has none."""
+    changes: dict[str, Any] = field(default_factory=dict)
+    """Fields of its jobs."""
+    targets: Sequence[str] | None = None
+    """Played targets, if not all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spec:
+    """One experiment."""
+
+    name: str
+    """Its command, and the name of its files."""
+    title: str
+    rows: Mapping[str, Row]
+    """Rows in the order of the table."""
+    targets: Sequence[str]
+    """Setpoints or trajectories that are played."""
+    allowed_targets: Sequence[str]
+    """All that may be requested."""
+    kind: str
+    """Kind of the targets, in the plural."""
+    by_target: bool
+    """True if the table has a line for each target."""
+    columns: Columns
+    """Columns of a row."""
+    note: str
+    bases: Sequence[str]
+    """The rows that the others are compared with, a table for each that was played."""
+    figures: Mapping[str, Statistic]
+    """Key of a trial's result -> how the trials that have it become one figure."""
+    differences: Sequence[str]
+    """Keys of `MEASURES` in which rows are compared."""
+    paper: Callable[[str, str], Mapping[str, Any] | None]
+    """Row of the paper's table and target -> key -> its figure; None where it has none."""
+    draw: Callable[[Results, Path], Path | None]
+    """Draws the results of the rows into the folder."""
+    picture: tuple[str, str]
+    """File of that figure, and what it shows."""
+
+    def paper_differences(self, row: Row, base: str) -> dict[str, float] | None:
+        """Key of `differences` -> the paper's row less that of a base; None where it has not both."""
+        if row.paper is None or self.rows[base].paper is None:
+            return None
+        targets = self.targets if self.by_target else [""]
+        pairs = [
+            (self.paper(row.paper, t) or {}, self.paper(self.rows[base].paper, t) or {}) for t in targets
+        ]
+        return {
+            key: float(np.mean([a[key] - b[key] for a, b in pairs]))
+            for key in self.differences
+            if all(figures_of_row.get(key) is not None for pair in pairs for figures_of_row in pair)
+        }
+
+    def tables(self, result: Mapping[str, Any]) -> list[Table]:
+        """The table of a result, and those of the differences from the bases, where there are some."""
+        units: Columns = {key: MEASURES[key] for key in self.differences}
+        tables = [self._table(result)]
+        for base, of_base in result["differences"].items():
+            rows = []
+            for name, differences in of_base.items():
+                rows.append([self.rows[name].title, *cells(differences, units)])
+                if theirs := self.paper_differences(self.rows[name], base):
+                    rows.append(["  paper", *cells(theirs, units)])
+            tables.append(
+                Table(
+                    title=f"{self.name.upper()}: differences from {self.rows[base].title}",
+                    heads=["", *(heading for heading, *_ in units.values())],
+                    rows=rows,
+                    note=DIFFERENCES_NOTE,
+                )
+            )
+        return tables
+
+    def _table(self, result: Mapping[str, Any]) -> Table:
+        """The table of a result; on hardware its rows say so."""
+        hardware, rows = result.get("robot"), []
+        for name, of_row in result["rows"].items():
+            row = self.rows[name]
+            title = f"{row.title}, hardware" if hardware else row.title
+            for target, figures in (of_row["by_target"] if self.by_target else {"": of_row}).items():
+                names = [target] if self.by_target else []
+                rows.append([title, *names, *cells(figures, self.columns)])
+                if row.paper and (theirs := self.paper(row.paper, target)):
+                    rows.append([f"  paper: {row.paper}", *names, *cells(theirs, self.columns)])
+        source, units = (
+            ("hardware, by the robot's own estimate, whose error is not in it", "seeds")
+            if hardware
+            else (
+                "a virtual pool whose vehicle, water and camera were not used in training",
+                "plants and seeds",
+            )
+        )
+        first = ["trajectory"] if self.by_target else []
+        return Table(
+            title=f"{self.title} ({self.name.upper()})",
+            headline=f"{self.name.upper()} {played_in(result, self.kind)}",
+            heads=["", *first, *(heading for heading, *_ in self.columns.values())],
+            rows=rows,
+            note=f"ours: {source}; mean, in brackets 95 % from a bootstrap of {units}{self.note}",
+            pictures=dict([self.picture]),
+        )
+
+
+def transfer_experiment(
+    spec: Spec,
+    *,
+    out: Path,
+    plants: Annotated[int, (1, 1000)] = 3,
+    seeds: Annotated[int, (1, 1000)] = 3,
+    seed: int = 1,
+    severity: str = "realistic",
+    camera: str = "corners",
+    firmware: str = "mcu",
+    estimator: str = "error-state",
+    rows: Annotated[Sequence[str] | None, ","] = None,
+    targets: Annotated[Sequence[str] | None, "python"] = None,
+    vehicle: str = "finsrov",
+    steps: Annotated[int | None, (1, None)] = None,
+    processes: Annotated[int | None, (1, None)] = None,
+    address: str | None = None,
+    robot: OnRobot | None = None,
+    attendant: Attendant | None = None,
+    pool_vehicle: Annotated[str | None, "python"] = None,
+    console: Console | None = None,
+    progress: Progress = lambda part, text: None,
+    show: Show = lambda job, result: None,
+) -> dict[str, Any]:
+    """Train what the rows need, play every target in every plant with every seed, and write the table.
+
+    The directory keeps policies and trials: a run that was interrupted goes on where it was, and one with more seeds
+    plays only what is new.
+
+    Args:
+        spec: Which experiment.
+        out (DIR): Directory for JSON, Markdown, figures, policies and trials; an interrupted one is continued.
+        plants: Number of virtual pools, each with different vehicle, water and camera.
+        seeds: Trainings of each policy, each tested with different noise.
+        seed: Seed of every random number; equal seeds give equal results.
+        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
+        camera (MODE): corners (projected through the rippling water, with noise), or pictures (rendered, with tag
+            detection: several times slower).
+        firmware (NAME): Firmware of the vehicle: mcu or ardusub (an autopilot over MAVLink: policies use its axes,
+            in a tank with a DVL and a compass instead of the pool and its camera, with setpoints three times as
+            far).
+        estimator (MODE): State estimator: error-state, with the IMU's accelerations, or constant-velocity, as in
+            the paper.
+        rows (NAMES): Rows of the table, separated by commas; all except nmpc, which needs an extra, if not given.
+        targets: What is played; the published ones if None.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        steps: Control steps of the training, summed over all worlds; the task's default if not given.
+        processes: Parallel trainings or trials; one per processor if not given.
+        address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto.
+        robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
+        attendant: The person beside that robot, instead of the terminal's keyboard.
+        pool_vehicle: Name or file of the vehicle around which the pools' own are drawn; `vehicle` if None.
+        console: Where a robot's state is told; standard error if None.
+        progress: Told the share that is done and what comes next.
+        show: Given each trial of a pool and its result, as soon as there is one.
+
+    Returns:
+        What NAME.json holds.
+
+    Raises:
+        ValueError: An unknown row, target, severity or camera, or a number below 1.
+    """
+    if robot is not None and (plants, severity, camera) != (3, "realistic", "corners"):
+        raise ValueError("a robot has its own plant and camera: leave --plants, --severity and --camera out")
+    usual = [name for name, row in spec.rows.items() if row.controller not in COSTLY]
+    rows, targets = list(rows or usual), list(targets or spec.targets)
+    check_choices(rows, spec.rows, "row", ValueError)
+    check_choices(targets, spec.allowed_targets, "target", ValueError)
+    check_choices([severity], ("nominal", "realistic", "hard"), "severity", ValueError)
+    check_choices([camera], ("corners", "pictures"), "camera", ValueError)
+    check_choices([estimator], MODELS, "estimator", ValueError)
+    if plants < 1 or seeds < 1:
+        raise ValueError(f"plants is {plants}, seeds {seeds}: expected at least 1 of each")
+    chosen = {name: spec.rows[name] for name in rows}
+    pools, run_seeds, folder = range(seed, seed + plants), range(seed, seed + seeds), Path(out)
+    firmware = firmware_of(firmware, load_vehicle(vehicle), robot)
+    action, site, sees = FIRMWARES[firmware]
+    controllers = controllers_of(
+        spec.name, chosen, run_seeds, folder, vehicle, steps, action,
+        lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
+    )  # fmt: skip
+    if robot is not None:  # there is one plant, whose severity was not chosen
+        pools, severity, camera = range(1), HARDWARE, HARDWARE
+        site = robot.site if firmware == "ardusub" else site
+    elif firmware == "ardusub":
+        camera = sees
+    jobs = [
+        Job(
+            row=name, controller=controllers[name, s], target=target, vehicle=vehicle,
+            pool_vehicle=pool_vehicle or vehicle, plant=plant, severity=severity, seed=s, site=site, firmware=firmware,
+            estimator=estimator, **{"camera": camera, **row.changes},
+        )
+        for name, row in chosen.items() for plant in pools for s in run_seeds for target in row.targets or targets
+    ]  # fmt: skip
+    results = play_jobs(
+        jobs, folder / "trials", robot, attendant=attendant, console=console, processes=processes, address=address,
+        show=show, progress=lambda part, text: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, text),
+    )  # fmt: skip
+    by_row = {name: [r for r in results if r["job"]["row"] == name] for name in chosen}
+    by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
+    body = load_vehicle(vehicle)
+    result = {
+        "experiment": spec.name, "severity": severity, "camera": camera, "estimator": estimator, "plants": list(pools),
+        "seeds": list(run_seeds), "targets": targets, "robot": robot and robot.title,
+        "vehicle": {"name": body.name, "sha256": body.sha256},
+        **scores(spec, by_row), "trials": results, "provenance": provenance(),
+    }  # fmt: skip
+    write_json(folder / f"{spec.name}.json", result, spec.tables(result))
+    spec.draw(by_row, folder)
+    return result
+
+
+def controllers_of(
+    task: str,
+    rows: Mapping[str, Row],
+    seeds: Sequence[int],
+    folder: Path,
+    vehicle: str,
+    steps: int | None = None,
+    action: str | None = None,
+    progress: Progress = lambda part, text: None,
+    *,
+    processes: int | None = None,
+    address: str | None = None,
+) -> dict[tuple[str, int], str]:
+    """Return the controllers by row and seed; policies that are not finished in the folder are trained.
+
+    Args:
+        task: Of the policies.
+        rows: Of a table.
+        seeds: Of the trainings.
+        folder: Of the experiment, whose `policies` has the directories.
+        vehicle: Name or file.
+        steps: Control steps of each training; the task's own if None.
+        action: Mode; the task's own if None.
+        progress: Told the share that is done and what is left.
+        processes, address: Where and how many at once, as of `campaign.spread`.
+
+    Returns:
+        (row, seed) -> directory of a policy, or the name of a PID.
+    """
+    controllers, body, missing = {}, load_vehicle(vehicle), {}
+    for (name, row), seed in product(rows.items(), seeds):
+        controllers[name, seed] = row.controller
+        if row.training is None:
+            continue
+        options = {"name": name, "remembers": False, **row.training}
+        label, remembers = options.pop("name"), options.pop("remembers")
+        policy = folder / "policies" / f"{label}-seed{seed}"
+        controllers[name, seed] = str(policy)
+        if not finished(policy, body):
+            options |= {"vehicle": vehicle, "action": action, "seed": seed, "steps": steps}
+            missing[policy] = {"task": task, **options, "settings": {} if remembers else FORGETFUL}
+    with closing(train_policies(missing, processes, address)) as done:
+        for remaining, (_, error) in zip(reversed(range(len(missing))), done, strict=True):
+            if error is not None:
+                raise error
+            progress(1.0 - remaining / len(missing), f"{remaining} trainings left")
+    return controllers
+
+
+def train_policies(
+    trainings: Mapping[Path, Mapping[str, Any]], processes: int | None = None, address: str | None = None
+) -> Generator[tuple[Path, BaseException | None], None, None]:
+    """Train policies in parallel, on this machine or a cluster.
+
+    Args:
+        trainings: Directory of the policy -> arguments of `finssim.learning.train.train`.
+        processes, address: As of `campaign.spread`.
+
+    Yields:
+        A directory as soon as its policy is written, and None; or the error of its training.
+    """
+    with closing(
+        spread(_trained, list(trainings.items()), 1 if len(trainings) == 1 else processes, address)
+    ) as done:
+        for (policy, _), outcome in done:
+            error = outcome.exception()
+            if error is None:
+                with atomic_directory(policy, replaces=DESCRIPTION_FILE) as scratch:
+                    for name, content in outcome.result().items():
+                        (scratch / plain_name(name, "file of a policy", PolicyError)).write_bytes(content)
+            yield policy, error
+
+
+def _trained(policy: tuple[Path, Mapping[str, Any]]) -> dict[str, bytes]:
+    """Train, on whatever machine: the files of the policy directory by name."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "policy"
+        train(out=out, **policy[1], console=Console(stderr=True, quiet=True))
+        return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
+def finished(directory: Path, vehicle: Vehicle | None = None) -> bool:
+    """Return whether a complete policy is there: not one that was interrupted, or cut short while it was written.
+
+    Args:
+        directory: Directory.
+        vehicle: That it must be for; any if None.
+    """
+    try:
+        return bool(Policy.load(directory, vehicle=vehicle).description.training.get("complete"))
+    except PolicyError:
+        return False
+
+
+def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
+    """Figures of every row, all targets together and each alone; differences from the reference."""
+    rows = {}
+    for name, results in by_row.items():
+        targets = dict.fromkeys(result["job"]["target"] for result in results)
+        each = {
+            target: row_figures([r for r in results if r["job"]["target"] == target], spec.figures)
+            for target in targets
+        }
+        rows[name] = {**row_figures(results, spec.figures), "by_target": each}
+    paired = {
+        name: {key: _by_trial(results, key) for key in spec.differences} for name, results in by_row.items()
+    }
+    differences = {
+        base: {
+            name: {key: paired_difference(paired[base][key], values) for key, values in of_row.items()}
+            for name, of_row in paired.items()
+            if name != base
+        }
+        for base in spec.bases
+        if base in paired and len(paired) > 1
+    }
+    return {"rows": rows, "differences": differences}
+
+
+def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Statistic]) -> dict[str, Any]:
+    """The figures of one row.
+
+    Args:
+        results: Of its trials, as `run_jobs` gives them.
+        figures: Key -> how the trials that have it become one figure.
+
+    Returns:
+        `trials`, `success` (count), `stopped` (trials that ended in a fault), `worst_success` (fewest successes of a
+        plant and seed, of `per_cluster` trials each), and by key an interval, or None where no trial has a figure.
+    """
+    clusters = Counter((r["job"]["plant"], r["job"]["seed"]) for r in results)
+    held = Counter((r["job"]["plant"], r["job"]["seed"]) for r in results if r["success"])
+    out: dict[str, Any] = {
+        "trials": len(results),
+        "success": held.total(),
+        "stopped": sum(bool(r["fault"]) for r in results),
+        "worst_success": min(held[cluster] for cluster in clusters),
+        "per_cluster": max(clusters.values()),
+    }
+    for key, statistic in figures.items():
+        values: dict[Hashable, list[float]] = {}
+        for (plant, seed, _), x in _by_trial(results, key).items():
+            values.setdefault((plant, seed), []).append(x)
+        out[key] = with_interval(values, statistic)
+    return out
+
+
+def _by_trial(results: Sequence[Mapping[str, Any]], key: str) -> dict[tuple[int, int, str], float]:
+    """Plant, seed and target -> the figure of that trial, where it has one."""
+    measure = "success" if key == "success_rate" else key
+    return {
+        (r["job"]["plant"], r["job"]["seed"], r["job"]["target"]): float(r[measure])
+        for r in results
+        if r.get(measure) is not None
+    }
+
+
+ROWS: Mapping[str, Mapping[str, Row]] = {
+    task: {name: Row(**row) for name, row in rows.items()}
+    for task, rows in yaml.safe_load(
+        Path(__file__).with_name("rows.yaml").read_text(encoding="utf-8")
+    ).items()
+}
+"""Task -> the rows of its table, in their order."""
+T1_DRAWN = ("calibrated", "mesh", "simplified", "pid-paper", "pid", "calibrated-pool")
+"""The paper's four curves, and ours."""
+
+T2_DRAWN = 4
+"""Greatest number of drawn rows, which can still be distinguished."""
+
+
+def played_in(result: Mapping[str, Any], targets_name: str) -> str:
+    """Return the place of an experiment, and its vehicle, as text."""
+    plants, seeds = len(result["plants"]), len(result["seeds"])
+    of = f"{targets_name}: {len(result['targets'])}; {result['vehicle']['name']} {result['vehicle']['sha256'][:12]}"
+    if result.get("robot"):
+        return f"on hardware, robot {result['robot']}, by its own estimate; seeds: {seeds}, {of}"
+    filtered = result.get("estimator", "constant-velocity")
+    pool = f"severity {result['severity']}, camera {result['camera']}, estimator {filtered}; plants: {plants}"
+    return f"in the virtual pool, {pool}, seeds: {seeds}, {of}"
+
+
+def _draw_t1(by_row: Results, folder: Path) -> Path:
+    """Position and yaw error against time of the rows of `T1_DRAWN` that were played, or of all."""
+    drawn = {name: by_row[name] for name in T1_DRAWN if name in by_row} or by_row
+    runs = {
+        ROWS["t1"][name].title: [played_trial(r, folder / "trials") for r in results]
+        for name, results in drawn.items()
+    }
+    hardware = any(r["job"]["severity"] == HARDWARE for results in by_row.values() for r in results)
+    title = f"T1 {'on hardware' if hardware else 'in the virtual pool'}: median and middle half"
+    return save_figure(draw_envelopes(runs, title), folder / "t1_envelopes.png")
+
+
+def _draw_t2(by_row: Results, folder: Path) -> Path | None:
+    """Draw the trial with the median error of each row and trajectory; return None if none was played."""
+    runs = {}
+    for name, results in by_row.items():
+        flown: dict[str, list[Mapping[str, Any]]] = {}
+        for result in sorted((r for r in results if r["p95_m"] is not None), key=lambda r: float(r["p95_m"])):
+            flown.setdefault(result["job"]["target"], []).append(result)
+        middle = [of_target[len(of_target) // 2] for of_target in flown.values()]
+        if middle:
+            runs[ROWS["t2"][name].title] = [played_trial(result, folder / "trials") for result in middle]
+    if not runs:
+        return None
+    return save_figure(draw_tracking(dict(list(runs.items())[:T2_DRAWN])), folder / "t2_paths.png")
+
+
+def _paper_t1(row: str, target: str) -> Mapping[str, Any]:
+    theirs = paper_row(row)
+    return {**theirs, "success_rate": theirs["success"] / theirs["trials"]}
+
+
+T1 = Spec(
+    name="t1",
+    title="Station keeping",
+    rows=ROWS["t1"],
+    targets=tuple(T1_SETPOINTS),
+    allowed_targets=tuple(T1_SETPOINTS),
+    kind="setpoints",
+    by_target=False,
+    columns=T1_COLUMNS,
+    note=". paper: its vehicle in its pool, one seed. errors: 40-60 s; e_y is vertical; "
+    "success: 0.10 m on each axis and 10° for 10 s. t_s (median) and jitter are of successful trials.",
+    bases=("calibrated", "pid"),
+    figures={
+        **dict.fromkeys(
+            ("success_rate", "e_p_m", "e_y_m", "e_psi_deg", "J_p_m", "J_psi_deg", "energy"), np.mean
+        ),
+        "t_s_s": np.median,
+    },
+    differences=("success_rate", "e_p_m", "e_psi_deg", "t_s_s", "energy"),
+    paper=_paper_t1,
+    draw=_draw_t1,
+    picture=("t1_envelopes.png", "Station keeping: error against time"),
+)
+"""`finssim experiment t1`."""
+T2 = Spec(
+    name="t2",
+    title="Trajectory tracking",
+    rows=ROWS["t2"],
+    targets=T2_TRAJECTORIES,
+    allowed_targets=tuple(TRAJECTORIES),
+    kind="trajectories",
+    by_target=True,
+    columns={
+        "success": ("done", ""),
+        "horizontal_rmse_m": ("horizontal RMSE [m]", ".3f"),
+        "vertical_rmse_m": ("vertical RMSE [m]", ".3f"),
+        "p95_m": ("3-D P95 [m]", ".3f"),
+    },
+    note="; done: trials that reached the end. paper: its vehicle in its pool.",
+    bases=("calibrated-dr", "pid"),
+    figures=dict.fromkeys(
+        ("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "cross_track_rmse_m", "energy"), np.mean
+    ),
+    differences=("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "energy"),
+    paper=paper_t2_row,
+    draw=_draw_t2,
+    picture=("t2_paths.png", "Trajectory tracking: paths from above"),
+)
+"""`finssim experiment t2`."""
+SPECS: Mapping[str, Spec] = {"t1": T1, "t2": T2}
+
+
+def t1(*, setpoints: Annotated[Sequence[str] | None, ","] = None, **options: Any) -> dict[str, Any]:
+    """Station keeping in the virtual pool (the paper's Table IV): success, errors [m, deg], time to settle [s], jitter.
+
+    With --robot, run the published protocol on a vehicle, with instructions on the screen, marked as hardware.
+
+    Example: finssim experiment t1 --rows calibrated,pid --seeds 1 --out t1
+
+    Example: finssim experiment t1 --rows pid --seeds 1 --robot serial:/dev/ttyUSB0 --pool-file p.yaml --arm --out hw
+
+    Args:
+        setpoints (NAMES): Setpoints, separated by commas; all published ones if not given.
+        options: As of `studies.transfer.transfer_experiment`.
+    """
+    return transfer_experiment(T1, targets=setpoints, **options)
+
+
+def t2(*, trajectories: Annotated[Sequence[str] | None, ","] = None, **options: Any) -> dict[str, Any]:
+    """Trajectory tracking in the virtual pool (the paper's Table V): horizontal and vertical RMSE, 3-D P95 [m].
+
+    With --robot, run the published protocol on a vehicle, with instructions on the screen, marked as hardware.
+
+    Example: finssim experiment t2 --rows calibrated-dr,pid --trajectories lemniscate --seeds 1 --out t2
+
+    Args:
+        trajectories (NAMES): Trajectories, separated by commas; all published ones if not given.
+        options: As of `studies.transfer.transfer_experiment`.
+    """
+    return transfer_experiment(T2, targets=trajectories, **options)
+
+
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """Return the tables of either."""
+    return SPECS[result["experiment"]].tables(result)

@@ -1,0 +1,206 @@
+"""Least squares for everything that is calibrated by sight: descent, robust weights, unknowns that one picture owns.
+
+Levenberg and Marquardt's descent takes any state; `arrow_step` is its step where many small groups of unknowns, such as
+the poses of pictures, share only a few.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.rotations import quat_from_rotvec, quat_to_matrix
+from finssim.identification.uncertainty import Evidence
+
+Array = NDArray[np.float64]
+State = TypeVar("State")
+
+STEADIEST = 1e10
+"""Damping at which no step leads down any more."""
+
+
+def descent(
+    state: State,
+    cost: Callable[[State], float],
+    steps_from: Callable[[State], Callable[[float], State | None]],
+    *,
+    rounds: int,
+    tolerance: float,
+) -> Iterator[tuple[State, float]]:
+    """The start and every better state, with its cost, until nothing is gained (Levenberg and Marquardt).
+
+    Args:
+        state: Where to begin.
+        cost: What falls; infinite where a state makes no sense.
+        steps_from: Linearises at a state: damping -> the state a damped step away, or None where there is none.
+        rounds: Linearisations, at most.
+        tolerance: Relative gain with which it ends.
+    """
+    value, damping = cost(state), 1e-3
+    yield state, value
+    for _ in range(rounds):
+        step = steps_from(state)
+        while True:
+            trial = step(damping)
+            after = np.inf if trial is None else cost(trial)
+            if trial is not None and after <= value:
+                break
+            damping *= 5.0
+            if damping > STEADIEST:
+                return
+        gain, state, value = value - after, trial, after
+        yield state, value
+        if gain <= tolerance * max(value, 1e-12) and damping < 1.0:
+            return
+        damping = max(damping / 6.0, 1e-12)
+
+
+def rms(errors: Array) -> float:
+    """Root mean square length of vectors (K, n); NaN of none."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else float("nan")
+
+
+def huber_weight(size: Array, limit: float) -> Array:
+    """1 up to a limit, falling as 1 / size beyond."""
+    return np.asarray(np.minimum(1.0, limit / np.maximum(size, 1e-300)))
+
+
+def huber_cost(size: Array, limit: float) -> float:
+    """Sum of squares of what is within a limit, growing linearly beyond."""
+    return float(np.sum(np.where(size <= limit, size**2, limit * (2.0 * size - limit))))
+
+
+def boxed(normal: Array, right: Array, low: Array, high: Array) -> Array:
+    """Minimum of ½ xᵀ N x - gᵀ x in a box, by bounded-variable least squares; on a bound exactly.
+
+    Args:
+        normal: N, positive definite, in any units [-] and frame, (P, P).
+        right: g, (P,).
+        low: Below `high`, (P,).
+        high: (P,)
+    """
+    from scipy.optimize import lsq_linear
+
+    scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+    L = np.linalg.cholesky(normal / np.outer(scale, scale) + 1e-9 * np.eye(len(scale)))
+    root = np.linalg.solve(L, right / scale)
+    free = np.linalg.solve(L.T, root) / scale
+    if ((free >= low) & (free <= high)).all():
+        return np.asarray(free)
+    solved = lsq_linear(L.T, root, (low * scale, high * scale), method="bvls")
+    inside = np.where(solved.active_mask < 0, low, np.where(solved.active_mask > 0, high, solved.x / scale))
+    return np.asarray(inside)
+
+
+class Pose(NamedTuple):
+    """A frame in another one."""
+
+    R: Array
+    """(3, 3)"""
+    t: Array
+    """[m], (3,)"""
+
+    def at(self, points: Array) -> Array:
+        """Points of the inner frame in the outer one, (..., 3)."""
+        return np.asarray(points @ self.R.T + self.t)
+
+    def then(self, inner: Pose) -> Pose:
+        """The pose of what lies in this frame at `inner`."""
+        return Pose(self.R @ inner.R, self.R @ inner.t + self.t)
+
+    @property
+    def inverse(self) -> Pose:
+        """The outer frame in the inner one."""
+        return Pose(self.R.T.copy(), -self.R.T @ self.t)
+
+    def stepped(self, step: Array) -> Pose:
+        """After a small turn about the outer axes (3) and a shift (3)."""
+        return Pose(quat_to_matrix(quat_from_rotvec(step[:3])) @ self.R, self.t + step[3:])
+
+
+class Block(NamedTuple):
+    """Weighted normal equations of one group, such as a picture with its pose."""
+
+    aa: Array
+    """Shared by shared, (P, P)."""
+    ab: Array
+    """Shared by own, (P, Q)."""
+    bb: Array
+    """Own by own, (Q, Q)."""
+    a: Array
+    """Right side of the shared, (P,)."""
+    b: Array
+    """Right side of the own, (Q,)."""
+
+
+def block_of(shared: Array, local: Array, residual: Array) -> Block:
+    """Return a block from whitened rows.
+
+    Args:
+        shared: Derivatives of the prediction with respect to the shared unknowns, (n, P).
+        local: And to the group's own, (n, Q).
+        residual: Measured less predicted, (n,).
+    """
+    return Block(
+        shared.T @ shared, shared.T @ local, local.T @ local, shared.T @ residual, local.T @ residual
+    )
+
+
+def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Array]]:
+    """One damped Gauss-Newton step (Marquardt), (P,) and (Q,) each.
+
+    A shared direction that nothing tells gets no step.
+
+    Args:
+        blocks: Normal equations of the groups.
+        damping: What the diagonals grow by, as a part of themselves [-].
+    """
+    total, right, inners = arrow_reduced(blocks, damping)
+    scale = np.sqrt(np.maximum(np.diagonal(total), 1e-300))
+    step, *_ = np.linalg.lstsq(total / np.outer(scale, scale), right / scale, rcond=1e-13)
+    step = step / scale
+    return step, [inner[:, -1] - inner[:, :-1] @ step for inner in inners]
+
+
+def arrow_reduced(blocks: Sequence[Block], damping: float) -> tuple[Array, Array, list[Array]]:
+    """Normal matrix (P, P) and right side (P,) of the shared unknowns alone, and [abᵀ b] over bb of each group.
+
+    Args:
+        blocks: Normal equations of the groups.
+        damping: What the diagonals grow by, as a part of themselves [-].
+    """
+    reduced, right, inners = zip(*(_eliminated(block, damping) for block in blocks), strict=True)
+    return np.sum(reduced, axis=0), np.sum(right, axis=0), list(inners)
+
+
+def arrow_evidence(
+    blocks: Sequence[Block], names: tuple[str, ...], unit: str, groups: int | None = None
+) -> Evidence:
+    """Return the evidence of each group on the shared unknowns without its own.
+
+    Args:
+        blocks: At the solution.
+        names: Of the shared unknowns.
+        unit: What a group is.
+        groups: Join consecutive blocks into that many; None keeps each for itself.
+    """
+    normal, score, _ = zip(*(_eliminated(block, 0.0) for block in blocks), strict=True)
+    parts = np.array_split(np.arange(len(blocks)), min(groups or len(blocks), len(blocks)))
+    return Evidence(
+        names=names,
+        normal=np.array([np.sum([normal[i] for i in p], axis=0) for p in parts]),
+        score=np.array([np.sum([score[i] for i in p], axis=0) for p in parts]),
+        unit=unit,
+    )
+
+
+def _eliminated(block: Block, damping: float) -> tuple[Array, Array, Array]:
+    """Damped normal matrix (P, P) and right side (P,) of the shared alone; (bb + damping) ⁻¹ [abᵀ b], (Q, P + 1)."""
+    diagonal = np.diagonal(block.bb)
+    bb = block.bb + damping * np.diag(diagonal) + 1e-14 * float(diagonal.max()) * np.eye(len(diagonal))
+    inner = np.linalg.solve(bb, np.column_stack([block.ab.T, block.b]))
+    aa = block.aa + damping * np.diag(np.diagonal(block.aa))
+    return aa - block.ab @ inner[:, :-1], block.a - block.ab @ inner[:, -1], inner

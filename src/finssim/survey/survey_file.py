@@ -1,0 +1,227 @@
+"""Survey file of `finssim calibrate pool`: surveyed points, priors of water, window and camera, and options."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from finssim.core.optics import Layer, OpticsError
+from finssim.core.rotations import quat_from_euler, quat_rotate
+from finssim.core.yaml_file import read_mapping
+from finssim.localization import LocalizationError
+from finssim.localization.camera_file import Fields
+from finssim.localization.detection.families import corners, family_named
+from finssim.survey.points import (
+    METRES,
+    Observations,
+    Placed,
+    Survey,
+    observe,
+    observe_combined,
+    read_survey,
+)
+from finssim.survey.pool_model import Settings
+from finssim.trials.findings import CalibrationError
+
+PRINTED = 0.0005
+"""Standard error of a tag on a board where the file gives none [m]; printers and glue do no better."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveyFile:
+    """Content of a survey file."""
+
+    path: Path
+    settings: Mapping[str, Any]
+    """Arguments of `Settings` that the file gives."""
+    points: Path | None = None
+    """Table of surveyed points or tags; None where a grid is given, or where the inputs contain the points."""
+    grid: Mapping[int, Placed] = field(default_factory=dict)
+    """Tags of a board, by their ids."""
+    unit: str | None = None
+    """Unit of lengths in tables that state none; None: metres."""
+    z: float | None = None
+    """Height of points in tables without z [m]."""
+    edge: float | None = None
+    """Edge of tags in a table without that column [m]."""
+    family: str | None = None
+    """Family of the tags in images."""
+    latency: float = 0.0
+    """Time stamp of an image minus the middle of its exposure [s]."""
+
+    @property
+    def sources(self) -> list[Path]:
+        """The file itself and its table."""
+        return [self.path] if self.points is None else [self.path, self.points]
+
+    def fit_settings(self, **defaults: Any) -> Settings:
+        """Return the settings of the fit.
+
+        Args:
+            defaults: Arguments of `Settings` for what the file does not give.
+
+        Raises:
+            CalibrationError: The arguments contradict each other, or one is out of its range.
+        """
+        try:
+            return Settings(**{**defaults, **self.settings})
+        except CalibrationError as error:
+            raise CalibrationError(f"{self.path}: {error}") from None
+
+    def observe(self, inputs: Sequence[Path]) -> Observations:
+        """Match files of detections, pixels or images with the surveyed points.
+
+        Args:
+            inputs: Detections or pixels (.csv), or images; where the file has neither points nor a grid, tables of
+                pixels with points.
+
+        Raises:
+            CalibrationError: A file cannot be read, or nothing in it was surveyed.
+        """
+        if self.grid:
+            return observe(inputs, Survey(str(self.path), tags=dict(self.grid)), family=self.family)
+        if self.points is None:
+            return observe_combined(inputs, unit=self.unit, z=self.z)
+        survey = read_survey(self.points, unit=self.unit, edge=self.edge, z=self.z)
+        return observe(inputs, survey, family=self.family)
+
+
+_SETTINGS = (
+    ("", "sigma", "survey_sigma"),
+    ("", "folds", "folds"),
+    ("tags", "yaw_sigma_deg", "survey_yaw_sigma"),
+    ("surface", "height", "water_height"),
+    ("surface", "depth", "water_depth"),
+    ("surface", "sigma", "place_sigma"),
+    ("surface", "tilt_sigma_deg", "tilt_sigma"),
+    ("window", "sigma", "place_sigma"),
+    ("window", "tilt_sigma_deg", "tilt_sigma"),
+    ("water", "index", "index"),
+    ("water", "index_sigma", "index_sigma"),
+    ("camera", "focal_sigma", "focal_sigma"),
+    ("camera", "center_sigma_px", "center_sigma"),
+    ("camera", "pixel_sigma_px", "pixel_sigma"),
+)
+"""Section, key and argument of `Settings` of each number."""
+
+
+def load_survey_file(path: str | Path) -> SurveyFile:
+    """Read a survey file; lengths are in metres, keys with `_deg` in degrees and with `_px` in pixels.
+
+    Raises:
+        CalibrationError: The file is unreadable, a key is missing or unknown, or a value is out of its range.
+    """
+    path = Path(path)
+    try:
+        top = Fields(read_mapping(path, LocalizationError, such_as="surface: {height: 1.02}"), str(path))
+        file = _survey_file(top, path)
+    except LocalizationError as error:
+        raise CalibrationError(str(error)) from None
+    file.fit_settings()
+    return file
+
+
+def _survey_file(top: Fields, path: Path) -> SurveyFile:
+    kinds = [kind for kind in ("surface", "window") if top.given(kind)]
+    if len(kinds) != 1:
+        count = "both surface and window are" if kinds else "neither surface nor window is"
+        raise top.error(
+            f"{count} given, expected one: what the camera looks through (surface: {{}} is enough)"
+        )
+    sections = {"": top, **{name: top.section(name) for name in ("tags", "water", "camera", *kinds)}}
+    tags, interface = sections["tags"], sections[kinds[0]]
+    options: dict[str, Any] = {}
+    for section, key, setting in _SETTINGS:
+        value = _number(sections[section], key) if section in sections else None
+        if value is not None:
+            options[setting] = math.radians(value) if key.endswith("_deg") else value
+    if options.get("folds", 2.0) % 1.0:
+        raise top.error(f"folds is {options['folds']:g}, expected an integer")
+    if "folds" in options:
+        options["folds"] = int(options["folds"])
+    window = kinds == ["window"]
+    if window:
+        try:
+            options["window"] = Layer(interface.number("thickness"), interface.number("index"))
+        except OpticsError as error:
+            raise interface.error(str(error)) from None
+        if interface.take("plane") is not None:
+            options["plane"] = interface.numbers("plane", 4)
+    place, sigmas = (
+        (("plane",), ("place_sigma", "tilt_sigma"))
+        if window
+        else (("water_height", "water_depth"), ("place_sigma",))
+    )
+    if options.keys() & {*sigmas} and not options.keys() & {*place}:
+        lack = "plane" if window else "height or depth"
+        raise interface.error(f"a standard deviation is given without {lack}: add what it is of")
+    names = top.take("fit")
+    if names is not None:
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise top.error(
+                f"fit is {names!r}, expected a list of names, such as [pose, height, tilt, index]"
+            )
+        options["fit"] = tuple(names)
+    words = {"points": _word(top, "points"), "unit": _word(top, "unit"), "family": _word(tags, "family")}
+    if words["unit"] is not None and words["unit"] not in METRES:
+        raise top.error(f"unknown unit '{words['unit']}'; available: {', '.join(METRES)}")
+    if words["family"] is not None:
+        family_named(words["family"])
+    grid = _grid(top.section("grid")) if top.given("grid") else {}
+    if grid and words["points"] is not None:
+        raise top.error("points and grid are given, expected one of them")
+    file = SurveyFile(
+        path=path,
+        settings=options,
+        points=None if words["points"] is None else path.parent / words["points"],
+        grid=grid,
+        unit=words["unit"],
+        z=_number(top, "z"),
+        edge=_number(tags, "edge"),
+        family=words["family"],
+        latency=sections["camera"].number("latency", 0.0),
+    )
+    for section in sections.values():
+        section.finish()
+    return file
+
+
+def _number(fields: Fields, key: str) -> float | None:
+    return None if fields.take(key) is None else fields.number(key)
+
+
+def _word(fields: Fields, key: str) -> str | None:
+    return None if fields.take(key) is None else fields.word(key)
+
+
+def _grid(fields: Fields) -> dict[int, Placed]:
+    """Return the tags of a board, by their ids.
+
+    Ids run along a column's x, then from row to row; `spacing` is from centre to centre along the printed x and y (a
+    negative second number counts rows downwards); `position` is the centre of the first tag; `yaw_deg`, `pitch_deg`,
+    `roll_deg` turn the board; `sigma` is the standard error of a tag within the board [m].
+    """
+    first, columns, rows = (int(fields.number(key)) for key in ("first", "columns", "rows"))
+    dx, dy = fields.numbers("spacing", 2)
+    edge, position = fields.number("edge"), fields.numbers("position", 3)
+    angles = [fields.number(f"{name}_deg", 0.0) for name in ("roll", "pitch", "yaw")]
+    sigma = fields.number("sigma", PRINTED)
+    fields.finish()
+    if columns < 1 or rows < 1 or edge <= 0.0 or min(abs(dx), abs(dy)) < edge:
+        raise fields.error(
+            f"{columns} x {rows} tags of {edge:g} m every {dx:g}, {dy:g} m: expected at least one tag, an edge above 0 "
+            "and a spacing above the edge"
+        )
+    turn = quat_from_euler(*np.radians(angles))
+    tags = {}
+    for row in range(rows):
+        for column in range(columns):
+            flat = corners(edge) + np.array([column * dx, row * dy, 0.0])
+            tag = first + row * columns + column
+            tags[tag] = Placed(f"tag {tag}", np.asarray(position) + quat_rotate(turn, flat), sigma)
+    return tags

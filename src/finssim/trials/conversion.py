@@ -1,0 +1,351 @@
+"""Units, clocks and axes of logs, and how they become ours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.frames import FROM_FOSSEN
+from finssim.core.rotations import (
+    matrix_to_quat,
+    quat_from_euler,
+    quat_multiply,
+    quat_rotate,
+    quat_to_euler,
+)
+from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.trials.trial import column_of
+from finssim.vehicles.part import did_you_mean
+
+Array = NDArray[np.float64]
+
+GRAVITY = 9.80665
+"""Standard gravity, of the units g and kgf [m/s²]."""
+
+POUND = 0.45359237
+"""Mass of the units lbf and ozf, which is a sixteenth of it [kg]."""
+
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+"""Seconds in one of each."""
+
+EXTRA_COLUMNS = {
+    "vx": ("m/s", "velocity along world x"),
+    "vy": ("m/s", "velocity along world y"),
+    "vz": ("m/s", "velocity along world z"),
+    "pressure": ("Pa", "absolute pressure, or above that of the surface with surface_pressure 0"),
+    "stick_roll": ("-", "ArduSub's demand of roll in [-1, 1], right side down"),
+    "stick_pitch": ("-", "of pitch, nose up"),
+    "stick_yaw": ("-", "of yaw, clockwise from above"),
+    "stick_throttle": ("-", "of throttle, up"),
+    "stick_forward": ("-", "of forward, ahead"),
+    "stick_lateral": ("-", "of lateral, right"),
+}
+"""Names that a map may give beside the canonical columns: they become u v w, depth and pulse widths in the trial."""
+
+UNITS: dict[str, dict[str, float]] = {
+    "angle": {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 1e-3, "cdeg": math.pi / 18000.0},
+    "rate": {
+        "rad/s": 1.0,
+        "deg/s": math.pi / 180.0,
+        "mrad/s": 1e-3,
+        "rpm": math.pi / 30.0,
+        "rps": 2.0 * math.pi,
+        "Hz": 2.0 * math.pi,
+    },
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254},
+    "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6, "kn": 1852.0 / 3600.0},
+    "acceleration": {"m/s²": 1.0, "m/s^2": 1.0, "m/s2": 1.0, "g": GRAVITY, "mg": 1e-3 * GRAVITY},
+    "force": {
+        "N": 1.0,
+        "mN": 1e-3,
+        "kN": 1e3,
+        "kgf": GRAVITY,
+        "gf": 1e-3 * GRAVITY,
+        "lbf": POUND * GRAVITY,
+        "ozf": POUND / 16.0 * GRAVITY,
+    },
+    "moment": {
+        "N m": 1.0,
+        "Nm": 1.0,
+        "N mm": 1e-3,
+        "kgf m": GRAVITY,
+        "kgf cm": 1e-2 * GRAVITY,
+        "lbf ft": POUND * GRAVITY * 0.3048,
+    },
+    "voltage": {"V": 1.0, "mV": 1e-3, "cV": 1e-2},
+    "pulse": {"µs": 1.0, "us": 1.0, "ms": 1e3, "s": 1e6, "ns": 1e-3},
+    "pressure": {
+        "Pa": 1.0,
+        "hPa": 1e2,
+        "mbar": 1e2,
+        "kPa": 1e3,
+        "bar": 1e5,
+        "dbar": 1e4,
+        "atm": 101325.0,
+        "psi": 6894.757293168,
+    },
+    "number": {"-": 1.0},
+}
+"""Dimension -> unit -> how many of our units it is."""
+
+_DIMENSION = {unit: dimension for dimension, units in UNITS.items() for unit in units}
+
+
+def unit_of(canonical: str) -> str:
+    """The unit that a canonical or extra column is kept in."""
+    if canonical in EXTRA_COLUMNS:
+        return EXTRA_COLUMNS[canonical][0]
+    column = column_of(canonical)
+    if column is None:
+        raise CalibrationError(f"'{canonical}' is no column of a trial")
+    return column.unit
+
+
+def factor(unit: str | None, canonical: str) -> float:
+    """Return the factor from a number in `unit` to the unit of the canonical column; 1 for no unit.
+
+    Raises:
+        CalibrationError: Unknown unit, or one of another dimension.
+    """
+    if unit is None:
+        return 1.0
+    target = unit_of(canonical)
+    if unit not in _DIMENSION:
+        raise CalibrationError(
+            f"unit of {canonical} is '{unit}'{did_you_mean(unit, list(_DIMENSION))} "
+            f"expected {_like(target)}: or give a scale to {target}"
+        )
+    dimension, target_dimension = _DIMENSION[unit], _DIMENSION[target]
+    if dimension != target_dimension:
+        article = "an" if dimension[0] == "a" else "a"
+        raise CalibrationError(
+            f"unit of {canonical} is '{unit}', {article} {dimension}, expected {_like(target)}"
+        )
+    return UNITS[target_dimension][unit] / UNITS[target_dimension][target]
+
+
+def _like(target: str) -> str:
+    return f"one of {', '.join(UNITS[_DIMENSION[target]])}"
+
+
+SAME_ROW = 1.0e-6
+"""Samples closer than this share a row [s]."""
+
+PIECE_GAP = 10.0
+"""Silence put between the pieces of a log whose clock jumped back [s]; what lay between is not known."""
+
+FEW = 3
+"""Rows that may arrive late before a step back counts as a jump of the clock."""
+
+
+def merged(streams: Mapping[str, tuple[Array, Array]]) -> tuple[Array, dict[str, Array]]:
+    """Streams of different times on their union time base.
+
+    Args:
+        streams: Column -> times [s], strictly increasing, and values, (k,) each.
+
+    Returns:
+        Times (n,), and column -> values with NaN where that stream has no sample, (n,) each. Samples within a
+        microsecond share a row.
+
+    Raises:
+        CalibrationError: There is no sample at all.
+    """
+    every = [t for t, _ in streams.values()]
+    times = np.unique(np.concatenate(every)) if every else np.empty(0)
+    if not len(times):
+        raise CalibrationError("no stream holds a sample")
+    starts = np.concatenate([[True], np.diff(times) > SAME_ROW])
+    row_of = np.cumsum(starts) - 1
+    base = times[starts]
+    channels = {}
+    for name, (t, values) in streams.items():
+        channels[name] = np.full(len(base), np.nan)
+        channels[name][row_of[np.searchsorted(times, t)]] = values
+    return base, channels
+
+
+def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.intp], list[Finding]]:
+    """Times in order, and the order of the rows.
+
+    Rows that arrived a little late, reversed and shuffled logs are sorted. Where the clock itself jumped back (a long
+    piece of rows lies over an earlier one), nobody can know how much time passed: the later piece is moved behind the
+    earlier one with a gap of `PIECE_GAP` seconds between, and nothing is interpolated across gaps.
+
+    Args:
+        t: Finite times [s], (n,).
+        columns: Column -> values, (n,); two pieces that fill different columns do not collide.
+
+    Returns:
+        Times not decreasing (n,), row numbers in that order (n,), and findings.
+    """
+    back = np.flatnonzero(np.diff(t) < 0.0) + 1
+    rows = np.arange(len(t))
+    if not len(back):
+        return t, rows, []
+    if len(back) <= max(1.0, 0.01 * len(t)):
+        jumps = [int(i) for i in back if _collides(t, columns, int(i))]
+        if jumps:
+            return _in_pieces(t, jumps)
+    rows = np.argsort(t, kind="stable")
+    return t[rows], rows, [finding("times_sorted", rows=len(back), total=len(t))]
+
+
+def _collides(t: Array, columns: Mapping[str, Array], i: int) -> bool:
+    """Return whether the rows from `i` on repeat times of earlier rows of the same columns."""
+    earlier = np.flatnonzero(t[:i] >= t[i])
+    later = i + np.flatnonzero(t[i:] <= t[:i].max())
+    if len(earlier) <= FEW or len(later) <= FEW:
+        return False
+    return any(
+        np.isfinite(v[earlier]).sum() > FEW and np.isfinite(v[later]).sum() > FEW for v in columns.values()
+    )
+
+
+def _in_pieces(t: Array, jumps: list[int]) -> tuple[Array, NDArray[np.intp], list[Finding]]:
+    moved, order, findings, end = [], [], [], -np.inf
+    for start, stop in zip([0, *jumps], [*jumps, len(t)], strict=True):
+        rows = start + np.argsort(t[start:stop], kind="stable")
+        times = t[rows]
+        if start:
+            shift = end + PIECE_GAP - times[0]
+            findings.append(
+                finding("clock_jump", before=t[start - 1], after=t[start], row=start + 1, shift=shift)
+            )
+            times = times + shift
+        moved.append(times)
+        order.append(rows)
+        end = times[-1]
+    return np.concatenate(moved), np.concatenate(order), findings
+
+
+def sampled(
+    t: Array, columns: Mapping[str, Array]
+) -> tuple[Array, dict[str, Array], NDArray[np.intp], list[Finding]]:
+    """One row for each time: rows of equal times are laid over one another, the later number where both have one.
+
+    Args:
+        t: Not decreasing [s], (n,).
+        columns: Column -> values, (n,).
+
+    Returns:
+        Times, strictly increasing (m,), columns (m,), the row each came from (m,), and findings.
+    """
+    starts = np.concatenate([[True], np.diff(t) > 0.0])
+    selected = np.flatnonzero(starts)
+    if len(selected) == len(t):
+        return t, dict(columns), selected, []
+    row_of = np.cumsum(starts) - 1
+    merged_columns, conflicts = {}, np.zeros(len(selected), bool)
+    for name, values in columns.items():
+        good = np.flatnonzero(np.isfinite(values))
+        merged_columns[name] = np.full(len(selected), np.nan)
+        merged_columns[name][row_of[good]] = values[good]  # NumPy keeps the last of equal indices
+        conflicts[row_of[good][values[good] != merged_columns[name][row_of[good]]]] = True
+    findings = []
+    if conflicts.any():
+        findings.append(finding("times_conflict", times=conflicts.sum(), first=t[selected][conflicts][0]))
+    elif len(columns):
+        findings.append(finding("times_repeat", rows=len(t) - len(selected)))
+    return t[selected], merged_columns, selected, findings
+
+
+Channels = dict[str, Array]
+
+POLAR = (("u", "v", "w"), ("ax", "ay", "az"), ("tau_x", "tau_y", "tau_z"))
+AXIAL = (("p", "q", "r"), ("tau_k", "tau_m", "tau_n"))
+EULER = ("roll", "pitch", "yaw")
+QUATERNION = ("qx", "qy", "qz", "qw")
+WORLD = (("x", "y", "z"),)
+
+LENGTH_TOLERANCE = 1e-6
+"""Quaternions within this of unit length are left as they are, so that our own files read back bit for bit."""
+
+
+def in_our_frames(channels: Channels, body: str, world: str) -> Channels:
+    """Columns in x forward, y left, z up of the body and a world with z up.
+
+    Args:
+        channels: By canonical name.
+        body: FLU or FRD, of the log.
+        world: z_up or NED, of the log.
+    """
+    turned, sunk = body == "FRD", world == "NED"
+    result = dict(channels)
+    signs: list[tuple[tuple[str, ...], Array]] = []
+    if turned:
+        signs += [(names, FROM_FOSSEN.A.diagonal()) for names in POLAR]
+        signs += [(names, FROM_FOSSEN.axial_map.diagonal()) for names in AXIAL]
+    if sunk:
+        signs += [(names, FROM_FOSSEN.A.diagonal()) for names in WORLD]
+    if turned and sunk:
+        signs.append((EULER, FROM_FOSSEN.axial_map.diagonal()))
+        signs.append((QUATERNION, FROM_FOSSEN.quaternion(np.ones(4))))
+    for names, sign in signs:
+        for name, s in zip(names, sign, strict=True):
+            if name in result:
+                result[name] = s * result[name]
+    if turned != sunk:
+        result.update(_half_turned_attitude(channels, turned))
+    return result
+
+
+def _half_turned_attitude(channels: Channels, body: bool) -> Channels:
+    """Attitude when only the body axes (or only the world axes) change: half a turn about x from one side."""
+    half_turn = matrix_to_quat(FROM_FOSSEN.A)
+
+    def turned(q: Array) -> Array:
+        return quat_multiply(q, half_turn) if body else quat_multiply(half_turn, q)
+
+    result: Channels = {}
+    if all(name in channels for name in QUATERNION):
+        q = turned(np.stack([channels[name] for name in QUATERNION], axis=-1))
+        result.update(zip(QUATERNION, np.moveaxis(q, -1, 0), strict=True))
+    angles_present = [name for name in EULER if name in channels]
+    if angles_present == ["yaw"]:  # the heading of the x axis, which both conventions share
+        return result if body else result | {"yaw": FROM_FOSSEN.yaw(channels["yaw"])}
+    if angles_present:
+        missing = np.zeros(len(channels[angles_present[0]]))
+        angles = quat_to_euler(turned(quat_from_euler(*(channels.get(name, missing) for name in EULER))))
+        result.update({name: a for name, a in zip(EULER, angles, strict=True) if name in angles_present})
+    return result
+
+
+def tidy_quaternions(channels: Channels) -> list[Finding]:
+    """Give quaternions unit length and a continuous sign, in place; findings on what could not be used."""
+    present = [name for name in QUATERNION if name in channels]
+    if not present:
+        return []
+    if len(present) < 4:
+        for name in present:
+            del channels[name]
+        return [finding("quaternion_incomplete", columns=tuple(present))]
+    q = np.stack([channels[name] for name in QUATERNION], axis=-1)
+    length = np.linalg.norm(q, axis=-1)
+    useless = np.isfinite(length) & (length < 0.5)
+    bad = ~np.isfinite(length) | useless
+    q[bad] = np.nan
+    stretched = ~bad & (np.abs(length - 1.0) > LENGTH_TOLERANCE)
+    q[stretched] /= length[stretched, None]
+    good = np.flatnonzero(~bad)
+    flips = np.sum(q[good[1:]] * q[good[:-1]], axis=-1) < 0.0
+    q[good[1:]] *= np.where(np.cumsum(flips) % 2 == 1, -1.0, 1.0)[:, None]
+    for i, name in enumerate(QUATERNION):
+        channels[name] = q[:, i]
+    return [finding("quaternion_lengths", samples=useless.sum())] if useless.any() else []
+
+
+def upside_down(channels: Mapping[str, Array]) -> bool:
+    """Return whether the vehicle is on its back most of the time, as with one axis convention left out."""
+    if all(name in channels for name in QUATERNION):
+        q = np.stack([channels[name] for name in QUATERNION], axis=-1)
+    elif "roll" in channels:
+        roll = channels["roll"]
+        q = quat_from_euler(roll, channels.get("pitch", np.zeros_like(roll)), 0.0)
+    else:
+        return False
+    q = q[np.isfinite(q).all(axis=-1)]
+    return len(q) > 0 and float(np.median(quat_rotate(q, np.array([0.0, 0.0, 1.0]))[:, 2])) < -0.5

@@ -1,0 +1,177 @@
+"""Assignment of the outputs of an ArduSub autopilot to thrusters, with their direction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from finssim.control.ardusub import NEUTRAL, Mixer
+from finssim.core.frames import FROM_FOSSEN
+from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.trials.trial import Array
+from finssim.vehicles import Vehicle
+from finssim.vehicles.autopilot import DEMANDS, FRAMES
+from finssim.vehicles.part import did_you_mean
+
+__all__ = ["STICKS", "mixed_pulses", "outputs_of"]
+
+STICKS = tuple(f"stick_{name}" for name in DEMANDS)
+"""Demands in the order of the mixer's factors."""
+
+MOTOR_1 = 33
+"""SERVOn_FUNCTION of the first motor."""
+
+LEAST_LIKENESS = 1.4
+"""Least likeness of a motor's factors to a thruster: at most 1 from the direction of the force and 1 from the signs of
+its moments."""
+
+
+def outputs_of(
+    vehicle: Vehicle, parameters: Mapping[str, float], requested: Mapping[str, str]
+) -> tuple[dict[int, tuple[str, int]], Finding]:
+    """Output (from 1) -> thruster, and -1 where its pulses have to be turned about neutral; and what that rests on.
+
+    Turned pulses are as the vehicle file has the thruster wired: longer ones push along its axis, or against it where
+    its motor_sign is -1.
+
+    From `requested` (`C1: T1`, `C2: -T2`), else from the vehicle's motor_index, else from the frame and the motor
+    directions that the autopilot's parameters name, matched with where the vehicle's thrusters sit.
+
+    Raises:
+        CalibrationError: Outputs or thrusters that do not exist, or nothing to go by.
+    """
+    if requested:
+        outputs = _stated_outputs(vehicle, requested)
+        basis = "as the map says"
+    elif all(thruster.motor_index is not None for thruster in vehicle.thrusters.values()):
+        outputs = {
+            _output_of(int(thruster.motor_index or 0) + 1, parameters): (name, thruster.motor_sign or 1)
+            for name, thruster in vehicle.thrusters.items()
+        }  # the motor_sign is the vehicle file's, so that no pulse is turned below
+        basis = "by the motor_index of the vehicle file"
+    else:
+        outputs, frame = _by_frame(vehicle, parameters)
+        basis = f"by the frame {frame} of the log"
+    outputs = {
+        output: (name, sign * (vehicle.thrusters[name].motor_sign or 1))
+        for output, (name, sign) in outputs.items()
+    }
+    pairs = tuple(
+        f"C{output} {'-' if sign < 0 else ''}{name}" for output, (name, sign) in sorted(outputs.items())
+    )
+    return outputs, finding("outputs_mapped", how=basis, pairs=pairs, neutral=NEUTRAL)
+
+
+def mixed_pulses(
+    vehicle: Vehicle,
+    demands: Array,
+    parameters: Mapping[str, float],
+    directions: Sequence[int],
+    requested: Mapping[str, str],
+) -> tuple[dict[str, Array], Finding]:
+    """pwm_NAME of each thruster [µs] from demands, by ArduSub's mixer, and which output drives which thruster.
+
+    Args:
+        vehicle: Whose thrusters the motors are.
+        demands: In the order of `STICKS` [-1, 1], (n, 6); rows that are not all known give NaN.
+        parameters: FRAME_CONFIG, one of `FRAMES`, and MOT_n_DIRECTION as `outputs_of` takes it.
+        directions: MOT_n_DIRECTION as the mixer takes it; 1 where not given.
+        requested: As of `outputs_of`.
+
+    Raises:
+        CalibrationError: The motors do not fit the thrusters.
+    """
+    outputs, mapped = outputs_of(vehicle, parameters, requested)
+    valid = np.isfinite(demands).all(axis=-1)
+    frame, _ = FRAMES[int(parameters["FRAME_CONFIG"])]
+    mixed = Mixer.of_frame(frame, directions).pulses(np.where(valid[:, None], demands, 0.0))
+    pulses = {
+        f"pwm_{thruster}": np.where(
+            valid, NEUTRAL + sign * (mixed[:, _motor(output, parameters)] - NEUTRAL), np.nan
+        )
+        for output, (thruster, sign) in outputs.items()
+    }
+    return pulses, mapped
+
+
+def _stated_outputs(vehicle: Vehicle, requested: Mapping[str, str]) -> dict[int, tuple[str, int]]:
+    outputs = {}
+    for output, target in requested.items():
+        number = output.upper().removeprefix("SERVO").removeprefix("C")
+        if not number.isdigit() or int(number) < 1:
+            raise CalibrationError(f"ardusub.outputs names '{output}', expected C1, C2, ...")
+        name, sign = (target[1:].strip(), -1) if target.startswith("-") else (target, 1)
+        if name not in vehicle.thrusters:
+            raise CalibrationError(
+                f"ardusub.outputs.{output}: {vehicle.name} has no thruster '{name}'"
+                f"{did_you_mean(name, list(vehicle.thrusters))} it has {', '.join(vehicle.thrusters)}"
+            )
+        outputs[int(number)] = (name, sign)
+    return outputs
+
+
+def _output_of(motor: int, parameters: Mapping[str, float]) -> int:
+    """The output that carries a motor, both from 1."""
+    for output in range(1, 33):
+        if parameters.get(f"SERVO{output}_FUNCTION") == MOTOR_1 + motor - 1:
+            return output
+    return motor
+
+
+def _motor(output: int, parameters: Mapping[str, float]) -> int:
+    """The motor, from 0, that an output, from 1, carries."""
+    return int(parameters.get(f"SERVO{output}_FUNCTION", MOTOR_1 + output - 1)) - MOTOR_1
+
+
+def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[int, tuple[str, int]], str]:
+    from scipy.optimize import linear_sum_assignment
+
+    way_out = "say it in a map: 'ardusub: {outputs: {C1: THRUSTER, C2: -THRUSTER, ...}}'"
+    config = parameters.get("FRAME_CONFIG")
+    if config is None or int(config) not in FRAMES:
+        lack = (
+            "does not name its frame"
+            if config is None
+            else f"has FRAME_CONFIG {int(config)}, which is not known here"
+        )
+        raise CalibrationError(
+            f"the log {lack}, so it is unknown which output drives which thruster: {way_out}"
+        )
+    frame, factors = FRAMES[int(config)]
+    names = list(vehicle.thrusters)
+    if len(factors) != len(names):
+        raise CalibrationError(
+            f"frame {frame} of the log has {len(factors)} motors, {vehicle.name} has {len(names)} thrusters: {way_out}"
+        )
+    roll, pitch, yaw, up, forward, right = np.array(factors, dtype=float).T
+    # ArduSub's "up" is positive against the z axis of its forward-right-down body.
+    motors = FROM_FOSSEN.twist(np.stack([forward, right, -up, roll, pitch, yaw], axis=-1))
+    likeness = np.array(
+        [[_likeness(motor, column) for column in vehicle.control_matrix.T] for motor in motors]
+    )
+    chosen = linear_sum_assignment(-np.abs(likeness))
+    if np.abs(likeness[chosen]).min() < LEAST_LIKENESS:
+        raise CalibrationError(
+            f"frame {frame} of the log does not fit the thrusters of {vehicle.name}: {way_out}"
+        )
+    outputs = {}
+    for motor, thruster in zip(*chosen, strict=True):
+        direction = parameters.get(f"MOT_{motor + 1}_DIRECTION")
+        if direction not in (1.0, -1.0):
+            raise CalibrationError(f"the log does not say MOT_{motor + 1}_DIRECTION: {way_out}")
+        sign = int(np.sign(likeness[motor, thruster]) * direction)
+        outputs[_output_of(int(motor) + 1, parameters)] = (names[thruster], sign)
+    return outputs, frame
+
+
+def _likeness(motor: np.ndarray, column: np.ndarray) -> float:
+    """Cosine between the forces, plus the mean agreement of the signs of the moments that the motor is used for."""
+    force = motor[:3] @ column[:3] / np.linalg.norm(motor[:3])
+    used = motor[3:] != 0.0
+    moments = (
+        float(np.mean(np.sign(motor[3:][used]) * np.sign(np.round(column[3:][used], 3))))
+        if used.any()
+        else 0.0
+    )
+    return float(force + (moments if used.any() else np.sign(force)))

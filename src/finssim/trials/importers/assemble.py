@@ -1,0 +1,742 @@
+"""Trials from mapped columns: axes, velocities of the world, pressure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from finssim.core.frames import FROM_FOSSEN
+from finssim.core.rotations import quat_from_euler, quat_inverse_rotate
+from finssim.core.yaml_file import read_mapping
+from finssim.trials.conversion import (
+    EULER,
+    EXTRA_COLUMNS,
+    GRAVITY,
+    QUATERNION,
+    SAME_ROW,
+    TIME_UNITS,
+    factor,
+    in_our_frames,
+    merged,
+    ordered,
+    tidy_quaternions,
+    upside_down,
+)
+from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.trials.importers.ardusub_outputs import STICKS, mixed_pulses
+from finssim.trials.trial import (
+    COLUMNS,
+    INPUT_PREFIXES,
+    NU,
+    PHASES,
+    Array,
+    Header,
+    Trial,
+    column_of,
+)
+from finssim.trials.trial_files import vehicle_reference
+from finssim.vehicles import load_vehicle
+from finssim.vehicles.autopilot import FRAMES
+from finssim.vehicles.part import Part, did_you_mean, refuse_section, refuse_value, sentence_of
+
+
+class ColumnSource(Part):
+    """Source of one canonical column: sign (scale * column + offset) in `unit`."""
+
+    column: str | None = None
+    """Name of a column, or dotted path of a field such as `twist.twist.linear.x` or `data[3]`."""
+    value: float | None = None
+    """A constant in place of a column."""
+    scale: float = 1.0
+    offset: float = 0.0
+    """Offset in `unit`, added after scaling."""
+    sign: Literal[1, -1] = 1
+    unit: str | None = None
+    """Unit of scale * column + offset; the unit of the canonical column if None."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        if isinstance(data, str):
+            return {"column": data}
+        if isinstance(data, (int, float)) and not isinstance(data, bool):
+            return {"value": data}
+        if not isinstance(data, dict):
+            raise refuse_section(
+                f"is {data!r}, expected the name of a column, a number, or column, unit, scale ..."
+            )
+        return data
+
+    @model_validator(mode="after")
+    def _single_source(self) -> ColumnSource:
+        if (self.column is None) == (self.value is None):
+            raise refuse_section("expected either 'column: NAME' or 'value: NUMBER'")
+        return self
+
+
+class TimeColumn(Part):
+    """The column that holds the time."""
+
+    column: str
+    unit: str = "s"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        return {"column": data} if isinstance(data, str) else data
+
+    @field_validator("unit")
+    @classmethod
+    def _check_names(cls, unit: str) -> str:
+        if unit not in TIME_UNITS and unit != "date":
+            raise refuse_value(
+                f"is '{unit}', expected one of {', '.join(TIME_UNITS)}, or date for written dates"
+            )
+        return unit
+
+
+class PhaseColumn(Part):
+    """The column that names the phases of an experiment."""
+
+    column: str
+    words: dict[str, str] = Field(default_factory=dict)
+    """Word of the log -> baseline, excitation, coast or rest; other words become none."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        return {"column": data} if isinstance(data, str) else data
+
+    @field_validator("words")
+    @classmethod
+    def _check_names(cls, labels: dict[str, str]) -> dict[str, str]:
+        for word in labels.values():
+            if word not in PHASES:
+                raise refuse_value(
+                    f"holds '{word}'{did_you_mean(word, list(PHASES))} expected {', '.join(PHASES)}"
+                )
+        return labels
+
+
+class Frame(Part):
+    """Axes that the log uses."""
+
+    body: Literal["FLU", "FRD"] = "FLU"
+    """Forward-left-up or forward-right-down."""
+    world: Literal["z_up", "NED"] = "z_up"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        if not isinstance(data, str):
+            return data
+        forms = {
+            "FLU": {},
+            "z_up": {},
+            "FRD": {"body": "FRD", "world": "NED"},
+            "NED": {"body": "FRD", "world": "NED"},
+        }
+        if data not in forms:
+            raise refuse_section(
+                f"is '{data}', expected FLU, FRD, or {{body: FLU or FRD, world: z_up or NED}}"
+            )
+        return forms[data]
+
+
+class SourceMap(Part):
+    """Map of one file or topic."""
+
+    time: TimeColumn | None = None
+    """Needed for files; topics have stamps."""
+    columns: dict[str, ColumnSource] = Field(default_factory=dict)
+    """Canonical column -> its source; for topics of known types the usual ones where nothing is given."""
+    frame: Frame = Field(default_factory=Frame)
+    time_offset: float = 0.0
+    """Added to the times [s]."""
+    phase: PhaseColumn | None = None
+    split: str | None = None
+    """Column whose changes of value begin a new trial."""
+    spaces: bool = False
+    """True if blanks separate the columns of a text table; commas, semicolons and tabs are detected."""
+    skip_rows: int = Field(default=0, ge=0)
+    """Lines before the line of names."""
+    names: tuple[str, ...] | None = None
+    """Names of the columns of a file that has no line of names."""
+    stamps: Literal["header", "received"] = "header"
+    """Times of a topic: the stamps in its messages, if it has them, or the times at which they were recorded."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        if isinstance(data, (list, tuple)):
+            raise refuse_section("is a list, expected columns: {CANONICAL: FIELD}")
+        return {} if data is None else data
+
+    @field_validator("columns", mode="before")
+    @classmethod
+    def _same_names(cls, columns: Any) -> Any:
+        """A list is of columns that the log calls as we do."""
+        if isinstance(columns, (list, tuple)) and all(isinstance(name, str) for name in columns):
+            return {name: name for name in columns}
+        if not isinstance(columns, dict):
+            raise refuse_value(f"is {columns!r}, expected {{CANONICAL: COLUMN}}")
+        return columns
+
+    @field_validator("columns")
+    @classmethod
+    def _check_names(cls, columns: dict[str, ColumnSource]) -> dict[str, ColumnSource]:
+        allowed = [*COLUMNS, *EXTRA_COLUMNS]
+        for name, source in columns.items():
+            if name not in EXTRA_COLUMNS and column_of(name) is None:
+                inputs = ", ".join(f"{prefix}NAME" for prefix in INPUT_PREFIXES)
+                raise refuse_value(
+                    f"names '{name}'{did_you_mean(name, allowed)} columns of a trial are {', '.join(allowed)}, {inputs}"
+                )
+            try:
+                factor(source.unit, name)
+            except CalibrationError as error:
+                raise refuse_value(f"holds a wrong unit: {error}") from None
+        return columns
+
+
+HEADER_KEYS = tuple(Header.model_fields)
+
+GROUPS = tuple(dict.fromkeys(column.group for column in COLUMNS.values()))
+
+
+class ArduSubMap(Part):
+    """Map of an ArduSub log, and settings of the mixer from sticks to pulses."""
+
+    outputs: dict[str, str] = Field(default_factory=dict)
+    """Output of the autopilot -> thruster, `{C1: T1, C2: -T2}`; a minus where longer pulses push backwards."""
+    velocity: Literal["auto", "ekf", "vision", "none"] = "auto"
+    """Source of u v w: the state estimate, or the position deltas of a DVL or visual odometry."""
+    imu: int = Field(default=0, ge=0)
+    barometer: int | None = Field(default=None, ge=0)
+    """The pressure sensor in the water; the primary one where not given."""
+    stamps: Literal["header", "received"] = "header"
+    """Times of a .tlog: the autopilot's own clock if a message has it, or the times at which messages were received."""
+    frame: Literal["VECTORED", "VECTORED_6DOF"] | None = None
+    """Frame of the mixer that `stick_*` columns went through."""
+    gain: float = Field(default=1.0, gt=0.0, le=1.0)
+    """Pilot gain (PilotGain, JS_GAIN_DEFAULT) of `stick_*` columns, where they are the joystick's, not scaled yet."""
+    motor_directions: tuple[Literal[1, -1], ...] = ()
+    """MOT_n_DIRECTION of motors 1, 2, ..., for `stick_*` columns; 1 where not given."""
+
+
+class SplitRule(Part):
+    """Rule that splits a log into several trials."""
+
+    by: Literal["phase", "gaps", "arming", "column", "windows"]
+    longest_gap: float = Field(default=2.0, gt=0.0)
+    """Longest pause within a trial, for `gaps` [s]."""
+    windows: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    """Trial -> start and end [s] after the start of the log, for `windows`."""
+    shortest: float = Field(default=1.0, ge=0.0)
+    """Shorter pieces are left out [s]."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        if isinstance(data, str):
+            return {"by": data}
+        if isinstance(data, dict) and "by" not in data:
+            if "windows" in data:
+                return {"by": "windows", **data}
+            if "gaps" in data:
+                return {
+                    "by": "gaps",
+                    "longest_gap": data["gaps"],
+                    **{k: v for k, v in data.items() if k != "gaps"},
+                }
+        return data
+
+    @model_validator(mode="after")
+    def _windows(self) -> SplitRule:
+        if (self.by == "windows") != bool(self.windows):
+            raise refuse_section("expected 'windows: {NAME: [FROM, TO]}' with windows, and only with them")
+        for name, (low, high) in self.windows.items():
+            if not high > low:
+                raise refuse_section(
+                    f"window {name} is [{low:g}, {high:g}], expected the end after the start"
+                )
+        return self
+
+
+class ColumnMap(Part):
+    """One map file."""
+
+    files: dict[str, SourceMap] = Field(default_factory=dict)
+    """Name or pattern of a file (`imu.csv`, `*_imu.csv`, `{trial}_imu.csv`) -> how it is read."""
+    topics: dict[str, SourceMap] = Field(default_factory=dict)
+    ardusub: ArduSubMap = Field(default_factory=ArduSubMap)
+    split: SplitRule | None = None
+    time_offsets: dict[str, float] = Field(default_factory=dict)
+    """Column, or group (command velocity rates acceleration attitude position depth) -> seconds added to its times."""
+    surface_pressure: float | None = Field(default=None, ge=0.0)
+    """Pressure of the surface as the sensor reads it, for `pressure` columns [Pa]; 0 for a gauge."""
+    header: dict[str, Any] = Field(default_factory=dict)
+    """Keys of `trial.yaml` of every trial."""
+    trials: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """Trial -> further keys of its `trial.yaml`, which replace those of every trial."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        """Accept keys of `trial.yaml`, and a single source for all files, at the top level."""
+        data = dict(data)
+        single = {
+            key: data.pop(key) for key in list(data) if key in SourceMap.model_fields and key != "split"
+        }
+        if single:
+            if "files" in data:
+                raise refuse_section(f"'{next(iter(single))}' is next to 'files': write it inside a file")
+            data["files"] = {"*": single}
+        header = {key: data.pop(key) for key in list(data) if key in HEADER_KEYS}
+        for key in data:
+            if key not in cls.model_fields:
+                allowed = [*cls.model_fields, *HEADER_KEYS, *SourceMap.model_fields]
+                raise refuse_section(
+                    f"unknown key '{key}'{did_you_mean(str(key), allowed)} known keys: {', '.join(allowed)}"
+                )
+        return {**data, "header": {**data.get("header", {}), **header}}
+
+    def header_of(self, trial: str, vehicle: str | None, recorded: Mapping[str, Any] | None = None) -> Header:
+        """Return the header of a trial; a vehicle given on the command line has priority, the log's own header is last.
+
+        Raises:
+            CalibrationError: A key or value that `trial.yaml` does not take.
+        """
+        keys = {**(recorded or {}), **self.header, **self.trials.get(trial, {})}
+        if vehicle is not None:
+            keys["vehicle"] = vehicle
+        if isinstance(keys.get("vehicle"), str):
+            keys["vehicle"] = vehicle_reference(keys["vehicle"])
+        place = f"trials.{trial}" if trial else ""
+        for key in keys:
+            if key not in HEADER_KEYS:
+                raise CalibrationError(
+                    f"{place and f'{place}: '}unknown key '{key}'{did_you_mean(str(key), list(HEADER_KEYS))} "
+                    f"known keys: {', '.join(HEADER_KEYS)}"
+                )
+        try:
+            return Header.model_validate(keys)
+        except ValidationError as error:
+            raise CalibrationError(sentence_of(error.errors()[0], place, "add it")) from None
+
+
+def read_map(path: Path) -> ColumnMap:
+    """Read and check a map file.
+
+    Raises:
+        CalibrationError: Unreadable, malformed, or a key or value that is refused.
+    """
+    tree = read_mapping(path, CalibrationError, such_as="files: {log.csv: {time: t, columns: {u: vel_x}}}")
+    try:
+        column_map = ColumnMap.model_validate(tree)
+        for trial in ("", *column_map.trials):
+            column_map.header_of(trial, None)
+    except ValidationError as error:
+        raise CalibrationError(sentence_of(error.errors()[0], str(path), "add it")) from None
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+    return column_map
+
+
+def split_rule(text: str) -> SplitRule:
+    """The rule that a word of the command line names: phase, gaps, gaps=SECONDS, arming or column.
+
+    Raises:
+        CalibrationError: Another word.
+    """
+    word, _, seconds = text.partition("=")
+    try:
+        return SplitRule.model_validate(
+            {"gaps": float(seconds)} if word == "gaps" and seconds else {"by": text}
+        )
+    except ValueError:
+        raise CalibrationError(
+            f"split is '{text}', expected phase, gaps, gaps=SECONDS, arming or column; give time windows in a map file"
+        ) from None
+
+
+# One table of a long log into several, one for each trial.
+
+Rows = NDArray[np.bool_]
+
+
+def split_table(name: str, table: Table, rule: SplitRule | None) -> dict[str, Table]:
+    """Name of a trial -> its part of the table, with times from 0; one part of that name without a rule.
+
+    Raises:
+        CalibrationError: The log has not what the rule goes by, or nothing is left.
+    """
+    if rule is None:
+        return {name: table}
+    pieces = (
+        _windows(name, table, rule) if rule.by == "windows" else _numbered(name, _labels(name, table, rule))
+    )
+    long_enough = {
+        piece: rows
+        for piece, rows in pieces.items()
+        if rows.sum() >= 2 and np.ptp(table.t[rows]) >= rule.shortest
+    }
+    if not long_enough:
+        raise CalibrationError(
+            f"{name}: splitting by {rule.by} leaves no piece of {rule.shortest:g} s or more"
+        )
+    return {piece: _part(table, rows) for piece, rows in long_enough.items()}
+
+
+def _part(table: Table, rows: Rows) -> Table:
+    t = table.t[rows]
+    return replace(
+        table,
+        start=table.start + float(t[0]),
+        t=np.round(t - t[0], 6),
+        channels={column: values[rows] for column, values in table.channels.items()},
+        words={column: spoken[rows] for column, spoken in table.words.items()},
+        findings=(*table.findings, finding("log_cut", start=t[0], end=t[-1])),
+    )
+
+
+WORDED = {
+    "phase": ("phase", "no source of the map names a phase column"),
+    "arming": ("arming", "the log has no arming messages"),
+    "column": ("split", "no source of the map names a split column"),
+}
+"""Rule -> the words that it uses, and the message if there are none."""
+
+
+def _labels(name: str, table: Table, rule: SplitRule) -> NDArray[np.int64]:
+    """Number of the piece that each row belongs to, -1 for none, (n,).
+
+    A trial of `phase` begins with each baseline; without baselines, with each excitation after something else.
+    """
+    if rule.by == "gaps":
+        return np.cumsum(np.diff(table.t, prepend=table.t[0]) > rule.longest_gap)
+    column, missing = WORDED[rule.by]
+    if column not in table.words:
+        raise CalibrationError(f"{name}: cannot be split by {column}: {missing}")
+    texts = table.words[column]
+    changes = np.concatenate([[True], texts[1:] != texts[:-1]])
+    if rule.by == "phase":
+        opening = "baseline" if (texts == "baseline").any() else "excitation"
+        return np.cumsum(changes & (texts == opening)) - 1
+    inside = texts == "armed" if rule.by == "arming" else ~np.isin(texts, ("", "nan", "None"))
+    return np.where(inside, np.cumsum(changes & inside) - 1, -1)
+
+
+def _numbered(name: str, labels: NDArray[np.int64]) -> dict[str, Rows]:
+    count = int(labels.max(initial=-1)) + 1
+    return {f"{name}_{i + 1:0{len(str(count))}d}": labels == i for i in range(count)}
+
+
+def _windows(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    pieces = {window: (table.t >= low) & (table.t <= high) for window, (low, high) in rule.windows.items()}
+    empty = [window for window, rows in pieces.items() if not rows.any()]
+    if empty:
+        raise CalibrationError(
+            f"{name}: window {empty[0]} is {list(rule.windows[empty[0]])} s, the log runs to {table.t[-1]:.3f} s"
+        )
+    return pieces
+
+
+Texts = NDArray[np.str_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stream:
+    """Content of one file, topic or kind of message, in canonical columns and SI."""
+
+    source: str
+    """Name of the source in messages."""
+    t: Array
+    """Times on the clock of the log [s], (n,)."""
+    channels: dict[str, Array] = field(default_factory=dict)
+    """Canonical or extra column -> values, (n,) each."""
+    words: dict[str, Texts] = field(default_factory=dict)
+    """`phase`, `split` or `arming` -> a word for every sample, (n,) each; a word holds until the next."""
+    findings: tuple[Finding, ...] = ()
+    """Repairs, and data that was left out."""
+
+    def selected(self, rows: NDArray[np.intp] | NDArray[np.bool_], t: Array | None = None) -> Stream:
+        """Some of the samples, in that order; at times `t` where given."""
+        return replace(
+            self,
+            t=self.t[rows] if t is None else t,
+            channels={name: values[rows] for name, values in self.channels.items()},
+            words={name: values[rows] for name, values in self.words.items()},
+        )
+
+    def noting(self, *findings: Finding) -> Stream:
+        """Return the stream with more findings."""
+        return replace(self, findings=(*self.findings, *findings))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Several streams on the union of their times."""
+
+    start: float
+    """Time of the log's clock at t = 0 [s]."""
+    t: Array
+    """Strictly increasing from 0 [s], (n,)."""
+    channels: dict[str, Array]
+    """NaN where a stream has no sample, (n,) each."""
+    words: dict[str, Texts]
+    """(n,) each."""
+    findings: tuple[Finding, ...]
+
+
+def in_order(stream: Stream, *, alone: bool) -> Stream:
+    """The stream with strictly increasing times.
+
+    Samples without a time are left out, late ones are sorted in, of samples with one time the first is kept. Where the
+    clock was set back, the rest follows after a gap if the stream is `alone`
+    (`finssim.trials.conversion.ordered`).
+
+    Raises:
+        CalibrationError: No samples, or a clock set back in one of several streams, which cannot be aligned again.
+    """
+    timed = np.isfinite(stream.t)
+    untimed = [] if timed.all() else [finding("samples_untimed", samples=(~timed).sum())]
+    stream = stream.selected(timed)
+    if len(stream.t) < 2:
+        raise CalibrationError(f"{stream.source}: {len(stream.t)} samples, expected at least two")
+    t, rows, repaired = ordered(stream.t, stream.channels)
+    jumps = [item.values for item in repaired if item.code == "clock_jump"]
+    if not alone and jumps:
+        raise CalibrationError(
+            f"the clock jumps back from {jumps[0]['before']:.6g} s to {jumps[0]['after']:.6g} s at row "
+            f"{jumps[0]['row']}, so its samples cannot be placed among those of the other sources: import the parts on "
+            "their own, or cut the log there",
+            stream.source,
+        )
+    stream = stream.selected(rows, t)
+    first = np.concatenate([[True], np.diff(t) > SAME_ROW])
+    if not first.all():
+        repaired = [*repaired, finding("samples_repeat", samples=(~first).sum())]
+        stream = stream.selected(first)
+    if len(stream.t) < 2:
+        raise CalibrationError(
+            f"{stream.source}: the time never increases: name the column that holds the time"
+        )
+    return stream.noting(*(item.about(stream.source) for item in (*untimed, *repaired)))
+
+
+def moved_in_time(streams: Sequence[Stream], offsets: Mapping[str, float]) -> list[Stream]:
+    """The streams with columns, or groups of them, moved in time; their words stay.
+
+    Args:
+        streams: Of a trial.
+        offsets: Column or group -> what is added to its times [s].
+
+    Raises:
+        CalibrationError: A key that is neither a group nor a column of these streams.
+    """
+    movable = [*GROUPS, *(name for stream in streams for name in stream.channels)]
+    for key in offsets:
+        if key not in movable:
+            raise CalibrationError(
+                f"time_offsets: '{key}' is neither a group nor a column of this log{did_you_mean(key, movable)} "
+                f"groups are {', '.join(GROUPS)}"
+            )
+    out = []
+    for stream in streams:
+        groups = {name: column.group if (column := column_of(name)) else "" for name in stream.channels}
+        by = {name: offsets.get(name, offsets.get(group, 0.0)) for name, group in groups.items()}
+        for seconds in dict.fromkeys(
+            [*([] if stream.channels and not stream.words else [0.0]), *by.values()]
+        ):
+            part = {name: values for name, values in stream.channels.items() if by[name] == seconds}
+            texts = stream.words if seconds == 0.0 else {}
+            out.append(replace(stream, t=stream.t + seconds, channels=part, words=texts))
+    return out
+
+
+def merge(streams: Sequence[Stream]) -> Table:
+    """All streams on the union of their times, which start at 0.
+
+    Raises:
+        CalibrationError: A column in two streams, or streams that lie apart in time.
+    """
+    each = [in_order(stream, alone=len(streams) == 1) for stream in streams]
+    _refuse_doubles(each)
+    _refuse_disjoint(each)
+    start = min(float(stream.t[0]) for stream in each)
+    # In integer microseconds, so that a written and read trial has the same times.
+    each = [replace(stream, t=np.round(stream.t - start, 6)) for stream in each]
+    columns = {name: (stream.t, values) for stream in each for name, values in stream.channels.items()}
+    spoken = {name: (stream.t, texts) for stream in each for name, texts in stream.words.items()}
+    t, channels = merged(columns)
+    texts = {}
+    for name, (times, labels) in spoken.items():
+        held = np.searchsorted(times, t, side="right") - 1
+        texts[name] = np.where(held >= 0, labels[np.maximum(held, 0)], "")
+    findings = [item for stream in each for item in stream.findings]
+    if start > 1e8:
+        findings.append(finding("clock_origin", start=start))
+    return Table(start=start, t=t, channels=channels, words=texts, findings=tuple(dict.fromkeys(findings)))
+
+
+def _refuse_doubles(streams: Sequence[Stream]) -> None:
+    sources: dict[str, str] = {}
+    for stream in streams:
+        for name in (*stream.channels, *stream.words):
+            if name in sources:
+                raise CalibrationError(
+                    f"{name} is in {sources[name]} and in {stream.source}: choose one of them in the map"
+                )
+            sources[name] = stream.source
+
+
+def _refuse_disjoint(streams: Sequence[Stream]) -> None:
+    longest = max(streams, key=lambda stream: stream.t[-1] - stream.t[0])
+    for stream in streams:
+        if stream.t[0] > longest.t[-1] or stream.t[-1] < longest.t[0]:
+            raise CalibrationError(
+                f"times of {longest.source} run from {longest.t[0]:.6g} to {longest.t[-1]:.6g} s and those of "
+                f"{stream.source} from {stream.t[0]:.6g} to {stream.t[-1]:.6g} s: they do not overlap: give the "
+                f"unit of the time, or a time_offset in the map that puts them on one clock"
+            )
+
+
+WORLD_VELOCITY = ("vx", "vy", "vz")
+STANDARD_ATMOSPHERE = 101325.0
+LONGEST_BRIDGE = 0.5
+"""Between two attitudes that a velocity of the world is turned with [s]."""
+
+
+def in_our_axes(stream: Stream, frame: Frame) -> Stream:
+    """The stream in x forward, y left, z up and a world with z up."""
+    channels = in_our_frames(stream.channels, frame.body, frame.world)
+    if frame.world == "NED":
+        for name, sign in zip(WORLD_VELOCITY, FROM_FOSSEN.A.diagonal(), strict=True):
+            if name in channels:
+                channels[name] = sign * channels[name]
+    return replace(stream, channels=channels)
+
+
+def trial_of(name: str, table: Table, header: Header, column_map: ColumnMap) -> Trial:
+    """The trial that a table makes, with u v w and depth in place of world velocities and pressure.
+
+    Raises:
+        CalibrationError: World velocities without an attitude, or beside body velocities.
+    """
+    channels, findings = dict(table.channels), list(table.findings)
+    if any(c in channels for c in WORLD_VELOCITY):
+        channels |= _body_velocity(name, table.t, channels)
+        channels = {c: v for c, v in channels.items() if c not in WORLD_VELOCITY}
+    if "pressure" in channels:
+        depth, assumed = _depth(channels.pop("pressure"), header, column_map)
+        findings += assumed
+        channels["depth"] = depth
+    if any(c in channels for c in STICKS):
+        pulses, mixed = _pulses(name, channels, header, column_map.ardusub)
+        channels = {c: v for c, v in channels.items() if c not in STICKS} | pulses
+        findings += mixed
+    findings += tidy_quaternions(channels)
+    if upside_down(channels):
+        findings.append(finding("upside_down"))
+    for column in [c for c, v in channels.items() if not np.isfinite(v).any()]:
+        findings.append(finding("column_empty", column=column))
+        del channels[column]
+    if not channels:
+        raise CalibrationError(f"{name}: no column of a trial holds a number")
+    return Trial(
+        name=name, t=table.t, channels=channels, phase=_phase(table), header=header, findings=tuple(findings)
+    )
+
+
+def _phase(table: Table) -> np.ndarray | None:
+    if "phase" not in table.words:
+        return None
+    labels = table.words["phase"]
+    return np.where(np.isin(labels, PHASES), labels, "").astype(np.str_)
+
+
+def _body_velocity(name: str, t: Array, channels: dict[str, Array]) -> dict[str, Array]:
+    """u v w from world velocities and the attitude interpolated to their times."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    missing = [c for c in WORLD_VELOCITY if c not in channels]
+    if missing or any(c in channels for c in NU[:3]):
+        raise CalibrationError(
+            f"{name}: expected all of vx, vy, vz (in the world) or u, v, w (in the body), not both"
+            + (f": {', '.join(missing)} missing" if missing else "")
+        )
+    if all(c in channels for c in QUATERNION):
+        q = np.stack([channels[c] for c in QUATERNION], axis=-1)
+    elif all(c in channels for c in EULER):
+        q = quat_from_euler(*(channels[c] for c in EULER))
+    else:
+        raise CalibrationError(
+            f"{name}: vx, vy, vz are velocities in the world, and without an attitude they cannot become u, v, w: "
+            "map roll pitch yaw or qx qy qz qw"
+        )
+    valid = np.isfinite(q).all(axis=-1) & (np.linalg.norm(np.nan_to_num(q), axis=-1) > 0.5)
+    velocity = np.stack([channels[c] for c in WORLD_VELOCITY], axis=-1)
+    if valid.sum() < 2:
+        raise CalibrationError(f"{name}: the attitude that turns vx, vy, vz holds fewer than two samples")
+    times = t[valid]
+    after = np.clip(np.searchsorted(times, t), 1, len(times) - 1)
+    near = (t >= times[0]) & (t <= times[-1]) & (times[after] - times[after - 1] <= LONGEST_BRIDGE)
+    usable = near & np.isfinite(velocity).all(axis=-1)
+    body = np.full_like(velocity, np.nan)
+    if usable.any():
+        attitude = Slerp(times, Rotation.from_quat(q[valid]))(t[usable]).as_quat()
+        body[usable] = quat_inverse_rotate(attitude, velocity[usable])
+    return dict(zip(NU[:3], body.T, strict=True))
+
+
+def _pulses(
+    name: str, channels: dict[str, Array], header: Header, requested: ArduSubMap
+) -> tuple[dict[str, Array], list[Finding]]:
+    """Pulse widths of the vehicle's thrusters [µs] from the sticks, by ArduSub's mixer; and findings."""
+    if requested.frame is None or header.vehicle is None:
+        raise CalibrationError(
+            f"{name}: stick_* columns go through ArduSub's mixer: give its frame in the map, "
+            "'ardusub: {frame: VECTORED_6DOF}' or VECTORED, and the vehicle"
+        )
+    pulses = [c for c in channels if c.startswith("pwm_")]
+    if pulses:
+        raise CalibrationError(
+            f"{name}: expected stick_* or pwm_* columns, not both: {pulses[0]} is there as well"
+        )
+    sticks = [channels[c] for c in STICKS if c in channels]
+    valid = np.all([np.isfinite(v) for v in sticks], axis=0)
+    demands = np.stack([channels.get(c, np.zeros(len(valid))) for c in STICKS], axis=-1)
+    beyond = float(np.abs(demands[valid]).max(initial=0.0))
+    if beyond > 1.01:
+        raise CalibrationError(
+            f"{name}: stick_* reach {beyond:g}, expected demands in [-1, 1]: "
+            "give scale and offset in the map, scale: 0.0025 and offset: -3.75 for channels of 1100 to 1900 µs"
+        )
+    vehicle = load_vehicle(header.vehicle)
+    config = next(number for number, (frame, _) in FRAMES.items() if frame == requested.frame)
+    parameters = {"FRAME_CONFIG": float(config)}
+    parameters |= {f"MOT_{motor + 1}_DIRECTION": 1.0 for motor in range(len(FRAMES[config][1]))}
+    findings, mapped = mixed_pulses(
+        vehicle, requested.gain * demands, parameters, requested.motor_directions, requested.outputs
+    )
+    return findings, [finding("sticks_mixed", frame=requested.frame, gain=requested.gain), mapped]
+
+
+def _depth(pressure: Array, header: Header, column_map: ColumnMap) -> tuple[Array, list[Finding]]:
+    """Depth of the pressure sensor [m]: (p - p_surface) / (rho g)."""
+    vehicle = load_vehicle(header.vehicle) if header.vehicle is not None else None
+    density = header.water.density or (vehicle.water.density if vehicle else 1000.0)
+    gravity = vehicle.water.gravity if vehicle else GRAVITY
+    surface = column_map.surface_pressure
+    findings = [finding("depth_of_pressure", density=density)]
+    if surface is None:
+        surface = STANDARD_ATMOSPHERE
+        findings.append(finding("surface_pressure_assumed", pressure=surface))
+    return (pressure - surface) / (density * gravity), findings

@@ -1,0 +1,112 @@
+"""Trials from tables in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from finssim.core.files import plain_name
+from finssim.trials.findings import CalibrationError, finding
+from finssim.trials.importers.assemble import ColumnMap, SourceMap, merge, trial_of
+from finssim.trials.importers.dispatch import table_stream
+from finssim.trials.trial import Trial, column_of
+from finssim.trials.trial_files import Table
+from finssim.vehicles.part import did_you_mean, sentence_of
+
+
+def trial_from_frame(
+    frame: Any,
+    *,
+    columns: Mapping[str, str] | None,
+    units: Mapping[str, str] | None,
+    time: str,
+    axes: str,
+    name: str,
+    surface_pressure: float | None,
+    header: Mapping[str, Any],
+) -> Trial:
+    """Return the trial of a table in memory; the arguments and errors are those of `Trial.from_frame`.
+
+    Args:
+        frame: A pandas DataFrame, or a mapping of names to columns.
+        columns: Column of a trial -> name of the column in `frame`.
+        units: Column of a trial, or `t` -> its unit in `frame`.
+        time: Name of the column of times.
+        axes: FLU or FRD.
+        name: Name of the trial.
+        surface_pressure: What the pressure sensor reads at the surface [Pa].
+        header: Further keys of `trial.yaml`.
+    """
+    plain_name(name, "name of the trial", CalibrationError)
+    table = _table(frame, time, name)
+    if columns is None:
+        columns = {column: column for column in table.columns if column_of(column) is not None}
+    units = dict(units or {})
+    unit_of_time = units.pop("t", "s")
+    for column in units:
+        if column not in columns:
+            known = ["t", *columns]
+            raise CalibrationError(
+                f"{name}: units names '{column}'{did_you_mean(column, known)} expected some of {', '.join(known)}"
+            )
+    if time not in table.columns:
+        raise CalibrationError(
+            f"{name}: no column '{time}' with the times; its columns are {', '.join(table.columns[:12])}: name the "
+            "column with time=, or use it as the index"
+        )
+    try:
+        source = SourceMap.model_validate(
+            {
+                "time": {"column": time, "unit": unit_of_time},
+                "frame": axes,
+                "columns": {
+                    column: {"column": given, "unit": units.get(column)} for column, given in columns.items()
+                },
+                "phase": "phase" if "phase" in table.words else None,
+            }
+        )
+        mapped = ColumnMap.model_validate({"header": dict(header), "surface_pressure": surface_pressure})
+    except ValidationError as error:
+        raise CalibrationError(sentence_of(error.errors()[0], name, "add it")) from None
+    used = {time, "phase", *columns.values()}
+    table.findings += [
+        finding("unknown_column", column=column, hint="") for column in table.columns if column not in used
+    ]
+    return trial_of(name, merge([table_stream(table, source, name)]), mapped.header_of(name, None), mapped)
+
+
+def _table(frame: Any, time: str, name: str) -> Table:
+    """Return the columns of a DataFrame, its index of times included, or of a mapping."""
+    if hasattr(frame, "columns") and hasattr(frame, "index"):
+        index = frame.index
+        held = index.name == time or np.issubdtype(np.asarray(index).dtype, np.datetime64)
+        if held and time not in frame.columns:
+            frame = frame.assign(**{time: np.asarray(index)})
+        columns = {str(column): frame[column] for column in frame.columns}
+        if len(columns) < len(frame.columns):
+            raise CalibrationError(f"{name}: two columns have one name: rename one")
+    elif isinstance(frame, Mapping):
+        columns = {str(column): values for column, values in frame.items()}
+    else:
+        raise CalibrationError(
+            f"{name}: a {type(frame).__name__}, expected a pandas DataFrame or a mapping of names to columns"
+        )
+    arrays = {column: np.asarray(values) for column, values in columns.items()}
+    shapes = {array.shape for array in arrays.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+        listed = ", ".join(f"{column} {array.shape}" for column, array in arrays.items())
+        raise CalibrationError(
+            f"{name}: columns {listed or 'none'}, expected one-dimensional ones of one length"
+        )
+    table = Table()
+    for column, array in arrays.items():
+        if np.issubdtype(array.dtype, np.datetime64):
+            table.words[column] = np.datetime_as_string(array.astype("datetime64[us]")).tolist()
+        elif array.dtype.kind in "biuf":
+            table.numbers[column] = array.astype(np.float64)
+        else:
+            table.words[column] = ["" if word is None else str(word) for word in array.tolist()]
+    return table

@@ -1,0 +1,593 @@
+"""Inputs of a trial: the recorded inputs as forces, and the wrench that they applied."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.rotations import skew
+from finssim.physics.types import MAX_THRUSTERS
+from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.trials.trial import INPUT_PREFIXES, TAU, Header, Trial
+from finssim.vehicles import AXES, Vehicle
+from finssim.vehicles.capability import terminal_speeds
+from finssim.vehicles.hydrodynamics import HydrodynamicSet
+from finssim.vehicles.part import did_you_mean
+
+Array = NDArray[np.float64]
+
+# What every fit asks of the trials and axes that it is given.
+
+
+FASTEST = 20.0
+"""No vehicle moves faster [m/s]."""
+FASTEST_TURN = 15.0
+"""Nor turns faster [rad/s]."""
+BEYOND = 5.0
+"""Times the speed that a vehicle file gives at full thrust, or the work of the thrust, beyond which no error of that
+file explains a log."""
+FEW = 97.0
+"""Percentile of a speed that is looked at: another unit shows in all samples, wild ones are left to the fit."""
+ADRIFT = 1.0
+"""Speed that water, waves and hands may give to a vehicle [m/s]."""
+
+
+def require_fittable(trials: Sequence[Trial], vehicle: Vehicle) -> None:
+    """Refuse trials that no fit may use.
+
+    Args:
+        trials: All that were given.
+        vehicle: The one that made them.
+
+    Raises:
+        CalibrationError: There are none, two share a name, one is held out, or no vehicle can have moved so.
+    """
+    if not trials:
+        raise CalibrationError("no trials were given, expected at least one to fit")
+    names = [trial.name for trial in trials]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise CalibrationError(f"two trials are called '{min(twice)}', expected a name for each: rename one")
+    for trial in trials:
+        if trial.header.role == "held-out":
+            raise CalibrationError(
+                f"{trial.name}: it is marked as held out: fit on other trials and replay this one"
+            )
+        for item in implausible(trial, vehicle):
+            raise CalibrationError(f"{trial.name}: {item}")
+
+
+def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
+    """Return findings about the impossible: speeds, and speeds or kinetic energy beyond what the thrust can give.
+
+    Args:
+        trial: As it was read.
+        vehicle: The one that made it; None: only what holds for all is looked at.
+    """
+    fastest = {name: _fastest(trial, name) for name in ("u", "v", "w", "p", "q", "r")}
+    limits = dict.fromkeys("uvw", FASTEST) | dict.fromkeys("pqr", FASTEST_TURN)
+    findings = [
+        finding("speed_unit", column=name, value=speed)
+        if name in "uvw"
+        else finding("degrees", column=name, value=speed, unit="rad/s")
+        for name, speed in fastest.items()
+        if speed > limits[name]
+    ]
+    if findings or vehicle is None or trial.header.passive:
+        return findings
+    if isinstance(vehicle.hydrodynamics.get("calibrated"), HydrodynamicSet):
+        for name, reach in zip("uvw", terminal_speeds(vehicle)[:3].tolist(), strict=True):
+            if 0.0 < reach and BEYOND * reach + ADRIFT < fastest[name]:
+                findings.append(finding("speed_beyond", column=name, value=fastest[name], reach=reach))
+    return findings or _unearned(trial, vehicle)
+
+
+def _fastest(trial: Trial, name: str) -> float:
+    """The speed that few samples exceed, see `FEW`; 0 where there is none."""
+    values = np.abs(trial.series(name)[1])
+    return float(np.percentile(values, FEW)) if len(values) else 0.0
+
+
+def _unearned(trial: Trial, vehicle: Vehicle) -> list[Finding]:
+    """Kinetic energy of the mass alone, E = m |v|² / 2, that the work of the inputs, ∫ |τ · v| dt, does not explain."""
+    if not trial.has("u", "v", "w"):
+        return []
+    try:
+        inputs = drive(trial, vehicle)
+    except CalibrationError:
+        return []  # a function that needs the inputs reports what is missing
+    v = np.column_stack([np.interp(inputs.t, *trial.series(name)) for name in "uvw"])
+    tau = np.nan_to_num(applied_wrench(inputs, vehicle, inputs.t)[:, :3])
+    power = np.abs(np.sum(tau * v, axis=1))
+    work = float(np.sum(power[:-1] * np.diff(inputs.t)))
+    square = np.percentile(np.sum(v * v, axis=1), FEW)
+    energy, free = (0.5 * vehicle.body.mass * float(s) for s in (square, np.sum(v[0] ** 2) + ADRIFT**2))
+    return [finding("energy", energy=energy, work=work)] if energy > BEYOND * (work + free) else []
+
+
+def require_axes(axes: Sequence[str] | None) -> None:
+    """Refuse words that name no axis.
+
+    Raises:
+        CalibrationError: It says which there are.
+    """
+    for axis in axes or ():
+        if axis not in AXES:
+            raise CalibrationError(f"unknown axis '{axis}'; available: {', '.join(AXES)}")
+
+
+# What the motors of a vehicle make of commanded forces: the engine's actuation in NumPy, exact in time.
+
+NO_LIMIT = 1.0e9
+"""Force and slew of a motor that has no limit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motors:
+    """Limits, dead zone, delay, lag and slew of k channels, (k,) each."""
+
+    lower: Array
+    """[N]"""
+    upper: Array
+    """[N]"""
+    dead_minus: Array
+    """Commands between this and `dead_plus` give nothing [N]."""
+    dead_plus: Array
+    """[N]"""
+    delay: Array
+    """[s]"""
+    time_constant: Array
+    """[s]"""
+    slew: Array
+    """[N/s], or [rad/s²] where `speed`."""
+    speed: NDArray[np.bool_]
+    """True if lag and slew act on shaft speed rather than on thrust."""
+    c_plus: Array
+    """T = c± ω|ω| [N s²/rad²]."""
+    c_minus: Array
+    """[N s²/rad²]"""
+
+
+def thruster_motors(vehicle: Vehicle) -> Motors:
+    """Motors of the vehicle's thrusters, in canonical order."""
+    thrusters = list(vehicle.thrusters.values())
+    speed = np.array([t.domain == "speed" for t in thrusters])
+
+    def column(name: str) -> Array:
+        return np.array([getattr(t, name) for t in thrusters], dtype=float)
+
+    def force_at(name: str) -> Array:
+        at = [t.thrust(getattr(t, name) * 2.0 * np.pi / 60.0) for t in thrusters]
+        return np.where(speed, at, 0.0)  # a motor that lags in force has no dead zone in the engine
+
+    return Motors(
+        lower=column("force_min"),
+        upper=column("force_max"),
+        dead_minus=force_at("dead_rpm_minus"),
+        dead_plus=force_at("dead_rpm_plus"),
+        delay=column("delay"),
+        time_constant=column("time_constant"),
+        slew=np.minimum(column("slew"), NO_LIMIT),
+        speed=speed,
+        c_plus=column("c_plus"),
+        c_minus=column("c_minus"),
+    )
+
+
+def wrench_motors(vehicle: Vehicle) -> Motors:
+    """Six equal motors for the axes of a wrench that was asked for: the mean delay and lag of the vehicle's thrusters.
+
+    Exact while all thrusters are equal, lag in force and keep away from their limits; who allocated the wrench, and
+    how, is not in the log.
+    """
+    motors = thruster_motors(vehicle)
+    six = np.ones(6)
+    return Motors(
+        lower=-NO_LIMIT * six,
+        upper=NO_LIMIT * six,
+        dead_minus=0.0 * six,
+        dead_plus=0.0 * six,
+        delay=motors.delay.mean() * six,
+        time_constant=motors.time_constant.mean() * six,
+        slew=NO_LIMIT * six,
+        speed=np.zeros(6, bool),
+        c_plus=six,
+        c_minus=six,
+    )
+
+
+def delivered(motors: Motors, t: Array, command: Array, at: Array) -> Array:
+    """Thrust at given times for commands that are held until the next.
+
+    u(t) = admissible(command(t - delay)),   x_dot = clip((u - x) / time_constant, ±slew),   T = x or c± x|x|
+
+    solved exactly between the changes of u. Before its first row a command is taken to have been held for long.
+
+    Args:
+        motors: Of the k channels.
+        t: Times of the commands, increasing [s], (n,).
+        command: [N], (n, k).
+        at: Times asked for [s], (m,).
+
+    Returns:
+        [N], (m, k).
+    """
+    f = np.clip(command, motors.lower, motors.upper)
+    f = np.where((f > motors.dead_minus) & (f < motors.dead_plus), 0.0, f)
+    c = np.where(f >= 0.0, motors.c_plus, motors.c_minus)
+    target = np.where(motors.speed, np.sign(f) * np.sqrt(np.abs(f) / c), f)
+    x = np.stack(
+        [
+            _followed(
+                *_changes(t + motors.delay[k], target[:, k]), at, motors.time_constant[k], motors.slew[k]
+            )
+            for k in range(command.shape[1])
+        ],
+        axis=-1,
+    )
+    c = np.where(x >= 0.0, motors.c_plus, motors.c_minus)
+    return np.where(motors.speed, c * x * np.abs(x), x)
+
+
+def _changes(t: Array, u: Array) -> tuple[Array, Array]:
+    """The rows at which a held value changes."""
+    rows = np.concatenate([[True], np.diff(u) != 0.0])
+    return t[rows], u[rows]
+
+
+def _followed(t: Array, u: Array, at: Array, time_constant: float, slew: float) -> Array:
+    """x(at) of x_dot = clip((u - x) / time_constant, ±slew), at rest on u[0] before t[0]; u is held from t on."""
+    x = np.empty(len(t))
+    x[0] = now = float(u[0])
+    for j, (goal, dt) in enumerate(zip(u.tolist(), np.diff(t).tolist(), strict=False)):
+        way = goal - now
+        ramp = max(abs(way) - slew * time_constant, 0.0) / slew
+        if ramp > 0.0:
+            now += math.copysign(slew * min(ramp, dt), way)
+            dt = max(dt - ramp, 0.0)
+        x[j + 1] = now = goal + (now - goal) * math.exp(-dt / time_constant)
+    last = np.maximum(np.searchsorted(t, at, side="right") - 1, 0)
+    since = np.maximum(at - t[last], 0.0)
+    ways = u[last] - x[last]
+    ramps = np.minimum(np.maximum(np.abs(ways) - slew * time_constant, 0.0) / slew, since)
+    remaining = ways - np.sign(ways) * slew * ramps
+    return np.asarray(u[last] - remaining * np.exp(-(since - ramps) / time_constant))
+
+
+# Columns of a trial that describe its inputs.
+
+ORDER = ("rpm_", "force_", "tau", "pwm_", "command_")
+"""Kinds of input, from the closest to what acted to the least close."""
+
+
+def input_columns(trial: Trial, vehicle: Vehicle) -> dict[str, list[str]]:
+    """Input columns that hold numbers, by kind, in canonical order.
+
+    Raises:
+        CalibrationError: One names a thruster that the vehicle has not.
+    """
+    return {kind: _columns(trial, vehicle, kind) for kind in ORDER}
+
+
+def first_complete(present: dict[str, list[str]], trial: Trial, vehicle: Vehicle) -> str:
+    """Return the kind of input closest to what acted, of those that are present for every thruster.
+
+    Of a wrench any axis will do.
+
+    Raises:
+        CalibrationError: None is.
+    """
+    for kind in ORDER:
+        if present[kind] and (kind == "tau" or len(present[kind]) == len(vehicle.thrusters)):
+            return kind
+    raise CalibrationError(_missing_inputs(present, vehicle), trial.name)
+
+
+def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
+    if kind == "tau":
+        return [name for name in TAU if trial.has(name)]
+    names = {c.removeprefix(kind): c for c in trial.channels if c.startswith(kind)}
+    for name, column in names.items():
+        if name not in vehicle.thrusters:
+            meant = next(
+                (thruster for thruster in vehicle.thrusters if thruster.lower() == name.lower()), name
+            )
+            raise CalibrationError(
+                f"{column}: {vehicle.name} has no thruster '{name}'"
+                f"{did_you_mean(meant, list(vehicle.thrusters))} it has {', '.join(vehicle.thrusters)}",
+                trial.name,
+            )
+    return [names[name] for name in vehicle.thrusters if name in names and trial.has(names[name])]
+
+
+def _missing_inputs(present: dict[str, list[str]], vehicle: Vehicle) -> str:
+    for kind in ORDER:
+        if present[kind]:
+            missing = [f"{kind}{n}" for n in vehicle.thrusters if f"{kind}{n}" not in present[kind]]
+            return (
+                f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing, expected a column for each of "
+                f"the {len(vehicle.thrusters)} thrusters of {vehicle.name}: give zeros for a thruster that never ran"
+            )
+    prefixes = ", ".join(f"{prefix}NAME" for prefix in INPUT_PREFIXES)
+    return (
+        f"no input columns, expected tau_x ... tau_n or one of {prefixes} for each thruster: log what drove the "
+        "vehicle, or write 'passive: true' in trial.yaml if the thrusters were off"
+    )
+
+
+ACTED = ("rpm_", "force_", "tau")
+"""Inputs that are what acted, unless the header states otherwise."""
+
+RPM = 2.0 * np.pi / 60.0
+"""rad/s of one turn a minute."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """The inputs of a trial as k forces."""
+
+    t: Array
+    """Times at which all of them are known [s], (n,)."""
+    force: Array
+    """[N; N m for the moments of a wrench], (n, k), k <= 8."""
+    B: Array
+    """Wrench about the body origin per unit force, body frame, (6, k)."""
+    names: tuple[str, ...]
+    """Thrusters, or `tau_x` ... `tau_n`."""
+    commanded: bool
+    """True if these were commanded: limits, dead zone, delay, lag and slew of the motors lie before what acted."""
+    thrusters: bool
+    """True if the channels are the vehicle's thrusters, in canonical order."""
+    held: bool
+    """True if a value acts until the next, rather than linearly to it."""
+    spans: Array
+    """Beginnings and ends of the stretches in which the inputs are known [s], (s, 2)."""
+    source: str
+    """`rpm`, `force`, `tau`, `pwm`, `command`, or `passive`."""
+    end: float | None = None
+    """Time from which on the recording continues and the inputs are unknown [s]; None if they last as long."""
+    findings: tuple[Finding, ...] = ()
+    """Assumptions."""
+
+    def at(self, t: Array) -> Array:
+        """Forces at given times [s], (m,) -> (m, k), before the motors; beyond the ends the nearest."""
+        if self.held:
+            return self.force[np.maximum(np.searchsorted(self.t, t, side="right") - 1, 0)]
+        return np.stack([np.interp(t, self.t, column) for column in self.force.T], axis=-1)
+
+
+def drive(trial: Trial, vehicle: Vehicle) -> Drive:
+    """The inputs of a trial: shaft speeds before forces before a wrench before pulse widths before commanded forces.
+
+    A kind that is there for some thrusters only is passed over for a complete one. Axes of a wrench that have no column
+    are taken as zero, for that is how single-axis trials are logged; thrusters without a column are not.
+
+    Raises:
+        CalibrationError: No inputs, a thruster that the vehicle has not, some thrusters missing, or pulse widths
+            without a speed controller in the vehicle file.
+    """
+    if trial.header.passive:
+        return _undriven(trial)
+    present = input_columns(trial, vehicle)
+    kind = first_complete(present, trial, vehicle)
+    columns = present[kind]
+    commanded, held, stepped = _between(trial, kind, columns)
+    t, values = _common_times(trial, columns, held)
+    force, B, names = _channels(trial, vehicle, kind, columns, t, values)
+    end = _end(trial, t, force) if held else None
+    zero_after = end is not None and trial.header.inputs_after == "zero"
+    if end is not None and zero_after:
+        t, force, end = np.append(t, end), np.concatenate([force, np.zeros_like(force[:1])]), None
+    if len(names) > MAX_THRUSTERS:
+        if commanded:
+            raise CalibrationError(
+                f"{len(names)} commanded thrusters are more than the {MAX_THRUSTERS} that are simulated; "
+                "give the wrench that acted as tau_x ... tau_n",
+                trial.name,
+            )
+        force, B, names = force @ B.T, np.eye(6), TAU
+    return Drive(
+        t=t,
+        force=force,
+        B=B,
+        names=names,
+        commanded=commanded,
+        thrusters=names is not TAU,
+        held=held,
+        spans=_held_spans(t, trial.t, end) if held else _spans(t),
+        end=end,
+        source=kind.rstrip("_"),
+        findings=(*_assumed(kind, present, stepped), *([finding("inputs_zero_after")] if zero_after else [])),
+    )
+
+
+def _undriven(trial: Trial) -> Drive:
+    """No wrench at any time, as in a passive trial."""
+    return Drive(
+        t=trial.t,
+        force=np.zeros((len(trial.t), 6)),
+        B=np.eye(6),
+        names=TAU,
+        commanded=False,
+        thrusters=False,
+        held=False,
+        spans=_spans(trial.t),
+        source="passive",
+    )
+
+
+def _between(trial: Trial, kind: str, columns: list[str]) -> tuple[bool, bool, bool]:
+    """Return whether inputs were commanded, hold from row to row, and are observed to hold though the header does not
+    state it."""
+    header = trial.header
+    commanded = header.inputs == "commanded" or (header.inputs is None and kind not in ACTED)
+    if header.inputs_between is not None:
+        return commanded, header.inputs_between == "held", False
+    stepped = not commanded and _keeps_levels(trial, columns)
+    return commanded, commanded or stepped, stepped
+
+
+def _channels(
+    trial: Trial, vehicle: Vehicle, kind: str, columns: list[str], t: Array, values: Array
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """Forces (n, k), their map to the wrench about the body origin (6, k), and names."""
+    if kind != "tau":
+        force = _forces(kind, values, t, trial, vehicle)
+        return force, vehicle.thruster_matrix(), vehicle.thruster_names
+    wrench = np.zeros((len(t), 6))
+    wrench[:, [TAU.index(name) for name in columns]] = values
+    return wrench, _about_origin(trial.header, vehicle), TAU
+
+
+def _assumed(kind: str, present: dict[str, list[str]], stepped: bool) -> list[Finding]:
+    """Return findings about the assumptions."""
+    source = kind.rstrip("_")
+    findings = [
+        finding("inputs_incomplete", kind=k, used=source) for k in ORDER[: ORDER.index(kind)] if present[k]
+    ]
+    if stepped:
+        findings.append(finding("inputs_held", kind=source))
+    missing = [name for name in TAU if name not in present[kind]] if kind == "tau" else []
+    if missing:
+        findings.append(finding("wrench_zero", columns=tuple(missing)))
+    return findings
+
+
+def applied_wrench(drive: Drive, vehicle: Vehicle, t: Array) -> Array:
+    """Wrench that acted, about the body origin, body frame [N, N m].
+
+    Where the inputs are commands, the motors of the vehicle file lie between: limits, dead zone, delay, lag and slew,
+    exact for a command that is held until the next.
+
+    Args:
+        drive: Of the trial.
+        vehicle: Whose motors they are.
+        t: Times [s], (m,).
+
+    Returns:
+        (m, 6); NaN outside the recorded inputs and inside their gaps.
+    """
+    if drive.commanded:
+        motors = thruster_motors(vehicle) if drive.thrusters else wrench_motors(vehicle)
+        force = delivered(motors, drive.t, drive.force, t)
+    else:
+        force = drive.at(t)
+    tau = force @ drive.B.T
+    slack = 0.5 * float(np.median(np.diff(drive.t)))
+    covered = np.any((t >= drive.spans[:, :1] - slack) & (t <= drive.spans[:, 1:] + slack), axis=0)
+    tau[~covered] = np.nan
+    return np.asarray(tau)
+
+
+def widest_step(t: Array) -> float:
+    """Longest time between samples of a stream that is not yet a gap [s]: half a second, or four usual steps."""
+    return max(0.5, 4.0 * float(np.median(np.diff(t)))) if len(t) > 1 else 0.5
+
+
+def _spans(t: Array) -> Array:
+    """Stretches without a gap, (s, 2)."""
+    wide = np.diff(t) > widest_step(t)
+    return np.stack([t[np.concatenate([[True], wide])], t[np.concatenate([wide, [True]])]], axis=-1)
+
+
+def _held_spans(t: Array, recording: Array, end: float | None) -> Array:
+    """Return where a command holds until the next, but not through a gap of the complete recording, nor beyond its
+    stream's end."""
+    inside = recording[(recording >= t[0]) & (recording <= (np.inf if end is None else end))]
+    return _spans(inside)
+
+
+def _end(trial: Trial, t: Array, force: Array) -> float | None:
+    """When a stream of commands ended well before the recording did, with thrust still asked for [s]; else None."""
+    after = trial.header.inputs_after
+    steps = np.diff(t)
+    longest = max(widest_step(t), 1.5 * float(steps.max()))
+    early = float(trial.t[-1] - t[-1]) > longest and after != "held"
+    if not early or (after is None and not np.any(force[-1])):
+        return None
+    return float(t[-1] + np.median(steps))
+
+
+def _keeps_levels(trial: Trial, columns: list[str]) -> bool:
+    """Return whether inputs stay exactly at levels and jump between them from row to row, as a program sets them.
+
+    What motors delivered passes through the values between, and what a sensor measured never repeats.
+    """
+    jumps = alone = 0
+    for column in columns:
+        _, values = trial.series(column)
+        change = np.concatenate([[False], values[1:] != values[:-1], [False]])
+        jumps += int(change.sum())
+        alone += int((change[1:-1] & ~change[:-2] & ~change[2:]).sum())
+    return jumps >= 2 and alone >= 0.9 * jumps
+
+
+def _common_times(trial: Trial, columns: list[str], held: bool) -> tuple[Array, Array]:
+    """Columns at the times when all of them are known: the last value if held, else in a straight line.
+
+    Raises:
+        CalibrationError: There is no such time.
+    """
+    series = [trial.series(column) for column in columns]
+    first, last = max(t[0] for t, _ in series), min(t[-1] for t, _ in series)
+    end = max(t[-1] for t, _ in series) if held else last
+    t = np.unique(np.concatenate([s for s, _ in series]))
+    t = t[(t >= first) & (t <= end)]
+    if len(t) < 2:
+        raise CalibrationError(
+            f"{', '.join(columns[:8])} are never known together: expected inputs that overlap in time",
+            trial.name,
+        )
+    if held:
+        return t, np.stack([v[np.searchsorted(s, t, side="right") - 1] for s, v in series], axis=-1)
+    for s, _ in series:
+        i = np.searchsorted(s, t, side="right") - 1
+        after = np.minimum(i + 1, len(s) - 1)
+        t = t[(s[i] == t) | (s[after] - s[i] <= widest_step(s))]
+    return t, np.stack([np.interp(t, s, v) for s, v in series], axis=-1)
+
+
+def _forces(kind: str, values: Array, t: Array, trial: Trial, vehicle: Vehicle) -> Array:
+    """Thrust of each thruster [N], (n, k)."""
+    thrusters = vehicle.thrusters.items()
+    if kind == "rpm_":
+        return np.stack(
+            [thruster.thrust(RPM * v) for (_, thruster), v in zip(thrusters, values.T, strict=True)], axis=-1
+        )
+    if kind != "pwm_":
+        return values
+    bare = [name for name, thruster in thrusters if thruster.esc is None]
+    if bare:
+        raise CalibrationError(
+            f"pwm_{bare[0]} needs an esc section for thruster {bare[0]} in vehicle {vehicle.name}: "
+            "calibrate one with 'finssim calibrate thruster', or log rpm, force or wrench",
+            trial.name,
+        )
+    voltage: Array | float | None = trial.header.voltage
+    if trial.has("voltage"):
+        voltage = np.interp(t, *trial.series("voltage"))
+    return np.stack(
+        [
+            thruster.thrust(thruster.shaft_speed(v, voltage))
+            for (_, thruster), v in zip(thrusters, values.T, strict=True)
+        ],
+        axis=-1,
+    )
+
+
+def _about_origin(header: Header, vehicle: Vehicle) -> Array:
+    """Map of a wrench about `wrench_at` to the body origin: M_O = M_P + r_P × F, (6, 6)."""
+    at = header.wrench_at
+    if at is None:
+        point = vehicle.wrench_reference
+    elif at == "origin":
+        point = np.zeros(3)
+    else:
+        point = vehicle.body.center_of_gravity if at == "center_of_gravity" else np.asarray(at, float)
+    B = np.eye(6)
+    B[3:, :3] = skew(point)
+    return B

@@ -1,0 +1,743 @@
+"""One trial on a uniform grid: velocities, attitude and applied wrench about the body origin.
+
+What is measured is smoothed (`finssim.trials.motion`) and moved to the body origin; what is not is
+derived where the other columns allow it, and NaN where they do not. Nothing is interpolated across a gap.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dst
+from scipy.linalg import solveh_banded
+
+from finssim.core.rotations import (
+    quat_conjugate,
+    quat_from_euler,
+    quat_inverse_rotate,
+    quat_multiply,
+    quat_rotate,
+)
+from finssim.trials.conversion import EULER, QUATERNION
+from finssim.trials.findings import Finding, finding
+from finssim.trials.inputs import Drive, applied_wrench, drive
+from finssim.trials.trial import COLUMNS, NU, Trial
+from finssim.vehicles import Vehicle
+
+__all__ = [
+    "AttitudeSignal", "Motion", "Offset", "attitude_samples", "attitude_signal", "holds_gravity", "motion",
+    "offset", "on_grid", "phase_at", "up_in_body",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttitudeSignal:
+    """Attitude on a grid of m times, as far as it is known."""
+
+    quaternion: Array
+    """Body to world, (m, 4); NaN where unknown, and everywhere if the tilt is not measured."""
+    rates: Array
+    """omega from the derivative of the attitude, body frame [rad/s], (m, 3); NaN where unknown."""
+    rates_std: Array
+    """Standard deviation of `rates` [rad/s], (3,)."""
+    turn: Array
+    """Rotation to use for vectors: `quaternion`, or level with the measured heading, (m, 4); NaN where unknown."""
+    heading: bool
+    """True if the heading is measured; otherwise `quaternion` has heading 0 and only its tilt is meaningful."""
+    tilt: bool
+    """True if roll and pitch are measured."""
+
+
+def attitude_samples(trial: Trial) -> tuple[Array, Array, tuple[str, ...]]:
+    """Attitude as sampled.
+
+    Returns:
+        Times (n,) [s], quaternions (n, 4) with 0 for angles that are not measured, and which of roll, pitch, yaw are.
+    """
+    if trial.has(*QUATERNION):
+        q = np.stack([trial.channels[name] for name in QUATERNION], axis=-1)
+        good = np.isfinite(q).all(axis=1)
+        return trial.t[good], q[good], EULER
+    given = tuple(name for name in EULER if trial.has(name))
+    if "roll" in given and "pitch" not in given or "pitch" in given and "roll" not in given:
+        given = tuple(name for name in given if name == "yaw")  # half a tilt is no attitude
+    if not given:
+        return np.empty(0), np.empty((0, 4)), ()
+    t = max((trial.series(name)[0] for name in given), key=len)
+    t = t[
+        (t >= max(trial.series(n)[0][0] for n in given)) & (t <= min(trial.series(n)[0][-1] for n in given))
+    ]
+    angles = {name: np.interp(t, trial.series(name)[0], np.unwrap(trial.series(name)[1])) for name in given}
+    zero = np.zeros(len(t))
+    q = quat_from_euler(*(angles.get(name, zero) for name in EULER))
+    flips = np.cumsum(np.sum(q[1:] * q[:-1], axis=-1) < 0.0) % 2 == 1
+    q[1:][flips] *= -1.0
+    return t, q, given
+
+
+def attitude_signal(trial: Trial, at: Array) -> AttitudeSignal:
+    """The attitude of a trial, smoothed, at given times (m,)."""
+    t, q, given = attitude_samples(trial)
+    nothing = np.full((len(at), 4), np.nan)
+    if len(t) < 2:
+        return AttitudeSignal(
+            quaternion=nothing,
+            rates=nothing[:, :3],
+            rates_std=np.full(3, np.nan),
+            turn=nothing,
+            heading=False,
+            tilt=False,
+        )
+    s = smooth(t, q, at, order=3, together=True)
+    length = np.linalg.norm(s.value, axis=1, keepdims=True)
+    quaternion = s.value / length
+    # q_dot = q omega / 2, with omega in body axes; the length of q drops out of the vector part.
+    rates = 2.0 * quat_multiply(quat_conjugate(quaternion), s.slope / length)[:, :3]
+    tilt, heading = "roll" in given, "yaw" in given
+    measured = np.array([tilt, tilt, heading])
+    rates[:, ~measured] = np.nan
+    return AttitudeSignal(
+        quaternion=quaternion if tilt else nothing,
+        rates=rates,
+        rates_std=np.where(measured, 2.0 * np.mean(s.slope_std), np.nan),
+        turn=quaternion,
+        heading=heading,
+        tilt=tilt,
+    )
+
+
+def up_in_body(quaternion: Array) -> Array:
+    """World z in the body frame, (m, 4) -> (m, 3)."""
+    return quat_rotate(quat_conjugate(quaternion), np.array([0.0, 0.0, 1.0]))
+
+
+# Velocity and position of the body origin on a grid, measured or derived from what is.
+
+STEEPEST = 0.3
+"""Cosine of the tilt below which a vertical velocity does not determine heave."""
+
+
+@dataclass
+class _Column:
+    """One column on the grid; all NaN if the trial does not have it."""
+
+    value: Array
+    slope: Array
+    raw: Array
+    noise: float = np.nan
+    slope_std: float = np.nan
+
+
+def velocities(trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSignal) -> dict[str, Any]:
+    """Velocity and position of the body origin: the fields of `Motion` that follow from the measured columns.
+
+    Args:
+        trial: The trial.
+        vehicle: Gives the place of the pressure sensor where the header does not.
+        at: Times [s], (m,).
+        attitude: At these times.
+    """
+    header, findings = trial.header, list[Finding]()
+    measured = [_column(trial, name, at, 2) for name in NU]
+    nu = np.stack([c.value for c in measured], axis=-1)
+    raw = np.stack([c.raw for c in measured], axis=-1)
+    noise = np.array([c.noise for c in measured])
+    source = ["measured" if trial.has(name) else "" for name in NU]
+    for i in range(3, 6):
+        if not source[i] and np.isfinite(attitude.rates[:, i - 3]).any():
+            nu[:, i], noise[i] = attitude.rates[:, i - 3], attitude.rates_std[i - 3]
+            source[i] = "derived from attitude"
+    omega = nu[:, 3:]
+    arm = np.asarray(header.velocity_at, float)
+    if arm.any():
+        if _lacks(omega, arm) and any(source[:3]):
+            findings.append(finding("rates_unknown"))
+        nu[:, :3] -= arm_velocity(omega, arm)
+        raw[:, :3] -= arm_velocity(omega, arm)
+    if header.velocity == "water" and header.water.current is not None:
+        drift = quat_inverse_rotate(attitude.turn, np.asarray(header.water.current, float))
+        nu[:, :3] += drift
+        raw[:, :3] += drift
+    position, flow, stds = _origin(trial, vehicle, at, attitude, omega)
+    for i, (column, name) in enumerate(_derived(nu, source, flow, attitude, trial, findings)):
+        if name:
+            nu[:, i], source[i] = column, name
+            noise[i] = stds[2] if i == 2 else stds[:2].mean()
+    return {
+        "nu": nu,
+        "raw": raw,
+        "nu_source": tuple(source),
+        "noise_std": noise,
+        "position": position,
+        "findings": tuple(findings),
+    }
+
+
+def arm_velocity(omega: Array, arm: Array) -> Array:
+    """omega × r, with unknown rates taken as 0, body frame [m/s], (m, 3).
+
+    Args:
+        omega: Angular velocity, body frame [rad/s], (m, 3).
+        arm: r from the body origin, body frame [m], (3,).
+    """
+    return np.cross(np.nan_to_num(omega), arm)
+
+
+def _lacks(omega: Array, arm: Array) -> bool:
+    """Return whether a rate that would move a point at `arm` is unknown throughout."""
+    unknown = ~np.asarray(np.isfinite(omega).any(axis=0))
+    return any(unknown[i] and np.delete(arm, i).any() for i in range(3))
+
+
+def _column(trial: Trial, name: str, at: Array, order: int) -> _Column:
+    t, y = trial.series(name)
+    nothing = np.full(len(at), np.nan)
+    if len(t) < 2:
+        return _Column(nothing, nothing, nothing)
+    s = smooth(t, y[:, None], at, order=order)
+    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    gap = longest_step(t)
+    bridged = (at >= t[0] - 1e-6) & (at <= t[-1] + 1e-6) & (t[i + 1] - t[i] <= gap)
+    raw = np.where(bridged, np.interp(at, t, y), np.nan)
+    return _Column(s.value[:, 0], s.slope[:, 0], raw, float(s.noise[0]), float(s.slope_std[0]))
+
+
+def _origin(
+    trial: Trial,
+    vehicle: Vehicle,
+    at: Array,
+    attitude: AttitudeSignal,
+    omega: Array,
+) -> tuple[Array, Array, Array]:
+    """Position and velocity of the body origin in the world, (m, 3) each, and the standard deviations of the latter and
+    of its slope by axis, (3, 2)."""
+    header = trial.header
+    x, y, z = (_column(trial, name, at, 3) for name in "xyz")
+    arms = [np.asarray(header.position_at, float)] * 3
+    if not trial.has("z") and trial.has("depth"):
+        depth = _column(trial, "depth", at, 3)
+        z = replace(depth, value=-depth.value, slope=-depth.slope)
+        arms[2] = depth_place(trial, vehicle)
+    known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
+    turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
+    value = np.stack([x.value, y.value, z.value], axis=-1)
+    slope = np.stack([x.slope, y.slope, z.slope], axis=-1)
+    for i, arm in enumerate(arms):
+        if arm.any():
+            value[:, i] -= quat_rotate(turn, arm)[:, i]
+            slope[:, i] -= quat_rotate(turn, arm_velocity(omega, arm))[:, i]
+            if attitude.tilt or attitude.heading:
+                value[~known, i] = slope[~known, i] = np.nan
+    return value, slope, np.array([c.slope_std for c in (x, y, z)])
+
+
+def depth_place(trial: Trial, vehicle: Vehicle) -> Array:
+    """Body point of the pressure sensor [m], (3,): the header's, the vehicle's, or the origin."""
+    if trial.header.depth_at is not None:
+        return np.asarray(trial.header.depth_at, float)
+    return np.zeros(3) if vehicle.sensors.depth is None else np.asarray(vehicle.sensors.depth.position, float)
+
+
+def _derived(
+    nu: Array, source: list[str], flow: Array, attitude: AttitudeSignal, trial: Trial, findings: list[Finding]
+) -> list[tuple[Array, str]]:
+    """Return u, v, w from the world velocity of the origin, and the names of their sources; no name if it is not
+    determined."""
+    known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
+    turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
+    horizontal = trial.has("x", "y") and attitude.heading
+    vertical = bool(np.isfinite(flow[:, 2]).any())
+    wanted = [not source[i] and (vertical if i == 2 else horizontal) for i in range(3)]
+    if any(wanted) and not attitude.tilt:
+        findings.append(finding("taken_level"))
+    if horizontal:
+        world = flow if vertical else np.concatenate([flow[:, :2], np.zeros((len(flow), 1))], axis=1)
+        body = quat_inverse_rotate(turn, world)
+        body[~known] = np.nan
+    else:
+        # Vertical velocity alone: z_dot = up · v, solved for heave with surge and sway as far as they are known.
+        up = quat_inverse_rotate(turn, np.array([0.0, 0.0, 1.0]))
+        if attitude.tilt:
+            up[~known] = np.nan
+        rest = np.sum(up[:, :2] * np.nan_to_num(nu[:, :2]), axis=1)
+        heave = np.where(up[:, 2] > STEEPEST, (flow[:, 2] - rest) / up[:, 2], np.nan)
+        body = np.stack([heave * np.nan, heave * np.nan, heave], axis=-1)
+    names = ["derived from position"] * 2 + [f"derived from {'position' if trial.has('z') else 'depth'}"]
+    return [(column, name if use else "") for column, name, use in zip(body.T, names, wanted, strict=True)]
+
+
+ACCELERATION = ("ax", "ay", "az")
+
+
+def holds_gravity(trial: Trial, gravity: float) -> bool:
+    """Return whether the accelerations are specific force, from the header or from their size.
+
+    Vehicles under water accelerate far less than gravity: what is about as large as gravity holds it. With only ax or
+    ay there is nothing to tell it by, and an accelerometer is assumed.
+
+    Args:
+        trial: Its header and its columns ax, ay, az.
+        gravity: [m/s²]
+    """
+    if trial.header.acceleration != "auto":
+        return trial.header.acceleration == "specific_force"
+    given = [name for name in ACCELERATION if trial.has(name)]
+    if "az" not in given:
+        return True
+    squares = [np.median(np.square(trial.series(name)[1])) for name in given]
+    return float(np.sqrt(np.sum(squares))) > 0.5 * gravity
+
+
+FASTEST = 100.0
+"""Rate of the grid that is not exceeded unless asked for [Hz]; bodies in water do not need more."""
+
+MOST = 0.5
+"""An axis that is known for less than this part of a trial does not decide which rows are valid."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """A trial on a uniform grid of n times. Body frame, about the body origin, unless stated otherwise."""
+
+    t: Array
+    """Times on the trial's clock [s], (n,)."""
+    rate: float
+    """Rate of the grid [Hz]."""
+    nu: Array
+    """u, v, w, p, q, r, smoothed [m/s, rad/s], (n, 6); NaN where unknown. Relative to the ground, or to the water where
+    the header says so and gives no current."""
+    raw: Array
+    """Velocities of measured axes, not smoothed, linear between samples, (n, 6); NaN if not measured."""
+    quaternion: Array
+    """Rotation from body to world, (n, 4); NaN without roll and pitch. The heading is 0 if it was not measured."""
+    position: Array
+    """World frame [m], (n, 3); NaN where unknown."""
+    tau: Array
+    """Wrench that acted [N, N m], (n, 6); commands have passed the motors of the vehicle file. NaN where unknown."""
+    phase: NDArray[np.str_]
+    """(n,); empty words where the trial names none."""
+    valid: NDArray[np.bool_]
+    """True if the wrench and every axis that is known for most of the trial are known, (n,)."""
+    nu_source: tuple[str, ...]
+    """Source of each axis: `measured`, `derived from position`, `derived from depth`, `derived from attitude`, or
+    nothing."""
+    noise_std: Array
+    """Standard deviation by axis of one sample of a measured velocity, or of the value of a derived one, (6,)."""
+    findings: tuple[Finding, ...] = ()
+    """Assumptions."""
+
+
+def motion(trial: Trial, vehicle: Vehicle) -> Motion:
+    """A trial on a uniform grid, of the rate of its fastest stream up to 100 Hz.
+
+    Times between samples of a stream of up to 0.2 s, or four usual steps, are bridged.
+
+    Args:
+        trial: The trial.
+        vehicle: Gives the places of sensors that the header leaves out, the motors and gravity.
+
+    Raises:
+        CalibrationError: The inputs are missing or not of this vehicle.
+    """
+    inputs = drive(trial, vehicle)
+    rate = grid_rate(trial, inputs)
+    t = trial.t[0] + np.arange(int(np.floor(trial.duration * rate + 1e-6)) + 1) / rate
+    attitude = attitude_signal(trial, t)
+    found = velocities(trial, vehicle, t, attitude)
+    found["findings"] = (*inputs.findings, *found["findings"])
+    tau = applied_wrench(inputs, vehicle, t)
+    return Motion(
+        t=t,
+        rate=rate,
+        quaternion=attitude.quaternion,
+        tau=tau,
+        phase=phase_at(trial, t),
+        valid=_valid(tau, found["nu"]),
+        **found,
+    )
+
+
+def grid_rate(trial: Trial, inputs: Drive) -> float:
+    """Rate of the fastest stream of inputs or motion, up to `FASTEST` [Hz]."""
+    steps = [float(np.median(np.diff(inputs.t)))] if inputs.source != "passive" else []
+    for column in trial.channels:
+        if column in COLUMNS and COLUMNS[column].group != "command" and trial.has(column):
+            steps.append(float(np.median(np.diff(trial.series(column)[0]))))
+    rate = 1.0 / min(steps) if steps else 1.0 / float(np.median(np.diff(trial.t)))
+    whole = round(rate)
+    return float(min(FASTEST, whole if whole >= 5 and abs(rate / whole - 1.0) < 0.01 else rate))
+
+
+def phase_at(trial: Trial, t: Array) -> NDArray[np.str_]:
+    """The phase that the log names at some times on the trial's clock [s], (n,); empty words where it names none."""
+    if trial.phase is None:
+        return np.full(len(t), "", dtype="<U10")
+    return trial.phase[np.maximum(np.searchsorted(trial.t, t + 1e-9, side="right") - 1, 0)]
+
+
+def _valid(tau: Array, nu: Array) -> NDArray[np.bool_]:
+    known = np.isfinite(nu)
+    counted = known.mean(axis=0) >= MOST if known.any() else np.zeros(len(NU), bool)
+    return np.asarray(np.isfinite(tau).all(axis=1) & known.any(axis=1) & known[:, counted].all(axis=1))
+
+
+# Constant time offset between two signals of the same motion.
+
+
+RATE = 100.0
+"""Rate of the grid on which streams are compared [Hz]; the peak is found between its points."""
+
+LONGEST = 1.0
+"""Offsets up to this are looked for [s]."""
+
+NEAR = 0.15
+"""Distance from the most shared motion within which the peak is refined [s]."""
+
+BLOCKS = 10
+"""Parts of a recording, each left out in turn to see how far the offset rests on it."""
+
+LEAST = 0.6
+"""Correlation below which two streams do not agree on any motion, so that their offset is unknown."""
+
+
+class Offset(NamedTuple):
+    """Time offset between two streams."""
+
+    seconds: float
+    """Time to add to the stream's times so that both agree [s]."""
+    std: float
+    """Standard deviation of `seconds` [s]."""
+    correlation: float
+    """Correlation of the two streams once they agree, -1 to 1."""
+
+
+def on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int = 2) -> tuple[Array, Array]:
+    """Columns of a trial, smoothed, and their slopes at times t (m,), (m, c) each; NaN where there are none."""
+    value, slope = np.full((len(t), len(columns)), np.nan), np.full((len(t), len(columns)), np.nan)
+    for i, name in enumerate(columns):
+        at, y = trial.series(name)
+        if len(at) >= 2:
+            s = smooth(at, y[:, None], t, order=order)
+            value[:, i], slope[:, i] = s.value[:, 0], s.slope[:, 0]
+    return value, slope
+
+
+def offset(fixed: Array, moved: Array) -> Offset | None:
+    """The offset of a signal to another of the same motion, from the peak of their correlation.
+
+    Args:
+        fixed: At `RATE`, NaN where unknown, (m, c).
+        moved: The same of the signal whose times are in question, (m, c).
+
+    Returns:
+        None if they do not agree on any motion.
+    """
+    both = np.isfinite(fixed).any(axis=0) & np.isfinite(moved).any(axis=0)
+    if not both.any():
+        return None
+    x, y = _centred(fixed[:, both]), _centred(moved[:, both])
+    longest = min(int(LONGEST * RATE), len(x) // 3)
+    lags = np.arange(-longest, longest + 1)
+    edges = np.linspace(0, len(x), BLOCKS + 1).astype(int)[:-1]
+    sums = np.array([_sums(x, y, int(k), edges) for k in lags])  # (lags, blocks, xx yy xy)
+    energy = np.sqrt(np.nansum(x**2) * np.nansum(y**2))
+    if not energy > 0.0:
+        return None
+    # The most shared motion finds the peak; the correlation of what overlaps, which the ends do not pull, refines it.
+    near = np.abs(lags - lags[int(np.argmax(sums[..., 2].sum(axis=1)))]) <= NEAR * RATE
+    place, height = _peak(_correlation(sums.sum(axis=1)), near)
+    if not height >= LEAST:
+        return None
+    parts = [_peak(_correlation(np.delete(sums, b, axis=1).sum(axis=1)), near)[0] for b in range(BLOCKS)]
+    spread = float(np.sqrt((BLOCKS - 1) * np.var(parts)))  # jackknife: one short event must not look certain
+    if not np.isfinite(spread):  # without one part there is no peak
+        return None
+    return Offset(-float(lags[0] + place) / RATE, max(spread, 0.1) / RATE, height)
+
+
+def _peak(correlation: Array, near: NDArray[np.bool_]) -> tuple[float, float]:
+    """Place, between the samples, and height of the highest peak of the part that is near; NaN if on its edge."""
+    best = int(np.argmax(np.where(near, correlation, -2.0)))
+    if best in (0, len(near) - 1) or not (near[best - 1] and near[best + 1]):
+        return np.nan, np.nan
+    before, peak, after = correlation[best - 1 : best + 2]
+    bend = before - 2.0 * peak + after
+    return best + (0.5 * (before - after) / bend if bend < 0.0 else 0.0), float(peak)
+
+
+def _centred(x: Array) -> Array:
+    return np.asarray(x - np.nanmedian(x, axis=0))
+
+
+def _sums(x: Array, y: Array, lag: int, edges: NDArray[np.int64]) -> Array:
+    """Sums of x², y² and x y of x(t) and y(t + lag) where both are known, by block of t, (blocks, 3)."""
+    n = len(x)
+    products = np.zeros((n, 3))
+    rows = slice(max(0, -lag), n - max(0, lag))
+    a, b = x[rows], y[max(0, lag) : n - max(0, -lag)]
+    known = np.isfinite(a) & np.isfinite(b)
+    a, b = np.where(known, a, 0.0), np.where(known, b, 0.0)
+    products[rows] = np.stack([np.sum(a * a, axis=1), np.sum(b * b, axis=1), np.sum(a * b, axis=1)], axis=-1)
+    return np.add.reduceat(products, edges, axis=0)
+
+
+def _correlation(sums: Array) -> Array:
+    """Return the correlation from sums of x², y² and x y, (lags, 3) -> (lags,)."""
+    return np.asarray(sums[:, 2] / np.maximum(np.sqrt(sums[:, 0] * sums[:, 1]), 1e-300))
+
+
+# Zero-phase smoothing of unevenly sampled signals, its strength chosen from the data.
+#
+# A penalised cubic B-spline (Eilers and Marx 1996), with up to a knot per sample, fitted to every stretch without a
+# gap:
+#
+#     min Σ (y_i - f(t_i))² + λ Σ (Δᵐ c)²
+#
+# λ is the one under which the data are most likely (restricted maximum likelihood; Wahba 1985), with the spectrum of
+# the smoother on a uniform grid, where sines diagonalise it. It is found for windows of some seconds and goes from
+# one to the next, so that a push is followed closely and the calm after it is not. Of the noise only whiteness is
+# assumed.
+
+FEWEST = 5
+"""Samples that a stretch needs; shorter ones are left out."""
+
+CANDIDATES = 48
+"""Values of λ that are tried."""
+
+WINDOW = 200
+"""Samples of a window, half shared with the next, at least; shorter stretches have one λ."""
+
+WINDOW_TIME = 4.0
+"""Length of a window, at least [s]."""
+
+SHARE = 0.3
+"""Weight, for a sample of a window, of the mean likelihood over all windows: what a window leaves open they decide."""
+
+STIFFEST = 1e9
+"""Largest λ where it varies: beside closely followed parts the equations would lose digits far above it."""
+
+KNOT_PHASE = 0.2
+"""Most that the frequency of half loss turns from one knot to the next [rad]."""
+
+MIN_INTERVALS = 4
+
+SPIKE = 8.0
+"""Robust standard deviations beyond which a sample is a spike."""
+
+
+class Smooth(NamedTuple):
+    """Signals on a grid; NaN where no stretch of samples reaches."""
+
+    value: Array
+    """(m, c)"""
+    slope: Array
+    """Its time derivative, (m, c)."""
+    noise: Array
+    """Standard deviation of one sample, (c,)."""
+    slope_std: Array
+    """Standard deviation of `slope`, of what noise remains and what signal was lost (Wahba 1983), (c,)."""
+
+
+def longest_step(t: Array) -> float:
+    """Longest time between samples that is still bridged [s]: 0.2 s, or four usual steps."""
+    return max(0.2, 4.0 * float(np.median(np.diff(t)))) if len(t) > 1 else 0.2
+
+
+def stretches(t: Array, max_gap: float) -> list[slice]:
+    """Runs of samples with no step longer than `max_gap`."""
+    edges = [0, *(np.flatnonzero(np.diff(t) > max_gap) + 1), len(t)]
+    return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False) if b > a]
+
+
+def spans_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Runs of samples that are true, [begin, end) each."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(b), int(e)) for b, e in edges.reshape(-1, 2)]
+
+
+def white_noise(values: Array) -> float:
+    """Standard deviation of white noise on a signal that is smooth from sample to sample, from its second differences.
+
+    Args:
+        values: Evenly sampled, finite, (n,).
+
+    Returns:
+        NaN for fewer than ten samples.
+    """
+    if len(values) < 10:
+        return math.nan
+    return float(np.median(np.abs(np.diff(values, 2)))) / (0.6745 * math.sqrt(6.0))
+
+
+def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:
+    """Return which samples are not spikes: far from the median of their five nearest, by the spread of all such
+    distances.
+
+    Args:
+        t: Times [s], (n,).
+        y: Values, (n, c).
+
+    Returns:
+        (n,); at most a twentieth is refused, for what happens more often is no spike.
+    """
+    n = len(t)
+    if n < 9:
+        return np.ones(n, bool)
+    padded = np.concatenate([y[2:0:-1], y, y[-2:-4:-1]])
+    median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0), axis=-1)
+    distance = np.abs(y - median)
+    usual_step = np.median(np.abs(np.diff(y, axis=0)), axis=0)
+    spread = np.maximum(1.4826 * np.median(distance, axis=0), 0.5 * usual_step)
+    floor = 0.02 * (np.percentile(y, 95.0, axis=0) - np.percentile(y, 5.0, axis=0)) + 1e-12
+    bad = np.any(distance > SPIKE * np.maximum(spread, floor), axis=1)
+    return ~bad if bad.sum() <= 0.05 * n else np.ones(n, bool)
+
+
+def smooth(t: Array, y: Array, at: Array, *, order: int = 2, together: bool = False) -> Smooth:
+    """Smooth signals that share their sample times.
+
+    Args:
+        t: Times of the samples, increasing [s], (n,).
+        y: Finite values, (n, c).
+        at: Times asked for [s], (m,).
+        order: m, the difference that is penalised: 2 for signals whose slope may jump, as velocities under a step of
+            force; 3 for their integrals.
+        together: One λ for all columns, for parts of one quantity such as a quaternion.
+
+    Returns:
+        On `at`.
+    """
+    good = without_spikes(t, y)
+    gap = longest_step(t)
+    t, y = t[good], y[good]
+    m, c = len(at), y.shape[1]
+    value, slope = np.full((m, c), np.nan), np.full((m, c), np.nan)
+    runs = [run for run in stretches(t, gap) if run.stop - run.start >= FEWEST]
+    if not runs:
+        return Smooth(value, slope, *(np.full(c, np.nan) for _ in range(2)))
+    shared = [slice(0, c)] if together else [slice(i, i + 1) for i in range(c)]
+    figures = np.empty((2, c))
+    for columns in shared:
+        windows = [window for run in runs for window in _windows(t, run)]
+        strength, figures[:, columns] = _choose([_spectrum(t[w], y[w, columns], order) for w in windows])
+        middle = np.array([0.5 * (t[w][0] + t[w][-1]) for w in windows])
+        for run in runs:
+            inside = (at >= t[run][0] - 1e-6) & (at <= t[run][-1] + 1e-6)
+            if inside.any():
+                own = (middle >= t[run][0]) & (middle <= t[run][-1])
+                f = _fit(t[run], y[run, columns], middle[own], strength[own], order, at[inside])
+                value[inside, columns], slope[inside, columns] = f
+    return Smooth(value, slope, *figures)
+
+
+def _windows(t: Array, run: slice) -> list[slice]:
+    """Windows of equal length that overlap by half."""
+    n = run.stop - run.start
+    whole = int(min(n / WINDOW, (t[run][-1] - t[run][0]) / WINDOW_TIME))
+    count = max(1, 2 * whole - 1)
+    width = 2 * n // (count + 1)
+    starts = np.linspace(run.start, run.stop - width, count)
+    return [slice(int(a), int(a) + width) for a in starts]
+
+
+def _spectrum(t: Array, y: Array, order: int) -> tuple[Array, Array, Array]:
+    """Penalty eigenvalue (k,), angular frequency (k,) [rad/s] and power by column (k, c) of the sines of a window."""
+    n = len(t)
+    grid = np.linspace(t[0], t[-1], n)
+    even = np.stack([np.interp(grid, t, column) for column in y.T], axis=-1)
+    part = (np.arange(n) / (n - 1))[:, None]
+    even = even - (1.0 - part) * _first(even) - part * _first(even[::-1])
+    theta = np.pi * np.arange(1, n - 1) / (n - 1)
+    symbol = (2.0 + np.cos(theta)) / 3.0  # a cubic B-spline sampled at its knots
+    penalty = (2.0 * np.sin(theta / 2.0)) ** (2 * order) / symbol**2
+    omega = theta * (n - 1) / (t[-1] - t[0])
+    return penalty, omega, dst(even[1:-1], type=1, norm="ortho", axis=0) ** 2
+
+
+def _first(y: Array) -> Array:
+    """The first value without its noise, (n, c) -> (c,): of the longest line that the first samples follow.
+
+    A line through two noisy ends would be a signal of its own.
+    """
+    noise = np.median(np.abs(np.diff(y, 2, axis=0)), axis=0) / (0.6745 * np.sqrt(6.0))
+    value, following = y[0].copy(), np.ones(y.shape[1], bool)
+    k = 4
+    while k <= len(y) // 8 and following.any():
+        x = np.arange(k) - 0.5 * (k - 1)
+        mean, slope = y[:k].sum(axis=0) / k, 12.0 * (x @ y[:k]) / (k * (k * k - 1.0))
+        rest = y[:k] - mean - x[:, None] * slope
+        fits = following & (np.sqrt(np.sum(rest**2, axis=0) / (k - 2)) <= (1.1 + np.sqrt(2.0 / k)) * noise)
+        value = np.where(fits, mean + x[0] * slope, value)
+        following = fits if k >= 16 else following  # four samples may misfit by chance
+        k *= 4
+    return value
+
+
+def _choose(spectra: list[tuple[Array, Array, Array]]) -> tuple[Array, Array]:
+    """λ of every window (w,), and noise and slope_std by column (2, c)."""
+    smallest, largest = min(p.min() for p, _, _ in spectra), max(p.max() for p, _, _ in spectra)
+    candidates = np.geomspace(1e-4 / largest, 1e1 / smallest, CANDIDATES)
+    unlikely, sizes = np.empty((len(spectra), CANDIDATES)), np.array([len(p) for p, _, _ in spectra])
+    for w, (penalty, _, power) in enumerate(spectra):
+        lost = candidates[:, None] * penalty / (1.0 + candidates[:, None] * penalty)  # eigenvalues of 1 - H
+        unlikely[w] = sizes[w] * np.log(lost @ power.sum(axis=1) + 1e-300) - np.log(lost).sum(axis=1)
+    mean = unlikely.sum(axis=0) / sizes.sum()
+    best = candidates[np.argmin(unlikely + SHARE * sizes[:, None] * mean, axis=1)]
+    figures = []
+    for strength, (penalty, omega, power) in zip(best, spectra, strict=True):
+        lost = strength * penalty / (1.0 + strength * penalty)
+        noise = np.sqrt((lost**2 @ power) / lost.sum())
+        figures.append([noise, noise * np.sqrt(np.mean((1.0 - lost) * omega**2))])
+    squares = np.square(figures)  # (w, 2, c)
+    errors = np.sqrt(np.average(squares, axis=0, weights=sizes))
+    errors[0] = np.sqrt(np.median(squares[:, 0], axis=0))
+    return best, errors
+
+
+def _fit(t: Array, y: Array, middle: Array, strength: Array, order: int, at: Array) -> tuple[Array, Array]:
+    """Value and slope at given times inside [t[0], t[-1]] of the penalised spline, (m, c) each; λ at `middle` (w,)."""
+    # What is smoothed strongly needs few knots; many would only make the equations ill-conditioned.
+    usual = len(t) - 1
+    intervals = max(MIN_INTERVALS, math.ceil(usual * min(1.0, strength.min() ** (-0.5 / order) / KNOT_PHASE)))
+    h = (t[-1] - t[0]) / intervals
+    trend = (y[-1] - y[0]) / (t[-1] - t[0])  # taken off, for what is small has small rounding
+    line, y = y[0] + (at - t[0])[:, None] * trend, y - y[0] - (t - t[0])[:, None] * trend
+    count = intervals + 3
+    if len(strength) > 1:
+        place = t[0] + h * (np.arange(count - order) + 0.5 * order - 1.0)
+        strength = np.exp(np.interp(place, middle, np.log(np.minimum(strength, STIFFEST))))
+    strength = strength * (intervals / usual) ** (2 * order - 1)
+    cell, weights, _ = _basis((t - t[0]) / h, intervals)
+    band = np.zeros((4, count))
+    for a in range(4):
+        for b in range(a, 4):
+            band[b - a] += np.bincount(cell + a, weights[a] * weights[b], count)
+    difference = np.array([1.0])
+    for _ in range(order):
+        difference = np.convolve(difference, [1.0, -1.0])
+    for a in range(order + 1):
+        for b in range(a, order + 1):
+            band[b - a, a : a + count - order] += strength * difference[a] * difference[b]
+    right = np.stack(
+        [sum(np.bincount(cell + a, weights[a] * column, count) for a in range(4)) for column in y.T], axis=-1
+    )
+    coefficients = solveh_banded(band, right, lower=True, check_finite=False)
+    cell, weights, slopes = _basis((at - t[0]) / h, intervals)
+    parts = coefficients[cell[:, None] + np.arange(4)]
+    return line + np.einsum("am,mac->mc", weights, parts), trend + np.einsum("am,mac->mc", slopes, parts) / h
+
+
+def _basis(x: Array, intervals: int) -> tuple[NDArray[np.intp], Array, Array]:
+    """Cell, and values and slopes of the four uniform cubic B-splines that are not zero there, (4, m) each."""
+    cell = np.clip(np.floor(x).astype(np.intp), 0, intervals - 1)
+    s = x - cell
+    r = 1.0 - s
+    values = [r**3, 3.0 * s**3 - 6.0 * s**2 + 4.0, 3.0 * r**3 - 6.0 * r**2 + 4.0, s**3]
+    slopes = [-(r**2), 3.0 * s**2 - 4.0 * s, -3.0 * r**2 + 4.0 * r, s**2]
+    return cell, np.stack(values) / 6.0, np.stack(slopes) / 2.0

@@ -1,0 +1,321 @@
+"""One trial: what was commanded and measured while a vehicle moved, in canonical columns."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+
+from finssim.core.page import notebook_html
+from finssim.trials.findings import CalibrationError, Finding
+from finssim.vehicles.part import Part, refuse_section, refuse_value
+from finssim.vehicles.vehicle import Axis
+
+__all__ = ["Array", "Header", "NU", "PHASES", "TAU", "Trial", "TrialWater", "column_of"]
+
+Array = NDArray[np.float64]
+
+
+def _point(value: Any) -> Any:
+    numbers = value if isinstance(value, (list, tuple)) else ()
+    finite = [isinstance(x, (int, float)) and not isinstance(x, bool) and math.isfinite(x) for x in numbers]
+    if len(finite) != 3 or not all(finite):
+        raise refuse_value(f"is {value!r}, expected 3 numbers [x, y, z]")
+    return value
+
+
+def _moment_point(value: Any) -> Any:
+    if isinstance(value, str) and value not in ("center_of_gravity", "origin"):
+        raise refuse_value(f"is {value!r}, expected 3 numbers [x, y, z], center_of_gravity or origin")
+    return value if value is None or isinstance(value, str) else _point(value)
+
+
+Point = Annotated[tuple[float, float, float], BeforeValidator(_point)]
+
+
+class _Section(Part):
+    model_config = ConfigDict(allow_inf_nan=False)
+
+
+class TrialWater(_Section):
+    """The water of the trial, where it differs from the vehicle file's."""
+
+    density: float | None = Field(default=None, gt=0.0)
+    """[kg/m³]"""
+    depth: float | None = Field(default=None, gt=0.0)
+    """Depth of the pool [m]."""
+    current: Point | None = None
+    """World frame [m/s]."""
+
+
+class Header(_Section):
+    """Content of `trial.yaml`. All keys are optional; the page on trials gives their defaults."""
+
+    vehicle: str | None = None
+    """Name or file of the vehicle."""
+    axis: tuple[Axis, ...] = ()
+    """Axes that the trial excites; found from the data where empty."""
+    role: Literal["fit", "held-out"] | None = None
+    """Role of the trial in a fit; a fit refuses held-out trials."""
+    description: str = ""
+    inputs: Literal["applied", "commanded"] | None = None
+    """Kind of the input columns: what acted (measured, reconstructed) or what was commanded, before delay and lag.
+    `None`: `rpm_*`, `force_*` and `tau_*` acted, `pwm_*` and `command_*` were commanded."""
+    inputs_between: Literal["held", "linear"] | None = None
+    """Inputs between two samples. `None`: commands are held, and so are inputs that keep exact levels and jump from row
+    to row; anything else that acted is linear."""
+    inputs_after: Literal["held", "zero", "unknown"] | None = None
+    """Inputs after the end of an input stream within the recording. `None`: a last command of no thrust is held, any
+    other is unknown from one sample later on."""
+    passive: bool = False
+    """Thrusters off: no input columns are needed."""
+    wrench_at: Annotated[
+        tuple[float, float, float] | Literal["center_of_gravity", "origin"] | None,
+        BeforeValidator(_moment_point),
+    ] = None
+    """Body point about which tau_k, tau_m, tau_n are moments [m]; the vehicle's `wrench_reference` where not given."""
+    velocity_at: Point = (0.0, 0.0, 0.0)
+    """Body point whose velocity u, v, w are [m]."""
+    position_at: Point = (0.0, 0.0, 0.0)
+    """Body point whose position x, y, z are [m]."""
+    acceleration_at: Point | None = None
+    """Body point of the accelerometer [m], for the record: no check or fit needs it."""
+    depth_at: Point | None = None
+    """Body point of the pressure sensor [m]; the vehicle's depth sensor where not given."""
+    acceleration: Literal["specific_force", "kinematic", "auto"] = "auto"
+    """Kind of ax, ay, az: with gravity (an accelerometer: +9.81 up at rest) or without; `auto` finds it."""
+    velocity: Literal["ground", "water"] = "ground"
+    """Reference of u, v, w."""
+    voltage: float | None = Field(default=None, gt=0.0)
+    """Voltage of the battery [V], for pulse widths; a column `voltage` has priority."""
+    water: TrialWater = Field(default_factory=TrialWater)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _single_axis(cls, data: Any) -> Any:
+        """Accept a single axis without brackets."""
+        if isinstance(data, dict) and "convert" in data:
+            raise refuse_section(
+                "convert is gone: import the table with a map of its columns, units, frame and clocks (trials import)"
+            )
+        if isinstance(data, dict) and isinstance(data.get("axis"), str):
+            return {**data, "axis": [data["axis"]]}
+        return data
+
+    def meaning(self) -> dict[str, Any]:
+        """The parts that change what the numbers mean, as plain values: all but description, role and vehicle."""
+        return self.model_dump(mode="json", exclude={"description", "role", "vehicle", "axis"})
+
+
+# The canonical columns of a trial: names, units, frames.
+
+
+class Column(NamedTuple):
+    """One canonical column."""
+
+    group: str
+    """Columns of one group come from one sensor: command velocity rates acceleration attitude position depth."""
+    unit: str
+    meaning: str
+
+
+TAU = ("tau_x", "tau_y", "tau_z", "tau_k", "tau_m", "tau_n")
+"""Wrench, body frame; moments about the header's `wrench_at`."""
+
+NU = ("u", "v", "w", "p", "q", "r")
+"""nu, body frame."""
+
+COLUMNS: dict[str, Column] = {
+    **{name: Column("command", "N", f"force on the vehicle along body {name[-1]}") for name in TAU[:3]},
+    **{
+        name: Column("command", "N m", f"moment about body {axis}")
+        for name, axis in zip(TAU[3:], "xyz", strict=True)
+    },
+    **{
+        name: Column("velocity", "m/s", f"velocity along body {axis}")
+        for name, axis in zip(NU[:3], "xyz", strict=True)
+    },
+    **{
+        name: Column("rates", "rad/s", f"angular rate about body {axis}")
+        for name, axis in zip(NU[3:], "xyz", strict=True)
+    },
+    **{f"a{axis}": Column("acceleration", "m/s²", f"acceleration along body {axis}") for axis in "xyz"},
+    "roll": Column("attitude", "rad", "about body x, the last of yaw-pitch-roll (z-y-x)"),
+    "pitch": Column("attitude", "rad", "about body y; positive is nose down, for z is up"),
+    "yaw": Column("attitude", "rad", "about world z, to the left"),
+    **{f"q{c}": Column("attitude", "-", "quaternion body to world, xyzw") for c in "xyzw"},
+    **{axis: Column("position", "m", f"world {axis}; z up, 0 on the still surface") for axis in "xyz"},
+    "depth": Column("depth", "m", "of the pressure sensor below the still surface, positive down"),
+    "voltage": Column("command", "V", "battery"),
+}
+"""Columns with fixed names."""
+
+INPUT_PREFIXES: dict[str, Column] = {
+    "force_": Column("command", "N", "thrust of one thruster"),
+    "rpm_": Column("command", "rpm", "shaft speed of one thruster, positive for positive thrust"),
+    "pwm_": Column("command", "µs", "pulse width sent to the speed controller of one thruster"),
+    "command_": Column("command", "N", "requested thrust of one thruster"),
+}
+"""Columns named PREFIX + thruster name."""
+
+
+def column_of(name: str) -> Column | None:
+    """The canonical column of that name, or None."""
+    if name in COLUMNS:
+        return COLUMNS[name]
+    for prefix, column in INPUT_PREFIXES.items():
+        if name.startswith(prefix) and len(name) > len(prefix):
+            return column
+    return None
+
+
+PHASES = ("baseline", "excitation", "coast", "rest")
+"""Words of the `phase` column; an empty word is none of them."""
+
+SLOWEST = 2.0
+"""Between the rows of a trial, usually: no motion can be learnt of what is seldomer [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """Measurements over one time base; streams of other rates leave NaN where they have no sample.
+
+    Frames and units are those of `finssim.trials.trial`.
+    """
+
+    name: str
+    """Unique among the trials used together; the folder's name."""
+    t: Array
+    """Seconds, strictly increasing, (n,)."""
+    channels: dict[str, Array] = field(default_factory=dict)
+    """Canonical column -> values, NaN where there is no sample, (n,) each."""
+    phase: NDArray[np.str_] | None = None
+    """A word of `PHASES` or "" for every row, (n,); None where the log names no phases."""
+    header: Header = field(default_factory=Header)
+    """Content of `trial.yaml`."""
+    findings: tuple[Finding, ...] = ()
+    """Repairs, and data that was left out while reading."""
+    path: Path | None = None
+    """Folder or file it was read from."""
+
+    def __post_init__(self) -> None:
+        t = self.t
+        if t.ndim != 1 or len(t) < 2 or not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
+            raise CalibrationError(f"{self.name}: t is not at least 2 strictly increasing times in s")
+        if (step := float(np.median(np.diff(t)))) > SLOWEST:
+            raise CalibrationError(
+                f"{self.name}: t has a row every {step:.3g} s, expected one every {SLOWEST:g} s at least: if its times "
+                "are in ms, import it with a map of the time's unit (time: {column: t, unit: ms})"
+            )
+        for column, values in self.channels.items():
+            if column_of(column) is None:
+                raise CalibrationError(f"{self.name}: '{column}' is not a column of a trial")
+            if values.shape != t.shape:
+                raise CalibrationError(
+                    f"{self.name}: {column} has shape {values.shape}, expected {t.shape} like t"
+                )
+        if self.phase is not None and (self.phase.shape != t.shape or not set(self.phase) <= {*PHASES, ""}):
+            raise CalibrationError(
+                f"{self.name}: phase must hold {len(t)} words of {', '.join(PHASES)}, or empty ones"
+            )
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: Any,
+        *,
+        columns: Mapping[str, str] | None = None,
+        units: Mapping[str, str] | None = None,
+        time: str = "t",
+        axes: str = "FLU",
+        name: str = "trial",
+        surface_pressure: float | None = None,
+        **header: Any,
+    ) -> Trial:
+        """Return the trial that a table in memory holds; columns that are not used are named in its findings.
+
+        Args:
+            frame: A pandas DataFrame, or a mapping of names to columns of one length. A DataFrame whose index holds the
+                times needs no time column.
+            columns: Column of a trial -> name of the column in `frame`; the columns that have the names of a trial's
+                columns if None.
+            units: Column of a trial, or `t` for the times -> its unit in `frame`, where that is not the trial's own
+                unit; `date` for written dates and for pandas timestamps.
+            time: Name of the column of times.
+            axes: Axes of the table: FLU (x forward, y left, z up) or FRD (x forward, y right, z down, and a world with
+                z down).
+            name: Name of the trial.
+            surface_pressure: What the sensor of a column `pressure` reads at the surface [Pa], 0 for a gauge; a
+                standard atmosphere if None, which is noted in the findings.
+            header: Further keys of `trial.yaml`, such as `vehicle`, `voltage` or `role`.
+
+        Raises:
+            CalibrationError: A column, unit or key that is not known, no times, or no usable column.
+        """
+        from finssim.trials.importers.frame import trial_from_frame
+
+        return trial_from_frame(
+            frame,
+            columns=columns,
+            units=units,
+            time=time,
+            axes=axes,
+            name=name,
+            surface_pressure=surface_pressure,
+            header=header,
+        )
+
+    def has(self, *columns: str) -> bool:
+        """Return whether every one of these columns holds at least two finite samples."""
+        return all(c in self.channels and np.isfinite(self.channels[c]).sum() >= 2 for c in columns)
+
+    def series(self, column: str) -> tuple[Array, Array]:
+        """Times [s] and values of the finite samples of a column, (k,) each; empty where there are none."""
+        values = self.channels.get(column)
+        if values is None:
+            return np.empty(0), np.empty(0)
+        good = np.isfinite(values)
+        return self.t[good], values[good]
+
+    @property
+    def duration(self) -> float:
+        """Time from the first row to the last [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    def __repr__(self) -> str:
+        columns = " ".join(self.channels) or "no columns"
+        return f"<Trial {self.name}: {self.duration:.1f} s, {len(self.t)} rows, {columns}>"
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for name in self.channels:
+            values, column = self.series(name)[1], column_of(name)
+            ends = [f"{f(values):.4g}" for f in (np.min, np.max)] if len(values) else ["–", "–"]
+            rows.append((name, column.unit if column else "", str(len(values)), *ends))
+        title = f"{self.name}: {self.duration:.1f} s, {len(self.t)} rows"
+        return notebook_html(title, ("column", "unit", "samples", "least", "greatest"), rows)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Digest of the numbers, the phases and the parts of the header that change their meaning.
+
+        It does not depend on the trial's name, its place, its file format or its role.
+        """
+        digest = hashlib.sha256(np.ascontiguousarray(self.t).tobytes())
+        for column in sorted(self.channels):
+            digest.update(column.encode())
+            values = self.channels[column] + 0.0  # no -0.0, and one NaN: equal numbers have equal bytes
+            digest.update(np.where(np.isnan(values), np.nan, values).tobytes())
+        if self.phase is not None:
+            digest.update("\n".join(self.phase.tolist()).encode())
+        digest.update(json.dumps(self.header.meaning(), sort_keys=True).encode())
+        return digest.hexdigest()

@@ -1,0 +1,133 @@
+"""Programmes in the virtual pool, through the robot's whole software: trials that tell of the plant."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from finssim.cli import boundary
+from finssim.cli.commands import app
+from finssim.evaluation.excitation import PoolRun, play_programme, record_programmes
+from finssim.identification.programmes import Programme, programmes
+from finssim.identification.regression.regress import regress
+from finssim.trials.findings import CalibrationError
+from finssim.trials.trial_files import load_trials
+from finssim.vehicles import load_vehicle
+
+pytestmark = pytest.mark.slow
+
+FINSROV = load_vehicle("finsrov")
+
+
+def step(level, axis="surge"):
+    return next(iter(programmes((axis,), FINSROV, levels=[level])))
+
+
+def run_of(programme, **settings):
+    return PoolRun(
+        row="fit",
+        target=programme.name,
+        programme=programme,
+        vehicle="finsrov",
+        pool_vehicle="finsrov",
+        severity="nominal",
+        **settings,
+    )
+
+
+@pytest.fixture(scope="module")
+def surge(tmp_path_factory):
+    """One step of 12 N in a pool without secrets: its trial."""
+    folder = tmp_path_factory.mktemp("surge")
+    run = run_of(step(12.0))
+    assert play_programme(run, folder)["fault"] == ""
+    return load_trials([folder / run.target])[0]
+
+
+def test_a_record_becomes_a_trial_with_phases_axis_and_role(surge):
+    assert surge.header.axis == ["surge"] or tuple(surge.header.axis) == ("surge",)
+    assert surge.header.role == "fit"
+    assert {"baseline", "excitation", "coast", "rest"} >= set(surge.phase) - {""}
+    assert (surge.phase == "excitation").any() and (surge.phase == "coast").any()
+    assert {"u", "r", "ax", "x", "depth", *(f"rpm_{name}" for name in FINSROV.thruster_names)} <= set(
+        surge.channels
+    )
+
+
+def test_the_way_stays_in_the_pool_and_the_other_axes_where_they_were(surge):
+    x, y, yaw = (surge.channels[name] for name in ("x", "y", "qz"))
+    assert np.nanmax(np.abs(x)) < 1.72  # the envelope's half length from the wall
+    assert np.nanmax(np.abs(y)) < 0.1 and np.nanmax(np.abs(yaw)) < 0.1
+
+
+def test_the_trial_tells_damping_and_mass_of_the_plant(surge):
+    """Nominal: the file's 27.1 kg with added mass and 39.1 N s/m. One trial, 5 %."""
+    fit = regress([surge], FINSROV, axes=["surge"], damping="linear")
+    assert fit.estimates["surge.d1"].estimate == pytest.approx(39.07, rel=0.05)
+    assert fit.estimates["surge.m_eff"].estimate == pytest.approx(27.14, rel=0.1)
+
+
+def test_equal_runs_have_equal_keys_and_every_setting_counts():
+    first = run_of(step(6.0))
+    assert first.key() == run_of(step(6.0)).key()
+    for other in (
+        run_of(step(9.0)),
+        run_of(step(6.0), seed=2),
+        run_of(step(6.0), plant=2),
+        run_of(step(6.0), hold=None),
+    ):
+        assert other.key() != first.key()
+
+
+def test_a_programme_that_the_bridge_stops_is_refused(tmp_path):
+    """Rolled hard and left so: the tilt watchdog ends it."""
+    n = 300
+    tau = np.zeros((n, 6))
+    tau[50:, 3] = FINSROV.wrench_limits[3]
+    phase = np.array(["baseline"] * 50 + ["excitation"] * (n - 50))
+    hard = Programme(name="roll_hard", axes=("roll",), rate=50.0, tau_desired=tau, phase=phase)
+    light = FINSROV.replace({"safety.max_tilt": 0.05})
+    from finssim.identification.vehicle_file import write_vehicle
+
+    write_vehicle(light, tmp_path / "light.yaml")
+    with pytest.raises(CalibrationError, match="roll_hard in the virtual pool: .*tilt"):
+        record_programmes(
+            {"fit": [hard]},
+            {"fit": tmp_path / "out"},
+            str(tmp_path / "light.yaml"),
+            pool_vehicle="finsrov",
+            severity="nominal",
+            processes=1,
+        )
+
+
+def test_excite_in_a_pool_by_command(tmp_path):
+    """Trials, records and what they are; the pool, its vehicle and its severity are those of the options."""
+    command = ["excite", "roll", "--vehicle", "finsrov", "--levels", "1.0", "--out", str(tmp_path / "t")]
+    pool = ["--pool", "3", "--severity", "nominal", "--pool-vehicle", "finsrov_sim7", "--json"]
+    done = CliRunner().invoke(app, [*command, *pool])
+    assert done.exit_code == 0, done.output
+    folders = json.loads(done.output.splitlines()[-1])["trials"]
+    assert folders == [str(tmp_path / "t" / f"roll_{word}_1") for word in ("plus", "minus")]
+    assert {p.name for p in (tmp_path / "t" / "records").iterdir()} == {
+        "roll_plus_1.mcap",
+        "roll_minus_1.mcap",
+    }
+    assert len(load_trials([tmp_path / "t"])) == 2
+    about = yaml.safe_load((tmp_path / "t" / "programmes.yaml").read_text(encoding="utf-8"))
+    assert about["pool"] == {"vehicle": "finsrov_sim7", "plant": 3, "severity": "nominal"}
+
+
+def test_a_pool_goes_with_no_other_simulation(tmp_path):
+    command = ["excite", "roll", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), "--pool", "1"]
+    assert boundary.run(app, [*command, "--simulate"]) == 2
+
+
+@pytest.mark.parametrize("option", [["--severity", "hard"], ["--pool-vehicle", "bluerov2"]])
+def test_what_tells_of_a_pool_needs_one(tmp_path, option, capsys):
+    """Refused, not left unheeded."""
+    command = ["excite", "roll", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), *option]
+    assert boundary.run(app, command) == 2 and not (tmp_path / "t").exists()
+    assert "--pool SEED" in capsys.readouterr().err

@@ -1,0 +1,56 @@
+"""`finssim play`: records go on to be printed, policies are filmed; and the onlooker's pictures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from finssim.cli.playback import PlaybackError, play
+from finssim.learning.gymnasium_env import Env
+from finssim.learning.train import train
+from finssim.tasks import Environment, StationKeeping, make
+from finssim.tasks.onlooker import Onlooker
+
+cv2 = pytest.importorskip("cv2")
+pytest.importorskip("newton")
+pytestmark = pytest.mark.slow
+
+
+def test_an_episode_of_a_policy_is_filmed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    policy = train("t1", out=tmp_path / "hold", seed=1, steps=8192, worlds=64)
+    monkeypatch.setattr("finssim.cli.playback.task_named", lambda _: StationKeeping(time_limit=0.5))
+    play(policy, video=tmp_path / "hold.mp4", speed=2.0)
+    film = cv2.VideoCapture(str(tmp_path / "hold.mp4"))
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 6 and film.get(cv2.CAP_PROP_FPS) == pytest.approx(20.0)
+    good, first = film.read()
+    assert good and first.shape == (360, 640, 3) and first.std() > 5.0
+    with pytest.raises(PlaybackError, match="give the film to write"):
+        play(policy)
+    with pytest.raises(PlaybackError, match="no directory of a policy"):
+        play(tmp_path / "run.mcap", video=tmp_path / "run.mp4")
+    with pytest.raises(PlaybackError, match="--speed is of a film"):
+        play(tmp_path / "run.mcap", speed=4.0)
+
+
+def test_the_onlooker_sees_the_vehicle_ahead_of_it_wherever_that_is():
+    """FinsROV's orange float is in the middle of the picture, in T1's basin and before the dock."""
+    for task in (replace(StationKeeping(), time_limit=1.0), make("camera-docking").task):
+        env = Environment(task, worlds=2, seed=3)
+        onlooker = Onlooker(env, 1, width=320)
+        for _ in range(2):
+            picture = onlooker.picture().astype(float)
+            orange = picture[..., 0] - picture[..., 2] > 25.0
+            rows, columns = np.nonzero(orange)
+            assert (
+                orange.sum() > 200
+                and abs(columns.mean() / 320 - 0.5) < 0.12
+                and 0.2 < rows.mean() / 180 < 0.75
+            )
+            env.reset()
+
+
+def test_gymnasium_renders():
+    env = Env("t1", render_mode="rgb_array")
+    env.reset(seed=1)
+    assert env.render().shape == (360, 640, 3) and Env("t1").render() is None

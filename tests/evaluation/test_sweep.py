@@ -1,0 +1,185 @@
+"""`finssim sweep`: results of every job, from one machine or from two of which one is lost."""
+
+import contextlib
+import json
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from finssim.cli import boundary
+from finssim.cli.commands import app
+from finssim.control.policy import Policy
+from finssim.evaluation.campaign import ClusterError
+from finssim.studies import sweep as command
+from finssim.studies import transfer
+from finssim.studies.sweep import load_sweep
+from studies.anatomy import anatomy
+from studies.faults import faults_experiment
+
+ray = pytest.importorskip("ray")
+
+
+@pytest.fixture(autouse=True)
+def nothing_left():
+    """No process of Ray outlives a test."""
+    before = ray_processes()
+    yield
+    left = ray_processes() - before
+    for _ in range(600):
+        if not left:
+            return
+        time.sleep(0.1)
+        left = ray_processes() - before
+    pytest.fail(f"processes of Ray are left: {left}")
+
+
+def ray_processes():
+    """Numbers of the processes of Ray on this machine, whoever started them."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):  # it ended meanwhile
+            words = path.read_bytes()
+            if words.startswith(b"ray::") or b"/raylet\0" in words or b"/gcs_server\0" in words:
+                found.add(int(path.parent.name))
+    return found
+
+
+@pytest.fixture
+def sweep_file(tmp_path):
+    """Two action modes, each trained for one short update."""
+    path = tmp_path / "sweep.yaml"
+    plan = {
+        "task": "t1",
+        "seeds": 1,
+        "train": {"steps": 1024, "worlds": 16},
+        "grid": {"action": ["wrench6", "wrench4"]},
+        "evaluate": {"plants": ["current"], "trials": 1},
+    }
+    path.write_text(yaml.safe_dump(plan), encoding="utf-8")
+    return path
+
+
+def changed(file, **changes):
+    """The same file with other values."""
+    plan = yaml.safe_load(file.read_text(encoding="utf-8"))
+    file.write_text(yaml.safe_dump({**plan, **changes}), encoding="utf-8")
+
+
+def swept(capsys, *words):
+    status = boundary.run(app, ["sweep", *map(str, words), "--json"])
+    lines = capsys.readouterr().out.splitlines()
+    return status, json.loads(lines[-1]) if lines else None
+
+
+@pytest.mark.slow
+def test_a_sweep_is_done_once_and_goes_on_where_it_was(tmp_path, sweep_file, capsys):
+    """A policy and a row for every training; only a missing one is repeated; one that fails is in the table."""
+    out = tmp_path / "out"
+    status, result = swept(capsys, sweep_file, "--out", out, "--processes", 2)
+    assert status == 0 and result["ok"] and len(result["rows"]) == 2
+    for row in result["rows"]:
+        assert set(row["plants"]) == {"current"} and row["plants"]["current"]["trials"] == 1
+        assert Policy.load(out / "runs" / row["run"]).description.action["mode"] == row["options"]["action"]
+        assert row["training_s"] > 0.0
+    kept = {path: path.stat().st_mtime_ns for path in out.glob("*/*/policy.onnx")}
+    evaluations = {path: path.stat().st_mtime_ns for path in (out / "evaluations").iterdir()}
+    gone = next(iter(kept)).parent
+    for path in gone.iterdir():
+        path.unlink()
+    gone.rmdir()
+    changed(sweep_file, grid={"action": ["wrench6", "wrench4", "soup"]})
+    status, again = swept(capsys, sweep_file, "--out", out, "--processes", 2)
+    assert status == 3 and not again["ok"] and len(again["rows"]) == 3
+    (failed,) = [row for row in again["rows"] if "error" in row]
+    assert failed["name"] == "action-soup" and "soup" in failed["error"]
+    assert failed["error"] in (out / "sweep.md").read_text(encoding="utf-8")
+    now = {path: path.stat().st_mtime_ns for path in out.glob("*/*/policy.onnx")}
+    assert now.keys() == kept.keys()
+    assert {path for path in kept if now[path] != kept[path]} == {gone / "policy.onnx"}
+    assert {row["run"] for row in result["rows"]} <= {row["run"] for row in again["rows"]}
+    evaluated = {path: path.stat().st_mtime_ns for path in (out / "evaluations").iterdir()}
+    assert evaluations.items() < evaluated.items() and len(evaluated) == 3  # one of the repeated training
+
+
+@pytest.fixture
+def two_machines(monkeypatch):
+    """Two Ray nodes of one processor each, on the loopback interface; the second one can be killed."""
+    from ray._private import ray_constants
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    # Otherwise Ray takes 127.0.0.1 for this machine's address on the network, where these nodes do not listen.
+    monkeypatch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)
+    node = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "include_dashboard": False}
+    cluster = Cluster(initialize_head=True, head_node_args=node)
+    try:
+        yield cluster, cluster.add_node(**node)
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+
+
+@pytest.mark.slow
+def test_a_machine_that_is_lost_half_way_is_made_up_for(tmp_path, sweep_file, two_machines, monkeypatch):
+    """One of two nodes is killed while both work. Every job still has its row and its policy."""
+    changed(sweep_file, seeds=2)
+    cluster, second = two_machines
+    ended, train_policies = [], command.train_policies
+
+    def watched(*words):
+        for policy, error in train_policies(*words):
+            ended.append(policy.name)
+            if (
+                len(ended) == 1
+            ):  # both nodes work now: one on its second training, the other on its first or second
+                cluster.remove_node(second, allow_graceful=False)
+            yield policy, error
+
+    monkeypatch.setattr(command, "train_policies", watched)
+    result = command.sweep(sweep_file, out=tmp_path / "out", address=cluster.address)
+    assert result["ok"] and sorted(ended) == sorted(t.run for t in load_sweep(sweep_file).trainings())
+    assert len(list(tmp_path.glob("out/runs/*/policy.onnx"))) == 4
+    assert all(row["plants"]["current"]["trials"] == 1 for row in result["rows"])
+
+
+def test_a_table_without_a_policy_shows_the_errors():
+    """Where every training failed."""
+    row = {"name": "run", "seed": 1, "run": "run-seed1", "options": {}, "error": "TrainingError: no"}
+    (table,) = command.tables_of({"rows": [row]})
+    assert table.rows == [["run", "1", "–", "–", "TrainingError: no"]] and len(table.heads) == 5
+
+
+@pytest.mark.slow
+def test_an_experiment_trains_and_plays_on_a_cluster(tmp_path, two_machines, monkeypatch):
+    """Policies, results and motions come back: nothing is left to do here, and the table is that of one machine."""
+    cluster, _ = two_machines
+    how = {"rows": ["calibrated", "pid"], "setpoints": ["P01"], "plants": 1, "seeds": 1, "steps": 4096}
+    away = transfer.t1(out=tmp_path, address=cluster.address, **how)
+    assert (tmp_path / "policies" / "calibrated-seed1" / "policy.onnx").is_file()
+    assert len(list((tmp_path / "trials").glob("*.npz"))) == 2
+
+    def played_here(*_):
+        raise AssertionError("was played already")
+
+    monkeypatch.setattr("finssim.evaluation.robot_trials.play", played_here)
+    again = transfer.t1(out=tmp_path, processes=1, **how)
+    assert again["rows"] == away["rows"] and away["rows"]["pid"]["success"] == 1
+    found = anatomy(
+        out=tmp_path / "anatomy", causes=("lag",), rows=("pid",), seeds=1, trials=1, address=cluster.address
+    )
+    assert found["foreign"]["pid"]["success"]["count"] == 10
+    broken = faults_experiment(out=tmp_path / "faults", scenarios=["frozen-depth"], address=cluster.address)
+    assert broken["ok"] and broken["trials"]
+
+
+@pytest.mark.parametrize(
+    ("address", "sentence"),
+    [("127.0.0.1:9", "no Ray cluster answers at 127.0.0.1:9"), ("here", "expected HOST:PORT or auto")],
+)
+def test_where_nobody_answers_is_told(tmp_path, sweep_file, address, sentence):
+    """One sentence at once, and nothing is written."""
+    with pytest.raises(ClusterError, match=sentence):
+        command.sweep(sweep_file, out=tmp_path / "out", address=address)
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,90 @@
+"""`finssim tasks`: every task in a line; one in full, with the numbers that its environment has."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from finssim.cli import boundary
+from finssim.cli.commands import app
+from finssim.cli.tasks_show import attribute_docs, describe_task
+from finssim.tasks import SEEING, TASKS, make
+from finssim.tasks.station_keeping import StationKeeping
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task_torch.py"
+WARP_EXAMPLE = EXAMPLE.with_name("own_task.py")
+
+
+def finssim(*words):
+    return boundary.run(app, [str(word) for word in words])
+
+
+def test_every_task_is_listed(capsys):
+    """By name, with what is to be done and its baseline."""
+    assert finssim("tasks") == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in TASKS)
+    assert all(words in out for words in ("align-insert", "formation", "pid", "[s]"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", (*TASKS, *SEEING, f"{EXAMPLE}:KeepDepth", f"{WARP_EXAMPLE}:KeepDepth"))
+def test_rewards_ends_and_totals_are_told_in_words(name):
+    """Also those that are expressions: a sentence stands in place of the source."""
+    told = describe_task(name)
+    for one in (*told["reward"]["terms"], *told["ends"], *told["totals"]):
+        assert one["told"].endswith("."), one
+        assert not re.search(r"\bp\.|\bw[,\]]|wp\.|\[0\]|>=| \* ", one["told"]), one
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+def test_what_is_told_is_what_the_environment_has(name):
+    """Sizes, agents, others, limits of the action, times; no part of the observation missing."""
+    told, env = describe_task(name), make(name)
+    assert told["observation"]["size"] == env.observation_size
+    assert sum(part["size"] for part in told["observation"]["parts"]) == env.observation_size
+    assert told["action"]["size"] == env.action_size and len(told["agents"]) == env.agents
+    assert told["title"] and told["success"] != "as metrics tells" and told["baselines"]
+    assert len(told["reward"]["weights"]) > 4 and "\n" in told["reward"]["told"]
+    surge = env.simulator.vehicles[0].wrench_limits[0]
+    assert told["action"]["components"][0] == {"name": "surge", "low": -surge, "high": surge, "unit": "N"}
+
+
+def test_a_task_is_shown_for_a_vehicle(capsys):
+    """Units in brackets, the vehicle's own numbers; and as data."""
+    assert finssim("tasks", "show", "team-pursuit", "--vehicle", "bluerov2_heavy") == 0
+    out = capsys.readouterr().out
+    assert "seen with sensors, imu: rate 100" in out and "seen with sensors, fixes: rate 30" in out
+    for words in ("prey (bluerov2_heavy)", "rad/s", "N m", "the net touches the prey"):
+        assert words in out
+    assert finssim("tasks", "show", "t1", "--action", "thruster8", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["action"]["size"] == 8 and told["action"]["components"][0]["unit"] == "N"
+    settings = {one["name"]: one for one in told["settings"]}
+    assert settings["tilt"]["told"] == "Largest roll and pitch at the start."
+    assert finssim("tasks", "show", "pursuit", "--vehicle", "warpauv", "--json") == 0
+    settings = {one["name"]: one["value"] for one in json.loads(capsys.readouterr().out)["settings"]}
+    assert settings["prey_drive"]["level"] is None  # it never tips over
+
+
+def test_a_task_of_ones_own_is_shown(capsys):
+    """By file and class; its own words in place of weights."""
+    assert finssim("tasks", "show", f"{EXAMPLE}:KeepDepth") == 0
+    out = capsys.readouterr().out
+    assert "keep-depth: Come to a depth" in out and "baselines: none" in out and "cheap thrusts" in out
+
+
+def test_what_there_is_not_is_refused(capsys):
+    """In one sentence."""
+    assert finssim("tasks", "show", "t9") == 2
+    assert "unknown task 't9'; available: t1" in capsys.readouterr().err
+    assert finssim("tasks", "show", "t1", "--vehicle", "finrov") == 2
+    assert "did you mean 'finsrov'" in capsys.readouterr().err
+
+
+def test_sentences_under_fields_are_read_from_the_source():
+    """Those of the bases too."""
+    docs = attribute_docs(StationKeeping)
+    assert docs["time_limit"] == "Length of an episode in training [s]." and docs["hold"].endswith("[s].")

@@ -1,0 +1,135 @@
+"""Which nodes a graph has, what they are told, and that the page tells the same."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from finssim.extensions.ros2 import Ros2Error
+from finssim.extensions.ros2.up import GRAPHS, NODES, Options, Plan, plan_of, topics_of
+from finssim.robot.goals import GoalError
+
+PAGE = (Path(__file__).resolve().parents[3] / "docs" / "reference" / "ros2_nodes.md").read_text()
+FILE = Path("/somewhere/pool.yaml")
+
+
+def source(node):
+    """Source of a node's module."""
+    return Path(importlib.util.find_spec(NODES[node].partition(":")[0]).origin).read_text()
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_each_node_is_a_class_and_stands_on_the_page(node):
+    """With every parameter that it declares."""
+    assert f"\nclass {NODES[node].partition(':')[2]}(RobotNode):" in source(node)
+    (row,) = re.findall(rf"^\| {node} \| .*$", PAGE, flags=re.MULTILINE)
+    declared = set(re.findall(r'self\.parameter\("(\w+)"', source(node)))
+    assert declared == set(re.findall(r"`(\w+)`", row.rsplit(" | ", 1)[1])), row
+
+
+def test_graphs_are_made_of_nodes():
+    """And the pool's is a robot in a pool."""
+    assert {node for nodes in GRAPHS.values() for node in nodes} <= set(NODES)
+    assert GRAPHS["pool"] == ("virtual_pool", *GRAPHS["robot"])
+
+
+def told(graph, tmp_path, **choices):
+    """Parameters of the file that nodes are started with: node -> parameters."""
+    plan_of(graph, Options(**choices), FILE).write(tmp_path / "p.yaml")
+    tree = yaml.safe_load((tmp_path / "p.yaml").read_text())
+    return {key.rsplit("/", 1)[-1]: value["ros__parameters"] for key, value in tree.items()}
+
+
+@pytest.mark.parametrize(
+    ("graph", "choices", "node", "parameters"),
+    [
+        ("sim", {}, "**", {"vehicle": "finsrov", "use_sim_time": True}),
+        ("sim", {"start": "0,0,-1,0"}, "sim", {"use_sim_time": False, "start": "0,0,-1,0", "seed": 1}),
+        ("sim", {"hydrodynamics": "mesh", "seed": 4}, "sim", {"hydrodynamics": "mesh", "seed": 4}),
+        ("sim", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper"}),
+        ("sim", {"goal": "0,0,-0.5,0"}, "controller", {"goal": "0,0,-0.5,0"}),
+        ("sim", {"trajectory": "helix", "task": "t2"}, "controller", {"trajectory": "helix", "task": "t2"}),
+        ("pool", {}, "virtual_pool", {"plant": "1", "severity": "realistic", "camera": "pictures"}),
+        ("pool", {"severity": "hard", "camera": "corners"}, "virtual_pool", {"severity": "hard"}),
+        ("pool", {"plant": "7", "truth": Path("t.fst")}, "virtual_pool", {"plant": "7", "truth": "t.fst"}),
+        ("pool", {"port": 6000}, "**", {"robot": "udp://127.0.0.1:6000"}),
+        ("pool", {"port": 6000}, "camera", {"pictures": "udp://127.0.0.1:6001", "pool_file": str(FILE)}),
+        ("pool", {"bind": "127.0.0.1:7000"}, "camera", {"pictures_bind": "127.0.0.1:7001"}),
+        ("pool", {"bind": "127.0.0.1:7000"}, "virtual_pool", {"bind": "127.0.0.1:7000"}),
+        ("pool", {"teleop": "joy"}, "hardware_bridge", {"need_reading": False}),
+        ("pool", {"teleop": "joy"}, "teleop", {"device": "joy", "other": "pid"}),
+        ("pool", {"record": Path("r.mcap")}, "recorder", {"record": "r.mcap", "pool_file": str(FILE)}),
+        (
+            "robot",
+            {"robot": "serial:/dev/x", "pool_file": FILE},
+            "**",
+            {"robot": "serial:/dev/x"},
+        ),
+        ("robot", {"site": "open-water"}, "state_estimation", {"pool_file": "none"}),
+        ("robot", {"site": "open-water"}, "**", {"vehicle": "finsrov", "site": "open-water"}),
+        ("pool", {"let_in": "1,-2"}, "state_estimation", {"let_in": "1,-2", "mode": "error-state"}),
+        ("pool", {"site": "tank"}, "virtual_pool", {"camera": "corners"}),
+        ("pool", {"namespace": "robot_1"}, "**", {"frame_prefix": "robot_1/"}),
+        ("pool", {"site": "open-water", "positioning": "usbl"}, "virtual_pool", {"camera": "none"}),
+        ("robot", {"robot": "serial:/dev/x", "pool_file": FILE}, "camera", {"pictures": "none"}),
+        ("robot", {"pictures": "udp://a:1", "pool_file": FILE}, "camera", {"pictures": "udp://a:1"}),
+    ],
+)
+def test_choices_reach_their_node(tmp_path, graph, choices, node, parameters):
+    """Each option becomes a parameter of the node that it is for."""
+    found = told(graph, tmp_path, **choices)
+    assert parameters.items() <= found[node].items()
+
+
+def test_extra_nodes_are_started_where_asked_for():
+    """Recorder and teleoperation."""
+    assert plan_of("sim", Options(), FILE).nodes == GRAPHS["sim"]
+    blind = plan_of("robot", Options(site="open-water"), FILE).nodes
+    assert blind == ("hardware_bridge", "state_estimation", "controller")
+    both = plan_of("sim", Options(record=Path("r.mcap"), teleop="joy"), FILE)
+    assert both.nodes == (*GRAPHS["sim"], "recorder", "teleop")
+
+
+@pytest.mark.parametrize(
+    ("graph", "choices", "error", "words"),
+    [
+        ("pond", {}, Ros2Error, "unknown graph 'pond'; available: sim, robot, pool"),
+        ("robot", {}, Ros2Error, "give --pool-file"),
+        ("pool", {"bind": "here"}, Ros2Error, "ADDRESS:PORT"),
+        ("robot", {"site": "open-water", "let_in": "here"}, GoalError, "two numbers x,y"),
+        ("sim", {"goal": "9,9,-9,0"}, GoalError, "outside the workspace"),
+        ("sim", {"goal": "0,0,-0.5,0", "trajectory": "helix"}, GoalError, "not both"),
+    ],
+)
+def test_what_cannot_be_started_is_refused_in_a_sentence(graph, choices, error, words):
+    """Before any process."""
+    with pytest.raises(error, match=re.escape(words)):
+        plan_of(graph, Options(**choices), FILE)
+
+
+def test_topics_are_those_of_the_nodes():
+    """Full names; a simulator has no camera."""
+    names = {name for name, _ in topics_of(Plan("sim", "finsrov", "rov"))}
+    assert {"/rov/odom", "/clock", "/rov/arm", "/rov/thruster_cmd"} <= names
+    assert "/rov/camera/image" not in names and "/rov/telemetry" not in names
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["node", "kamera"], "unknown node 'kamera'; available: camera, controller"),
+        (["up", "pond"], "unknown graph 'pond'"),
+        (["up", "robot"], "give --pool-file"),
+        (["up", "sim", "--vehicle", "finrov"], "did you mean 'finsrov'"),
+        (["up", "sim", "--goal", "here"], "expected four numbers"),
+    ],
+)
+def test_the_command_refuses_in_a_sentence(capsys, words, sentence):
+    """With status 2, and nothing started."""
+    from finssim.cli import boundary
+    from finssim.cli.commands import app
+
+    assert boundary.run(app, ["ros2", *words]) == 2
+    assert sentence in capsys.readouterr().err

@@ -1,0 +1,317 @@
+"""Our message files are legal ROS 2, and the workspace builds from the very same ones."""
+
+import ast
+import contextlib
+import importlib
+import inspect
+import re
+import runpy
+import subprocess
+import sys
+import types
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+import yaml
+
+from finssim.extensions.ros2 import Ros2Error
+from finssim.extensions.ros2.backend import activate
+from finssim.extensions.ros2.codec import INTERFACES
+from finssim.extensions.ros2.shim.arguments import overrides_for, parse_arguments
+from finssim.extensions.ros2.topics import OWN_TOPICS, SERVICES, TOPICS
+from finssim.extensions.ros2.up import NODES as GRAPH_NODES
+from finssim.extensions.ros2.up import Options, plan_of
+from finssim.robot.wiring import POOL_ADDRESS
+from finssim.vehicles.loader import catalogue
+
+MESSAGES = sorted(INTERFACES.glob("finssim_msgs/msg/*.msg"))
+"""Ours; those of sonars are marine_msgs', which a ROS 2 has of its own."""
+WORKSPACE = Path(__file__).resolve().parents[3] / "ros2_ws" / "src"
+NODES = WORKSPACE / "finssim_ros"
+
+
+def names(path):
+    """Name and text of each message file in a folder."""
+    return {file.name: file.read_text() for file in path.glob("*.msg")}
+
+
+def test_the_workspace_holds_the_same_messages():
+    """A changed message must be changed in both places: colcon and the wheel must agree on every byte."""
+    assert names(WORKSPACE / "finssim_msgs/msg") == names(INTERFACES / "finssim_msgs/msg")
+
+
+def test_cmake_builds_every_message():
+    """A message left out of CMakeLists.txt would be missing in a real ROS 2."""
+    text = (WORKSPACE / "finssim_msgs/CMakeLists.txt").read_text()
+    assert {f"msg/{path.name}" for path in MESSAGES} == {
+        w.strip('"') for w in text.split() if w.startswith('"msg/')
+    }
+
+
+@pytest.mark.parametrize("path", MESSAGES, ids=lambda path: path.stem)
+def test_messages_begin_with_a_header_and_hold_no_char(path):
+    """`char` hashes differently between implementations, and everything we send has a time."""
+    lines = [line.split("#")[0].split() for line in path.read_text().splitlines()]
+    fields = [words for words in lines if len(words) == 2 and "=" not in words[1]]
+    assert fields[0] == ["std_msgs/Header", "header"]
+    assert not any(kind.startswith("char") for kind, _ in fields)
+
+
+def has_rosidl():
+    """Whether the system's Python has ROS 2's own parser."""
+    try:
+        probe = subprocess.run(["/usr/bin/python3", "-c", "import rosidl_adapter.msg"], capture_output=True)
+    except OSError:
+        return False
+    return probe.returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not has_rosidl(), reason="needs apt-get install python3-rosidl python3-lark python3-empy")
+def test_the_official_parser_takes_every_message(tmp_path):
+    """rosidl_adapter turns each into IDL."""
+    script = (
+        "import sys, pathlib; from rosidl_adapter.msg import convert_msg_to_idl\n"
+        "root, out = map(pathlib.Path, sys.argv[1:])\n"
+        "for f in sorted(root.glob('msg/*.msg')): convert_msg_to_idl(root, root.name, f.relative_to(root), out)"
+    )
+    command = ["/usr/bin/python3", "-c", script, str(INTERFACES / "finssim_msgs"), str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True)
+    assert {p.stem for p in tmp_path.glob("*.idl")} == {p.stem for p in MESSAGES}
+
+
+@pytest.mark.parametrize("package", ["finssim_msgs", "finssim_ros"])
+def test_packages_are_named_as_their_folders(package):
+    """colcon goes by package.xml."""
+    root = ElementTree.parse(WORKSPACE / package / "package.xml").getroot()
+    assert root.findtext("name") == package and root.get("format") == "3"
+    build = root.findtext("export/build_type")
+    assert build == ("ament_cmake" if package == "finssim_msgs" else "ament_python")
+
+
+def test_messages_depend_on_every_package_they_use():
+    """A package left out of package.xml builds only by luck."""
+    root = ElementTree.parse(WORKSPACE / "finssim_msgs/package.xml").getroot()
+    used = {
+        w.split("/")[0] for p in MESSAGES for w in p.read_text().split() if w.count("/") == 1 and "_" in w
+    }
+    assert {e.text for e in root.findall("depend")} == {
+        u for u in used if u.endswith(("_msgs", "_interfaces"))
+    }
+
+
+def test_nodes_depend_on_every_package_whose_types_they_use():
+    """Topics, services and what nodes import."""
+    root = ElementTree.parse(NODES / "package.xml").getroot()
+    own = [topic for topics in OWN_TOPICS.values() for topic in topics.values()]
+    used = {kind.type.split("/")[0] for kind in (*TOPICS.values(), *SERVICES.values(), *own)}
+    assert used | {"rclpy", "rcl_interfaces"} <= {e.text for e in root.findall("exec_depend")}
+
+
+@pytest.mark.parametrize("path", sorted(NODES.rglob("*.py")), ids=lambda path: path.name)
+def test_python_of_the_workspace_compiles_on_humble(path):
+    """Python 3.10 reads every file."""
+    ast.parse(path.read_text(), feature_version=(3, 10))
+
+
+def entry_points():
+    """Names that setup.py installs."""
+    tree = ast.parse((NODES / "setup.py").read_text())
+    nodes = next(n for n in tree.body if isinstance(n, ast.Assign) and n.targets[0].id == "NODES")
+    return {element.value for element in nodes.value.elts}
+
+
+@pytest.fixture
+def launched(monkeypatch, tmp_path):
+    """Runs a launch file with arguments; gives executable -> command line, as launch_ros makes it.
+
+    launch and launch_ros are not on PyPI. What stands in for them here does what launch_ros/actions/node.py does with
+    names and parameters: a dictionary becomes a file, below the node's full name if name and namespace are given.
+    """
+
+    def node(**told):
+        named = {"name", "namespace"} <= told.keys()
+        full = f"/{told['namespace'].strip('/')}/{told['name']}" if named else "/**"
+        line = ["--ros-args", "-r", f"__node:={told['name']}", "-r", f"__ns:=/{told['namespace'].strip('/')}"]
+        for i, given in enumerate(told["parameters"]):
+            if isinstance(given, dict):
+                path = tmp_path / f"{told['executable']}{i}.yaml"
+                path.write_text(yaml.dump({full: {"ros__parameters": given}}))
+                given = str(path)
+            line += ["--params-file", given]
+        return told["executable"], line
+
+    parts = {
+        "launch": {"LaunchDescription": list},
+        "launch.actions": {
+            "DeclareLaunchArgument": lambda name, default_value, description: (name, default_value),
+            "OpaqueFunction": lambda function: function,
+        },
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": node},
+        "launch_ros.parameter_descriptions": {"ParameterValue": lambda value, value_type: value_type(value)},
+        "ament_index_python": {},
+        "ament_index_python.packages": {
+            "get_package_share_directory": lambda package: str(WORKSPACE / package)
+        },
+    }
+    for name, contents in parts.items():
+        module = types.ModuleType(name)
+        module.__dict__.update(contents)
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.syspath_prepend(str(NODES))
+    for name in ("finssim_ros", "finssim_ros.launching"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+
+    def start(graph, **given):
+        *declared, function = runpy.run_path(str(NODES / f"launch/{graph}.launch.py"))[
+            "generate_launch_description"
+        ]()
+        values = dict(declared)
+        assert set(given) <= set(values), f"{graph}.launch.py does not declare {set(given) - set(values)}"
+        return dict(function(types.SimpleNamespace(launch_configurations={**values, **given})))
+
+    return start
+
+
+def parameters_of(lines, node, namespace="finsrov"):
+    """What a node gets of its command line."""
+    return overrides_for(f"/{namespace}/{node}", parse_arguments(lines[node]).parameters)
+
+
+@pytest.mark.parametrize(
+    ("graph", "given", "node", "parameters"),
+    [
+        ("robot", {"robot": "udp://1.2.3.4:5"}, "hardware_bridge", {"robot": "udp://1.2.3.4:5"}),
+        ("robot", {"record": "a.mcap"}, "recorder", {"record": "a.mcap"}),
+        ("robot", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper", "vehicle": "finsrov"}),
+        ("robot", {"policy": "runs/hold", "teleop": "true"}, "teleop", {"other": "policy", "device": "joy"}),
+        ("robot", {"teleop": "gamepad"}, "hardware_bridge", {"need_reading": False}),
+        ("robot", {"bind": "10.0.0.1:6000"}, "hardware_bridge", {"bind": "10.0.0.1:6000"}),
+        ("robot", {"bind": "10.0.0.1:6000"}, "camera", {"pictures_bind": "10.0.0.1:6001"}),
+        ("robot", {"robot": "udp://a:1", "pictures": "udp://b:2"}, "camera", {"pictures": "udp://b:2"}),
+        ("robot", {"let_in": "1,2"}, "state_estimation", {"let_in": "1,2", "mode": "error-state"}),
+        ("robot", {"goal": "0,0,-0.5,0"}, "controller", {"goal": "0,0,-0.5,0"}),
+        ("robot", {"namespace": "robot_1"}, "camera", {"frame_prefix": "robot_1/"}),
+        ("robot", {"namespace": "robot_1", "frame_prefix": "a/"}, "camera", {"frame_prefix": "a/"}),
+        ("pool", {"positioning": "usbl", "site": "open-water"}, "virtual_pool", {"positioning": "usbl"}),
+        ("pool", {"port": "6000", "seed": "4"}, "virtual_pool", {"port": 6000, "seed": 4}),
+        ("pool", {}, "virtual_pool", {"pool_file": "pool.yaml"}),
+        ("sim", {"start": "0,0,-1,0"}, "sim", {"start": "0,0,-1,0", "use_sim_time": False}),
+        ("robot", {"pool_file": "1.yaml"}, "localizer", {"pool_file": "1.yaml"}),
+        ("robot", {"vehicle": "warpauv"}, "camera", {"vehicle": "warpauv"}),
+        ("robot", {}, "controller", {"policy": "pid", "vehicle": "finsrov"}),
+        ("sim", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper", "use_sim_time": True}),
+        ("sim", {"vehicle": "bluerov2_heavy"}, "sim", {"vehicle": "bluerov2_heavy", "seed": 1}),
+        ("pool", {"plant": "7"}, "virtual_pool", {"plant": "7", "severity": "realistic"}),
+    ],
+)
+def test_launch_arguments_win_over_parameter_files(launched, graph, given, node, parameters):
+    """Files that begin with /**, as ours do, lose against what is given at launch, and win over what is not."""
+    namespace = given.get("namespace") or given.get("vehicle", "finsrov")
+    assert parameters.items() <= parameters_of(launched(graph, **given), node, namespace).items()
+
+
+def defaults_of(node):
+    """Parameter -> default of a node, as its source and that of every node declare them."""
+    module = importlib.import_module(GRAPH_NODES[node].partition(":")[0])
+    found = {}
+    for part in (importlib.import_module("finssim.extensions.ros2.nodes.robot_node"), module):
+        for call in ast.walk(ast.parse(inspect.getsource(part))):
+            if (
+                isinstance(call, ast.Call)
+                and ast.unparse(call.func) == "self.parameter"
+                and len(call.args) == 2
+            ):
+                name, default = call.args
+                with contextlib.suppress(NameError):  # one that depends on the vehicle
+                    found[ast.literal_eval(name)] = eval(ast.unparse(default), vars(part))
+    return found
+
+
+EQUAL = [
+    ("sim", {}),
+    ("sim", {"vehicle": "bluerov2_heavy", "policy": "pid-paper", "goal": "0.5,0,-0.7,45", "seed": "3"}),
+    ("sim", {"namespace": "robot_1", "hydrodynamics": "mesh", "record": "a.mcap", "teleop": "joy"}),
+    ("robot", {"site": "open-water", "pool_file": "none", "camera": "none", "record": "x.mcap"}),
+    ("robot", {"pool_file": "none", "robot": "udp://192.168.0.2:58766", "bind": "192.168.0.10:54321"}),
+    ("robot", {"pool_file": "/a/pool.yaml", "robot": "serial:/dev/x", "pictures": "udp://b:2"}),
+    ("robot", {"site": "open-water", "let_in": "1,-2", "trajectory": "helix", "teleop": "gamepad"}),
+    ("pool", {"pool_file": "/a/pool.yaml"}),
+    ("pool", {"pool_file": "/a/pool.yaml", "site": "tank", "plant": "7", "severity": "hard", "port": "6000"}),
+    ("pool", {"site": "open-water", "positioning": "usbl", "world": "dock", "start": "0,1,-3,0"}),
+]
+
+
+@pytest.mark.parametrize(("graph", "given"), EQUAL)
+def test_launch_files_start_what_up_starts(launched, graph, given):
+    """The same namespace, the same nodes, each parameter the same; the pool's robot is its own launch file."""
+    pytest.importorskip("cyclonedds")
+    activate(announce=False)
+    typed = {name: int(text) if name in ("seed", "port") else text for name, text in given.items()}
+    plan = plan_of(graph, Options(**typed), given.get("pool_file", "pool.yaml"))
+    lines = launched(graph, **given)
+    if graph == "pool":
+        shared = {"namespace", "site", "bind", "port", "pool_file"} & given.keys()
+        assert set(lines) == {"virtual_pool"}
+        pictures = {"pictures": "udp://127.0.0.1:58767"} if "world" in given else {}
+        lines |= launched("robot", **{name: given[name] for name in shared}, robot="pool", **pictures)
+    assert set(lines) == set(plan.nodes)
+    for node in plan.nodes:
+        wanted = {**defaults_of(node), **plan.parameters["/**"], **plan.parameters.get(node, {})}
+        found = {**defaults_of(node), **parameters_of(lines, node, plan.namespace)}
+        for values in (wanted, found):
+            values["robot"] = POOL_ADDRESS if values["robot"] == "pool" else values["robot"]
+            if node == "sim":
+                values.pop("real_time_factor")
+        assert found == wanted, node
+
+
+def test_a_number_that_is_none_is_refused(launched):
+    """At launch, before any process."""
+    with pytest.raises(Ros2Error, match="seed:=x: expected an integer"):
+        launched("sim", seed="x")
+
+
+def test_a_recorder_is_started_where_a_parameter_file_names_its_file(launched, tmp_path):
+    """As launch files always did; otherwise only with record:=."""
+    path = tmp_path / "own.yaml"
+    path.write_text("/**/recorder:\n  ros__parameters: {record: a.mcap}\n")
+    lines = launched("robot", params_file=str(path))
+    assert parameters_of(lines, "recorder") == {"record": "a.mcap"}
+    assert "recorder" not in launched("robot")
+
+
+def test_a_parameter_file_of_ones_own_keeps_what_launch_does_not_say(launched, tmp_path):
+    """Nothing that a launch file would have as default."""
+    path = tmp_path / "own.yaml"
+    path.write_text("/**:\n  ros__parameters: {vehicle: lauv, policy: runs/a, rate: 30.0}\n")
+    lines = launched("robot", params_file=str(path), namespace="deep/blue")
+    assert parameters_of(lines, "controller", "deep/blue") == {
+        "vehicle": "lauv",
+        "policy": "runs/a",
+        "rate": 30.0,
+        "frame_prefix": "deep/blue/",
+    }
+    lines = launched("robot", params_file=str(path), policy="pid")
+    assert parameters_of(lines, "controller")["policy"] == "pid"
+
+
+def test_launch_files_start_what_is_installed(launched):
+    """Every executable has an entry point, and every node is one."""
+    started = [set(launched(graph)) for graph in ("sim", "pool", "robot")] + [
+        set(launched("robot", teleop="true", record="a.mcap"))
+    ]
+    assert set(launched("robot", camera="false")) == {"hardware_bridge", "state_estimation", "controller"}
+    assert set().union(*started) == entry_points() == set(GRAPH_NODES)
+    run = runpy.run_path(str(NODES / "finssim_ros/run.py"))
+    with pytest.raises(AttributeError, match="available: camera"):
+        run["__getattr__"]("kamera")
+
+
+def test_vehicles_that_pages_and_launch_files_name_exist():
+    """After `vehicle:=` and `--vehicle`."""
+    files = [*NODES.rglob("*.py"), WORKSPACE.parents[1] / "docs" / "ros2.md"]
+    named = {m for file in files for m in re.findall(r"(?:vehicle:=|--vehicle )([\w-]+)", file.read_text())}
+    assert {"finsrov", "bluerov2_heavy"} <= named <= set(catalogue())

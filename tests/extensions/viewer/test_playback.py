@@ -1,0 +1,34 @@
+"""The clock of a view."""
+
+import math
+
+import pytest
+
+from finssim.extensions.viewer.app import LONGEST_TURN, Playback
+
+
+def test_a_recording_stops_at_its_end_and_starts_again_from_there():
+    """Played at its end, it begins anew."""
+    clock = Playback(1.0, speed=4.0)
+    for _ in range(20):
+        clock.advance(0.05)
+    assert clock.time == 1.0 and not clock.playing
+    clock.seek(0.99)
+    clock.play(True)
+    assert clock.advance(0.05) == pytest.approx(0.2)
+
+
+def test_a_paused_clock_stands():
+    """And can be set meanwhile, within the recording."""
+    clock = Playback(10.0, playing=False)
+    clock.seek(99.0)
+    assert clock.advance(0.05) == 10.0
+    clock.seek(3.0)
+    assert clock.advance(0.05) == 3.0
+
+
+def test_a_live_source_knows_no_other_time():
+    """It cannot be set, and a turn that took long does not make it jump."""
+    clock = Playback(math.inf)
+    clock.seek(5.0)
+    assert clock.live and clock.advance(60.0) == LONGEST_TURN

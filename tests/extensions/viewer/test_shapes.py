@@ -1,0 +1,100 @@
+"""What is drawn has the size and the place of what is meant."""
+
+import numpy as np
+import pytest
+
+from finssim.core.rotations import quat_from_yaw
+from finssim.extensions.viewer.app import FIRST, LINE, blank, draw_picture, legend_of, plots_of
+from finssim.extensions.viewer.frame import Curve, Picture, Pose
+from finssim.extensions.viewer.shapes import ARROW, force_arrows, hull_of, line_of, tag_plates, wall_mesh
+from finssim.robot.messages import TagCorners
+from finssim.vehicles import load_vehicle
+
+FINSROV = load_vehicle("finsrov")
+
+
+def volume(mesh):
+    """Of a closed mesh, by the divergence theorem: sum of a . (b x c) / 6."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+
+
+def test_arrows_push_where_thrusters_push():
+    """Full thrust forward has the full length along the turned axis; nothing is drawn for no thrust."""
+    force = np.zeros(len(FINSROV.thruster_names))
+    force[0] = -np.max(np.abs(FINSROV.force_limits))
+    pose = Pose(np.array([1.0, 2.0, -0.5]), quat_from_yaw(np.pi / 2))
+    (arrow,) = force_arrows(FINSROV, force, pose)
+    thruster = FINSROV.thrusters[FINSROV.thruster_names[0]]
+    x, y, z = -np.asarray(thruster.axis) * ARROW * np.max(FINSROV.body.size)
+    assert arrow[1] - arrow[0] == pytest.approx([-y, x, z])
+    assert not len(force_arrows(FINSROV, 0.0 * force, pose)) and not len(
+        force_arrows(FINSROV, force[:0], pose)
+    )
+
+
+def test_a_vehicle_without_a_hull_is_a_box_of_its_size():
+    """The box is closed and faces outwards: its volume is that of the size."""
+    bare = FINSROV.model_copy(update={"hull": None})
+    assert volume(hull_of(bare)) == pytest.approx(float(np.prod(FINSROV.body.size)))
+    assert len(hull_of(FINSROV).faces) > 12
+
+
+@pytest.mark.parametrize("top", [0.0, -0.1])
+def test_walls_face_the_water(top):
+    """Floor and four walls, seen from inside, whatever the height of the lid that is left out."""
+    walls = wall_mesh(np.array([-2.0, -1.0, -1.0]), np.array([2.0, 1.0, top]))
+    a, b, c = (walls.vertices[walls.faces[:, i]] for i in range(3))
+    normal, middle = np.cross(b - a, c - a), (a + b + c) / 3.0
+    assert len(walls.faces) == 10
+    assert (np.einsum("ij,ij->i", normal, np.array([0.0, 0.0, -0.5]) - middle) > 0.0).all()
+
+
+def test_plates_lie_on_the_mounts():
+    """One plate for each tag, around its position."""
+    plates, tags = tag_plates(FINSROV)
+    positions = [m.position for m in FINSROV.tags.mounts.values()]
+    assert plates.vertices.reshape(-1, 4, 3).mean(axis=1) == pytest.approx(np.array(positions))
+    assert np.ptp(tags.vertices[:4], axis=0).max() == pytest.approx(0.9 * FINSROV.tags.edge)
+
+
+def test_a_line_leaves_out_what_is_unknown():
+    """k points make k - 1 segments; NaN is not drawn."""
+    points = np.array([[0.0, 0.0, 0.0], [np.nan] * 3, [1.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
+    assert line_of(points).shape == (2, 2, 3) and line_of(points[:1]).shape == (0, 2, 3)
+
+
+def test_tags_are_outlined_where_they_were_found():
+    """The outline is on the corners, the enlarged part beside; a tag at the border or of NaN hurts nobody."""
+    image = np.full((720, 1280), 90, np.uint8)
+    corners = np.array([[600.0, 300.0], [640.0, 300.0], [640.0, 340.0], [600.0, 340.0]])
+    plain, drawn = draw_picture(Picture(image)), draw_picture(Picture(image, [TagCorners(3, corners)]))
+    assert plain.shape == drawn.shape == (360, 640, 3) and (plain == 90).all()
+    assert tuple(drawn[150, 310]) == FIRST and tuple(drawn[170, 310]) == LINE
+    assert tuple(drawn[160, 310]) == (90, 90, 90)
+    odd = [TagCorners(1, corners - [620.0, 320.0]), TagCorners(2, corners * np.nan)]
+    draw_picture(Picture(image, odd[:1]))
+    draw_picture(Picture(None, odd[:1]))
+    assert blank().shape[2] == 3
+
+
+def test_plots_show_the_past_in_full():
+    """Curves of one title stand in one plot; of each, the part up to now is drawn again."""
+    time = np.arange(5.0)
+    curves = [Curve("a", "x", time, time), Curve("b", "x", time, -time), Curve("a", "y", time, 2 * time)]
+    first, second = plots_of(curves)
+    assert [c.label for c in first.curves] == ["x", "y"] and second.title == "b"
+    _, whole, past, *_ = first.data(2.0)
+    assert whole.tolist() == [0, 1, 2, 3, 4] and np.isnan(past).tolist() == [False] * 3 + [True] * 2
+    assert len(first.series()) == len(first.data(2.0)) == 5
+    assert legend_of([first, second]).count("■") == 2
+
+
+def test_a_plot_begins_where_all_its_curves_have_values():
+    """The first estimate comes later than the first distance to the goal; the browser draws nothing from a NaN on."""
+    time, late = np.arange(4.0), np.array([np.nan, 2.0, 3.0, 4.0])
+    curves = [Curve("position", "to the goal", time, time), Curve("position", "of the estimate", time, late)]
+    (plot,) = plots_of(curves)
+    data = plot.data(0.0)
+    assert [column[0] for column in data] == [1.0, 1.0, 1.0, 2.0, 2.0]
+    assert all(len(column) == 3 for column in data)

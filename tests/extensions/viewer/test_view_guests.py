@@ -1,0 +1,70 @@
+"""Who may connect to the page: the page itself, and no other that a browser shows."""
+
+import socket
+import urllib.error
+import urllib.request
+
+import pytest
+import viser
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from finssim.extensions.viewer.app import View
+from finssim.extensions.viewer.sources import RecordSource
+
+
+@pytest.fixture(scope="module")
+def port(trial):
+    """Of a page that is served."""
+    view = View(RecordSource(trial.record), port=8260, playing=False)
+    yield view.server.get_port()
+    view.close()
+
+
+def opened(port, host, origin):
+    """The WebSocket's first message, or the status of its refusal; the connection itself goes to this machine."""
+    options = {
+        "subprotocols": [f"viser-v{viser.__version__}"],
+        "additional_headers": {} if origin is None else {"Origin": origin},
+        "sock": socket.create_connection(("127.0.0.1", port)),
+    }
+    try:
+        with connect(f"ws://{host}", **options, proxy=None, max_size=None) as page:
+            return page.recv(timeout=30.0)
+    except InvalidStatus as refusal:
+        return refusal.response.status_code
+
+
+@pytest.mark.slow
+def test_only_the_served_page_may_connect(port):
+    """The page's own WebSocket gets the scene; one of another site, of a name led here or without one gets 403."""
+    own = f"localhost:{port}"
+    assert isinstance(opened(port, own, f"http://{own}"), bytes)
+    assert isinstance(opened(port, f"127.0.0.1:{port}", f"http://127.0.0.1:{port}"), bytes)
+    for host, origin in (
+        (own, "http://evil.example"),
+        (own, f"https://{own}"),
+        (own, "null"),
+        (own, None),
+        (own, f"http://localhost:{port}1"),
+        (f"evil.example:{port}", f"http://evil.example:{port}"),
+        (f"localhost.evil.example:{port}", f"http://localhost.evil.example:{port}"),
+    ):
+        assert opened(port, host, origin) == 403, (host, origin)
+
+
+@pytest.mark.slow
+def test_the_page_is_served_under_names_of_this_machine_alone(port):
+    """A name that another site led here gets no page either."""
+    for host, status in (
+        (f"localhost:{port}", 200),
+        (f"127.0.0.1:{port}", 200),
+        (f"evil.example:{port}", 403),
+    ):
+        request = urllib.request.Request(f"http://127.0.0.1:{port}/", headers={"Host": host})
+        try:
+            with urllib.request.urlopen(request, timeout=30.0) as page:
+                found = page.status
+        except urllib.error.HTTPError as refusal:
+            found = refusal.code
+        assert found == status

@@ -1,0 +1,117 @@
+"""The page in a real browser: it plays, draws the vehicle where it is, and the slider moves it."""
+
+import shutil
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from finssim.core.rotations import quat_to_matrix
+from finssim.extensions.viewer.app import View
+from finssim.extensions.viewer.sources import RecordSource
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+PATIENCE = 120.0
+"""Software rendering on a busy machine takes its time [s]."""
+
+
+@pytest.fixture
+def view(trial):
+    """A page of the record, standing at its beginning."""
+    view = View(
+        RecordSource(trial.record, truth=trial.truth, basin=(4.0, 2.0, 1.0)), port=8230, playing=False
+    )
+    yield view
+    view.close()
+
+
+@pytest.fixture
+def page(view):
+    """The page in headless Chromium."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE))
+        page = browser.new_page(viewport={"width": 960, "height": 640})
+        page.set_default_timeout(1e3 * PATIENCE)
+        page.goto(view.url)
+        page.wait_for_selector("canvas")
+        page.locator(".mantine-Notification-closeButton").first.click()  # that it renders without a GPU
+        yield page
+        browser.close()
+
+
+def shot(page):
+    """What is on the page, (h, w, 3) BGR."""
+    return cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+
+
+def place_of(view, position):
+    """Where on the page a point of the world is drawn [px]."""
+    (client,) = view.server.get_clients().values()
+    camera = client.camera
+    w, x, y, z = camera.wxyz
+    ray = quat_to_matrix([x, y, z, w]).T @ (np.asarray(position) - camera.position)
+    focal = 0.5 * camera.image_height / np.tan(0.5 * camera.fov)
+    return 0.5 * np.array([camera.image_width, camera.image_height]) + focal * ray[:2] / ray[2]
+
+
+def orange_near(picture, place, reach=45):
+    """How many pixels around a place have the colour of the true vehicle."""
+    x, y = place.round().astype(int)
+    part = picture[max(y - reach, 0) : y + reach, max(x - reach, 0) : x + reach].astype(int)
+    blue, green, red = np.moveaxis(part, 2, 0)
+    return int(((red - blue > 40) & (red > green)).sum())
+
+
+def until(view, page, holds):
+    """Turn the loop and look at the page until it shows what it should; returns the picture."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        view.turn(0.6)
+        picture = shot(page)
+        if holds(picture):
+            return picture
+    pytest.fail("the page never showed it")
+
+
+def wait(holds):
+    """Until something is true that another thread brings about."""
+    end = time.monotonic() + PATIENCE
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+def test_the_vehicle_is_drawn_where_it_is_and_moves_with_the_slider(view, page):
+    """Hundreds of colours; truth-coloured pixels where the pose projects to; at the slider's end they are elsewhere."""
+    page.get_by_role("button", name="play").click()
+    wait(lambda: view.playback.playing)
+    view.turn(0.6)
+    assert view.playback.time > 0.0
+    view.playback.play(False)
+    view.playback.seek(1.0)
+    view.turn(0.6)
+    true = view.source.frame(1.0).truth.position
+    before = until(view, page, lambda picture: orange_near(picture, place_of(view, true)) > 150)
+    first = place_of(view, true)
+    scene = before[:, : int(2 * first[0])]
+    assert len(np.unique(scene.reshape(-1, 3), axis=0)) > 200
+
+    page.get_by_role("slider").first.press("End")
+    last = place_of(view, view.source.frame(view.source.duration).truth.position)
+    assert np.linalg.norm(last - first) > 40.0
+    left = 0.5 * orange_near(before, first, reach=20)
+
+    def moved(picture):
+        there, here = orange_near(picture, last, reach=20), orange_near(picture, first, reach=20)
+        return view.playback.time > 5.0 and there > 100 and here < left
+
+    after = until(view, page, moved)
+    # The camera's picture in the panel follows, too.
+    panel = np.s_[200:, int(0.7 * after.shape[1]) :]
+    assert (np.abs(after[panel].astype(int) - before[panel]) > 40).sum() > 500

@@ -1,0 +1,114 @@
+"""Every vector of the box is a plant that can be."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from finssim.identification.simulation.fit import Parameters
+from finssim.sim.plant_arrays import vehicle_parameters
+from finssim.trials.findings import CalibrationError
+from finssim.vehicles import AXES, load_vehicle
+
+VEHICLES = {
+    name: load_vehicle(name) for name in ("finsrov", "bluerov2", "bluerov2_heavy", "rexrov", "remus100")
+}
+
+
+def made(name, axes, extras=()):
+    vehicle = VEHICLES[name]
+    return Parameters(
+        vehicle,
+        axes=axes,
+        damping=dict.fromkeys(axes, "both"),
+        extras=extras,
+        biases=axes,
+    )
+
+
+def vectors(p, seed):
+    """Random vectors over orders of magnitude, in and far outside the box."""
+    rng = np.random.default_rng(seed)
+    size = p.scale * 10.0 ** rng.uniform(-3.0, 3.0, (20, len(p.scale)))
+    return p.start * rng.choice([0.0, 1.0], (20, 1)) + rng.choice([-1.0, 0.0, 1.0], size.shape) * size
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000), chosen=st.sets(st.sampled_from(AXES), min_size=1))
+def test_any_vector_is_positive_definite_and_takes_energy_out(name, seed, chosen):
+    """M_RB + M_A is symmetric and positive definite; nu · (D1 + D2 diag|nu|) nu >= 0 for velocities of all sizes."""
+    axes = tuple(a for a in AXES if a in chosen)
+    p = made(name, axes)
+    M_A, D1, D2 = p.matrices(vectors(p, seed))
+    M = p.M_RB + M_A
+    np.testing.assert_allclose(M, np.swapaxes(M, 1, 2), rtol=1e-9, atol=1e-12 * np.abs(M).max())
+    scale = np.sqrt(np.einsum("wii->wi", M))
+    assert np.linalg.eigvalsh(M / (scale[:, :, None] * scale[:, None, :])).min() > 0.0
+    rng = np.random.default_rng(seed)
+    nu = rng.normal(size=(300, 6)) * 10.0 ** rng.uniform(-2.0, 2.0, (300, 6))
+    for matrices, speed, own in (
+        (D1, nu, p.set.linear_damping),
+        (D2, np.abs(nu) * nu, p.set.quadratic_damping),
+    ):
+        if np.einsum("ni,ij,nj->n", nu, own, speed).min() < 0.0 or np.any(own - np.diag(np.diag(own))):
+            continue  # couplings of the vehicle file itself, which the fit of some axes keeps
+        power = np.einsum("ni,wij,nj->wn", nu, matrices, speed)
+        size = np.einsum("ni,wij,nj->wn", np.abs(nu), np.abs(matrices), np.abs(speed))
+        assert (power >= -1e-9 * size).all()
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_the_start_is_the_vehicle_file(name):
+    """Added mass, damping, buoyancy and stiffness of the start vector are those the simulator makes of the file."""
+    p = made(name, AXES, ("k", "buoyancy_excess", "thrust_scale"))
+    plants = p.plants(p.start)
+    own = vehicle_parameters(VEHICLES[name], "calibrated")
+    np.testing.assert_allclose(
+        plants.fields["M_A"][0, 0], own["M_A"], rtol=1e-7, atol=1e-6 * np.abs(own["M_A"]).max()
+    )
+    np.testing.assert_allclose(plants.fields["volume"][0, 0], own["volume"], rtol=1e-9)
+    assert plants.fields["gain"][0, 0].tolist() == [1.0] * 8
+    assert not plants.bias.any()
+    if VEHICLES[name].body.center_of_buoyancy[2] > VEHICLES[name].body.center_of_gravity[2]:
+        np.testing.assert_allclose(plants.fields["r_b"][0, 0], own["r_b"], atol=1e-9)
+    np.testing.assert_allclose(plants.fields["D1"][0, 0], own["D1"])
+    np.testing.assert_allclose(plants.fields["D2"][0, 0], own["D2"])
+
+
+def test_what_is_not_free_stays():
+    """A fit of surge leaves every entry of the other axes as the file has it."""
+    p = made("bluerov2", ("surge",))
+    M_A, D1, D2 = p.matrices(p.start + 3.0)
+    rest = ~np.eye(6, dtype=bool)[0]
+    assert (M_A[0, 0, 0], D1[0, 0, 0], D2[0, 0, 0]) == pytest.approx((8.5, 7.03, 21.18))
+    for found, name in ((M_A, "added_mass"), (D1, "linear_damping"), (D2, "quadratic_damping")):
+        assert np.array_equal(found[0][:, rest], getattr(p.set, name)[:, rest])
+
+
+def test_a_bias_acts_against_the_motion_at_the_reference_point():
+    """M nu_dot + D nu + b = tau: a bias b of surge pushes with -b at the reference point, and so turns the origin."""
+    p = made("finsrov", ("surge",))
+    x = p.start.copy()
+    x[p.names.index("surge.bias")] = 2.0
+    np.testing.assert_allclose(p.plants(x).bias[0, 0], [-2.0, 0, 0, 0, -2.0 * -0.08, 0], atol=1e-12)
+
+
+def test_stiffness_is_the_restoring_moment_of_the_plant():
+    """k = B (z_b - z_r) - W (z_g - z_r), whatever else is free."""
+    p = made("finsrov", ("roll",), ("k", "buoyancy_excess"))
+    x = p.start.copy()
+    x[p.names.index("k")], x[p.names.index("buoyancy_excess")] = 5.0, 3.0
+    f, v = p.plants(x).fields, VEHICLES["finsrov"]
+    B = v.water.density * v.water.gravity * float(f["volume"][0, 0])
+    assert B - v.weight == pytest.approx(3.0)
+    k = B * (f["r_b"][0, 0, 2] - p.r_h[2]) - v.weight * (v.body.center_of_gravity[2] - p.r_h[2])
+    assert k == pytest.approx(5.0)
+
+
+def test_a_set_without_coefficients_is_refused():
+    """A mesh has no damping that could be fitted."""
+    sets = VEHICLES["finsrov"].hydrodynamics
+    bare = VEHICLES["finsrov"].model_copy(update={"hydrodynamics": {"calibrated": sets["mesh"]}})
+    with pytest.raises(CalibrationError, match="no coefficients in hydrodynamics.calibrated"):
+        Parameters(bare, axes=("surge",), damping={"surge": "both"})

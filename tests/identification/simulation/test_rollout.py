@@ -1,0 +1,217 @@
+"""Segments under candidate plants move as in a simulator of their own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from finssim.identification.simulation.rollout import Rollouts, Segment
+from finssim.sim.simulator import Simulator
+from finssim.trials.findings import CalibrationError
+from finssim.vehicles import load_vehicle
+
+STEP = 0.02
+DEPTH = 50.0
+
+
+def segment(vehicle, force, *, B=None, commanded=True, before=None, **changes):
+    """A stretch that starts level and at rest with motors that have been told the first force for long."""
+    force = np.asarray(force, float)
+    thrusters = B is None
+    given = {
+        "trial": "made up",
+        "index": 0,
+        "t0": 0.0,
+        "step": STEP,
+        "force": force,
+        "before": np.repeat(force[:1], 50, axis=0) if before is None else np.asarray(before, float),
+        "B": vehicle.thruster_matrix() if thrusters else np.asarray(B, float),
+        "commanded": commanded,
+        "thrusters": thrusters,
+        "position": np.zeros(3),
+        "quaternion": np.array([0.0, 0.0, 0.0, 1.0]),
+        "nu": np.zeros(6),
+        "known": np.ones(12, bool),
+        "sink": -DEPTH,
+        "density": vehicle.water.density,
+        "current": np.zeros(3),
+        "measured": {},
+        "velocity_at": np.zeros(3),
+        "velocity_in_water": False,
+        "position_at": np.zeros(3),
+        "depth_at": np.zeros(3),
+    }
+    return Segment(**{**given, **changes})
+
+
+def steps_of(vehicle, n, seed=0, size=3.0):
+    """Thruster forces that jump every 0.2 s."""
+    levels = size * np.random.default_rng(seed).normal(size=(n // 10 + 1, len(vehicle.thrusters)))
+    return np.repeat(levels, 10, axis=0)[:n]
+
+
+def plain(vehicle, force, *, hydrodynamics="calibrated", substeps=1):
+    """Velocity after every step of an ordinary simulation whose motors already ran on the first command."""
+    sim = Simulator(
+        vehicle, control_step=STEP, substeps=substeps, integrator="rk4", hydrodynamics=hydrodynamics
+    )
+    for _ in range(100):
+        sim.set_thrust(force[0])
+        sim.step()
+    sim.numpy("position")[...] = [0.0, 0.0, -DEPTH]
+    sim.numpy("quaternion")[...] = [0.0, 0.0, 0.0, 1.0]
+    sim.numpy("velocity")[...] = 0.0
+    out = [np.zeros(6, np.float32)]
+    for f in force:
+        sim.set_thrust(f)
+        sim.step()
+        out.append(sim.numpy("velocity")[0, 0].copy())
+    return np.array(out)
+
+
+@pytest.mark.parametrize("hydrodynamics", ["calibrated", "mesh"])
+@pytest.mark.parametrize("name", ["finsrov", "bluerov2", "bluerov2_heavy"])
+def test_a_rollout_is_an_ordinary_simulation(name, hydrodynamics):
+    """Motors, delay and hydrodynamics are the simulator's: every candidate's world moves as a plain run does."""
+    vehicle = load_vehicle(name)
+    force = steps_of(vehicle, 60)
+    response = Rollouts(vehicle, [segment(vehicle, force)], hydrodynamics=hydrodynamics).run(candidates=2)
+    expected = plain(vehicle, force, hydrodynamics=hydrodynamics)
+    np.testing.assert_allclose(response.nu[:, 1, 0], expected, atol=2e-6)
+    assert response.finite.all()
+
+
+@pytest.mark.parametrize("domain", ["force", "speed"])
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_motors_of_a_later_segment_are_already_running(domain, substeps):
+    """A segment cut from a run goes on as that run did, lag and delay line included."""
+    slew = {"force": 100.0, "speed": 2000.0}[domain]
+    vehicle = load_vehicle("finsrov").replace({"thrusters.*.domain": domain, "thrusters.*.slew": slew})
+    force, begin = steps_of(vehicle, 120), 80
+    first = Rollouts(vehicle, [segment(vehicle, force)], substeps=substeps).run()
+    state = {"nu": first.nu, "quaternion": first.quaternion, "position": first.position}
+    later = replace(
+        segment(vehicle, force[begin:], before=force[:begin]),
+        **{name: values[begin, 0, 0].astype(float) for name, values in state.items()},
+    )
+    again = Rollouts(vehicle, [later], substeps=substeps).run()
+    np.testing.assert_allclose(again.nu[:, 0, 0], first.nu[begin:, 0, 0], atol=5e-5)
+
+
+def test_a_wrench_acts_as_the_thrusters_that_make_it():
+    """Applied thruster forces f and the applied wrench B f are one drive."""
+    vehicle = load_vehicle("bluerov2")
+    force = steps_of(vehicle, 60)
+    B = vehicle.thruster_matrix()
+    pair = [
+        segment(vehicle, force, commanded=False),
+        segment(vehicle, force @ B.T, B=np.eye(6), commanded=False),
+    ]
+    nu = Rollouts(vehicle, pair).run().nu
+    np.testing.assert_allclose(nu[:, 0, 0], nu[:, 0, 1], atol=2e-6)
+
+
+@pytest.mark.parametrize("thrusters", [True, False])
+def test_what_was_commanded_is_delayed_and_what_acted_is_not(thrusters):
+    """FinsROV's motors wait 0.05 s: a commanded step moves nothing before, an applied one does."""
+    vehicle = load_vehicle("finsrov")
+    force = np.repeat(vehicle.thruster_matrix()[:1] * 3.0, 20, axis=0)
+    B = None
+    if not thrusters:
+        force, B = force @ vehicle.thruster_matrix().T, np.eye(6)
+    pair = [
+        segment(vehicle, force, B=B, commanded=commanded, before=np.zeros((50, force.shape[1])))
+        for commanded in (True, False)
+    ]
+    u = Rollouts(vehicle, pair).run().nu[:, 0, :, 0]
+    assert abs(u[2, 0]) < 1e-6 < 0.005 < u[2, 1]
+    assert u[10, 0] > 0.01
+
+
+def test_an_applied_force_is_linear_between_its_samples():
+    """Coarse samples of a ramp move the vehicle as fine ones do."""
+    vehicle = load_vehicle("finsrov")
+    ends = []
+    for step in (0.1, 0.01):
+        t = step * np.arange(1, round(2.0 / step) + 1)
+        force = np.outer(20.0 * t, [1.0, 0, 0, 0, 0, 0])
+        s = segment(
+            vehicle, force, B=np.eye(6), commanded=False, before=np.zeros((5, 6)), step=step, nu=np.zeros(6)
+        )
+        ends.append(Rollouts(vehicle, [s], substeps=1).run().nu[-1, 0, 0, 0])
+    # A staircase would lead by half a coarse step, 1 N of 40 N.
+    np.testing.assert_allclose(*ends, rtol=2e-3)
+
+
+def test_a_batch_equals_its_parts():
+    """No world knows of another: candidates and segments together give bitwise what each gives alone."""
+    vehicle = load_vehicle("finsrov")
+    parts = [segment(vehicle, steps_of(vehicle, n, seed=n)) for n in (30, 50)]
+    damping = np.stack([np.diag([s, 50.0, 80.0, 1.0, 1.0, 0.3]) for s in (20.0, 40.0, 60.0)])[:, None]
+    whole = Rollouts(vehicle, parts).run({"D1": damping})
+    for i, part in enumerate(parts):
+        for c in range(3):
+            alone = Rollouts(vehicle, [part]).run({"D1": damping[c : c + 1]})
+            assert np.array_equal(alone.nu[:, 0, 0], whole.nu[: part.steps + 1, c, i])
+    assert np.isnan(whole.nu[31:, :, 0]).all()
+    assert np.isfinite(whole.nu[:, :, 1]).all()
+
+
+def test_the_passes_of_a_large_batch_change_nothing(monkeypatch):
+    """Candidates that do not fit into memory at once are simulated in turns."""
+    vehicle = load_vehicle("finsrov")
+    rollouts = Rollouts(vehicle, [segment(vehicle, steps_of(vehicle, 20))])
+    mass = np.linspace(10.0, 14.0, 7)[:, None]
+    at_once = rollouts.run({"mass": mass}).nu
+    monkeypatch.setattr("finssim.identification.simulation.rollout.BUDGET", 3 * 8000.0)
+    assert np.array_equal(rollouts.run({"mass": mass}).nu, at_once)
+
+
+def test_the_water_of_a_trial_is_its_own():
+    """Denser water in the trial's header is the same as denser water in the vehicle file."""
+    vehicle = load_vehicle("finsrov")
+    still = np.zeros((50, 8))
+    dense = Rollouts(vehicle, [segment(vehicle, still, density=1050.0)]).run().nu[-1, 0, 0]
+    file = vehicle.replace({"water.density": 1050.0})
+    assert dense[2] > 0.01
+    np.testing.assert_allclose(dense, Rollouts(file, [segment(file, still)]).run().nu[-1, 0, 0], atol=1e-7)
+
+
+def test_a_current_carries_the_vehicle():
+    """At rest in a current, drag and the water's own acceleration pull it along until it drifts with the water."""
+    vehicle = load_vehicle("finsrov")
+    current = np.array([0.1, 0.0, 0.0])
+    response = Rollouts(vehicle, [segment(vehicle, np.zeros((600, 8)), current=current)]).run()
+    assert response.nu[-1, 0, 0, 0] == pytest.approx(0.1, rel=0.02)
+
+
+def test_a_submerged_vehicle_does_not_surface_while_it_drifts():
+    """Simulated far below and reported where it began, buoyancy stays whole however high it rises."""
+    vehicle = load_vehicle("finsrov").replace({"body.displaced_volume": 0.0121})
+    response = Rollouts(
+        vehicle, [segment(vehicle, np.zeros((500, 8)), position=np.array([0.0, 0.0, -0.5]))]
+    ).run()
+    z, w = response.position[:, 0, 0, 2], response.nu[:, 0, 0, 2]
+    assert z[0] == pytest.approx(-0.5, abs=1e-5) and z[-1] > -0.4
+    assert (np.diff(w) > -1e-6).all()
+
+
+def test_a_candidate_that_diverges_is_told_and_harms_no_other():
+    """Negative damping grows without bound; its neighbour moves as ever."""
+    vehicle = load_vehicle("finsrov")
+    D2 = np.zeros((2, 1, 6, 6))
+    D2[1, 0, 0, 0] = -1e5
+    moving = segment(vehicle, np.zeros((100, 8)), nu=np.array([1.0, 0, 0, 0, 0, 0]))
+    response = Rollouts(vehicle, [moving]).run({"D2": D2})
+    assert response.finite[:, 0].tolist() == [True, False]
+    assert np.isfinite(response.nu[:, 0]).all() and np.isnan(response.nu[-1, 1]).all()
+
+
+def test_segments_of_different_steps_are_refused():
+    """One batch has one clock."""
+    vehicle = load_vehicle("finsrov")
+    pair = [segment(vehicle, np.zeros((10, 8))), replace(segment(vehicle, np.zeros((10, 8))), step=0.05)]
+    with pytest.raises(CalibrationError, match="one step"):
+        Rollouts(vehicle, pair)
+    with pytest.raises(CalibrationError, match="nothing to simulate"):
+        Rollouts(vehicle, [])

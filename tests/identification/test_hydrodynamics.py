@@ -1,0 +1,188 @@
+"""From logs as people have them to a vehicle file that replays other trials better than the catalogue's."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from finssim.identification.fit import Estimate
+from finssim.identification.hydrodynamics import _worse, fit_hydrodynamics
+from finssim.identification.programmes import programmes
+from finssim.identification.regression.axis_estimates import trim
+from finssim.identification.replay import replay
+from finssim.identification.synthetic import simulate_programme
+from finssim.identification.vehicle_file import calibrated
+from finssim.trials.check import check_trials
+from finssim.trials.findings import CalibrationError
+from finssim.trials.importers.dispatch import read_trials
+from finssim.vehicles import load_vehicle
+
+DATA = Path(__file__).parents[1] / "data" / "standins"
+DOCS = Path(__file__).parents[2] / "docs" / "reference" / "trial_format.md"
+
+
+def read(pattern, name, folder, tmp):
+    """Trials of a set by the map that the page on trials prints under this name."""
+    block = DOCS.read_text(encoding="utf-8").split(f"# {name}\n", 1)[1].split("```", 1)[0]
+    (tmp / name).write_text(block)
+    files = sorted(path for p in pattern for path in (DATA / folder).glob(p))
+    return read_trials(files, column_map=tmp / name)
+
+
+def scores(vehicle, trials, **options):
+    """NRMSE by axis, the median over the trials."""
+    return replay(trials, vehicle, **options).aggregate("calibrated").by_axis
+
+
+@pytest.fixture(scope="module")
+def joystick(tmp_path_factory):
+    """Trials to fit, trials to replay."""
+    tmp = tmp_path_factory.mktemp("map")
+    held = [f"*_{level}.csv" for level in ("040", "060")]
+    return read(["*_025.csv"], "joystick.yaml", "joystick_mocap", tmp), read(
+        held, "joystick.yaml", "joystick_mocap", tmp
+    )
+
+
+def test_sticks_and_motion_capture_at_5_hz(joystick):
+    """Fitted at a quarter of the sticks' range, replayed at twice that: below 0.1, and better than the catalogue."""
+    fitted, held = joystick
+    vehicle = load_vehicle("bluerov2_heavy")
+    fit = fit_hydrodynamics(fitted, vehicle, method="regression")
+    found, before = scores(calibrated(fit), held), scores(vehicle, held)
+    assert max(found[axis] for axis in ("surge", "sway", "yaw", "heave")) < 0.10, found
+    assert all(found[axis] < 0.8 * before[axis] for axis in found), (found, before)
+    scale = fit.estimates["thrust_scale"]
+    assert scale.ci95[0] < scale.estimate < scale.ci95[1] and scale.ci95[1] > 1.5 * scale.ci95[0]
+    mass = fit.estimates["surge.m_eff"]
+    assert mass.ci95[1] - mass.ci95[0] > 0.4 * mass.estimate and not mass.identifiable
+    assert "voltage_unknown" in {one.code for one in fit.findings}
+
+
+def test_a_known_voltage_leaves_the_thrust_alone(joystick):
+    """With the voltage in the header no scale is estimated, and the masses are surer."""
+    fitted, _ = joystick
+    vehicle = load_vehicle("bluerov2_heavy")
+    told = [replace(t, header=t.header.model_copy(update={"voltage": 15.0})) for t in fitted]
+    fit = fit_hydrodynamics(told, vehicle, method="regression", axes=["yaw"])
+    assert "thrust_scale" not in fit.estimates
+    assert fit.estimates["yaw.m_eff"].identifiable
+
+
+@pytest.mark.slow
+def test_pulses_and_an_imu_without_any_velocity(tmp_path):
+    """Roll, pitch, yaw three seconds ahead and a yaw trial of a higher level, from gyro, attitude and depth alone."""
+    vehicle = load_vehicle("bluerov2")
+    fitted = read(["yaw_020*", "yaw_035*", "mixed_035*", "heave_050*"], "pulses.yaml", "pulses_imu", tmp_path)
+    held = read(["yaw_050*", "mixed_050*"], "pulses.yaml", "pulses_imu", tmp_path)
+    reports = check_trials(fitted, vehicle)
+    for report in reports:
+        assert {"heading_drift", "inputs_zero_after"} <= {one.code for one in report.findings}, (
+            report.findings
+        )
+    fit = fit_hydrodynamics(fitted, vehicle)
+    assert fit.method == "simulation"
+    assert "not_converged" not in {one.code for one in fit.findings}
+    result = replay(held, calibrated(fit), horizon=3.0)
+    ahead = {axis: result.ahead[axis]["calibrated"].nrmse[-1] for axis in ("roll", "pitch", "yaw")}
+    assert max(ahead.values()) < 0.15, ahead
+    (yaw,) = (
+        s["yaw"].value
+        for p, s in zip(result.pairs, result.scores["calibrated"], strict=True)
+        if p.name == "yaw_050"
+    )
+    assert yaw < 0.10
+
+
+def test_a_heading_that_decays(tmp_path):
+    """Spun by hand and weighed by nobody: quadratic drag over inertia, with an interval; an inertia scales it."""
+    vehicle = load_vehicle("bluerov2")
+    trials = read(["*.csv"], "decay.yaml", "yaw_decay", tmp_path)
+    fit = fit_hydrodynamics(trials, vehicle)
+    ratio = fit.estimates["yaw.d2/m_eff"]
+    assert ratio.estimate == pytest.approx(0.775, rel=0.02) and ratio.identifiable
+    assert ratio.ci95[1] - ratio.ci95[0] < 0.05 * ratio.estimate
+    assert fit.quality["yaw"]["rmse_quadratic"] < 0.2 * fit.quality["yaw"]["rmse_linear"]
+    assert scores(calibrated(fit), trials)["yaw"] < 0.02
+    linear = fit_hydrodynamics(trials, vehicle, damping="linear").estimates
+    assert linear["yaw.d1/m_eff"].estimate > 0.1 and linear["yaw.d2/m_eff"].estimate == 0.0
+    known = fit_hydrodynamics(trials, vehicle, known={"yaw": 0.5})
+    assert known.estimates["yaw.d2"].estimate == pytest.approx(0.5 * ratio.estimate)
+    assert calibrated(known).mass_matrix()[5, 5] == pytest.approx(0.5, rel=1e-6)
+
+
+def test_what_replays_worse_is_judged_by_trials_that_were_not_fitted(tmp_path):
+    """Held-out trials where there are any, else each trial by a fit of the others, and the finding says which."""
+    vehicle = load_vehicle("bluerov2")
+    slow = read(["spin_[1-3].csv"], "decay.yaml", "yaw_decay", tmp_path)
+    words = []
+    told = lambda part, text: words.append((part, text))  # noqa: E731
+    fit = fit_hydrodynamics(slow, vehicle, progress=told)
+    assert not {"replays_worse"} & {one.code for one in fit.findings}
+    assert words[0][0] <= words[-1][0] <= 1.0 and any("free motion of yaw" in text for _, text in words)
+    (drag,) = (path for path in fit.changes if "quadratic_damping" in path)
+    bad = replace(fit, changes={**fit.changes, drag: 5.0})
+    before = {"yaw": 1e-3}
+    held = _worse(bad, vehicle, slow, slow, {}, None)
+    assert [one.values["judged"] for one in held] == ["the held-out trials"]
+    wild = replace(fit, changes={**fit.changes, drag: 500.0})  # no replay stays finite
+    assert _worse(wild, vehicle, slow, slow, {}, None)
+    crossed = _worse(fit, vehicle, slow, (), before, lambda k: bad)
+    assert [one.values["judged"] for one in crossed] == ["trials left out of the fit in turn"]
+
+
+def test_options_belong_to_their_method(joystick):
+    """What a method cannot do is refused before anything is fitted."""
+    fitted, _ = joystick
+    vehicle = load_vehicle("bluerov2_heavy")
+    for options in (
+        {"method": "regression", "horizon": 5.0},
+        {"method": "simulation", "known": {"yaw": 1.0}},
+        {"method": "x"},
+    ):
+        with pytest.raises(CalibrationError):
+            fit_hydrodynamics(fitted, vehicle, **options)
+
+
+def test_a_known_inertia_tells_the_thrust(joystick):
+    """Yaw's inertia given: the scale is what makes the motion agree with it, and is surer than batteries are."""
+    fitted, _ = joystick
+    vehicle = load_vehicle("bluerov2_heavy")
+    free = fit_hydrodynamics(fitted, vehicle, method="regression", axes=["yaw"])
+    ratio = free.estimates["yaw.m_eff"].estimate / free.estimates["thrust_scale"].estimate
+    fit = fit_hydrodynamics(fitted, vehicle, method="regression", axes=["yaw"], known={"yaw": 0.9})
+    scale = fit.estimates["thrust_scale"]
+    assert scale.estimate == pytest.approx(0.9 / ratio, rel=0.03)
+    assert scale.ci95[1] < 1.2 * scale.ci95[0]
+    assert fit.estimates["yaw.m_eff"].ci95 == (0.9, 0.9)
+
+
+def test_a_vehicle_that_lies_tilted_keeps_its_tilt():
+    """The centre of buoyancy that constant moments of roll and pitch give holds the vehicle where they did."""
+    k, buoyancy, tilts = 2.0, 110.0, {"roll.bias": 0.2, "pitch.bias": -0.3}
+    found = {
+        name: Estimate(name=name, estimate=b, ci95=(b - 0.1, b + 0.1), unit="N m", identifiable=True)
+        for name, b in tilts.items()
+    }
+    moved = trim(found, buoyancy, (0.01, 0.0, 0.05))
+    arm = buoyancy * np.array(
+        [moved["body.center_of_buoyancy.0"] - 0.01, moved["body.center_of_buoyancy.1"], k / buoyancy]
+    )
+    moment = np.cross(arm, [0.0, 0.0, 1.0])  # level: what b takes off on the left side of the equation
+    np.testing.assert_allclose(moment[:2], [-tilts["roll.bias"], -tilts["pitch.bias"]], atol=1e-12)
+    unsure = {"roll.bias": replace(found["roll.bias"], ci95=(-0.1, 0.5))}
+    assert trim(unsure, buoyancy, (0.0, 0.0, 0.05)) == {}
+
+
+@pytest.mark.parametrize("lead", [0.0, 0.1])
+def test_a_replay_allows_for_two_clocks(lead):
+    """Motion stamped a tenth of a second early: named, and the score is that of one clock."""
+    vehicle = load_vehicle("bluerov2_heavy")
+    (trial,) = simulate_programme(programmes("yaw", vehicle)[:1], vehicle, seed=2, inputs=("command",))
+    n = round(lead * 50)
+    channels = {c: v[: len(v) - n] if c.startswith("command") else v[n:] for c, v in trial.channels.items()}
+    moved = replace(trial, t=trial.t[: len(trial.t) - n], channels=channels, phase=None)
+    result = replay([moved], vehicle)
+    assert result.pairs[0].late.get("calibrated", 0.0) == pytest.approx(-lead, abs=0.011)
+    assert result.scores["calibrated"][0]["yaw"].value < 0.03

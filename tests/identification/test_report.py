@@ -1,0 +1,103 @@
+"""A calibration's report stands alone and says what a reader needs to trust or to repeat it."""
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+
+from finssim.core.files import OutputError
+from finssim.identification.fit import Curve
+from finssim.identification.report import write_report
+from finssim.identification.vehicle_file import calibrated
+from finssim.trials.findings import finding
+from identification.made_fits import made_fit
+
+WEAK = [finding("unusable", reason="surge <alone> is weak")]
+COMMAND = "finssim calibrate hydrodynamics trials --vehicle finsrov --out mine.yaml"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The report of a fit made by hand."""
+    fit = made_fit()
+    out = tmp_path_factory.mktemp("report") / "report"
+    write_report(fit, out, calibrated(fit), command=COMMAND, findings=WEAK)
+    return out
+
+
+def test_the_page_loads_nothing(folder):
+    """Pictures are inside; no script, no style sheet, no address; text is escaped."""
+    html = (folder / "report.html").read_text(encoding="utf-8")
+    sources = re.findall(r'(?:src|href)="([^"]{0,30})', html)
+    assert len(sources) == 2 and all(source.startswith("data:image/png;base64,") for source in sources)
+    assert "http" not in re.sub(r'"data:[^"]*"', "", html) and "<script" not in html
+    assert "surge &lt;alone&gt; is weak" in html
+
+
+@pytest.mark.parametrize("name", ["report.html", "report.md"])
+def test_a_reader_finds_what_they_need(folder, name):
+    """Estimates with intervals, what was kept, warnings, trials by digest, and how to do it again."""
+    text = (folder / name).read_text(encoding="utf-8")
+    vehicle = calibrated(made_fit())
+    for words in (
+        "37.9 to 40.2",
+        "5 of 7 parameters",
+        "yaw.d2 0.4776",
+        "rests on its bound",
+        "11" * 32,
+        COMMAND,
+        vehicle.sha256,
+        '"seed": 4' if name.endswith("md") else "&quot;seed&quot;: 4",
+    ):
+        assert words in text
+
+
+def test_the_pictures_of_the_markdown_are_there(folder):
+    """Every picture that it names is a PNG beside it."""
+    named = re.findall(r"\]\((.*?)\)", (folder / "report.md").read_text(encoding="utf-8"))
+    assert sorted(named) == ["correlation.png", "curves_1.png"]
+    assert all((folder / name).read_bytes().startswith(b"\x89PNG") for name in named)
+    assert json.loads((folder / "fit.json").read_text())["parameters"]["surge.d1"]["estimate"] == 39.1
+
+
+def test_equal_fits_make_equal_reports(folder, tmp_path):
+    """No clock time enters, in pictures either."""
+    fit = made_fit()
+    write_report(fit, tmp_path / "r", calibrated(fit), command=COMMAND, findings=WEAK)
+    assert (tmp_path / "r" / "report.html").read_bytes() == (folder / "report.html").read_bytes()
+
+
+def test_a_fit_of_almost_nothing_has_a_report(tmp_path):
+    """No curve, no correlation, no finite interval."""
+    fit = made_fit()
+    fit = dataclasses.replace(
+        fit,
+        curves=(),
+        correlation=None,
+        changes={},
+        quality={},
+        estimates={"heave.d1": fit.estimates["heave.d1"]},
+    )
+    write_report(fit, tmp_path / "r", calibrated(fit))
+    assert "0 of 1 parameters" in (tmp_path / "r" / "report.md").read_text(encoding="utf-8")
+    assert not list((tmp_path / "r").glob("*.png"))
+
+
+@pytest.mark.slow
+def test_many_curves_are_drawn_up_to_a_limit_that_is_said(tmp_path):
+    """A hundred curves give eight figures and a sentence."""
+    x = np.arange(3.0)
+    curve = Curve(title="c", x_label="t [s]", y_label="u", x=x, measured=x, fitted=x)
+    fit = dataclasses.replace(made_fit(), curves=(curve,) * 100)
+    write_report(fit, tmp_path / "r", calibrated(fit))
+    assert len(list((tmp_path / "r").glob("curves_*.png"))) == 8
+    assert "52 more curves are not drawn" in (tmp_path / "r" / "report.html").read_text(encoding="utf-8")
+
+
+def test_somebodys_files_are_not_replaced(tmp_path):
+    """A folder with other files is refused; an earlier report is replaced."""
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(OutputError, match="already holds files"):
+        write_report(made_fit(), tmp_path, calibrated(made_fit()))

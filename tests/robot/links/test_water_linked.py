@@ -1,0 +1,283 @@
+"""Water Linked DVL lines: the published example, our axes, ages, hostile input, and both ends of the connection."""
+
+import json
+import math
+import random
+import re
+import socket
+import time
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from finssim.robot.links import water_linked
+from finssim.robot.links.frames import LinkError
+from finssim.robot.links.water_linked import DvlClient, DvlServer, decode_line, encode_velocity
+from finssim.robot.messages import VELOCITY
+
+REPORT = {
+    "time": 106.39, "vx": 0.5, "vy": 0.25, "vz": -0.125, "fom": 1.6e-4,
+    "covariance": [[2.4e-8, 0.0, 0.0], [0.0, 1.5e-8, 0.0], [0.0, 0.0, 1.6e-9]], "altitude": 0.495,
+    "transducers": [
+        {"id": i, "velocity": 1e-4, "distance": 0.55, "rssi": -30.5, "nsd": -88.7, "beam_valid": True}
+        for i in range(4)
+    ],
+    "velocity_valid": True, "status": 0, "format": "json_v3.1", "type": "velocity",
+    "time_of_validity": 1638191471563017, "time_of_transmission": 1638191471752336,
+}  # fmt: skip
+"""As the protocol's page has it, with velocities whose signs can be seen."""
+
+
+def line(**changes):
+    return json.dumps(REPORT | changes, separators=(",", ":")).encode()
+
+
+def test_the_published_report_becomes_a_velocity_in_our_axes_with_the_logs_own_age():
+    """Right and down of the log are left and up of ours, turned; 189.319 ms passed between reflection and sending."""
+    aid = decode_line(line())
+    assert (aid.kind, aid.values) == (VELOCITY, (0.5, -0.25, 0.125))
+    assert aid.age == pytest.approx(0.189319, abs=1e-9)
+    assert (aid.altitude, aid.fom) == (0.495, 1.6e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "counted"),
+    [
+        ({"velocity_valid": False}, "no bottom lock"),
+        ({"velocity_valid": 1}, "no bottom lock"),
+        ({"vx": math.nan}, "implausible"),
+        ({"vx": "0.5"}, "implausible"),
+        ({"vx": True}, "implausible"),
+        ({"vx": None}, "implausible"),
+        ({"vz": -11.0}, "implausible"),
+        ({"vz": 10**400}, "implausible"),
+        ({"time_of_validity": 10**400, "time_of_transmission": 10**400}, "implausible"),
+        ({"time_of_validity": 1638191471852336}, "implausible"),
+        ({"time_of_validity": 1638191461852336}, "implausible"),
+        ({"type": "velocity_water"}, "velocity_water"),
+        ({"tracking_mode": "water"}, "velocity_water"),
+        ({"type": "position_local"}, "position_local"),
+        ({"type": "response"}, "response"),
+        ({"type": ["velocity"]}, "not a report"),
+    ],
+)
+def test_what_is_no_velocity_over_the_floor_is_counted(changes, counted):
+    """Each with its reason, and nothing comes of it."""
+    counts = Counter()
+    assert decode_line(line(**changes), counts) is None
+    assert counts == {counted: 1}
+
+
+@pytest.mark.parametrize("text", [b"", b"\xff", b"[1]", b"[" * 100_000, b"9" * 5000, line()[:-1], b"null"])
+def test_what_is_no_json_object_is_counted(text):
+    """Whatever the bytes are."""
+    counts = Counter()
+    assert decode_line(text, counts) is None
+    assert counts == {"not a report": 1}
+
+
+def test_a_report_without_altitude_is_a_velocity():
+    """Neither altitude nor figure of merit decides on the velocity."""
+    aid = decode_line(line(altitude=-1, fom=10**400))
+    assert math.isnan(aid.altitude) and math.isnan(aid.fom)
+
+
+def test_an_encoded_velocity_comes_back():
+    """Round trip, with the fields of the published report in their order and beams that see the velocity."""
+    data = encode_velocity([0.5, -0.25, 0.125], altitude=0.495, measured=1e9, sent=1e9 + 0.19, interval=0.1)
+    report, aid = json.loads(data), decode_line(data)
+    assert data.endswith(b"}\n") and data.count(b"\n") == 1
+    assert list(report) == list(REPORT) and list(report["transducers"][0]) == list(REPORT["transducers"][0])
+    assert (report["vx"], report["vy"], report["vz"]) == (0.5, 0.25, -0.125)
+    assert isinstance(report["time_of_validity"], int)
+    assert aid.values == (0.5, -0.25, 0.125)
+    assert aid.age == pytest.approx(0.19, abs=1e-6)
+    assert aid.altitude == 0.495
+    # Opposite beams: their mean is the part along z, their sum of all the horizontal ones is nothing.
+    beams = [beam["velocity"] for beam in report["transducers"]]
+    assert np.mean(beams) == pytest.approx(-0.125 * math.cos(math.radians(22.5)))
+    assert report["transducers"][0]["distance"] == pytest.approx(0.495 / math.cos(math.radians(22.5)))
+
+
+def test_a_lost_bottom_is_sent_as_a_log_sends_it():
+    """Zeros, altitude and distances of -1, no valid beam."""
+    report = json.loads(encode_velocity(None, measured=1.0, sent=1.2, interval=0.1))
+    assert (report["vx"], report["altitude"], report["velocity_valid"]) == (0.0, -1.0, False)
+    assert all(b["distance"] == -1.0 and b["beam_valid"] is False for b in report["transducers"])
+    assert decode_line(json.dumps(report).encode()) is None
+
+
+WORDS = (
+    b"NaN",
+    b"1e999",
+    b"-Infinity",
+    b"null",
+    b"true",
+    b'"',
+    b"[",
+    b"{}",
+    b"9" * 400,
+    b"-",
+    b"\\u",
+    b"\xff",
+)
+
+
+def mutated(source: random.Random, data: bytes) -> bytes:
+    """One to three changes: of a value, or of some bytes."""
+    for _ in range(source.randint(1, 3)):
+        if source.random() < 0.7:
+            values = [*re.finditer(rb'(?<=":)[^,\[\]{}]+', data)]
+            if values:
+                value = source.choice(values)
+                number = str(source.choice((1e-9, 0.1, 3.0, 11.0, 1e20)) * source.choice((-1, 1))).encode()
+                data = data[: value.start()] + source.choice((*WORDS, number, number)) + data[value.end() :]
+            continue
+        at, length = source.randrange(len(data) + 1), source.randint(1, 12)
+        more = source.choice((source.randbytes(length), source.choice(WORDS), data[at : at + length]))
+        data = data[:at] + more + data[at + source.choice((0, length, length, len(data))) :]
+    return data
+
+
+def fuzz(lines: int, seed: int = 0) -> Counter:
+    """What becomes of mutated lines; values that get through are always plausible."""
+    source, counts = random.Random(seed), Counter()
+    lost = encode_velocity(None, measured=1.0, sent=1.2, interval=0.1)
+    whole = [
+        line(),
+        encode_velocity([1.0, 2.0, 3.0], altitude=2.0, measured=1.0, sent=1.2, interval=0.1),
+        lost,
+    ]
+    for _ in range(lines):
+        aid = decode_line(mutated(source, source.choice(whole)), counts)
+        assert aid is None or (max(map(abs, aid.values)) <= 10.0 and 0.0 <= aid.age <= 5.0)
+    assert counts.total() == lines
+    return counts
+
+
+def test_no_mutated_line_upsets_the_reader():
+    """Three thousand of them at every run; `python -m robot.links.test_water_linked` does a hundred thousand."""
+    assert fuzz(3000)["velocity"] > 100
+
+
+@pytest.fixture
+def server():
+    server = DvlServer(("127.0.0.1", 0))
+    yield server
+    server.close()
+
+
+def received(client, server, many=1, within=5.0):
+    """Lines of the client, with the server looked after, until there are as many."""
+    found, end = [], time.monotonic() + within
+    while len(found) < many and time.monotonic() < end:
+        server.poll()
+        found += client.receive()
+        time.sleep(0.001)
+    return found
+
+
+def connected(server):
+    client = DvlClient(*server.address)
+    while not client.connected:
+        client.receive()
+        server.poll()
+    return client
+
+
+def test_reports_reach_several_clients_as_whole_lines(server):
+    """Whatever pieces TCP makes of them."""
+    clients = [connected(server), connected(server)]
+    server.poll()
+    data = encode_velocity([0.1, 0.2, 0.3], altitude=1.0, measured=1.0, sent=1.2, interval=0.1)
+    for _ in range(100):
+        server.send(data)
+    for client in clients:
+        assert received(client, server, 100) == [data.strip()] * 100
+        client.close()
+        assert client.receive() == [] and "closed" in client.describe()
+
+
+@pytest.mark.parametrize("command", ["reset_dead_reckoning", "set_config", ["set_config"]])
+def test_commands_are_refused(server, command):
+    """With a `response` as a log gives it, which the reader knows."""
+    client, counts = connected(server), Counter()
+    client.send(json.dumps({"command": command}).encode() + b"\n")
+    (answer,) = received(client, server)
+    assert json.loads(answer)["success"] is False and json.loads(answer)["error_message"]
+    assert decode_line(answer, counts) is None and counts == {"response": 1}
+    client.close()
+
+
+def test_a_lost_log_is_found_again_without_waiting():
+    """Nobody there, then somebody, who leaves and comes back; no call takes as long as one turn of the robot's loop."""
+    server = DvlServer(("127.0.0.1", 0))
+    address, now = server.address, [0.0]
+    server.close()
+    client = DvlClient(*address, clock=lambda: now[0])
+    assert client.receive() == [] and not client.connected
+    client.send(b"{}\n")
+    assert client.send_errors == 1
+    for connections in (1, 2):
+        server = DvlServer(address)
+        for _ in range(1000):
+            now[0] += 0.01
+            server.poll()
+            client.receive()
+        assert client.connected and client.connections >= connections
+        server.close()
+        now[0] += 0.01
+        client.receive()
+        assert not client.connected
+    client.close()
+
+
+def test_a_silent_log_is_left(server):
+    """A pulled cable ends no connection: five seconds without a byte do."""
+    now = [0.0]
+    client = DvlClient(*server.address, clock=lambda: now[0])
+    for _ in range(100):
+        client.receive()
+    assert client.connected
+    now[0] = 5.1
+    client.receive()
+    assert not client.connected
+    client.close()
+
+
+def test_a_line_without_end_is_dropped(server, monkeypatch):
+    """The buffer stays small, and the next line is read."""
+    monkeypatch.setattr(water_linked, "_LONGEST_LINE", 1000)
+    client = connected(server)
+    server.poll()
+    for piece in (b"x" * 700, b"x" * 700, b"x\n", b'{"a":1}\n'):
+        server.send(piece)
+    assert received(client, server) == [b'{"a":1}']
+    client.close()
+
+
+def test_a_client_that_does_not_read_is_let_go(server):
+    """It holds nobody up."""
+    lazy = socket.create_connection(server.address)
+    client = connected(server)
+    server.poll()
+    data = b"x" * 60_000 + b"\n"
+    for _ in range(200):
+        server.send(data)
+        client.receive()
+    assert len(server._server.clients) == 1
+    lazy.close()
+    client.close()
+
+
+def test_a_port_that_is_taken_and_a_host_that_is_not_there_are_refused(server):
+    """With what to do."""
+    with pytest.raises(LinkError, match="give another port"):
+        DvlServer(server.address)
+    with pytest.raises(LinkError, match="no such host"):
+        DvlClient("no-such-host.invalid")
+
+
+if __name__ == "__main__":
+    print(dict(fuzz(100_000)))

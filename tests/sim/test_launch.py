@@ -1,0 +1,54 @@
+"""Slices on threads: an interrupt leaves nothing behind, and a forked process makes threads of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from finssim.sim import Simulator
+
+
+def simulator(threads: int) -> Simulator:
+    """Two slices or one, under random thrust."""
+    made = Simulator("finsrov", worlds=4096, threads=threads)
+    made.set_thrust(np.random.default_rng(3).uniform(-5.0, 5.0, (4096, 1, 8)))
+    return made
+
+
+def test_a_step_is_over_when_it_returns_even_after_an_interrupt() -> None:
+    """SIGINTs in the middle of steps; afterwards every step moves all slices by exactly one step."""
+    threaded, alone = simulator(2), simulator(1)
+    for delay in (1e-4, 3e-4, 6e-4, 1e-3, 2e-3):
+        with pytest.raises(KeyboardInterrupt):
+            threading.Timer(delay, os.kill, (os.getpid(), signal.SIGINT)).start()
+            lost = time.monotonic() + 5.0
+            while True:
+                threaded.step()
+                if time.monotonic() > lost:  # Python drops an interrupt that falls into a destructor
+                    os.kill(os.getpid(), signal.SIGINT)
+    for made in (threaded, alone):
+        made.place(position=(0.0, 0.0, -5.0))
+        for _ in range(20):
+            made.step()
+            assert (made.numpy("steps") == made.numpy("steps")[0]).all()
+    np.testing.assert_array_equal(threaded.numpy("velocity"), alone.numpy("velocity"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_steps_on_threads_of_its_own() -> None:
+    """Threads do not survive a fork: the child must not wait for the parent's."""
+    made = simulator(2)
+    made.step()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(30)  # a child that waits forever is ended by the system
+        made.step()
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == 0

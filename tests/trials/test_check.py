@@ -1,0 +1,386 @@
+"""`trials check` finds what is wrong with a log, and says what it can and cannot identify."""
+
+import json
+from dataclasses import replace
+from io import StringIO
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from finssim.identification.programmes import programmes
+from finssim.identification.synthetic import simulate_programme
+from finssim.trials.check import check, check_trials, print_reports, set_findings
+from finssim.trials.trial import Trial
+from finssim.trials.trial_files import write_trial
+from finssim.vehicles import load_vehicle
+
+VEHICLE = load_vehicle("bluerov2_heavy")
+NAMES = ("surge_plus_82", "heave_dive_55", "roll_plus_3.2", "yaw_minus_8.8")
+COLUMNS = ("u", "v", "w", "p", "q", "r", "ax", "ay", "az", "roll", "pitch", "yaw", "x", "y", "z", "depth")
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    """Trials of the simulator with the noise of the vehicle's sensors, by axis."""
+    every = {
+        p.name: p
+        for p in programmes(
+            ["surge", "heave", "roll", "yaw"], VEHICLE, seed=3, levels={"surge": (41.0, 82.0, 123.0)}
+        )
+    }
+    trials = simulate_programme(
+        [every[name] for name in NAMES], VEHICLE, seed=3, columns=COLUMNS, inputs=("wrench",)
+    )
+    return {trial.name.split("_")[0]: trial for trial in trials}
+
+
+def changed(trial, header=None, **columns):
+    """The trial with columns replaced by functions of them, or taken away by None."""
+    channels = dict(trial.channels)
+    for name, change in columns.items():
+        if change is None:
+            del channels[name]
+        else:
+            channels[name] = change(channels[name])
+    new = trial.header.model_copy(update=header) if header else trial.header
+    return replace(trial, channels=channels, header=new)
+
+
+REPORTS = {}
+"""Trials that were checked, by identity; they are kept, so that no identity comes twice."""
+
+
+def report(trial, vehicle=VEHICLE):
+    """The report of a trial, made once."""
+    key = (id(trial), vehicle.sha256)
+    if key not in REPORTS:
+        REPORTS[key] = trial, check_trials([trial], vehicle)[0]
+    return REPORTS[key][1]
+
+
+def axis(trial, name, vehicle=VEHICLE):
+    return next(a for a in report(trial, vehicle).axes if a.axis == name)
+
+
+def said(findings, code, severity=None):
+    """Values of the findings of a code, and of a severity where it is given."""
+    return [one.values for one in findings if one.code == code and severity in (None, one.severity)]
+
+
+def told(trial, code, severity=None, vehicle=VEHICLE):
+    return said(report(trial, vehicle).findings, code, severity)
+
+
+def negative(x):
+    return -x
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["surge", "heave", "roll", "yaw"])
+def test_a_good_trial_is_usable_and_tells_its_axis(simulated, name):
+    """Nothing to complain of; mass and both dampings of the driven axis; nothing of an axis that rests."""
+    found = report(simulated[name])
+    assert found.verdict == "usable", found.findings
+    mine = axis(simulated[name], name)
+    assert mine.excited and all(mine.tells[p].can for p in ("m_eff", "d1", "d2"))
+    idle = axis(simulated[name], "sway")
+    assert not idle.excited and not any(told.can for told in idle.tells.values())
+
+
+def test_a_dive_and_coast_tells_buoyancy_and_a_roll_pulse_the_restoring_moment(simulated):
+    """What only these trials can tell."""
+    assert axis(simulated["heave"], "heave").tells["buoyancy"].can
+    assert axis(simulated["roll"], "roll").tells["k"].can
+    assert "k" not in axis(simulated["yaw"], "yaw").tells
+
+
+WRONG = {
+    "gravity downwards": ("surge", {"ax": negative, "ay": negative, "az": negative}, "gravity_wrong_way", {}),
+    "in g": (
+        "surge",
+        {a: (lambda y: y / 9.80665) for a in ("ax", "ay", "az")},
+        "acceleration_unit",
+        {"unit": "g"},
+    ),
+    "pitch rate turned": ("surge", {"q": negative}, "rate_sign", {"column": "q", "other": "pitch"}),
+    "yaw turned": ("yaw", {"yaw": negative}, "rate_sign", {"column": "r", "other": "yaw"}),
+    "speed in mm/s": ("surge", {"u": lambda y: 1000.0 * y}, "speed_unit", {"column": "u"}),
+    "rate in degrees": ("yaw", {"r": np.degrees}, "degrees", {"column": "r"}),
+    "roll in degrees": ("roll", {"roll": np.degrees}, "degrees", {"column": "roll"}),
+    "heave turned": ("heave", {"w": negative}, "rate_sign", {"column": "w", "other": "z"}),
+    "z downwards": ("heave", {"z": negative}, "z_down", {}),
+    "force turned": ("surge", {"tau_x": negative}, "energy_taken", {"wrench": "tau_x", "velocity": "u"}),
+    "moment turned": ("yaw", {"tau_n": negative}, "energy_taken", {"wrench": "tau_n", "velocity": "r"}),
+    "roll of the accelerometer turned": (
+        "roll",
+        {"ay": negative},
+        "acceleration_sign",
+        {"column": "ay", "angle": "roll"},
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_signs_and_units_are_refused(simulated, case):
+    """One convention changed in a good trial is found, named, and nothing may rest on it."""
+    name, columns, code, values = WRONG[case]
+    trial = changed(simulated[name], **columns)
+    assert report(trial).verdict == "refused"
+    assert any(values.items() <= given.items() for given in told(trial, code, "refused")), report(
+        trial
+    ).findings
+
+
+def test_a_heading_that_is_turned_against_the_position_is_found(simulated):
+    """Motion capture whose x axis is not the compass's: 90 degrees between them."""
+    trial = changed(simulated["surge"], yaw=lambda y: y + np.pi / 2)
+    (disagreement,) = told(trial, "heading_disagrees", "care")
+    assert disagreement["angle"] == pytest.approx(-90.0, abs=2.0)
+
+
+def test_noise_of_the_heading_is_not_taken_for_a_wrong_sign():
+    """1.4 degrees of noise on a heading that hardly moves: the changes of a smoothed heading are mostly noise."""
+    for seed in (7, 15, 26, 27, 47, 53, 117):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0.0, 8.0, 0.2)
+        r = 0.004 * np.sin(2.0 * np.pi * (t / rng.uniform(4.0, 12.0) + rng.random()))
+        yaw = 0.2 * np.cumsum(r) + 0.025 * rng.standard_normal(len(t))
+        channels = {"r": r + 0.001 * rng.standard_normal(len(t)), "yaw": yaw}
+        assert not told(Trial(name=f"drift_{seed}", t=t, channels=channels), "rate_sign")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bluerov2_einarsson", "bluerov2_heavy_morgan"])
+def test_the_buoyancy_of_the_vehicle_file_is_not_taken_for_a_wrong_sign(name):
+    """Pushes of 2 % against a buoyancy of 4 N, and against a weight of 7 N: the inputs take energy out of heave."""
+    vehicle = load_vehicle(name)
+    weak = programmes(["heave"], vehicle, levels={"heave": (0.02 * vehicle.wrench_limits[2],)})
+    trials = simulate_programme(weak, vehicle, seed=3, columns=COLUMNS, inputs=("wrench",))
+    found = [told(trial, "energy_taken", vehicle=vehicle) for trial in trials]
+    assert not any(found)
+
+
+def test_a_depth_in_another_unit_is_told(simulated):
+    """Feet and centimetres, against z and against w."""
+    trial = simulated["heave"]
+    (against_z,) = told(changed(trial, depth=lambda d: d / 0.3048), "speed_ratio", "care")
+    assert against_z["ratio"] == pytest.approx(0.3048, abs=0.02)
+    (against_w,) = told(changed(trial, z=None, depth=lambda d: 100.0 * d), "speed_ratio", "care")
+    assert against_w["ratio"] == pytest.approx(100.0, rel=0.1) and against_w["velocity"] == "w"
+
+
+def test_a_heading_that_samples_slowly_or_a_vehicle_on_its_nose_has_no_drift():
+    """A turn of 4 rad/s seen by a heading of 1 Hz, and a somersault, in which the heading jumps by half a turn."""
+    t = np.arange(0.0, 20.0, 0.02)
+    spin = Trial(
+        name="spin",
+        t=t,
+        channels={"r": np.full(len(t), 4.0), "yaw": np.where(np.arange(len(t)) % 50, np.nan, 4.0 * t % 6.28)},
+    )
+    assert not told(spin, "heading_drift")
+    angle = 0.5 * t
+    flip = {"qy": np.sin(0.5 * angle), "qw": np.cos(0.5 * angle), "qx": 0.0 * t, "qz": 0.0 * t}
+    rates = {"p": 0.0 * t, "q": 0.0 * t + 0.5, "r": 0.0 * t}
+    assert not told(Trial(name="somersault", t=t, channels=flip | rates), "heading_drift")
+
+
+def test_a_vehicle_that_rolls_without_a_measured_tilt_is_not_taken_as_level():
+    """On its back it rises while w is negative; only the gyro shows that it turned over."""
+    t = np.arange(0.0, 20.0, 0.05)
+    rate = np.where((t > 2.0) & (t < 4.0), 0.5 * np.pi, 0.0)
+    roll = 0.05 * np.cumsum(rate)
+    rising = 0.2 * np.sin(1.5 * t)
+    channels = {"w": rising * np.cos(roll), "z": 0.05 * np.cumsum(rising) - 5.0, "yaw": 0.0 * t}
+    trial = Trial(name="over", t=t, channels=channels)
+    assert told(trial, "rate_sign")
+    turning = replace(trial, channels={**channels, "p": rate, "q": 0.0 * t})
+    assert not told(turning, "rate_sign")
+
+
+def test_five_hertz_with_wrench_and_velocity_only(simulated):
+    """Every tenth row, two columns: the surge axis is still told, the lag is not, the rest has no velocity."""
+    trial = simulated["surge"]
+    rows = slice(None, None, 10)
+    trial = replace(
+        trial, t=trial.t[rows], phase=None, channels={c: trial.channels[c][rows] for c in ("u", "tau_x")}
+    )
+    trial = changed(trial, header={"inputs": "commanded"})
+    assert report(trial).verdict == "usable", report(trial).findings
+    told = axis(trial, "surge").tells
+    assert told["m_eff"].can and told["d2"].can
+    assert "no velocity: neither v nor x, y" in axis(trial, "sway").tells["m_eff"].why
+
+
+def test_gyro_without_velocity_tells_the_turns_only(simulated):
+    """No u, v, w, no position: yaw from the gyroscope, surge from nothing."""
+    gone = dict.fromkeys(("u", "v", "w", "x", "y", "z", "depth", "roll", "pitch", "yaw"))
+    assert axis(changed(simulated["yaw"], **gone), "yaw").tells["d1"].can
+    trial = changed(simulated["surge"], **gone)
+    assert not any(told.can for told in axis(trial, "surge").tells.values())
+
+
+def test_one_level_without_a_coast_cannot_part_linear_and_quadratic_drag(simulated):
+    """The steady part of a step alone: one speed, one number; and no mass."""
+    trial = simulated["surge"]
+    u = trial.series("u")[1]
+    steady = np.flatnonzero(np.abs(trial.channels["tau_x"]) > 0.9 * np.abs(trial.channels["tau_x"]).max())[
+        200:
+    ]
+    trial = replace(
+        trial,
+        t=trial.t[steady],
+        phase=None,
+        channels={c: v[steady] for c, v in trial.channels.items()},
+    )
+    told = axis(trial, "surge").tells
+    assert np.ptp(trial.series("u")[1]) < 0.2 * np.ptp(u)
+    assert not told["d1"].can and not told["d2"].can and not told["m_eff"].can
+    assert "only their sum" in told["d2"].why
+
+
+def test_a_passive_trial_tells_against_the_restoring_moment_only(simulated):
+    """The ring-down of the roll pulse, thrusters off."""
+    trial = simulated["roll"]
+    after = np.flatnonzero(trial.phase == "coast")
+    trial = replace(
+        trial,
+        t=trial.t[after],
+        phase=None,
+        channels={c: v[after] for c, v in trial.channels.items() if not c.startswith("tau")},
+    )
+    trial = changed(trial, header={"passive": True})
+    told = axis(trial, "roll").tells
+    assert told["m_eff"].can and "restoring moment" in told["m_eff"].why
+    assert not told["k"].can
+    assert not axis(trial, "surge").tells["m_eff"].can
+
+
+def test_no_inputs_pulses_without_a_controller_and_strange_thrusters_are_refused(simulated):
+    """Each with the reason, and the motion is looked at all the same."""
+    gone = {c: None for c in simulated["surge"].channels if c.startswith("tau")}
+    bare = changed(simulated["surge"], **gone)
+    assert "no input columns" in told(bare, "unusable", "refused")[0]["reason"]
+    assert axis(bare, "surge").fastest > 0.3
+    for prefix, thrusters, vehicle, words in (
+        ("pwm_", VEHICLE.thrusters, VEHICLE.replace({"thrusters.*.esc": None}), "esc"),
+        ("rpm_", ("T1", "T2"), VEHICLE, "missing"),
+        ("rpm_", ("front",), VEHICLE, "no thruster 'front'"),
+    ):
+        pulses = {f"{prefix}{name}": np.full(len(bare.t), 1600.0) for name in thrusters}
+        trial = replace(bare, channels={**bare.channels, **pulses})
+        assert words in told(trial, "unusable", "refused", vehicle)[0]["reason"]
+
+
+def test_no_vehicle_is_refused_but_the_sampling_is_reported(simulated):
+    """Nobody said what it was."""
+    found = check_trials([changed(simulated["surge"], header={"vehicle": None})])[0]
+    assert found.verdict == "refused" and found.streams and not found.axes
+    assert said(found.findings, "no_vehicle", "refused")
+
+
+def test_gaps_rates_and_jitter_are_measured(simulated):
+    """Four seconds of velocity missing in fourteen; depth at its own rate."""
+    trial = simulated["surge"]
+    missing = (trial.t > 5.0) & (trial.t < 9.0)
+    trial = changed(trial, **{c: (lambda y: np.where(missing, np.nan, y)) for c in ("u", "v", "w")})
+    (velocity,) = [s for s in report(trial).streams if "u" in s.columns]
+    assert velocity.gaps == 1 and velocity.longest_gap == pytest.approx(4.0, abs=0.05)
+    assert velocity.rate == pytest.approx(50.0) and velocity.missing == pytest.approx(4.0 / 13.98, abs=0.01)
+    (gap,) = (one for one in report(trial).findings if one.code == "gap" and one.severity == "care")
+    assert gap.subject == "u, v, w" and gap.values["longest"] == pytest.approx(4.0, abs=0.05)
+    jittered = replace(trial, t=trial.t + np.where(np.arange(len(trial.t)) % 2, 0.008, 0.0))
+    assert [s for s in report(jittered).streams if "p" in s.columns][0].jitter == pytest.approx(0.4, abs=0.02)
+
+
+def test_heights_above_the_surface_are_told(simulated):
+    """Motion capture counts from the floor, and some logs count depth upwards."""
+    trial = simulated["yaw"]
+    raised = changed(trial, z=lambda z: z - z.min() + 1.0)
+    assert told(raised, "above_surface", "care")[0]["height"] > 1.0
+    assert told(changed(trial, depth=np.negative), "depth_above_surface", "care")
+    assert not told(trial, "above_surface") and not told(trial, "depth_above_surface")
+
+
+def test_stuck_held_and_clipped_sensors_are_found(simulated):
+    """A gyroscope that stops, a velocity that comes at a fifth of the rate, a rate beyond the sensor's range."""
+    trial = simulated["yaw"]
+    i = np.arange(len(trial.t))
+    stuck = changed(trial, r=lambda y: np.where((trial.t > 4.0) & (trial.t < 7.0), y[200], y))
+    assert told(stuck, "stuck", "care")[0]["span"] == pytest.approx(3.0, abs=0.1)
+    held = changed(trial, u=lambda y: y[5 * (i // 5)])
+    assert told(held, "values_held")[0] == {
+        "rows": 5.0,
+        "rate": pytest.approx(10.0),
+        "row_rate": pytest.approx(50.0),
+    }
+    clipped = changed(trial, r=lambda y: np.maximum(y, -1.5))
+    assert told(clipped, "clipped_below", "care")[0]["value"] == -1.5
+
+
+def test_saturation_is_found(simulated):
+    """A commanded wrench that the thrusters cannot give, and thrusters at their limits."""
+    commanded = changed(simulated["surge"], header={"inputs": "commanded"}, tau_x=lambda y: 10.0 * y)
+    assert told(commanded, "command_beyond", "care")[0]["column"] == "tau_x"
+    bare = changed(
+        simulated["surge"], **{c: None for c in simulated["surge"].channels if c.startswith("tau")}
+    )
+    top = {f"rpm_{n}": np.where(bare.t > 3.0, t.rpm_max, 0.0) for n, t in VEHICLE.thrusters.items()}
+    saturated = replace(bare, channels={**bare.channels, **top})
+    assert set(told(saturated, "saturated", "care")[0]["thrusters"]) == set(VEHICLE.thrusters)
+
+
+def test_an_axis_that_the_header_names_but_nothing_drives_is_told(simulated):
+    """trial.yaml says sway."""
+    assert told(changed(simulated["surge"], header={"axis": ("sway",)}), "axis_still") == [{"axis": "sway"}]
+
+
+@pytest.mark.slow
+def test_between_trials(simulated):
+    """Duplicates, roles, vehicles."""
+    surge, yaw = simulated["surge"], simulated["yaw"]
+    twice = check_trials([surge, replace(surge, name="again")], VEHICLE)
+    assert [r.verdict for r in twice] == ["usable", "refused"]
+    assert said(twice[1].findings, "duplicate") == [{"other": surge.name}]
+    out = [changed(trial, header={"role": "held-out"}) for trial in (surge, yaw)]
+    assert said(set_findings(check_trials(out, VEHICLE)), "all_held_out")
+    mixed = check_trials(
+        [changed(surge, header={"vehicle": "bluerov2"}), changed(yaw, header={"vehicle": "finsrov"})]
+    )
+    assert said(set_findings(mixed), "several_vehicles") == [{"vehicles": ("bluerov2", "finsrov")}]
+    good = set_findings(check_trials([surge, changed(yaw, header={"role": "held-out"})], VEHICLE))
+    assert {"sway", "yaw"} <= set(said(good, "axes_untold")[0]["axes"])
+
+
+@pytest.mark.slow
+def test_the_report_is_json_and_fits_a_hundred_columns(simulated):
+    """Programs get plain finite values; people lines that do not wrap."""
+    reports = check_trials(list(simulated.values()), VEHICLE)
+    text = json.dumps({"trials": [one.as_json() for one in reports]}, allow_nan=False)
+    assert json.loads(text)["trials"][0]["axes"]["surge"]["tells"]["m_eff"]["can"] is True
+    page = StringIO()
+    print_reports(reports, Console(file=page, width=100), set_findings(reports))
+    lines = page.getvalue().split("\n")
+    assert max(map(len, lines)) <= 100 and any(line.startswith("surge") for line in lines)
+
+
+def test_the_command_reads_folders_and_reports_broken_ones(simulated, tmp_path, capsys):
+    """One good trial, one that is no table: both are in the report."""
+    write_trial(simulated["surge"], tmp_path / "a")
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "data.csv").write_text("nothing\n")
+    check([tmp_path], vehicle="bluerov2_heavy", as_json=True)
+    found = {trial["name"]: trial["verdict"] for trial in json.loads(capsys.readouterr().out)["trials"]}
+    assert found == {"a": "usable", "b": "refused"}
+    check([tmp_path / "a"], vehicle="bluerov2_heavy")
+    assert "usable" in capsys.readouterr().out
+
+
+def test_of_many_columns_with_one_remark_four_are_named():
+    """A gap in six columns is one remark, which names four of them and counts the others."""
+    t = np.arange(0.0, 20.0, 0.05)
+    t[100:] += 5.0
+    channels = {name: 0.1 * np.sin(t + i) for i, name in enumerate(("p", "q", "r", "u", "v", "w"))}
+    found = check_trials([Trial(name="a", t=t, channels=channels)], VEHICLE)[0].findings
+    assert [one.subject for one in found if one.code == "gap"] == ["p, q, r, u and 2 more"]
