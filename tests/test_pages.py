@@ -40,10 +40,10 @@ def blocks(page: Path, language: str) -> list[str]:
 )
 def test_python_on_a_page_runs(page, tmp_path, monkeypatch):
     """The Python blocks of a page run one after the other, as a reader would try them."""
-    (tmp_path / "core/page.py").write_text("\n".join(blocks(page, "python")), encoding="utf-8")
+    (tmp_path / "page.py").write_text("\n".join(blocks(page, "python")), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     with mock.patch.dict(TASKS):  # a page adds a task
-        runpy.run_path("core/page.py", run_name="__main__")
+        runpy.run_path("page.py", run_name="__main__")
 
 
 def test_the_vehicle_on_the_page_loads(tmp_path):

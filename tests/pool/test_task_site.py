@@ -12,11 +12,11 @@ from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.control import ControlError
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.extensions.teams.communication import Communication
 from finssim.pool.fleet import Medium
 from finssim.pool.positioning import Exposure
 from finssim.robot.pilots import AgentPilot
 from finssim.tasks import SEEING, TASKS, Environment, task_named
+from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
 from reference.policies import linear, written
 from reference.programs import study

@@ -11,10 +11,10 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.extensions.teams.communication import Communication
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.messages import Picture
 from finssim.robot.runtime import Runtime
+from finssim.tasks.communication import Communication
 
 __all__ = ["Fleet", "Medium", "one_picture"]
 

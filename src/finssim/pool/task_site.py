@@ -23,7 +23,6 @@ from finssim.control.modes import action_mode
 from finssim.core.rotations import quat_from_yaw, quat_inverse_rotate, quat_yaw
 from finssim.extensions.perception import WorldBatch
 from finssim.extensions.perception.sight import first_draw, put_goal
-from finssim.extensions.teams.communication import Communication
 from finssim.localization.overhead_camera import Pool
 from finssim.pool.draw_plant import positioning_of
 from finssim.pool.fleet import Fleet, Medium
@@ -41,6 +40,7 @@ from finssim.robot.team import Team, encode_track
 from finssim.sim.launch import Pipeline
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task, one_world, unscored
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.terms import Terms

@@ -10,10 +10,10 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from finssim.agents.agents import baseline
-from finssim.extensions.teams.communication import Communication
 from finssim.extensions.teams.formation import Formation, sorted_edges, triangle_distance
 from finssim.extensions.teams.pursuit import DriveNumbers
 from finssim.tasks import Environment, EnvironmentSetupError
+from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
 
 QUIET = Formation(drift=0.0)

@@ -9,9 +9,9 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from finssim.agents.agents import baseline
-from finssim.extensions.teams.communication import Communication
 from finssim.extensions.teams.pursuit import LEVELS, DriveNumbers, Prey, TeamPursuit, net_distance
 from finssim.tasks import Environment, EnvironmentSetupError
+from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
 
 

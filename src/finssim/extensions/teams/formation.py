@@ -6,12 +6,6 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from finssim.extensions.teams.communication import (
-    exchange_messages,
-    key_messages,
-    mate_position,
-    open_messages,
-)
 from finssim.extensions.teams.pursuit import (
     PI,
     VELOCITY_CLIP,
@@ -25,6 +19,12 @@ from finssim.extensions.teams.pursuit import (
 )
 from finssim.sim.state import State
 from finssim.tasks.arrays import NetTable, TaskArrays, allocated
+from finssim.tasks.communication import (
+    exchange_messages,
+    key_messages,
+    mate_position,
+    open_messages,
+)
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.terms import (
     End,

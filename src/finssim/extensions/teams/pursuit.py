@@ -11,7 +11,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.extensions.teams.communication import (
+from finssim.physics.types import vec6
+from finssim.sim.state import State
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.communication import (
     Communication,
     exchange_messages,
     key_messages,
@@ -20,9 +23,6 @@ from finssim.extensions.teams.communication import (
     message_table,
     open_messages,
 )
-from finssim.physics.types import vec6
-from finssim.sim.state import State
-from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Task
 from finssim.tasks.terms import (

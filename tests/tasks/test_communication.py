@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from finssim.extensions.teams.communication import Communication
 from finssim.extensions.teams.pursuit import TeamPursuit
 from finssim.tasks import Environment, EnvironmentSetupError
+from finssim.tasks.communication import Communication
 
 SLOW = Communication(period=0.5, processing=0.23, loss=0.0, speed_of_sound=6.0)
 """Sound so slow that a metre more is a control step later or two."""
