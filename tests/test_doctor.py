@@ -44,7 +44,8 @@ def test_a_missing_extra_is_named_with_what_it_enables(monkeypatch, capsys):
 def test_json_is_one_object(capfd):
     """Standard output of --json is JSON alone, with what text shows."""
     assert doctor.doctor(as_json=True) == 0
-    assert json.loads(capfd.readouterr().out).keys() == {"healthy", "machine", "core", "devices", "extras"}
+    keys = {"healthy", "machine", "core", "devices", "extras", "registered", "failures"}
+    assert json.loads(capfd.readouterr().out).keys() == keys
 
 
 def test_extras_are_those_of_the_package():

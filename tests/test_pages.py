@@ -5,12 +5,12 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
 
 from finssim.core.optics import Interface
+from finssim.core.registry import FAMILIES
 from finssim.evaluation.plants import load_plant
 from finssim.extensions.perception import load_world
 from finssim.localization.camera_file import write_camera
@@ -18,7 +18,6 @@ from finssim.localization.overhead_camera import load_pool
 from finssim.sim.ranges_file import load_ranges
 from finssim.studies.sweep import load_sweep
 from finssim.survey.pool_fit import run
-from finssim.tasks import TASKS
 from finssim.tasks.sensing import load_sensing
 from finssim.trials.importers.dispatch import read_trials
 from finssim.vehicles import VehicleError, load_vehicle
@@ -42,8 +41,13 @@ def test_python_on_a_page_runs(page, tmp_path, monkeypatch):
     """The Python blocks of a page run one after the other, as a reader would try them."""
     (tmp_path / "page.py").write_text("\n".join(blocks(page, "python")), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    with mock.patch.dict(TASKS):  # a page adds a task
+    try:
         runpy.run_path("page.py", run_name="__main__")
+    finally:
+        for family in FAMILIES:  # a page adds a task
+            for name, package in family.packages().items():
+                if package == "this program":
+                    del family[name]
 
 
 def test_the_vehicle_on_the_page_loads(tmp_path):

@@ -21,9 +21,11 @@ BIN = Path(sys.executable).parent
 SMALL = {"train": ["--steps", "4096", "--worlds", "64"], "evaluate": ["--trials", "2"]}
 """Options that make a command's run small; a later option wins over an earlier one."""
 
-EXAMPLES = [path for path in sorted((ROOT / "examples").glob("*.py")) if path.name != "own_term.py"]
+EXAMPLES = [
+    path for path in sorted((ROOT / "examples").glob("*.py")) if path.stem not in ("own_term", "own_sensor")
+]
 EXAMPLES.append(ROOT / "examples" / "bluerov2" / "loop.py")
-"""Without the one whose term stays known in the process; `tests/physics/test_own_term.py` runs it in one of its own."""
+"""Without those whose term or sensor stays known in the process; their own tests run them in another."""
 
 SHORT = {
     "learn_with_pettingzoo.py": ("TURNS, TRIES = 30, 4", "TURNS, TRIES = 2, 2"),

@@ -5,23 +5,23 @@ import numpy as np
 import pytest
 import warp as wp
 
+from finssim.core.registry import TERMS
 from finssim.physics.terms.composed import composed, layout, parameter_row
 from finssim.physics.types import mat66, vec6
 from finssim.sim import Simulator
 from finssim.vehicles import load_vehicle
-from finssim.vehicles.terms import TERMS, find_term, term_names
 from reference.examples import example
 
 WING = example("own_term").WING
-EVERY = pytest.mark.parametrize("name", sorted({*term_names(), WING.name}))
+EVERY = pytest.mark.parametrize("name", sorted({*TERMS, WING.name}))
 RNG = np.random.default_rng(7)
 NU = RNG.uniform(-2.0, 2.0, (64, 6))
 
 
 @pytest.fixture
 def term(name):
-    TERMS.setdefault(WING.name, WING)
-    return find_term(name)
+    TERMS[WING.name] = WING
+    return TERMS[name]
 
 
 def drawn(term, diagonal=False):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from finssim.core.registry import RegistryError
 from finssim.identification.vehicle_file import write_vehicle
 from finssim.physics.terms import Term, add_term
 from finssim.physics.terms.composed import TermError, composed
@@ -15,9 +16,9 @@ from finssim.physics.types import vec6
 from finssim.sim import Simulator
 from finssim.sim.ranges_file import RangesError, load_ranges
 from finssim.vehicles import VehicleError, check_vehicle, load_vehicle
-from finssim.vehicles.terms import TERMS
 from reference.draws import column, draw
 from reference.examples import EXAMPLES, example
+from reference.installed import install
 
 own_term = example("own_term")
 WING, Wing, wing_wrench = own_term.WING, own_term.Wing, own_term.wing_wrench
@@ -251,7 +252,7 @@ def test_a_term_that_cannot_be_is_refused():
             "has units of lift, expected",
         ),
     ):
-        with pytest.raises(TermError, match=sentence):
+        with pytest.raises((TermError, RegistryError), match=sentence):
             add_term(term)
     with pytest.raises(TermError, match="not zero where all its parameters are"):
         composed((Term(name="fin", schema=Wing, units=units, wrench=pushing),), "wrench")
@@ -336,7 +337,7 @@ def test_the_example_runs():
 
 PACKAGE = """
 import warp as wp
-from finssim.physics.terms import Term, add_term
+from finssim.physics.terms import Term
 from finssim.physics.types import vec6
 from finssim.vehicles.part import NonNegative
 
@@ -344,25 +345,27 @@ from finssim.vehicles.part import NonNegative
 def fin_wrench(nu_r: vec6, fin_drag: float) -> vec6:
     return vec6(0.0, -fin_drag * nu_r[1], 0.0, 0.0, 0.0, 0.0)
 
-add_term(Term(name="fin_drag", schema=NonNegative, units={"fin_drag": "N s/m"}, wrench=fin_wrench))
+FIN_DRAG = Term(name="fin_drag", schema=NonNegative, units={"fin_drag": "N s/m"}, wrench=fin_wrench)
 """
 
 
 def test_an_installed_package_brings_its_own(tmp_path, monkeypatch):
     """A key that nobody imported is found by the entry point of a package: so commands know it too."""
-    (tmp_path / "finned_package.py").write_text(PACKAGE, encoding="utf-8")
-    about = tmp_path / "finned-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: finned\nVersion: 1.0\n", encoding="utf-8")
-    (about / "entry_points.txt").write_text("[finssim.terms]\nfin_drag = finned_package\n", encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    try:
-        vehicle = load_vehicle("bluerov2").replace({"hydrodynamics.calibrated.fin_drag": 3.0})
-        assert vehicle.hydrodynamics["calibrated"].term_parameters == {"fin_drag": 3.0}
-        with pytest.raises(VehicleError, match="fin_drag is -3.0, expected >= 0"):
-            vehicle.replace({"hydrodynamics.calibrated.fin_drag": -3.0})
-        (tmp_path / "ranges.yaml").write_text("fin_drag: [0.5, 2.0]\n", encoding="utf-8")
-        assert load_ranges(tmp_path / "ranges.yaml").terms == {"fin_drag": (0.5, 2.0)}
-    finally:
-        TERMS.pop("fin_drag", None)
-        sys.modules.pop("finned_package", None)
+    install(tmp_path, monkeypatch, "finned", PACKAGE, {"terms": {"fin_drag": "finned:FIN_DRAG"}})
+    vehicle = load_vehicle("bluerov2").replace({"hydrodynamics.calibrated.fin_drag": 3.0})
+    assert vehicle.hydrodynamics["calibrated"].term_parameters == {"fin_drag": 3.0}
+    with pytest.raises(VehicleError, match="fin_drag is -3.0, expected >= 0"):
+        vehicle.replace({"hydrodynamics.calibrated.fin_drag": -3.0})
+    (tmp_path / "ranges.yaml").write_text("fin_drag: [0.5, 2.0]\n", encoding="utf-8")
+    assert load_ranges(tmp_path / "ranges.yaml").terms == {"fin_drag": (0.5, 2.0)}
+
+
+def test_a_term_of_a_package_without_a_unit_is_refused_in_one_sentence(tmp_path, monkeypatch):
+    """The sentence names package and object; a vehicle without the key loads as ever."""
+    bad = PACKAGE.replace('units={"fin_drag": "N s/m"}', "units={}")
+    install(tmp_path, monkeypatch, "finless", bad, {"terms": {"fin_drag": "finless:FIN_DRAG"}})
+    with pytest.raises(
+        VehicleError, match="'fin_drag' of package finless 1.0 cannot be used: finless:FIN_DRAG"
+    ):
+        load_vehicle("bluerov2").replace({"hydrodynamics.calibrated.fin_drag": 3.0})
+    assert load_vehicle("bluerov2").name == "bluerov2"

@@ -15,7 +15,7 @@ from finssim.control.trajectories import TRAJECTORIES
 from finssim.pool.fleet import Medium
 from finssim.pool.positioning import Exposure
 from finssim.robot.pilots import AgentPilot
-from finssim.tasks import SEEING, TASKS, Environment, task_named
+from finssim.tasks import TASKS, Environment, task_named
 from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
 from reference.policies import linear, written
@@ -32,7 +32,7 @@ SEEDS = {"camera-docking": 4, "pipeline": 2, "gate": 4}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*TASKS, *SEEING])
+@pytest.mark.parametrize("name", TASKS)
 def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
     """Scored by the task itself on the true state; nobody is stopped, everybody decides at the task's rate."""
     (who, *_), task = BASELINES[name], task_named(name)

@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.tasks import TASKS, EnvironmentSetupError, make
+from finssim.tasks import SEEING, TASKS, EnvironmentSetupError, make
 from finssim.tasks.fitting import coefficients_of, driven_axes
 from finssim.vehicles import catalogue, load_vehicle
 from reference.examples import example
 
+NUMERIC = [name for name in TASKS if name not in SEEING]
+
 OWN = example("own_task").KeepDepth
-NAMES = [*TASKS, OWN().name]
+NAMES = [*NUMERIC, OWN().name]
 """Those of the package, and one from outside."""
 SHORT = 1.0
 """Length of an episode [s]: several end in a test."""

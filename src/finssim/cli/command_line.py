@@ -42,6 +42,7 @@ import typer.core
 
 from finssim.cli import boundary
 from finssim.core.files import sole_writer
+from finssim.core.registry import COMMANDS, Family, RegistryError
 from finssim.core.system import replace_unwritable
 
 ROOT = Path(__file__).parents[2]
@@ -179,7 +180,8 @@ def read(path: str) -> Definition:
         file = Path(str(import_module(module).__file__))
     source = file.read_text(encoding="utf-8")
     start = re.search(rf"^(def {name}\(|class {name}[(:])", source, re.MULTILINE)
-    assert start is not None, path
+    if start is None:
+        raise AttributeError(f"{file} defines no function {name}")
     text = re.split(r"\n(?=[^\s)#])", source[start.start() :], maxsplit=1)[0]
     (node,) = ast.parse(text).body
     assert isinstance(node, ast.FunctionDef | ast.ClassDef)
@@ -279,7 +281,10 @@ def _literal(default: ast.expr, source: str) -> Any:
 
 
 def command_app(
-    sections: Mapping[str, Mapping[str, Work]], groups: Mapping[str, str], **settings: Any
+    sections: Mapping[str, Mapping[str, Work]],
+    groups: Mapping[str, str],
+    further: Family | None = None,
+    **settings: Any,
 ) -> typer.Typer:
     """Return the command line with all commands.
 
@@ -287,20 +292,33 @@ def command_app(
         sections: Heading of the help -> words after the program's name -> what is done. One of a group's own name is
             what the group does when nothing follows it; other groups then print their help.
         groups: Word -> help of a group that does nothing itself.
+        further: Commands of other packages; each is imported when it is called.
         settings: Of the outermost `typer.Typer`.
     """
     commands = {name: work for section in sections.values() for name, work in section.items()}
 
+    def others() -> list[str]:
+        return [] if further is None else further.of_packages()
+
     class Sections(typer.core.TyperGroup):
-        """Lists commands by section, in the order in which they are given."""
+        """Commands by section, in the order in which they are given, and after them those of other packages."""
+
+        def get_command(self, context: Any, name: str) -> Any:
+            known = super().get_command(context, name)
+            return _registered(name) if known is None and name in others() else known
 
         def format_commands(self, context: Any, formatter: Any) -> None:
-            width = max(len(word) for word in self.commands)
+            width = max(len(word) for word in (*self.commands, *others()))
             for heading, section in sections.items():
                 words = dict.fromkeys(name.partition(" ")[0] for name in section)
                 room = formatter.width - width - 6
                 rows = [(f"{word:{width}}", self.commands[word].get_short_help_str(room)) for word in words]
                 with formatter.section(heading):
+                    formatter.write_dl(rows)
+            if others():
+                room = formatter.width - width - 6
+                rows = [(f"{word:{width}}", _short_help(word, room)) for word in others()]
+                with formatter.section("Installed packages"):
                     formatter.write_dl(rows)
 
     app = typer.Typer(**SETTINGS, **settings, cls=Sections)
@@ -319,6 +337,32 @@ def command_app(
             options = {"allow_extra_args": True, "ignore_unknown_options": True} if extra else None
             (apps[first] if last else app).command(last or first, context_settings=options)(handler)
     return app
+
+
+def _registered(name: str) -> Any:
+    """Return a command of another package.
+
+    Raises:
+        RegistryError: Its module cannot be imported, or has no such function.
+    """
+    reference, package = COMMANDS.reference(name), COMMANDS.packages()[name]
+    app = typer.Typer(**SETTINGS)
+    try:
+        app.command(name)(_handler(name, reference))
+    except Exception as error:  # a package's code may raise anything when it is imported
+        raise RegistryError(
+            f"command '{name}' of package {package} cannot be used: {reference}: {type(error).__name__}: {error}; "
+            "repair or uninstall that package"
+        ) from error
+    return typer.main.get_command(app)
+
+
+def _short_help(name: str, room: int) -> str:
+    """Return the first sentence of a command of another package, or that it cannot be used."""
+    try:
+        return str(_registered(name).get_short_help_str(room))
+    except RegistryError:
+        return "cannot be used: see finssim doctor"
 
 
 def run_script(work: Work) -> NoReturn:

@@ -13,6 +13,7 @@ import typer
 from finssim import __version__
 from finssim.cli import boundary
 from finssim.cli.command_line import CONTEXT, Experiment, command_app
+from finssim.core.registry import COMMANDS as FAMILY
 from finssim.core.system import announce, replace_unwritable
 
 SECTIONS: dict[str, dict[str, str | Experiment]] = {
@@ -77,6 +78,8 @@ SECTIONS: dict[str, dict[str, str | Experiment]] = {
 COMMANDS = {words: work for section in SECTIONS.values() for words, work in section.items()}
 """Words of every command -> what it does."""
 
+FAMILY.ship({words.partition(" ")[0]: "finssim.cli.commands:app" for words in COMMANDS})
+
 GROUPS = {
     "trials": "Check trials, and import foreign logs as trials.\n\nExample: finssim trials check trials",
     "calibrate": "Fit a vehicle's numbers to measurements and write a vehicle file with their 95 % intervals.\n\n"
@@ -93,6 +96,7 @@ PICTURES = (".png", ".svg", ".pdf")
 app = command_app(
     SECTIONS,
     GROUPS,
+    FAMILY,
     name="finssim",
     help="Identify, locate and simulate underwater vehicles, train controllers, and deploy them.",
     pretty_exceptions_enable=False,
@@ -136,11 +140,12 @@ def vehicles(*, as_json: bool = False) -> None:
     """
     from rich.console import Console
 
-    from finssim.vehicles import catalogue, load_vehicle
+    from finssim.core.registry import VEHICLES
+    from finssim.vehicles import load_vehicle
     from finssim.vehicles.show import print_catalogue, vehicle_data
 
     if as_json:
-        print(json.dumps({name: vehicle_data(load_vehicle(name)) for name in catalogue()}))
+        print(json.dumps({name: vehicle_data(load_vehicle(name)) for name in sorted(VEHICLES.usable())}))
     else:
         print_catalogue(Console())
 

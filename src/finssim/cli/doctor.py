@@ -1,4 +1,4 @@
-"""`finssim doctor`: what is installed, which devices compute, what each missing extra would enable."""
+"""`finssim doctor`: installed packages, compute devices, missing extras, and what packages register."""
 
 # No postponed annotations here: Warp reads those of its kernels.
 import json
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from finssim.core.provenance import package_versions, revision
+from finssim.core.registry import FAMILIES, Family
 
 CORE = ("numpy", "scipy", "warp-lang", "pydantic", "PyYAML", "typer", "rich", "onnxruntime")
 """Distributions FinsSim cannot do without."""
@@ -104,7 +105,7 @@ EXTRA_OF_MODULE = {
 
 
 def doctor(*, as_json: bool = False) -> int:
-    """List installed packages and compute devices, and what each missing extra would enable.
+    """List installed packages, compute devices, what each missing extra would enable, and what packages register.
 
     Exit status 1: a core package or a working compute device is missing.
 
@@ -123,7 +124,8 @@ def examine() -> dict[str, Any]:
 
     Returns:
         `healthy`; `machine`; `core` (name -> version or None); `devices`, each with `name`, `works`, `detail`; `extras`
-        (name -> `complete`, `versions`, `missing`, `enables`).
+        (name -> `complete`, `versions`, `missing`, `enables`); `registered` (family -> package -> names); `failures`, a
+        sentence about each member of another package that cannot be used.
     """
     core = package_versions(CORE)
     devices = _devices() if "warp-lang" in core else []
@@ -149,7 +151,17 @@ def examine() -> dict[str, Any]:
         "core": {name: core.get(name) for name in CORE},
         "devices": devices,
         "extras": extras,
+        "registered": {f"{family.noun}s": _by_package(family) for family in FAMILIES},
+        "failures": [sentence for family in FAMILIES for sentence in family.failures().values()],
     }
+
+
+def _by_package(family: Family) -> dict[str, list[str]]:
+    """Return package -> names of the members that it registers."""
+    packages: dict[str, list[str]] = {}
+    for name, package in family.packages().items():
+        packages.setdefault(package, []).append(name)
+    return {package: sorted(names) for package, names in sorted(packages.items())}
 
 
 def _devices() -> list[dict[str, Any]]:
@@ -186,6 +198,7 @@ def _devices() -> list[dict[str, Any]]:
 
 def _print(report: dict[str, Any]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console()
@@ -214,7 +227,12 @@ def _print(report: dict[str, Any]) -> None:
         if extra["missing"]:
             missing_text = ", ".join(extra["missing"])
             table.add_row("", "", f"without {missing_text}: pip install 'finssim\\[{name}]'")
+    for family, packages in report["registered"].items():
+        for package, names in packages.items():
+            table.add_row(family, package, ", ".join(names))
     console.print(table)
+    for sentence in report["failures"]:
+        console.print(f"[red]{escape(sentence)}[/]", highlight=False)
     console.print(
         "ready" if report["healthy"] else "[red]not ready: the core does not work[/]", highlight=False
     )

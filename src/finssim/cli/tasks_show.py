@@ -15,7 +15,7 @@ from typing import Any
 from finssim.agents.agents import BASELINES
 from finssim.control.modes import AXES, action_mode
 from finssim.evaluation.tables import Table
-from finssim.tasks import SEEING, TASKS
+from finssim.tasks import TASKS
 from finssim.tasks import terms as library
 from finssim.tasks.given import crew
 from finssim.tasks.make import task_named
@@ -158,7 +158,7 @@ def tasks_list() -> dict[str, Any]:
 
     Example: finssim tasks
     """
-    return {name: describe_task(name) for name in (*TASKS, *SEEING)}
+    return {name: describe_task(name) for name in TASKS.usable()}
 
 
 def tasks_show(task: str, *, vehicle: str = "finsrov", action: str | None = None) -> dict[str, Any]:

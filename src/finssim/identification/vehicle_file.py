@@ -19,6 +19,7 @@ import yaml
 
 from finssim.core.files import atomic_write
 from finssim.core.provenance import provenance
+from finssim.core.registry import TERMS
 from finssim.identification.fit import Estimate, Fit
 from finssim.trials.findings import CalibrationError, Finding, finding, plain
 from finssim.vehicles import (
@@ -31,7 +32,6 @@ from finssim.vehicles import (
     check_vehicle,
     load_vehicle,
 )
-from finssim.vehicles.terms import TERMS
 
 __all__ = [
     "all_findings", "calibrated", "estimate_at", "file_tree", "folded", "retained_values", "leaves",

@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from finssim.learning.served import copied, served, single_agent
-from finssim.tasks import SEEING, TASKS, Environment, EnvironmentSetupError, Task
+from finssim.tasks import TASKS, Environment, EnvironmentSetupError, Task
 from finssim.tasks.onlooker import Onlooker
 
 # Gymnasium's spaces of an environment's observations and actions.
@@ -217,8 +217,8 @@ def _replace(observation: Observation, other: Observation, rows: NDArray[np.bool
         array[rows] = other[name][rows]
 
 
-for _name, _kind in (*TASKS.items(), *SEEING.items()):
-    if len(_kind.agents) == 1:
+for _name, _kind in TASKS.usable().items():
+    if isinstance(_kind, type) and len(_kind.agents) == 1:
         gymnasium.register(
             id=f"finssim/{_kind.__name__}-v0",
             entry_point="finssim.learning.gymnasium_env:Env",

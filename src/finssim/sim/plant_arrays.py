@@ -7,11 +7,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from finssim.core.registry import TERMS
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.terms.composed import layout, row_length
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.sim.packed import Packed
-from finssim.vehicles.terms import TERMS
 
 if TYPE_CHECKING:
     from finssim.vehicles import Vehicle

@@ -16,6 +16,7 @@ from pydantic import (
     model_validator,
 )
 
+from finssim.core.registry import TERMS
 from finssim.core.yaml_file import read_mapping
 from finssim.sim.distributions import (
     Above0,
@@ -30,7 +31,7 @@ from finssim.sim.distributions import (
     unknown,
 )
 from finssim.sim.site import SurroundingsError, Wave
-from finssim.vehicles.terms import Term, find_term
+from finssim.vehicles.terms import Term
 
 SHIPPED = Path(__file__).parent / "ranges"
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
@@ -324,7 +325,7 @@ class Ranges(Part):
             name, _, parameter = entry.partition(".")
             out[name] = {**out.get(name, {}), parameter: drawn} if parameter else drawn
         for name in [name for name in out if name not in cls.model_fields]:
-            term = find_term(str(name))
+            term = TERMS.get(str(name))
             if term is not None:  # another is refused as an unknown entry
                 terms |= _of_term(term, out.pop(name))
         return {**out, "terms": terms} if terms else out

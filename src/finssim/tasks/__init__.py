@@ -1,6 +1,5 @@
 """Tasks, and the batched environment that runs any of them."""
 
-from finssim.extensions.perception.docking import Docking
 from finssim.tasks.environment import Environment, EnvironmentSetupError, Step
 from finssim.tasks.make import SEEING, TASKS, make, task_named
 from finssim.tasks.measurement import MeasurementNoise
@@ -14,7 +13,6 @@ from finssim.tasks.trajectory_tracking import TrajectoryTracking, follow
 __all__ = [
     "SEEING",
     "TASKS",
-    "Docking",
     "Environment",
     "EnvironmentSetupError",
     "MeasurementNoise",

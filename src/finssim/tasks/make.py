@@ -6,41 +6,18 @@ import hashlib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from finssim.extensions.perception.docking import CameraDocking, Docking
-from finssim.extensions.perception.gate import Gate
-from finssim.extensions.perception.net import Net
-from finssim.extensions.teams.formation import Formation
-from finssim.extensions.teams.pursuit import Pursuit, TeamPursuit
+from finssim.core.registry import TASKS, RegistryError
 from finssim.sim.randomize import Randomization
 from finssim.tasks.environment import Environment, EnvironmentSetupError
 from finssim.tasks.measurement import ESTIMATOR, MeasurementNoise
-from finssim.tasks.moving_target import MovingTarget
-from finssim.tasks.pipeline import Pipeline
 from finssim.tasks.sensing import Sensing, load_sensing
-from finssim.tasks.station_keeping import StationKeeping
 from finssim.tasks.task import Task
-from finssim.tasks.trajectory_tracking import TrajectoryTracking
 from finssim.vehicles import Vehicle
-
-# Every task by name.
-
-
-TASKS: dict[str, type[Task]] = {
-    "t1": StationKeeping,
-    "t2": TrajectoryTracking,
-    "t3": MovingTarget,
-    "docking": Docking,
-    "pursuit": Pursuit,
-    "team-pursuit": TeamPursuit,
-    "formation": Formation,
-}
-"""Every task of numbers alone by the name that commands take; call it for the task with its default settings."""
-
 
 # Tasks of one's own by name: `path/to/file.py:ClassName`, or `package.module:ClassName` of what Python can import.
 
@@ -55,7 +32,11 @@ def own_task(reference: str, **settings: Any) -> Task:
     Raises:
         EnvironmentSetupError: There is no such file, module or name; its code fails; or it makes no task.
     """
-    factory = own_class(reference, Task, "task")
+    return _made(reference, own_class(reference, Task, "task"), settings)
+
+
+def _made(reference: str, factory: Any, settings: Mapping[str, Any]) -> Task:
+    """Return the task that a class or function makes; `reference` is its name in messages."""
     try:
         task = factory(**settings)
     except TypeError as error:
@@ -125,13 +106,24 @@ def _of_import(name: str) -> ModuleType:
         raise EnvironmentSetupError(f"module '{name}' cannot be imported: {error}") from error
 
 
-SEEING: dict[str, type[Task]] = {
-    "camera-docking": CameraDocking,
-    "pipeline": Pipeline,
-    "gate": Gate,
-    "net": Net,
-}
-"""Every task that observes pictures, which needs `finssim[perception]`; otherwise as `TASKS`."""
+SEEING = ("camera-docking", "pipeline", "gate", "net")
+"""Names of the tasks that observe pictures, which need `finssim[perception]`."""
+
+
+def check_registered(name: str, task: Any) -> None:
+    """Refuse what makes no task.
+
+    Args:
+        name: Name of the task.
+        task: The object that is registered under it.
+
+    Raises:
+        EnvironmentSetupError: It is no callable, or a class that is not derived from `Task`.
+    """
+    if not callable(task) or (isinstance(task, type) and not issubclass(task, Task)):
+        raise EnvironmentSetupError(
+            f"{name} is {task!r:.80}, expected a class derived from finssim.tasks.Task, or a function that returns one"
+        )
 
 
 OBSERVED: dict[str, MeasurementNoise | Sensing] = {
@@ -166,15 +158,17 @@ def task_named(task: str | Task, **settings: Any) -> Task:
     """
     if isinstance(task, Task):
         return task
-    tasks = {**SEEING, **TASKS}
-    if task not in tasks and ":" in task:
+    if task not in TASKS and ":" in task:
         return own_task(task, **settings)
-    if task not in tasks:
+    if task not in TASKS:
         raise EnvironmentSetupError(
-            f"unknown task '{task}'; available: {', '.join((*TASKS, *SEEING))}; or your own: FILE.py:CLASS"
+            f"unknown task '{task}'; available: {', '.join(TASKS)}; or your own: FILE.py:CLASS"
         )
-    named: Task = tasks[task](**settings)
-    return named
+    try:
+        factory = TASKS[task]
+    except RegistryError as error:
+        raise EnvironmentSetupError(str(error)) from error
+    return _made(task, factory, settings)
 
 
 def make(

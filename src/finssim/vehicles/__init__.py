@@ -1,10 +1,10 @@
 """Vehicles: one file each, read, checked and frozen."""
 
 from finssim.vehicles.check import Finding, check_vehicle
-from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensors, Tags
+from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensor, Sensors, Tags
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.loader import catalogue, catalogue_vehicle, load_vehicle
-from finssim.vehicles.part import VehicleError
+from finssim.vehicles.part import NonNegative, Number, Part, Positive, VehicleError
 from finssim.vehicles.thruster import Esc, Thruster
 from finssim.vehicles.vehicle import AXES, Body, CalibrationRecord, Hull, Provenance, Vehicle, Water
 
@@ -22,8 +22,13 @@ __all__ = [
     "Mcu",
     "MeshSet",
     "Mount",
+    "NonNegative",
+    "Number",
+    "Part",
+    "Positive",
     "Provenance",
     "Safety",
+    "Sensor",
     "Sensors",
     "Tags",
     "Thruster",

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.core.registry import TERMS
 from finssim.vehicles.capability import trim, wrench_capability
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.part import VehicleError
-from finssim.vehicles.terms import TERMS
 from finssim.vehicles.vehicle import AXES, Vehicle
 
 __all__ = ["Finding", "check_vehicle"]

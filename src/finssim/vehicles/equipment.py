@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+import re
+from functools import cache
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, ValidationError, create_model, model_validator
 
+from finssim.core.registry import SENSORS, RegistryError
 from finssim.vehicles.part import (
     NonNegative,
     Part,
@@ -19,6 +22,7 @@ from finssim.vehicles.part import (
     did_you_mean,
     identity_quaternion,
     refuse_section,
+    sentence_of,
 )
 
 
@@ -114,12 +118,21 @@ class Compass(Sensor):
     """[rad]; 0 for none."""
 
 
-OWN_SENSORS: dict[str, type[Sensor]] = {}
-"""Kind -> schema of sensors that `finssim.sim.sensors.add_sensor` made known."""
+SENSOR_NAME = "[a-z][a-z0-9_]{0,31}"
+"""Regular expression of the name of a sensor."""
+
+OTHER_NAMES = ("pressure", "base", "camera")
+"""Names that frames and topics of a robot have besides those of its sensors."""
+
+OWN_KINDS: dict[str, type[Sensor]] = {"imu": Imu, "depth": DepthSensor, "dvl": Dvl, "compass": Compass}
+"""Kind -> schema of the sensors of FinsSim; those of other packages are in `finssim.core.registry.SENSORS`."""
 
 
 class Sensors(Part):
-    """Sensors aboard; None for those that are absent. Additional kinds (`OWN_SENSORS`) are listed under their names."""
+    """Sensors aboard by name; None for those of FinsSim that are absent.
+
+    A section has the name of its kind, or names its kind: `stern_depth: {kind: depth, ...}`.
+    """
 
     model_config = ConfigDict(frozen=True, extra="allow", arbitrary_types_allowed=True)
 
@@ -128,27 +141,70 @@ class Sensors(Part):
     def _known_keys_only(cls, data: Any) -> Any:
         if not isinstance(data, dict):
             return data
-        extra = {key: OWN_SENSORS[key].model_validate(data[key]) for key in data if key in OWN_SENSORS}
-        for key in data:
-            if key not in extra and key not in cls.model_fields:
-                allowed = [*cls.model_fields, *OWN_SENSORS]
-                raise refuse_section(
-                    f"unknown key '{key}'{did_you_mean(str(key), allowed)} known keys: {', '.join(allowed)}"
-                )
-        return {**data, **extra}
+        return {
+            key: value if key in cls.model_fields else _additional(str(key), value)
+            for key, value in data.items()
+        }
 
     imu: Imu | None = None
     depth: DepthSensor | None = None
     dvl: Dvl | None = None
     compass: Compass | None = None
 
+    @property
+    def by_name(self) -> dict[str, Sensor]:
+        """Name -> section of each sensor that the vehicle carries, in the order imu, depth, dvl, compass, others."""
+        entries = {name: getattr(self, name) for name in (*OWN_KINDS, *sorted(self.model_extra or {}))}
+        return {name: entry for name, entry in entries.items() if entry is not None}
 
-SENSOR_NAME = "[a-z][a-z0-9_]{0,31}"
-"""Regular expression of the name of a `RaySensor`."""
+    def kind_of(self, name: str) -> str:
+        """Return the kind of a sensor by its name."""
+        return str(getattr(getattr(self, name), "kind", name))
 
 
-RESERVED = (*Sensors.model_fields, "pressure", "base", "camera")
-"""Names that frames and topics of a robot have already."""
+def _additional(name: str, value: Any) -> Sensor:
+    """Return the section of a sensor that has a name of its own, or a kind of another package."""
+    if isinstance(value, Sensor):
+        return value
+    named = isinstance(value, dict) and "kind" in value
+    kind = str(value["kind"]) if named else name
+    schema = _schema_of(kind)
+    if schema is None:
+        known = [*OWN_KINDS, *(key for key in SENSORS if key not in OWN_KINDS)]
+        if named:
+            raise refuse_section(
+                f"{name}: kind is '{kind}'{did_you_mean(kind, known)} known kinds: {', '.join(known)}"
+            )
+        raise refuse_section(
+            f"unknown key '{name}'{did_you_mean(name, known)} known keys: {', '.join(known)}; a sensor of another "
+            f"name gives its kind, such as '{name}: {{kind: depth, ...}}'"
+        )
+    if not re.fullmatch(SENSOR_NAME, name) or name in OTHER_NAMES:
+        raise refuse_section(
+            f"'{name}' cannot be the name of a sensor: give up to 32 lower-case letters, digits and _, such as "
+            f"stern_depth, other than {', '.join(OTHER_NAMES)}"
+        )
+    try:
+        return (_named_kind(schema, kind) if named else schema).model_validate(value)
+    except ValidationError as error:
+        raise refuse_section("; ".join(sentence_of(detail, name) for detail in error.errors())) from None
+
+
+def _schema_of(kind: str) -> type[Sensor] | None:
+    """Return the schema of a kind; None where there is none."""
+    if kind in OWN_KINDS:
+        return OWN_KINDS[kind]
+    try:
+        batch = SENSORS.get(kind)
+    except RegistryError as error:
+        raise refuse_section(str(error)) from error
+    return None if batch is None else batch.schema
+
+
+@cache
+def _named_kind(schema: type[Sensor], kind: str) -> type[Sensor]:
+    """Return a schema with the key `kind`, for sections that have another name."""
+    return create_model(schema.__name__, __base__=schema, kind=(Literal[kind], ...))
 
 
 class RaySensor(Sensor):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Discriminator, Tag, model_serializer, model_validator
 
+from finssim.core.registry import TERMS, RegistryError
 from finssim.vehicles.part import (
     Matrix6,
     NonNegative,
@@ -18,7 +19,6 @@ from finssim.vehicles.part import (
     refuse_section,
     zeros,
 )
-from finssim.vehicles.terms import SHIPPED, TERMS, find_term, term_names
 
 
 class HydrodynamicSet(Part):
@@ -47,9 +47,12 @@ class HydrodynamicSet(Part):
             return data
         out = dict(data)
         for key in [key for key in data if key not in cls.model_fields]:
-            term = find_term(str(key))
+            try:
+                term = TERMS.get(str(key))
+            except RegistryError as error:
+                raise refuse_section(str(error)) from error
             if term is None:
-                allowed = [*cls.model_fields, *term_names()]
+                allowed = [*cls.model_fields, *TERMS]
                 raise refuse_section(
                     f"unknown key '{key}'{did_you_mean(str(key), allowed)} known keys: {', '.join(allowed)}"
                 )
@@ -65,9 +68,9 @@ class HydrodynamicSet(Part):
         try:
             return super().__getattr__(name)  # type: ignore[misc]
         except AttributeError:
-            if name not in SHIPPED and name not in TERMS:
+            if name not in TERMS:
                 raise
-        return getattr(find_term(name), "absent", None)
+        return TERMS[name].absent
 
     @property
     def terms(self) -> dict[str, Any]:

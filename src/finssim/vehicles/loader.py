@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from finssim.core.files import plain_name
+from finssim.core.registry import VEHICLES, RegistryError
 from finssim.core.yaml_file import read_mapping
 from finssim.vehicles.part import VehicleError, did_you_mean, sentence_of
 from finssim.vehicles.vehicle import ORIGINS, Provenance, Vehicle
@@ -20,15 +21,13 @@ from finssim.vehicles.vehicle import ORIGINS, Provenance, Vehicle
 GREATEST = 1e12
 """Magnitude of a number in a vehicle file; squares and products of greater ones leave double precision."""
 
-CATALOGUE = Path(__file__).parent / "catalogue"
-
 Tree = dict[str, Any]
 Origins = dict[str, Provenance]
 
 
 def catalogue() -> list[str]:
-    """Names of the vehicles that come with FinsSim."""
-    return sorted(path.stem for path in CATALOGUE.glob("*.yaml"))
+    """Return the names of the vehicles of FinsSim and of installed packages."""
+    return sorted(VEHICLES)
 
 
 def load_vehicle(name_or_path: Vehicle | str | os.PathLike[str]) -> Vehicle:
@@ -102,9 +101,26 @@ def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) ->
         return path, text
     if beside is not None and (beside / f"{text}.yaml").is_file():
         return beside / f"{text}.yaml", f"{text}.yaml"
-    if text not in catalogue():
+    if text not in VEHICLES:
         raise VehicleError(_unknown(text))
-    return CATALOGUE / f"{text}.yaml", f"catalogue/{text}.yaml"
+    try:
+        return VEHICLES[text], f"catalogue/{text}.yaml"
+    except RegistryError as error:
+        raise VehicleError(str(error)) from error
+
+
+def check_registered(name: str, path: Any) -> None:
+    """Refuse what is no path of a vehicle file.
+
+    Args:
+        name: Name of the vehicle.
+        path: The object that is registered under it.
+
+    Raises:
+        VehicleError: It is no `pathlib.Path` of a file `NAME.yaml`.
+    """
+    if not isinstance(path, Path) or not path.is_file() or path.name != f"{name}.yaml":
+        raise VehicleError(f"{name} is {str(path)!r}, expected the pathlib.Path of a file {name}.yaml")
 
 
 def _unknown(name: str) -> str:

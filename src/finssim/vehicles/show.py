@@ -15,12 +15,12 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from finssim.core.registry import TERMS, VEHICLES
 from finssim.vehicles.capability import restoring, terminal_speeds, time_constants, wrench_capability
 from finssim.vehicles.check import check_vehicle
 from finssim.vehicles.defaults import DEFAULTS
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
-from finssim.vehicles.loader import catalogue, load_vehicle
-from finssim.vehicles.terms import TERMS
+from finssim.vehicles.loader import load_vehicle
 from finssim.vehicles.vehicle import AXES, ORIGINS, Vehicle
 
 if TYPE_CHECKING:
@@ -39,14 +39,14 @@ WIDE = 110
 
 
 def print_catalogue(console: Console) -> None:
-    """One line per vehicle that comes with FinsSim."""
+    """Print one line for each vehicle of FinsSim and of installed packages."""
     table = Table(title="Vehicles", title_justify="left", box=None, pad_edge=False)
     for column in ("name", "mass\n[kg]", "thrusters", "axes"):
         table.add_column(Text(column), justify="left" if column == "name" else "right", no_wrap=True)
     wide = console.width >= WIDE
     for column in ("hydrodynamics", "description") if wide else ("description",):
         table.add_column(column)
-    for name in catalogue():
+    for name in sorted(VEHICLES.usable()):
         vehicle = load_vehicle(name)
         numbers = (f"{vehicle.body.mass:g}", len(vehicle.thrusters), len(vehicle.controlled_axes))
         words = (" ".join(vehicle.hydrodynamics), vehicle.title) if wide else (vehicle.title,)
@@ -115,6 +115,13 @@ def _tables(vehicle: Vehicle) -> Iterator[Table]:
             yield _table(f"Terms: {name}", ("", "value", "unit"), _terms(vehicle, name, chosen))
     heads = ("", "position [m]", "axis", "force [N]", "rpm", "lag [s]", "acts on", "motor")
     yield _table("Thrusters", heads, _thrusters(vehicle))
+    if "sensors" not in vehicle.defaults:
+        heads = ("", "kind", "position [m]", "rate [Hz]", "latency [s]", "lost")
+        aboard = (
+            (n, vehicle.sensors.kind_of(n), _rounded(s.position), f"{s.rate:g}", f"{s.latency:g}", f"{s.dropout:.1%}")
+            for n, s in vehicle.sensors.by_name.items()
+        )  # fmt: skip
+        yield _table("Sensors", heads, aboard)
     if "perception" not in vehicle.defaults:
         heads = ("", "device", "position [m]", "rate [Hz]", "latency [s]", "lost")
         sensors = (

@@ -1,6 +1,6 @@
 """Hydrodynamic terms: parts of the water's wrench beyond added mass and damping, each from one file.
 
-This layer knows a term by what a vehicle file says of it; `finssim.physics.terms` adds terms and evaluates them.
+This layer reads their keys in a vehicle file; `finssim.physics.terms` adds terms and evaluates them.
 """
 
 from __future__ import annotations
@@ -8,28 +8,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib import import_module
-from importlib.metadata import entry_points
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, create_model
 
+from finssim.core.registry import TERMS
 from finssim.vehicles.part import Part
 
-__all__ = ["TERMS", "Term", "find_term", "term_names", "unit_of"]
+__all__ = ["Term", "unit_of"]
 
 Array = NDArray[np.float64]
-
-SHIPPED = {"surge_damping": "finssim.physics.terms.surge_damping"}
-"""Key in a vehicle file -> the file of the term: a name and no import, for physics is a layer above."""
-
-GROUP = "finssim.terms"
-"""Entry points of installed packages that add terms: `lift = "my_package.lift"`."""
-
-TERMS: dict[str, Term] = {}
-"""Key in a hydrodynamic set -> the term, of those whose files were imported."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,17 +103,3 @@ def unit_of(path: str) -> str:
     """Unit of a term's parameter, by its path within a hydrodynamic set."""
     term, _, name = path.rpartition(".")
     return TERMS[term or name].units[name]
-
-
-def term_names() -> list[str]:
-    """Keys of all terms that a vehicle file may have."""
-    return list(dict.fromkeys([*SHIPPED, *(point.name for point in entry_points(group=GROUP)), *TERMS]))
-
-
-def find_term(name: str) -> Term | None:
-    """The term of that key, whose file is imported now if it was not; None where there is none."""
-    if name not in TERMS:
-        module = SHIPPED.get(name) or next((p.value for p in entry_points(group=GROUP, name=name)), None)
-        if module is not None:
-            import_module(module)
-    return TERMS.get(name)

@@ -24,7 +24,16 @@ from finssim.vehicles.defaults import (
     default_sensors,
     default_tags,
 )
-from finssim.vehicles.equipment import RESERVED, SENSOR_NAME, Mcu, RaySensor, Safety, Sensors, Tags
+from finssim.vehicles.equipment import (
+    OTHER_NAMES,
+    OWN_KINDS,
+    SENSOR_NAME,
+    Mcu,
+    RaySensor,
+    Safety,
+    Sensors,
+    Tags,
+)
 from finssim.vehicles.hydrodynamics import AnyHydrodynamicSet, HydrodynamicSet, MeshSet
 from finssim.vehicles.part import (
     Inertia,
@@ -196,7 +205,8 @@ class Vehicle(Part):
                 raise refuse_section(
                     f"'{name}' is no name of a sensor: give up to 32 small letters, digits and _, as in front_camera"
                 )
-            if name in RESERVED or name in info.data.get("thrusters", ()):
+            aboard = (*OWN_KINDS, *info.data["sensors"].by_name) if "sensors" in info.data else OWN_KINDS
+            if name in (*OTHER_NAMES, *aboard, *info.data.get("thrusters", ())):
                 raise refuse_section(f"'{name}' is the name of something else of a robot: take another")
         return value
 

@@ -15,7 +15,7 @@ from finssim.extensions.perception import load_world, sight
 from finssim.extensions.perception.docking import CameraDocking
 from finssim.extensions.perception.gate import Gate, from_bar
 from finssim.extensions.perception.net import Net
-from finssim.tasks import SEEING, Environment, EnvironmentSetupError, environment, make, measurement
+from finssim.tasks import SEEING, TASKS, Environment, EnvironmentSetupError, environment, make, measurement
 from finssim.tasks.check import check_task
 from finssim.tasks.pipeline import Pipeline
 from finssim.tasks.task import kernels_of
@@ -421,13 +421,14 @@ def test_who_follows_the_net_at_the_wrong_distance_has_not_inspected_it():
         assert (measured["error"] < 0.1).all() == (success == 1.0)
 
 
-@pytest.mark.parametrize("kind", SEEING.values(), ids=SEEING)
-def test_the_kernels_of_tasks_that_see_compile_for_cuda(kind, tmp_path):
+@pytest.mark.parametrize("name", SEEING)
+def test_the_kernels_of_tasks_that_see_compile_for_cuda(name, tmp_path):
     """NVRTC, which needs no device, makes PTX for compute capability 7.5: of the task, of its teacher's, and
     of what all of them are run, measured and seen with."""
     wp.init()
     if wp.get_cuda_toolkit_version() is None:
         pytest.skip("this Warp has no CUDA compiler")
+    kind = TASKS[name]
     made = [kernels_of(task).evaluate.module for task in (kind(), kind().for_teacher())]
     common = [wp.get_module(module.__name__) for module in (sight, environment, measurement)]
     for i, module in enumerate([*made, *(common if kind is Net else [])]):

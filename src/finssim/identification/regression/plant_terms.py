@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.core.registry import TERMS
 from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.sim.plant_arrays import twist_shift
 from finssim.trials.findings import CalibrationError
 from finssim.vehicles import HydrodynamicSet, Vehicle
-from finssim.vehicles.terms import TERMS, Term
+from finssim.vehicles.terms import Term
 
 Array = NDArray[np.float64]
 

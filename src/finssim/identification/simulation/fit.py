@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.core.registry import TERMS
 from finssim.core.rotations import (
     quat_conjugate,
     quat_from_rotvec,
@@ -56,7 +57,7 @@ from finssim.trials.inputs import require_axes, require_fittable
 from finssim.trials.motion import Motion
 from finssim.trials.trial import COLUMNS, Trial
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
-from finssim.vehicles.terms import TERMS, unit_of
+from finssim.vehicles.terms import unit_of
 
 __all__ = ["EXTRAS", "fit_by_simulation"]
 

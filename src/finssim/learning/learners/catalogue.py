@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol
 
+from finssim.core.registry import LEARNERS, RegistryError
 from finssim.learning.learners.base import ActingLearner, task_settings
 from finssim.tasks import Environment, Task
 from finssim.tasks.make import own_class
@@ -52,6 +54,8 @@ class Learner(Protocol):
 class LearnerKind:
     """A learner that can be made: call it for one."""
 
+    key: str
+    """Name that commands take; FILE.py:CLASS of a user's own."""
     module: str
     """Module of its class."""
     name: str
@@ -83,9 +87,7 @@ class LearnerKind:
         """
         task_changes = {}
         if self.own is None:
-            task_changes = task_settings(
-                task.name, next(name for name, kind in LEARNERS.items() if kind == self), randomized
-            )
+            task_changes = task_settings(task.name, self.key, randomized)
         chosen = self._class().settings_for(task, task_changes, worlds, steps)
         return replace(
             chosen, **{name: _fitting(chosen, name, value) for name, value in (changes or {}).items()}
@@ -109,16 +111,12 @@ class LearnerKind:
         """
         sees = bool(task.pictures)
         if self.sees not in (sees, None) and self.own is None:
-            able = [name for name, kind in LEARNERS.items() if kind.sees in (sees, None)]
+            able = [name for name, kind in _ours() if kind.sees in (sees, None)]
             observes = "pictures" if task.pictures else "no pictures"
             raise LearningError(f"task '{task.name}' observes {observes}: take {', '.join(able)}")
         n = len(task.agents)
         if (self.agents == "one" and n > 1) or (self.agents == "several" and n == 1):
-            able = [
-                name
-                for name, kind in LEARNERS.items()
-                if kind.agents in ("any", "one" if n == 1 else "several")
-            ]
+            able = [name for name, kind in _ours() if kind.agents in ("any", "one" if n == 1 else "several")]
             has = "one agent" if n == 1 else f"{n} agents"
             raise LearningError(
                 f"task '{task.name}' has {has}, and this learner trains {self.agents}: take {', '.join(able)}"
@@ -137,37 +135,58 @@ class LearnerKind:
             ) from error
 
 
-LEARNERS: dict[str, LearnerKind] = {
-    "ppo": LearnerKind("ppo", "Ppo", "PPO of our own, NumPy on a processor and torch on a GPU"),
-    "sb3-ppo": LearnerKind("sb3", "Sb3Ppo", "PPO of Stable-Baselines3"),
-    "rsl-rl": LearnerKind("rsl_rl_ppo", "RslRlPpo", "PPO of RSL-RL", extra="rsl-rl"),
-    "torchrl-ppo": LearnerKind("torchrl_ppo", "TorchRlPpo", "PPO of TorchRL", extra="torchrl", agents="one"),
-    "torchrl-ippo": LearnerKind(
-        "torchrl_ppo",
-        "TorchRlIppo",
-        "independent PPO of TorchRL: each agent's value from its own observation",
-        extra="torchrl",
-        agents="several",
-    ),
-    "torchrl-mappo": LearnerKind(
-        "torchrl_ppo",
-        "TorchRlMappo",
-        "multi-agent PPO of TorchRL: values from the observations of all agents",
-        extra="torchrl",
-        agents="several",
-    ),
-    "bc": LearnerKind("imitation", "Bc", "behaviour cloning of demonstrations", extra="imitation", sees=None),
-    "dagger": LearnerKind("imitation", "Dagger", "DAgger: an expert labels each step", extra="imitation"),
-    "distill": LearnerKind(
-        "distill",
-        "Distill",
-        "a teacher by PPO, distilled into a student with images",
-        extra="perception",
-        agents="one",
-        sees=True,
-    ),
-}
-"""Learner by the name that commands take."""
+PPO = LearnerKind("ppo", "ppo", "Ppo", "PPO of our own, NumPy on a processor and torch on a GPU")
+SB3_PPO = LearnerKind("sb3-ppo", "sb3", "Sb3Ppo", "PPO of Stable-Baselines3")
+RSL_RL = LearnerKind("rsl-rl", "rsl_rl_ppo", "RslRlPpo", "PPO of RSL-RL", extra="rsl-rl")
+TORCHRL_PPO = LearnerKind(
+    "torchrl-ppo", "torchrl_ppo", "TorchRlPpo", "PPO of TorchRL", extra="torchrl", agents="one"
+)
+TORCHRL_IPPO = LearnerKind(
+    "torchrl-ippo",
+    "torchrl_ppo",
+    "TorchRlIppo",
+    "independent PPO of TorchRL: each agent's value from its own observation",
+    extra="torchrl",
+    agents="several",
+)
+TORCHRL_MAPPO = LearnerKind(
+    "torchrl-mappo",
+    "torchrl_ppo",
+    "TorchRlMappo",
+    "multi-agent PPO of TorchRL: values from the observations of all agents",
+    extra="torchrl",
+    agents="several",
+)
+BC = LearnerKind("bc", "imitation", "Bc", "behaviour cloning of demonstrations", extra="imitation", sees=None)
+DAGGER = LearnerKind("dagger", "imitation", "Dagger", "DAgger: an expert labels each step", extra="imitation")
+DISTILL = LearnerKind(
+    "distill",
+    "distill",
+    "Distill",
+    "a teacher by PPO, distilled into a student with images",
+    extra="perception",
+    agents="one",
+    sees=True,
+)
+
+
+def check_registered(name: str, learner: Any) -> None:
+    """Refuse what is no learner.
+
+    Args:
+        name: Name of the learner.
+        learner: The object that is registered under it.
+
+    Raises:
+        LearningError: It is no class derived from `ActingLearner` with settings.
+    """
+    if not (
+        isinstance(learner, type) and issubclass(learner, ActingLearner) and hasattr(learner, "Settings")
+    ):
+        raise LearningError(
+            f"'{name}' is no learner: derive it from finssim.learning.learners.base.ActingLearner, with a frozen "
+            "dataclass Settings"
+        )
 
 
 MAY_BE_ZERO = ("warm_up", "expert_rounds", "history", "memory")
@@ -181,7 +200,7 @@ SHARES = ("discount", "gae_lambda", "smoothing", "taught")
 
 
 def learner_named(name: str) -> LearnerKind:
-    """The kind of that name; or one's own, FILE.py:CLASS or MODULE:CLASS, a class derived from `ActingLearner`.
+    """Return the learner of a name; or a user's own, FILE.py:CLASS or MODULE:CLASS, derived from `ActingLearner`.
 
     Raises:
         LearningError: There is none, or the class is no learner.
@@ -189,18 +208,25 @@ def learner_named(name: str) -> LearnerKind:
     """
     if ":" in name:
         learner = own_class(name, ActingLearner, "learner")
-        if not (
-            isinstance(learner, type) and issubclass(learner, ActingLearner) and hasattr(learner, "Settings")
-        ):
-            raise LearningError(
-                f"'{name}' is no learner: derive it from finssim.learning.learners.base.ActingLearner, with a frozen "
-                "dataclass Settings"
-            )
-        title = (learner.__doc__ or learner.__name__).strip().splitlines()[0]
-        return LearnerKind(learner.__module__, learner.__name__, title, own=learner)
-    if name not in LEARNERS:
+        check_registered(name, learner)
+    elif name not in LEARNERS:
         raise LearningError(f"unknown learner '{name}'; available: {', '.join(LEARNERS)}, or FILE.py:CLASS")
-    return LEARNERS[name]
+    else:
+        try:
+            learner = LEARNERS[name]
+        except RegistryError as error:
+            raise LearningError(str(error)) from error
+    if isinstance(learner, LearnerKind):
+        return learner
+    title = (learner.__doc__ or learner.__name__).strip().splitlines()[0]
+    return LearnerKind(name, learner.__module__, learner.__name__, title, own=learner)
+
+
+def _ours() -> list[tuple[str, LearnerKind]]:
+    """Return name and kind of the learners of FinsSim, for messages."""
+    return [
+        (kind.key, kind) for kind in vars(sys.modules[__name__]).values() if isinstance(kind, LearnerKind)
+    ]
 
 
 def _fitting(settings: Any, name: str, value: Any) -> Any:

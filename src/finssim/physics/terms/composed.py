@@ -25,9 +25,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from finssim.core.registry import TERMS
 from finssim.physics.types import mat66, vec6
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
-from finssim.vehicles.terms import TERMS, Term
+from finssim.vehicles.terms import Term
 
 STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density": float}
 """Arguments that a term's functions may take besides its parameters."""
@@ -45,13 +46,28 @@ def add_term(term: Term) -> Term:
     """Make a term known: vehicle files may then have it, and simulations of vehicles that do evaluate it.
 
     Args:
-        term: All of it; one file holds it.
+        term: The term, of one file.
 
     Raises:
-        TermError: Its key is taken, its functions take what there is not, or a unit is missing.
+        RegistryError: There is another term of that key.
+        TermError: A function has an argument that is neither state nor parameter, or a unit is missing.
     """
-    if TERMS.get(term.name, term) is not term:
-        raise TermError(f"there is a term '{term.name}' already: give yours another name")
+    TERMS[term.name] = term
+    return term
+
+
+def check_registered(name: str, term: Any) -> None:
+    """Refuse what is no term, or a term that cannot be evaluated.
+
+    Args:
+        name: Key in a hydrodynamic set.
+        term: The object that is registered under it.
+
+    Raises:
+        TermError: It is no `Term`, has another name, an argument that is neither state nor parameter, or no unit.
+    """
+    if not isinstance(term, Term) or term.name != name:
+        raise TermError(f"{name} is {term!r:.80}, expected a finssim.physics.terms.Term of that name")
     if term.name in {*HydrodynamicSet.model_fields, *MeshSet.model_fields} or not term.name.isidentifier():
         raise TermError(f"a term cannot be named '{term.name}': give it a key that no hydrodynamic set has")
     if set(term.units) != set(term.parameters):
@@ -72,8 +88,6 @@ def add_term(term: Term) -> Term:
     unused = [name for name in term.parameters if name not in used]
     if unused:
         raise TermError(f"term '{term.name}': no function takes the parameter '{unused[0]}'")
-    TERMS[term.name] = term
-    return term
 
 
 @cache  # not as a term is added: this starts Warp, which a vehicle file alone does not need

@@ -8,7 +8,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.physics.terms.composed import add_term
 from finssim.physics.types import linear, mat66, vec6
 from finssim.vehicles.part import Matrix6, zeros
 from finssim.vehicles.terms import Term
@@ -55,15 +54,13 @@ def _check(Du: Any) -> tuple[bool, str]:
     return smallest >= -1e-9 * float(np.abs(Du).max()), sentence
 
 
-SURGE_DAMPING = add_term(
-    Term(
-        name="surge_damping",
-        schema=Matrix6,
-        units={"surge_damping": "N s²/m², N s²/rad"},
-        wrench=surge_coupled_wrench,
-        slope=surge_coupled_slope,
-        absent=zeros(6, 6),
-        quadratic=_quadratic,
-        check=_check,
-    )
+SURGE_DAMPING = Term(
+    name="surge_damping",
+    schema=Matrix6,
+    units={"surge_damping": "N s²/m², N s²/rad"},
+    wrench=surge_coupled_wrench,
+    slope=surge_coupled_slope,
+    absent=zeros(6, 6),
+    quadratic=_quadratic,
+    check=_check,
 )

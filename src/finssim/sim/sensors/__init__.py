@@ -1,6 +1,41 @@
 """Sensors of a vehicle's own motion, with the noise, delays and losses of real instruments."""
 
-from finssim.sim.sensors.batch import SensorError
+from finssim.sim.sensors.batch import SensorBatch, SensorError
+from finssim.sim.sensors.sampling import (
+    DROPOUT,
+    TURN_ON,
+    TURN_ON_2,
+    WALK,
+    WALK_2,
+    WHITE,
+    WHITE_2,
+    Truth,
+    digitised,
+    digitised3,
+    normal,
+    normal3,
+    parameters_of,
+    sampling_kernel,
+)
 from finssim.sim.sensors.suite import SensorSuite, add_sensor
 
-__all__ = ["SensorError", "SensorSuite", "add_sensor"]
+__all__ = [
+    "DROPOUT",
+    "TURN_ON",
+    "TURN_ON_2",
+    "WALK",
+    "WALK_2",
+    "WHITE",
+    "WHITE_2",
+    "SensorBatch",
+    "SensorError",
+    "SensorSuite",
+    "Truth",
+    "add_sensor",
+    "digitised",
+    "digitised3",
+    "normal",
+    "normal3",
+    "parameters_of",
+    "sampling_kernel",
+]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -9,6 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.sim.sensors.sampling import SensedState, new_sampling
+from finssim.vehicles.equipment import Sensor
 
 
 class SensorError(ValueError):
@@ -26,8 +28,12 @@ class Surroundings(NamedTuple):
     """Depth of the flat floor [m]; infinite if not known."""
 
 
+NUMBERS = {"imu": 1, "depth": 2, "dvl": 3, "compass": 4}
+"""Number of a sensor in the key of its random numbers; that of another name is a checksum of the name."""
+
+
 class SensorBatch:
-    """One kind of sensor, for every vehicle of every world.
+    """One sensor, by its name in the vehicle files, for every vehicle of every world.
 
     Its readings are Warp arrays (W, V) that stay in place. `stamp` and `fresh` say how old they are. Where a vehicle
     lacks the sensor they stay zero, never fresh, with the stamp -1.
@@ -36,30 +42,35 @@ class SensorBatch:
     kind: ClassVar[str]
     """Its key under `sensors` in a vehicle file."""
     schema: ClassVar[Any] = None
-    """Schema of its section in a vehicle file, a `vehicles.equipment.Sensor`; for `add_sensor`."""
+    """Schema of its section in a vehicle file, derived from `vehicles.equipment.Sensor`; those of FinsSim have none."""
     kernel: ClassVar[Any]
     """Kernel made by `sampling.sampling_kernel`."""
-    parameter_struct: ClassVar[Any]
-    """Struct made by `sampling.parameters_of`."""
-    array_struct: ClassVar[Any]
-    """Warp struct of readings, by (world, vehicle), and of rings, which have one more index."""
     readings: ClassVar[tuple[str, ...]]
     """Names of the arrays that `numpy` returns beside `stamp` and `fresh`."""
 
     def __init__(
-        self, entries: Sequence[Any], worlds: int, control_step: float, seed: int, device: Any
+        self, name: str, entries: Sequence[Any], worlds: int, control_step: float, seed: int, device: Any
     ) -> None:
         """Lay out the memory.
 
         Args:
+            name: Name of the sensor under `sensors` in the vehicle files.
             entries: What each vehicle's file says about this sensor, or None; only rate and latency are read here.
             worlds: Number of worlds W.
             control_step: [s]
             seed: Of all random numbers.
             device: Warp device.
         """
+        self.name = name
+        # The kernel's own structs: Warp takes an earlier kernel where a class is defined again with the same code.
+        arguments = {argument.label: argument.type for argument in self.kernel.adj.args}
+        self.parameter_struct: Any = arguments["errors"].dtype
+        """Struct made by `sampling.parameters_of`."""
+        self.array_struct: Any = arguments["sensor"]
+        """Struct of readings, by (world, vehicle), and of rings, which have one more index."""
         self.device = device
         self.seed = seed
+        self.number = NUMBERS.get(name) or zlib.crc32(name.encode()) >> 1
         self.shape = (worlds, len(entries))
         self.sampling = new_sampling(
             [0.0 if entry is None else entry.rate for entry in entries],
@@ -97,14 +108,14 @@ class SensorBatch:
         """
         truth = [state.position, state.quaternion, state.velocity, state.acceleration, water_velocity]
         memory = [self.parameters, self.arrays, self.sampling]
-        return [*truth, state.steps, state.episode, *memory, mask, restarting, self.seed]
+        return [*truth, state.steps, state.episode, *memory, mask, restarting, self.seed, self.number]
 
     def use(self, vehicle: int, entry: Any, site: Surroundings) -> None:
         """Take one vehicle's parameters from its file.
 
         Args:
             vehicle: Index.
-            entry: `vehicle.sensors.KIND`.
+            entry: Its section in the vehicle file, of `vehicle.sensors.by_name`.
             site: What else they depend on.
         """
         names = self.parameter_struct.vars
@@ -137,3 +148,28 @@ class SensorBatch:
                 raise SensorError(f"no {self.kind} parameter '{name}'; available: {available}")
             table[name][:, vehicle] = value
         self.parameters.assign(table)  # type: ignore[no-untyped-call]
+
+
+def check_registered(kind: str, batch: Any) -> None:
+    """Refuse what is no kind of sensor.
+
+    Args:
+        kind: Key in a vehicle file under which it is registered.
+        batch: The object that is registered under it.
+
+    Raises:
+        SensorError: It is no `SensorBatch`, has another kind, or no schema.
+    """
+    if (
+        not (isinstance(batch, type) and issubclass(batch, SensorBatch))
+        or getattr(batch, "kind", None) != kind
+    ):
+        raise SensorError(
+            f"{kind} is {batch!r:.80}, expected a class derived from finssim.sim.sensors.SensorBatch "
+            f"with kind = '{kind}'"
+        )
+    if not (isinstance(batch.schema, type) and issubclass(batch.schema, Sensor)):
+        raise SensorError(
+            f"sensor '{kind}' has no schema of its section in a vehicle file: derive one from "
+            "finssim.vehicles.equipment.Sensor"
+        )

@@ -63,9 +63,7 @@ class CompassBatch(SensorBatch):
     """The compasses of all vehicles of all worlds."""
 
     kind = "compass"
-    parameter_struct = CompassParameters
-    array_struct = CompassArrays
-    kernel = sampling_kernel(4, CompassParameters, CompassArrays, measure_heading, display_heading)
+    kernel = sampling_kernel(CompassParameters, CompassArrays, measure_heading, display_heading)
     readings = ("heading",)
 
     heading: "wp.array[Any]"

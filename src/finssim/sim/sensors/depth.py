@@ -79,9 +79,7 @@ class DepthBatch(SensorBatch):
     """The pressure gauges of all vehicles of all worlds."""
 
     kind = "depth"
-    parameter_struct = DepthParameters
-    array_struct = DepthArrays
-    kernel = sampling_kernel(2, DepthParameters, DepthArrays, measure_depth, display_depth)
+    kernel = sampling_kernel(DepthParameters, DepthArrays, measure_depth, display_depth)
     readings = ("depth", "pressure")
 
     depth: "wp.array[Any]"

@@ -99,9 +99,7 @@ class DvlBatch(SensorBatch):
     """The DVLs of all vehicles of all worlds."""
 
     kind = "dvl"
-    parameter_struct = DvlParameters
-    array_struct = DvlArrays
-    kernel = sampling_kernel(3, DvlParameters, DvlArrays, measure_velocity, display_velocity)
+    kernel = sampling_kernel(DvlParameters, DvlArrays, measure_velocity, display_velocity)
     readings = ("velocity",)
 
     velocity: "wp.array[Any]"

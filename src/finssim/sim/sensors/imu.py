@@ -107,9 +107,7 @@ class ImuBatch(SensorBatch):
     """The IMUs of all vehicles of all worlds."""
 
     kind = "imu"
-    parameter_struct = ImuParameters
-    array_struct = ImuArrays
-    kernel = sampling_kernel(1, ImuParameters, ImuArrays, measure_motion, display_motion)
+    kernel = sampling_kernel(ImuParameters, ImuArrays, measure_motion, display_motion)
     readings = ("gyro", "accel")
 
     gyro: "wp.array[Any]"

@@ -31,7 +31,7 @@ def sample_key(seed: int, sensor: int, world: int, vehicle: int, episode: int, s
 
     Args:
         seed: Of the suite.
-        sensor: Which kind of sensor.
+        sensor: Number of the sensor.
         world: Index of the world.
         vehicle: Index of the vehicle in its world.
         episode: Resets of the world so far.
@@ -254,11 +254,10 @@ def parameters_of(schema: type[Sensor], **derived: Any) -> Any:
     return wp.struct(type(f"{schema.__name__}Parameters", (), space))
 
 
-def sampling_kernel(number: int, parameters: Any, arrays: Any, measure: Any, display: Any) -> Any:
+def sampling_kernel(parameters: Any, arrays: Any, measure: Any, display: Any) -> Any:
     """Return the kernel that updates all sensors of one kind after a control step, or at a reset.
 
     Args:
-        number: Of the kind, in the key of its random numbers; no other kind may have it.
         parameters: Warp struct of one sensor, from `parameters_of`.
         arrays: Warp struct of readings and memory.
         measure: Warp function (truth, parameters, key, root of the time since the last sample [√s], whether worlds were
@@ -283,6 +282,7 @@ def sampling_kernel(number: int, parameters: Any, arrays: Any, measure: Any, dis
         mask: wp.array(dtype=int),
         restarting: bool,
         seed: int,
+        number: int,
         world_offset: int,
     ):
         i, v = wp.tid()

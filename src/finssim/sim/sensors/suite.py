@@ -4,43 +4,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from finssim.core.registry import SENSORS
 from finssim.sim.sensors.batch import SensorBatch, SensorError, Surroundings
-from finssim.sim.sensors.compass import CompassBatch
-from finssim.sim.sensors.depth import DepthBatch
-from finssim.sim.sensors.dvl import DvlBatch
-from finssim.sim.sensors.imu import ImuBatch
 from finssim.sim.sensors.sampling import SensedState
 from finssim.vehicles import Vehicle
-from finssim.vehicles.equipment import OWN_SENSORS
+from finssim.vehicles.equipment import OWN_KINDS
+
+if TYPE_CHECKING:
+    from finssim.sim.sensors.compass import CompassBatch
+    from finssim.sim.sensors.depth import DepthBatch
+    from finssim.sim.sensors.dvl import DvlBatch
+    from finssim.sim.sensors.imu import ImuBatch
 
 Stage = tuple[Any, list[Any]]
 
-KINDS: dict[str, type[SensorBatch]] = {
-    batch.kind: batch for batch in (ImuBatch, DepthBatch, DvlBatch, CompassBatch)
-}
-"""Key under `sensors` in a vehicle file -> its batch."""
-
 
 def add_sensor(batch: type[SensorBatch]) -> type[SensorBatch]:
-    """Make a kind of sensor known, from anywhere: vehicle files may then have it under its `kind`.
+    """Make a kind of sensor known to this program: vehicle files may then have it under its `kind`.
+
+    An installed package registers it by an entry point instead; see `finssim.core.registry`.
 
     Args:
-        batch: With `kind`, a `schema` of what a vehicle file says of it, a kernel and `use`; one file holds all of it.
+        batch: Class with `kind`, the `schema` of its section in a vehicle file, a kernel and `readings`.
 
     Raises:
-        SensorError: It has no schema, or there is another of that kind.
+        RegistryError: There is another sensor of that kind.
+        SensorError: It is no `SensorBatch`, or has no schema.
     """
-    if batch.schema is None:
-        raise SensorError(
-            f"sensor '{batch.kind}' has no schema: say what a vehicle file gives, from vehicles.equipment.Sensor"
-        )
-    if KINDS.setdefault(batch.kind, batch) is not batch:
-        raise SensorError(f"there is a sensor '{batch.kind}' already: give yours another kind")
-    OWN_SENSORS[batch.kind] = batch.schema
+    SENSORS[batch.kind] = batch
     return batch
 
 
@@ -84,7 +79,7 @@ class SensorSuite:
             floor_depth: Depth of the flat floor, for the reach of a DVL [m]; if not given the floor is always in reach.
 
         Raises:
-            SensorError: A number is out of range.
+            SensorError: A number is out of range, or vehicles have sensors of one name and different kinds.
         """
         if worlds < 1:
             raise SensorError(f"worlds is {worlds}, expected at least 1")
@@ -97,31 +92,33 @@ class SensorSuite:
         self.device = device
         self._everywhere = wp.full(worlds, 1, dtype=int, device=device)
 
-        def batch(kind: type[SensorBatch]) -> Any:
-            entries = [getattr(vehicle.sensors, kind.kind, None) for vehicle in vehicles]
-            return kind(entries, worlds, control_step, seed, device) if any(entries) else None
-
-        self.by_kind: dict[str, SensorBatch] = {
-            name: batch_of_kind for name, kind in KINDS.items() if (batch_of_kind := batch(kind)) is not None
+        self.by_name: dict[str, SensorBatch] = {
+            name: SENSORS[kind](
+                name,
+                [vehicle.sensors.by_name.get(name) for vehicle in vehicles],
+                worlds,
+                control_step,
+                seed,
+                device,
+            )
+            for name, kind in _kinds(vehicles).items()
         }
-        """The kinds of sensor that at least one vehicle has, one's own among them."""
-        for name in ("imu", "depth", "dvl", "compass"):
-            setattr(self, name, self.by_kind.get(name))
+        """Sensors that at least one vehicle carries, by their names in the vehicle files."""
+        for name in OWN_KINDS:
+            setattr(self, name, self.by_name.get(name))
         for v, vehicle in enumerate(vehicles):
             site = Surroundings(
                 gravity=vehicle.water.gravity if gravity is None else gravity,
                 density=vehicle.water.density if density is None else density,
                 floor_depth=math.inf if floor_depth is None else floor_depth,
             )
-            for name, batch_of_kind in self.by_kind.items():
-                entry = getattr(vehicle.sensors, name, None)
-                if entry is not None:
-                    batch_of_kind.use(v, entry, site)
+            for name, entry in vehicle.sensors.by_name.items():
+                self.by_name[name].use(v, entry, site)
 
     @property
     def batches(self) -> tuple[SensorBatch, ...]:
-        """The kinds of sensor that at least one vehicle has."""
-        return tuple(self.by_kind.values())
+        """Sensors that at least one vehicle carries."""
+        return tuple(self.by_name.values())
 
     def update_stages(self, state: SensedState, water_velocity: Any = None) -> list[Stage]:
         """Return the launches of `update`, for a program that records its launches.
@@ -175,3 +172,22 @@ class SensorSuite:
     def _run(self, stages: list[Stage]) -> None:
         for kernel, inputs in stages:
             wp.launch(kernel, dim=(self.worlds, self.vehicles), inputs=[*inputs, 0], device=self.device)
+
+
+def _kinds(vehicles: Sequence[Vehicle]) -> dict[str, str]:
+    """Return name -> kind of all sensors of some vehicles."""
+    kinds: dict[str, str] = {}
+    for vehicle in vehicles:
+        for name in vehicle.sensors.by_name:
+            kind = vehicle.sensors.kind_of(name)
+            if kinds.setdefault(name, kind) != kind:
+                raise SensorError(
+                    f"sensor '{name}' of {vehicle.name} is of the kind {kind}, that of another vehicle "
+                    f"{kinds[name]}: give them different names"
+                )
+    return dict(sorted(kinds.items(), key=lambda item: _order(item[0])))
+
+
+def _order(name: str) -> tuple[int, str]:
+    """Return the place of a sensor: those of FinsSim come first, in their order."""
+    return ([*OWN_KINDS].index(name) if name in OWN_KINDS else len(OWN_KINDS), name)

@@ -1,0 +1,267 @@
+"""Registry of everything that can be added to FinsSim: one dictionary for each family.
+
+An installed package adds members by entry points, and FinsSim's own members are references of the same form:
+
+    [project.entry-points."finssim.sensors"]
+    pinger = "acoustics.pinger:PingerBatch"
+
+A member is imported and checked when it is first used, so that a broken package stops only what needs it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping, MutableMapping
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+__all__ = [
+    "COMMANDS",
+    "FAMILIES",
+    "LEARNERS",
+    "SENSORS",
+    "TASKS",
+    "TERMS",
+    "VEHICLES",
+    "Family",
+    "RegistryError",
+]
+
+
+class RegistryError(ValueError):
+    """A member of a family cannot be used; the message names the package that registers it."""
+
+
+class Family(MutableMapping[str, Any]):
+    """Members of one family by name: those of FinsSim, those of installed packages, those that a program adds.
+
+    Iteration gives all names and imports nothing; an item is imported when it is read.
+    """
+
+    def __init__(self, noun: str, shipped: Mapping[str, Any], check: str | None = None) -> None:
+        """
+        Args:
+            noun: Name of one member in messages; its plural is the group of entry points.
+            shipped: Name -> `module:object`, or the object itself, of FinsSim's own members.
+            check: `module:function` of (name, member) that raises a ValueError for what is no member.
+        """
+        self.noun = noun
+        self.group = f"finssim.{noun}s"
+        self._shipped = dict(shipped)
+        self._check = check
+        self._added: dict[str, Any] = {}
+        self._imported: dict[tuple[str, str], Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a member, which is imported now if it was not.
+
+        Raises:
+            KeyError: There is none of that name.
+            RegistryError: Its package cannot be imported, it is no member, or several packages register that name.
+        """
+        if name in self._added:
+            return self._added[name]
+        if name in self._shipped:
+            shipped = self._shipped[name]
+            return _object(shipped) if isinstance(shipped, str) else shipped
+        point, package = self._point(name)
+        key = (package, point.value)
+        if key not in self._imported:
+            try:
+                member = _object(point.value)
+                self._refuse_unfit(name, member)
+            except Exception as error:  # a package's code may raise anything when it is imported
+                raise RegistryError(
+                    f"{self.noun} '{name}' of package {package} cannot be used: {point.value}: "
+                    f"{type(error).__name__}: {error}; repair or uninstall that package"
+                ) from error
+            self._imported[key] = member
+        return self._imported[key]
+
+    def __setitem__(self, name: str, member: Any) -> None:
+        """Add a member for this program; a class or function that is defined again replaces the earlier one.
+
+        Raises:
+            RegistryError: FinsSim, a package, or another object of this program has that name already.
+        """
+        known = self._added.get(name)
+        again = known is member or (_identity(known) is not None and _identity(known) == _identity(member))
+        if not again and name in self:
+            raise RegistryError(
+                f"there is a {self.noun} '{name}' already, of {self.packages()[name]}: choose another name"
+            )
+        self._refuse_unfit(name, member)
+        self._added[name] = member
+
+    def __delitem__(self, name: str) -> None:
+        """Remove a member that this program added."""
+        del self._added[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys([*self._shipped, *self._points(), *self._added]))
+
+    def __len__(self) -> int:
+        return len({*self._shipped, *self._points(), *self._added})
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._shipped or name in self._added or name in self._points()
+
+    def ship(self, members: Mapping[str, Any]) -> None:
+        """Add members of FinsSim itself, as the constructor does."""
+        self._shipped |= members
+
+    def of_packages(self) -> list[str]:
+        """Return the names that other packages register and FinsSim does not have."""
+        return [name for name in self._points() if name not in self._shipped]
+
+    def packages(self) -> dict[str, str]:
+        """Return the package of each member by name: `finssim`, name and version of another, or `this program`."""
+        of_points = {
+            name: " and ".join(package for _, package in points) for name, points in self._points().items()
+        }
+        return (
+            of_points | dict.fromkeys(self._added, "this program") | dict.fromkeys(self._shipped, "finssim")
+        )
+
+    def failures(self) -> dict[str, str]:
+        """Import the members of other packages, and return name -> sentence of each that cannot be used."""
+        sentences = {}
+        for name, points in self._points().items():
+            if name in self._shipped:
+                package = points[0][1]
+                sentences[name] = (
+                    f"{self.noun} '{name}' of package {package} is not used: FinsSim has that name"
+                )
+                continue
+            try:
+                self[name]
+            except RegistryError as error:
+                sentences[name] = str(error)
+        return sentences
+
+    def usable(self) -> dict[str, Any]:
+        """Return all members but those of packages that cannot be used; `finssim doctor` reports these."""
+        failed = self.failures()
+        return {name: self[name] for name in self if name in self._shipped or name not in failed}
+
+    def reference(self, name: str) -> str:
+        """Return `module:object` of a member of another package, which is not imported.
+
+        Raises:
+            KeyError: No package registers that name.
+            RegistryError: Several packages do.
+        """
+        return str(self._point(name)[0].value)
+
+    def _refuse_unfit(self, name: str, member: Any) -> None:
+        if self._check is not None:
+            _object(self._check)(name, member)
+
+    def _point(self, name: str) -> tuple[Any, str]:
+        """Return the entry point of a name, and its package."""
+        points = self._points()[name]
+        if len(points) > 1:
+            names = " and ".join(package for _, package in points)
+            raise RegistryError(
+                f"packages {names} both register a {self.noun} '{name}': uninstall one of them"
+            )
+        return points[0]
+
+    def _points(self) -> dict[str, list[tuple[Any, str]]]:
+        return _entry_points(self.group, tuple(sys.path))
+
+
+@cache
+def _entry_points(group: str, path: tuple[str, ...]) -> dict[str, list[tuple[Any, str]]]:
+    """Return name -> entry points of a group with their packages; `path` is the search path that they are found on."""
+    from importlib.metadata import entry_points  # slow to import
+
+    points: dict[str, list[tuple[Any, str]]] = {}
+    for point in entry_points(group=group):
+        package = "unknown" if point.dist is None else f"{point.dist.name} {point.dist.version}"
+        points.setdefault(point.name, []).append((point, package))
+    return points
+
+
+def _object(reference: str) -> Any:
+    """Return the object of `module:object`."""
+    module, _, name = reference.partition(":")
+    value: Any = import_module(module)
+    for part in name.split(".") if name else ():
+        value = getattr(value, part)
+    return value
+
+
+def _identity(member: Any) -> tuple[str, str] | None:
+    """Return module and qualified name of a class or function; None of other objects."""
+    name = getattr(member, "__qualname__", None)
+    return None if name is None else (str(member.__module__), name)
+
+
+CATALOGUE = Path(__file__).parents[1] / "vehicles/catalogue"
+"""Directory of the vehicle files of FinsSim."""
+
+VEHICLES = Family(
+    "vehicle",
+    {path.stem: path for path in sorted(CATALOGUE.glob("*.yaml"))},
+    check="finssim.vehicles.loader:check_registered",
+)
+"""Name -> path of the vehicle file."""
+
+TASKS = Family(
+    "task",
+    {
+        "t1": "finssim.tasks.station_keeping:StationKeeping",
+        "t2": "finssim.tasks.trajectory_tracking:TrajectoryTracking",
+        "t3": "finssim.tasks.moving_target:MovingTarget",
+        "docking": "finssim.extensions.perception.docking:Docking",
+        "pursuit": "finssim.extensions.teams.pursuit:Pursuit",
+        "team-pursuit": "finssim.extensions.teams.pursuit:TeamPursuit",
+        "formation": "finssim.extensions.teams.formation:Formation",
+        "camera-docking": "finssim.extensions.perception.docking:CameraDocking",
+        "pipeline": "finssim.tasks.pipeline:Pipeline",
+        "gate": "finssim.extensions.perception.gate:Gate",
+        "net": "finssim.extensions.perception.net:Net",
+    },
+    check="finssim.tasks.make:check_registered",
+)
+"""Name -> class of the task, or another callable; called without arguments, it returns the task as it ships."""
+
+SENSORS = Family(
+    "sensor",
+    {
+        "imu": "finssim.sim.sensors.imu:ImuBatch",
+        "depth": "finssim.sim.sensors.depth:DepthBatch",
+        "dvl": "finssim.sim.sensors.dvl:DvlBatch",
+        "compass": "finssim.sim.sensors.compass:CompassBatch",
+    },
+    check="finssim.sim.sensors.batch:check_registered",
+)
+"""Kind of a section under `sensors` in a vehicle file -> its `finssim.sim.sensors.SensorBatch`."""
+
+TERMS = Family(
+    "term",
+    {"surge_damping": "finssim.physics.terms.surge_damping:SURGE_DAMPING"},
+    check="finssim.physics.terms.composed:check_registered",
+)
+"""Key in a hydrodynamic set of a vehicle file -> its `finssim.physics.terms.Term`."""
+
+LEARNERS = Family(
+    "learner",
+    {
+        name: f"finssim.learning.learners.catalogue:{name.upper().replace('-', '_')}"
+        for name in (
+            "ppo", "sb3-ppo", "rsl-rl", "torchrl-ppo", "torchrl-ippo", "torchrl-mappo", "bc", "dagger", "distill",
+        )
+    },
+    check="finssim.learning.learners.catalogue:check_registered",
+)  # fmt: skip
+"""Name -> the `LearnerKind`; of other packages, a class derived from `ActingLearner`."""
+
+COMMANDS = Family("command", {})
+"""First word after `finssim` -> function; `finssim.cli` adds those of FinsSim."""
+
+FAMILIES: tuple[Family, ...] = (VEHICLES, TASKS, SENSORS, TERMS, LEARNERS, COMMANDS)
+"""All families."""
