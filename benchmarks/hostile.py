@@ -627,7 +627,7 @@ def _parquet(table: Path, target: Path) -> None:
 
 
 def _plant(path: Path) -> None:
-    from finssim.pool.draw_plant import draw_plant
+    from finssim.pool.drawn_plant import draw_plant
     from finssim.vehicles import load_vehicle
 
     draw_plant(load_vehicle("finsrov"), 1).write(path)

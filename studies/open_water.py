@@ -27,7 +27,7 @@ from finssim.evaluation.robot_trials import RobotTrial, play_in_pool
 from finssim.evaluation.tables import Columns, Table, cells
 from finssim.evaluation.trials import interpolated
 from finssim.pool import read_truth
-from finssim.pool.draw_plant import positioning_of
+from finssim.pool.drawn_plant import positioning_of
 from finssim.pool.plant_spec import Severity
 from finssim.pool.run import make_plan
 from finssim.robot.perception import LET_IN_STD

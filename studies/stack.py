@@ -18,8 +18,8 @@ from finssim.evaluation.plants import load_plant
 from finssim.evaluation.tables import Table, figure_text
 from finssim.evaluation.trials import EpisodeError, follows, run_episodes, summarize_episodes
 from finssim.pool.camera import PoolCamera, camera_of
-from finssim.pool.draw_plant import draw_plant
-from finssim.pool.draw_plant import site_of as plant_at
+from finssim.pool.drawn_plant import draw_plant
+from finssim.pool.drawn_plant import site_of as plant_at
 from finssim.pool.plant_spec import Severity
 from finssim.pool.task_site import TaskSite
 from finssim.robot.pilots import make_pilot

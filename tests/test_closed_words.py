@@ -16,7 +16,7 @@ from finssim.extensions import perception as worlds
 from finssim.extensions.perception.description import load_device, load_world
 from finssim.localization.camera_file import load_camera
 from finssim.localization.overhead_camera import load_pool
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool.drawn_plant import draw_plant
 from finssim.pool.plant_spec import load_plant_spec
 from finssim.robot.goals import station_of
 from finssim.sim.ranges_file import SHIPPED, load_ranges

@@ -5,10 +5,14 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from functools import cache
-from itertools import chain
+from graphlib import TopologicalSorter
+from importlib import import_module
+from itertools import accumulate, chain
 from pathlib import Path
 
 import pytest
+
+from finssim.core.lazy import imported_lazily
 
 SOURCE = Path(__file__).resolve().parents[1] / "src" / "finssim"
 MODULES = sorted(SOURCE.rglob("*.py"))
@@ -219,6 +223,64 @@ def test_imports_follow_the_arrows():
         allowed = {own} | below(own)
         against[path.relative_to(SOURCE).as_posix()] = imported_layers(path) - allowed
     assert {path: layers for path, layers in against.items() if layers} == PENDING
+
+
+def loaded_with(path: Path) -> set[str]:
+    """Modules of FinsSim that a module imports when it is imported, without the packages that it lies in."""
+    loaded, nodes = set(), list(ast.parse(path.read_text(encoding="utf-8")).body)
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, ast.Import):
+            loaded |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            loaded |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            nodes += node.orelse
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            nodes += ast.iter_child_nodes(node)
+    own = dotted(path)
+    parts = chain.from_iterable(accumulate(name.split("."), "{}.{}".format) for name in loaded)
+    return {name for name in parts if name != own and not own.startswith(f"{name}.")}
+
+
+def dotted(path: Path) -> str:
+    """Name of the module of a file."""
+    return ".".join(("finssim", *path.relative_to(SOURCE).with_suffix("").parts)).removesuffix(".__init__")
+
+
+def test_no_module_imports_one_that_imports_it():
+    """Any module can be imported first: nothing that a module imports imports it in turn, at any distance."""
+    graph = {dotted(path): loaded_with(path) for path in MODULES}
+    known = {name: imported & graph.keys() for name, imported in graph.items()}
+    sorter = TopologicalSorter(known)
+    sorter.prepare()  # raises a CycleError that lists the circle
+
+
+def exporting() -> list[str]:
+    """Packages that import their names when these are first used."""
+    return [
+        dotted(path)
+        for path in MODULES
+        if "\n__getattr__, __dir__ = exports(" in path.read_text(encoding="utf-8")
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("package", exporting())
+def test_a_package_exports_what_it_says(package):
+    """Its list is that of its imports, each name can be imported, and none is the name of a module of it."""
+    module = import_module(package)
+    folder = Path(str(module.__file__)).parent
+    modules = {path.stem for path in folder.glob("*.py")} | {
+        path.parent.name for path in folder.glob("*/__init__.py")
+    }
+    assert not modules & set(module.__all__), "a module of that name would hide what is exported"
+    assert set(module.__all__) - {"__version__"} == set(dict(imported_lazily(module.__file__)))
+    for name in module.__all__:
+        assert getattr(module, name) is not None
+        assert name in dir(module)
+    with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'absent'"):
+        module.absent  # noqa: B018
 
 
 def test_the_package_imports_nothing_of_the_checkout():

@@ -8,7 +8,7 @@ import pytest
 from finssim.agents.agents import BASELINES, TASKS_OF_PIDS, agent_for
 from finssim.agents.controllers import CONTROLLERS, COSTLY
 from finssim.control.guidance import Goal, Known
-from finssim.tasks.make import task_named
+from finssim.tasks.catalogue import task_named
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import load_vehicle
 

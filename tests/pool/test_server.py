@@ -14,7 +14,7 @@ import pytest
 
 from finssim.core import realtime
 from finssim.localization.overhead_camera import load_pool
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool.drawn_plant import draw_plant
 from finssim.pool.fleet import Fleet
 from finssim.pool.run import LockstepServer, make_plan, serve_realtime
 from finssim.pool.virtual_pool import VirtualPool, read_truth

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.pool.camera import PoolCamera, camera_of
-from finssim.pool.draw_plant import OPEN, draw_plant, positioning_of, site_of
+from finssim.pool.drawn_plant import OPEN, draw_plant, positioning_of, site_of
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError
 from finssim.pool.positioning import POSITIONING, Positioning
 from finssim.pool.run import make_plan

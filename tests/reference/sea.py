@@ -2,7 +2,7 @@
 
 import time
 
-from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
+from finssim.pool.drawn_plant import draw_plant, positioning_of, site_of
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.links.transports import UdpTransport
 from finssim.vehicles import load_vehicle

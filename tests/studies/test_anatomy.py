@@ -9,7 +9,7 @@ import pytest
 from finssim.agents.agents import agent_for
 from finssim.evaluation import evaluate
 from finssim.evaluation.plants import Plant
-from finssim.tasks.make import task_named
+from finssim.tasks.catalogue import task_named
 from finssim.vehicles import load_vehicle
 from studies import anatomy as module
 from studies.anatomy import CAUSES, anatomy, tables_of, tolerated

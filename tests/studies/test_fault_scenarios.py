@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.core.quiet import start_warp
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool.drawn_plant import draw_plant
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.links.frames import Decoder, encode_command
 from finssim.robot.messages import ThrusterCommand

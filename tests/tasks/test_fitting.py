@@ -14,9 +14,9 @@ from finssim.evaluation.metrics import T1_SETPOINTS, in_room
 from finssim.learning.train import train
 from finssim.sim import Pool
 from finssim.tasks import SEEING, EnvironmentSetupError
+from finssim.tasks.catalogue import TASKS
 from finssim.tasks.fitting import authority
 from finssim.tasks.given import crew
-from finssim.tasks.make import TASKS
 from finssim.vehicles import catalogue, load_vehicle
 from finssim.vehicles.defaults import room
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from finssim.core.rotations import quat_to_matrix
 from finssim.identification.vehicle_file import write_vehicle
 from finssim.pool.camera import camera_of
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool.drawn_plant import draw_plant
 from finssim.pool.plant_spec import Basin, basin_of
 from finssim.vehicles import VehicleError, catalogue, load_vehicle
 from finssim.vehicles.defaults import DEFAULTS

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-import finssim.tasks  # noqa: F401  # before perception, which imports it
 from finssim.agents.controllers import CONTROLLERS, controller_for
 from finssim.agents.pid import Pid, PidMemory
 from finssim.control.guidance import Goal, Known, Measured, Track

@@ -17,8 +17,8 @@ from finssim.control.modes import AXES, action_mode
 from finssim.evaluation.tables import Table
 from finssim.tasks import TASKS
 from finssim.tasks import terms as library
+from finssim.tasks.catalogue import task_named
 from finssim.tasks.given import crew
-from finssim.tasks.make import task_named
 from finssim.tasks.sensing import Sensing, seen_with
 from finssim.tasks.task import Task
 from finssim.tasks.terms import End, ObservationPart, RewardTerm, Total

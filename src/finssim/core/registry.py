@@ -225,7 +225,7 @@ TASKS = Family(
         "gate": "finssim.extensions.perception.gate:Gate",
         "net": "finssim.extensions.perception.net:Net",
     },
-    check="finssim.tasks.make:check_registered",
+    check="finssim.tasks.catalogue:check_registered",
 )
 """Name -> class of the task, or another callable; called without arguments, it returns the task as it ships."""
 

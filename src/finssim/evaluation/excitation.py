@@ -38,7 +38,7 @@ from finssim.evaluation.robot_trials import (
 from finssim.identification.programmes import Programme, programmes, write_programme
 from finssim.identification.synthetic import simulate_programme
 from finssim.pool import draw_plant
-from finssim.pool.draw_plant import site_of
+from finssim.pool.drawn_plant import site_of
 from finssim.pool.plant_spec import Basin
 from finssim.robot.perception import Perception
 from finssim.robot.recorder import Recorder

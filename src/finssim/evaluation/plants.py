@@ -15,7 +15,7 @@ from finssim.sim import Water
 from finssim.sim.randomize import Randomization
 from finssim.sim.ranges_file import Ranges, load_ranges
 from finssim.tasks import Environment, MeasurementNoise, Task
-from finssim.tasks.make import observed
+from finssim.tasks.catalogue import observed
 from finssim.tasks.sensing import seen_with
 from finssim.vehicles import Vehicle
 

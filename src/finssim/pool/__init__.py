@@ -1,8 +1,13 @@
 """The virtual pool: the vehicle, its motor controller and its room, behind the wires that a real one has."""
 
-from finssim.pool.draw_plant import SPREADS, draw_plant
-from finssim.pool.plant_spec import PlantSpec, PlantSpecError, load_plant_spec
-from finssim.pool.virtual_pool import Truth, TruthError, VirtualPool, read_truth
+from typing import TYPE_CHECKING
+
+from finssim.core.lazy import exports
+
+if TYPE_CHECKING:
+    from finssim.pool.drawn_plant import SPREADS, draw_plant
+    from finssim.pool.plant_spec import PlantSpec, PlantSpecError, load_plant_spec
+    from finssim.pool.virtual_pool import Truth, TruthError, VirtualPool, read_truth
 
 __all__ = [
     "SPREADS",
@@ -15,3 +20,5 @@ __all__ = [
     "load_plant_spec",
     "read_truth",
 ]
+
+__getattr__, __dir__ = exports(__name__)

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from finssim.extensions.perception import RangeBatch, WorldBatch, WorldLayout, load_world, sensor_of
-from finssim.pool.draw_plant import site_of
+from finssim.pool.drawn_plant import site_of
 from finssim.pool.plant_spec import Basin, PlantSpec
 from finssim.pool.positioning import Exposure, Mail, PoseAt, Shutter
 from finssim.robot.messages import Picture

@@ -23,7 +23,7 @@ from finssim.core.rotations import quat_from_yaw, quat_yaw
 from finssim.extensions.perception import load_world
 from finssim.localization.overhead_camera import Pool, write_pool
 from finssim.pool.camera import PoolCamera, camera_of
-from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
+from finssim.pool.drawn_plant import draw_plant, positioning_of, site_of
 from finssim.pool.fleet import Fleet, Medium, one_picture
 from finssim.pool.onboard import Cameras, OnboardPlan, site_of_world
 from finssim.pool.pictures import CameraPlan, PictureProcess, Plan, UdpSender

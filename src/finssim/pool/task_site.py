@@ -24,7 +24,7 @@ from finssim.core.rotations import quat_from_yaw, quat_inverse_rotate, quat_yaw
 from finssim.extensions.perception import WorldBatch
 from finssim.extensions.perception.sight import first_draw, put_goal
 from finssim.localization.overhead_camera import Pool
-from finssim.pool.draw_plant import positioning_of
+from finssim.pool.drawn_plant import positioning_of
 from finssim.pool.fleet import Fleet, Medium
 from finssim.pool.onboard import OnboardSensors
 from finssim.pool.plant_spec import Basin, PlantSpec

@@ -49,7 +49,7 @@ from finssim.identification.replay import Replay, draw_response_envelopes, repla
 from finssim.identification.report import interval_text, number_text, state_text, write_report
 from finssim.identification.vehicle_file import all_findings, calibrated, number_in, write_vehicle
 from finssim.pool import draw_plant
-from finssim.pool.draw_plant import site_of
+from finssim.pool.drawn_plant import site_of
 from finssim.sim import Pool
 from finssim.studies.transfer import T1, Spec, transfer_experiment
 from finssim.trials.findings import Finding, sentences

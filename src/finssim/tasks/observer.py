@@ -20,8 +20,8 @@ from finssim.physics.types import vec6
 from finssim.sim.launch import Pipeline
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.catalogue import task_named
 from finssim.tasks.given import EnvironmentSetupError, crew
-from finssim.tasks.make import task_named
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.trajectory_tracking import fill_table
 from finssim.vehicles import Vehicle

@@ -1,12 +1,17 @@
 """Vehicles: one file each, read, checked and frozen."""
 
-from finssim.vehicles.check import Finding, check_vehicle
-from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensor, Sensors, Tags
-from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
-from finssim.vehicles.loader import catalogue, catalogue_vehicle, load_vehicle
-from finssim.vehicles.part import NonNegative, Number, Part, Positive, VehicleError
-from finssim.vehicles.thruster import Esc, Thruster
-from finssim.vehicles.vehicle import AXES, Body, CalibrationRecord, Hull, Provenance, Vehicle, Water
+from typing import TYPE_CHECKING
+
+from finssim.core.lazy import exports
+
+if TYPE_CHECKING:
+    from finssim.vehicles.check import Finding, check_vehicle
+    from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensor, Sensors, Tags
+    from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
+    from finssim.vehicles.loader import catalogue, catalogue_vehicle, load_vehicle
+    from finssim.vehicles.part import NonNegative, Number, Part, Positive, VehicleError
+    from finssim.vehicles.thruster import Esc, Thruster
+    from finssim.vehicles.vehicle import AXES, Body, CalibrationRecord, Hull, Provenance, Vehicle, Water
 
 __all__ = [
     "AXES",
@@ -40,3 +45,5 @@ __all__ = [
     "check_vehicle",
     "load_vehicle",
 ]
+
+__getattr__, __dir__ = exports(__name__)

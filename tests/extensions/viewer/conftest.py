@@ -9,7 +9,7 @@ import pytest
 from finssim.control.guidance import Station
 from finssim.localization.overhead_camera import write_pool
 from finssim.pool.camera import PoolCamera, camera_of
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool.drawn_plant import draw_plant
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.pilots import make_pilot

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from finssim.control.guidance import Station
 from finssim.core.rotations import quat_to_euler
 from finssim.pool import VirtualPool, draw_plant
-from finssim.pool.draw_plant import site_of
+from finssim.pool.drawn_plant import site_of
 from finssim.robot.links.frames import LinkError
 from finssim.robot.links.mavlink import MavlinkLink
 from finssim.robot.links.transports import MavlinkAddress

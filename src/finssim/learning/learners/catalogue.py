@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from finssim.core.registry import LEARNERS, RegistryError
 from finssim.learning.learners.base import ActingLearner, task_settings
 from finssim.tasks import Environment, Task
-from finssim.tasks.make import own_class
+from finssim.tasks.catalogue import own_class
 
 if TYPE_CHECKING:
     from torch import nn

@@ -1,7 +1,12 @@
 """Images of a fixed camera above a pool: tags and tiles through a flat or rippling surface."""
 
-from finssim.sim.overhead_camera.render import OverheadCamera, Rectangle
-from finssim.sim.overhead_camera.scene import Basin, Pose, Ripples, Scene, Sensor, TagInScene, Water
+from typing import TYPE_CHECKING
+
+from finssim.core.lazy import exports
+
+if TYPE_CHECKING:
+    from finssim.sim.overhead_camera.render import OverheadCamera, Rectangle
+    from finssim.sim.overhead_camera.scene import Basin, Pose, Ripples, Scene, Sensor, TagInScene, Water
 
 __all__ = [
     "Basin",
@@ -14,3 +19,5 @@ __all__ = [
     "TagInScene",
     "Water",
 ]
+
+__getattr__, __dir__ = exports(__name__)

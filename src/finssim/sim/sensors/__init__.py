@@ -1,23 +1,28 @@
 """Sensors of a vehicle's own motion, with the noise, delays and losses of real instruments."""
 
-from finssim.sim.sensors.batch import SensorBatch, SensorError
-from finssim.sim.sensors.sampling import (
-    DROPOUT,
-    TURN_ON,
-    TURN_ON_2,
-    WALK,
-    WALK_2,
-    WHITE,
-    WHITE_2,
-    Truth,
-    digitised,
-    digitised3,
-    normal,
-    normal3,
-    parameters_of,
-    sampling_kernel,
-)
-from finssim.sim.sensors.suite import SensorSuite, add_sensor
+from typing import TYPE_CHECKING
+
+from finssim.core.lazy import exports
+
+if TYPE_CHECKING:
+    from finssim.sim.sensors.batch import SensorBatch, SensorError
+    from finssim.sim.sensors.sampling import (
+        DROPOUT,
+        TURN_ON,
+        TURN_ON_2,
+        WALK,
+        WALK_2,
+        WHITE,
+        WHITE_2,
+        Truth,
+        digitised,
+        digitised3,
+        normal,
+        normal3,
+        parameters_of,
+        sampling_kernel,
+    )
+    from finssim.sim.sensors.suite import SensorSuite, add_sensor
 
 __all__ = [
     "DROPOUT",
@@ -39,3 +44,5 @@ __all__ = [
     "parameters_of",
     "sampling_kernel",
 ]
+
+__getattr__, __dir__ = exports(__name__)

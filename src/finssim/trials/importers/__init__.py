@@ -1,5 +1,12 @@
 """Foreign logs to trial folders: tables, ArduSub logs, ROS 2 bags."""
 
-from finssim.trials.importers.dispatch import FORMATS, import_trials
+from typing import TYPE_CHECKING
+
+from finssim.core.lazy import exports
+
+if TYPE_CHECKING:
+    from finssim.trials.importers.dispatch import FORMATS, import_trials
 
 __all__ = ["FORMATS", "import_trials"]
+
+__getattr__, __dir__ = exports(__name__)

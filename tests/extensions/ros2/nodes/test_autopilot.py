@@ -13,7 +13,7 @@ from rclpy.node import Node
 from finssim.extensions.ros2.nodes.conversions import ros_type
 from finssim.extensions.ros2.nodes.hardware_bridge import HardwareBridge
 from finssim.pool import VirtualPool, draw_plant
-from finssim.pool.draw_plant import site_of
+from finssim.pool.drawn_plant import site_of
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 from reference.ros_time import RosTime
