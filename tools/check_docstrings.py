@@ -1,10 +1,12 @@
-"""Do public functions say in which unit, frame and shape they take and give physical quantities?
+"""Check that public docstrings state unit, shape and frame of the numbers that functions take, return and keep.
 
     python tools/check_docstrings.py    what is missing; exit status 1 where there is any
 
-A parameter is physical by its name (`QUANTITIES`) and its type: a number or an array. Its entry under `Args:`, or the
-docstring's other text where it names none, must hold a unit in brackets, such as [m/s] or [-] for none; of an array
-a shape, such as (n, 3); and of a quantity with a direction a frame.
+A parameter, a return value or a field is judged by its annotated type. A real number, or an array of real numbers, has
+a unit in brackets, such as [m/s], or is called what has none, such as a share or a quaternion; or the text names the
+documented function or class whose numbers they are. An array that a function takes has a shape, such as (n, 3), and a
+quantity with a direction a frame. What is read is the entry under `Args:` or `Returns:` or the docstring of the field,
+and where there is none the docstring of the function or class. Whole numbers are counts, indices and seeds.
 """
 
 from __future__ import annotations
@@ -12,7 +14,8 @@ from __future__ import annotations
 import ast
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -21,74 +24,233 @@ DIRECTED = set(
     "position velocity acceleration force moment torque wrench tau nu twist omega quaternion normal gravity current "
     "displacement momentum direction attitude".split()
 )
-"""Names of quantities that have a direction: their frame must be said."""
+"""Names of quantities that have a direction: their frame must be stated."""
 QUANTITIES = DIRECTED | set(
     "time duration speed depth height length width radius diameter angle yaw roll pitch tilt heading mass inertia "
     "density volume area thrust voltage pressure temperature rate frequency period latency delay distance stiffness "
     "damping power energy rpm pulse".split()
 )
-ARRAYS = re.compile(r"\b(Array|NDArray|ndarray|ArrayLike|Tensor|array)\b")
-NUMBERS = re.compile(r"\b(float|vec\d*|quat|mat\d*)\b")
-VECTORS = re.compile(r"\b(vec\d*|quat|mat\d*)\b")
-UNIT = re.compile(r"\[[^\]\n]*\]")
+"""Names of quantities whose shape must be stated where they are arrays."""
+REAL = re.compile(r"float(16|32|64)?|floating|(vec|mat|quat)\d*[df]?|transform")
+VECTORS = re.compile(r"(vec|mat|quat)\d*[df]?")
+ARRAYS = {"NDArray", "ndarray", "ArrayLike", "Tensor", "array", "array2d", "array3d", "array4d"}
+SEVERAL = {
+    "Mapping",
+    "Sequence",
+    "Iterable",
+    "Iterator",
+    "tuple",
+    "list",
+    "dict",
+    "str",
+    "Any",
+    "Annotated",
+    "Optional",
+}
+"""Types of which nothing is known of the numbers in them."""
+UNIT = re.compile(r"\[[^\]\n]*\]|\bunits?\b|\bin (metres|seconds|radians|degrees|newtons|pixels|hertz)\b")
+PURE = re.compile(
+    r"\b(dimensionless|share|part of|fraction|ratio|probabilit\w+|likelihoods?|factors?|weights?|scales?|quaternions?|"
+    r"scores?|per cent|rewards?|rotation matri(x|ces)|co?sines?|correlations?|quantiles?|logarithms?|numbers? "
+    r"of|counts?|index|indices|seeds?|standard normal|observations?|actions?|pictures?|colours?|grey|gray|contrast|"
+    r"reflectances?|confidence|exponent|learning rate|gradients?|logits?|features?|refractive ind(ex|ices))\b",
+    re.IGNORECASE,
+)
+REFERENCE = re.compile(r"\bas\b[^.;\n]*`", re.IGNORECASE)
 SHAPE = re.compile(r"\((?:[A-Za-z0-9_.+* -]+,)+[A-Za-z0-9_.+* ,-]*\)")
 FRAME = re.compile(r"\b(frame|axes|body|world|pool|camera|optical|map|reference)\b", re.IGNORECASE)
 
+PENDING = {
+    "finssim.agents",
+    "finssim.bench",
+    "finssim.control",
+    "finssim.core",
+    "finssim.evaluation",
+    "finssim.extensions.perception",
+    "finssim.extensions.ros2",
+    "finssim.extensions.teams",
+    "finssim.extensions.viewer",
+    "finssim.identification",
+    "finssim.learning",
+    "finssim.localization",
+    "finssim.physics",
+    "finssim.pool",
+    "finssim.robot",
+    "finssim.sim",
+    "finssim.studies",
+    "finssim.survey",
+    "finssim.tasks",
+    "finssim.trials",
+    "finssim.vehicles",
+    "studies.anatomy",
+    "studies.faults",
+}
+"""Packages of which only parameters that are named as a quantity are judged yet."""
 
-def functions(tree: ast.Module) -> Iterator[tuple[str, ast.FunctionDef]]:
-    """Public functions of a module, and public methods of its public classes, by name."""
+
+@cache
+def tree_of(module: str) -> ast.Module | None:
+    """Return the syntax tree of a module of the package or the studies; None where there is no such file."""
+    path = ROOT / ("src" if module.partition(".")[0] == "finssim" else "") / module.replace(".", "/")
+    for file in (path.with_suffix(".py"), path / "__init__.py"):
+        if file.is_file():
+            return ast.parse(file.read_text(encoding="utf-8"))
+    return None
+
+
+@cache
+def definitions(module: str) -> dict[str, ast.expr | tuple[str, str]]:
+    """Return name -> expression of what a module assigns, or module and name of what it imports."""
+    tree = tree_of(module)
+    known: dict[str, ast.expr | tuple[str, str]] = {}
+    for node in [] if tree is None else ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            known |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
+    for node in [] if tree is None else tree.body:
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Subscript | ast.BinOp | ast.Name):
+            known[ast.unparse(node.targets[0])] = node.value
+    return known
+
+
+def definition(module: str, name: str) -> tuple[str, ast.expr] | None:
+    """Return the module and the expression of a type's other name, such as `Array`; None where it has none."""
+    known = definitions(module).get(name)
+    if isinstance(known, tuple):
+        return definition(*known) if known != (module, name) else None
+    return None if known is None else (module, known)
+
+
+def types(module: str, node: ast.expr | None) -> set[str]:
+    """Return the names in an annotation, those of types that have another name resolved."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return types(module, ast.parse(node.value, mode="eval").body)
+    if isinstance(node, ast.Name):
+        known = definition(module, node.id)
+        return {node.id} if known is None else types(*known)
+    if isinstance(node, ast.Attribute):
+        return {node.attr}
+    if isinstance(node, ast.Call):  # wp.array(dtype=wp.vec3)
+        return types(module, node.func).union(*(types(module, word.value) for word in node.keywords))
+    if isinstance(node, ast.Subscript):
+        head = types(module, node.value)
+        if head & {"Literal", "Callable", "ClassVar", "type"}:
+            return set()
+        inner = (
+            node.slice.elts[0] if "Annotated" in head and isinstance(node.slice, ast.Tuple) else node.slice
+        )
+        return head | types(module, inner)
+    if isinstance(node, ast.Tuple | ast.List):
+        return set().union(*(types(module, part) for part in node.elts))
+    if isinstance(node, ast.BinOp):
+        return types(module, node.left) | types(module, node.right)
+    return set()
+
+
+def is_real(names: set[str]) -> bool:
+    """Return whether a type is, or contains, a real number or an array of them."""
+    return any(REAL.fullmatch(name) for name in names) or (bool(names & ARRAYS) and names <= ARRAYS | SEVERAL)
+
+
+def has_unit(text: str) -> bool:
+    """Return whether a text states a unit, or that there is none."""
+    return bool(UNIT.search(text) or PURE.search(text) or REFERENCE.search(text))
+
+
+def entry(text: str, name: str) -> str | None:
+    """Return the text of an argument in a docstring; None where it has no entry."""
+    found = re.search(rf"^( *){re.escape(name)}(?: \([^)]*\))?: (.*(?:\n\1 +.*)*)", text, re.MULTILINE)
+    return found and found.group(2)
+
+
+def missing(
+    function: ast.FunctionDef, module: str = "", about: str = "", by_type: bool = True
+) -> Iterator[str]:
+    """Yield what the docstring of a function does not state.
+
+    Args:
+        function: The function.
+        module: Module whose names its annotations use.
+        about: Docstring of the class, of a constructor.
+        by_type: Whether types are judged; otherwise only parameters that are named as a quantity.
+    """
+    text = f"{ast.get_docstring(function) or ''}\n{about}"
+    for parameter in [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]:
+        names = types(module, parameter.annotation)
+        words = set(parameter.arg.lower().split("_"))
+        if not is_real(names) or not (by_type or words & QUANTITIES):
+            continue
+        own = entry(text, parameter.arg) or text
+        if not has_unit(own) and "quaternion" not in words:
+            yield f"{parameter.arg}: unit"
+        if names & ARRAYS and words & QUANTITIES and not SHAPE.search(own):
+            yield f"{parameter.arg}: shape"
+        vector = names & ARRAYS or any(VECTORS.fullmatch(name) for name in names)
+        if vector and words & DIRECTED and not FRAME.search(text):
+            yield f"{parameter.arg}: frame"
+    if by_type and is_real(types(module, function.returns)):
+        section = re.search(r"^ *(?:Returns|Yields):\n(.*?)(?:\n\n|\Z)", text, re.MULTILINE | re.DOTALL)
+        if not has_unit(section.group(1) if section else text.partition("Args:\n")[0]):
+            yield "what it returns: unit"
+
+
+def missing_of_fields(kind: ast.ClassDef, module: str = "") -> Iterator[str]:
+    """Yield the fields of a class whose numbers have no unit."""
+    about = ast.get_docstring(kind) or ""
+    for node, after in zip(kind.body, [*kind.body[1:], None], strict=True):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            name = node.target.id
+            own = ast.unparse(after.value) if isinstance(after, ast.Expr) else entry(about, name) or about
+            if not name.startswith("_") and is_real(types(module, node.annotation)) and not has_unit(own):
+                yield f"{name}: unit"
+
+
+def lacking(tree: ast.Module, module: str, by_type: bool) -> Iterator[tuple[str, list[str]]]:
+    """Yield what is missing for each public function, class and method of a module."""
     for node in tree.body:
         if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
-            yield node.name, node
+            yield node.name, list(missing(node, module, by_type=by_type))
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            if by_type:
+                yield node.name, list(missing_of_fields(node, module))
             for own in node.body:
-                if isinstance(own, ast.FunctionDef) and not own.name.startswith("_"):
-                    yield f"{node.name}.{own.name}", own
+                made = isinstance(own, ast.FunctionDef) and own.name == "__init__" and by_type
+                if isinstance(own, ast.FunctionDef) and (made or not own.name.startswith("_")):
+                    about = ast.get_docstring(node) or "" if made else ""
+                    yield f"{node.name}.{own.name}", list(missing(own, module, about, by_type))
 
 
-def missing(function: ast.FunctionDef) -> list[str]:
-    """What its docstring does not say of its physical parameters."""
-    text = ast.get_docstring(function) or ""
-    out = []
-    for parameter in [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]:
-        kind = ast.unparse(parameter.annotation) if parameter.annotation else ""
-        words = set(parameter.arg.lower().split("_"))
-        array = bool(ARRAYS.search(kind))
-        if not words & QUANTITIES or not (array or NUMBERS.search(kind)) or "Callable" in kind:
-            continue
-        entry = re.search(
-            rf"^ *{re.escape(parameter.arg)}( \([^)]*\))?: (.*(?:\n {{8,}}.*)*)", text, re.MULTILINE
-        )
-        own = entry.group(2) if entry else text
-        if not UNIT.search(own) and "quaternion" not in words:
-            out.append(f"{parameter.arg}: unit")
-        if array and not SHAPE.search(own):
-            out.append(f"{parameter.arg}: shape")
-        if words & DIRECTED and (array or VECTORS.search(kind)) and not FRAME.search(text):
-            out.append(f"{parameter.arg}: frame")
-    return out
+def package_of(module: str) -> str:
+    """Return the package of a module: two names, of an extension three."""
+    parts = module.split(".")
+    return ".".join(parts[: 3 if parts[1:2] == ["extensions"] else 2])
 
 
-def found() -> dict[str, list[str]]:
-    """What is missing, by function."""
+def found(pending: Collection[str] = PENDING) -> dict[str, list[str]]:
+    """Return what is missing, by function or class.
+
+    Args:
+        pending: Packages of which only parameters that are named as a quantity are judged.
+    """
     out = {}
     files = [(path, ROOT / "src") for path in sorted((ROOT / "src").rglob("*.py"))]
     for path, source in [*files, *((path, ROOT) for path in sorted((ROOT / "studies").rglob("*.py")))]:
         if path.name.startswith("_") and path.name != "__init__.py":
             continue
         module = ".".join(path.relative_to(source).with_suffix("").parts).removesuffix(".__init__")
-        for name, function in functions(ast.parse(path.read_text(encoding="utf-8"))):
-            if missing(function):
-                out[f"{module}:{name}"] = missing(function)
+        tree = tree_of(module)
+        assert tree is not None
+        for name, what in lacking(tree, module, package_of(module) not in pending):
+            if what:
+                out[f"{module}:{name}"] = what
     return out
 
 
 def main() -> int:
-    """Exit status 1 where something is missing."""
-    lacking = found()
-    for name, what in lacking.items():
-        print(f"{name}: its docstring does not say: {', '.join(what)}")
-    return int(bool(lacking))
+    """Return exit status 1 where something is missing."""
+    lacks = found()
+    for name, what in lacks.items():
+        print(f"{name}: its docstring does not state: {', '.join(what)}")
+    return int(bool(lacks))
 
 
 if __name__ == "__main__":

@@ -342,7 +342,10 @@ def shift(
 def take_fix(
     state: State, m: Measurement, e: Estimates, rate: wp.float64, dt: float, seed: int, w: int, v: int
 ):
-    """Apply the fixes of their delay ago, if any arrived: of several in a control step the mean."""
+    """Apply the fixes of their delay ago, if any arrived: of several in a control step the mean.
+
+    Fixes come at `rate` [1/s]; a control step takes `dt` [s].
+    """
     step = state.steps[w]
     at = measured_at(e, int(wp.rint(m.delay / dt)), step)
     if at < 1:
@@ -420,7 +423,10 @@ def estimate(
     state: State, arrays: TaskArrays, noise: wp.array2d(dtype=Measurement), r: Readings, e: Estimates, rate: wp.float64,
     dt: float, seed: int, mask: wp.array(dtype=int), starting: bool, world_offset: int,
 ):  # fmt: skip
-    """Write every vehicle's estimate: after a control step of all, or where an episode starts and mask is not 0."""
+    """Write every vehicle's estimate: after a control step of all, or where an episode starts and mask is not 0.
+
+    Fixes come at `rate` [1/s], 0 for none; a control step takes `dt` [s].
+    """
     i, v = wp.tid()
     w = world_offset + i
     if mask[w] == 0 or state.frozen[w] != 0:
