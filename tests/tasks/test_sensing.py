@@ -77,11 +77,10 @@ def test_doubts_grow_and_shrink_as_in_the_filters_of_the_robot():
     np.testing.assert_allclose(grown(wp.vec3(*P), q, dt), later.P[[0, 0, 3], [0, 3, 3]], rtol=1e-5)
     for column, known in ((0, value_known), (3, rate_known)):
         H, noise = np.eye(6)[[column]], np.array([[R]])
-        found = position_filter.innovation(there, H, np.ones(1), noise)
-        after = position_filter.correct(there, found, H, noise)
+        after = there.corrected(there.innovation(np.ones(1), H, noise))
         np.testing.assert_allclose(known(wp.vec3(*P), R), after.P[[0, 0, 3], [0, 3, 3]], rtol=1e-4)
     yaw = attitude.YawState(0.0, 0.0, P[0], -P[1], P[2])
-    after = attitude.correct(yaw, attitude.innovation(yaw, 1.0, R), R)
+    after = yaw.corrected(yaw.innovation(np.ones(1), np.array([[1.0, 0.0]]), np.array([[R]])))
     np.testing.assert_allclose(value_gain(wp.vec3(*P), R), [after.yaw, -after.bias], rtol=1e-5)
     after = attitude.predict(yaw, 0.0, dt, attitude.YawNoise(rate=0.0, bias_walk=math.sqrt(q)))
     expected = [after.variance, -after.cross, after.bias_variance]

@@ -19,18 +19,17 @@ from finssim.core.rotations import (
 from finssim.localization.fusion.error_state import (
     ErrorStateNoise,
     InertialState,
-    capped,
-    correct,
     depth_model,
-    error_innovation,
     heading_model,
+    limits,
     position_model,
     predict,
-    restarted,
     turned,
     velocity_model,
     yaw_model,
 )
+from finssim.localization.fusion.kalman import Innovation, bounded
+from finssim.localization.fusion.position_filter import restarted
 
 RUNS = 200
 NOISE = ErrorStateNoise(gyro=2e-3, accel=0.02, gyro_walk=2e-4, accel_walk=2e-3)
@@ -42,32 +41,31 @@ LEVER = np.array([0.1, -0.05, 0.2])
 
 def some_state(seed=0, batch=()):
     rng = np.random.default_rng(seed)
+    position, velocity = rng.standard_normal((*batch, 3)), rng.standard_normal((*batch, 3))
     return InertialState(
-        rng.standard_normal((*batch, 3)),
-        rng.standard_normal((*batch, 3)),
+        np.concatenate([position, velocity], axis=-1),
+        np.broadcast_to(np.diag(STD**2), (*batch, 15, 15)),
         quat_from_euler(*np.broadcast_arrays(0.2, -0.3, np.full(batch, 1.1))),
         0.1 * rng.standard_normal((*batch, 3)),
         0.3 * rng.standard_normal((*batch, 3)),
-        np.broadcast_to(np.diag(STD**2), (*batch, 15, 15)),
     )
 
 
 def moved(state, d):
     """The state that an error leads to."""
     return InertialState(
-        state.p + d[..., 0:3],
-        state.v + d[..., 3:6],
+        state.x + d[..., 0:6],
+        state.P,
         quat_multiply(quat_from_rotvec(d[..., 6:9]), state.q),
         state.gyro_bias + d[..., 9:12],
         state.accel_bias + d[..., 12:15],
-        state.covariance,
     )
 
 
 def error(true, found):
     """The error that leads from the found state to the true one, (..., 15)."""
     turn = quat_to_rotvec(quat_multiply(true.q, quat_conjugate(found.q)))
-    parts = (true.p - found.p, true.v - found.v, turn)
+    parts = (true.x - found.x, turn)
     return np.concatenate([*parts, true.gyro_bias - found.gyro_bias, true.accel_bias - found.accel_bias], -1)
 
 
@@ -81,9 +79,9 @@ def test_propagation_carries_errors_as_its_covariance_says():
     state, omega, force, dt = some_state(), np.array([0.3, -0.5, 0.8]), np.array([0.5, -1.0, 9.0]), 0.01
     after = predict(state, omega, force, dt, SILENT, GRAVITY)
     F = jacobian(lambda d: error(predict(moved(state, d), omega, force, dt, SILENT, GRAVITY), after), 15)
-    expected = F @ state.covariance @ F.T
+    expected = F @ state.P @ F.T
     # F is first order in the turn of one step, omega dt = 0.01.
-    np.testing.assert_allclose(after.covariance, expected, atol=0.01 * dt * np.abs(expected).max())
+    np.testing.assert_allclose(after.P, expected, atol=0.01 * dt * np.abs(expected).max())
 
 
 @pytest.mark.parametrize(
@@ -104,8 +102,8 @@ def test_measurement_jacobians_are_derivatives(model, m):
 
 def aided_state(random):
     return InertialState(
-        random.standard_normal(3), random.standard_normal(3), quat_from_euler(0.2, -0.1, 1.0),
-        0.01 * random.standard_normal(3), np.zeros(3), np.eye(20), np.array([0.02, 0.01, 0.1, -0.2, 0.05]),
+        random.standard_normal(6), np.eye(20), quat_from_euler(0.2, -0.1, 1.0),
+        0.01 * random.standard_normal(3), np.zeros(3), np.array([0.02, 0.01, 0.1, -0.2, 0.05]),
     )  # fmt: skip
 
 
@@ -118,13 +116,13 @@ def test_jacobians_of_doppler_log_and_compass_are_derivatives(model):
     def value(x):
         return velocity_model(x, omega, lever) if model == "velocity" else heading_model(x)
 
-    _, H = value(s)
+    H = value(s).H
     for k in range(20):
         ends = []
         for sign in (1.0, -1.0):
-            gain = np.zeros((20, 1))
-            gain[k] = 1.0
-            moved = correct(s, np.array([sign * 1e-6]), np.zeros((1, 20)), np.eye(1), gain)
+            gain = np.eye(20)[:, k : k + 1]
+            found = Innovation(np.array([sign * 1e-6]), np.zeros((1, 20)), np.eye(1), np.zeros(()), gain)
+            moved = s.corrected(found)
             ends.append(value(moved)[0])
         np.testing.assert_allclose((ends[0] - ends[1]) / 2e-6, H[:, k], atol=2e-6)
 
@@ -132,11 +130,11 @@ def test_jacobians_of_doppler_log_and_compass_are_derivatives(model):
 def test_a_doppler_log_reads_what_a_turning_vehicle_moves_at():
     """At rest but turning, a log ahead of the IMU reads ω x l; scale and offset are on top."""
     q, none = quat_from_euler(0.0, 0.0, 0.7), np.zeros(3)
-    turning = InertialState(none, none, q, none, none, np.eye(20), np.zeros(5))
-    read, _ = velocity_model(turning, np.array([0.0, 0.0, 0.5]), np.array([0.4, 0.0, 0.0]))
+    turning = InertialState(np.zeros(6), np.eye(20), q, none, none, np.zeros(5))
+    read = velocity_model(turning, np.array([0.0, 0.0, 0.5]), np.array([0.4, 0.0, 0.0])).value
     np.testing.assert_allclose(read, [0.0, 0.2, 0.0], atol=1e-12)
     north, extra = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.1, 0.0, 0.0, 0.3])
-    moving = InertialState(none, north, q, none, none, np.eye(20), extra)
+    moving = InertialState(np.append(none, north), np.eye(20), q, none, none, extra)
     expected = 1.1 * quat_to_matrix(q).T @ north + [0.0, 0.0, 0.3]
     np.testing.assert_allclose(velocity_model(moving, none, none)[0], expected)
 
@@ -146,30 +144,31 @@ def test_a_constant_push_in_a_turn_is_followed_to_second_order():
     speed, rate, dt = 0.5, 1.0, 0.01
     n = round(2 * np.pi / rate / dt)
     dt = 2 * np.pi / rate / n
-    still = replace(some_state(), p=np.zeros(3), v=np.array([speed, 0, 0]), q=np.array([0.0, 0, 0, 1]))
+    still = replace(some_state(), x=np.array([0, 0, 0, speed, 0, 0]), q=np.array([0.0, 0, 0, 1]))
     state = replace(still, gyro_bias=np.zeros(3), accel_bias=np.zeros(3))
     force = np.array([0.0, speed * rate, 9.81])  # towards the centre, on the left
     for _ in range(n):
         state = predict(state, np.array([0.0, 0.0, rate]), force, dt, SILENT, GRAVITY)
-    np.testing.assert_allclose(state.p, 0.0, atol=speed * rate * dt)
-    np.testing.assert_allclose(state.v, [speed, 0.0, 0.0], atol=speed * dt**2)
+    np.testing.assert_allclose(state.x[:3], 0.0, atol=speed * rate * dt)
+    np.testing.assert_allclose(state.x[3:], [speed, 0.0, 0.0], atol=speed * dt**2)
 
 
 def test_at_rest_with_the_right_biases_nothing_moves():
     """Level or tilted, an accelerometer that reads gravity and its bias leaves the vehicle where it is."""
-    state = replace(some_state(2), v=np.zeros(3))
+    state = replace(some_state(2), x=some_state(2).x * [1, 1, 1, 0, 0, 0])
     force = quat_rotate(quat_conjugate(state.q), -GRAVITY) + state.accel_bias
     after = state
     for _ in range(500):
         after = predict(after, state.gyro_bias, force, 0.01, SILENT, GRAVITY)
-    np.testing.assert_allclose(after.p, state.p, atol=1e-9)
+    np.testing.assert_allclose(after.x[:3], state.x[:3], atol=1e-9)
 
 
 @pytest.mark.slow
 def test_errors_and_innovations_are_as_large_as_the_filter_says():
     """NEES (15) of 200 runs and NIS of fixes, yaws and depths lie in their 95 % bands about 95 % of the time."""
     rng, dt, variance = np.random.default_rng(7), 0.01, {"xy": 1e-4, "yaw": 4e-4, "depth": 2.5e-5}
-    found = replace(some_state(3, (RUNS,)), v=np.zeros((RUNS, 3)))
+    found = some_state(3, (RUNS,))
+    found = replace(found, x=found.x * [1, 1, 1, 0, 0, 0])
     true = moved(found, STD * rng.standard_normal((RUNS, 15)))
     nees, nis = [], {name: [] for name in variance}
     for k in range(1, 1000):
@@ -193,7 +192,7 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says():
             found = measured(found, true, name, variance[name], rng, nis)
         if due and k % 15 == 0:
             e = error(true, found)
-            nees.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(found.covariance), e))
+            nees.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(found.P), e))
     for rows, dimension, slack in (
         (nees, 15, 0.08),
         (nis["xy"], 2, 0.05),
@@ -208,30 +207,28 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says():
 def measured(found, true, name, variance, rng, nis):
     """The filter after one measurement of each run."""
     model = {
-        "xy": lambda s: tuple(
-            part[..., :2] if i == 0 else part[..., :2, :] for i, part in enumerate(position_model(s, LEVER))
-        ),
+        "xy": lambda s: (position_model(s, LEVER).value[..., :2], position_model(s, LEVER).H[..., :2, :]),
         "yaw": yaw_model,
         "depth": lambda s: depth_model(s, LEVER, np.array([0.0, 0.0, 1.0]), 0.0),
     }[name]
-    expected, H = model(found)
+    expected, H = model(found)[:2]
     z = model(true)[0] + np.sqrt(variance) * rng.standard_normal(expected.shape)
     residual = wrap_angle(z - expected) if name == "yaw" else z - expected
     R = variance * np.eye(H.shape[-2])
-    distance, gain = error_innovation(found, residual, H, R)
-    nis[name].append(distance)
-    return correct(found, residual, H, R, gain)
+    compared = found.innovation(residual, H, R)
+    nis[name].append(compared.mahalanobis)
+    return found.corrected(compared)
 
 
 def test_restarts_and_caps_keep_the_covariance_positive():
     """Restarted axes and headings are as sure as their measurement; capped doubt is bounded; nothing turns negative."""
     state = predict(some_state(), np.zeros(3), np.array([0, 0, 9.81]), 1.0, NOISE, GRAVITY)
     after = turned(restarted(state, [0, 1], np.array([3.0, 4.0]), np.eye(2) * 0.01, 0.3), 0.5, 0.02)
-    np.testing.assert_array_equal(after.p[:2], [3.0, 4.0])
-    assert after.covariance[8, 8] == 0.02
+    np.testing.assert_array_equal(after.x[:2], [3.0, 4.0])
+    assert after.P[8, 8] == 0.02
     assert float(wrap_angle(yaw_model(after)[0] - yaw_model(state)[0])[0]) == pytest.approx(0.5)
-    bounded = capped(replace(after, covariance=after.covariance * 1e6), 100.0, 0.5)
-    d = np.diagonal(bounded.covariance)
+    capped = bounded(after.P * 1e6, limits(100.0, 15))
+    d = np.diagonal(capped)
     assert np.all(d[:3] <= 100.0 * (1 + 1e-12)) and np.all(d[6:8] <= 0.25 * (1 + 1e-12))
-    for P in (after.covariance, bounded.covariance):
+    for P in (after.P, capped):
         assert np.linalg.eigvalsh(P)[0] > -1e-9

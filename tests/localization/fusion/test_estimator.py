@@ -2,23 +2,24 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from finssim.core.rotations import wrap_angle
+from finssim.core.rotations import quat_to_matrix, wrap_angle
 from finssim.localization import LocalizationError
 from finssim.localization.fusion import position_filter
 from finssim.localization.fusion.attitude import up_of
-from finssim.localization.fusion.error_state import vision_covariance
 from finssim.localization.fusion.estimator import MODELS, Estimator
 from finssim.localization.fusion.fuse_settings import Settings
 from finssim.localization.fusion.position_filter import PositionState
+from finssim.localization.fusion.sensors import SENSORS, Sensor, vision_covariance
 from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
 from localization.fusion.known_streams import (
     QUIET,
     SITE,
+    attitude,
     position,
     run,
     shuffled,
@@ -115,7 +116,7 @@ def by_hand(state, sample, s, up):
         H, z, R = up, np.array([height_of(sample)]), np.array([[s.depth_std**2]])
     else:
         H, z, R = np.eye(6)[:2], np.array(sample.position), vision_covariance(sample, s)[:2, :2]
-    return position_filter.correct(state, position_filter.innovation(state, H, z, R), H, R)
+    return state.corrected(state.innovation(z - state.x @ H.T, H, R))
 
 
 @pytest.mark.slow
@@ -476,6 +477,42 @@ def test_times_since_1970_are_as_good(mode):
     a, b = e.estimate(4.0), other.estimate(4.0 + 1.7e9)
     np.testing.assert_allclose(b.x, a.x, atol=1e-5)
     assert e.counts == other.counts
+
+
+@dataclass(frozen=True)
+class AltitudeSample:
+    """Height above the surface, of an instrument that the package does not know."""
+
+    time: float
+    height: float
+    arrival: float | None = None
+    stream: str = "altitude"
+
+
+@both
+def test_a_new_sensor_is_one_entry_of_the_table(mode, monkeypatch):
+    """An instrument that measures the port's height to a millimetre is used, gated and counted by both filters."""
+    entry = Sensor(
+        stream="altitude",
+        quantity="height",
+        reading=lambda sample: (sample.height,),
+        noise=lambda sample, settings: np.array([[1e-6]]),
+        drift=0.3,
+    )
+    monkeypatch.setitem(SENSORS, "altitude", entry)
+    port = [position(t) + quat_to_matrix(attitude(t)) @ np.array(SITE.depth_port) for t in (3.0, 3.1, 3.2)]
+    height = [float(np.array(SITE.up) @ p + SITE.offset) for p in port]
+    e = estimator(mode)
+    for sample in sorted(streams(3.25), key=lambda s: s.time):
+        e.add(sample)
+    before = e.estimate(3.25)
+    assert e.add(AltitudeSample(3.0, height[0])) == "accepted"
+    assert e.add(AltitudeSample(3.1, height[1] + 0.5)) == "gate"
+    assert e.add(AltitudeSample(3.2, height[2])) == "accepted"
+    after = e.estimate(3.25)
+    assert e.counts["altitude"] == {"accepted": 2, "gate": 1} and e.nis["altitude"][1] == 2
+    assert after.P[2, 2] < 0.25 * before.P[2, 2]
+    assert abs(after.x[2] - position(3.25)[2]) < 0.003
 
 
 def test_an_unknown_mode_is_refused_with_the_names():

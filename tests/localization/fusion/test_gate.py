@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.localization.fusion.error_state import GateMemory, due, judge, judge_carried, remember
-from finssim.localization.fusion.fuse_settings import Gate
+from finssim.localization.fusion.gates import Gate, GateMemory, due, judge, judge_carried, remember
 
 
 @pytest.mark.parametrize("dimension", [1, 2, 3])
@@ -23,7 +22,7 @@ def test_an_outlier_is_what_lies_beyond_the_limit(carried):
     def verdict(distance, dimension):
         memory, R = GateMemory(5), 1e-4 * np.eye(dimension)
         if dimension == 1 and carried:
-            return judge_carried(Gate(), memory, 0.0, 0.03, 1e-4, distance, 0.05, True)[0]
+            return judge_carried(Gate(), memory, 0.0, 0.03, 1e-4, distance, 0.05)[0]
         return judge(Gate(), memory, 0.0, np.zeros(dimension), R, distance, 0.3)[0]
 
     assert [verdict(10.82, 1), verdict(10.84, 1)] == ["accepted", "gate"]

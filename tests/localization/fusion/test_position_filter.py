@@ -8,9 +8,7 @@ from finssim.localization.fusion.position_filter import (
     Motion,
     PositionState,
     capped,
-    correct,
     frozen,
-    innovation,
     predict,
     process_noise,
     restarted,
@@ -27,6 +25,11 @@ def start(batch=()):
     return PositionState(
         np.zeros((*batch, 6)), np.broadcast_to(np.diag([0.01] * 3 + [0.09] * 3), (*batch, 6, 6))
     )
+
+
+def compared(state, H, z, R):
+    """The innovation of a measurement z = H x + noise."""
+    return state.innovation(z - state.x @ H.T, H, R)
 
 
 @pytest.mark.parametrize("motion", [MOTION, SLOWING], ids=["constant", "slowing"])
@@ -65,7 +68,7 @@ def test_update_is_the_least_squares_answer():
     A = rng.standard_normal((6, 6))
     state = PositionState(rng.standard_normal(6), A @ A.T)
     R, z = np.array([[0.04, 0.018], [0.018, 0.01]]), np.array([0.3, -0.2])
-    after = correct(state, innovation(state, VISION, z, R), VISION, R)
+    after = state.corrected(compared(state, VISION, z, R))
     information = np.linalg.inv(state.P) + VISION.T @ np.linalg.inv(R) @ VISION
     np.testing.assert_allclose(after.P, np.linalg.inv(information), rtol=1e-9, atol=1e-12)
     expected = after.P @ (np.linalg.solve(state.P, state.x) + VISION.T @ np.linalg.solve(R, z))
@@ -78,7 +81,7 @@ def test_covariance_stays_symmetric_and_positive_with_a_measurement_nearly_exact
     R = np.eye(2) * 1e-18
     for _ in range(1000):
         state = predict(state, 0.01, MOTION)
-        state = correct(state, innovation(state, VISION, np.zeros(2), R), VISION, R)
+        state = state.corrected(compared(state, VISION, np.zeros(2), R))
     assert np.array_equal(state.P, state.P.T)
     assert np.linalg.eigvalsh(state.P)[0] > -1e-15
 
@@ -98,8 +101,8 @@ def simulate(seed, duration=10.0, rate=120):
         state = predict(state, 1.0 / rate, MOTION)
         for name in due:
             noise = rng.standard_normal((RUNS, len(H[name]))) @ np.linalg.cholesky(R[name]).T
-            found = innovation(state, H[name], truth @ H[name].T + noise, R[name])
-            state = correct(state, found, H[name], R[name])
+            found = compared(state, H[name], truth @ H[name].T + noise, R[name])
+            state = state.corrected(found)
             nis[name].append(found.mahalanobis)
         if due:
             e = state.x - truth
@@ -131,10 +134,10 @@ def test_a_batch_is_its_runs():
     rng = np.random.default_rng(5)
     batch = PositionState(rng.standard_normal((3, 6)), start((3,)).P)
     z, R = rng.standard_normal((3, 2)), np.eye(2) * 0.01
-    together = correct(batch, innovation(batch, VISION, z, R), VISION, R)
+    together = batch.corrected(compared(batch, VISION, z, R))
     for i in range(3):
         one = PositionState(batch.x[i], batch.P[i])
-        one = correct(one, innovation(one, VISION, z[i], R), VISION, R)
+        one = one.corrected(compared(one, VISION, z[i], R))
         np.testing.assert_allclose(together.x[i], one.x, rtol=1e-14)
         np.testing.assert_allclose(together.P[i], one.P, rtol=1e-13, atol=1e-18)
 

@@ -9,8 +9,6 @@ from finssim.localization.fusion.attitude import (
     YawNoise,
     YawState,
     capped,
-    correct,
-    innovation,
     predict,
     restarted,
     yaw_rate,
@@ -24,6 +22,12 @@ NOISE = YawNoise(rate=3e-3, bias_walk=5e-4)
 def start(batch=(), variance=0.01, bias_std=0.02):
     zero = np.zeros(batch)
     return YawState(zero, zero, zero + variance, zero, zero + bias_std**2)
+
+
+def compared(state, seen, variance):
+    """The innovation of a measured yaw."""
+    residual = np.atleast_1d(wrap_angle(seen - state.yaw)[..., None])
+    return state.innovation(residual, np.array([[1.0, 0.0]]), np.array([[variance]]))
 
 
 def test_yaw_rate_is_the_derivative_of_yaw_on_a_tilting_path():
@@ -49,9 +53,7 @@ def test_a_left_turn_raises_yaw():
 def test_correction_goes_the_short_way_round(true):
     """From just across the half turn the correction is small, and yaw stays in [-pi, pi)."""
     state = restarted(start(), true, 0.01, 0.0)
-    found = innovation(state, true + 0.1 - 6 * np.pi, 0.01)
-    assert found.residual == pytest.approx(0.1)
-    after = correct(state, found, 0.01)
+    after = state.corrected(compared(state, true + 0.1 - 6 * np.pi, 0.01))
     assert wrap_angle(after.yaw - true) == pytest.approx(0.05)
     assert -np.pi <= after.yaw < np.pi
 
@@ -64,7 +66,7 @@ def test_the_bias_is_found():
         state = predict(state, 0.3 + 0.02 + 0.01 * rng.standard_normal(), 0.01, noise)
         if k % 10 == 0:
             seen = 0.3 * 0.01 * k + 0.01 * rng.standard_normal()
-            state = correct(state, innovation(state, seen, 1e-4), 1e-4)
+            state = state.corrected(compared(state, seen, 1e-4))
     assert float(state.bias) == pytest.approx(0.02, abs=0.001)
     assert np.sqrt(state.P[1, 1]) < 0.002
 
@@ -77,9 +79,9 @@ def test_without_a_bias_the_gain_is_the_published_one():
     for _ in range(3):
         state = predict(state, 0.1, 0.02, noise)
         P = P + 0.02 * 0.02
-        found = innovation(state, 0.5, R)
-        after = correct(state, found, R)
-        assert float((after.yaw - state.yaw) / found.residual) == pytest.approx(P / (P + 0.05))
+        found = compared(state, 0.5, R)
+        after = state.corrected(found)
+        assert float((after.yaw - state.yaw) / found.residual[0]) == pytest.approx(P / (P + 0.05))
         state, P = after, P - P**2 / (P + 0.05)
         assert state.P[0, 0] == pytest.approx(P)
 
@@ -101,8 +103,8 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says():
             truth, bias = truth + turning * dt, bias + walk
             state = predict(state, shown, dt, NOISE)
         if k % (rate // 30) == 0 and k % (rate // 100) == 0:
-            found = innovation(state, truth + np.sqrt(variance) * rng.standard_normal(RUNS), variance)
-            state = correct(state, found, variance)
+            found = compared(state, truth + np.sqrt(variance) * rng.standard_normal(RUNS), variance)
+            state = state.corrected(found)
             nis.append(found.mahalanobis)
             e = np.stack([wrap_angle(state.yaw - truth), state.bias - bias], -1)
             nees.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(state.P), e))

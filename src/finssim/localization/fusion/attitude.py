@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.core.rotations import quat_from_rotvec, quat_rotate, quat_to_matrix, skew
+from finssim.core.rotations import cross, quat_from_rotvec, quat_rotate, quat_to_matrix
+from finssim.localization.fusion.kalman import Innovation, Number
 
 Array = npt.NDArray[np.float64]
 
@@ -97,14 +97,14 @@ def follow(tilt: Tilt, omega: npt.ArrayLike, accel: npt.ArrayLike, dt: float, ga
         gains: How quickly the accelerometer is believed.
     """
     accel = np.asarray(accel, float)
-    force = np.sqrt(np.sum(accel * accel, axis=-1, keepdims=True))
+    force = np.sqrt((accel * accel).sum(axis=-1, keepdims=True))
     usable = np.isfinite(force) & (force > 1e-6)
     weight = np.where(usable, np.exp(-0.5 * ((force - gains.gravity) / gains.tolerance) ** 2), 0.0)
     up_measured = np.where(usable, accel / np.where(usable, force, 1.0), tilt.up)
-    error = weight * (skew(up_measured) @ tilt.up[..., None])[..., 0]
+    error = weight * cross(up_measured, tilt.up)
     turn = np.asarray(omega, float) - tilt.bias + gains.proportional * error
     up = (quat_to_matrix(quat_from_rotvec(-dt * turn)) @ tilt.up[..., None])[..., 0]
-    length = np.sqrt(np.sum(up * up, axis=-1, keepdims=True))
+    length = np.sqrt((up * up).sum(axis=-1, keepdims=True))
     return Tilt(up / length, np.asarray(tilt.bias - gains.integral * error * dt))
 
 
@@ -112,9 +112,6 @@ def follow(tilt: Tilt, omega: npt.ArrayLike, accel: npt.ArrayLike, dt: float, ga
 #
 # Pure functions of plain numbers or, but for restarts and caps, of arrays of them. Yaw is left positive, about the
 # vertical.
-
-Number: TypeAlias = Any
-"""A float, or an array with one for each run: the formulas take both, and plain floats cost a tenth."""
 
 
 @dataclass(frozen=True)
@@ -135,8 +132,37 @@ class YawState:
     @property
     def P(self) -> Array:
         """Covariance of yaw and bias, (..., 2, 2)."""
-        P = np.array([[self.variance, self.cross], [self.cross, self.bias_variance]])
-        return np.moveaxis(P, (0, 1), (-2, -1))
+        rows = np.array([self.variance, self.cross, self.cross, self.bias_variance]).T
+        return rows.reshape(*rows.shape[:-1], 2, 2)
+
+    def innovation(self, residual: Array, H: Array, R: Array) -> Innovation:
+        """Compare a measured yaw with its prediction, by plain numbers.
+
+        Args:
+            residual: Measured minus predicted, the short way round [rad], (..., 1).
+            H: Jacobian of yaw, [[1, 0]].
+            R: Variance of the measurement [rad²], (1, 1).
+        """
+        rho = residual.item() if residual.ndim == 1 else residual[..., 0]
+        S = self.variance + R.item()
+        return Innovation(residual, H, R, rho**2 / S, (self.variance / S, self.cross / S))
+
+    def corrected(self, found: Innovation) -> YawState:
+        """Return the state after a measurement, in Joseph's form.
+
+        ψ <- ψ + K (ψ_vis - ψ),  K = P / (P + R), and likewise the bias                 (paper, eq. 15)
+        """
+        rho = found.residual.item() if found.residual.ndim == 1 else found.residual[..., 0]
+        (K, L), R = found.gain, found.R.item()
+        # P <- [1-K 0; -L 1] P [1-K 0; -L 1]' + R [K L]' [K L]
+        retained, cross = 1.0 - K, self.cross - L * self.variance
+        return YawState(
+            wrapped(self.yaw + K * rho),
+            self.bias + L * rho,
+            retained * retained * self.variance + R * K * K,
+            retained * cross + R * K * L,
+            self.bias_variance - L * (self.cross + cross) + R * L * L,
+        )
 
 
 @dataclass(frozen=True)
@@ -147,18 +173,6 @@ class YawNoise:
     """Noise density of the rate [rad/s/√Hz]."""
     bias_walk: float = 2e-5
     """Random walk of its bias [rad/s²/√Hz]."""
-
-
-@dataclass(frozen=True)
-class YawInnovation:
-    """Difference between a measured yaw and the predicted one."""
-
-    residual: Number
-    """The short way round [rad]."""
-    S: Number
-    """Its variance [rad²]."""
-    mahalanobis: Number
-    """Squared."""
 
 
 def yaw_rate(q: float, r: float, roll: float, pitch: float) -> float:
@@ -192,36 +206,11 @@ def predict(state: YawState, rate: Number, dt: float, noise: YawNoise) -> YawSta
     """
     w, doubt = noise.bias_walk**2, state.bias_variance
     return YawState(
-        _wrapped(state.yaw + (rate - state.bias) * dt),
+        wrapped(state.yaw + (rate - state.bias) * dt),
         state.bias,
         state.variance + dt * (dt * doubt - 2.0 * state.cross + noise.rate**2) + w * dt**3 / 3.0,
         state.cross - dt * doubt - 0.5 * w * dt**2,
         doubt + w * dt,
-    )
-
-
-def innovation(state: YawState, yaw: Number, variance: Number) -> YawInnovation:
-    """Compare a measured yaw [rad] of that variance [rad²] with the prediction."""
-    residual = _wrapped(yaw - state.yaw)
-    S = state.variance + variance
-    return YawInnovation(residual, S, residual**2 / S)
-
-
-def correct(state: YawState, correction: YawInnovation, variance: Number) -> YawState:
-    """The state after a measured yaw, in Joseph's form.
-
-    ψ <- ψ + K (ψ_vis - ψ),  K = P / (P + R), and likewise the bias                     (paper, eq. 15)
-    """
-    K, L = state.variance / correction.S, state.cross / correction.S
-    # P <- [1-K 0; -L 1] P [1-K 0; -L 1]' + R [K L]' [K L]
-    retained = 1.0 - K
-    cross = state.cross - L * state.variance
-    return YawState(
-        _wrapped(state.yaw + K * correction.residual),
-        state.bias + L * correction.residual,
-        retained * retained * state.variance + variance * K * K,
-        retained * cross + variance * K * L,
-        state.bias_variance - L * (state.cross + cross) + variance * L * L,
     )
 
 
@@ -234,7 +223,7 @@ def restarted(state: YawState, yaw: float, variance: float, bias_std: float) -> 
         variance: Of `yaw` [rad²].
         bias_std: Of the gyro's bias at power-on [rad/s].
     """
-    return YawState(_wrapped(yaw), state.bias, variance, 0.0, max(state.bias_variance, bias_std**2))
+    return YawState(wrapped(yaw), state.bias, variance, 0.0, max(state.bias_variance, bias_std**2))
 
 
 def capped(state: YawState, variance: float) -> YawState:
@@ -245,6 +234,6 @@ def capped(state: YawState, variance: float) -> YawState:
     )
 
 
-def _wrapped(angle: Number) -> Number:
+def wrapped(angle: Number) -> Number:
     """Return an angle in [-pi, pi) [rad]."""
     return (angle + math.pi) % math.tau - math.pi

@@ -13,12 +13,11 @@ import numpy as np
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame
 from finssim.localization.fusion.attitude import height_above_origin
-from finssim.localization.fusion.error_state import (
-    ConstantVelocity,
-    ErrorState,
-)
+from finssim.localization.fusion.constant_velocity import ConstantVelocity
+from finssim.localization.fusion.error_state import ErrorState
 from finssim.localization.fusion.fuse_log import counted, rows_of
 from finssim.localization.fusion.fuse_settings import Settings, Site
+from finssim.localization.fusion.sensors import SENSORS, Filter
 from finssim.localization.fusion.streams import (
     DepthSample,
     Estimate,
@@ -36,8 +35,6 @@ S = TypeVar("S")
 
 # Samples in the order of their times, so that one that comes late is put where it belongs.
 
-_RANK = {"imu": 0, "depth": 1, "vision": 2, "heading": 3, "velocity": 4}
-"""Order of samples of one time, so that delivery decides nothing."""
 SAME = 1e-7
 """Stamps nearer than this are the same [s]."""
 
@@ -67,6 +64,8 @@ class Timeline(Generic[S]):
             horizon: How far back a late sample is still taken [s].
         """
         self.horizon = horizon
+        self._ranks = {name: rank for rank, name in enumerate(("imu", *SENSORS))}
+        """Order of samples of one time, so that delivery decides nothing."""
         self._before = start
         """State before the oldest sample that is kept."""
         self._closed = -math.inf
@@ -90,7 +89,7 @@ class Timeline(Generic[S]):
 
     def state_at(self, time: float) -> S:
         """State after the last sample not later than `time` [s], of those remembered."""
-        k = bisect.bisect_right(self._keys, (time + SAME, len(_RANK)))
+        k = bisect.bisect_right(self._keys, (time + SAME, len(self._ranks)))
         return self._states[k - 1] if k else self._before
 
     def refusal(self, sample: Sample) -> str | None:
@@ -106,7 +105,7 @@ class Timeline(Generic[S]):
 
     def insert(self, sample: Sample) -> None:
         """Insert a sample that `refusal` accepts at its time; states are out of date until `settle`."""
-        key = (sample.time, _RANK[sample.stream])
+        key = (sample.time, self._ranks[sample.stream])
         k = bisect.bisect_right(self._keys, key)
         self._keys.insert(k, key)
         self._samples.insert(k, sample)
@@ -292,16 +291,17 @@ def _plain(value: Any) -> Any:
     return value
 
 
-STREAMS = ("imu", "depth", "vision", "yaw", "velocity", "heading")
 AGREED = 10
 """Samples on one other clock after which that clock is believed."""
 UNHEARD = 10.0
 """Gap between samples without arrival times that counts as a silence [s]."""
 
 
-MODELS: dict[str, Any] = {"constant-velocity": ConstantVelocity, "error-state": ErrorState}
-"""Name -> model, made from settings and site: `start`, `estimate`, and for each stream a pure function from a track and
-a sample to the track after it and what became of the sample."""
+MODELS: dict[str, Callable[[Settings, Site], Filter[Any]]] = {
+    "constant-velocity": ConstantVelocity,
+    "error-state": ErrorState,
+}
+"""Name -> filter, made from settings and site."""
 
 
 class Estimator:
@@ -328,13 +328,11 @@ class Estimator:
             raise LocalizationError(f"unknown estimator '{mode}'; available: {', '.join(MODELS)}")
         self.settings, self.site = settings or Settings(), site or Site()
         self._model = MODELS[mode](self.settings, self.site)
-        self._counts: dict[str, dict[str, int]] = {stream: {} for stream in STREAMS}
+        self._counts: dict[str, dict[str, int]] = {name: {} for name in ("imu", *SENSORS)}
         self._latest: dict[str, float] = {}
         self._reason = ""
-        self.nis: dict[str, tuple[float, int]] = dict.fromkeys(
-            ("vision", "yaw", "depth", "velocity", "heading"), (0.0, 0)
-        )
-        """Stream -> sum of squared Mahalanobis distances of accepted measurements, and of their dimensions."""
+        self.nis: dict[str, tuple[float, int]] = dict.fromkeys(SENSORS, (0.0, 0))
+        """Sensor -> sum of squared Mahalanobis distances of accepted measurements, and of their dimensions."""
         self._arrived = -math.inf
         self._other: list[float] = []
         self._timeline: Timeline[Any] = Timeline(self._model.start(), self.settings.horizon)
@@ -363,7 +361,7 @@ class Estimator:
 
     def _settle(self) -> list[tuple[Sample, tuple[Outcome, ...] | None, tuple[Outcome, ...]]]:
         """Apply what was put, and count what became of it."""
-        settled = self._timeline.settle(self._apply)
+        settled = self._timeline.settle(self._model.apply)
         for _, old, new in settled:
             # An outcome that is the same object as before is kept: those of the IMU's samples, which are most.
             if old is new:
@@ -393,8 +391,7 @@ class Estimator:
         if time is None:
             time = self._timeline.head if math.isfinite(self._timeline.head) else 0.0
         track = self._timeline.state_at(time) if time < self._timeline.head else self._timeline.state
-        predicted: Estimate = self._model.estimate(track, time)
-        return predicted
+        return self._model.estimate(track, time)
 
     def health(self, estimate: Estimate) -> Health:
         """The condition that goes with an estimate."""
@@ -420,10 +417,6 @@ class Estimator:
         self._settle()
         self._timeline = Timeline(self._model.start(), self.settings.horizon)
         self._arrived = -math.inf
-
-    def _apply(self, track: Any, sample: Sample) -> tuple[Any, tuple[Outcome, ...]]:
-        result: tuple[Any, tuple[Outcome, ...]] = getattr(self._model, sample.stream)(track, sample)
-        return result
 
     def _clock(self, sample: Sample) -> str | None:
         """Refuse a stamp that runs away from its arrival, until enough samples agree on the other clock.

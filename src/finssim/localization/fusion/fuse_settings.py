@@ -4,41 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from finssim.localization import LocalizationError
 from finssim.localization.fusion.attitude import YawNoise
+from finssim.localization.fusion.gates import Gate
 from finssim.localization.fusion.position_filter import Motion
 from finssim.localization.overhead_camera import Pool
 from finssim.vehicles import Vehicle
 
 Array = npt.NDArray[np.float64]
-
-
-@lru_cache(maxsize=64)
-def _quantile(dimension: int, probability: float) -> float:
-    from scipy.special import chdtri
-
-    return float(chdtri(dimension, 1.0 - probability))
-
-
-@dataclass(frozen=True)
-class Gate:
-    """Beyond which squared Mahalanobis distance a measurement is an outlier, and when a run of them takes over."""
-
-    probability: float = 0.999
-    """Share of honest measurements that pass."""
-    reacquire_after: float = 1.0
-    """A run of refused measurements that agree with one another takes over after this long [s]; inf: never."""
-    reacquire_samples: int = 5
-    """And after this many of them."""
-
-    def limit(self, dimension: int) -> float:
-        """Largest squared Mahalanobis distance that passes, for a measurement of that many numbers."""
-        return _quantile(dimension, self.probability)
 
 
 @dataclass(frozen=True)

@@ -1,24 +1,38 @@
-"""Position and velocity in the pool frame (paper, eq. 14): pure predict and update over a leading `...` batch."""
+"""Position and velocity in the pool frame (paper, eq. 14), predicted between measurements, over a leading `...` batch.
+
+The functions take any state that begins with position and velocity.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+
+from finssim.localization.fusion.kalman import MatrixState, bounded, isolated
+from finssim.localization.fusion.streams import changed
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class PositionState:
-    """State of the filter."""
+class PositionState(MatrixState):
+    """State of a filter that begins with position and velocity."""
 
     x: Array
     """Position [m] and velocity [m/s], pool frame, (..., 6)."""
     P: Array
-    """Covariance, (..., 6, 6)."""
+    """Covariance of the errors, those of `x` first, (..., n, n)."""
+
+    def moved(self, error: Array, P: Array) -> Self:
+        """Return the state corrected by an error (..., n), with a new covariance (..., n, n)."""
+        return changed(self, x=self.x + error, P=P)
+
+
+S = TypeVar("S", bound=PositionState)
 
 
 @dataclass(frozen=True)
@@ -37,20 +51,6 @@ class Motion:
     """Spectral density q of the acceleration [m²/s³]."""
     decay: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Rate λ at which velocity dies away [1/s]."""
-
-
-@dataclass(frozen=True)
-class Innovation:
-    """Difference between a measurement and its prediction."""
-
-    residual: Array
-    """Measured minus predicted, (..., m)."""
-    S: Array
-    """Its covariance, (..., m, m)."""
-    mahalanobis: Array
-    """Squared Mahalanobis distance, (...)."""
-    gain: Array
-    """Gain of the Kalman filter, (..., 6, m)."""
 
 
 _I6 = np.eye(6)
@@ -99,96 +99,53 @@ def _noise_powers(motion: Motion) -> Array:
     return powers.reshape(3, 36)
 
 
-def predict(state: PositionState, dt: float, motion: Motion) -> PositionState:
-    """The state a time later.
+def predict(state: S, dt: float, motion: Motion) -> S:
+    """Return the state after a time step.
 
     x <- A x,  P <- A P A' + Q                                                        (paper, eq. 14)
 
     Args:
-        state: Before.
-        dt: Time that passes [s], not negative.
-        motion: How the vehicle may move meanwhile.
+        state: State before.
+        dt: Length of the step [s], not negative.
+        motion: Model of the vehicle's motion.
     """
-    A = transition(dt, motion)
-    return PositionState(state.x @ A.T, A @ state.P @ A.T + process_noise(dt, motion))
+    F, Q = A, added = transition(dt, motion), process_noise(dt, motion)
+    n = state.P.shape[-1]
+    if n > 6:
+        F, Q = np.eye(n), np.zeros((n, n))
+        F[:6, :6], Q[:6, :6] = A, added
+    return changed(state, x=state.x @ A.T, P=F @ state.P @ F.T + Q)
 
 
-def innovation(state: PositionState, H: Array, z: Array, R: Array) -> Innovation:
-    """Compare a measurement z = H x + noise with the prediction.
+def restarted(state: S, axes: list[int], value: Array, R: Array, speed_std: float) -> S:
+    """Discard some axes and start them at a measurement, at rest within `speed_std`.
 
     Args:
-        state: The prediction.
-        H: Rows of what is measured, (m, 6).
-        z: Measurement, (..., m).
-        R: Its covariance, (..., m, m).
-    """
-    residual = z - state.x @ H.T
-    PHt = state.P @ H.T
-    S = H @ PHt + R
-    inverse = _inverse(S)
-    weighted = (inverse @ residual[..., None])[..., 0]
-    return Innovation(residual, S, np.asarray(np.sum(residual * weighted, axis=-1)), PHt @ inverse)
-
-
-def _inverse(S: Array) -> Array:
-    """Inverse of symmetric matrices, (..., m, m); np.linalg costs four times as much for a small one."""
-    if S.shape[-1] == 1:
-        return np.asarray(1.0 / S)
-    if S.shape != (2, 2):
-        return np.asarray(np.linalg.inv(S), np.float64)
-    (a, b), (_, c) = S.tolist()
-    determinant = a * c - b * b
-    return np.asarray(np.array([[c, -b], [-b, a]]) / determinant)
-
-
-def correct(state: PositionState, correction: Innovation, H: Array, R: Array) -> PositionState:
-    """The state after a measurement, in Joseph's form, which keeps P symmetric and positive whatever is rounded.
-
-    x <- x + K ρ,  P <- (I - K H) P (I - K H)' + K R K'
-    """
-    K = correction.gain
-    retained = _I6 - K @ H
-    P = retained @ state.P @ retained.swapaxes(-1, -2) + K @ R @ K.swapaxes(-1, -2)
-    x = state.x + (K @ correction.residual[..., None])[..., 0]
-    return PositionState(x, 0.5 * (P + P.swapaxes(-1, -2)))
-
-
-def restarted(
-    state: PositionState, axes: list[int], value: Array, R: Array, speed_std: float
-) -> PositionState:
-    """Forget some axes and start them at a measurement, at rest give or take `speed_std`.
-
-    Args:
-        state: Before.
+        state: State before.
         axes: Position axes to restart, of 0, 1, 2.
         value: Their positions [m], (..., n).
         R: Covariance of `value` [m²], (..., n, n).
         speed_std: Standard deviation of the velocity per axis [m/s].
     """
-    speeds = [axis + 3 for axis in axes]
-    x, P = state.x.copy(), state.P.copy()
-    P[..., axes + speeds, :] = 0.0
-    P[..., :, axes + speeds] = 0.0
+    speeds, n = [axis + 3 for axis in axes], len(axes)
+    x = state.x.copy()
     x[..., axes], x[..., speeds] = value, 0.0
-    P[..., np.array(axes)[:, None], np.array(axes)] = R
-    P[..., speeds, speeds] = speed_std**2
-    return PositionState(x, P)
+    block = np.zeros((*x.shape[:-1], 2 * n, 2 * n))
+    block[..., :n, :n], block[..., n:, n:] = R, speed_std**2 * np.eye(n)
+    return changed(state, x=x, P=isolated(state.P, axes + speeds, block))
 
 
-def frozen(state: PositionState, axes: list[int]) -> PositionState:
-    """Stop some axes: their velocity becomes zero, and what it was becomes doubt about it."""
+def frozen(state: S, axes: list[int]) -> S:
+    """Stop some axes: their velocity becomes zero, and its square is added to its variance."""
     speeds = [axis + 3 for axis in axes]
     x, P = state.x.copy(), state.P.copy()
     P[..., speeds, speeds] += x[..., speeds] ** 2
     x[..., speeds] = 0.0
-    return PositionState(x, P)
+    return changed(state, x=x, P=P)
 
 
-def capped(state: PositionState, variance: float) -> PositionState:
-    """No position less certain than `variance` [m²]: rows and columns above it are scaled down together."""
-    d = state.P.diagonal(axis1=-2, axis2=-1)[..., :3]
-    if d.max() <= variance:
+def capped(state: S, variance: float) -> S:
+    """Return the state with variances of position up to `variance` [m²]."""
+    if state.P.diagonal(0, -2, -1)[..., :3].max() <= variance:
         return state
-    scale = np.ones(state.x.shape)
-    scale[..., :3] = np.sqrt(np.minimum(1.0, variance / np.maximum(d, 1e-300)))
-    return PositionState(state.x, state.P * scale[..., :, None] * scale[..., None, :])
+    return changed(state, P=bounded(state.P, np.array([variance] * 3 + [np.inf] * (state.P.shape[-1] - 3))))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias, TypeVar
+from math import isfinite
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -102,25 +103,31 @@ class HeadingSample:
     stream: str = field(default="heading", init=False)
 
 
-Sample: TypeAlias = "ImuSample | DepthSample | VisionSample | VelocitySample | HeadingSample"
+class Sample(Protocol):
+    """Sample of any sensor: a dataclass of numbers and tuples of numbers."""
+
+    @property
+    def time(self) -> float:
+        """Time of the measurement [s]."""
+
+    @property
+    def arrival(self) -> float | None:
+        """Time of delivery [s]; None: with its time."""
+
+    @property
+    def stream(self) -> str:
+        """Stream to which it belongs."""
 
 
 def refusal(sample: Sample) -> str | None:
     """Return why a sample cannot be used in any case, or None: text for counting, such as "not finite"."""
-    if not math.isfinite(sample.time) or not (sample.arrival is None or math.isfinite(sample.arrival)):
-        return "time not finite"
-    if isinstance(sample, ImuSample):
-        values = (*sample.omega, *(sample.force or ()), *(sample.tilt or ()))
-        return None if all(map(math.isfinite, values)) else "not finite"
-    if isinstance(sample, DepthSample):
-        return None if math.isfinite(sample.depth) else "not finite"
-    if isinstance(sample, VelocitySample | HeadingSample):
-        numbers = sample.velocity if isinstance(sample, VelocitySample) else (sample.yaw,)
-        return None if all(map(math.isfinite, numbers)) else "not finite"
-    values = (*sample.position, *(() if sample.yaw is None else (sample.yaw,)))
-    if not all(map(math.isfinite, values)):
-        return "not finite"
-    return None if sample.covariance is None or _covariance(sample.covariance) else "covariance not positive"
+    for name, value in vars(sample).items():
+        if value is None or value.__class__ is str or name == "covariance":
+            continue
+        if not isfinite(sum(value) if value.__class__ is tuple else value):
+            return "time not finite" if name in ("time", "arrival") else "not finite"
+    covariance = vars(sample).get("covariance")
+    return None if covariance is None or _covariance(covariance) else "covariance not positive"
 
 
 def _covariance(rows: tuple[tuple[float, float, float], ...]) -> bool:

@@ -1,0 +1,216 @@
+"""Gates: decide which measurements are accepted, and when a run of refused ones replaces the state."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+LONGEST_SUPPORT = 200
+"""Largest count of accepted measurements."""
+
+OUTVOTED = 6
+"""Divisor of the support of a state carried by a gyro: a run of refused measurements needs that share of it."""
+
+
+@lru_cache(maxsize=64)
+def _quantile(dimension: int, probability: float) -> float:
+    from scipy.special import chdtri
+
+    return float(chdtri(dimension, 1.0 - probability))
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Limit of an outlier, and conditions under which a run of refused measurements replaces the state."""
+
+    probability: float = 0.999
+    """Share of measurements without gross error that pass."""
+    reacquire_after: float = 1.0
+    """Duration after which refused measurements that agree with one another replace the state [s]; inf: never."""
+    reacquire_samples: int = 5
+    """Least number of these measurements."""
+
+    def limit(self, dimension: int) -> float:
+        """Return the largest squared Mahalanobis distance that passes, for a measurement of that many numbers."""
+        return _quantile(dimension, self.probability)
+
+
+@dataclass(frozen=True)
+class Suspects:
+    """Run of refused measurements that agree with one another."""
+
+    since: float
+    """Time of the first [s]."""
+    time: float
+    """Time of the latest [s]."""
+    value: tuple[float, ...]
+    """Latest value."""
+    covariance: tuple[tuple[float, ...], ...]
+    """Covariance of the latest value."""
+    hits: int = 1
+    """Number of measurements that agree."""
+    misses: int = 0
+    """Number of refused measurements in between that agree with none of them."""
+
+
+def remember(
+    suspects: Suspects | None, time: float, value: Array, covariance: Array, drift: float, gate: Gate
+) -> Suspects:
+    """Return the run with one more refused measurement.
+
+    The measurement belongs to the run if its distance to the latest is within their covariances and the quantity's
+    possible change meanwhile. A run that more measurements contradict than support is dropped for the newest.
+
+    Args:
+        suspects: Run so far; None after an accepted measurement.
+        time: Time of the measurement [s].
+        value: The measurement, (n,).
+        covariance: Its covariance, (n, n).
+        drift: Largest rate of change of the quantity [units/s].
+        gate: The gate.
+    """
+    rows = tuple(tuple(float(c) for c in row) for row in covariance)
+    fresh = Suspects(time, time, tuple(float(v) for v in value), rows)
+    if suspects is None:
+        return fresh
+    difference = value - np.array(suspects.value)
+    moved = (drift * (time - suspects.time)) ** 2
+    S = covariance + np.array(suspects.covariance) + moved * np.eye(len(value))
+    if float(difference @ np.linalg.solve(S, difference)) <= gate.limit(len(value)):
+        return Suspects(suspects.since, time, fresh.value, rows, suspects.hits + 1, suspects.misses)
+    if suspects.misses + 1 > suspects.hits:
+        return fresh
+    return replace(suspects, misses=suspects.misses + 1)
+
+
+def due(suspects: Suspects, gate: Gate) -> bool:
+    """Return whether the run is long enough, in time and number, to replace the state."""
+    if math.isinf(gate.reacquire_after):
+        return False
+    # A microsecond of slack: stamps are sums of periods.
+    long = suspects.time - suspects.since >= gate.reacquire_after - 1e-6
+    return long and suspects.hits >= gate.reacquire_samples
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Replaced state, kept in case it was right."""
+
+    offset: float
+    """Difference from the current state [units of the measurement]."""
+    held: int
+    """Number of measurements that supported it."""
+    won: int
+    """Number of measurements that support the current state."""
+
+
+@dataclass(frozen=True)
+class GateMemory:
+    """Memory of one gate."""
+
+    support: int = 0
+    """Number of measurements accepted since the state was started from one, up to `reacquire_samples`; 0: no state."""
+    suspects: Suspects | None = None
+    believed: int = 0
+    """Number of accepted measurements, up to `LONGEST_SUPPORT`."""
+    rival: Rival | None = None
+
+    @property
+    def doubt(self) -> float:
+        """Variance that a rival or a run of refused measurements adds to the state's variance [units²]."""
+        if self.rival is not None:
+            return self.rival.offset**2 * self.rival.held / (self.rival.held + self.rival.won)
+        if self.suspects is not None and self.suspects.hits > 1:
+            return self.suspects.value[0] ** 2 * self.suspects.hits / (self.suspects.hits + self.believed)
+        return 0.0
+
+
+def judge(
+    gate: Gate,
+    memory: GateMemory,
+    time: float,
+    value: Array,
+    covariance: Array,
+    distance: float,
+    drift: float,
+) -> tuple[str, GateMemory]:
+    """Return whether a measurement is accepted or refused as an outlier, and the gate's memory after it.
+
+    A state that was started from one measurement is as uncertain as that measurement: until `reacquire_samples` others
+    support it, a run replaces it as soon as the run outnumbers its support.
+
+    Args:
+        gate: The gate.
+        memory: Memory before; support 0 where there is no state yet.
+        time: Time of the measurement [s].
+        value: Number or numbers compared among refused measurements, (n,).
+        covariance: Covariance of `value`, (n, n).
+        distance: Squared Mahalanobis distance of the measurement from its prediction [-].
+        drift: Largest rate of change of `value` [units/s].
+
+    Returns:
+        `initialized` for the first, `accepted`, `gate` where it is refused, or `reacquired` where it ends a run that
+        replaces the state; and the memory.
+    """
+    if memory.support == 0:
+        return "initialized", GateMemory(1)
+    if distance <= gate.limit(len(value)):
+        return "accepted", GateMemory(min(memory.support + 1, gate.reacquire_samples))
+    suspects = remember(memory.suspects, time, value, covariance, drift, gate)
+    outvoted = memory.support < gate.reacquire_samples and suspects.hits > memory.support
+    if due(suspects, gate) or (outvoted and math.isfinite(gate.reacquire_after)):
+        return "reacquired", GateMemory(min(suspects.hits, gate.reacquire_samples))
+    return "gate", GateMemory(memory.support, suspects)
+
+
+def judge_carried(
+    gate: Gate,
+    memory: GateMemory,
+    time: float,
+    residual: float,
+    variance: float,
+    distance: float,
+    drift: float,
+) -> tuple[str, GateMemory]:
+    """Return the result of `judge` for a state that another sensor carries, as a gyro carries yaw.
+
+    Between two measurements such a state is right to a fraction of a degree: a jump is an error of the measurement, or
+    the state was wrong before. A state with long support gives way only to a run of a sixth of its support, and is kept
+    as a rival: a measurement that agrees with a rival of more support restores it at once.
+
+    Args:
+        gate: The gate.
+        memory: Memory before.
+        time: Time of the measurement [s].
+        residual: Measurement minus prediction [units].
+        variance: Variance of the measurement [units²].
+        distance: Squared Mahalanobis distance of the measurement from its prediction [-].
+        drift: Largest rate of change of residuals that agree [units/s].
+    """
+    value, R = np.array([residual]), np.array([[variance]])
+    rival = memory.rival
+    refused = memory.support > 0 and distance > gate.limit(1)
+    if refused and rival is not None and rival.held >= rival.won and math.isfinite(gate.reacquire_after):
+        S = max(residual**2 / distance, variance)
+        if (residual - rival.offset) ** 2 / S <= gate.limit(1):
+            back = Rival(-residual, rival.won, rival.held)
+            return "reacquired", GateMemory(gate.reacquire_samples, None, rival.held, back)
+    verdict, after = judge(gate, memory, time, value, R, distance, drift)
+    if verdict == "reacquired":
+        hits = memory.suspects.hits + 1 if memory.suspects is not None else 1
+        if hits * OUTVOTED < memory.believed:
+            suspects = remember(memory.suspects, time, value, R, drift, gate)
+            return "gate", GateMemory(memory.support, suspects, memory.believed, rival)
+        return verdict, GateMemory(after.support, None, hits, Rival(-residual, memory.believed, hits))
+    if verdict == "gate":
+        return verdict, GateMemory(after.support, after.suspects, memory.believed, rival)
+    believed = min(memory.believed + 1, LONGEST_SUPPORT)
+    if rival is not None:
+        rival = Rival(rival.offset, rival.held, rival.won + 1) if rival.won < 2 * rival.held else None
+    return verdict, GateMemory(after.support, None, believed, rival)
