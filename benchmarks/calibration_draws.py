@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from finssim.identification.hydrodynamics import fit_hydrodynamics
-from finssim.identification.programmes import Programme
-from finssim.identification.replay import replay
+from finssim.identification.prediction import replay
+from finssim.identification.programme import Programme
 from finssim.identification.synthetic import NoiseProfile, record, trials_of
 from finssim.identification.vehicle_file import calibrated, scaled_thrust
 from finssim.trials.trial import Trial

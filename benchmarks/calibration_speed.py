@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.identification.programmes import Programme, programmes
+from finssim.identification.programme import Programme, programmes
 from finssim.identification.regression.regress import regress
 from finssim.identification.simulation.fit import fit_by_simulation
 from finssim.identification.synthetic import simulate_programme

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.identification.programmes import Programme
+from finssim.identification.programme import Programme
 from finssim.identification.synthetic import NoiseProfile, Recording, record, trials_of
 from finssim.sim import Simulator
 from finssim.trials.check import check_trials

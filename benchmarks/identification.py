@@ -29,10 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.identification.fit import Estimate, Fit
-from finssim.identification.programmes import Programme, programmes
+from finssim.identification.prediction import replay
+from finssim.identification.programme import Programme, programmes
 from finssim.identification.regression.passive import passive
 from finssim.identification.regression.regress import regress
-from finssim.identification.replay import replay
 from finssim.identification.simulation.fit import fit_by_simulation
 from finssim.identification.synthetic import Recording, record, simulate_programme, trials_of
 from finssim.trials.trial import Header, Trial

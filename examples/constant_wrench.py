@@ -1,6 +1,6 @@
 """Push a vehicle forward and to the left for ten seconds, and read where it went."""
 
-from finssim.control.allocation import Allocator
+from finssim.control import Allocator
 from finssim.sim import Simulator
 from finssim.vehicles import load_vehicle
 

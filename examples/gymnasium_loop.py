@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 
-import finssim.learning.gymnasium_env  # registers the tasks  # noqa: F401
+from finssim.learning import gymnasium_env  # registers the tasks  # noqa: F401
 
 env = gymnasium.make("finssim/StationKeeping-v0", vehicle="finsrov", action="wrench4")
 observation, info = env.reset(seed=4)

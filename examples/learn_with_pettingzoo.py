@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from finssim.learning.pettingzoo_env import PettingZooEnv
+from finssim.learning import PettingZooEnv
 from finssim.tasks import task_named
 
 TURNS, TRIES = 30, 4

@@ -3,7 +3,7 @@
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from finssim.learning.rsl_rl_env import RslRlVecEnv
+from finssim.learning import RslRlVecEnv
 
 torch.manual_seed(1)
 torch.set_num_threads(1)  # a second thread gains nothing on so small a network

@@ -4,7 +4,7 @@ import torch
 from stable_baselines3 import PPO
 from torch import nn
 
-from finssim.learning.sb3 import Sb3VecEnv
+from finssim.learning import Sb3VecEnv
 
 torch.set_num_threads(1)  # a second thread gains nothing on so small a network
 worlds = Sb3VecEnv("t1", worlds=256, vehicle="finsrov", seed=1, stagger=True)

@@ -9,7 +9,7 @@ from skrl.trainers.torch import SequentialTrainer
 from skrl.utils import set_seed
 from torch import nn
 
-from finssim.learning.skrl_env import SkrlEnv, bootstrapping
+from finssim.learning import SkrlEnv, bootstrapping
 
 set_seed(1)
 torch.set_num_threads(1)  # a second thread gains nothing on so small a network

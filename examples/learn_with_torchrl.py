@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 
-from finssim.learning.torchrl_env import TorchRlEnv
+from finssim.learning import TorchRlEnv
 
 torch.manual_seed(1)
 torch.set_num_threads(1)  # a second thread gains nothing on so small a network

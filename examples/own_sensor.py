@@ -3,11 +3,11 @@
 import numpy as np
 import warp as wp
 
-from finssim.sim import Simulator
-from finssim.sim.sensors import (
+from finssim.sim import (
     WHITE,
     SensorBatch,
     SensorSuite,
+    Simulator,
     Truth,
     add_sensor,
     normal,

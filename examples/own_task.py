@@ -6,11 +6,18 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from finssim.sim.state import State
-from finssim.tasks import Environment, ObservationPart, Task
-from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.check import check_task
-from finssim.tasks.terms import RewardTerm, Terms, action_effort, place_at_rest
+from finssim.sim import State
+from finssim.tasks import (
+    Environment,
+    ObservationPart,
+    RewardTerm,
+    Task,
+    TaskArrays,
+    Terms,
+    action_effort,
+    check_task,
+    place_at_rest,
+)
 
 
 @wp.func

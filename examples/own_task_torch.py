@@ -6,9 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from finssim.tasks import Environment, ObservationPart
-from finssim.tasks.check import check_task
-from finssim.tasks.torch_task import Start, TorchTask, Worlds
+from finssim.tasks import Environment, ObservationPart, Start, TorchTask, Worlds, check_task
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,11 +3,9 @@
 import numpy as np
 import warp as wp
 
-from finssim.physics.terms import Term, add_term
-from finssim.physics.types import vec6
+from finssim.physics import Term, add_term, vec6
 from finssim.sim import Simulator
-from finssim.vehicles import load_vehicle
-from finssim.vehicles.part import NonNegative, Number, Part
+from finssim.vehicles import NonNegative, Number, Part, load_vehicle
 
 
 class Wing(Part):

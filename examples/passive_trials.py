@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.identification.fit import Curve
-from finssim.identification.regression.passive import passive
-from finssim.trials.trial import Header, Trial
-from finssim.vehicles import load_vehicle
+import finssim as fs
+from finssim.identification import Curve
+from finssim.trials import Header, Trial
 
 MOCAP = ("", "x", "y", "z", "qx", "qy", "qz", "qw")
 IMU = ("", "", "", "", "", "p", "q", "r")
@@ -64,7 +63,7 @@ def main() -> None:
     given = parser.parse_args()
     names = sorted(path.name.removesuffix("_mocap.csv") for path in given.folder.glob("*_mocap.csv"))
     trials = [read(given.folder, name) for name in names]
-    fit = passive(trials, load_vehicle("bluerov2_heavy"), axes=["roll", "pitch"])
+    fit = fs.identify("bluerov2_heavy", trials, axes=["roll", "pitch"])
     for e in fit.estimates.values():
         print(f"{e.name:24s} {e.estimate:9.4g} [{e.ci95[0]:.4g}, {e.ci95[1]:.4g}] {e.unit:8s} {e.note}")
     for finding in fit.findings:

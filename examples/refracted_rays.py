@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 
-from finssim.core.optics import Camera, Interface, Lens, back_project, project
+from finssim.core import Camera, Interface, Lens, back_project, project
 
 CAMERA = Camera(
     Lens(1280, 720, 540.9, 540.9, 639.5, 359.5), (0.0, 0.0, 2.17), (1.0, 0.0, 0.0, 0.0)

@@ -8,20 +8,9 @@ import torch
 from torch import Tensor
 
 import finssim
-from finssim.agents.agents import baseline
-from finssim.tasks import ObservationPart
-from finssim.tasks.station_keeping import OBSERVATION, Reward
-from finssim.tasks.torch_rotations import (
-    about_axis,
-    angle,
-    conjugate,
-    heading,
-    matrix,
-    multiply,
-    rotate_inverse,
-    wrapped,
-)
-from finssim.tasks.torch_task import Start, TorchTask, Worlds
+from finssim.agents import baseline
+from finssim.tasks import ObservationPart, Start, TorchTask, Worlds, station_keeping
+from finssim.tasks import torch_rotations as rot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +18,7 @@ class TorchStationKeeping(TorchTask):
     """Reach a pose in the pool and hold it: 0.10 m per axis and 10° in yaw, for 10 s."""
 
     name: str = "t1-torch"
-    observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
+    observation: tuple[ObservationPart, ...] = field(default=station_keeping.OBSERVATION, repr=False)
     hold: float = 10.0
     goal_low: tuple[float, float, float] = (-1.2, -0.5, -0.82)
     goal_high: tuple[float, float, float] = (1.2, 0.5, -0.28)
@@ -43,7 +32,7 @@ class TorchStationKeeping(TorchTask):
     depth: float = 1.5
     tolerance: float = 0.10
     yaw_tolerance: float = math.radians(10.0)
-    weights: Reward = field(default_factory=Reward)
+    weights: station_keeping.Reward = field(default_factory=station_keeping.Reward)
 
     def reset(self, w: Worlds) -> Start:
         """Goal and start drawn from boxes; the goal is level."""
@@ -51,18 +40,19 @@ class TorchStationKeeping(TorchTask):
         most = (*[self.speed] * 3, *[self.rate] * 3)
         return Start(
             position=w.uniform(self.spawn_low, self.spawn_high),
-            quaternion=multiply(
-                about_axis(2, a[:, 2]), multiply(about_axis(1, a[:, 1]), about_axis(0, a[:, 0]))
+            quaternion=rot.multiply(
+                rot.about_axis(2, a[:, 2]),
+                rot.multiply(rot.about_axis(1, a[:, 1]), rot.about_axis(0, a[:, 0])),
             ),
             velocity=w.uniform([-x for x in most], most),
             goal_position=w.uniform(self.goal_low, self.goal_high),
-            goal_quaternion=about_axis(2, w.uniform(-math.pi, math.pi)),
+            goal_quaternion=rot.about_axis(2, w.uniform(-math.pi, math.pi)),
         )
 
     def observe(self, w: Worlds) -> Sequence[Tensor]:
         """The 16 numbers of T1."""
-        offset = rotate_inverse(w.quaternion, w.goal_position - w.position)
-        R = matrix(self.turn(w))
+        offset = rot.rotate_inverse(w.quaternion, w.goal_position - w.position)
+        R = rot.matrix(self.turn(w))
         return (
             offset,
             torch.cat((R[:, :, 0], R[:, :, 1]), dim=1),
@@ -75,7 +65,7 @@ class TorchStationKeeping(TorchTask):
         """See `station_keeping.Reward`."""
         r = self.weights
         e = torch.linalg.vector_norm(w.goal_position - w.position, dim=1)
-        theta = angle(self.turn(w))
+        theta = rot.angle(self.turn(w))
         omega = w.velocity[:, 3:].square().sum(dim=1)
         return (
             r.position * torch.exp(-e / r.position_scale)
@@ -98,12 +88,12 @@ class TorchStationKeeping(TorchTask):
     def inside(self, w: Worlds) -> Tensor:
         """Every axis and the heading within the tolerance."""
         off = (w.goal_position - w.position).abs().amax(dim=1)
-        turn = wrapped(heading(w.goal_quaternion) - heading(w.quaternion)).abs()
+        turn = rot.wrapped(rot.heading(w.goal_quaternion) - rot.heading(w.quaternion)).abs()
         return (off <= self.tolerance) & (turn <= self.yaw_tolerance)
 
     def turn(self, w: Worlds) -> Tensor:
         """Rotation of the goal relative to the body, (worlds, 4)."""
-        return multiply(conjugate(w.quaternion), w.goal_quaternion)
+        return rot.multiply(rot.conjugate(w.quaternion), w.goal_quaternion)
 
 
 if __name__ == "__main__":

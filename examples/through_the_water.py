@@ -14,23 +14,32 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.core.optics import Camera, Interface, Lens
-from finssim.core.quiet import start_warp
-from finssim.core.rotations import (
+from finssim.core import (
+    Camera,
+    Interface,
+    Lens,
     matrix_to_quat,
     quat_from_euler,
     quat_multiply,
     quat_to_matrix,
+    start_warp,
     wrap_angle,
 )
-from finssim.localization.detection.detector import RegionTracker, detector
-from finssim.localization.detection.families import bitmap, tag_corners_b
-from finssim.localization.fusion.estimator import Estimator
-from finssim.localization.fusion.fuse_settings import site_of
-from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
-from finssim.localization.overhead_camera import Pool
-from finssim.localization.poses.methods import METHODS, Constraints
-from finssim.sim.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
+from finssim.localization import (
+    METHODS,
+    Constraints,
+    DepthSample,
+    Estimator,
+    ImuSample,
+    Pool,
+    RegionTracker,
+    VisionSample,
+    bitmap,
+    detector,
+    site_of,
+    tag_corners_b,
+)
+from finssim.sim import overhead_camera
 from finssim.vehicles import load_vehicle
 
 DURATION, PERIOD = 8.0, 24.0
@@ -55,22 +64,23 @@ def main() -> None:
         1280, 720, 540.93, 540.93, 682.23, 348.61, "plumb_bob", (0.0294, -0.0598, 0.0009, 0.0018, 0.0126)
     )
     pool = Pool(Camera(lens, [0.0, 0.0, 1.2], [1.0, 0.0, 0.0, 0.0]), Interface.water(0.0))
-    scene = Scene(
+    scene = overhead_camera.Scene(
         camera=pool.camera,
         interface=pool.interface,
-        basin=Basin(lower=(-2.0, -1.0, -1.0), upper=(2.0, 1.0, 0.1)),
-        ripples=Ripples(rms_slope=0.01, seed=2),
+        basin=overhead_camera.Basin(lower=(-2.0, -1.0, -1.0), upper=(2.0, 1.0, 0.1)),
+        ripples=overhead_camera.Ripples(rms_slope=0.01, seed=2),
     )
-    overhead, tracker = OverheadCamera(scene), RegionTracker(detector(vehicle.tags.family), tags_b)
+    overhead = overhead_camera.OverheadCamera(scene)
+    tracker = RegionTracker(detector(vehicle.tags.family), tags_b)
     estimator = Estimator(site=site_of(pool, vehicle))
 
-    def tag(number: int, position: NDArray[np.float64], q: NDArray[np.float64]) -> TagInScene:
+    def tag(number: int, position: NDArray[np.float64], q: NDArray[np.float64]) -> overhead_camera.TagInScene:
         mount = vehicle.tags.mounts[number]
         at = position + quat_to_matrix(q) @ mount.position
-        pose = Pose(
+        pose = overhead_camera.Pose(
             position=tuple(at.tolist()), orientation=tuple(quat_multiply(q, mount.orientation).tolist())
         )
-        return TagInScene(
+        return overhead_camera.TagInScene(
             bitmap=bitmap(vehicle.tags.family, number), edge=vehicle.tags.edge, pose=pose, margin=0.014
         )
 

@@ -4,21 +4,16 @@ A full training takes twice as long and holds closer: `python train_and_evaluate
 """
 
 import sys
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from finssim.evaluation.evaluate import evaluate_controller
-from finssim.evaluation.plants import load_plant
-from finssim.learning.train import train
+import finssim as fs
 
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 600_000
 
-with TemporaryDirectory() as folder:
-    policy = train("t1", out=Path(folder) / "hold", steps=steps, seed=1)
-    for plant in ("nominal", "current", "waves"):
-        for controller in (policy, "pid"):
-            result = evaluate_controller(controller, load_plant(plant), trials=8).result
-            name, error = result["controller"]["name"], 100.0 * result["e_p_m"]
-            print(
-                f"{plant:8} {name:5} held {result['success']}/{result['trials']}, {error:.1f} cm off in the end"
-            )
+policy = fs.train("t1", steps=steps, seed=1)
+for plant in ("nominal", "current", "waves"):
+    for name, controller in (("hold", policy), ("pid", "pid")):
+        metrics = fs.evaluate(controller, "t1", plant=plant, trials=8).metrics
+        error = 100.0 * metrics["e_p_m"]
+        print(
+            f"{plant:8} {name:5} held {metrics['success']}/{metrics['trials']}, {error:.1f} cm off in the end"
+        )

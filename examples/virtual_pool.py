@@ -13,13 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.control.guidance import Station
-from finssim.core.quiet import start_warp
-from finssim.pool import VirtualPool, draw_plant, read_truth
-from finssim.pool.camera import PoolCamera, camera_of
-from finssim.robot.lockstep import run_lockstep
-from finssim.robot.pilots import make_pilot
-from finssim.robot.runtime import Runtime
+from finssim.control import Station
+from finssim.core import start_warp
+from finssim.pool import PoolCamera, VirtualPool, camera_of, draw_plant, read_truth
+from finssim.robot import Runtime, make_pilot, run_lockstep
 from finssim.vehicles import load_vehicle
 
 SEED, DURATION = 7, 20.0

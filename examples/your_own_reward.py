@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from finssim.tasks import Environment, StationKeeping
-from finssim.tasks.station_keeping import Reward
+from finssim.tasks import Environment, StationKeeping, station_keeping
 
-quiet = replace(StationKeeping(), tilt=0.0, speed=0.0, rate=0.0, reward=Reward(change=0.5))
+quiet = replace(StationKeeping(), tilt=0.0, speed=0.0, rate=0.0, reward=station_keeping.Reward(change=0.5))
 
 rng = np.random.default_rng(seed=2)
 for name, task in (("default", StationKeeping()), ("quiet", quiet)):

@@ -185,7 +185,7 @@ def test_what_is_no_table_is_refused():
 @pytest.mark.slow
 def test_a_study_from_trials_to_the_pool(capfd, tmp_path):
     """Every step takes what the step before returned; nothing is printed on standard output."""
-    from finssim.identification.programmes import programmes
+    from finssim.identification.programme import programmes
     from finssim.identification.synthetic import simulate_programme
 
     truth = fs.load_vehicle("finsrov").replace({"hydrodynamics.calibrated.linear_damping.5.5": 1.2})

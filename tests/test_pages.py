@@ -1,5 +1,7 @@
 """What the pages show works: their Python runs, their vehicle loads, and the strict build passes."""
 
+import ast
+import json
 import re
 import runpy
 import subprocess
@@ -148,3 +150,31 @@ def test_files_that_a_page_names_exist(page):
     named = re.findall(r"`((?:tests|src|examples|finssim)/[\w./]+)`", page.read_text(encoding="utf-8"))
     missing = [name for name in named if not (ROOT / name).exists() and not (ROOT / "src" / name).exists()]
     assert missing == []
+
+
+def imports_of(text: str) -> set[str]:
+    """Modules of FinsSim that Python code imports or imports from."""
+    names = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(str(node.module))
+    return {name for name in names if name.partition(".")[0] == "finssim"}
+
+
+def test_pages_and_examples_import_from_finssim_or_one_of_its_packages():
+    """Readers see the names that packages export; where these are defined may change."""
+    texts = {page: "\n".join(blocks(page, "py(?:thon)?")) for page in [*PAGES, ROOT / "README.md"]}
+    texts |= {file: file.read_text(encoding="utf-8") for file in (ROOT / "examples").rglob("*.py")}
+    for file in (ROOT / "examples").rglob("*.ipynb"):
+        cells = json.loads(file.read_text(encoding="utf-8"))["cells"]
+        lines = [line for cell in cells if cell["cell_type"] == "code" for line in [*cell["source"], "\n"]]
+        texts[file] = "".join(line for line in lines if not line.startswith("%"))
+    deeper = {
+        (file.relative_to(ROOT).as_posix(), name)
+        for file, text in texts.items()
+        for name in imports_of(text)
+        if name.count(".") > (2 if name.startswith("finssim.extensions.") else 1)
+    }
+    assert not deeper

@@ -13,9 +13,8 @@ import time
 os.environ["MAVLINK20"] = "1"  # before the import: the message has no form in MAVLink 1
 from pymavlink import mavutil
 
-from finssim.core.frames import TO_FOSSEN
-from finssim.robot.links.transports import host_port
-from finssim.robot.links.water_linked import DvlClient, decode_line
+from finssim.core import TO_FOSSEN
+from finssim.robot import DvlClient, decode_line, host_port
 
 SHORTEST, LONGEST = 0.05, 1.0
 """ArduSub's EKF drops what comes faster; a longer gap is a lost bottom, over which nobody knows the way [s]."""

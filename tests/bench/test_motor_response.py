@@ -6,7 +6,7 @@ import pytest
 from bench.made_steps import RPM, held, lagged, sampled, step_log
 from finssim.bench.levels import find_steps, levels
 from finssim.bench.motor import cut_steps, fit_motor, fit_response
-from finssim.identification.programmes import programmes
+from finssim.identification.programme import programmes
 from finssim.identification.synthetic import simulate_programme
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial import Header, Trial

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.evaluation.excitation import PoolRun, play_programme, record_programmes
-from finssim.identification.programmes import Programme, programmes
+from finssim.identification.programme import Programme, programmes
 from finssim.identification.regression.regress import regress
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial_files import load_trials

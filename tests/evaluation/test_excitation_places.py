@@ -5,7 +5,7 @@ import pytest
 
 from finssim.core.rotations import quat_from_yaw, quat_rotate
 from finssim.evaluation.excitation import STOPPING, box_of, start_of
-from finssim.identification.programmes import programmes
+from finssim.identification.programme import programmes
 from finssim.pool.plant_spec import Basin
 from finssim.trials.findings import CalibrationError
 from finssim.vehicles import AXES, load_vehicle

@@ -141,7 +141,7 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     with pytest.raises(CalibrationError, match="to go along surge"):
         box = box_of(small)
         from finssim.evaluation.excitation import start_of
-        from finssim.identification.programmes import programmes
+        from finssim.identification.programme import programmes
 
         start_of(programmes("surge", small)[0], small, box)
 

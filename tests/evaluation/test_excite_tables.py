@@ -8,7 +8,7 @@ import yaml
 
 from finssim.core.files import OutputError
 from finssim.evaluation.excitation import excite
-from finssim.identification.programmes import programmes
+from finssim.identification.programme import programmes
 from finssim.identification.synthetic import simulate_programme
 from finssim.trials.trial_files import load_trial
 from finssim.vehicles import load_vehicle

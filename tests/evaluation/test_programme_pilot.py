@@ -9,7 +9,7 @@ from finssim.control import ControlError
 from finssim.control.allocation import Allocator
 from finssim.control.guidance import Station
 from finssim.evaluation.excitation import ProgrammePilot
-from finssim.identification.programmes import Programme
+from finssim.identification.programme import Programme
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("finsrov")

@@ -82,12 +82,12 @@ class _Replay:
     pairs = ()
 
     def __init__(self, **values):
-        from finssim.identification.replay import Score
+        from finssim.identification.prediction import Score
 
         self.scores = {"calibrated": [{axis: Score(v)} for axis, several in values.items() for v in several]}
 
     def aggregate(self, model):
-        from finssim.identification.replay import aggregate
+        from finssim.identification.prediction import aggregate
 
         return aggregate([{a: s.value for a, s in row.items()} for row in self.scores[model]])
 

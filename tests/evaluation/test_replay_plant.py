@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.identification.programmes import programmes
+from finssim.identification.programme import programmes
 from finssim.sim import Simulator
 from finssim.studies.replay import ReplayPlant
 from finssim.vehicles import load_vehicle

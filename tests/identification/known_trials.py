@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from finssim.identification.programmes import programmes
+from finssim.identification.programme import programmes
 from finssim.identification.regression.plant_terms import matrices
 from finssim.identification.synthetic import NoiseProfile, record, trials_of
 from finssim.vehicles import AXES, load_vehicle

@@ -8,9 +8,9 @@ import pytest
 
 from finssim.identification.fit import Estimate
 from finssim.identification.hydrodynamics import _worse, fit_hydrodynamics
-from finssim.identification.programmes import programmes
+from finssim.identification.prediction import replay
+from finssim.identification.programme import programmes
 from finssim.identification.regression.axis_estimates import trim
-from finssim.identification.replay import replay
 from finssim.identification.synthetic import simulate_programme
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.check import check_trials

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.control.allocation import Allocator
-from finssim.identification.programmes import programmes, which_axes
+from finssim.identification.programme import programmes, which_axes
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial import PHASES
 from finssim.vehicles import AXES, load_vehicle

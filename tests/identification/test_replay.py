@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.identification.programmes import programmes
-from finssim.identification.replay import replay, run_replay
+from finssim.identification.prediction import replay, run_replay
+from finssim.identification.programme import programmes
 from finssim.identification.synthetic import simulate_programme
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial_files import write_trial
@@ -135,7 +135,7 @@ def test_a_velocity_from_position_is_labelled_as_derived(surge):
     result = replay(derived, FINSROV)
     assert result.as_json()["trials"][surge[0].name]["source"]["u"] == "derived from position"
     console = Console(width=140, record=True, file=io.StringIO())
-    from finssim.identification.replay import print_replay
+    from finssim.identification.prediction import print_replay
 
     print_replay(result, console)
     assert "not measured but derived from position" in console.export_text()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.core.rotations import quat_rotate
-from finssim.identification.programmes import programmes
+from finssim.identification.programme import programmes
 from finssim.identification.synthetic import (
     NOISE_PROFILES,
     NoiseProfile,

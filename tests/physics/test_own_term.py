@@ -261,7 +261,7 @@ def test_a_term_that_cannot_be_is_refused():
 @pytest.fixture(scope="module")
 def trials():
     """A multisine on surge and heave together of the vehicle with the wing, with noise of its sensors."""
-    from finssim.identification.programmes import programmes
+    from finssim.identification.programme import programmes
     from finssim.identification.synthetic import simulate_programme
 
     vehicle = load_vehicle("bluerov2").replace(

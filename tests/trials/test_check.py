@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.identification.programmes import programmes
+from finssim.identification.programme import programmes
 from finssim.identification.synthetic import simulate_programme
 from finssim.trials.check import check, check_trials, print_reports, set_findings
 from finssim.trials.trial import Trial

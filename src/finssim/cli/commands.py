@@ -39,7 +39,7 @@ SECTIONS: dict[str, dict[str, str | Experiment]] = {
         "calibrate camera": "finssim.survey.camera:run",
         "calibrate pool": "finssim.survey.pool_fit:run",
         "calibrate mounts": "finssim.survey.mounts:run",
-        "replay": "finssim.identification.replay:run_replay",
+        "replay": "finssim.identification.prediction:run_replay",
     },
     "Locate it": {
         "localize": "finssim.localization.localize:run",

@@ -1,6 +1,27 @@
 """Control: wrench allocation, action modes and the PID baseline, the same in simulation and on the robot."""
 
-__all__ = ["ControlError"]
+from typing import TYPE_CHECKING
+
+from finssim.core.lazy import exports
+
+if TYPE_CHECKING:
+    from finssim.control.allocation import Allocator
+    from finssim.control.guidance import Station
+    from finssim.control.modes import action_mode
+    from finssim.control.policy import Policy
+    from finssim.control.trajectories import TRAJECTORIES, load_trajectory
+
+__all__ = [
+    "Allocator",
+    "ControlError",
+    "Policy",
+    "Station",
+    "TRAJECTORIES",
+    "action_mode",
+    "load_trajectory",
+]
+
+__getattr__, __dir__ = exports(__name__)
 
 
 class ControlError(ValueError):

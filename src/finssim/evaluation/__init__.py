@@ -1,1 +1,17 @@
 """Experiments: the paper's definitions of its measures, its setpoints, and the figures drawn from them."""
+
+from typing import TYPE_CHECKING
+
+from finssim.core.lazy import exports
+
+if TYPE_CHECKING:
+    from finssim.evaluation.evaluate import Evaluations, evaluate_controller
+    from finssim.evaluation.plants import load_plant
+
+__all__ = [
+    "Evaluations",
+    "evaluate_controller",
+    "load_plant",
+]
+
+__getattr__, __dir__ = exports(__name__)

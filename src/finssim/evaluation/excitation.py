@@ -35,7 +35,7 @@ from finssim.evaluation.robot_trials import (
     session,
     take_folder,
 )
-from finssim.identification.programmes import Programme, programmes, write_programme
+from finssim.identification.programme import Programme, programmes, write_programme
 from finssim.identification.synthetic import simulate_programme
 from finssim.pool import draw_plant
 from finssim.pool.drawn_plant import site_of

@@ -207,7 +207,7 @@ def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
 
 def _values(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, list[float]]:
     """NRMSE of the replay of each trial by axis."""
-    from finssim.identification.replay import replay
+    from finssim.identification.prediction import replay
 
     try:
         rows = replay(trials, vehicle).scores["calibrated"]

@@ -27,7 +27,7 @@ from finssim.core.rotations import (
     quat_rotate,
     quat_to_euler,
 )
-from finssim.identification.programmes import Programme
+from finssim.identification.programme import Programme
 from finssim.physics.plant import DERIVED
 from finssim.physics.types import vec6
 from finssim.sim import Simulator, TetherLine, Water

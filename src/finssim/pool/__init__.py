@@ -5,17 +5,20 @@ from typing import TYPE_CHECKING
 from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
+    from finssim.pool.camera import PoolCamera, camera_of
     from finssim.pool.drawn_plant import SPREADS, draw_plant
     from finssim.pool.plant_spec import PlantSpec, PlantSpecError, load_plant_spec
     from finssim.pool.virtual_pool import Truth, TruthError, VirtualPool, read_truth
 
 __all__ = [
-    "SPREADS",
     "PlantSpec",
     "PlantSpecError",
+    "PoolCamera",
+    "SPREADS",
     "Truth",
     "TruthError",
     "VirtualPool",
+    "camera_of",
     "draw_plant",
     "load_plant_spec",
     "read_truth",

@@ -7,20 +7,33 @@ from finssim.core.lazy import exports
 if TYPE_CHECKING:
     from finssim.sim.plant_arrays import SimulatorError
     from finssim.sim.recorder import Recorder, read_run
+    from finssim.sim.sensors.batch import SensorBatch
+    from finssim.sim.sensors.sampling import WHITE, Truth, normal, parameters_of, sampling_kernel
+    from finssim.sim.sensors.suite import SensorSuite, add_sensor
     from finssim.sim.simulator import Simulator
     from finssim.sim.site import Dock, Pool, SurroundingsError, TetherLine, Water, Wave
+    from finssim.sim.state import State
 
 __all__ = [
     "Dock",
     "Pool",
     "Recorder",
+    "SensorBatch",
+    "SensorSuite",
     "Simulator",
     "SimulatorError",
+    "State",
     "SurroundingsError",
     "TetherLine",
+    "Truth",
+    "WHITE",
     "Water",
     "Wave",
+    "add_sensor",
+    "normal",
+    "parameters_of",
     "read_run",
+    "sampling_kernel",
 ]
 
 __getattr__, __dir__ = exports(__name__)

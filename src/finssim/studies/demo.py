@@ -43,9 +43,9 @@ from finssim.evaluation.robot_trials import (
 from finssim.evaluation.tables import Table, cells, html_of, print_tables
 from finssim.evaluation.trials import Trial
 from finssim.identification.fit import Fit
-from finssim.identification.programmes import RATE, STEADY, Programme, programmes, which_axes
+from finssim.identification.prediction import Replay, draw_response_envelopes, replay
+from finssim.identification.programme import RATE, STEADY, Programme, programmes, which_axes
 from finssim.identification.regression.regress import regress
-from finssim.identification.replay import Replay, draw_response_envelopes, replay
 from finssim.identification.report import interval_text, number_text, state_text, write_report
 from finssim.identification.vehicle_file import all_findings, calibrated, number_in, write_vehicle
 from finssim.pool import draw_plant

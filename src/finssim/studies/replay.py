@@ -22,9 +22,15 @@ from finssim.evaluation.metrics import PAPER
 from finssim.evaluation.statistics import RESAMPLES, SEED, bootstrap
 from finssim.evaluation.tables import Table, figure_text
 from finssim.identification.fit import Fit
-from finssim.identification.programmes import Programme, programmes
+from finssim.identification.prediction import (
+    DEFINITION,
+    MODEL_LABELS,
+    Replay,
+    draw_response_envelopes,
+    replay,
+)
+from finssim.identification.programme import Programme, programmes
 from finssim.identification.regression.regress import regress
-from finssim.identification.replay import DEFINITION, MODEL_LABELS, Replay, draw_response_envelopes, replay
 from finssim.identification.synthetic import Recording, record, trials_of
 from finssim.identification.vehicle_file import calibrated, write_vehicle
 from finssim.pool.plant_spec import CoupledMatrix

@@ -1,1 +1,16 @@
 """Calibration by pictures: lens, camera pose and water plane, tags on the vehicle, its sensors' mounting."""
+
+from typing import TYPE_CHECKING
+
+from finssim.core.lazy import exports
+
+if TYPE_CHECKING:
+    from finssim.survey.camera import Board, BoardView, calibrate_camera
+
+__all__ = [
+    "Board",
+    "BoardView",
+    "calibrate_camera",
+]
+
+__getattr__, __dir__ = exports(__name__)

@@ -60,7 +60,7 @@ def test_unknown_damping_is_refused():
 
 def test_slow_speeds_do_not_make_a_quadratic_term():
     """Steps of 1 N: at 2 cm/s the quadratic damping of heave cannot show; it is not called identifiable."""
-    from finssim.identification.programmes import programmes
+    from finssim.identification.programme import programmes
     from finssim.identification.synthetic import record, trials_of
     from finssim.vehicles import load_vehicle
 

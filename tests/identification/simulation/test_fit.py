@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.identification.programmes import programmes
+from finssim.identification.programme import programmes
 from finssim.identification.simulation.fit import compared, excites, fit_by_simulation
 from finssim.identification.simulation.rollout import segments, streams
 from finssim.identification.synthetic import simulate_programme

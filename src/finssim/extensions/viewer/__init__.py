@@ -1,1 +1,15 @@
 """A live view in the browser: of the virtual pool, of the simulator, and of what was recorded."""
+
+from typing import TYPE_CHECKING
+
+from finssim.core.lazy import exports
+
+if TYPE_CHECKING:
+    from finssim.extensions.viewer.run import Choice, open_source
+
+__all__ = [
+    "Choice",
+    "open_source",
+]
+
+__getattr__, __dir__ = exports(__name__)

@@ -1,0 +1,46 @@
+"""The notebooks run from their first cell to their last."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "examples" / "notebooks").glob("*.ipynb"))
+
+
+def cells(path: Path) -> list[dict]:
+    """Code cells of a notebook, in order."""
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    assert notebook["nbformat"] == 4
+    return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+
+
+def code(path: Path) -> str:
+    """Code of a notebook without the directives of IPython."""
+    lines = [line for cell in cells(path) for line in [*cell["source"], "\n"]]
+    return "".join(line for line in lines if not line.startswith("%"))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_committed_without_outputs(path):
+    """Outputs are made by who runs it; a difference then shows what its author changed."""
+    assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells(path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs(path, tmp_path):
+    """In a process and a folder of its own."""
+    (tmp_path / "notebook.py").write_text(code(path), encoding="utf-8")
+    run = subprocess.run(
+        [sys.executable, "notebook.py"],
+        cwd=tmp_path,
+        env={**os.environ, "MPLBACKEND": "Agg"},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip()
