@@ -15,22 +15,15 @@ from typing import Any
 
 import warp as wp
 
-from finssim.cli.command_line import Experiment, run_script
+from finssim.cli.command_line import run_script
 from finssim.core.progress import Progress
 from finssim.core.provenance import provenance
 from finssim.core.system import peak_memory, processor_name
 from finssim.evaluation.tables import Table
-from finssim.extensions.perception import (
-    CameraBatch,
-    SonarBatch,
-    WorldBatch,
-    load_device,
-    load_world,
-    poses_of,
-)
-from finssim.extensions.perception.description import CameraDevice, SonarDevice
+from finssim.extensions.perception import CameraBatch, SonarBatch, WorldBatch, load_world, poses_of
 from finssim.sim import Simulator
 from finssim.sim.launch import default_threads
+from finssim.vehicles.devices import CameraDevice, SonarDevice, load_device
 
 SIZES = (16, 32, 64, 128)
 """Edge lengths of the images [px]."""
@@ -175,4 +168,4 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 
 if __name__ == "__main__":
-    run_script(Experiment("__main__:bench_cameras"))
+    run_script("__main__:bench_cameras")

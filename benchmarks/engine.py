@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from finssim.cli.command_line import Experiment, run_script
+from finssim.cli.command_line import run_script
 from finssim.core.progress import Progress
 from finssim.core.provenance import provenance
 from finssim.core.system import peak_memory, processor_name
@@ -201,4 +201,4 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 
 if __name__ == "__main__":
-    run_script(Experiment("__main__:bench"))
+    run_script("__main__:bench")

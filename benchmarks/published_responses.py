@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from finssim.cli.command_line import Experiment, run_script
+from finssim.cli.command_line import run_script
 from finssim.control.allocation import Allocator
 from finssim.core.provenance import provenance
 from finssim.evaluation.tables import Table
@@ -128,4 +128,4 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 
 if __name__ == "__main__":
-    run_script(Experiment("__main__:validate"))
+    run_script("__main__:validate")

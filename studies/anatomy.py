@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from finssim.cli.command_line import Experiment, run_script
+from finssim.cli.command_line import run_script
 from finssim.core.progress import Progress
 from finssim.core.provenance import provenance
 from finssim.evaluation.campaign import check_choices, run_jobs, write_json
@@ -255,4 +255,4 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    run_script(Experiment("studies.anatomy:anatomy"))
+    run_script("studies.anatomy:anatomy")

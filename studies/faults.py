@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.cli.command_line import Experiment, run_script
+from finssim.cli.command_line import run_script
 from finssim.core.progress import Progress
 from finssim.core.provenance import provenance
 from finssim.core.quiet import start_warp
@@ -1102,4 +1102,4 @@ def row_ok(name: str, trials: Sequence[Mapping[str, Any]]) -> bool:
 
 
 if __name__ == "__main__":
-    run_script(Experiment("studies.faults:faults_experiment"))
+    run_script("studies.faults:faults_experiment")

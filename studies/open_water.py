@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.cli.command_line import Experiment, run_script
+from finssim.cli.command_line import run_script
 from finssim.control.guidance import Station
 from finssim.control.trajectories import Trajectory
 from finssim.core.progress import Progress
@@ -226,4 +226,4 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 
 if __name__ == "__main__":
-    run_script(Experiment("studies.open_water:open_water"))
+    run_script("studies.open_water:open_water")

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.cli.command_line import Experiment, run_script
+from finssim.cli.command_line import run_script
 from finssim.core.progress import Progress
 from finssim.core.provenance import provenance
 from finssim.core.system import peak_memory
@@ -157,4 +157,4 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 
 if __name__ == "__main__":
-    run_script(Experiment("studies.soak:soak"))
+    run_script("studies.soak:soak")

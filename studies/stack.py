@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from finssim.cli.command_line import Experiment, run_script
+from finssim.cli.command_line import run_script
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.evaluation.campaign import keep_result, load_result
@@ -168,4 +168,4 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 
 if __name__ == "__main__":
-    run_script(Experiment("studies.stack:play"))
+    run_script("studies.stack:play")

@@ -13,7 +13,7 @@ from finssim.control.policy import read_description
 from finssim.control.trajectories import read_trajectory
 from finssim.evaluation.plants import load_plant
 from finssim.extensions import perception as worlds
-from finssim.extensions.perception.description import load_device, load_world
+from finssim.extensions.perception.description import load_world
 from finssim.localization.camera_file import load_camera
 from finssim.localization.overhead_camera import load_pool
 from finssim.pool.drawn_plant import draw_plant
@@ -26,6 +26,7 @@ from finssim.tasks.sensing import load_sensing
 from finssim.trials.importers.assemble import read_map
 from finssim.trials.trial_files import read_header
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.devices import DEVICES, load_device
 
 VEHICLES = Path(vehicles.__file__).parent / "catalogue"
 WORLDS = Path(worlds.__file__).parent
@@ -80,9 +81,9 @@ READERS = {
     "vehicle": (load_vehicle, VEHICLES / "finsrov.yaml", "own.yaml"),
     "site": (load_world, WORLDS / "catalogue" / "dock.yaml", "own.yaml"),
     "site with models": (load_world, WORLDS / "catalogue" / "wreck.yaml", "own.yaml"),
-    "camera of a vehicle": (load_device, WORLDS / "devices" / "low_light_camera.yaml", "own.yaml"),
-    "sonar": (load_device, WORLDS / "devices" / "oculus_m750d.yaml", "own.yaml"),
-    "altimeter": (load_device, WORLDS / "devices" / "ping.yaml", "own.yaml"),
+    "camera of a vehicle": (load_device, DEVICES / "low_light_camera.yaml", "own.yaml"),
+    "sonar": (load_device, DEVICES / "oculus_m750d.yaml", "own.yaml"),
+    "altimeter": (load_device, DEVICES / "ping.yaml", "own.yaml"),
     "map": (
         read_map,
         "vehicle: bluerov2_heavy\nsplit: {gaps: 2.0}\nfiles:\n  a.csv:\n    time: {column: t, unit: s}\n"

@@ -11,8 +11,9 @@ import typer
 from typer.main import get_command
 
 from finssim.cli import boundary, command_line
-from finssim.cli.command_line import Experiment, command_app, read, run_script
-from finssim.cli.commands import COMMANDS, SECTIONS, app
+from finssim.cli.command_line import command_app, read, run_script
+from finssim.cli.commands import SECTIONS, app
+from reference.commands import EVERY
 
 SOURCE = '''
 from __future__ import annotations
@@ -128,11 +129,10 @@ def test_a_script_is_a_command_of_its_own(work, monkeypatch, words, status):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", COMMANDS)
+@pytest.mark.parametrize("words", EVERY)
 def test_what_the_source_says_is_what_python_has(words):
     """Each command's options, as read from its source, are parameters of its function with the same defaults."""
-    what = COMMANDS[words]
-    definition = read(what.work if isinstance(what, Experiment) else what)
+    definition = read(EVERY[words])
     module, _, name = definition.path.partition(":")
     found = inspect.signature(getattr(import_module(module), name)).parameters
     extra = any(p.kind is p.VAR_KEYWORD for p in found.values())
@@ -150,8 +150,8 @@ def test_every_option_has_help():
         for parameter in command.params:
             if parameter.name not in ("help", "context"):
                 assert parameter.help, f"finssim {' '.join(words)}: {parameter.name}"
-        for name, below in getattr(command, "commands", {}).items():
-            walk(below, [*words, name])
+        for name in command.list_commands(None) if hasattr(command, "list_commands") else ():
+            walk(command.get_command(None, name), [*words, name])
 
     from finssim.cli.commands import app
 
@@ -172,14 +172,14 @@ SERVING = {"pool", "teleop", "view", "play", "ros2 up", "ros2 node", "ardusub-si
 """Commands that serve, or print lines of JSON already."""
 
 
-@pytest.mark.parametrize("words", [words for words in COMMANDS if words not in SERVING])
+@pytest.mark.parametrize("words", [words for words in EVERY if words not in SERVING])
 def test_every_command_with_a_result_prints_json(words, capsys):
     """--json is an option of all."""
     assert boundary.run(app, [*words.split(), "--help"]) == 0
     assert "--json" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", COMMANDS)
+@pytest.mark.parametrize("words", EVERY)
 def test_an_option_means_the_same_in_every_command(words, capsys):
     """--seed is 1 where it has a default; the estimator is never called a mode."""
     assert boundary.run(app, [*words.split(), "--help"]) == 0
@@ -193,8 +193,8 @@ def test_the_help_lists_commands_by_section_in_the_order_of_use(capsys):
     """Every command once, below its section, and no line wider than 80 columns."""
     assert boundary.run(app, ["--help"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    first = dict.fromkeys(words.partition(" ")[0] for words in COMMANDS)
-    headings = [line.rstrip(":") for line in lines if line.rstrip(":") in SECTIONS]
-    assert headings == list(SECTIONS)
+    first = dict.fromkeys(words.partition(" ")[0] for words in EVERY)
+    sections = [*SECTIONS, "Extensions"]
+    assert [line.rstrip(":") for line in lines if line.rstrip(":") in sections] == sections
     listed = [line.split()[0] for line in lines if line.startswith("  ") and line.split()[0] in first]
     assert listed == list(first)

@@ -1,24 +1,24 @@
 """Baselines do their tasks from the observation alone, as `Pid` does from the state."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import pytest
 
-from finssim.agents.agents import (
-    BASELINES,
-    BaselineError,
+from finssim.agents.baselines import (
+    StationPid,
     acceleration_ahead,
     attitude_from,
-    baseline,
     heading_rate,
-    restarted,
     seen_from_goal,
 )
+from finssim.agents.catalogue import BaselineError, baseline, baselines_of
+from finssim.agents.memory import restarted
 from finssim.agents.pid import Pid, PidMemory
 from finssim.control.guidance import Goal
 from finssim.core.rotations import quat_from_euler, quat_multiply, quat_rotate
-from finssim.tasks import TASKS, make
+from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping, make
 from finssim.tasks.fitting import coefficients_of, driven_axes
 from finssim.vehicles import catalogue, load_vehicle
 
@@ -46,7 +46,7 @@ def rollout(task, name, vehicle="finsrov", worlds=16, seed=3, **options):
 @pytest.mark.parametrize("task", SINGLE)
 def test_a_baseline_does_its_task(task, observe):
     """FinsROV succeeds in at least 15 of 16 episodes, with the truth and with what localization makes of it."""
-    measured = rollout(task, next(iter(BASELINES[task])), observe=observe)
+    measured = rollout(task, next(iter(baselines_of(task))), observe=observe)
     assert measured["success"].sum() >= 15
     assert measured["length"].min() > 100
 
@@ -58,13 +58,13 @@ def test_a_baseline_does_its_task_with_every_vehicle_that_can(task, vehicle):
     """Three directions of thrust are enough for 7 of 8 episodes of the tasks that have their own size by vehicle."""
     if task in ("t1", "t2") and max(load_vehicle(vehicle).body.size) > 1.0:
         pytest.skip("the paper's pool is too small for it")
-    assert rollout(task, next(iter(BASELINES[task])), vehicle, worlds=8)["success"].sum() >= 7
+    assert rollout(task, next(iter(baselines_of(task))), vehicle, worlds=8)["success"].sum() >= 7
 
 
 @pytest.mark.parametrize("task", SINGLE)
 def test_a_baseline_needs_the_observation_alone(task):
     """Rows are independent: one vehicle is commanded alike, alone or among others, whatever the memory of these."""
-    player = baseline(task, next(iter(BASELINES[task])))
+    player = baseline(task, next(iter(baselines_of(task))))
     rows = [make(task, worlds=6, seed=s).arrays.observation.numpy().copy() for s in range(3)]
     memory, lone = player.reset(6), player.reset(1)
     for observation in rows:
@@ -142,10 +142,27 @@ def test_memories_start_over_row_by_row():
 def test_an_unknown_baseline_is_refused_with_what_there_is():
     with pytest.raises(BaselineError, match="unknown baseline 'lqr' of task 't1'; available: pid"):
         baseline("t1", "lqr")
-    with pytest.raises(BaselineError, match="of task 't9'; available: none"):
+    with pytest.raises(EnvironmentSetupError, match="unknown task 't9'"):
         baseline("t9", "pid")
+
+
+def test_a_subclass_under_another_name_has_the_baselines_alone_that_it_defines():
+    """It may observe something else than the baseline expects."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Renamed(StationKeeping):
+        name: str = "renamed"
+
+    @dataclass(frozen=True, kw_only=True)
+    class WithOwn(Renamed):
+        baselines: ClassVar = {"mine": lambda vehicle: StationPid.for_vehicle(vehicle)}
+        name: str = "with-own"
+
+    assert list(baselines_of(StationKeeping())) == ["pid"] and not baselines_of(Renamed())
+    assert list(baselines_of(WithOwn())) == ["mine"]
+    assert isinstance(baseline(WithOwn(), "mine"), StationPid)
 
 
 def test_every_task_has_a_baseline():
     """Something honest to beat."""
-    assert set(BASELINES) == set(TASKS)
+    assert all(baselines_of(task) for task in TASKS)

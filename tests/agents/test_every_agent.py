@@ -5,10 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from finssim.agents.agents import BASELINES, TASKS_OF_PIDS, agent_for
+from finssim.agents.agent import TASKS_OF_PIDS, agent_for
+from finssim.agents.catalogue import baselines_of
 from finssim.agents.controllers import CONTROLLERS, COSTLY
 from finssim.control.guidance import Goal, Known
-from finssim.tasks.catalogue import task_named
+from finssim.tasks import TASKS, task_named
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import load_vehicle
 
@@ -34,7 +35,7 @@ class Homing:
 
 PAIRS = [(task, name) for task in TASKS_OF_PIDS for name in CONTROLLERS if name not in COSTLY]
 PAIRS += [pytest.param("t1", name, marks=pytest.mark.slow) for name in COSTLY]
-PAIRS += [(task, name) for task, names in BASELINES.items() for name in names if (task, name) not in PAIRS]
+PAIRS += [(task, name) for task in TASKS for name in baselines_of(task) if (task, name) not in PAIRS]
 PAIRS += [("t1", "homing")]
 EVERY = pytest.mark.parametrize(("task", "name"), PAIRS)
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from finssim.agents.controllers import CONTROLLERS, controller
-from finssim.agents.pid import AxisModel, Pid, place_poles
+from finssim.agents.pid import Pid, place_poles
 from finssim.control import ControlError
+from finssim.control.axis_model import AxisModel
 from finssim.control.guidance import Goal, tracking_error
 from finssim.core.rotations import (
     quat_from_euler,

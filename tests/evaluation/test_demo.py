@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.agents.pid import axis_model
 from finssim.cli import boundary
 from finssim.cli.commands import app
+from finssim.control.axis_model import axis_model
 from finssim.control.policy import Policy
 from finssim.evaluation.figures import new_figure, save_figure
 from finssim.evaluation.metrics import T1_SETPOINTS

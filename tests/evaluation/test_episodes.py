@@ -5,16 +5,17 @@ import json
 import numpy as np
 import pytest
 
-from finssim.agents.agents import BASELINES, agent_for
+from finssim.agents.agent import agent_for
+from finssim.agents.catalogue import baselines_of
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.control.modes import MODES
 from finssim.evaluation.plants import load_plant
 from finssim.evaluation.trials import EpisodeError, run_episodes, summarize_episodes
-from finssim.tasks import SEEING, TASKS, Environment, task_named
+from finssim.tasks import Environment, numeric_tasks, task_named
 from finssim.vehicles import load_vehicle
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 FINSROV, NOMINAL = load_vehicle("finsrov"), load_plant("nominal")
 
@@ -105,7 +106,7 @@ def test_means_have_intervals_and_what_is_missing_is_counted():
 @pytest.mark.parametrize("name", ["t3", "team-pursuit"])
 def test_baselines_are_evaluated_by_name(name, tmp_path, capsys):
     """Table, JSON and figure; a row for each plant where there are two."""
-    who = next(iter(BASELINES[name]))
+    who = next(iter(baselines_of(name)))
     assert agent_for(who, FINSROV, task_named(name)).describe()["kind"] == "baseline"
     words = ["evaluate", who, "--task", name, "--plant", "nominal", "--plant", "noise", "--trials", "2"]
     assert boundary.run(app, [*words, "--out", str(tmp_path / "out")]) == 0

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from finssim.agents.agents import AgentError, PidAgent
+from finssim.agents.agent import AgentError, PidAgent
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.control.modes import action_mode

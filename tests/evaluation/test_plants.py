@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from finssim.agents.agents import agent_for
+from finssim.agents.agent import agent_for
 from finssim.control.modes import MODES
 from finssim.control.trajectories import load_trajectory
 from finssim.evaluation import trials as trials_module

@@ -8,8 +8,8 @@ import pytest
 from finssim.cli.playback import PlaybackError, play
 from finssim.learning.gymnasium_env import Env
 from finssim.learning.train import train
+from finssim.sim.site import described_world
 from finssim.tasks import Environment, StationKeeping, make
-from finssim.tasks.onlooker import Onlooker
 
 cv2 = pytest.importorskip("cv2")
 pytest.importorskip("newton")
@@ -37,7 +37,7 @@ def test_the_onlooker_sees_the_vehicle_ahead_of_it_wherever_that_is():
     """FinsROV's orange float is in the middle of the picture, in T1's basin and before the dock."""
     for task in (replace(StationKeeping(), time_limit=1.0), make("camera-docking").task):
         env = Environment(task, worlds=2, seed=3)
-        onlooker = Onlooker(env, 1, width=320)
+        onlooker = described_world("pool").onlooker(env, 1, width=320)
         for _ in range(2):
             picture = onlooker.picture().astype(float)
             orange = picture[..., 0] - picture[..., 2] > 25.0

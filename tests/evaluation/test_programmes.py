@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.agents.pid import axis_model
+from finssim.control.axis_model import axis_model
 from finssim.studies.demo import FULL, SHARE, STEADY, matched
 from finssim.vehicles import catalogue, load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from finssim.agents.agents import PidAgent
+from finssim.agents.agent import PidAgent
 from finssim.control.guidance import Station
 from finssim.core.rotations import quat_from_yaw
 from finssim.evaluation.records import collect_records

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.agents.agents import BASELINES
+from finssim.agents.catalogue import baselines_of
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.control import ControlError
@@ -183,7 +183,7 @@ def test_a_record_is_scored_as_the_episode_was(task, tmp_path, capsys):
 
     The truth's clock is found to 10 ms, and at 0.5 m/s that is 5 mm; the return is a mean over hundreds of steps.
     """
-    who = next(iter(BASELINES.get(task, {})), "")
+    who = next(iter(baselines_of(task)), "")
     if task.startswith("own"):
         task = f"{EXAMPLES / task}.py:KeepDepth"
         gain = np.zeros((6, 2), np.float32)

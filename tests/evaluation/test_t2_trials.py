@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.agents.agents import agent_for
+from finssim.agents.agent import agent_for
 from finssim.agents.controllers import controller_for
 from finssim.agents.pid import PAPER_PROFILE, TRAJECTORY_PROFILE
 from finssim.control import ControlError

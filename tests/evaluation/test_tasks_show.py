@@ -9,10 +9,10 @@ import pytest
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.cli.tasks_show import attribute_docs, describe_task
-from finssim.tasks import SEEING, TASKS, make
+from finssim.tasks import TASKS, make, numeric_tasks
 from finssim.tasks.station_keeping import StationKeeping
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task_torch.py"
 WARP_EXAMPLE = EXAMPLE.with_name("own_task.py")

@@ -6,7 +6,7 @@ import minari
 import numpy as np
 import pytest
 
-from finssim.agents.agents import AgentError, expert_for
+from finssim.agents.agent import AgentError, expert_for
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.learning.demonstrations import DatasetError, about, collect, load, record_episodes, save

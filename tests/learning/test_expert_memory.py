@@ -3,16 +3,19 @@
 import numpy as np
 import pytest
 
-from finssim.agents.agents import BASELINES, baseline, memory_from, memory_leaves
+from finssim.agents.catalogue import baseline, baselines_of
+from finssim.agents.memory import memory_from, memory_leaves
 from finssim.learning.resume import read_state, write_state
-from finssim.tasks import SEEING, TASKS, make
+from finssim.tasks import TASKS, make
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", [task for task in TASKS if task not in SEEING and BASELINES.get(task)])
+@pytest.mark.parametrize(
+    "task", [task for task in TASKS if not TASKS[task]().pictures and baselines_of(task)]
+)
 def test_every_baselines_memory_survives(task, tmp_path):
     """After one action of three rows: from disk it gives the same second action."""
-    who = baseline(task, next(iter(BASELINES[task])))
+    who = baseline(task, next(iter(baselines_of(task))))
     environment = make(task, worlds=3, seed=1)
     seen = environment.arrays.observation.numpy().reshape(3 * environment.agents, -1)
     fresh = who.reset(len(seen))

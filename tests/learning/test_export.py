@@ -15,7 +15,7 @@ import yaml
 from torch import nn
 
 import finssim
-from finssim.agents.agents import agent_for
+from finssim.agents.agent import agent_for
 from finssim.control.policy import (
     ObservationEntry,
     ObservationSchema,

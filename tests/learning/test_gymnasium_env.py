@@ -11,12 +11,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from finssim.extensions.perception.docking import CameraDocking
+from finssim.extensions.perception.camera_docking import CameraDocking
 from finssim.learning.gymnasium_env import Env, VectorEnv
-from finssim.tasks import SEEING, TASKS, EnvironmentSetupError, StationKeeping
+from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping, numeric_tasks
 
 SHORT = StationKeeping(time_limit=0.5)
-ALONE = [name for name in TASKS if name not in SEEING and len(TASKS[name].agents) == 1]
+ALONE = [name for name in numeric_tasks() if len(TASKS[name].agents) == 1]
 UNBOUNDED = pytest.mark.filterwarnings("ignore:.*infinity.*")
 """Offsets have no bound, and the space says so."""
 

@@ -5,10 +5,10 @@ import pytest
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from finssim.learning.pettingzoo_env import PettingZooEnv
-from finssim.tasks import SEEING, TASKS, EnvironmentSetupError, StationKeeping
+from finssim.tasks import EnvironmentSetupError, StationKeeping, numeric_tasks
 from reference.pair import Pair
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 EVERY = pytest.mark.parametrize("task", [*NUMERIC, Pair()], ids=[*NUMERIC, "pair"])
 

@@ -10,7 +10,8 @@ import yaml
 from torch import nn
 
 import finssim
-from finssim.agents.agents import NOWHERE, agent_for, expert_for, known_in, restarted
+from finssim.agents.agent import NOWHERE, agent_for, expert_for, known_in
+from finssim.agents.memory import restarted
 from finssim.control.guidance import Known, Station
 from finssim.control.modes import action_mode
 from finssim.control.policy import Policy, PolicyError

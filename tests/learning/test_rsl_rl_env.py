@@ -6,11 +6,11 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from finssim.learning.rsl_rl_env import RslRlVecEnv
-from finssim.tasks import SEEING, TASKS, StationKeeping, make
+from finssim.tasks import StationKeeping, make, numeric_tasks
 from reference.learners import rsl_rl_settings
 from reference.pair import Pair
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 SHORT = StationKeeping(time_limit=0.5)
 

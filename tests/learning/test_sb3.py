@@ -7,15 +7,15 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import VecCheckNan
 
-from finssim.extensions.perception.docking import CameraDocking
+from finssim.extensions.perception.camera_docking import CameraDocking
 from finssim.extensions.perception.net import Net
 from finssim.learning.gymnasium_env import Env
 from finssim.learning.sb3 import Sb3VecEnv
 from finssim.sim import Pool
-from finssim.tasks import SEEING, TASKS, Environment, EnvironmentSetupError, StationKeeping
+from finssim.tasks import TASKS, Environment, EnvironmentSetupError, StationKeeping, numeric_tasks
 from reference.pair import Pair
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 SHORT = StationKeeping(time_limit=0.5)
 

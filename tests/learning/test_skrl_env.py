@@ -6,11 +6,11 @@ import torch
 from skrl.trainers.torch import SequentialTrainer
 
 from finssim.learning.skrl_env import SkrlEnv, SkrlTeamEnv
-from finssim.tasks import SEEING, TASKS, StationKeeping, make
+from finssim.tasks import StationKeeping, make, numeric_tasks
 from reference.learners import mappo, ppo
 from reference.pair import Pair
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 SHORT = StationKeeping(time_limit=0.5)
 

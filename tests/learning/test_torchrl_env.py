@@ -9,10 +9,10 @@ from torchrl.envs.utils import check_env_specs
 
 from finssim.learning.gymnasium_env import VectorEnv
 from finssim.learning.torchrl_env import TorchRlEnv
-from finssim.tasks import SEEING, TASKS, EnvironmentSetupError, StationKeeping, make
+from finssim.tasks import EnvironmentSetupError, StationKeeping, make, numeric_tasks
 from reference.pair import Pair
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 SHORT = StationKeeping(time_limit=0.5)
 APART = {"port": ["right"], "starboard": ["left"]}

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from finssim.agents.agents import AgentError
+from finssim.agents.agent import AgentError
 from finssim.control.modes import action_mode
 from finssim.control.policy import Policy
 from finssim.core.files import OutputError

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.agents.agents import BASELINES
+from finssim.agents.catalogue import baselines_of
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.control import ControlError
@@ -35,7 +35,7 @@ SEEDS = {"camera-docking": 4, "pipeline": 2, "gate": 4}
 @pytest.mark.parametrize("name", TASKS)
 def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
     """Scored by the task itself on the true state; nobody is stopped, everybody decides at the task's rate."""
-    (who, *_), task = BASELINES[name], task_named(name)
+    (who, *_), task = baselines_of(name), task_named(name)
     if task.pictures:
         pytest.importorskip("newton", reason="finssim[perception] is not installed")
     task = replace(task, time_limit=SHORT.get(name, task.time_limit))

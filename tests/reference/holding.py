@@ -1,4 +1,4 @@
-"""A controller holds the published setpoints in a plant of `tests/control/conftest.py`, and how long it takes."""
+"""A controller holds the published setpoints in a plant of `tests/agents/conftest.py`, and how long it takes."""
 
 import math
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.agents.agents import PidAgent
+from finssim.agents.agent import PidAgent
 from finssim.control import ControlError
 from finssim.control.guidance import Station
 from finssim.robot.links.frames import MCU, Decoder, encode_telemetry

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.agents.agents import agent_for
+from finssim.agents.agent import agent_for
 from finssim.evaluation import evaluate
 from finssim.evaluation.plants import Plant
 from finssim.tasks.catalogue import task_named

@@ -11,12 +11,12 @@ import pytest
 import warp as wp
 
 from finssim.sim.state import State
-from finssim.tasks import SEEING, TASKS, Environment, EnvironmentSetupError, ObservationPart
+from finssim.tasks import TASKS, Environment, EnvironmentSetupError, ObservationPart, numeric_tasks
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.check import TaskError, check_task
 from finssim.tasks.terms import RewardTerm
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task.py"
 spec = importlib.util.spec_from_file_location("own_task", EXAMPLE)

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.tasks import SEEING, TASKS, EnvironmentSetupError, make
+from finssim.tasks import TASKS, EnvironmentSetupError, make, numeric_tasks
 from finssim.tasks.fitting import coefficients_of, driven_axes
 from finssim.vehicles import catalogue, load_vehicle
 from reference.examples import example
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 OWN = example("own_task").KeepDepth
 NAMES = [*NUMERIC, OWN().name]

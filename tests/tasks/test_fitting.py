@@ -7,20 +7,19 @@ import pytest
 from rich.console import Console
 
 from finssim import make
-from finssim.agents.pid import axis_model
+from finssim.control.axis_model import axis_model
 from finssim.control.modes import mode_from_dict
 from finssim.control.policy import Policy
 from finssim.evaluation.metrics import T1_SETPOINTS, in_room
 from finssim.learning.train import train
 from finssim.sim import Pool
-from finssim.tasks import SEEING, EnvironmentSetupError
-from finssim.tasks.catalogue import TASKS
+from finssim.tasks import TASKS, EnvironmentSetupError, numeric_tasks
 from finssim.tasks.fitting import authority
 from finssim.tasks.given import crew
 from finssim.vehicles import catalogue, load_vehicle
 from finssim.vehicles.defaults import room
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 QUIET = Console(file=io.StringIO())
 

@@ -9,12 +9,12 @@ from finssim.control import ControlError
 from finssim.control.guidance import Reference, Station, Track
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.core.rotations import quat_from_yaw, quat_rotate, quat_yaw
-from finssim.tasks import SEEING, TASKS, Environment, follow, task_named
+from finssim.tasks import Environment, follow, numeric_tasks, task_named
 from finssim.tasks.observer import Observer
 from finssim.tasks.task import Batch
 from finssim.vehicles import load_vehicle
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

@@ -14,7 +14,7 @@ def test_a_class_of_a_file_or_module_is_a_task():
     task = task_named(f"{EXAMPLE}:KeepDepth", deepest=0.6)
     assert task.name == "keep-depth" and task.deepest == 0.6
     assert type(task) is type(task_named(f"{EXAMPLE}:KeepDepth"))
-    assert task_named("finssim.extensions.perception.docking:Docking").name == "docking"
+    assert task_named("finssim.tasks.docking:Docking").name == "docking"
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,12 @@ import finssim
 from finssim.sim import Water
 from finssim.sim.randomize import Randomization
 from finssim.sim.ranges_file import Curriculum, Ranges, load_ranges
-from finssim.tasks import SEEING, TASKS, EnvironmentSetupError, MeasurementNoise
+from finssim.tasks import EnvironmentSetupError, MeasurementNoise, numeric_tasks
 from finssim.tasks.sensing import Sensing
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.equipment import DepthSensor, Dvl
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 NOISE = MeasurementNoise(
     position_std=0.02, yaw_std=0.1, velocity_std=0.02, rate_std=0.02, position_bias=0.01, delay=0.2

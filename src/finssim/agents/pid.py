@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from finssim.control import ControlError
 from finssim.control.allocation import Allocator
+from finssim.control.axis_model import AxisModel, axis_model
 from finssim.control.guidance import Goal, Measured, tracking_error, velocity_at
 from finssim.core.frames import FROM_CONTROLLER, TO_CONTROLLER
 from finssim.core.rotations import cross, quat_inverse_rotate, quat_rotate, quat_yaw, wrap_angle
-from finssim.vehicles import HydrodynamicSet, Vehicle
-from finssim.vehicles.vehicle import moved_to_origin
+from finssim.vehicles import Vehicle
 
 # PID gains that put the poles of an identified axis where they are wanted, the actuators' lag included.
 
@@ -30,53 +30,6 @@ INTEGRAL_RATIO = 0.2
 
 
 @dataclass(frozen=True)
-class AxisModel:
-    """Six uncoupled axes m x'' + (d1 + d2 |x'|) x' + k x = tau about the wrench reference, body frame."""
-
-    inertia: Array
-    """m, rigid body and added mass [kg, kg m^2], (6,)."""
-    linear_damping: Array
-    """d1 [N s/m, N m s], (6,)."""
-    quadratic_damping: Array
-    """d2 [N s^2/m^2, N m s^2], (6,)."""
-    stiffness: Array
-    """k of roll and pitch about level, zero elsewhere [N m/rad], (6,)."""
-
-    def damping(self, nu: npt.ArrayLike) -> Array:
-        """d1 + d2 |nu| [N s/m, N m s], (..., 6).
-
-        Args:
-            nu: Velocity of the wrench reference, body frame [m/s, rad/s], (..., 6).
-        """
-        return np.asarray(self.linear_damping + self.quadratic_damping * np.abs(np.asarray(nu, float)))
-
-    def terminal_speed(self, tau: Array) -> Array:
-        """Positive root of d1 v + d2 v^2 = tau, infinite without damping [m/s, rad/s], (6,).
-
-        Args:
-            tau: Magnitude of the wrench on every axis, body frame [N, N m], (6,).
-        """
-        d1, d2 = self.linear_damping, self.quadratic_damping
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(
-                np.where(d1 + d2 > 0.0, 2.0 * tau / (d1 + np.sqrt(d1**2 + 4.0 * d2 * tau)), np.inf)
-            )
-
-    def coriolis(self, nu: npt.ArrayLike) -> Array:
-        """C(nu) nu of the diagonal inertia, Munk moment included [N, N m], (..., 6).
-
-        omega x (m v), and omega x (I omega) + v x (m v)                                        (Fossen 2021, eq. 6.43)
-
-        Args:
-            nu: Velocity of the wrench reference, body frame [m/s, rad/s], (..., 6).
-        """
-        nu = np.asarray(nu, float)
-        v, omega, momentum = nu[..., :3], nu[..., 3:], self.inertia * nu
-        turning = cross(omega, momentum[..., 3:]) + cross(v, momentum[..., :3])
-        return np.concatenate([cross(omega, momentum[..., :3]), turning], axis=-1)
-
-
-@dataclass(frozen=True)
 class Gains:
     """Gains of tau = kp e + integral - kd x', with integral' = rate (the force that the model leaves unexplained), per
     axis."""
@@ -87,31 +40,6 @@ class Gains:
     """[N s/m, N m s/rad], (6,)."""
     rate: Array
     """Rate at which the integral takes over an unknown force [1/s], (6,)."""
-
-
-def axis_model(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> AxisModel:
-    """The diagonal of a vehicle's model at its wrench reference.
-
-    Raises:
-        ControlError: The set has no coefficients (it is a mesh).
-        VehicleError: The vehicle has no set of that name.
-    """
-    chosen = vehicle.hydrodynamic_set(hydrodynamics)
-    if not isinstance(chosen, HydrodynamicSet):
-        raise ControlError(
-            f"hydrodynamic set '{hydrodynamics}' of {vehicle.name} has no damping coefficients to place poles with: "
-            "name one that does"
-        )
-    reference = np.asarray(vehicle.wrench_reference, float)
-    arm = np.asarray(chosen.reference_point, float) - reference
-    above = np.array([vehicle.body.center_of_buoyancy, vehicle.body.center_of_gravity])[:, 2] - reference[2]
-    tilt_stiffness = vehicle.buoyancy * above[0] - vehicle.weight * above[1]
-    return AxisModel(
-        inertia=np.diag(moved_to_origin(vehicle.mass_matrix(hydrodynamics), -reference)),
-        linear_damping=np.diag(moved_to_origin(np.asarray(chosen.linear_damping), arm)),
-        quadratic_damping=np.diag(np.asarray(chosen.quadratic_damping)),
-        stiffness=np.array([0.0, 0.0, 0.0, tilt_stiffness, tilt_stiffness, 0.0]),
-    )
 
 
 def place_poles(model: AxisModel, lag: float | Array, speed: npt.ArrayLike = 0.0) -> Gains:

@@ -17,9 +17,10 @@ once:
 What comes before `*` is typed by its place, the rest as `--name`; a bool is a flag, a `Sequence` may be given several
 times. A directory `out (DIR)` is written by one command at a time. `Annotated` adds bounds as `(low, high)`, another
 `"--name"`, or `","` where one option holds several words. What is no text, number, flag or path, or is annotated
-"python", is no option and keeps its default, but for the types of `MAKERS`. `**options`, "As of `module.function`,
-without rows, robot.", are those of that function but for some. What is returned is the exit status, or a result, whose
-`ok` makes it 0 or 3.
+"python", is no option and keeps its default, but for the types of `MAKERS`, and for a dataclass of the same module that
+is annotated "options", whose fields are. `**options`, "As of `module.function`, without rows, robot.", are those of
+that function but for some. What is returned is the exit status, or a result, whose `ok` makes it 0 or 3. In a module
+that defines `tables_of`, every function returns a result, of which `tables_of` makes tables.
 """
 
 from __future__ import annotations
@@ -50,12 +51,9 @@ KINDS: Mapping[str, Any] = {
     "str": str, "int": int, "float": float, "bool": bool, "Path": Path, "Literal": str, "Severity": str, "Format": str
 }  # fmt: skip
 """Name of an annotation -> what the command line makes of a word."""
-MAKERS = {
-    "OnRobot": "finssim.evaluation.robot_trials:robot_or_none",
-    "Choice": "finssim.extensions.viewer.run:Choice",
-    "Options": "finssim.extensions.ros2.up:Options",
-}
-"""Name of an annotation -> function or dataclass that makes it, whose options replace the parameter."""
+MAKERS = {"OnRobot": "finssim.evaluation.robot_trials:robot_or_none"}
+"""Name of an annotation -> function or dataclass that makes it, whose options replace the parameter; besides these, the
+dataclasses that are annotated "options"."""
 SEEDS = (0, 2**31 - 1)
 LARGEST = 1e9
 """Greatest magnitude of a number on the command line, in any unit."""
@@ -64,18 +62,6 @@ SETTINGS: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
 WRITTEN = ("out", "lerobot")
 """Options whose directories are written."""
 JSON = "Print one JSON object instead of tables."
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """A command whose work returns a result, of which the module's `tables_of` makes tables."""
-
-    work: str
-    """module:function"""
-
-
-Work = str | Experiment
-"""Work of a command: module:function, or an experiment."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +127,8 @@ class Definition:
     """Parameter -> the function that makes its value of options."""
     extra: bool
     """Takes whatever words follow, as `*words`."""
+    tabled: bool
+    """Returns a result, of which the module's `tables_of` makes tables."""
 
     def all_options(self) -> Iterator[Option]:
         """Yield all options, those of the makers included, in the order of the help."""
@@ -171,17 +159,27 @@ def loaded(path: str) -> Callable[..., Any]:
     return function
 
 
+def _source(module: str) -> str:
+    """Return the source of a module; one that is outside this package, such as `__main__`, is imported."""
+    file = ROOT / (module.replace(".", "/") + ".py")
+    if not file.is_file():
+        file = Path(str(import_module(module).__file__))
+    return file.read_text(encoding="utf-8")
+
+
+def about(path: str) -> str:
+    """Return the docstring of the module of module:function, the help of a group of commands."""
+    return ast.get_docstring(ast.parse(_source(path.partition(":")[0]))) or ""
+
+
 @cache
 def read(path: str) -> Definition:
     """Read a function, or a dataclass of settings, from its source."""
     module, _, name = path.partition(":")
-    file = ROOT / (module.replace(".", "/") + ".py")
-    if not file.is_file():  # a module outside the package, such as __main__
-        file = Path(str(import_module(module).__file__))
-    source = file.read_text(encoding="utf-8")
+    source = _source(module)
     start = re.search(rf"^(def {name}\(|class {name}[(:])", source, re.MULTILINE)
     if start is None:
-        raise AttributeError(f"{file} defines no function {name}")
+        raise AttributeError(f"{module} defines no function {name}")
     text = re.split(r"\n(?=[^\s)#])", source[start.start() :], maxsplit=1)[0]
     (node,) = ast.parse(text).body
     assert isinstance(node, ast.FunctionDef | ast.ClassDef)
@@ -191,8 +189,8 @@ def read(path: str) -> Definition:
     options, makers = [], {}
     for argument, annotation, default, positional, (metavar, help_text) in arguments:
         kind, many, notes = _kind(annotation)
-        if kind in MAKERS:
-            makers[argument] = read(MAKERS[kind])
+        if kind in MAKERS or "options" in notes:
+            makers[argument] = read(MAKERS.get(kind, f"{module}:{kind}"))
         elif kind is not None and "python" not in notes:
             value = inspect.Parameter.empty if default is None else _literal(default, source)
             help_text = help_text or (JSON if argument == "as_json" else "")
@@ -207,7 +205,8 @@ def read(path: str) -> Definition:
         makers |= {name: maker for name, maker in further.makers.items() if name not in names}
     lines_of_help = re.split(r"\n(?:Args|Returns|Raises|Note):\n", about)[0].replace("`", "")
     extra = isinstance(node, ast.FunctionDef) and node.args.vararg is not None
-    return Definition(path, lines_of_help, tuple(options), makers, extra)
+    tabled = re.search(r"^def tables_of\(", source, re.MULTILINE) is not None
+    return Definition(path, lines_of_help, tuple(options), makers, extra, tabled)
 
 
 Help = tuple[str | None, str]
@@ -261,6 +260,8 @@ def _kind(annotation: ast.expr | None) -> tuple[Any, bool, tuple[Any, ...]]:
             first, *others = annotation.slice.elts
             kind, many, _ = _kind(first)
             notes = tuple(map(ast.literal_eval, others))
+            if "options" in notes:
+                return ast.unparse(first), False, notes
             return kind, many and "," not in notes, notes
         if head in ("Sequence", "list"):
             return _kind(annotation.slice)[0], True, ()
@@ -281,7 +282,7 @@ def _literal(default: ast.expr, source: str) -> Any:
 
 
 def command_app(
-    sections: Mapping[str, Mapping[str, Work]],
+    sections: Mapping[str, Mapping[str, str]],
     groups: Mapping[str, str],
     further: Family | None = None,
     **settings: Any,
@@ -289,19 +290,24 @@ def command_app(
     """Return the command line with all commands.
 
     Args:
-        sections: Heading of the help -> words after the program's name -> what is done. One of a group's own name is
-            what the group does when nothing follows it; other groups then print their help.
+        sections: Heading of the help -> words after the program's name -> function, as module:function. One of a
+            group's own name is what the group does when nothing follows it; other groups then print their help.
         groups: Word -> help of a group that does nothing itself.
-        further: Commands of other packages; each is imported when it is called.
+        further: Commands of extensions and other packages; each is read when it is asked for.
         settings: Of the outermost `typer.Typer`.
     """
     commands = {name: work for section in sections.values() for name, work in section.items()}
 
-    def others() -> list[str]:
-        return [] if further is None else further.of_packages()
+    def others() -> dict[str, None]:
+        return dict.fromkeys(
+            name.partition(" ")[0] for name in ([] if further is None else further.of_packages())
+        )
 
     class Sections(typer.core.TyperGroup):
         """Commands by section, in the order in which they are given, and after them those of other packages."""
+
+        def list_commands(self, context: Any) -> list[str]:
+            return [*super().list_commands(context), *others()]
 
         def get_command(self, context: Any, name: str) -> Any:
             known = super().get_command(context, name)
@@ -318,10 +324,16 @@ def command_app(
             if others():
                 room = formatter.width - width - 6
                 rows = [(f"{word:{width}}", _short_help(word, room)) for word in others()]
-                with formatter.section("Installed packages"):
+                with formatter.section("Extensions"):
                     formatter.write_dl(rows)
 
     app = typer.Typer(**SETTINGS, **settings, cls=Sections)
+    _add(app, commands, groups)
+    return app
+
+
+def _add(app: typer.Typer, commands: Mapping[str, str], groups: Mapping[str, str]) -> None:
+    """Add commands of one or two words to a command line."""
     apps: dict[str, typer.Typer] = {}
     for name, work in commands.items():
         first, _, last = name.partition(" ")
@@ -329,32 +341,35 @@ def command_app(
         if is_group or (last and first not in apps):
             apps[first] = typer.Typer(**SETTINGS, invoke_without_command=True)
             app.add_typer(apps[first], name=first)
-            handler = _handler(name, work, group=True) if is_group else _group(groups[first])
+            handler = (
+                _handler(name, work, group=True) if is_group else _group(groups.get(first) or about(work))
+            )
             apps[first].callback()(handler)
         if not is_group:
             handler = _handler(name, work)
             extra = getattr(handler, "definition").extra  # noqa: B009
             options = {"allow_extra_args": True, "ignore_unknown_options": True} if extra else None
             (apps[first] if last else app).command(last or first, context_settings=options)(handler)
-    return app
 
 
-def _registered(name: str) -> Any:
-    """Return a command of another package.
+def _registered(word: str) -> Any:
+    """Return the command of an extension or another package by its first word, with those below it.
 
     Raises:
-        RegistryError: Its module cannot be imported, or has no such function.
+        RegistryError: Its module cannot be found or imported, or has no such function.
     """
-    reference, package = COMMANDS.reference(name), COMMANDS.packages()[name]
+    names = [name for name in COMMANDS.of_packages() if name.partition(" ")[0] == word]
+    references = {name: COMMANDS.reference(name) for name in names}
     app = typer.Typer(**SETTINGS)
+    app.callback()(lambda: None)
     try:
-        app.command(name)(_handler(name, reference))
+        _add(app, references, {})
     except Exception as error:  # a package's code may raise anything when it is imported
         raise RegistryError(
-            f"command '{name}' of package {package} cannot be used: {reference}: {type(error).__name__}: {error}; "
-            "repair or uninstall that package"
+            f"command '{word}' of package {COMMANDS.packages()[names[0]]} cannot be used: {references[names[0]]}: "
+            f"{type(error).__name__}: {error}; repair or uninstall that package"
         ) from error
-    return typer.main.get_command(app)
+    return typer.main.get_command(app).commands[word]  # type: ignore[attr-defined]
 
 
 def _short_help(name: str, room: int) -> str:
@@ -365,15 +380,14 @@ def _short_help(name: str, room: int) -> str:
         return "cannot be used: see finssim doctor"
 
 
-def run_script(work: Work) -> NoReturn:
+def run_script(path: str) -> NoReturn:
     """Run a function as a program whose options are those of its signature, and exit.
 
     Args:
-        work: The function, module:function, or an experiment; the module may be `__main__`.
+        path: The function, module:function; the module may be `__main__`.
     """
-    path = work.work if isinstance(work, Experiment) else work
     app = typer.Typer(**SETTINGS, pretty_exceptions_enable=False, context_settings=CONTEXT)
-    app.command()(_handler(path.rpartition(":")[2], work))
+    app.command()(_handler(path.rpartition(":")[2], path))
     replace_unwritable(sys.stdout, sys.stderr)
     sys.exit(boundary.run(app, sys.argv[1:], script=path.partition(":")[0]))
 
@@ -388,12 +402,11 @@ def _group(title: str) -> Callable[..., None]:
     return show
 
 
-def _handler(name: str, work: Work, *, group: bool = False) -> Callable[..., Any]:
-    """A function with the signature that Typer reads, which calls the one that is meant."""
-    experiment = work if isinstance(work, Experiment) else None
-    definition = read(experiment.work if experiment else str(work))
+def _handler(name: str, path: str, *, group: bool = False) -> Callable[..., Any]:
+    """Return a function with the signature that Typer reads, which calls the one that is meant."""
+    definition = read(path)
     options = list(definition.all_options())
-    if experiment is not None:
+    if definition.tabled:
         options.append(Option("as_json", bool, False, False, False, (), None, JSON))
 
     def handle(context: typer.Context, **typed: Any) -> Any:
@@ -402,7 +415,7 @@ def _handler(name: str, work: Work, *, group: bool = False) -> Callable[..., Any
         with ExitStack() as locks:
             for place in _directories(options, typed):
                 locks.enter_context(sole_writer(place))
-            if experiment is not None:
+            if definition.tabled:
                 return _experiment(name, definition, typed)
             return _status(definition.call(typed, *(context.args if definition.extra else ())))
 

@@ -12,11 +12,11 @@ import typer
 
 from finssim import __version__
 from finssim.cli import boundary
-from finssim.cli.command_line import CONTEXT, Experiment, command_app
+from finssim.cli.command_line import CONTEXT, command_app
 from finssim.core.registry import COMMANDS as FAMILY
 from finssim.core.system import announce, replace_unwritable
 
-SECTIONS: dict[str, dict[str, str | Experiment]] = {
+SECTIONS: dict[str, dict[str, str]] = {
     "Start": {
         "demo": "finssim.studies.demo:demo",
         "doctor": "finssim.cli.doctor:doctor",
@@ -24,10 +24,7 @@ SECTIONS: dict[str, dict[str, str | Experiment]] = {
     "Describe and simulate": {
         "vehicles": "finssim.cli.commands:vehicles",
         "vehicles show": "finssim.cli.commands:show_vehicle",
-        "worlds": Experiment("finssim.extensions.perception.show:worlds_list"),
-        "worlds show": Experiment("finssim.extensions.perception.show:worlds_show"),
         "simulate": "finssim.cli.simulate:simulate",
-        "view": "finssim.extensions.viewer.run:run",
     },
     "Identify a vehicle": {
         "excite": "finssim.evaluation.excitation:excite",
@@ -48,13 +45,13 @@ SECTIONS: dict[str, dict[str, str | Experiment]] = {
         "backproject": "finssim.localization.points:run_backproject",
     },
     "Train and evaluate": {
-        "tasks": Experiment("finssim.cli.tasks_show:tasks_list"),
-        "tasks show": Experiment("finssim.cli.tasks_show:tasks_show"),
+        "tasks": "finssim.cli.tasks_show:tasks_list",
+        "tasks show": "finssim.cli.tasks_show:tasks_show",
         "train": "finssim.learning.train:train",
-        "evaluate": Experiment("finssim.evaluation.evaluate:evaluate"),
-        "sweep": Experiment("finssim.studies.sweep:sweep"),
-        "collect": Experiment("finssim.evaluation.records:collect"),
-        "datasets": Experiment("finssim.evaluation.records:datasets"),
+        "evaluate": "finssim.evaluation.evaluate:evaluate",
+        "sweep": "finssim.studies.sweep:sweep",
+        "collect": "finssim.evaluation.records:collect",
+        "datasets": "finssim.evaluation.records:datasets",
     },
     "Deploy": {
         "pool": "finssim.pool.run:run",
@@ -63,20 +60,18 @@ SECTIONS: dict[str, dict[str, str | Experiment]] = {
         "record info": "finssim.robot.record_reader:info",
         "record repair": "finssim.robot.record_reader:repair",
         "play": "finssim.cli.playback:play",
-        "ros2 up": "finssim.extensions.ros2.up:up",
-        "ros2 node": "finssim.extensions.ros2.up:run_node",
         "ardusub-sitl": "finssim.pool.ardusub_sitl:run",
     },
     "Prove": {
-        "experiment t1": Experiment("finssim.studies.transfer:t1"),
-        "experiment t2": Experiment("finssim.studies.transfer:t2"),
-        "experiment localization": Experiment("finssim.studies.localization:localization_experiment"),
-        "experiment replay": Experiment("finssim.studies.replay:replay_experiment"),
+        "experiment t1": "finssim.studies.transfer:t1",
+        "experiment t2": "finssim.studies.transfer:t2",
+        "experiment localization": "finssim.studies.localization:localization_experiment",
+        "experiment replay": "finssim.studies.replay:replay_experiment",
     },
 }
 """Section of the help -> words of a command -> what it does, in the order of a user's path."""
 COMMANDS = {words: work for section in SECTIONS.values() for words, work in section.items()}
-"""Words of every command -> what it does."""
+"""Words of every command of the core -> its function."""
 
 FAMILY.ship({words.partition(" ")[0]: "finssim.cli.commands:app" for words in COMMANDS})
 
@@ -87,7 +82,6 @@ GROUPS = {
     "experiment": "Reproduce a table of the paper in simulation, beside the paper's own numbers.\n\n"
     "Example: finssim experiment replay --help",
     "record": "Inspect records of runs, and repair truncated ones.\n\nExample: finssim record info run.mcap",
-    "ros2": "Run ROS 2 nodes, with or without a ROS 2 installation.\n\nExample: finssim ros2 up pool",
 }
 """Help of what only has commands below it."""
 
@@ -174,7 +168,7 @@ def show_vehicle(
         raise ValueError(f"{picture} ends in '{picture.suffix}', expected one of {' '.join(PICTURES)}")
     vehicle = load_vehicle(name)
     if "perception" not in vehicle.defaults:
-        from finssim.extensions.perception import device_of
+        from finssim.vehicles.devices import device_of
 
         for sensor in vehicle.perception:
             device_of(vehicle, sensor)

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.agents.agents import NOWHERE, agent_for, rollout
+from finssim.agents.agent import NOWHERE, agent_for, rollout
 from finssim.control.policy import read_description
 from finssim.core.files import atomic_write
 from finssim.core.progress import progress_bar
 from finssim.core.quiet import start_warp
 from finssim.evaluation.plants import load_plant
 from finssim.robot.record_reader import play_record
+from finssim.sim.site import described_world
 from finssim.tasks import Environment, task_named
-from finssim.tasks.onlooker import Onlooker, write_video
 from finssim.vehicles import catalogue_vehicle, load_vehicle
 
 
@@ -81,13 +81,13 @@ def play(
     environment = load_plant(plant).environment(agent, the_task, body, seed=seed, auto_reset=False)
     with atomic_write(video) as temporary, progress_bar("episode") as show:
         steps = round(the_task.time_limit / the_task.control_step)
-        onlooker, pictures = Onlooker(environment), []
+        onlooker, pictures = described_world("pool").onlooker(environment), []
         for k, step in rollout(agent, environment, steps, lambda t: NOWHERE):
             pictures.append(_with_observed(onlooker.picture(), environment))
             show(k / steps)
             if step is not None and (step.terminated[0] or step.truncated[0]):
                 break
-        write_video(temporary, pictures, speed / the_task.control_step)
+        _write_video(temporary, pictures, speed / the_task.control_step)
     outcome = environment.task.metrics(environment.arrays)
     success = {1.0: ", success", 0.0: ", no success"}.get(float(outcome.get("success", [np.nan])[0]), "")
     Console(stderr=True).print(
@@ -106,3 +106,14 @@ def _with_observed(picture: NDArray[np.uint8], environment: Environment) -> NDAr
         picture[corner : corner + large.shape[0], : large.shape[1]] = large
         corner += large.shape[0] + 2
     return picture
+
+
+def _write_video(path: Path, pictures: list[NDArray[np.uint8]], rate: float) -> None:
+    """Write pictures of one size as a film (.mp4), so many a second [Hz]."""
+    import cv2
+
+    height, width = pictures[0].shape[:2]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
+    for picture in pictures:
+        writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    writer.release()

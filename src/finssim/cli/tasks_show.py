@@ -12,7 +12,7 @@ from dataclasses import asdict, fields, is_dataclass
 from itertools import pairwise
 from typing import Any
 
-from finssim.agents.agents import BASELINES
+from finssim.agents.catalogue import baselines_of
 from finssim.control.modes import AXES, action_mode
 from finssim.evaluation.tables import Table
 from finssim.tasks import TASKS
@@ -98,7 +98,7 @@ def describe_task(
         "settings": _settings(the_task),
         "training_noise": seen_with(the_task.training_noise, vehicles[0]),
         "sensors": seen_with(Sensing(), vehicles[0]),
-        "baselines": list(BASELINES.get(the_task.name, {})),
+        "baselines": list(baselines_of(the_task)),
     }
 
 

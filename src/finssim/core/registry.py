@@ -25,6 +25,7 @@ __all__ = [
     "TASKS",
     "TERMS",
     "VEHICLES",
+    "WORLDS",
     "Family",
     "RegistryError",
 ]
@@ -216,14 +217,7 @@ TASKS = Family(
         "t1": "finssim.tasks.station_keeping:StationKeeping",
         "t2": "finssim.tasks.trajectory_tracking:TrajectoryTracking",
         "t3": "finssim.tasks.moving_target:MovingTarget",
-        "docking": "finssim.extensions.perception.docking:Docking",
-        "pursuit": "finssim.extensions.teams.pursuit:Pursuit",
-        "team-pursuit": "finssim.extensions.teams.pursuit:TeamPursuit",
-        "formation": "finssim.extensions.teams.formation:Formation",
-        "camera-docking": "finssim.extensions.perception.docking:CameraDocking",
-        "pipeline": "finssim.tasks.pipeline:Pipeline",
-        "gate": "finssim.extensions.perception.gate:Gate",
-        "net": "finssim.extensions.perception.net:Net",
+        "docking": "finssim.tasks.docking:Docking",
     },
     check="finssim.tasks.catalogue:check_registered",
 )
@@ -263,5 +257,8 @@ LEARNERS = Family(
 COMMANDS = Family("command", {})
 """First word after `finssim` -> function; `finssim.cli` adds those of FinsSim."""
 
-FAMILIES: tuple[Family, ...] = (VEHICLES, TASKS, SENSORS, TERMS, LEARNERS, COMMANDS)
+WORLDS = Family("world", {})
+"""Kind of a described world -> function of a name or path that returns the world; `described` is that of perception."""
+
+FAMILIES: tuple[Family, ...] = (VEHICLES, TASKS, SENSORS, TERMS, LEARNERS, COMMANDS, WORLDS)
 """All families."""

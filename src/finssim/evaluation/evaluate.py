@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from finssim.agents.agents import agent_for
+from finssim.agents.agent import agent_for
 from finssim.control.policy import read_description
 from finssim.core.files import atomic_directory, plain_name
 from finssim.core.progress import progress_bar

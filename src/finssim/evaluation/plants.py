@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from finssim.agents.agents import Agent
+from finssim.agents.agent import Agent
 from finssim.core.yaml_file import first_problem, read_mapping
 from finssim.sim import Water
 from finssim.sim.randomize import Randomization

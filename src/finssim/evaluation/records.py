@@ -21,11 +21,10 @@ from finssim.core.provenance import provenance
 from finssim.core.rotations import quat_from_yaw
 from finssim.core.yaml_file import json_value
 from finssim.evaluation.campaign import Progress
+from finssim.evaluation.clocks import ClockError, clock_offset
 from finssim.evaluation.metrics import MAX_GAP, T1_SETPOINTS, in_room
 from finssim.evaluation.tables import Table
 from finssim.evaluation.trials import DURATION, Motion, Trial, follows, interpolated, localization_errors
-from finssim.extensions.viewer.frame import ViewError
-from finssim.extensions.viewer.series import PoseSeries, offset_between
 from finssim.learning.demonstrations import DatasetError, Episode, about, data_sets_in, save
 from finssim.learning.demonstrations import collect as collect_episodes
 from finssim.learning.lerobot import export_lerobot
@@ -754,9 +753,8 @@ def _truth(path: Path, drive: Drive, until: float) -> tuple[Motion, float]:
     """The true motion from the guide's start to a time after it [s], and what was added to its times."""
     motion = _table(path)
     try:
-        robot = PoseSeries(drive.time, drive.motion.position, drive.motion.quaternion)
-        offset = offset_between(robot, motion.t, motion.position)
-    except ViewError as error:
+        offset = clock_offset(drive.time, drive.motion.position, motion.t, motion.position)
+    except ClockError as error:
         raise DriveError(f"{path}: {error}") from None
     t = motion.t + offset - (drive.time[0] - drive.motion.t[0])
     return replace(motion, t=t).between((t >= 0.0) & (t <= until + 1e-6)), offset

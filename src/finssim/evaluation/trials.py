@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.agents.agents import NOWHERE, Agent, rollout
+from finssim.agents.agent import NOWHERE, Agent, rollout
 from finssim.control.guidance import Goal, Guide, Station, Track, acceleration_at
 from finssim.control.trajectories import load_trajectory
 from finssim.core.files import atomic_write

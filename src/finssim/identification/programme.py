@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.agents.pid import axis_model
 from finssim.control.allocation import Allocator
+from finssim.control.axis_model import axis_model
 from finssim.core.files import atomic_write
 from finssim.core.quiet import start_warp
 from finssim.core.text_table import write_csv

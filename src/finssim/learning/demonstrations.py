@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.agents.agents import NOWHERE, Agent, expert_for, restarted
+from finssim.agents.agent import NOWHERE, Agent, expert_for
+from finssim.agents.memory import restarted
 from finssim.control.guidance import Known
 from finssim.control.modes import action_mode
 from finssim.control.policy import plain_data

@@ -17,8 +17,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from finssim.learning.served import copied, served, single_agent
+from finssim.sim.site import described_world
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, Task
-from finssim.tasks.onlooker import Onlooker
 
 # Gymnasium's spaces of an environment's observations and actions.
 
@@ -76,13 +76,13 @@ class Env(gymnasium.Env[Any, Any]):
         self.observation_space = observation_space(self.environment)
         self.action_space = action_space(self.environment)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.environment.task.control_step)}
-        self._onlooker: Onlooker | None = None
+        self._onlooker: Any = None
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the vehicle from behind, uint8 (360, 640, 3), with `render_mode="rgb_array"`; otherwise None."""
         if self.render_mode != "rgb_array":
             return None
-        self._onlooker = self._onlooker or Onlooker(self.environment)
+        self._onlooker = self._onlooker or described_world("pool").onlooker(self.environment)
         return self._onlooker.picture()
 
     def reset(

@@ -468,3 +468,19 @@ def positioning_of(name: str, seed: int) -> Positioning | None:
     if name not in POSITIONING:
         raise PlantSpecError(f"unknown positioning '{name}'; available: none, {', '.join(POSITIONING)}")
     return Positioning(POSITIONING[name], seed)
+
+
+def site_of_world(world: Any, spec: PlantSpec) -> PlantSpec:
+    """The plant in the water of a world: its basin, or open water above its seabed.
+
+    Args:
+        world: Described world.
+        spec: Drawn for the pool.
+    """
+    if world.basin is not None:
+        length, width, depth = world.basin.size.tolist()
+        basin = Basin(length=length, width=width, depth=depth)
+        return spec if basin == spec.basin else spec.model_copy(update={"basin": basin, "tether": None})
+    spec = site_of("open-water", spec)
+    depth = spec.basin.depth if world.seabed is None else world.seabed.depth
+    return spec.model_copy(update={"basin": spec.basin.model_copy(update={"depth": depth})})

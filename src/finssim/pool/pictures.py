@@ -257,3 +257,14 @@ def _first(plan: CameraPlan) -> Exposure:
     """A vehicle in the middle of the pool."""
     pose = np.array([0.0, 0.0, -0.5 * plan.basin.depth]), np.array([0.0, 0.0, 0.0, 1.0])
     return Exposure(0, 0.0, 0.0, pose, pose)
+
+
+class Cameras:
+    """Several cameras as one."""
+
+    def __init__(self, *cameras: Any) -> None:
+        self._cameras = cameras
+
+    def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Picture]:
+        """Pictures of all; in the order of the cameras."""
+        return [picture for camera in self._cameras for picture in camera.advance(t0, t1, pose_at)]

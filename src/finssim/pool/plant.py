@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.extensions.perception.layout import WorldLayout
 from finssim.physics.hydrostatics import submerged_fraction
 from finssim.physics.kinematics import up_in_body
 from finssim.physics.motors import thrust_of_speed
@@ -544,7 +543,7 @@ class Plant:
         position: ArrayLike = (0.0, 0.0, -0.5),
         quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0),
         speed_loop: bool = True,
-        world: WorldLayout | None = None,
+        world: Any | None = None,
         dock: Dock | None = None,
     ) -> None:
         """Put the vehicle into the water, at rest.
@@ -591,7 +590,7 @@ class Plant:
         self.steps = 0
 
     def _simulator(
-        self, position: ArrayLike, quaternion: ArrayLike, world: WorldLayout | None, dock: Dock | None
+        self, position: ArrayLike, quaternion: ArrayLike, world: Any | None, dock: Dock | None
     ) -> Simulator:
         spec, hull = self.spec, self.spec.hull
         basin = Pool(length=spec.basin.length, width=spec.basin.width, depth=spec.basin.depth)

@@ -20,13 +20,11 @@ import numpy as np
 from finssim.control.guidance import Station
 from finssim.core import realtime
 from finssim.core.rotations import quat_from_yaw, quat_yaw
-from finssim.extensions.perception import load_world
 from finssim.localization.overhead_camera import Pool, write_pool
 from finssim.pool.camera import PoolCamera, camera_of
-from finssim.pool.drawn_plant import draw_plant, positioning_of, site_of
+from finssim.pool.drawn_plant import draw_plant, positioning_of, site_of, site_of_world
 from finssim.pool.fleet import Fleet, Medium, one_picture
-from finssim.pool.onboard import Cameras, OnboardPlan, site_of_world
-from finssim.pool.pictures import CameraPlan, PictureProcess, Plan, UdpSender
+from finssim.pool.pictures import CameraPlan, Cameras, PictureProcess, Plan, UdpSender
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
 from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
@@ -46,6 +44,7 @@ from finssim.robot.links.water_linked import DvlServer
 from finssim.robot.lockstep import LockstepError, decode_request, encode_delivery, encode_refusal, receive
 from finssim.robot.messages import Picture
 from finssim.robot.team import decode_track
+from finssim.sim.site import described_world
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
@@ -433,7 +432,7 @@ class PoolPlan:
     """Name of the positioning system."""
     firmware: Literal["mcu", "ardusub"] = "mcu"
     """Firmware of the vehicle."""
-    onboard: OnboardPlan | None = None
+    onboard: Any = None
     """The vehicle's own cameras, sonars and altimeters, in the world that they see; None: there is none."""
 
     def eye(self) -> Any:
@@ -497,10 +496,9 @@ def make_plan(
     """
     ours = load_vehicle(vehicle)
     spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
-    world_is_site = world is not None and site is None
-    spec = (
-        site_of_world(world, spec) if world_is_site and world is not None else site_of(site or "pool", spec)
-    )
+    seen = None if world is None else described_world(world)
+    world_is_site = seen is not None and site is None
+    spec = site_of_world(seen, spec) if world_is_site else site_of(site or "pool", spec)
     site = site or ("pool" if world is None else "open-water")
     ours = vehicle_at(site, ours, navigation=firmware == "ardusub")
     if site == "open-water" and camera != "none":
@@ -511,9 +509,7 @@ def make_plan(
         raise PlantSpecError(f"unknown firmware '{firmware}'; available: mcu, ardusub")
     if camera not in ("pictures", "corners", "none"):
         raise PlantSpecError(f"unknown camera '{camera}'; available: pictures, corners, none")
-    onboard = (
-        None if world is None else OnboardPlan(vehicle=ours, world=world, seed=seed, solid=world_is_site)
-    )
+    onboard = None if seen is None else seen.onboard(ours, seed, solid=world_is_site)
     plan = PoolPlan(vehicle=ours, spec=spec, camera=None, calibrated=None, firmware=firmware, onboard=onboard)
     if camera == "none":
         return plan
@@ -622,7 +618,7 @@ def run(
     )
     plan = replace(plan, positioning=positioning)
     if start is None and world is not None and site is None:
-        view = load_world(world).viewpoint
+        view = described_world(world).viewpoint
         start = ",".join(f"{x:g}" for x in (*view.position, math.degrees(view.yaw)))
     start = start or f"0,0,{-0.5 * plan.spec.basin.depth:g},0"
     begin = station_of(start)
@@ -899,7 +895,7 @@ def _tell_plant(plan: PoolPlan, pool_file: Path | None, truth: Path | None) -> N
         )
     if plan.onboard is not None:
         rates = (f"{name} {sensor.rate:g} Hz" for name, sensor in plan.vehicle.perception.items())
-        _say(f"world: {plan.onboard.world}, seed {plan.onboard.seed}; {', '.join(rates)}")
+        _say(f"world: {plan.onboard.name}, seed {plan.onboard.seed}; {', '.join(rates)}")
     for name, path in (("pool file", pool_file), ("truth", truth)):
         if path is not None:
             _say(f"{name}: {path}")

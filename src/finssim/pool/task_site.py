@@ -21,12 +21,9 @@ from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured, Reference, Track
 from finssim.control.modes import action_mode
 from finssim.core.rotations import quat_from_yaw, quat_inverse_rotate, quat_yaw
-from finssim.extensions.perception import WorldBatch
-from finssim.extensions.perception.sight import first_draw, put_goal
 from finssim.localization.overhead_camera import Pool
 from finssim.pool.drawn_plant import positioning_of
 from finssim.pool.fleet import Fleet, Medium
-from finssim.pool.onboard import OnboardSensors
 from finssim.pool.plant_spec import Basin, PlantSpec
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.bridge import Bridge, BridgeSettings
@@ -38,6 +35,7 @@ from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.team import Team, encode_track
 from finssim.sim.launch import Pipeline
+from finssim.sim.site import described_world
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.communication import Communication
@@ -225,15 +223,13 @@ class Referee:
         if guide is not None and follows:
             fill_table(self.arrays.reference, [guide])
         self._guide = guide if start is not None else None
-        self.world: WorldBatch | None = None
+        self.world: Any = None
         """What a vehicle that sees has around it, drawn as in training."""
         if start is not None:
             self._put({task.vehicles[0]: start})
             self._aim(0.0)
         elif task.world:
-            self.world = WorldBatch(task.world)
-            self.world.draw(first_draw(seed), held_out=task.held_out)
-            put_goal(task, self.world, self.arrays)
+            self.world = described_world(task.world).drawn_for(task, self.arrays, seed)
         batch, mask = Batch(self._state, self.arrays, seed), wp.ones(1, dtype=wp.int32, device=device)
         self._evaluate, opening = Pipeline(1, device), Pipeline(1, device)
         task.add_spawn(opening, batch, mask)
@@ -431,12 +427,12 @@ class TaskSite(Fleet):
                 else None,
             )
 
-    def _eyes(self, vehicle: Vehicle, seed: int) -> OnboardSensors | None:
+    def _eyes(self, vehicle: Vehicle, seed: int) -> Any:
         """The vehicle's own sensors that the task observes, in the world of its episode."""
         if self.referee.world is None:
             return None
         names = [*(picture.name for picture in self.task.pictures), *self.task.ranges]
-        return OnboardSensors(vehicle, self.referee.world, names=names, seed=seed)
+        return self.referee.world.sensors(vehicle, names, seed)
 
     def run(self, duration: float | None = None) -> dict[str, float]:
         """Play until the task ends, or for a time from the start of the last robot [s]; its time limit if None.

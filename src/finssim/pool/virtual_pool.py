@@ -29,7 +29,6 @@ from finssim.robot.messages import Delivery, Picture, Telemetry
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:
-    from finssim.extensions.perception import WorldLayout
     from finssim.pool.ardusub import ArduSub
     from finssim.sim import Dock
 
@@ -337,7 +336,7 @@ class VirtualPool:
         truth: str | Path | None = None,
         truth_period: float = 0.01,
         firmware: Literal["mcu", "ardusub"] = "mcu",
-        world: WorldLayout | None = None,
+        world: Any = None,
         dock: Dock | None = None,
     ) -> None:
         """Put the vehicle into the pool, at rest, with its motor controller running.

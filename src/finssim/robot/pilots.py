@@ -22,7 +22,7 @@ from finssim.robot.pictures import resized
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:
-    from finssim.agents.agents import Agent
+    from finssim.agents.agent import Agent
     from finssim.tasks.observer import Observer
 
 
@@ -304,14 +304,15 @@ def make_pilot(
     Raises:
         PolicyError, ControlError: It does not fit the vehicle or the task, in one sentence.
     """
-    from finssim.agents.agents import BASELINES, TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
+    from finssim.agents.agent import TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
+    from finssim.agents.catalogue import baselines_of
     from finssim.tasks.observer import Observer
 
     controller = str(name_or_directory)
     if controller in CONTROLLERS and task in (None, *TASKS_OF_PIDS):
         return AgentPilot(PidAgent(controller, vehicle, task or "t1"), vehicle)
     if not Path(controller).exists():
-        baselines = BASELINES.get(task or "", {})
+        baselines = {} if task is None else baselines_of(task)
         if controller not in baselines:
             names = dict.fromkeys([*(CONTROLLERS if task in (None, *TASKS_OF_PIDS) else ()), *baselines])
             raise PolicyError(

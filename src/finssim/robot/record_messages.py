@@ -18,14 +18,7 @@ import numpy.typing as npt
 
 from finssim.core.optics import Lens
 from finssim.core.rotations import quat_conjugate, quat_from_yaw, quat_multiply, quat_to_matrix
-from finssim.extensions.perception.description import (
-    CameraDevice,
-    Device,
-    RangeDevice,
-    SonarDevice,
-    device_of,
-)
-from finssim.extensions.perception.rays import fan_picture
+from finssim.core.sonar_fan import fan_picture
 from finssim.robot.messages import (
     HEADING,
     POSE,
@@ -42,6 +35,7 @@ from finssim.robot.pictures import jpeg
 from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import with_navigation
+from finssim.vehicles.devices import CameraDevice, Device, RangeDevice, SonarDevice, device_of
 
 # Names, types, frames and policies of all data of a robot: one table, for topics, records and the page.
 
@@ -227,7 +221,7 @@ def own_topics(vehicle: Vehicle) -> dict[str, Topic]:
     """Topics of the cameras, sonars and altimeters of a vehicle, by key: `front_camera/image`.
 
     Raises:
-        WorldError: The device of one of them is refused.
+        DeviceError: The device of one of them is refused.
     """
     return {
         f"{name}/{key}": replace(

@@ -3,10 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
 
+from finssim.core.registry import WORLDS
 from finssim.physics.contact import PoolWalls
 from finssim.physics.funnel import Funnel
 from finssim.physics.tether import Tether
@@ -233,3 +236,20 @@ class Dock:
         funnel.force = wp.zeros((worlds, vehicles), dtype=wp.float32, device=device)
         funnel.impulse = wp.zeros((worlds, vehicles), dtype=wp.float32, device=device)
         return funnel
+
+
+def described_world(name_or_path: "str | Path") -> Any:
+    """Return a described world, which the extension for perception reads.
+
+    Args:
+        name_or_path: A site of `finssim worlds`, or a YAML file.
+
+    Raises:
+        WorldError: There is none of that name, or the file is refused.
+        SurroundingsError, RegistryError: The extension is not installed, or cannot be used.
+    """
+    if "described" not in WORLDS:
+        raise SurroundingsError(
+            f"world '{name_or_path}': no extension reads described worlds; install finssim with its extensions"
+        )
+    return WORLDS["described"](name_or_path)

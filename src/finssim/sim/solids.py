@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,26 +16,22 @@ from finssim.physics.solids import NEIGHBOURS, Solids, free_water
 from finssim.physics.types import linear
 from finssim.sim.midpoint import WALL_STEP
 from finssim.sim.plant_arrays import SimulatorError
-from finssim.sim.site import Pool
+from finssim.sim.site import Pool, described_world
 from finssim.sim.state import State
-
-if TYPE_CHECKING:
-    from finssim.extensions.perception import World, WorldLayout
 
 KINDS = ("box", "sphere", "capsule", "cylinder", "plane", "mesh", "heightfield")
 """Shapes in the order of the constants of `finssim.physics.solids`."""
 
 
-def layout_of(world: Any, worlds: int, device: wp.Device) -> WorldLayout:
+def layout_of(world: Any, worlds: int, device: wp.Device) -> Any:
     """A layout with as many worlds, made if only a world or its name is there.
 
     Raises:
         SimulatorError: It has another number of worlds, or is on another device.
     """
-    from finssim.extensions.perception import WorldLayout
-
-    if not isinstance(world, WorldLayout):
-        return WorldLayout(world, worlds, str(device))
+    if isinstance(world, str | Path):
+        world = described_world(world)
+    world = world.layout(worlds, str(device))
     if world.worlds != worlds or world.device != device:
         raise SimulatorError(
             f"the world has {world.worlds} copies on {world.device}, expected {worlds} on {device}: make it so"
@@ -42,7 +39,7 @@ def layout_of(world: Any, worlds: int, device: wp.Device) -> WorldLayout:
     return world
 
 
-def pool_of(world: World) -> Pool | None:
+def pool_of(world: Any) -> Pool | None:
     """The basin of a world as walls and a floor; None if it has none."""
     if world.basin is None:
         return None
@@ -53,7 +50,7 @@ def pool_of(world: World) -> Pool | None:
     )
 
 
-def solid_shapes(layout: WorldLayout) -> list[int]:
+def solid_shapes(layout: Any) -> list[int]:
     """Return the shapes of a layout, other than the basin, that vehicles collide with."""
     return [
         k
@@ -65,7 +62,7 @@ def solid_shapes(layout: WorldLayout) -> list[int]:
 class WorldSolids:
     """Shapes that a vehicle can collide with, other than the basin: the struct that kernels take, and its arrays."""
 
-    def __init__(self, layout: WorldLayout, vehicles: int, lightest: float) -> None:
+    def __init__(self, layout: Any, vehicles: int, lightest: float) -> None:
         """Take the shapes of a layout whose objects are solid.
 
         Args:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.agents.pid import axis_model
+from finssim.control.axis_model import axis_model
 from finssim.control.policy import Policy
 from finssim.core.files import atomic_write
 from finssim.core.page import html_page

@@ -26,7 +26,7 @@ from finssim.evaluation.plants import load_plant
 from finssim.evaluation.tables import Table, cells
 from finssim.learning.train import train
 from finssim.studies.transfer import finished, train_policies
-from finssim.tasks import SEEING, TASKS
+from finssim.tasks import numeric_tasks
 from finssim.vehicles import load_vehicle
 
 RESULT_FILE = "sweep.json"
@@ -92,7 +92,7 @@ class Sweep(BaseModel):
 
     @model_validator(mode="after")
     def _check_options(self) -> Sweep:
-        without_pictures = [name for name in TASKS if name not in SEEING]
+        without_pictures = numeric_tasks()
         if self.task not in without_pictures:
             raise ValueError(f"task is '{self.task}', expected one of {', '.join(without_pictures)}")
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):

@@ -7,7 +7,7 @@ from finssim.core.lazy import exports
 if TYPE_CHECKING:
     from finssim.core.registry import TASKS
     from finssim.tasks.arrays import TaskArrays
-    from finssim.tasks.catalogue import SEEING, make, task_named
+    from finssim.tasks.catalogue import make, numeric_tasks, task_named
     from finssim.tasks.check import check_task
     from finssim.tasks.communication import Communication
     from finssim.tasks.environment import Environment, EnvironmentSetupError, Step
@@ -28,7 +28,6 @@ __all__ = [
     "MovingTarget",
     "ObservationPart",
     "RewardTerm",
-    "SEEING",
     "Sensing",
     "Start",
     "StationKeeping",
@@ -44,6 +43,7 @@ __all__ = [
     "check_task",
     "follow",
     "make",
+    "numeric_tasks",
     "place_at_rest",
     "task_named",
 ]

@@ -106,8 +106,9 @@ def _of_import(name: str) -> ModuleType:
         raise EnvironmentSetupError(f"module '{name}' cannot be imported: {error}") from error
 
 
-SEEING = ("camera-docking", "pipeline", "gate", "net")
-"""Names of the tasks that observe pictures, which need `finssim[perception]`."""
+def numeric_tasks() -> list[str]:
+    """Return the names of the tasks that observe no pictures; those that cannot be imported are left out."""
+    return [name for name, kind in TASKS.usable().items() if not kind().pictures]
 
 
 def check_registered(name: str, task: Any) -> None:

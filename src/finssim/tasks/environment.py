@@ -11,12 +11,12 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
-from finssim.extensions.perception.sight import Sight
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
 from finssim.sim import Pool, Simulator, TetherLine, Water
 from finssim.sim.launch import Pipeline
 from finssim.sim.randomize import Draws, Randomization
+from finssim.sim.site import described_world
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
@@ -197,10 +197,14 @@ class Environment:
                 drawn,
             )
         self._draw(randomization, privileged)
-        self.sight = Sight(task, self.simulator, self.arrays, self.seed) if task.pictures else None
+        self.sight = self._sight() if task.pictures else None
         """The world that the vehicle sees, and its pictures; None of a task that does not see."""
         self._build()
         self.reset(seed=self.seed)
+
+    def _sight(self) -> Any:
+        """The world that the vehicle sees, with the sensors that the task observes."""
+        return described_world(self.task.world).sight(self.task, self.simulator, self.arrays, self.seed)
 
     def _draw(self, randomization: Randomization | None, privileged: bool) -> None:
         """Set up what the randomisation needs, and the arrays of the privileged numbers."""

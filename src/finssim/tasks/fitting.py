@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.agents.pid import axis_model
+from finssim.control.axis_model import axis_model
 from finssim.sim import Pool
 from finssim.tasks.measurement import TRAINING, MeasurementNoise
 from finssim.tasks.task import Task

@@ -146,6 +146,7 @@ class MovingTarget(PoolTask):
     succeeds: ClassVar[str] = "once"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "stay with a target that changes its course"
+    baselines: ClassVar = {"pid": "finssim.agents.baselines:TargetPid"}
     name: str = "t3"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0

@@ -122,6 +122,7 @@ class StationKeeping(PoolTask):
     succeeds: ClassVar[str] = "held"
     title: ClassVar[str] = "reach a pose in the pool and hold it"
     needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
+    baselines: ClassVar = {"pid": "finssim.agents.baselines:StationPid"}
     name: str = "t1"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     goal_low: tuple[float, float, float] = (-1.2, -0.5, -0.82)

@@ -5,7 +5,7 @@ import hashlib
 import inspect
 import itertools
 import linecache
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from types import UnionType
@@ -16,7 +16,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.control.policy import ObservationEntry, ObservationSchema
-from finssim.extensions.perception.sight import Picture
 from finssim.sim import Dock, Pool
 from finssim.sim.launch import Pipeline
 from finssim.sim.state import State
@@ -24,6 +23,7 @@ from finssim.tasks import terms as library
 from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.picture import Picture
 from finssim.tasks.terms import ObservationPart, Terms
 from finssim.vehicles import Vehicle
 
@@ -73,6 +73,9 @@ class Task:
     the name of an end. Empty: nothing is."""
     fails: ClassVar[tuple[str, ...]] = ()
     """Ends after which the episode is no success, whatever came before."""
+    baselines: ClassVar[Mapping[str, str | Callable[..., Any]]] = {}
+    """Classical controllers that see what a policy sees, by name: `module:class`, made by its `for_vehicle`, or a
+    function of a vehicle that returns the controller (`finssim.agents.baselines.Baseline`)."""
 
     name: str
     observation: tuple[ObservationPart, ...] = field(repr=False)

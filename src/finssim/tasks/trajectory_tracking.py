@@ -395,6 +395,7 @@ class TrajectoryTracking(FittedTask):
     succeeds: ClassVar[str] = "held"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "follow a moving reference, heading free"
+    baselines: ClassVar = {"pid": "finssim.agents.baselines:TrackingPid"}
     name: str = "t2"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0

@@ -4,16 +4,9 @@ import numpy as np
 import pytest
 
 from finssim.core.rotations import quat_rotate
-from finssim.extensions.perception import (
-    CameraBatch,
-    RangeBatch,
-    SonarBatch,
-    WorldError,
-    device_of,
-    load_device,
-    sensor_of,
-)
+from finssim.extensions.perception import CameraBatch, RangeBatch, SonarBatch, sensor_of
 from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles.devices import DeviceError, device_of, load_device
 
 
 @pytest.mark.parametrize("name", catalogue())
@@ -50,7 +43,7 @@ def test_an_entry_scales_its_camera_and_its_sonar():
 def test_what_is_no_sensor_is_refused(changes, name, message):
     """In one sentence that names the vehicle's entry."""
     vehicle = load_vehicle("finsrov").replace(changes)
-    with pytest.raises(WorldError, match=message.replace("?", r"\?")) as refused:
+    with pytest.raises(DeviceError, match=message.replace("?", r"\?")) as refused:
         device_of(vehicle, name)
     assert "\n" not in str(refused.value)
 

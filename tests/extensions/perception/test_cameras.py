@@ -9,15 +9,8 @@ from scipy.integrate import quad
 
 from finssim.core.frames import TO_OPTICAL
 from finssim.core.optics import Camera, Interface, Layer, project
-from finssim.extensions.perception import (
-    CameraBatch,
-    Headlight,
-    RangeBatch,
-    SonarBatch,
-    WorldBatch,
-    load_device,
-)
-from finssim.extensions.perception.description import CameraDevice, Mount, Port
+from finssim.extensions.perception import CameraBatch, Headlight, RangeBatch, SonarBatch, WorldBatch
+from finssim.vehicles.devices import CameraDevice, Mount, Port, load_device
 
 pytestmark = pytest.mark.slow
 

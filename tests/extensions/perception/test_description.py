@@ -9,17 +9,15 @@ import pytest
 from finssim.core.mesh import write_stl
 from finssim.core.rotations import quat_rotate
 from finssim.extensions.perception.description import (
-    DEVICES,
     SITES,
     Object,
     WorldError,
     WorldWater,
-    devices,
-    load_device,
     load_world,
     sites,
 )
 from finssim.sim.overhead_camera import Water
+from finssim.vehicles.devices import DEVICES, DeviceError, devices, load_device
 
 WORLD = """
 about: A ball over a floor.
@@ -107,19 +105,19 @@ def test_places_that_come_of_files_are_within_reach(tmp_path):
 
 def test_a_sensor_of_no_kind_and_a_site_of_no_name_are_refused(tmp_path):
     """What there is stands in the message."""
-    with pytest.raises(WorldError, match="kind is 'radar', expected one of camera, sonar, range"):
+    with pytest.raises(DeviceError, match="kind is 'radar', expected one of camera, sonar, range"):
         load_device(written(tmp_path, "kind: radar\n"))
-    with pytest.raises(WorldError, match="kind is \\['camera'\\], expected one of"):
+    with pytest.raises(DeviceError, match="kind is \\['camera'\\], expected one of"):
         load_device(written(tmp_path, "kind: [camera]\n"))
     camera = (DEVICES / "low_light_camera.yaml").read_text()
     for key in ("width", "height"):
         camera = re.sub(rf"(?m)^{key}: \d+", f"{key}: 8192", camera)
-    with pytest.raises(WorldError, match="8192 x 8192 pixels, expected at most 8 million"):
+    with pytest.raises(DeviceError, match="8192 x 8192 pixels, expected at most 8 million"):
         load_device(written(tmp_path, camera))
     sonar = (DEVICES / "oculus_m750d.yaml").read_text()
     for key in ("beams", "bins"):
         sonar = re.sub(rf"(?m)^{key}: \d+", f"{key}: 4096", sonar)
-    with pytest.raises(WorldError, match="4096 beams with 4096 bins .* expected at most 8 million"):
+    with pytest.raises(DeviceError, match="4096 beams with 4096 bins .* expected at most 8 million"):
         load_device(written(tmp_path, sonar))
     with pytest.raises(WorldError, match="unknown site 'dok', did you mean 'dock'?"):
         load_world("dok")
@@ -130,9 +128,9 @@ def test_an_exposure_is_auto_or_a_number(tmp_path):
     camera = (
         "kind: camera\nabout: x\nsource: y\nwidth: 64\nheight: 48\nfocal_length: 50\nrate: 10\nexposure: "
     )
-    assert load_device(written(tmp_path, camera + "0.5\n")).sensor.gain == 0.5
+    assert load_device(written(tmp_path, camera + "0.5\n")).gain == 0.5
     for bad in ("-1", "bright", "[1]", ".nan"):
-        with pytest.raises(WorldError, match="exposure is .*, expected auto or a number > 0$"):
+        with pytest.raises(DeviceError, match="exposure is .*, expected auto or a number > 0$"):
             load_device(written(tmp_path, camera + bad + "\n"))
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from finssim.extensions.perception.docking import Docking, Hull
 from finssim.tasks import Environment, make
+from finssim.tasks.docking import Docking, Hull
 from finssim.vehicles import catalogue, load_vehicle
 
 TASK = Docking()

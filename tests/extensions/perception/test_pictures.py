@@ -7,8 +7,9 @@ import pytest
 import warp as wp
 
 from finssim.extensions.perception import CameraBatch, WorldBatch, WorldError, load_world
-from finssim.extensions.perception.description import JERLOV, CameraDevice, WorldWater
+from finssim.extensions.perception.description import JERLOV, WorldWater
 from finssim.physics.types import vec6
+from finssim.vehicles.devices import CameraDevice
 
 cv2 = pytest.importorskip("cv2", reason="finssim[vision] is not installed")
 pytestmark = pytest.mark.slow

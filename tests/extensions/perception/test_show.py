@@ -8,8 +8,9 @@ import pytest
 
 from finssim.cli import boundary
 from finssim.cli.commands import app
-from finssim.extensions.perception.description import devices, sites
-from finssim.extensions.perception.rays import fan_picture
+from finssim.core.sonar_fan import fan_picture
+from finssim.extensions.perception.description import sites
+from finssim.vehicles.devices import devices
 
 
 def finssim(*words):

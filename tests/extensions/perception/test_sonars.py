@@ -8,9 +8,9 @@ import warp as wp
 from scipy.integrate import quad
 
 from finssim.core.rotations import quat_from_euler, quat_rotate
-from finssim.extensions.perception import DopplerBatch, RangeBatch, SonarBatch, WorldError, load_device
-from finssim.extensions.perception.description import Mount, RangeDevice, SonarDevice
+from finssim.extensions.perception import DopplerBatch, RangeBatch, SonarBatch, WorldError
 from finssim.physics.types import vec6
+from finssim.vehicles.devices import Mount, RangeDevice, SonarDevice, load_device
 
 pytestmark = pytest.mark.slow
 

@@ -9,9 +9,9 @@ import warp as wp
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from finssim.agents.agents import baseline
+from finssim.agents.catalogue import baseline
+from finssim.agents.drive import DriveNumbers
 from finssim.extensions.teams.formation import Formation, sorted_edges, triangle_distance
-from finssim.extensions.teams.pursuit import DriveNumbers
 from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle

@@ -8,8 +8,9 @@ import pytest
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from finssim.agents.agents import baseline
-from finssim.extensions.teams.pursuit import PREY_MODES, DriveNumbers, Prey, Pursuit
+from finssim.agents.catalogue import baseline
+from finssim.agents.drive import DriveNumbers
+from finssim.extensions.teams.pursuit import PREY_MODES, Prey, Pursuit
 from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.vehicles import load_vehicle
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.tasks import SEEING, TASKS, make
+from finssim.tasks import make, numeric_tasks
 
-NUMERIC = [name for name in TASKS if name not in SEEING]
+NUMERIC = numeric_tasks()
 
 
 @pytest.mark.slow

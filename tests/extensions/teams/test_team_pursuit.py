@@ -8,8 +8,9 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from finssim.agents.agents import baseline
-from finssim.extensions.teams.pursuit import LEVELS, DriveNumbers, Prey, TeamPursuit, net_distance
+from finssim.agents.catalogue import baseline
+from finssim.agents.drive import DriveNumbers
+from finssim.extensions.teams.pursuit import LEVELS, Prey, TeamPursuit, net_distance
 from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle

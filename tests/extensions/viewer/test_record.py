@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from finssim.extensions.viewer.frame import ViewError
-from finssim.extensions.viewer.series import PoseSeries, offset_between
+from finssim.evaluation.clocks import ClockError, clock_offset
+from finssim.extensions.viewer.series import PoseSeries
 from finssim.extensions.viewer.sources import RecordSource
 from finssim.pool.virtual_pool import TruthError, read_truth
 from finssim.robot.record_messages import RecordError
@@ -59,12 +59,12 @@ def test_the_truth_lies_under_the_estimate(source, trial):
 def test_clocks_are_laid_over_each_other_by_the_motion(trial, source):
     """Truth whose clock began 123.4 s later is found to within the time in which the vehicle moves some millimetres."""
     truth = read_truth(trial.truth)
-    found = offset_between(source._odom, truth.time - 123.4, truth.position)
+    found = clock_offset(source._odom.time, source._odom.position, truth.time - 123.4, truth.position)
     assert found == pytest.approx(123.4, abs=0.1)
-    with pytest.raises(ViewError, match="less than half"):
-        offset_between(source._odom, truth.time[:50], truth.position[:50])
-    with pytest.raises(ViewError, match="expected at most 86400 s with the record: give times in s"):
-        offset_between(source._odom, 1e5 * truth.time, truth.position)
+    with pytest.raises(ClockError, match="less than half"):
+        clock_offset(source._odom.time, source._odom.position, truth.time[:50], truth.position[:50])
+    with pytest.raises(ClockError, match="expected at most 86400 s with the record: give times in s"):
+        clock_offset(source._odom.time, source._odom.position, 1e5 * truth.time, truth.position)
 
 
 def test_a_damaged_truth_is_refused(trial, tmp_path):

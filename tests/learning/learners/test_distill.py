@@ -10,19 +10,19 @@ import torch
 
 pytest.importorskip("newton")
 
-from finssim.agents.agents import NOWHERE, agent_for
+from finssim.agents.agent import NOWHERE, agent_for
 from finssim.control.guidance import Known
 from finssim.control.policy import Policy, PolicyError
 from finssim.evaluation.plants import load_plant
 from finssim.evaluation.trials import run_episodes
-from finssim.extensions.perception.docking import CameraDocking
-from finssim.extensions.perception.sight import Picture
+from finssim.extensions.perception.camera_docking import CameraDocking
 from finssim.learning.demonstrations import Episode, collect, load, save
 from finssim.learning.export import write_seeing
 from finssim.learning.learners import LearningError, learner_named
 from finssim.learning.torch_networks import SeeingNetwork
 from finssim.learning.train import train
 from finssim.tasks import Environment, make
+from finssim.tasks.picture import Picture
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow

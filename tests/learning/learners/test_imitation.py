@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from finssim.agents.agents import NOWHERE
+from finssim.agents.agent import NOWHERE
 from finssim.control.guidance import Known
 from finssim.learning.demonstrations import Episode, collect, save
 from finssim.learning.learners import LearningError, learner_named

@@ -12,7 +12,7 @@ from finssim.learning.episodes import HeldEvaluation
 from finssim.learning.learners import LEARNERS, LearningError, learner_named
 from finssim.learning.network import Network, answer_of, first_memory
 from finssim.learning.resume import read_state, write_state
-from finssim.tasks import SEEING, TASKS, task_named
+from finssim.tasks import TASKS, numeric_tasks, task_named
 from reference.guess import BEST, Guess, GuessTogether
 
 IMITATING = ("bc", "dagger", "distill")
@@ -27,7 +27,7 @@ TRAINED = [
     *(
         ("ppo" if len(task_named(task).agents) == 1 else "torchrl-ippo", task)
         for task in TASKS
-        if task not in SEEING
+        if task in numeric_tasks()
         if task != "t1"
     ),
 ]
@@ -45,7 +45,7 @@ def made(name, task, seed=3, **changes):
     """A learner in a small environment of its own."""
     task = task_named(task) if isinstance(task, str) else task
     settings = small(name, task, **changes)
-    ranges = "fossen_learn_to_swim" if task.name in TASKS and task.name not in SEEING else None
+    ranges = "fossen_learn_to_swim" if task.name in numeric_tasks() else None
     environment = finssim.make(task, worlds=settings.worlds, seed=seed, observe="training", randomize=ranges)
     return learner_named(name)(environment, settings, seed=seed)
 

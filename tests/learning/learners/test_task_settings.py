@@ -6,7 +6,7 @@ import pytest
 
 from finssim.learning.learners import LEARNERS, base, learner_named
 from finssim.learning.learners.base import ON_POLICY, RANDOMIZED, SETTINGS, task_settings
-from finssim.tasks import SEEING, TASKS, task_named
+from finssim.tasks import TASKS, numeric_tasks, task_named
 from reference.guess import Guess
 
 
@@ -34,7 +34,7 @@ def test_the_tasks_own_lines_outrank_the_others(monkeypatch):
 def test_a_training_begins_with_its_tasks_settings(name, randomized):
     """And what the command says outranks them."""
     kind = learner_named(name)
-    for task in (name for name in TASKS if name not in SEEING):
+    for task in numeric_tasks():
         settings = kind.settings(task_named(task), randomized=randomized)
         for setting, value in task_settings(task, name, randomized).items():
             assert setting == "rollout" or getattr(settings, setting) == value

@@ -1,4 +1,4 @@
-"""Worlds as data, and the sensors that observe them: cameras, imaging sonars, altimeters, DVL beams.
+"""Perception: worlds as data, and the sensors that observe them: cameras, imaging sonars, altimeters, DVL beams.
 
 `WorldLayout`, `description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
 (`pip install 'finssim[perception]'`). What computes is imported when it is first named: a robot that
@@ -11,9 +11,6 @@ from typing import TYPE_CHECKING, Any
 from finssim.extensions.perception.description import (
     World,
     WorldError,
-    device_of,
-    devices,
-    load_device,
     load_world,
     sites,
 )
@@ -43,9 +40,6 @@ __all__ = [
     "WorldBatch",
     "WorldError",
     "WorldLayout",
-    "device_of",
-    "devices",
-    "load_device",
     "load_world",
     "poses_of",
     "sensor_of",

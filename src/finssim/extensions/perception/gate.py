@@ -7,11 +7,11 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from finssim.extensions.perception.docking import Hull
 from finssim.extensions.perception.seeing import SeeingTask
 from finssim.physics.solids import box_distance
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.docking import Hull
 from finssim.tasks.terms import (
     End,
     ObservationPart,
@@ -144,6 +144,7 @@ class Gate(SeeingTask):
         ObservationPart("gate rotation relative to the body, first two columns", 6, "1", term="goal_columns"),
         *own_velocity(clip=2.0),
     )
+    baselines: ClassVar = {"post-servo": "finssim.extensions.perception.servos:PostServo"}
     name: str = "gate"
     world: str = "gate"
     time_limit: float = 25.0

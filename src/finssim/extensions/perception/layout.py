@@ -81,6 +81,10 @@ class WorldLayout:
         self.draws = wp.zeros(worlds, dtype=int, device=self.device)
         WorldLayout._place(self, np.arange(worlds))
 
+    def layout(self, worlds: int, device: str) -> WorldLayout:
+        """Return itself: where a world is asked for, its copies may be given."""
+        return self
+
     def draw(self, seed: ArrayLike, mask: ArrayLike | None = None, held_out: bool = False) -> None:
         """Draw poses of objects, water, look and colours of worlds; world w depends on its seed and w alone.
 

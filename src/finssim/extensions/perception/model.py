@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -14,6 +15,10 @@ from finssim.core.budget import decoded_picture, read_bytes
 from finssim.core.rotations import quat_rotate
 from finssim.extensions.perception.description import Light, Look, Texture, World, WorldError
 from finssim.extensions.perception.layout import WorldLayout
+
+if TYPE_CHECKING:
+    from finssim.extensions.perception.onboard import OnboardSensors
+    from finssim.vehicles import Vehicle
 
 # Pictures and printed tags on shapes, as reflectances.
 
@@ -252,6 +257,12 @@ class WorldBatch(WorldLayout):
                     picture, row["size"], row["contrast"] = picture_of(self.world, texture)
                     self._pictures.append(picture)
         return table
+
+    def sensors(self, vehicle: Vehicle, names: Sequence[str], seed: int) -> OnboardSensors:
+        """Return some of a vehicle's cameras and sonars in this world, which must be one; see `OnboardSensors`."""
+        from finssim.extensions.perception.onboard import OnboardSensors
+
+        return OnboardSensors(vehicle, self, names=names, seed=seed)
 
 
 def _suns(light: Light, drawn: np.ndarray) -> np.ndarray:

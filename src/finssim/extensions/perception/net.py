@@ -10,10 +10,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.extensions.perception.seeing import SeeingTask, up
-from finssim.extensions.perception.sight import Picture
 from finssim.physics.types import vec6
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.picture import Picture
 from finssim.tasks.terms import (
     End,
     ObservationPart,
@@ -229,6 +229,7 @@ class Net(SeeingTask):
         ObservationPart("up, body frame", 3, "1", term=up),
         *own_velocity(clip=2.0),
     )
+    baselines: ClassVar = {"wall-follower": "finssim.extensions.perception.servos:WallFollower"}
     name: str = "net"
     observation: tuple[ObservationPart, ...] = (
         ObservationPart("up, body frame", 3, "1", term=up),

@@ -6,15 +6,13 @@ Each is (rows, columns, 2, 3): where a ray enters the water [m], and its unit di
 from __future__ import annotations
 
 import math
-from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.frames import FROM_OPTICAL
 from finssim.core.optics import Camera, Interface, Layer, Lens, back_project
-from finssim.extensions.perception.description import Port, RangeDevice, SonarDevice
+from finssim.vehicles.devices import Port, RangeDevice, SonarDevice
 
 Array = NDArray[np.float64]
 
@@ -70,35 +68,6 @@ def fan(device: SonarDevice, beams: int | None = None) -> Array:
         axis=-1,
     )
     return np.stack([np.zeros_like(directions), directions], axis=2)
-
-
-def fan_picture(levels: NDArray[Any], sector: float, side: int = 720) -> NDArray[Any]:
-    """A sonar's picture as a fan seen from above, the sonar at the bottom, ahead upwards; NaN outside.
-
-    Args:
-        levels: By beam, 0 at the left, and range cell, (beams, bins).
-        sector: Field of view [rad].
-        side: Rows of the result, one range long [-].
-
-    Returns:
-        (side, columns).
-    """
-    rows, columns, inside = _fan_cells(*levels.shape, sector, side)
-    return np.where(inside, levels[rows, columns], np.nan)
-
-
-@cache
-def _fan_cells(beams: int, bins: int, sector: float, side: int) -> tuple[NDArray[Any], ...]:
-    """Beam and range cell of each pixel of a fan, and whether it lies in it, (side, columns) each."""
-    half = min(1.0, math.sin(min(0.5 * sector, 0.5 * math.pi)))
-    x = np.linspace(-half, half, round(2.0 * half * side))
-    y = np.linspace(1.0, 0.0, side)[:, None]
-    radius, azimuth = np.hypot(x, y), np.arctan2(-x, y)
-    beam = (0.5 - azimuth / sector) * beams
-    cell = radius * bins
-    inside = (beam >= 0.0) & (beam < beams) & (cell < bins)
-    rows, columns = (np.where(inside, index, 0).astype(int) for index in (beam, cell))
-    return rows, columns, inside
 
 
 def ray_elevations(device: SonarDevice) -> Array:

@@ -6,10 +6,10 @@ from typing import ClassVar
 
 import warp as wp
 
-from finssim.extensions.perception.sight import Picture
 from finssim.sim import Pool
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.measurement import TRAINING, MeasurementNoise
+from finssim.tasks.picture import Picture
 from finssim.tasks.task import Task
 from finssim.tasks.terms import ObservationPart, own_velocity
 

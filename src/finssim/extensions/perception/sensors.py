@@ -21,20 +21,14 @@ import numpy as np
 import warp as wp
 from scipy.special import ndtri
 
-from finssim.extensions.perception.description import (
-    CameraDevice,
-    Mount,
-    RangeDevice,
-    SonarDevice,
-    WorldError,
-    device_of,
-)
+from finssim.extensions.perception.description import WorldError
 from finssim.extensions.perception.model import Optics, Surface, WorldBatch
 from finssim.extensions.perception.rays import WATER_INDEX, camera_rays, cones, fan, ray_elevations
 from finssim.physics.types import angular, linear, vec6
 from finssim.sim.overhead_camera.photometry import fresnel, noise_key, refracted, through_water
 from finssim.sim.sensors.dvl import sensed_velocity
 from finssim.vehicles import Vehicle
+from finssim.vehicles.devices import CameraDevice, Mount, RangeDevice, SonarDevice, device_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -685,21 +679,20 @@ class CameraBatch(RayBatch):
         linear: bool = False,
         twists: wp.array | None = None,
     ) -> None:
-        self.camera, self.lens, sensor = camera, camera.lens(width), camera.sensor
+        self.camera, self.lens = camera, camera.lens(width)
         super().__init__(batch, camera_rays(self.lens, camera.port), camera.mount, vehicles)
         shape = self.depth.shape
         self.twists = twists if camera.exposure_time > 0.0 else None
         keep = linear or self.twists is not None
-        code = 255.0 * np.linspace(0.0, 1.0, LEVELS) ** (1.0 / sensor.gamma) + 0.5
+        code = 255.0 * np.linspace(0.0, 1.0, LEVELS) ** (1.0 / camera.gamma) + 0.5
         with wp.ScopedDevice(self.device):
             self.reading = self.picture = wp.zeros((*shape, 3), dtype=wp.uint8)
             self.radiance = wp.zeros(shape if keep else (0, 0, 0), dtype=wp.vec3)
             self._moved = wp.zeros(self.count, dtype=wp.transform)
-            self.gain = wp.full(self.count, wp.vec3(sensor.gain), dtype=wp.vec3)
+            self.gain = wp.full(self.count, wp.vec3(camera.gain), dtype=wp.vec3)
             self._normal = wp.array(np.float32(ndtri((np.arange(1024) + 0.5) / 1024)), dtype=float)
             self._code = wp.array(np.uint8(code), dtype=wp.uint8)
             self._lamps = wp.array([_lamp(lamp) for lamp in lamps], dtype=Lamp)
-        self._sensor = sensor
 
     def update(
         self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
@@ -723,12 +716,11 @@ class CameraBatch(RayBatch):
                 wp.launch(_move, self.count, inputs, device=self.device)
             self._expose(self._moved if moments > 1 else poses, seed, time, mask, k, moments)
         if self.camera.exposure == "auto":
-            sensor = self._sensor
             inputs = [
                 self.worlds,
                 self.picture,
                 AUTO_MEAN,
-                sensor.gamma,
+                self.camera.gamma,
                 self.camera.white_balance,
                 self.gain,
             ]
@@ -742,7 +734,7 @@ class CameraBatch(RayBatch):
         self.cast(poses, mask)
         if moments > 1 and k == 0:
             wp.launch(_clear, self.radiance.shape, [self.worlds, self.radiance], device=self.device)
-        sensor, key = self._sensor, -1 if seed is None else noise_key(seed, time)
+        key = -1 if seed is None else noise_key(seed, time)
         inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, poses, self.worlds]
         inputs += [
             self.dimming,
@@ -756,7 +748,7 @@ class CameraBatch(RayBatch):
             int(k == moments - 1),
             self.gain,
         ]
-        inputs += [sensor.full_well, sensor.read_noise, self._code, self._normal, key]
+        inputs += [self.camera.full_well, self.camera.read_noise, self._code, self._normal, key]
         inputs += [self._span(self.depth.shape[2]), self.radiance, self.picture]
         wp.launch(_take_picture, self._blocks(self.depth), inputs, device=self.device)
 

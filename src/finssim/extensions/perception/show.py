@@ -10,19 +10,11 @@ from typing import Annotated, Any
 import numpy as np
 
 from finssim.core.files import atomic_write
+from finssim.core.sonar_fan import fan_picture
 from finssim.evaluation.figures import DPI, new_figure
 from finssim.evaluation.tables import Table
-from finssim.extensions.perception.description import (
-    CameraDevice,
-    SonarDevice,
-    World,
-    WorldError,
-    devices,
-    load_device,
-    load_world,
-    sites,
-)
-from finssim.extensions.perception.rays import fan_picture
+from finssim.extensions.perception.description import World, WorldError, load_world, sites
+from finssim.vehicles.devices import CameraDevice, SonarDevice, devices, load_device
 
 WIDTH = 800
 """Width of the camera's part of a picture [px], each the mean of 2 x 2 rays."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,14 +10,15 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.core.rotations import quat_inverse_rotate
-from finssim.extensions.perception.description import CameraDevice, RangeDevice, SonarDevice, device_of
 from finssim.sim.simulator import Simulator
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
-from finssim.vehicles import Vehicle
+from finssim.vehicles.devices import CameraDevice, RangeDevice, SonarDevice, device_of
 
 if TYPE_CHECKING:
+    from finssim.extensions.perception.description import World
     from finssim.extensions.perception.layout import WorldLayout
+    from finssim.extensions.perception.model import WorldBatch
     from finssim.tasks.task import Task
 
 DRAWS = 1_000_003
@@ -44,41 +44,14 @@ def put_goal(task: Task, layout: WorldLayout, arrays: TaskArrays) -> None:
         arrays.reference.position.assign(np.float32(np.stack(places, axis=1)))
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A picture that a task observes: of a camera in colours, of a sonar the echoes by beam and range."""
+def drawn_for(task: Task, world: World, arrays: TaskArrays, seed: int) -> WorldBatch:
+    """Return one copy of a world, drawn as for the first episode of a task, whose goal is set to the landmark."""
+    from finssim.extensions.perception.model import WorldBatch
 
-    name: str
-    """Name of the entry in the vehicle's `perception`, such as `front_camera`."""
-    width: int | None = None
-    """Columns of a camera's [px], in place of the entry's; the height follows."""
-    bins: int | None = None
-    """The nearest range cells of a sonar, so many; all if None."""
-
-    def device(self, vehicle: Vehicle) -> CameraDevice | SonarDevice:
-        """Return the device that takes it, a sonar with the range of its cells.
-
-        Raises:
-            EnvironmentSetupError: The vehicle's sensor takes no pictures.
-            WorldError: The vehicle has no such sensor, or it is refused.
-        """
-        device = device_of(vehicle, self.name)
-        if isinstance(device, RangeDevice):
-            raise EnvironmentSetupError(
-                f"{vehicle.name}: perception.{self.name} measures ranges, expected a camera or a sonar"
-            )
-        if isinstance(device, CameraDevice):
-            return device
-        bins = min(self.bins or device.bins, device.bins)
-        return device.model_copy(update={"bins": bins, "range": device.range * bins / device.bins})
-
-    def shape(self, vehicle: Vehicle) -> tuple[int, int, int]:
-        """(height, width, 3), row 0 at the top; of a sonar (beams, range cells, 1), beam 0 at the left."""
-        device = self.device(vehicle)
-        if isinstance(device, SonarDevice):
-            return device.beams, device.bins, 1
-        lens = device.lens(self.width)
-        return lens.height, lens.width, 3
+    batch = WorldBatch(world)
+    batch.draw(first_draw(seed), held_out=task.held_out)
+    put_goal(task, batch, arrays)
+    return batch
 
 
 @wp.kernel(enable_backward=False)
@@ -116,7 +89,7 @@ class Sight:
         final_pictures: The last of the episodes that ended last, the same shapes.
     """
 
-    def __init__(self, task: Task, simulator: Simulator, arrays: TaskArrays, seed: int) -> None:
+    def __init__(self, task: Task, world: World, simulator: Simulator, arrays: TaskArrays, seed: int) -> None:
         """Build the world and the sensors; `begin` takes the first pictures.
 
         Raises:
@@ -133,7 +106,7 @@ class Sight:
         self._task, self._state, self._arrays, self.seed = task, simulator.state, arrays, seed
         self._poses_of, self._vehicle = poses_of, simulator.vehicles[0]
         try:
-            self.batch = WorldBatch(task.world, simulator.worlds, str(simulator.device))
+            self.batch = WorldBatch(world, simulator.worlds, str(simulator.device))
         except ModuleNotFoundError as error:
             raise EnvironmentSetupError(
                 f"task '{task.name}' sees, which needs {error.name}: pip install 'finssim[perception]'"
@@ -195,7 +168,7 @@ class Sight:
         self._mask.assign(mask.astype(np.int32))
         poses = self._poses_of(self._state, self._poses)
         for camera in self._metered.values():
-            gain = wp.vec3(camera.camera.sensor.gain)
+            gain = wp.vec3(camera.camera.gain)
             wp.launch(_fill_masked, len(mask), [self._mask, gain, camera.gain], device=camera.device)
             for _ in range(SETTLING):
                 camera.update(poses, mask=self._mask)
@@ -221,7 +194,7 @@ class Sight:
 
     def shown(self, world: int) -> dict[str, NDArray[np.uint8]]:
         """The pictures of one world for people, (height, width, 3): those of cameras, and a sonar's as a gray fan."""
-        from finssim.extensions.perception.rays import fan_picture
+        from finssim.core.sonar_fan import fan_picture
 
         out = {}
         for name, pictures in self.pictures.items():

@@ -1,4 +1,7 @@
-"""`finssim ros2 up`: a complete graph of nodes as processes, without ROS installed."""
+"""Run ROS 2 nodes, with or without a ROS 2 installation.
+
+Example: finssim ros2 up pool
+"""
 
 from __future__ import annotations
 
@@ -313,7 +316,7 @@ def _wire(plan: Plan, o: Options) -> None:
     plan.set("camera", pictures=o.pictures or eye)
 
 
-def up(graph: str, *, options: Options, notify: Callable[[str], None] = print) -> int:
+def up(graph: str, *, options: Annotated[Options, "options"], notify: Callable[[str], None] = print) -> int:
     """Start a graph of nodes as processes, print its topics and events, and stop it with Ctrl-C.
 
     Exit status 1: a node died. 3: the bridge ended in a fault.

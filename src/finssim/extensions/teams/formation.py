@@ -303,6 +303,7 @@ class Formation(Team):
     agents: ClassVar[tuple[str, ...]] = ("corner_1", "corner_2", "corner_3")
     succeeds: ClassVar[str] = "delivered"
     title: ClassVar[str] = "catch what drifts in a net and carry it, three together"
+    baselines: ClassVar = {"consensus": "finssim.extensions.teams.baselines:ConsensusFormation"}
     name: str = "formation"
     observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
     spawn_radius: float = 1.0

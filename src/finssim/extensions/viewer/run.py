@@ -106,7 +106,7 @@ def open_source(choice: Choice) -> Source:
 
 
 def run(
-    choice: Choice,
+    choice: Annotated[Choice, "options"],
     *,
     speed: Annotated[float, (0.01, 100.0)] = 1.0,
     port: Annotated[int, (1, 65535)] = 8080,

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.core.rotations import quat_yaw
-from finssim.extensions.viewer.frame import Curve, Pose, ViewError, nowhere
+from finssim.extensions.viewer.frame import Curve, Pose, nowhere
 
 __all__ = ["Errors", "HEADING", "POSITION", "PoseSeries", "Series", "errors_between"]
 
@@ -135,52 +135,3 @@ def _error(a: Pose | None, b: Pose | None) -> tuple[float, float]:
     of_a, of_b = ((p.position[None], np.atleast_1d(quat_yaw(p.quaternion))) for p in (a, b))
     distance, turn = errors_between(of_a, of_b)
     return float(distance[0]), float(turn[0])
-
-
-# The clocks of a record and of a truth file, laid over each other by the motion that both show.
-
-COARSE, FINE = 0.2, 0.01
-"""Steps of the search [s]."""
-SAMPLES = 400
-"""Number of samples of the estimate that are compared."""
-LONGEST = 86_400.0
-"""Longest duration of truth and estimate together [s]; the search takes 0.1 ms for each of its steps."""
-OVERLAP = 0.5
-"""Part of the estimate that the truth must cover."""
-
-
-def offset_between(estimate: PoseSeries, time: Array, position: Array) -> float:
-    """Return the time to add to the truth's times so that it matches the estimate [s].
-
-    The one with the least mean square distance, of all under which at least half of the estimate is covered.
-
-    Args:
-        estimate: As recorded, robot's clock.
-        time: Of the truth, pool's clock [s], (k,).
-        position: Of the truth [m], (k, 3).
-
-    Raises:
-        ViewError: The truth is too short, or too long to be searched.
-    """
-    chosen = np.unique(np.linspace(0, len(estimate) - 1, SAMPLES).round().astype(int))
-    t, x = estimate.time[chosen], estimate.position[chosen]
-    finite = np.isfinite(x).all(axis=1)
-    t, x = t[finite], x[finite]
-    first, last = t[0] - time[-1], t[-1] - time[0]
-    if last - first > LONGEST:
-        raise ViewError(
-            f"it lasts {last - first:g} s, expected at most {LONGEST:g} s with the record: give times in s"
-        )
-
-    def error(offset: float) -> float:
-        inside = (t - offset >= time[0]) & (t - offset <= time[-1])
-        if inside.mean() < OVERLAP:
-            return np.inf
-        there = np.stack([np.interp(t[inside] - offset, time, column) for column in position.T], axis=1)
-        return float(np.mean(np.sum((there - x[inside]) ** 2, axis=1)))
-
-    best = min(np.arange(first, last + COARSE, COARSE), key=error)
-    best = min(np.arange(best - COARSE, best + COARSE, FINE), key=error)
-    if not np.isfinite(error(float(best))):
-        raise ViewError("the truth covers less than half of the record: it is not of this run")
-    return float(best)

@@ -8,14 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.core.rotations import quat_to_matrix
-from finssim.extensions.perception import device_of
-from finssim.extensions.perception.description import SonarDevice
+from finssim.core.sonar_fan import fan_picture
 from finssim.extensions.perception.layout import Shape, WorldLayout
-from finssim.extensions.perception.rays import fan_picture
 from finssim.extensions.viewer.frame import Body, Pose
 from finssim.robot.messages import Picture
 from finssim.robot.record_messages import FAN_ROWS
 from finssim.vehicles import Vehicle, VehicleError
+from finssim.vehicles.devices import SonarDevice, device_of
 
 Array = npt.NDArray[np.float64]
 

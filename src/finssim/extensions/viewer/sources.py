@@ -15,8 +15,10 @@ import numpy.typing as npt
 from finssim.control.guidance import Guide, Station
 from finssim.core.rotations import quat_from_yaw
 from finssim.core.yaml_file import json_value
+from finssim.evaluation.clocks import clock_offset
 from finssim.extensions.perception import RangeBatch
 from finssim.extensions.perception.layout import WorldLayout
+from finssim.extensions.perception.onboard import OnboardSensors
 from finssim.extensions.viewer.frame import (
     Curve,
     Frame,
@@ -35,11 +37,9 @@ from finssim.extensions.viewer.series import (
     PoseSeries,
     Series,
     errors_between,
-    offset_between,
 )
 from finssim.extensions.viewer.shapes import shown_of, world_bodies
 from finssim.localization.detection.detector import RegionTracker, detector
-from finssim.pool.onboard import OnboardSensors
 from finssim.pool.plant_spec import PlantSpecError, Severity
 from finssim.pool.run import make_plan
 from finssim.pool.virtual_pool import Truth, read_truth
@@ -473,7 +473,11 @@ class RecordSource:
     def _add_truth(self, truth: Truth, offset: float | None) -> None:
         if offset is None:
             lockstep = float(self._record.get("epoch", "nan")) == 0.0
-            offset = 0.0 if lockstep else offset_between(self._odom, truth.time, truth.position)
+            offset = (
+                0.0
+                if lockstep
+                else clock_offset(self._odom.time, self._odom.position, truth.time, truth.position)
+            )
         self._truth = PoseSeries(truth.time + offset, truth.position, truth.quaternion)
 
     def _picture(self, at: float) -> Picture | None:

@@ -8,7 +8,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from finssim.agents.agents import expert_for
+from finssim.agents.agent import expert_for
 from finssim.control.modes import MODES
 from finssim.learning.episodes import EpisodeTally
 from finssim.learning.layers import Arrays

@@ -12,7 +12,8 @@ import torch
 import warp as wp
 from torch import nn
 
-from finssim.agents.agents import NOWHERE, memory_from, memory_leaves, restarted
+from finssim.agents.agent import NOWHERE
+from finssim.agents.memory import memory_from, memory_leaves, restarted
 from finssim.control.guidance import Known
 from finssim.learning.demonstrations import Demonstrations, load
 from finssim.learning.learners.base import ActingLearner, expert_in

@@ -26,7 +26,8 @@ from typing import Any
 
 import numpy as np
 
-from finssim.agents.agents import NOWHERE, memory_from, memory_leaves, restarted
+from finssim.agents.agent import NOWHERE
+from finssim.agents.memory import memory_from, memory_leaves, restarted
 from finssim.control.guidance import Known
 from finssim.learning.layers import Adam, Array, Arrays, Gru, Parameters, Row, Stack
 from finssim.learning.learners.base import ActingLearner, expert_in

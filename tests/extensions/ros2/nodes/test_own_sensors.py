@@ -17,7 +17,6 @@ import rclpy
 from rclpy.node import Node
 
 from finssim.core.rotations import quat_conjugate, quat_rotate
-from finssim.extensions.perception import device_of, load_device
 from finssim.extensions.perception.rays import cones, fan
 from finssim.extensions.ros2.nodes.camera import Camera
 from finssim.extensions.ros2.nodes.controller import MOST_PICTURES, Controller
@@ -34,6 +33,7 @@ from finssim.extensions.ros2.topics import own_topics, quality_profile
 from finssim.pool.pictures import UdpSender
 from finssim.robot.messages import Picture
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.devices import device_of, load_device
 from finssim.vehicles.equipment import RaySensor
 from reference.policies import seeing
 

@@ -18,7 +18,6 @@ from finssim.core.rotations import (
     quat_rotate,
     quat_to_euler,
 )
-from finssim.extensions.perception import device_of
 from finssim.extensions.ros2.nodes.conversions import ros_type, xyz, xyzw
 from finssim.extensions.ros2.nodes.robot_node import RobotNode
 from finssim.localization.fusion.estimator import Estimator
@@ -28,6 +27,7 @@ from finssim.localization.poses import axes_of_up
 from finssim.robot.reading import Reading
 from finssim.robot.record_messages import own_kind
 from finssim.vehicles import Vehicle
+from finssim.vehicles.devices import device_of
 
 Array = npt.NDArray[np.float64]
 

@@ -5,20 +5,15 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import warp as wp
 
-from finssim.extensions.perception import RangeBatch, WorldBatch, WorldLayout, load_world, sensor_of
-from finssim.pool.drawn_plant import site_of
-from finssim.pool.plant_spec import Basin, PlantSpec
+from finssim.extensions.perception import RangeBatch, WorldBatch, WorldLayout, sensor_of
+from finssim.extensions.perception.description import World
 from finssim.pool.positioning import Exposure, Mail, PoseAt, Shutter
 from finssim.robot.messages import Picture
 from finssim.vehicles import Vehicle
-
-__all__ = ["Cameras", "OnboardPlan", "OnboardSensors", "site_of_world"]
-
 
 SETTLING = 3
 """Pictures of automatic exposure before time begins."""
@@ -63,7 +58,7 @@ class OnboardSensors:
     def __init__(
         self,
         vehicle: Vehicle,
-        world: WorldBatch | str,
+        world: WorldBatch | World | str,
         *,
         names: Sequence[str] | None = None,
         seed: int = 0,
@@ -111,33 +106,27 @@ class OnboardSensors:
         return replace(picture, **{"ranges" if isinstance(sensor, RangeBatch) else "image": developed})
 
 
-class Cameras:
-    """Several cameras as one."""
-
-    def __init__(self, *cameras: Any) -> None:
-        self._cameras = cameras
-
-    def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Picture]:
-        """Pictures of all; see `OnboardSensors.advance`."""
-        return [picture for camera in self._cameras for picture in camera.advance(t0, t1, pose_at)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class OnboardPlan:
     """Arguments of `OnboardSensors`, so that another process can make them."""
 
     vehicle: Vehicle
-    world: str
-    """Site of the catalogue, or a path."""
+    world: World
+    """Around the vehicle."""
     seed: int
     solid: bool = True
     """True if the hull collides with the world's bodies: not if the water is that of another site."""
+
+    @property
+    def name(self) -> str:
+        """Name of the world."""
+        return self.world.name
 
     def layout(self) -> WorldLayout | None:
         """Return the bodies that the hull collides with, drawn as the sensors see them."""
         if not self.solid:
             return None
-        layout = WorldLayout(self.world)
+        layout = self.world.layout()
         layout.draw(self.seed)
         return layout
 
@@ -148,20 +137,3 @@ class OnboardPlan:
     def shutter(self) -> Shutters:
         """When they measure."""
         return Shutters(self.vehicle, list(self.vehicle.perception), self.seed)
-
-
-def site_of_world(name: str, spec: PlantSpec) -> PlantSpec:
-    """The plant in the water of a world: its basin, or open water above its seabed.
-
-    Args:
-        name: Site of the catalogue of worlds, or a path.
-        spec: Drawn for the pool.
-    """
-    world = load_world(name)
-    if world.basin is not None:
-        length, width, depth = world.basin.size.tolist()
-        basin = Basin(length=length, width=width, depth=depth)
-        return spec if basin == spec.basin else spec.model_copy(update={"basin": basin, "tether": None})
-    spec = site_of("open-water", spec)
-    depth = spec.basin.depth if world.seabed is None else world.seabed.depth
-    return spec.model_copy(update={"basin": spec.basin.model_copy(update={"depth": depth})})

@@ -10,10 +10,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.extensions.perception.description import load_world
-from finssim.extensions.perception.docking import Hull
 from finssim.extensions.perception.seeing import SeeingTask, up
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.docking import Hull
 from finssim.tasks.terms import (
     End,
     ObservationPart,
@@ -159,6 +159,7 @@ class Pipeline(SeeingTask):
         ObservationPart("up, body frame", 3, "1", term=up),
         *own_velocity(clip=2.0),
     )
+    baselines: ClassVar = {"line-follower": "finssim.extensions.perception.servos:LineFollower"}
     name: str = "pipeline"
     world: str = "pipeline"
     time_limit: float = 45.0

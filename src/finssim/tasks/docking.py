@@ -1,4 +1,4 @@
-"""Docking: enter a funnel nose first, gently, and stay in its tube; its pose is given, or found in a picture."""
+"""Docking: enter a funnel nose first, gently, and stay in its tube."""
 
 import math
 from collections.abc import Sequence
@@ -7,14 +7,12 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from finssim.agents.pid import axis_model
-from finssim.extensions.perception.seeing import SeeingTask
+from finssim.control.axis_model import axis_model
 from finssim.physics.types import vec6
 from finssim.sim import Dock, Pool
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.fitting import coefficients_of
-from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import TRAINING, MeasurementNoise
 from finssim.tasks.task import Task
 from finssim.tasks.terms import End, ObservationPart, RewardTerm, Terms, Total, own_velocity, tilted, uniform3
@@ -189,6 +187,7 @@ class Docking(Task):
     fails: ClassVar[tuple[str, ...]] = ("crash",)
     title: ClassVar[str] = "enter a funnel nose first, gently"
     needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
+    baselines: ClassVar = {"align-insert": "finssim.agents.docking:DockingPid"}
     name: str = "docking"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 40.0
@@ -322,72 +321,3 @@ class Docking(Task):
                 Total("peak_force", "wp.max(was, force)"),
             ),
         )
-
-
-# The same by camera: find a dock in the picture.
-
-
-MOUTH, THROAT, CONE, TUBE = 0.745, 0.32, 0.75, 0.93
-"""Inner radii of the funnel of the site `dock`, its length, and that of its tube up to the plate [m]."""
-
-
-@wp.func
-def start_at_site(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """The dock where the world has it, or where `Docking` draws it, and a vehicle at rest before its mouth."""
-    x = arrays.goal_position[w]
-    q = arrays.goal_quaternion[w]
-    start(state, arrays, p, key, w)
-    if p.placed:
-        back = wp.quat_inverse(arrays.goal_quaternion[w])
-        state.position[w, 0] = x + wp.quat_rotate(q * back, state.position[w, 0] - arrays.goal_position[w])
-        state.quaternion[w, 0] = q * back * state.quaternion[w, 0]
-        arrays.goal_position[w] = x
-        arrays.goal_quaternion[w] = q
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraDocking(SeeingTask, Docking):
-    """Docking into the dock of the site `dock`, whose pose, look and light differ in each episode.
-
-    The row of numbers holds attitude, velocity and depth alone: where the dock is, the picture shows. What `docking`
-    observes is `teacher`, for who may know it in training.
-    """
-
-    title: ClassVar[str] = "dock by camera"
-    landmark: ClassVar[str] = "dock"
-    teacher: ClassVar[tuple[ObservationPart, ...]] = OBSERVATION
-    name: str = "camera-docking"
-    world: str = "dock"
-    time_limit: float = 30.0
-    cone: float = math.atan((MOUTH - THROAT) / CONE)
-    berth: float = 0.55
-    inside: float = 0.3
-    start: tuple[float, float] = (2.0, 4.5)
-    start_aside: tuple[float, float] = (1.2, 0.6)
-    turn: float = math.radians(15.0)
-    tank: tuple[float, float] = (10.0, 6.0)
-
-    def fitted(self, vehicles: Sequence[Vehicle]) -> "CameraDocking":
-        """For the vehicle, if it fits into the dock."""
-        fitted = replace(self, hull=Hull.of(vehicles[0]))
-        if fitted.hull.girth > 0.95 * THROAT:
-            raise EnvironmentSetupError(
-                f"vehicle '{vehicles[0].name}' is {2.0 * fitted.hull.girth:.2f} m across its corners, and the dock of "
-                f"site 'dock' takes {2.0 * 0.95 * THROAT:.2f} m: take a slimmer one, such as finsrov"
-            )
-        return fitted
-
-    def dock(self) -> Dock:
-        """The funnel that the picture shows, with stiffness and damping as of `Docking`."""
-        return replace(
-            super().dock(),
-            mouth_radius=MOUTH, throat_radius=THROAT, cone_length=CONE, tube_length=TUBE, rim=0.06,
-        )  # fmt: skip
-
-    def arena(self) -> Pool:
-        """Up to the quay and the bottom; without the world, where the dock looks any way, as wide as long."""
-        return replace(Docking.arena(self), length=24.0, width=7.8 if self.placed else 24.0, depth=4.95)
-
-    def terms(self) -> Terms:
-        """Return the terms of `Docking`."""
-        return replace(super().terms(), start=start_at_site)

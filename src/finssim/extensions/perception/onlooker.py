@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,8 +9,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.core.rotations import quat_from_euler, quat_from_yaw, quat_rotate, quat_yaw
+from finssim.extensions.perception.description import Object, Variation, World
 from finssim.tasks.environment import Environment
 from finssim.tasks.given import EnvironmentSetupError
+from finssim.vehicles.devices import CameraDevice
 
 COLOURS = ((0.95, 0.45, 0.04), (0.10, 0.45, 0.90), (0.85, 0.10, 0.15), (0.55, 0.75, 0.15))
 """Colours of the vehicles' floats, in turn."""
@@ -31,23 +32,24 @@ class Onlooker:
     A task without a world of its own is drawn in a tiled basin of its arena's size.
     """
 
-    def __init__(self, environment: Environment, world: int = 0, width: int = 640) -> None:
+    def __init__(self, environment: Environment, site: World, world: int = 0, width: int = 640) -> None:
         """Build a copy of the world that also has the vehicles in it.
 
         Args:
             environment: Whose.
+            site: World that is drawn around a task without one.
             world: Its number.
             width: Of the pictures [px]; their height is 9/16 of it.
 
         Raises:
             EnvironmentSetupError: Newton is not installed.
         """
-        from finssim.extensions.perception import CameraBatch, WorldBatch, load_world
-        from finssim.extensions.perception.description import CameraDevice, Object, Variation
+        from finssim.extensions.perception.model import WorldBatch
+        from finssim.extensions.perception.sensors import CameraBatch
 
         self._environment, self._index = environment, world
         sight, task = environment.sight, environment.task
-        site = load_world("pool") if sight is None else sight.batch.world
+        site = site if sight is None else sight.batch.world
         self._landmark = task.landmark
         objects = dict(site.objects) if sight is not None else {}
         free = Variation()
@@ -114,14 +116,3 @@ class Onlooker:
         self._settled = True
         picture: NDArray[np.uint8] = self._camera.picture.numpy()[0].copy()
         return picture
-
-
-def write_video(path: Path, pictures: list[NDArray[np.uint8]], rate: float) -> None:
-    """Write pictures of one size as a film (.mp4), so many a second [Hz]."""
-    import cv2
-
-    height, width = pictures[0].shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
-    for picture in pictures:
-        writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    writer.release()

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("newton", reason="finssim[perception] is not installed")
 
 from finssim.core.rotations import quat_from_yaw
-from finssim.pool.onboard import OnboardSensors
+from finssim.extensions.perception.onboard import OnboardSensors
 from finssim.pool.plant_spec import PlantSpecError
 from finssim.pool.run import LockstepServer, make_plan, run
 from finssim.robot.goals import station_of

@@ -1,0 +1,100 @@
+"""The classical way into a dock: come before its mouth, turn to it, and go in as far as the nose is on the axis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from finssim.agents.baselines import LEVEL, PERIOD, Array, Rows, WrenchPid, turned_from
+from finssim.agents.pid import PidMemory
+from finssim.control.guidance import Goal, Track
+from finssim.core.rotations import quat_rotate
+from finssim.tasks.docking import DISTANCE_SCALE as DOCK_SCALE
+from finssim.tasks.docking import Docking
+from finssim.vehicles import Vehicle
+
+
+@dataclass(frozen=True)
+class DockingPid(WrenchPid):
+    """A PID whose goal runs ahead of the nose, along the dock's axis, while nose and heading are right.
+
+    In dock axes. Beside the axis, or turned away, the goal is the waiting place before the mouth; there is no switch
+    between the two: the goal moves with how right it is.
+    """
+
+    nose: float
+    """Distance of the vehicle's nose from its origin [m]."""
+    berth: float
+    """Final place of the nose, along the axis [m]."""
+    wait: float
+    """Place where the nose waits until it is aligned, along the axis [m]."""
+    gap: float
+    """Greatest distance of the nose from the axis in the tube [m]; towards the mouth it grows by `slope`."""
+    slope: float
+    lead: float
+    """Distance of the goal ahead of the nose [m], which sets the speed."""
+    turn: float = np.radians(15.0)
+    """Greatest angle away from the axis [rad]."""
+
+    @classmethod
+    def for_vehicle(
+        cls,
+        vehicle: Vehicle,
+        period: float = PERIOD,
+        task: Docking | None = None,
+        lead: float = 0.25,
+        **more: Any,
+    ) -> Any:
+        """For a vehicle and its dock.
+
+        Args:
+            vehicle: Its file.
+            period: Time between two actions [s].
+            task: Whose dock it is; None: that of `Docking`.
+            lead: How far the goal runs ahead of the nose, in lengths of the vehicle.
+            more: Further fields.
+        """
+        task = (task or Docking()).fitted([vehicle])
+        dock, hull = task.dock(), task.hull
+        return cls(
+            WrenchPid.for_vehicle(vehicle, period).pid,
+            nose=0.5 * hull.length,
+            berth=task.berth * dock.tube_length,
+            wait=-dock.cone_length - 0.5 * hull.length,
+            gap=dock.throat_radius - hull.girth,
+            slope=0.5 * np.tan(task.cone),
+            lead=lead * hull.length,
+            **more,
+        )
+
+    def act(self, memory: PidMemory, observation: Rows) -> tuple[Rows, PidMemory]:
+        """Actions for observations of docking."""
+        o = np.asarray(observation, float)
+        return self.steer(memory, DOCK_SCALE * o[..., 15:18], turned_from(o), o[..., 9:15])
+
+    def steer(self, memory: PidMemory, nose: Array, q: Array, nu: Array) -> tuple[Rows, PidMemory]:
+        """Actions for where the nose is.
+
+        Args:
+            memory: Of the PID.
+            nose: From the throat, dock axes [m], (n, 3).
+            q: Body to dock axes, xyzw, (n, 4).
+            nu: Twist, body frame [m/s, rad/s], (n, 6).
+        """
+        arm = np.array([self.nose, 0.0, 0.0])
+        aim = np.zeros_like(nose)
+        aim[..., 0] = self._ahead(nose, quat_rotate(q, [1.0, 0.0, 0.0]))
+        level = np.broadcast_to(LEVEL, q.shape)
+        track = Track(nose - quat_rotate(q, arm), q, nu)
+        return self.command(memory, track, Goal(aim - arm, level))
+
+    def _ahead(self, nose: Array, forward: Array) -> Array:
+        """Return the nose's next place on the axis [m], (n,), from its position and direction, dock axes, (n, 3)."""
+        aside = np.hypot(nose[..., 1], nose[..., 2])
+        allowed = self.gap + self.slope * np.maximum(-nose[..., 0], 0.0)
+        turned = np.arccos(np.clip(forward[..., 0], -1.0, 1.0))
+        right = np.clip(2.0 - np.maximum(aside / allowed, turned / self.turn), 0.0, 1.0)
+        onward = np.minimum(nose[..., 0] + self.lead, self.berth)
+        return np.asarray(self.wait + right * (np.maximum(onward, self.wait) - self.wait))

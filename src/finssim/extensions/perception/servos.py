@@ -1,0 +1,490 @@
+"""Baselines that see: classical controllers that find a dock, a gate, a pipeline or a net in pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.agents.baselines import (
+    PERIOD,
+    Array,
+    Mask,
+    Pictures,
+    Rows,
+    WrenchPid,
+    attitude_from,
+    heading_rate,
+)
+from finssim.agents.docking import DockingPid
+from finssim.agents.drive import DriveBaseline, DriveNumbers
+from finssim.agents.pid import PidMemory
+from finssim.core.rotations import quat_conjugate, quat_from_yaw, quat_multiply, quat_rotate
+from finssim.extensions.perception.camera_docking import CameraDocking
+from finssim.extensions.perception.gate import HALF, Gate
+from finssim.extensions.perception.net import RANGE_SCALE, Net
+from finssim.extensions.perception.pipeline import Pipeline
+from finssim.extensions.perception.seeing import DEPTH_SCALE
+from finssim.tasks.task import Task
+from finssim.vehicles import Vehicle
+from finssim.vehicles.devices import device_of
+
+
+def camera_of(vehicle: Vehicle, task: Task) -> dict[str, Any]:
+    """Return the camera of a task: focal length as a share of its width, and position, body axes [m]."""
+    device = device_of(vehicle, task.pictures[0].name)
+    return {"focal_share": device.focal_length / device.width, "eye": tuple(device.mount.position.tolist())}
+
+
+class SightMemory(NamedTuple):
+    """Memory of `LightServo`; the axes are level, at the start, with x in the vehicle's initial direction."""
+
+    position: Array
+    """Position of the body origin, by its velocity and depth [m], (n, 3)."""
+    heading: Array
+    """[rad], (n,)."""
+    dock: Array
+    """Its throat [m] and heading [rad] as far as known, (n, 4)."""
+    looks: Array
+    """Pictures that it is the mean of, (n,)."""
+    pid: PidMemory
+
+
+@dataclass(frozen=True)
+class LightServo(DockingPid):
+    """`DockingPid` towards a dock whose pose comes from the four guide lights in the picture.
+
+    The upper two are white, the lower two red, in the corners of an upright square of known side. The height of each
+    pair in the picture gives its distance, their middle the bearing, the difference of the distances the dock's
+    heading. A picture counts where all four are in it; the estimate is the mean of the last dozen, and between them,
+    and in the funnel, the vehicle dead-reckons by its velocity.
+    """
+
+    focal_share: float = 0.0
+    """Focal length as a share of the picture's width."""
+    eye: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Position of the camera, body axes [m]."""
+    side: float = 1.16
+    """Side of the square of lights [m]."""
+    before: float = 0.78
+    """Distance of the square before the throat [m]."""
+    first: float = 2.8
+    """Assumed distance of the dock until it has been found [m]."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD, **more: Any) -> Any:
+        """For a vehicle with a `front_camera`, the dock of the site `dock`, and the time between two actions [s]."""
+        task = CameraDocking()
+        return super().for_vehicle(vehicle, period, task, lead=0.4, **camera_of(vehicle, task))
+
+    def reset(self, n: int) -> SightMemory:
+        """A dock straight ahead, unseen."""
+        dock = np.tile([self.first, 0.0, 0.0, 0.0], (n, 1))
+        return SightMemory(np.zeros((n, 3)), np.zeros(n), dock, np.zeros(n), self.pid.reset(n))
+
+    def act(self, memory: SightMemory, observation: Rows, pictures: Pictures) -> tuple[Rows, SightMemory]:  # type: ignore[override]
+        """Actions for observations and pictures of docking by camera."""
+        o = np.asarray(observation, float)
+        up, nu, depth = o[:, :3], o[:, 3:9], DEPTH_SCALE * o[:, 9]
+        q, position = attitude_from(up, memory.heading), memory.position.copy()
+        position[:, 2] = -depth
+        fresh = memory.looks == 0.0
+        dock = memory.dock.copy()
+        dock[fresh, 2] = position[fresh, 2]
+        bearing, heading, visible = self.measure(next(iter(pictures.values())), up)
+        measured_dock = np.column_stack(
+            [position + quat_rotate(q, bearing + self.eye), memory.heading + heading]
+        )
+        count = memory.looks + visible
+        share = np.where(visible, 1.0 / np.clip(count, 1.0, 12.0), 0.0)[:, None]
+        dock += share * np.where(visible[:, None], measured_dock - dock, 0.0)
+        q_dock = quat_from_yaw(dock[:, 3])
+        throat = dock[:, :3] + quat_rotate(q_dock, [self.before, 0.0, 0.0]) * (count > 0.0)[:, None]
+        nose = position + quat_rotate(q, [self.nose, 0.0, 0.0]) - throat
+        own = quat_multiply(quat_conjugate(q_dock), q)
+        action, pid = self.steer(memory.pid, quat_rotate(quat_conjugate(q_dock), nose), own, nu)
+        moved = position + self.period * quat_rotate(q, nu[:, :3])
+        turned = memory.heading + self.period * heading_rate(up, nu)
+        return action, SightMemory(moved, turned, dock, count, pid)
+
+    def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, Mask]:
+        """The square of lights in pictures.
+
+        Args:
+            picture: uint8 (n, height, width, 3).
+            up: World's up in the body [-], (n, 3).
+
+        Returns:
+            Its middle from the camera, body frame [m], (n, 3); its heading from the vehicle's [rad], (n,); where all
+            four lights are in the picture, (n,).
+        """
+        red, green, blue = np.moveaxis(picture.astype(float), -1, 0)
+        rows, columns = np.mgrid[: red.shape[1], : red.shape[2]]
+        lamps = {"white": np.minimum(np.minimum(red, green), blue) > 235.0}
+        lamps["red"] = (red > 200.0) & (red - np.maximum(green, blue) > 50.0)
+        corners, visible = [], np.ones(len(red), bool)
+        for lit in lamps.values():
+            count = np.maximum(lit.sum((1, 2)), 1)
+            middle = (lit * columns).sum((1, 2)) / count
+            for side in (columns < middle[:, None, None], columns > middle[:, None, None]):
+                of_side = lit & side
+                number = np.maximum(of_side.sum((1, 2)), 1)
+                corners.append([(of_side * grid).sum((1, 2)) / number for grid in (columns, rows)])
+                visible &= of_side.any((1, 2))
+        return self.locate(np.array(corners), visible, red.shape[1:])
+
+    def locate(self, corners: Array, visible: Mask, shape: Sequence[int]) -> tuple[Array, Array, Mask]:
+        """The upright square in space.
+
+        Args:
+            corners: Column and row of its upper left, upper right, lower left and lower right corner [px], (4, 2, n).
+            visible: Where all four are in the picture, (n,).
+            shape: Height and width of the picture [px].
+
+        Returns:
+            As `measure`.
+        """
+        x, y = np.moveaxis(corners, 1, 0)
+        focal = self.focal_share * shape[1]
+        y0, right = (focal * self.side / np.maximum(y[i + 2] - y[i], 0.5) for i in (0, 1))
+        visible = visible & (y[2] - y[0] > 3.0) & (y[3] - y[1] > 3.0) & (x[1] - x[0] > 3.0)
+        ahead = 0.5 * (y0 + right)
+        aside = (0.5 * (shape[1] - 1) - x.mean(0)) / focal
+        above = (0.5 * (shape[0] - 1) - y.mean(0)) / focal
+        heading = np.arcsin(np.clip((right - y0) / self.side, -0.7, 0.7))
+        return ahead[:, None] * np.column_stack([np.ones_like(aside), aside, above]), heading, visible
+
+
+# Passing a gate the classical way: its posts are what is redder and greener than the rest of a row, in one column.
+
+
+@dataclass(frozen=True)
+class PostServo(LightServo):
+    """`LightServo` through a gate, whose posts are the sides of the upright square: the left red, the right green.
+
+    A post is the column with the most of its colour above the median of each row; where both are in the picture from
+    head to foot their lengths give distance and heading.
+    """
+
+    side: float = 1.5
+    before: float = 0.0
+    least: float = 60.0
+    """Levels of its colour that a post has in its column, all rows together."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD, **more: Any) -> PostServo:
+        """For a vehicle with a `front_camera`, the gate of the site `gate`, and the time between two actions [s]."""
+        task = Gate().fitted([vehicle])
+        length = task.hull.length
+        return cls(
+            WrenchPid.for_vehicle(vehicle, period).pid,
+            nose=0.5 * length,
+            berth=2.0 * length,
+            wait=-2.0 * length,
+            gap=0.4 * float(HALF),
+            slope=0.5,
+            lead=0.6 * length,
+            **camera_of(vehicle, task),
+        )
+
+    def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, Mask]:
+        """The square between the posts; see `LightServo`."""
+        red, green, blue = np.moveaxis(picture.astype(float), -1, 0)
+        n, height, width = red.shape
+        ends, visible = [], np.ones(n, bool)
+        for post in (red - np.maximum(green, blue), green - np.maximum(red, blue)):
+            post = post - np.median(post, axis=2, keepdims=True)
+            post = np.maximum(post - 2.0 * np.median(np.abs(post), axis=(1, 2), keepdims=True), 0.0)
+            best = np.clip(post.sum(1).argmax(1), 1, width - 2)
+            near = best[:, None] + np.arange(-1, 2)
+            strip = np.take_along_axis(post, near[:, None], 2)  # three columns around the post
+            share = strip.sum(1)
+            total, profile = share.sum(1), strip.sum(2)
+            lit = profile > 0.3 * profile.max(1, keepdims=True)
+            top, foot = lit.argmax(1), height - 1 - lit[:, ::-1].argmax(1)
+            visible &= (total > self.least) & (top > 0) & (foot < height - 1)
+            column = (share * near).sum(1) / np.maximum(total, 1e-9)
+            ends.append([[column, top - 0.5], [column, foot + 0.5]])
+        (first, right) = ends
+        return self.locate(np.array([first[0], right[0], first[1], right[1]]), visible, (height, width))
+
+
+# Following a pipeline the classical way: a line through what is yellower than its surroundings, and steer along it.
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineFollower(DriveBaseline):
+    """Fits a line over the bottom to the yellow pixels of the picture, and steers to it and along it.
+
+    Yellow is (red + green)/2 - blue above the median of a picture's row. A row below the horizon looks at the bottom at
+    one distance, which the pipe's charted depth tells; a straight line is fitted to all rows, weighted by the square of
+    the yellow, and its estimate is followed where a picture shows too little.
+    """
+
+    cruise: float
+    """[m/s]"""
+    charted: float
+    """Depth of the pipe's axis [m]."""
+    height: float
+    """Above it [m]."""
+    focal_share: float
+    """Focal length as a share of the picture's width."""
+    eye: tuple[float, float, float]
+    """Position of the camera, body axes [m]."""
+    least: float = 60.0
+    """Squared numbers of yellow, summed over a picture, below which it shows too little."""
+    gain: float = 0.5
+    """Speed to the side and down per distance [1/s]."""
+    memory_share: float = 0.8
+    """Share of the line before, in the next estimate."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> LineFollower:
+        """For a vehicle with a `front_camera`, and the site `pipeline`."""
+        task = Pipeline().fitted([vehicle])
+        return cls(
+            drive=DriveNumbers.of(vehicle), cruise=task.cruise, charted=-task.bottom, height=task.height,
+            **camera_of(vehicle, task),
+        )  # fmt: skip
+
+    def reset(self, n: int) -> Array:  # type: ignore[override]
+        """The line straight below and ahead, (n, 2)."""
+        return np.zeros((n, 2))
+
+    def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
+        """Actions for observations and pictures of following a pipeline."""
+        o = np.asarray(observation, float)
+        depth = DEPTH_SCALE * o[:, 9]
+        line, enough = self.line(next(iter(pictures.values())), o[:, :3], self.charted - depth)
+        share = np.where(enough, 1.0 - self.memory_share, 0.0)[:, None]
+        line = memory + share * (line - memory)
+        turn = np.arctan(line[:, 1] + 0.5 * line[:, 0])
+        target = np.column_stack(
+            [
+                self.cruise * np.clip(1.5 - 1.5 * np.abs(turn), 0.2, 1.0),
+                np.clip(self.gain * line[:, 0], -0.1, 0.1),
+                np.clip(self.gain * (depth - self.charted + self.height), -0.1, 0.1),
+                self.drive.turned(turn),
+            ]
+        )
+        return self.drive.action(o[:, [3, 4, 5, 8]], target), line
+
+    def line(self, picture: NDArray[np.uint8], up: Array, above: Array) -> tuple[Array, Mask]:
+        """The pipe in pictures.
+
+        Args:
+            picture: uint8 (n, height, width, 3).
+            up: World's up in the body [-], (n, 3).
+            above: Height of the body origin above the pipe's axis [m], (n,).
+
+        Returns:
+            How far it lies to the left below the vehicle [m], and its slope to the left, (n, 2); where there is enough
+            of it in the picture, (n,).
+        """
+        red, green, blue = np.moveaxis(picture.astype(float), -1, 0)
+        yellow = 0.5 * (red + green) - blue
+        yellow -= np.median(yellow, axis=2, keepdims=True)
+        height, width = yellow.shape[1:]
+        focal = self.focal_share * width
+        down = (np.arange(height) - 0.5 * (height - 1)) / focal
+        fall = down + up[:, :1]  # of a row's rays per metre ahead, pitched by the vehicle
+        ahead = np.where(fall > 0.15, (above + self.eye[2])[:, None] / np.maximum(fall, 0.15), 0.0)
+        aside = ahead[:, :, None] * (0.5 * (width - 1) - np.arange(width)) / focal
+        noise = 1.5 * np.median(np.abs(yellow), axis=(1, 2), keepdims=True)
+        weight = np.maximum(yellow - noise, 0.0) ** 2 * ((ahead > 0.0) & (ahead < 5.0))[:, :, None]
+        total = np.maximum(weight.sum((1, 2)), 1e-9)
+        x = np.broadcast_to(ahead[:, :, None] + self.eye[0], weight.shape)
+        mean_x, mean_y = (weight * x).sum((1, 2)) / total, (weight * aside).sum((1, 2)) / total
+        dx = x - mean_x[:, None, None]
+        slope = (weight * dx * aside).sum((1, 2)) / np.maximum((weight * dx * dx).sum((1, 2)), 1e-9)
+        slope = np.clip(slope, -1.0, 1.0)
+        return np.column_stack([mean_y - slope * mean_x, slope]), total > self.least
+
+
+# Along a net the classical way: straight sides through the loudest echoes, and the altimeter for the height.
+
+
+class Side(NamedTuple):
+    """A straight side of a net, as a ping shows it, in the plane of the body's x and y axes."""
+
+    angle: Array
+    """Angle of its normal, away from the vehicle [rad], (n,)."""
+    distance: Array
+    """Along that, of its straight line [m], (n,)."""
+    right: Array
+    """Along the line to the left from the point nearest to the vehicle: where it begins [m], (n,), ..."""
+    left: Array
+    """... and where it ends."""
+
+    @property
+    def nearest(self) -> Array:
+        """Its point nearest to the vehicle [m], (n, 2)."""
+        along = np.where(self.right < self.left, np.clip(0.0, self.right - 0.1, self.left + 0.1), 0.0)
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        return np.column_stack([self.distance * c - along * s, self.distance * s + along * c])
+
+    def meets(self, other: Side, reach: float) -> Mask:
+        """Return whether the two lines cross within a distance beyond an end of each [m], at 3° to 40°, (n,)."""
+        turn = other.angle - self.angle
+        sine = np.where(np.abs(turn) < 0.05, 1.0, np.sin(turn))
+        beyond = np.zeros_like(turn)
+        for side, far, sign in ((self, other, -1.0), (other, self, 1.0)):
+            along = sign * (side.distance * np.cos(turn) - far.distance) / sine
+            gap = np.minimum(np.abs(along - side.right), np.abs(along - side.left))
+            beyond = np.maximum(beyond, gap)
+        return (np.abs(turn) > 0.05) & (np.abs(turn) < 0.7) & (beyond < reach)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallFollower(DriveBaseline):
+    """Finds the net's sides among the two loudest echoes of each beam, faces its nearest point and goes to the left.
+
+    The side on which most echoes lie is the one with the most votes of a Hough transform, refined by least squares with
+    less weight on what is far off it, as fish are. Of what is left, a second and a third side are found likewise, and
+    believed where they meet the first near its end and theirs. The altimeter hears the tube at the net's foot, whose
+    slant range and the distance give the height; a range that does not fit is left out.
+    """
+
+    speed: float
+    """Along the net [m/s]."""
+    distance: float
+    """Distance from the net [m]."""
+    height: float
+    """Above its foot [m]."""
+    sector: float
+    """Sector of the sonar [rad]."""
+    bin_length: float
+    """[m]"""
+    eye: tuple[float, float, float]
+    """Position of the sonar, body axes [m]."""
+    under: float
+    """Distance of the altimeter below the body origin [m]."""
+    least: float = 60.0
+    """Level of an echo in the picture that counts."""
+    behind: float = 0.03
+    """The loudest echo of twine comes from so far behind the net's plane, from above or below the beam's middle [m]."""
+    echoes: int = 12
+    """Least number of echoes on a side for it to be used."""
+    reach: float = 0.45
+    """Sides that meet do so at most this beyond the last echo on each [m]."""
+    tube: float = 0.14
+    """Radius of the tube at the net's foot [m]."""
+    gain: float = 0.5
+    """Speed per distance [1/s]."""
+    integral: float = 0.3
+    """Integral gain of the error of the speed over ground [1/s], which compensates a stream."""
+    jump: float = 0.25
+    """Distance and heading change by less from ping to ping [m, rad]."""
+    memory_share: float = 0.5
+    """Share of distance and heading before, in the next estimate."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> WallFollower:
+        """For a vehicle with `sonar` and `altimeter`, and the site `net`."""
+        task = Net()
+        sonar: Any = task.pictures[0].device(vehicle)
+        altimeter = device_of(vehicle, task.ranges[0])
+        return cls(
+            drive=DriveNumbers.of(vehicle), speed=task.speed, distance=task.distance, height=task.height,
+            sector=sonar.sector, bin_length=sonar.range / sonar.bins, eye=tuple(sonar.mount.position.tolist()),
+            under=-float(altimeter.mount.position[2]),
+        )  # fmt: skip
+
+    def reset(self, n: int) -> Array:  # type: ignore[override]
+        """The net square ahead at its distance, and no integral of the speeds along x, y, z, (n, 5)."""
+        return np.tile([self.distance, 0.0, 0.0, 0.0, 0.0], (n, 1))
+
+    def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
+        """Actions for observations and pictures of inspecting a net."""
+        o = np.asarray(observation, float)
+        point, enough = self.nearest(next(iter(pictures.values())), memory[:, 0])
+        measured = np.column_stack([np.hypot(point[:, 0], point[:, 1]), np.arctan2(point[:, 1], point[:, 0])])
+        share = np.where(enough, 1.0 - self.memory_share, 0.0)[:, None]
+        line = memory[:, :2] + share * np.clip(measured - memory[:, :2], -self.jump, self.jump)
+        away, turn = line.T
+        slant = self.height + RANGE_SCALE * o[:, 9] + self.tube
+        above = np.sqrt(np.maximum(slant**2 - away**2, 0.0)) + self.under - self.height
+        towards = np.clip(self.gain * (away - self.distance), -0.15, 0.15)
+        target = np.column_stack(
+            [
+                towards * np.cos(turn) - self.speed * np.sin(turn),
+                towards * np.sin(turn) + self.speed * np.cos(turn),
+                np.where(np.abs(above) < 1.0, np.clip(-self.gain * above, -0.1, 0.1), 0.0),
+                self.drive.turned(turn),
+            ]
+        )
+        lag = memory[:, 2:] + self.period * self.integral * (target[:, :3] - o[:, 3:6])
+        lag = np.clip(lag, -self.speed, self.speed)
+        target[:, :3] += lag
+        return self.drive.action(o[:, [3, 4, 5, 8]], target), np.column_stack([line, lag])
+
+    def nearest(self, picture: NDArray[np.uint8], before: Array) -> tuple[Array, Mask]:
+        """The net in pings.
+
+        Args:
+            picture: uint8 (n, beams, range cells, 1).
+            before: Its distance before [m], (n,).
+
+        Returns:
+            Its nearest point, from the body origin along x and y [m], (n, 2); where there is one, (n,).
+        """
+        levels = picture[..., 0].astype(float)
+        count, cells = levels.shape[1:]
+        azimuth = self.sector * (0.5 - (np.arange(count) + 0.5) / count)
+        rows = []
+        for _ in range(2):
+            cell = levels.argmax(2)
+            r = (cell + 0.5) * self.bin_length - self.behind
+            weight = r * (
+                levels.max(2) >= self.least
+            )  # the way along a side from beam to beam grows with the range
+            rows.append((r * np.cos(azimuth) + self.eye[0], r * np.sin(azimuth), weight))
+            levels = np.where(np.abs(np.arange(cells) - cell[..., None]) <= 3, 0.0, levels)
+        x, y, weight = (np.concatenate(parts, 1) for parts in zip(*rows, strict=True))
+        first, on = self.side(x, y, weight)
+        point, found = first.nearest, on.sum(1) >= self.echoes
+        for _ in range(2):
+            weight = np.where(on, 0.0, weight)
+            other, on = self.side(x, y, weight)
+            away = np.hypot(*other.nearest.T)
+            likely = (away < np.hypot(*point.T)) & (np.abs(away - before) < self.jump)
+            use = likely & (on.sum(1) >= self.echoes) & first.meets(other, self.reach)
+            point = np.where(use[:, None], other.nearest, point)
+        return point, found
+
+    def side(self, x: Array, y: Array, weight: Array) -> tuple[Side, Mask]:
+        """The straight side on which the greatest weight lies, and which points lie on it.
+
+        Args:
+            x: Of the points, from the body origin [m], (n, points).
+            y: Likewise.
+            weight: Likewise [-].
+        """
+        n, angles, step, rows = len(x), np.radians(np.arange(-48.0, 49.0, 3.0)), 0.05, 80
+        distance = x[..., None] * np.cos(angles) + y[..., None] * np.sin(angles)
+        row = np.clip(distance / step, 0, rows - 1).astype(int)
+        index = (np.arange(n)[:, None, None] * len(angles) + np.arange(len(angles))) * rows + row
+        votes = np.bincount(
+            index.ravel(), np.broadcast_to(weight[..., None], row.shape).ravel(), n * len(angles) * rows
+        ).reshape(n, len(angles), rows)
+        votes[..., 1:-1] = votes[..., :-2] + votes[..., 1:-1] + votes[..., 2:]
+        best = votes.reshape(n, -1).argmax(1)
+        angle, distance = angles[best // rows], (best % rows + 0.5) * step
+        for width in (0.15, 0.1, 0.1):
+            off = x * np.cos(angle)[:, None] + y * np.sin(angle)[:, None] - distance[:, None]
+            w = weight * np.maximum(1.0 - (off / width) ** 2, 0.0) ** 2
+            total = np.maximum(w.sum(1), 1e-9)
+            mean_x, mean_y = (w * x).sum(1) / total, (w * y).sum(1) / total
+            dx, dy = x - mean_x[:, None], y - mean_y[:, None]
+            spread = (w * (dx * dx - dy * dy)).sum(1)
+            angle = 0.5 * np.arctan2(-2.0 * (w * dx * dy).sum(1), -spread)  # of the normal
+            distance = mean_x * np.cos(angle) + mean_y * np.sin(angle)
+        off = x * np.cos(angle)[:, None] + y * np.sin(angle)[:, None] - distance[:, None]
+        on = (np.abs(off) < 0.12) & (weight > 0.0)
+        along = y * np.cos(angle)[:, None] - x * np.sin(angle)[:, None]
+        right = np.sort(np.where(on, along, np.inf), 1)[:, 3]  # not the last: one fish may lie on the line
+        left = -np.sort(np.where(on, -along, np.inf), 1)[:, 3]
+        return Side(angle, distance, right, left), on

@@ -1,0 +1,147 @@
+"""Baselines of teams: lead pursuit, a formation around the prey, and a consensus on a net's shape."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from finssim.agents.baselines import Array
+from finssim.agents.drive import DriveBaseline, DriveNumbers
+from finssim.extensions.teams.formation import NEAR, Formation
+from finssim.extensions.teams.pursuit import DISTANCE_SCALE as CHASE_SCALE
+from finssim.extensions.teams.pursuit import PI
+from finssim.vehicles import Vehicle
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeadPursuit(DriveBaseline):
+    """Point at where the prey will be, turn first while that is far to the side, then come up and keep its speed.
+
+    The point aimed at lies `lead` seconds ahead of the prey. Closing in, the speed wanted is the prey's plus
+    `approach` times the way that is left to `stand_off`, so that the relative speed vanishes there.
+    """
+
+    lead: float = 0.30
+    """[s]"""
+    turn_first: float = math.radians(15.0)
+    approach: float = 0.5
+    """[1/s]"""
+    stand_off: float = 0.5
+    """Distance that is gone to [m]."""
+
+    def wanted(self, o: Array) -> tuple[Array, Array]:
+        """See `DriveBaseline`."""
+        velocity, gap, relative = o[:, 0:3], CHASE_SCALE * o[:, 6:9], o[:, 9:12]
+        aim = gap + self.lead * relative
+        distance = np.maximum(np.linalg.norm(gap, axis=1, keepdims=True), 1e-6)
+        target = velocity + relative + self.approach * (distance - self.stand_off) * aim / distance
+        top = np.array([self.drive.top, *self.drive.terminal[1:3]])
+        return np.clip(target, -top, top), np.arctan2(aim[:, 1], aim[:, 0])
+
+
+# The classical controller of formation keeping: a consensus on the shape, and a state machine for where to go.
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConsensusFormation(DriveBaseline):
+    """Each agent pulls its edges to equal sides and its height to the others', and adds what the state asks for.
+
+    gather, while an edge is off by more than `loose`: the shape alone. approach: the net's middle goes to the target.
+    carry, while the net has the target: on to the goal, with the target kept in the middle. Which state it is follows
+    from the observation alone, so that all three agree without a word, as far as they see the same.
+    """
+
+    side: float
+    """Side of the net [m]."""
+    reach: float
+    """Distance from the net within which it has the target [m]."""
+    shape: float = 0.6
+    """Speed per error of an edge or of the height [1/s]."""
+    go: float = 0.4
+    """Speed per distance [1/s]."""
+    cruise: float = 0.5
+    """Largest speed of the net's middle, as a part of the vehicle's slowest steady speed."""
+    loose: float = 0.15
+    """[sides]"""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> ConsensusFormation:
+        """Return the baseline with the numbers of a vehicle, for the net that three of them carry by default."""
+        task = Formation().fitted([vehicle])
+        return cls(drive=DriveNumbers.of(vehicle), side=task.side, reach=task.reach)
+
+    def wanted(self, o: Array) -> tuple[Array, Array]:
+        """See `DriveBaseline`; of observations (n, 34)."""
+        mates = CHASE_SCALE * np.stack([o[:, 14:17], o[:, 20:23]], axis=1)
+        return self.shaping(mates) + self.going(o, mates.sum(axis=1) / 3.0), PI * o[:, 13]
+
+    def shaping(self, mates: Array) -> Array:
+        """Velocity towards equal sides and equal heights, from the team-mates' places, (n, 2, 3)."""
+        length = np.maximum(np.linalg.norm(mates, axis=2, keepdims=True), 1e-6)
+        pull = np.sum((length - self.side) * mates / length, axis=1)
+        pull[:, 2] = mates[:, :, 2].sum(axis=1)
+        return np.asarray(self.shape * pull)
+
+    def going(self, o: Array, middle: Array) -> Array:
+        """Velocity of the net's middle, from the observation and from where the middle is."""
+        target, goal = NEAR * o[:, 6:9], NEAR * o[:, 26:29]
+        has = (NEAR * o[:, 32] <= self.reach) & (o[:, 33] >= 0.0)
+        way = np.where(has[:, None], goal - target + 0.5 * (target - middle), target - middle)
+        speed = self.go * np.linalg.norm(way, axis=1, keepdims=True)
+        top = self.cruise * min(self.drive.top, *self.drive.terminal[1:3])
+        going = self.go * way * np.minimum(1.0, top / np.maximum(speed, 1e-6))
+        loose = np.abs(o[:, 29:32]).max(axis=1) > self.loose
+        return np.asarray(np.where(loose[:, None], 0.0, going))
+
+
+# The formation baseline of 3-v-1 pursuit: netters abreast of the prey, herder behind it.
+
+
+def level_unit(x: Array) -> Array:
+    """Level directions of vectors (n, 3); zero where there is none."""
+    level = x * np.array([1.0, 1.0, 0.0])
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    return level / np.maximum(length, 1e-6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FormationPursuit(DriveBaseline):
+    """Each agent goes to its place relative to the prey, from its own observation and with the prey's velocity added.
+
+    The way ahead leads from the herder through the prey. Netters stand `forward` ahead of the prey and half of
+    `spacing` to either side of the way, so that the net lies across it; the herder stays `behind`. Published with 6, 2
+    and 3 m for vehicles twelve times as fast; here 0.4 times that.
+    """
+
+    spacing: float = 2.4
+    forward: float = 0.8
+    behind: float = 1.2
+    gain: float = 0.6
+    """Speed per distance to one's place [1/s]."""
+
+    def places(self, observation: Array) -> Array:
+        """Return the place of each agent relative to itself, body frame [m], (n, 3); one row per agent."""
+        prey = CHASE_SCALE * observation[:, 6:9]
+        mates = CHASE_SCALE * np.stack([observation[:, 16:19], observation[:, 24:27]], axis=1)
+        herds = observation[:, [14, 22]]
+        herder = herds.max(axis=1) < 0.5
+        ahead = level_unit(prey - np.einsum("nm,nmk->nk", herds, mates))
+        across = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))])
+        other = np.einsum("nm,nmk->nk", 1.0 - herds, mates)
+        # Of two netters the one farther to the left of the way takes the left place.
+        side = np.where(np.sum(other * across, axis=1) < 0.0, 1.0, -1.0)[:, None]
+        netter = prey + self.forward * ahead + 0.5 * self.spacing * side * across
+        drives = level_unit(0.5 * mates.sum(axis=1) - prey)
+        return np.asarray(np.where(herder[:, None], prey - self.behind * drives, netter))
+
+    def wanted(self, o: Array) -> tuple[Array, Array]:
+        """See `DriveBaseline`; of observations (n, 30)."""
+        target = o[:, 0:3] + o[:, 9:12] + self.gain * self.places(o)
+        # Faster than the vehicle goes is the same direction as fast as it goes.
+        level = np.maximum(np.linalg.norm(target[:, :2], axis=1, keepdims=True) / self.drive.top, 1.0)
+        target[:, :2] /= level
+        target[:, 2] = np.clip(target[:, 2], -self.drive.terminal[2], self.drive.terminal[2])
+        moving = np.linalg.norm(target[:, :2], axis=1) > 0.05
+        return target, np.where(moving, np.arctan2(target[:, 1], target[:, 0]), 0.0)
