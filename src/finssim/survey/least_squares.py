@@ -1,13 +1,9 @@
-"""Least squares for everything that is calibrated by sight: descent, robust weights, unknowns that one picture owns.
-
-Levenberg and Marquardt's descent takes any state; `arrow_step` is its step where many small groups of unknowns, such as
-the poses of pictures, share only a few.
-"""
+"""Parts of least-squares problems: robust weights, bounds, poses, and unknowns that belong to one group of rows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,65 +12,25 @@ from finssim.core.rotations import quat_from_rotvec, quat_to_matrix
 from finssim.identification.uncertainty import Evidence
 
 Array = NDArray[np.float64]
-State = TypeVar("State")
-
-STEADIEST = 1e10
-"""Damping at which no step leads down any more."""
-
-
-def descent(
-    state: State,
-    cost: Callable[[State], float],
-    steps_from: Callable[[State], Callable[[float], State | None]],
-    *,
-    rounds: int,
-    tolerance: float,
-) -> Iterator[tuple[State, float]]:
-    """The start and every better state, with its cost, until nothing is gained (Levenberg and Marquardt).
-
-    Args:
-        state: Where to begin.
-        cost: What falls; infinite where a state makes no sense.
-        steps_from: Linearises at a state: damping -> the state a damped step away, or None where there is none.
-        rounds: Linearisations, at most.
-        tolerance: Relative gain with which it ends.
-    """
-    value, damping = cost(state), 1e-3
-    yield state, value
-    for _ in range(rounds):
-        step = steps_from(state)
-        while True:
-            trial = step(damping)
-            after = np.inf if trial is None else cost(trial)
-            if trial is not None and after <= value:
-                break
-            damping *= 5.0
-            if damping > STEADIEST:
-                return
-        gain, state, value = value - after, trial, after
-        yield state, value
-        if gain <= tolerance * max(value, 1e-12) and damping < 1.0:
-            return
-        damping = max(damping / 6.0, 1e-12)
 
 
 def rms(errors: Array) -> float:
-    """Root mean square length of vectors (K, n); NaN of none."""
+    """Return the root mean square length of vectors (K, n); NaN without any."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else float("nan")
 
 
 def huber_weight(size: Array, limit: float) -> Array:
-    """1 up to a limit, falling as 1 / size beyond."""
+    """Return the weight of residuals: 1 up to a limit, falling as 1 / size beyond."""
     return np.asarray(np.minimum(1.0, limit / np.maximum(size, 1e-300)))
 
 
 def huber_cost(size: Array, limit: float) -> float:
-    """Sum of squares of what is within a limit, growing linearly beyond."""
+    """Return the sum of squares of sizes within a limit, which grows linearly beyond."""
     return float(np.sum(np.where(size <= limit, size**2, limit * (2.0 * size - limit))))
 
 
 def boxed(normal: Array, right: Array, low: Array, high: Array) -> Array:
-    """Minimum of ½ xᵀ N x - gᵀ x in a box, by bounded-variable least squares; on a bound exactly.
+    """Return the minimum of ½ xᵀ N x - gᵀ x in a box, by bounded-variable least squares; on a bound exactly.
 
     Args:
         normal: N, positive definite, in any units [-] and frame, (P, P).
@@ -96,7 +52,7 @@ def boxed(normal: Array, right: Array, low: Array, high: Array) -> Array:
 
 
 class Pose(NamedTuple):
-    """A frame in another one."""
+    """Pose of a frame in another one."""
 
     R: Array
     """(3, 3)"""
@@ -104,20 +60,20 @@ class Pose(NamedTuple):
     """[m], (3,)"""
 
     def at(self, points: Array) -> Array:
-        """Points of the inner frame in the outer one, (..., 3)."""
+        """Return points of the inner frame in the outer one, (..., 3)."""
         return np.asarray(points @ self.R.T + self.t)
 
     def then(self, inner: Pose) -> Pose:
-        """The pose of what lies in this frame at `inner`."""
+        """Return the pose of a frame that has the pose `inner` in this one."""
         return Pose(self.R @ inner.R, self.R @ inner.t + self.t)
 
     @property
     def inverse(self) -> Pose:
-        """The outer frame in the inner one."""
+        """Return the pose of the outer frame in the inner one."""
         return Pose(self.R.T.copy(), -self.R.T @ self.t)
 
     def stepped(self, step: Array) -> Pose:
-        """After a small turn about the outer axes (3) and a shift (3)."""
+        """Return the pose after a small turn about the outer axes (3) and a shift (3)."""
         return Pose(quat_to_matrix(quat_from_rotvec(step[:3])) @ self.R, self.t + step[3:])
 
 
@@ -149,10 +105,10 @@ def block_of(shared: Array, local: Array, residual: Array) -> Block:
     )
 
 
-def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Array]]:
-    """One damped Gauss-Newton step (Marquardt), (P,) and (Q,) each.
+def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Array], float]:
+    """Return one damped Gauss-Newton step (Marquardt), (P,) and (Q,) each, and the decrease it promises.
 
-    A shared direction that nothing tells gets no step.
+    A shared direction that no row determines gets no step. The decrease is that of the sum of squares.
 
     Args:
         blocks: Normal equations of the groups.
@@ -162,11 +118,16 @@ def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Arr
     scale = np.sqrt(np.maximum(np.diagonal(total), 1e-300))
     step, *_ = np.linalg.lstsq(total / np.outer(scale, scale), right / scale, rcond=1e-13)
     step = step / scale
-    return step, [inner[:, -1] - inner[:, :-1] @ step for inner in inners]
+    own = [inner[:, -1] - inner[:, :-1] @ step for inner in inners]
+    promised = sum(
+        step @ (2.0 * block.a - block.aa @ step - 2.0 * block.ab @ y) + y @ (2.0 * block.b - block.bb @ y)
+        for block, y in zip(blocks, own, strict=True)
+    )
+    return step, own, float(promised)
 
 
 def arrow_reduced(blocks: Sequence[Block], damping: float) -> tuple[Array, Array, list[Array]]:
-    """Normal matrix (P, P) and right side (P,) of the shared unknowns alone, and [abᵀ b] over bb of each group.
+    """Return normal matrix (P, P) and right side (P,) of the shared unknowns alone, and [abᵀ b] over bb of each group.
 
     Args:
         blocks: Normal equations of the groups.
@@ -198,7 +159,8 @@ def arrow_evidence(
 
 
 def _eliminated(block: Block, damping: float) -> tuple[Array, Array, Array]:
-    """Damped normal matrix (P, P) and right side (P,) of the shared alone; (bb + damping) ⁻¹ [abᵀ b], (Q, P + 1)."""
+    """Return the damped normal matrix (P, P) and right side (P,) of the shared unknowns alone, and (bb + damping)⁻¹
+    [abᵀ b], (Q, P + 1)."""
     diagonal = np.diagonal(block.bb)
     bb = block.bb + damping * np.diag(diagonal) + 1e-14 * float(diagonal.max()) * np.eye(len(diagonal))
     inner = np.linalg.solve(bb, np.column_stack([block.ab.T, block.b]))

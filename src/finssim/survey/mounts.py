@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.core.least_squares import Step, descend
 from finssim.core.optics import back_project, project, projection_jacobians
 from finssim.core.rotations import (
     matrix_to_quat,
@@ -42,7 +43,6 @@ from finssim.survey.least_squares import (
     arrow_evidence,
     arrow_step,
     block_of,
-    descent,
     huber_cost,
     huber_weight,
 )
@@ -331,18 +331,17 @@ def minimise(
         total += float(np.sum(np.concatenate(rest) ** 2))
         return total if math.isfinite(total) else math.inf
 
-    def steps_from(state: MountState) -> Callable[[float], MountState]:
+    def linearise(state: MountState) -> Step[MountState]:
         blocks = [restricted(block, state, free) for block in moment_blocks(rig, state, moments)]
 
-        def stepped(damping: float) -> MountState:
+        def stepped(damping: float) -> tuple[MountState, float]:
             shared = np.zeros(len(state.names))
-            shared[index], local = arrow_step(blocks, damping)
-            return moved(state, shared, local)
+            shared[index], local, promised = arrow_step(blocks, damping)
+            return moved(state, shared, local), promised
 
         return stepped
 
-    *_, (state, _) = descent(state, cost, steps_from, rounds=steps, tolerance=1e-7)
-    return state
+    return descend(state, cost, linearise, steps=steps, still=1e-19, share=1e-7).state
 
 
 def as_before(state: MountState, origin: MountState, frozen: Sequence[str]) -> MountState:

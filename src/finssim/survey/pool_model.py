@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from finssim.core.least_squares import Step, descend
 from finssim.core.optics import (
     COEFFICIENTS,
     Camera,
@@ -23,7 +24,6 @@ from finssim.core.optics import (
     projection_jacobians,
 )
 from finssim.core.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, skew
-from finssim.survey.least_squares import descent
 from finssim.survey.points import Observations
 from finssim.trials.findings import CalibrationError
 
@@ -393,15 +393,15 @@ def solve(
     """
     free = np.flatnonzero(active)
 
-    def steps_from(model: PoolModel) -> Callable[[float], PoolModel | None]:
+    def linearise(model: PoolModel) -> Step[PoolModel]:
         N, g = normal_equations(model, observed, whiten, free, prior)
         bounds, scale = _bounds(model, observed, free), np.sqrt(np.maximum(np.diagonal(N), 1e-300))
         H, b = N / np.outer(scale, scale), g / scale
 
-        def stepped(damping: float) -> PoolModel | None:
-            step = np.zeros(len(NAMES))
-            step[free] = _sliding(H + damping * np.eye(len(free)), b, scale, bounds) / scale
-            return _stepped(model, step, observed, 8 in free)
+        def stepped(damping: float) -> tuple[PoolModel | None, float]:
+            step, x = np.zeros(len(NAMES)), _sliding(H + damping * np.eye(len(free)), b, scale, bounds)
+            step[free] = x / scale
+            return _stepped(model, step, observed, 8 in free), float(x @ (b - 0.5 * H @ x))
 
         return stepped
 
@@ -411,8 +411,8 @@ def solve(
         e, r = whiten(residuals(model, observed)[0]), prior.rows(model)[0]
         return 0.5 * float(e @ e + r @ r)
 
-    *_, end = descent(start, cost, steps_from, rounds=iterations, tolerance=tolerance)
-    return Solution(*end)
+    end = descend(start, cost, linearise, steps=iterations, still=1e-12 * tolerance, share=tolerance)
+    return Solution(end.state, end.cost)
 
 
 def normal_equations(

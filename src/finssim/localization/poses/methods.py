@@ -11,6 +11,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from finssim.core.least_squares import Step, descend
 from finssim.core.optics import Camera, Lens, Status, back_project, count_rejections, projection_jacobians
 from finssim.core.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, quat_to_rotvec, skew
 from finssim.localization import LocalizationError
@@ -107,32 +108,32 @@ def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | Non
     Returns:
         The fit, or None where the points are too close together to tell the angle.
     """
-    xi = _least_squares(Q, points, A)
-    now = _evaluate(xi, Q, points, A, huber)
-    damping, converged = 1e-6, False
-    step_number = 0
-    while step_number < _MAX_STEPS and not converged:
-        step_number += 1
-        inverse = _damped_inverse(now.H, damping)
-        if inverse is None:
-            return None
-        step = -inverse @ now.g
-        converged = bool(-(step @ now.g) < _STILL_PLANE)
-        trial = (xi[0] + step[0], xi[1] + step[1], xi[2] + step[2])
-        then = _evaluate(trial, Q, points, A, huber)
-        if converged or then.cost <= now.cost:  # the last step changes the cost by no more than rounding does
-            xi, now, damping = trial, then, max(0.1 * damping, 1e-12)
-        else:
-            damping = max(10.0 * damping, 1e-6)
+
+    def linearise(now: _State) -> Step[_State]:
+        def stepped(damping: float) -> tuple[_State | None, float]:
+            inverse = _damped_inverse(now.H, damping)
+            if inverse is None:
+                return None, math.inf
+            step = -inverse @ now.g
+            xi = (now.xi[0] + step[0], now.xi[1] + step[1], now.xi[2] + step[2])
+            return _evaluate(xi, Q, points, A, huber), float(-(step @ now.g))
+
+        return stepped
+
+    start = _evaluate(_least_squares(Q, points, A), Q, points, A, huber)
+    now, _, steps, converged = descend(
+        start, lambda now: now.cost, linearise, steps=_MAX_STEPS, still=_STILL_PLANE, damping=1e-6
+    )
     inverse = _damped_inverse(now.H, 0.0)
     if inverse is None:
         return None
-    pose = (float(xi[0]), float(xi[1]), math.remainder(float(xi[2]), math.tau))
-    return RigidFit(pose, inverse, now.weighted_J, A, now.missed, step_number, converged)
+    pose = (float(now.xi[0]), float(now.xi[1]), math.remainder(float(now.xi[2]), math.tau))
+    return RigidFit(pose, inverse, now.weighted_J, A, now.missed, steps, converged)
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
+    xi: tuple[float, float, float]
     cost: float
     H: Array
     g: Array
@@ -225,7 +226,7 @@ def _evaluate(xi: tuple[float, float, float], Q: Array, points: Array, A: Array,
     missed = np.sqrt(squares)
     flat = J.reshape(-1, 3)
     if missed.max() <= huber:
-        return _State(float(squares.sum()), flat.T @ flat, flat.T @ miss.ravel(), J, missed)
+        return _State(xi, float(squares.sum()), flat.T @ flat, flat.T @ miss.ravel(), J, missed)
     far = missed > huber
     weight = np.where(far, huber / np.maximum(missed, huber), 1.0)
     cost = float(np.where(far, huber * (2.0 * missed - huber), squares).sum())
@@ -234,7 +235,7 @@ def _evaluate(xi: tuple[float, float, float], Q: Array, points: Array, A: Array,
     across = J - towards[:, :, None] * np.einsum("ij,ijk->ik", towards, J)[:, None, :]
     weighted = weight[:, None, None] * across
     g = flat.T @ (weight[:, None] * miss).ravel()
-    return _State(cost, weighted.reshape(-1, 3).T @ flat, g, weighted, missed)
+    return _State(xi, cost, weighted.reshape(-1, 3).T @ flat, g, weighted, missed)
 
 
 _UNIT, _ONES = np.eye(2), np.ones(2)
@@ -685,9 +686,7 @@ def refine_pose(
     extra_rows: ExtraRows | None = None,
     max_steps: int = 50,
 ) -> RefinedPose | None:
-    """Levenberg and Marquardt's method on the reprojection error, with analytic Jacobians and Huber's rho.
-
-    The damping follows Nielsen (1999), "Damping parameter in Marquardt's method".
+    """Minimise the reprojection error by Levenberg and Marquardt's method, with analytic Jacobians and Huber's rho.
 
     Args:
         see: Where points appear.
@@ -706,27 +705,24 @@ def refine_pose(
     def at(position: Array, rotation: Array, shift: Array) -> RefinedPose | None:
         return _linearised(see, points_b, pixels, huber, extra_rows, position, rotation, shift)
 
-    now = at(position, rotation, np.zeros(2))
-    if now is None:
+    def linearise(now: RefinedPose) -> Step[RefinedPose]:
+        def stepped(damping: float) -> tuple[RefinedPose | None, float]:
+            D = damping * np.maximum(np.diagonal(now.H), 1e-12)
+            step = np.linalg.solve(now.curvature + np.diag(D), -now.g)
+            turn = quat_to_matrix(quat_from_rotvec(step[3:6]))
+            shift = now.shift + step[6:] if extra_rows else now.shift
+            trial = at(now.position + step[:3], turn @ now.rotation, shift)
+            return trial, float(-(step @ now.g) + step @ (D * step))
+
+        return stepped
+
+    start = at(position, rotation, np.zeros(2))
+    if start is None:
         return None
-    share = _STILL_SHARE if extra_rows is None else 0.0
-    damping, growth, converged, steps = 1e-3 if extra_rows is None else 1e-6, 2.0, False, 0
-    while steps < max_steps and not converged and damping < 1e12:
-        steps += 1
-        D = damping * np.maximum(np.diagonal(now.H), 1e-12)
-        step = np.linalg.solve(now.curvature + np.diag(D), -now.g)
-        promised = float(-(step @ now.g) + step @ (D * step))
-        converged = promised < max(_STILL, share * now.cost)
-        turn = quat_to_matrix(quat_from_rotvec(step[3:6]))
-        shift = now.shift + step[6:] if extra_rows else now.shift
-        then = at(now.position + step[:3], turn @ now.rotation, shift)
-        gain = -1.0 if then is None else (now.cost - then.cost) / max(promised, 1e-300)
-        if then is not None and gain >= 0.0:
-            now = then
-            # Nielsen's rule: the damping stays where steps keep half of what they promise, in flat valleys.
-            damping, growth = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-12), 2.0
-        else:
-            damping, growth = damping * growth, 2.0 * growth
+    share, damping = (_STILL_SHARE, 1e-3) if extra_rows is None else (0.0, 1e-6)
+    now, _, steps, converged = descend(
+        start, lambda now: now.cost, linearise, steps=max_steps, still=_STILL, share=share, damping=damping
+    )
     return replace(now, iterations=steps, converged=converged)
 
 
