@@ -3,10 +3,11 @@
     python tools/check_docstrings.py    what is missing; exit status 1 where there is any
 
 A parameter, a return value or a field is judged by its annotated type. A real number, or an array of real numbers, has
-a unit in brackets, such as [m/s], or is called what has none, such as a share or a quaternion; or the text names the
-documented function or class whose numbers they are. An array that a function takes has a shape, such as (n, 3), and a
-quantity with a direction a frame. What is read is the entry under `Args:` or `Returns:` or the docstring of the field,
-and where there is none the docstring of the function or class. Whole numbers are counts, indices and seeds.
+a unit in brackets, such as [m/s], or is called what has none, such as a share; or the text names the documented
+function or class whose numbers they are. Quaternions have none by their type. An array that a function takes has a
+shape, such as (n, 3), and a quantity with a direction a frame. What is read is the entry under `Args:` or `Returns:`,
+the docstring or comment of the field, and where there is none the docstring of the function or class. Whole numbers
+are counts, indices and seeds.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ QUANTITIES = DIRECTED | set(
     "damping power energy rpm pulse".split()
 )
 """Names of quantities whose shape must be stated where they are arrays."""
-REAL = re.compile(r"float(16|32|64)?|floating|(vec|mat|quat)\d*[df]?|transform")
+NAMED = {"quaternion", "orientation", "pixel", "pixels", "mask"}
+"""Names that state a unit, or that there is none."""
+REAL = re.compile(r"float(16|32|64)?|floating|(vec|mat)\d*[df]?|transform")
 VECTORS = re.compile(r"(vec|mat|quat)\d*[df]?")
 ARRAYS = {"NDArray", "ndarray", "ArrayLike", "Tensor", "array", "array2d", "array3d", "array4d"}
 SEVERAL = {
@@ -48,15 +51,17 @@ SEVERAL = {
     "Optional",
 }
 """Types of which nothing is known of the numbers in them."""
-UNIT = re.compile(r"\[[^\]\n]*\]|\bunits?\b|\bin (metres|seconds|radians|degrees|newtons|pixels|hertz)\b")
+UNIT = re.compile(
+    r"\[[^\]\n]*\]|\bunits?\b|\bpixels?\b|\bin (metres|seconds|radians|degrees)\b", re.IGNORECASE
+)
 PURE = re.compile(
-    r"\b(dimensionless|share|part of|fraction|ratio|probabilit\w+|likelihoods?|factors?|weights?|scales?|quaternions?|"
-    r"scores?|per cent|rewards?|rotation matri(x|ces)|co?sines?|correlations?|quantiles?|logarithms?|numbers? "
-    r"of|counts?|index|indices|seeds?|standard normal|observations?|actions?|pictures?|colours?|grey|gray|contrast|"
-    r"reflectances?|confidence|exponent|learning rate|gradients?|logits?|features?|refractive ind(ex|ices))\b",
+    r"\b(dimensionless|shares?|chances?|part of|fraction|ratio|probabilit\w+|likelihoods?|factors?|weights?|scales?|"
+    r"quaternions?|scores?|per cent|rewards?|rotation matri(x|ces)|co?sines?|correlations?|quantiles?|logarithms?|"
+    r"numbers? of|counts?|index|indices|seeds?|faces|attitudes?|standard normal|observations?|actions?|pictures?|"
+    r"colours?|grey|gray|contrast|reflectances?|confidence|exponent|learning rate|gradients?|logits?|features?)\b",
     re.IGNORECASE,
 )
-REFERENCE = re.compile(r"\bas\b[^.;\n]*`", re.IGNORECASE)
+REFERENCE = re.compile(r"\b(as|see)\b[^.;\n]*`", re.IGNORECASE)
 SHAPE = re.compile(r"\((?:[A-Za-z0-9_.+* -]+,)+[A-Za-z0-9_.+* ,-]*\)")
 FRAME = re.compile(r"\b(frame|axes|body|world|pool|camera|optical|map|reference)\b", re.IGNORECASE)
 
@@ -89,13 +94,20 @@ PENDING = {
 
 
 @cache
-def tree_of(module: str) -> ast.Module | None:
-    """Return the syntax tree of a module of the package or the studies; None where there is no such file."""
+def source_of(module: str) -> str | None:
+    """Return the source of a module of the package or the studies; None where there is no such file."""
     path = ROOT / ("src" if module.partition(".")[0] == "finssim" else "") / module.replace(".", "/")
     for file in (path.with_suffix(".py"), path / "__init__.py"):
         if file.is_file():
-            return ast.parse(file.read_text(encoding="utf-8"))
+            return file.read_text(encoding="utf-8")
     return None
+
+
+@cache
+def tree_of(module: str) -> ast.Module | None:
+    """Return the syntax tree of a module of the package or the studies; None where there is no such file."""
+    source = source_of(module)
+    return None if source is None else ast.parse(source)
 
 
 @cache
@@ -180,7 +192,7 @@ def missing(
         if not is_real(names) or not (by_type or words & QUANTITIES):
             continue
         own = entry(text, parameter.arg) or text
-        if not has_unit(own) and "quaternion" not in words:
+        if not has_unit(own) and not words & NAMED:
             yield f"{parameter.arg}: unit"
         if names & ARRAYS and words & QUANTITIES and not SHAPE.search(own):
             yield f"{parameter.arg}: shape"
@@ -196,11 +208,18 @@ def missing(
 def missing_of_fields(kind: ast.ClassDef, module: str = "") -> Iterator[str]:
     """Yield the fields of a class whose numbers have no unit."""
     about = ast.get_docstring(kind) or ""
+    lines = (source_of(module) or "").splitlines()
     for node, after in zip(kind.body, [*kind.body[1:], None], strict=True):
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             name = node.target.id
-            own = ast.unparse(after.value) if isinstance(after, ast.Expr) else entry(about, name) or about
-            if not name.startswith("_") and is_real(types(module, node.annotation)) and not has_unit(own):
+            comment = lines[node.end_lineno - 1].partition("  # ")[2] if lines and node.end_lineno else ""
+            own = (
+                ast.unparse(after.value)
+                if isinstance(after, ast.Expr)
+                else comment or entry(about, name) or about
+            )
+            real = is_real(types(module, node.annotation)) and not NAMED & set(name.lower().split("_"))
+            if not name.startswith("_") and real and not has_unit(own):
                 yield f"{name}: unit"
 
 

@@ -49,10 +49,10 @@ class Tables(NamedTuple):
     """Fields of `allocation.AllocationData` for one vehicle type, padded with absent thrusters (no gain, no thrust)."""
 
     gain: npt.NDArray[np.float32]
-    """Columns of H^-1 B' W^2, (6, 8)."""
+    """Columns of H^-1 B' W^2 [N per N or N m], (6, 8)."""
 
     clamped: npt.NDArray[np.float32]
-    """Columns of the map d -> (f_F - f0_F, mu) for each set of thrusters at a limit, (256, 8, 8)."""
+    """Columns of the map d -> (f_F - f0_F, mu) for each set of thrusters at a limit, (256, 8, 8) [-]."""
 
     lower: npt.NDArray[np.float32]
     """Least thrust [N], (8,)."""
@@ -135,7 +135,8 @@ class AllocationData:
     """Columns of H^-1 B' W^2: thrust per unit of wanted wrench [N/N, N/(N m)], (vehicles, 6)."""
 
     clamped: wp.array3d(dtype=vec8)
-    """Columns of the map d -> (f_F - f0_F, mu) for every set C (bit i: thruster i at a limit), (vehicles, 256, 8)."""
+    """Columns of the map d -> (f_F - f0_F, mu) for every set C (bit i: thruster i at a limit), (vehicles, 256, 8)
+    [-]."""
 
     lower: wp.array(dtype=vec8)
     """Least thrust [N], (vehicles,)."""
@@ -146,7 +147,7 @@ class AllocationData:
 
 @wp.func
 def clip(f: vec8, lower: vec8, upper: vec8) -> vec8:
-    """`f` moved exactly onto the bounds it exceeds; NaN stays NaN."""
+    """Return `f` moved exactly onto the bounds it exceeds, all in one unit; NaN stays NaN."""
     g = f
     for i in range(MAX_THRUSTERS):
         g[i] = wp.where(f[i] < lower[i], lower[i], wp.where(f[i] > upper[i], upper[i], f[i]))
@@ -286,7 +287,7 @@ def allocation_data(
     """Tables of one or more vehicle types for `allocate`; every sequence has one entry per type.
 
     Args:
-        B: Thruster matrices, wrench = B f about the commanded point in the body frame, (6, n) with n <= 8 each.
+        B: Thruster matrices, wrench = B f about the commanded point in the body frame [-, m], (6, n) with n <= 8 each.
         lower: Least thrusts f- [N], (n,) each, at most zero.
         upper: Greatest thrusts f+ [N], (n,) each, at least zero.
         weights: Diagonals of W [1/N, 1/(N m)], (6,) each: 1/wrench limit, and zero for an axis that does not matter.
@@ -341,7 +342,10 @@ class Allocator:
 
     @classmethod
     def from_vehicle(cls, vehicle: Any, regularisation: float = REGULARISATION) -> Allocator:
-        """Allocator about `vehicle.wrench_reference`, weighing each axis by its wrench limit."""
+        """Allocator about `vehicle.wrench_reference`, weighing each axis by its wrench limit.
+
+        `regularisation` is a weight.
+        """
         lower, upper = vehicle.force_limits
         return cls(vehicle.control_matrix, lower, upper, axis_weights(vehicle.wrench_limits), regularisation)
 

@@ -51,7 +51,7 @@ class MixerData:
     motor: wp.array2d(dtype=int)
     """Motor of each thruster, canonical order, (vehicles, motors)."""
     direction: wp.array2d(dtype=float)
-    """MOT_n_DIRECTION, by motor, (vehicles, motors)."""
+    """MOT_n_DIRECTION, by motor, -1 or 1 [-], (vehicles, motors)."""
     thrust: wp.array3d(dtype=float)
     """Steady thrust of each thruster, canonical order, at the pulses of `PULSES` [N], (vehicles, motors, 801)."""
 
@@ -64,7 +64,7 @@ def mix(demand: vec6, vehicle: int, data: MixerData) -> vec8:
     1 - |throttle|; VECTORED_6DOF divides verticals and horizontals each by their largest sum above 1.
 
     Args:
-        demand: Of `DEMANDS`; those beyond +-1 saturate.
+        demand: Of `DEMANDS` [-1, 1]; those beyond saturate.
         vehicle: First index into `data`.
         data: From `mixer_data`.
     """
@@ -99,7 +99,7 @@ def mixed_thrusts(demand: vec6, vehicle: int, data: MixerData) -> vec8:
     """Steady thrusts that demands give, canonical order [N].
 
     Args:
-        demand: Of `DEMANDS`; those beyond +-1 saturate.
+        demand: Of `DEMANDS` [-1, 1]; those beyond saturate.
         vehicle: First index into `data`.
         data: From `mixer_data`.
     """
@@ -118,9 +118,9 @@ def mix_row(demand: wp.array(dtype=vec6), data: MixerData, out: wp.array(dtype=v
     """`mix` for the first vehicle.
 
     Args:
-        demand: Of `DEMANDS`, (N,).
+        demand: Of `DEMANDS` [-1, 1], (N,).
         data: From `mixer_data`.
-        out: Outputs before directions, by motor, out, (N,).
+        out: Outputs before directions [-1, 1], by motor, (N,); written.
     """
     i = wp.tid()
     out[i] = mix(demand[i], 0, data)

@@ -185,9 +185,10 @@ class Station:
     """[rad]"""
     name: str = "station"
     duration: float = math.inf
+    """Time to hold the pose [s]."""
 
     def at(self, t: npt.ArrayLike) -> Reference:
-        """Return the same reference at all times."""
+        """Return the same reference at all times. Times `t` are in [s]."""
         shape = np.shape(t)
         position = np.broadcast_to(np.asarray(self.position, float), (*shape, 3))
         return Reference(position, np.zeros((*shape, 3)), np.full(shape, self.yaw), np.zeros(shape))

@@ -115,7 +115,7 @@ def thrusts_of(action: vec8, vehicle: int, data: ModeData) -> vec8:
     """Thrusts that an action asks for, canonical order [N].
 
     Args:
-        action: Its components; those beyond +-1 saturate.
+        action: Its components [-1, 1]; those beyond saturate.
         vehicle: First index into `data`.
         data: From `mode_data`.
     """
@@ -204,7 +204,7 @@ def before_dead_band(part: npt.ArrayLike, dead_band: npt.ArrayLike) -> Array:
 
     Args:
         part: In [-1, 1], (..., 6).
-        dead_band: From `axis_dead_band`, (6,).
+        dead_band: From `axis_dead_band`, a share of each axis' limit, (6,).
     """
     band, size = np.broadcast_to(dead_band, np.shape(part)), np.abs(part)
     rest = np.divide(size - band, 1.0 - band, out=np.ones_like(size), where=band < 1.0)

@@ -33,7 +33,7 @@ class PulseMemory(NamedTuple):
     owed: float
     """Impulse that was asked for and not delivered [N s]."""
     pulse: float
-    """Direction of the running pulse: -1, 0 or 1."""
+    """Direction of the running pulse [-]: -1, 0 or 1."""
     shaft: float
     """Shaft speed that the pulses left, by the model [rad/s]."""
 

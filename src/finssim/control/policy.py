@@ -56,7 +56,7 @@ class ObservationEntry(_Record):
     scale: float = Field(default=1.0, gt=0.0)
     """Divisor, in `unit`."""
     clip: tuple[float, float] | None = None
-    """Bounds (low, high) put on the divided value, or None."""
+    """Bounds (low, high) put on the divided value [-], or None."""
 
 
 class ObservationSchema(_Record):
@@ -301,7 +301,7 @@ class Policy:
         """Action for each observation, of a policy without memory.
 
         Args:
-            observation: Scaled and clipped as the schema says, shape (..., n); taken as float32.
+            observation: Scaled and clipped [-] as the schema says, shape (..., n); taken as float32.
 
         Returns:
             Action in [-1, 1], shape (..., m); its meaning is `description.action`.
@@ -313,7 +313,10 @@ class Policy:
         return self.step(None, observation)[0]
 
     def reset(self, n: int) -> NDArray[np.float32] | None:
-        """Return the memory at the start of n episodes, (n, k); None for a policy without memory."""
+        """Return the memory at the start of n episodes, (n, k); None for a policy without memory.
+
+        The memory has no unit [-].
+        """
         k = self.description.memory
         return np.zeros((n, k), dtype=np.float32) if k else None
 

@@ -43,6 +43,8 @@ TABLE_SIZE = 2048
 def polyline(points: Sequence[Sequence[float]], durations: Sequence[float]) -> Timed:
     """Return straight segments from point to point, each from rest to rest: s = 3u² - 2u³.
 
+    Points are [x, y, z, yaw] in [m] and [rad], durations in [s]; so is the result.
+
     Args:
         points: Corners, world frame [m], (n + 1, 3).
         durations: Time for each segment [s], (n,).
@@ -70,6 +72,8 @@ def polyline(points: Sequence[Sequence[float]], durations: Sequence[float]) -> T
 def circle(radius: float, turns: float, duration: float, depth: float = DEPTH) -> Timed:
     """Circles about the pool's middle at constant speed, counter-clockwise from (radius, 0).
 
+    Lengths and the result are in [m], times in [s].
+
     Args:
         radius: [m]
         turns: Number of circles.
@@ -96,6 +100,8 @@ def helix(radius: float, turns: float, duration: float, bottom: float, top: floa
 def gerono(a: float, b: float, duration: float, depth: float = DEPTH) -> Timed:
     """A figure of eight at constant phase rate: x = a sin θ, y = b sin θ cos θ (Gerono's lemniscate).
 
+    Lengths and the result are in [m], times in [s].
+
     Args:
         a: Half its length along world x [m].
         b: Its width along world y [m].
@@ -119,6 +125,8 @@ def ellipse(a: float, b: float, duration: float, depth: float = DEPTH) -> Timed:
 
     The speed along the arc follows 0.5 + 0.5 sin² 2θ, and time itself runs by s = 3u² - 2u³. That reading of what is
     published gives the published peak: 0.1031 m/s for half axes of 1.0 and 0.4 m in 92.70 s.
+
+    Lengths and the result are in [m], times in [s].
 
     Args:
         a: Half axis along world x [m].

@@ -35,21 +35,21 @@ class Axes:
     """
 
     rows: tuple[tuple[float, float, float], ...]
-    """The new axes written in the old ones: the rows of A."""
+    """The new axes written in the old ones: the rows of A, unit vectors."""
 
     @property
     def A(self) -> Array:
-        """The matrix A, (3, 3)."""
+        """Return the matrix A of unit vectors, (3, 3)."""
         return np.array(self.rows)
 
     @property
     def axial_map(self) -> Array:
-        """det(A) A, (3, 3)."""
+        """Return det(A) A, which has no unit [-], (3, 3)."""
         return np.asarray(np.round(np.linalg.det(self.A)) * self.A)
 
     @property
     def twist_map(self) -> Array:
-        """diag(A, det(A) A), (6, 6)."""
+        """Return diag(A, det(A) A), which has no unit [-], (6, 6)."""
         o = np.zeros((3, 3))
         return np.block([[self.A, o], [o, self.axial_map]])
 
@@ -59,15 +59,17 @@ class Axes:
         return Axes(tuple(tuple(row) for row in self.A.T.tolist()))
 
     def vector(self, v: npt.ArrayLike) -> Array:
-        """Polar vector: position, velocity, acceleration, force, (..., 3)."""
+        """Return a polar vector in the new axes and its own unit: position, velocity, acceleration, force, (..., 3)."""
         return np.asarray(np.asarray(v, float) @ self.A.T)
 
     def axial(self, w: npt.ArrayLike) -> Array:
-        """Axial vector: angular velocity, moment, rotation vector, (..., 3)."""
+        """Return an axial vector in the new axes and its own unit: angular velocity, moment, rotation vector, (...,
+        3)."""
         return np.asarray(np.asarray(w, float) @ self.axial_map.T)
 
     def twist(self, x: npt.ArrayLike) -> Array:
-        """Twist or wrench: three polar, then three axial components, (..., 6)."""
+        """Return a twist or wrench in the new axes and its own units: three polar, then three axial components, (...,
+        6)."""
         return np.asarray(np.asarray(x, float) @ self.twist_map.T)
 
     def rotation(self, R: npt.ArrayLike) -> Array:
@@ -84,7 +86,10 @@ class Axes:
         return np.asarray(np.asarray(yaw, float) * np.sum(self.axial([0.0, 0.0, 1.0])))
 
     def covariance(self, S: npt.ArrayLike) -> Array:
-        """Covariance, inertia or damping: of polar vectors (..., 3, 3), of twists or wrenches (..., 6, 6)."""
+        """Return a covariance, inertia or damping in the new axes and its own unit.
+
+        Polar vectors have (..., 3, 3), twists or wrenches (..., 6, 6).
+        """
         S = np.asarray(S, float)
         M = self.A if S.shape[-1] == 3 else self.twist_map
         return np.asarray(M @ S @ M.T)

@@ -27,7 +27,7 @@ def unit_hull(fill: float) -> tuple[Vertices, Faces]:
         fill: The share, above 0 and up to 1.
 
     Returns:
-        Vertices (n, 3) and outward faces (m, 3).
+        Vertices in a cube of unit size, (n, 3), and outward faces (m, 3).
     """
     from scipy.optimize import brentq  # here and below: a robot that needs no hull starts without them
 

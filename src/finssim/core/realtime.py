@@ -19,7 +19,7 @@ class ClockRateError(ValueError):
 
 
 def clock_rate() -> float:
-    """Return how many seconds of the session pass in one second of this machine.
+    """Return how many seconds of the session pass in one second of this machine [-].
 
     Raises:
         ClockRateError: The environment variable is not a number between 0.01 and 1.

@@ -51,14 +51,14 @@ def _cross(a: tuple[Any, ...], b: tuple[Any, ...]) -> tuple[Any, Any, Any]:
 
 
 def skew(a: npt.ArrayLike) -> Array:
-    """Matrix S(a) with S(a) b = a x b, (..., 3) -> (..., 3, 3)."""
+    """Matrix S(a) with S(a) b = a x b, (..., 3) -> (..., 3, 3). The unit is kept."""
     x, y, z = _components(a)
     S = _vector(0.0, -z, y, z, 0.0, -x, -y, x, 0.0)
     return S.reshape(*S.shape[:-1], 3, 3)
 
 
 def quat_multiply(q_ab: npt.ArrayLike, q_bc: npt.ArrayLike) -> Array:
-    """Composition q_ac = q_ab q_bc, (..., 4)."""
+    """Return the composition q_ac = q_ab q_bc of quaternions, (..., 4)."""
     a, b = _components(q_ab), _components(q_bc)
     x, y, z = _cross(a, b)
     return _vector(
@@ -75,7 +75,7 @@ def quat_conjugate(q: npt.ArrayLike) -> Array:
 
 
 def quat_rotate(q_ab: npt.ArrayLike, vector_b: npt.ArrayLike) -> Array:
-    """A vector written in b, written in a: (..., 4), (..., 3) -> (..., 3)."""
+    """Return a vector of any unit that is written in b, written in a: (..., 4), (..., 3) -> (..., 3)."""
     q, v = _components(q_ab), _components(vector_b)
     x, y, z = _cross(q, v)
     twice = 2.0 * x, 2.0 * y, 2.0 * z
@@ -84,7 +84,7 @@ def quat_rotate(q_ab: npt.ArrayLike, vector_b: npt.ArrayLike) -> Array:
 
 
 def quat_inverse_rotate(q_ab: npt.ArrayLike, vector_a: npt.ArrayLike) -> Array:
-    """A vector written in a, written in b: (..., 4), (..., 3) -> (..., 3)."""
+    """Return a vector of any unit that is written in a, written in b: (..., 4), (..., 3) -> (..., 3)."""
     return quat_rotate(quat_conjugate(q_ab), vector_a)
 
 

@@ -49,7 +49,7 @@ class TextTable:
         return [self.split(text) for text in self.texts]
 
     def number(self, cell: str) -> float | None:
-        """The number in a cell; NaN where it holds a word of `EMPTY`, None where it holds another."""
+        """Return the number in a cell, in the unit of its column; NaN for a word of `EMPTY`, None for another word."""
         return number(cell, decimal_comma=self.decimal_comma)
 
     def place(self, names: Sequence[str]) -> int | None:
@@ -59,7 +59,7 @@ class TextTable:
 
 
 def number(cell: str, *, decimal_comma: bool = False) -> float | None:
-    """The number in a cell; NaN where it holds a word of `EMPTY`, None where it holds another."""
+    """Return the number in a cell, in the unit of its column; NaN for a word of `EMPTY`, None for another word."""
     cell = cell.strip().replace("−", "-")
     try:
         return float(cell.replace(",", ".") if decimal_comma else cell)

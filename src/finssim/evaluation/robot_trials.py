@@ -260,7 +260,7 @@ class Stages:
         return (late or t > self._trial.duration + GETTING_READY) and self._end("not there")
 
     def there(self, reading: Reading, now: float) -> bool:
-        """Return whether the vehicle has been at its start, at rest, for long enough."""
+        """Return whether the vehicle has been at its start, at rest, for long enough. `now` is the time [s]."""
         off = (
             float(np.abs(reading.position - self._start.position).max()),
             abs(self._turn(reading)),

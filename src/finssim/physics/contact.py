@@ -17,7 +17,7 @@ class PoolWalls:
     depth: float  # floor at z = -depth [m]
     stiffness: float  # per corner [N/m]
     damping: float  # per corner, against approach only [N s/m]
-    friction: float  # Coulomb coefficient
+    friction: float  # Coulomb coefficient [-]
 
 
 @wp.func
@@ -29,10 +29,10 @@ def penalty_force(
     Args:
         penetration: Depth of the point behind the surface [m]; no force unless positive.
         v: Velocity of the point [m/s].
-        n: Normal of the surface, out of the solid, in the same axes.
+        n: Unit normal of the surface, out of the solid, in the same axes.
         stiffness: [N/m].
         damping: [N s/m].
-        friction: Coulomb coefficient.
+        friction: Coulomb coefficient [-].
         slip: Speed below which friction is linear, so that it stays dissipative and has no step at rest [m/s].
 
     Returns:
@@ -53,7 +53,7 @@ def wall_force(penetration: float, v: wp.vec3, n: wp.vec3, walls: PoolWalls) -> 
     Args:
         penetration: Depth of the corner behind the wall [m]; no force unless positive.
         v: Velocity of the corner, world frame [m/s].
-        n: Wall normal into the water, world frame.
+        n: Unit normal of the wall, into the water, world frame.
         walls: Stiffness, damping and friction.
 
     Returns:

@@ -26,7 +26,7 @@ class Funnel:
     back: float  # thickness behind the tube's end [m]
     stiffness: float  # per point of the hull [N/m]
     damping: float  # per point, against approach only [N s/m]
-    friction: float  # Coulomb coefficient
+    friction: float  # Coulomb coefficient [-]
     slip: float  # speed below which friction is linear [m/s]
     position: wp.array(dtype=wp.vec3)  # of the throat, by world, world frame [m]
     quaternion: wp.array(dtype=wp.quat)  # dock axes to world

@@ -61,7 +61,7 @@ def water_acceleration_wrench(
     water keeps moving with it, whatever its added mass.
 
     Args:
-        M_A: Added mass about the body origin.
+        M_A: Added mass about the body origin [kg, kg m, kg m²].
         r_b: Centre of buoyancy, body frame [m].
         water_b: Velocity of the water v_c, body frame [m/s].
         passing: Rate of the water's velocity where the body is, as it moves: a_x, body frame [m/s²].
@@ -110,7 +110,10 @@ def invert_spd(M: mat66) -> mat66:
 
 @wp.func
 def solve_spd(M: mat66, b: vec6) -> vec6:
-    """x with M x = b for a symmetric positive definite M, by elimination in float64; see `invert_spd`."""
+    """x with M x = b for a symmetric positive definite M, by elimination in float64; see `invert_spd`.
+
+    The unit of x is that of b over that of M.
+    """
     A = mat66d()
     x = vec6d()
     for i in range(6):

@@ -52,7 +52,7 @@ def rotate_by(q: wp.quat, omega: wp.vec3, h: float) -> wp.quat:
 
 @wp.func
 def up_in_body(q: wp.quat) -> wp.vec3:
-    """World z axis in the body frame: the last row of R(q)."""
+    """Return the world z axis in the body frame, a unit vector: the last row of R(q)."""
     return wp.vec3(
         2.0 * (q[0] * q[2] - q[3] * q[1]),
         2.0 * (q[1] * q[2] + q[3] * q[0]),

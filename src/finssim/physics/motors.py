@@ -44,7 +44,7 @@ def first_order(x: vec8, target: vec8, alpha: vec8, max_change: vec8) -> vec8:
 
     Args:
         x: Thrusts [N] or speeds [rad/s] now.
-        target: Commanded thrusts or speeds.
+        target: Commanded thrusts [N] or speeds [rad/s], in the unit of x.
         alpha: Part of the way made in one step, in (0, 1].
         max_change: Slew limit times the step, same unit as x.
 

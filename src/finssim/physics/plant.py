@@ -20,34 +20,34 @@ class VehicleParameters:
     r_b: wp.vec3  # centre of buoyancy, body frame [m]
     surface_half_height: float  # [m]
     half_size: wp.vec3  # half extents of the envelope [m]
-    M_A: mat66  # added mass about the body origin
-    M_inv: mat66  # inverse of M_RB + M_A
-    G: mat68  # M_inv B: thruster forces to acceleration, submerged
+    M_A: mat66  # added mass about the body origin [kg, kg m, kg m²]
+    M_inv: mat66  # inverse of M_RB + M_A [1/kg, 1/(kg m), 1/(kg m²)]
+    G: mat68  # M_inv B: thruster forces to acceleration, submerged [1/kg, 1/(kg m)]
     r_m: wp.vec3  # point about which inertia is nearly diagonal, body frame [m], kept by `refresh_plant`
-    relax: vec6  # relaxation of a substep per slope of the damping, kept by `refresh_plant`
-    relax_1: vec6  # what linear damping adds to the relaxation of a substep, kept by `refresh_plant`
+    relax: vec6  # relaxation of a substep per slope of the damping [s/kg, s/(kg m²)], kept by `refresh_plant`
+    relax_1: vec6  # what linear damping adds to the relaxation of a substep [-], kept by `refresh_plant`
     relax_2: vec6  # what quadratic damping adds to it, per speed on the same axis [s/m, s/rad]
     relax_v: vec6  # what damping away from the origin adds, per linear speed [s/m]
     r_h: wp.vec3  # point where the damping coefficients hold, body frame [m]
-    D1: mat66
-    D2: mat66
-    form_drag: float
-    skin_drag: float
+    D1: mat66  # linear damping at r_h [N s/m, N s, N m s]
+    D2: mat66  # quadratic damping at r_h [N s²/m², N s²/m, N s², N m s²]
+    form_drag: float  # form drag coefficient of the mesh model [-]
+    skin_drag: float  # skin drag coefficient of the mesh model [-]
     hull: int  # which hull mesh, for the mesh model
-    B: mat68  # thruster forces to the wrench about the body origin
+    B: mat68  # thruster forces to the wrench about the body origin [-, m]
     force_min: vec8  # [N]
-    force_max: vec8
+    force_max: vec8  # [N]
     dead_minus: vec8  # commands between dead_minus and dead_plus give nothing [N]
-    dead_plus: vec8
-    gain: vec8  # delivered over nominal thrust; 0 is a dead thruster
+    dead_plus: vec8  # [N]
+    gain: vec8  # ratio of delivered to nominal thrust; 0 is a dead thruster
     time_constant: vec8  # [s]
     slew: vec8  # [N/s] or, for a speed lag, [rad/s²]
-    alpha: vec8  # 1 - exp(-substep / time_constant), kept by `refresh_plant`
-    beta: vec8  # the same for the mean over a substep, kept by `refresh_plant`
+    alpha: vec8  # share 1 - exp(-substep / time_constant), kept by `refresh_plant`
+    beta: vec8  # the same share for the mean over a substep, kept by `refresh_plant`
     delay: float  # command delay [s]
     speed_lag: int  # 1: lag and slew act on propeller speed, 0: on force
     c_plus: vec8  # [N s²/rad²]
-    c_minus: vec8
+    c_minus: vec8  # [N s²/rad²]
 
 
 @wp.struct
@@ -143,7 +143,10 @@ def refresh_plant(
 
 @wp.func
 def inertia_center(M: mat66) -> wp.vec3:
-    """Point about which a 6x6 inertia hardly couples translation with turning: the mean of the two axes' points."""
+    """Return the point about which a 6x6 inertia M [kg, kg m, kg m²] hardly couples translation with turning [m].
+
+    It is the mean of the two axes' points.
+    """
     return 0.5 * wp.vec3(
         M[1, 5] / M[1, 1] - M[2, 4] / M[2, 2],
         M[2, 3] / M[2, 2] - M[0, 5] / M[0, 0],
@@ -153,7 +156,10 @@ def inertia_center(M: mat66) -> wp.vec3:
 
 @wp.func
 def diagonal_at_origin(d: vec6, r: wp.vec3) -> vec6:
-    """Diagonal of Hᵀ diag(d) H: of a matrix that holds at the point r, about the origin."""
+    """Diagonal of Hᵀ diag(d) H: of a matrix that holds at the point r, about the origin.
+
+    The unit is that of d, and r is in [m].
+    """
     x = r[0] * r[0]
     y = r[1] * r[1]
     z = r[2] * r[2]

@@ -24,13 +24,13 @@ class Solids:
     """Solids of one kind each in every world, whose poses and sizes differ."""
 
     kind: wp.array(dtype=int)  # BOX ... HEIGHTFIELD
-    size: wp.array(dtype=wp.vec3)  # half extents; radius and half length; of a mesh: 1 if closed
+    size: wp.array(dtype=wp.vec3)  # half extents; radius and half length [m]; of a mesh: 1 if closed
     bound: wp.array(dtype=float)  # radius of the ball around its origin that holds it [m]
     mesh: wp.array(dtype=wp.uint64)  # of meshes
     heights: wp.array2d(dtype=float)  # of the heightfield: z by (y, x) [m]
     gentle: float  # cosine of the heightfield's steepest slope
     shape: wp.array(dtype=int)  # index of each among the poses
-    pose: wp.array2d(dtype=wp.transform)  # to world, by (world, shape)
+    pose: wp.array2d(dtype=wp.transform)  # to world [m], by (world, shape)
     scale: wp.array2d(dtype=float)  # factor on its size, by (world, shape)
     draws: wp.array(dtype=int)  # changes with the poses of a world
     drawn: wp.array2d(dtype=int)  # at the last look around, by (world, vehicle)
@@ -39,7 +39,7 @@ class Solids:
     reach: wp.array2d(dtype=float)  # how far the vehicle may have come from there without meeting others [m]
     stiffness: float  # per point or sphere of the hull [N/m]
     damping: float  # per point, against approach only [N s/m]
-    friction: float  # Coulomb coefficient
+    friction: float  # Coulomb coefficient [-]
     step: float  # longest step in which contacts are integrated [s]
     force: wp.array2d(dtype=float)  # greatest contact force on a vehicle in the last control step [N]
 
@@ -73,6 +73,8 @@ def box_distance(x: wp.vec3, half: wp.vec3) -> wp.vec4:
 def ball_distance(x: wp.vec3, radius: float) -> wp.vec4:
     """Normal and signed distance of a sphere about the origin; see `box_distance`.
 
+    Both in [m], as the arguments.
+
     Args:
         x: A point [m].
         radius: [m].
@@ -85,6 +87,8 @@ def ball_distance(x: wp.vec3, radius: float) -> wp.vec4:
 @wp.func
 def cylinder_distance(x: wp.vec3, radius: float, half: float) -> wp.vec4:
     """Normal and signed distance of a cylinder along z; see `box_distance`.
+
+    Both in [m], as the arguments.
 
     Args:
         x: A point, cylinder axes [m].
@@ -299,7 +303,7 @@ def solids_wrench(
 
     Args:
         solids: All solids.
-        clearing: A ball of free water; see `solids_within`.
+        clearing: A ball of free water: its centre and radius [m]; see `solids_within`.
         w: Which world.
         v: Which vehicle.
         position: Body origin, world frame [m].

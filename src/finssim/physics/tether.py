@@ -14,7 +14,7 @@ class Tether:
     anchor: wp.vec3  # where it enters the water, world frame [m]
     attachment: wp.vec3  # on the vehicle, body frame [m]
     diameter: float  # [m]
-    drag_coefficient: float  # of a cylinder across the flow
+    drag_coefficient: float  # of a cylinder across the flow [-]
     wet_weight: float  # weight in water per length [N/m]; negative floats
 
 

@@ -17,23 +17,26 @@ mat68 = wp.types.matrix(shape=(6, MAX_THRUSTERS), dtype=wp.float32)
 
 @wp.func
 def linear(x: vec6) -> wp.vec3:
-    """First three components: linear velocity or force."""
+    """First three components: linear velocity or force. The unit is kept."""
     return wp.vec3(x[0], x[1], x[2])
 
 
 @wp.func
 def angular(x: vec6) -> wp.vec3:
-    """Last three components: angular velocity or moment."""
+    """Last three components: angular velocity or moment. The unit is kept."""
     return wp.vec3(x[3], x[4], x[5])
 
 
 @wp.func
 def join(a: wp.vec3, b: wp.vec3) -> vec6:
-    """A twist or wrench from its linear and angular parts."""
+    """A twist or wrench from its linear and angular parts. The units are kept."""
     return vec6(a[0], a[1], a[2], b[0], b[1], b[2])
 
 
 @wp.func
 def symmetric_times(M: mat66, x: vec6) -> vec6:
-    """M x for a symmetric M, as xᵀ M: a sum of rows, which the compiler turns into vector instructions."""
+    """M x for a symmetric M, as xᵀ M: a sum of rows, which the compiler turns into vector instructions.
+
+    The unit is the product of those of M and x.
+    """
     return x * M

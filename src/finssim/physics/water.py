@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 class WaterArrays:
     """Water of every world; the arrays are indexed by world, the wave arrays by (world, component)."""
 
-    density: float
-    gravity: float
+    density: float  # [kg/m³]
+    gravity: float  # [m/s²]
     depth: float  # still water depth [m], for the wave dispersion
     n_waves: int
     moving: int  # 0: still water everywhere, nothing below is read
@@ -22,7 +22,7 @@ class WaterArrays:
     shear: wp.array(dtype=wp.vec3)  # d(current)/dz, world frame [1/s]
     drift: wp.array(dtype=wp.vec3)  # slow random part of the current at the start of the step [m/s]
     drift_rate: wp.array(dtype=wp.vec3)  # its rate during the step [m/s²]
-    drift_std: wp.array(dtype=wp.vec3)
+    drift_std: wp.array(dtype=wp.vec3)  # standard deviation of the drift, world frame [m/s]
     drift_time: wp.array(dtype=float)  # correlation time [s]
     wave_amplitude: wp.array2d(dtype=float)  # [m]
     wave_number: wp.array2d(dtype=float)  # k [rad/m]
@@ -39,7 +39,7 @@ class Flow:
     acceleration: wp.vec3  # local acceleration, world frame [m/s²]
     elevation: float  # surface height above still water [m]
     gradient: wp.mat33  # d velocity_i / d x_j, world frame [1/s]
-    normal: wp.vec3  # upward normal of the surface, world frame
+    normal: wp.vec3  # unit normal of the surface, upwards, world frame
 
 
 def dispersion(wave_number: ArrayLike, depth: float, gravity: float = 9.81) -> NDArray[np.float64]:
@@ -157,6 +157,8 @@ def advance_drift(
     """Draw the drifting current of the coming control step: a Gauss-Markov process, exact for its sampling.
 
     d(0) = σ N(0, 1),  d(t + T) = a d(t) + sqrt(1 - a²) σ N(0, 1),  a = exp(-T / time)
+
+    `control_step` is the length of a control step [s].
     """
     w = world_offset + wp.tid()
     if water.drift_time[w] <= 0.0:

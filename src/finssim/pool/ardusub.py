@@ -217,12 +217,15 @@ class ArduSub:
     # What the pool calls.
 
     def reboot(self, now: float) -> None:
-        """Stop the motors, be silent for the plant's `reboot_time`, then restart everything but the parameters."""
+        """Stop the motors, be silent for the plant's `reboot_time`, then restart everything but the parameters.
+
+        `now` is the time [s].
+        """
         self._clock_start = 0
         self._start(now + self._spec.reboot_time)
 
     def running(self, now: float) -> bool:
-        """Return whether it has finished starting."""
+        """Return whether it has finished starting. `now` is the time [s]."""
         return now >= self._boot
 
     @property
@@ -231,7 +234,10 @@ class ArduSub:
         return self.armed
 
     def receive(self, now: float, data: bytes) -> list[bytes]:
-        """Read a datagram of complete MAVLink frames and return the answers; it raises nothing."""
+        """Read a datagram of complete MAVLink frames and return the answers; it raises nothing.
+
+        `now` is the time [s].
+        """
         if not self.running(now):
             return []
         self._now = max(self._now, now)
@@ -250,7 +256,10 @@ class ArduSub:
         return out
 
     def watch(self, now: float) -> None:
-        """Let overrides lapse, look at the pilot and the ground station, and set the motors."""
+        """Let overrides lapse, look at the pilot and the ground station, and set the motors.
+
+        `now` is the time [s].
+        """
         if not self.running(now):
             return
         self._now = now = max(self._now, now)

@@ -350,7 +350,7 @@ class CornerCamera:
 
         Args:
             start: Position [m] and orientation (xyzw) of the body when it began, pool frame.
-            end: The same when it ended.
+            end: Position [m], (3,), and attitude when it ended.
             middle: [s]
             sequence: Of the picture.
         """
@@ -413,7 +413,7 @@ class CameraSettings:
     dropout: float = 0.0
     """Chance that a picture is lost."""
     ripples: float = 0.0
-    """Root mean square of the water's slope."""
+    """Root mean square of the water's slope [-]."""
     pixel_noise: float = 0.03
     """Noise of corners that are made without a picture, per axis [px]; rendered pictures have the noise of their
     pixels."""
@@ -715,7 +715,10 @@ class PoolCamera:
         return [self.develop(exposure) for exposure in self.exposures(t0, t1, pose_at)]
 
     def exposures(self, t0: float, t1: float, pose_at: PoseAt) -> list[Exposure]:
-        """Return the exposures of `advance` before they are developed: for a process that renders them in parallel."""
+        """Return the exposures of `advance` before they are developed: for a process that renders them in parallel.
+
+        Times are in [s].
+        """
         self._mail.post(self._shutter.advance(t0, t1, pose_at))
         return self._mail.arrived(t1)
 

@@ -187,7 +187,7 @@ def steady_share(vehicle: Vehicle, panels: Array, propellers: Mapping[str, float
     Args:
         vehicle: Its file.
         panels: Drag of the panels, by axis [N, N m], (6,).
-        propellers: Keys of `Propellers`.
+        propellers: Keys of `Propellers`, in the units of `Propellers`.
         deduction: Mean of the thrust deduction [-].
     """
     F, v = cruise(vehicle)
@@ -217,7 +217,7 @@ def less_share(vehicle: Vehicle, D1: Array, D2: Array, drag: Array) -> tuple[Arr
         drag: Drag when cruising, by axis [N, N m], (6,): out of the linear part first.
 
     Returns:
-        D1 and D2 with smaller diagonals.
+        D1 [N s/m, N m s] and D2 [N s²/m², N m s²] with smaller diagonals.
     """
     _, v = cruise(vehicle)
     first = np.minimum(drag, LARGEST * np.diag(D1) * v)

@@ -187,7 +187,7 @@ class AttitudeFilter:
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """IMU frame to level world, xyzw; identity before the first sample."""
+        """Return the quaternion from IMU frame to level world, xyzw; identity before the first sample."""
         w, x, y, z = self._q or (1.0, 0.0, 0.0, 0.0)
         return x, y, z, w
 
@@ -313,7 +313,7 @@ class Firmware:
         self._start(now + self._spec.reboot_time)
 
     def running(self, now: float) -> bool:
-        """Return whether it has finished starting."""
+        """Return whether it has finished starting. `now` is the time [s]."""
         return now >= self._boot
 
     def clock(self, now: float) -> int:
@@ -322,7 +322,7 @@ class Firmware:
         return (self._clock_start + int(rate * (now - self._boot))) & 0xFFFFFFFF
 
     def receive(self, now: float, data: bytes) -> list[bytes]:
-        """Take bytes from the wire; returns the echoes that they cause."""
+        """Take bytes from the wire; returns the echoes that they cause. `now` is the time [s]."""
         if not self.running(now):
             return []
         replies = []
@@ -387,7 +387,7 @@ class Firmware:
         return encode_echo(echo)
 
     def watch(self, now: float) -> None:
-        """Stop the motors if commands have stopped."""
+        """Stop the motors if commands have stopped. `now` is the time [s]."""
         if self._last_command is not None and now - self._last_command > self._timeout:
             self._last_command, self._timed_out, self._enabled = None, True, False
             self._aim(np.zeros(self._outputs))
@@ -416,7 +416,7 @@ class Firmware:
             now: When it is sent [s].
             sample: Of the instruments.
             speed: Measured shaft speeds, canonical [rad/s], (n,).
-            throttle: Newest, canonical, (n,).
+            throttle: Newest [-1, 1], canonical, (n,).
         """
         if not self.running(now):
             return None

@@ -31,13 +31,13 @@ class Gyre:
     length: float  # [m]
     width: float  # [m]
     depth: float  # [m]
-    floor_share: float
+    floor_share: float  # share of the speed that is left at the floor
     stream: wp.vec3  # the same everywhere [m/s]
-    cells: wp.array(dtype=float)
+    cells: wp.array(dtype=float)  # number of cells along the pool [-]
     speed: wp.array(dtype=float)  # signed by the sense of rotation [m/s]
-    unsteadiness: wp.array(dtype=float)
+    unsteadiness: wp.array(dtype=float)  # share of the speed that comes and goes
     rate: wp.array(dtype=float)  # [rad/s]
-    phase: wp.array(dtype=float)
+    phase: wp.array(dtype=float)  # [rad]
 
 
 @wp.func
@@ -54,7 +54,7 @@ def circulation_at(gyre: Gyre, position: wp.vec3, t: float) -> wp.vec3:
         t: Time [s].
 
     Returns:
-        The stream, and horizontally what the eddies add to it within the walls.
+        The stream, and horizontally what the eddies add to it within the walls [m/s].
     """
     X = position[0] / gyre.length + 0.5
     Y = position[1] / gyre.width + 0.5
@@ -121,11 +121,11 @@ class PropellerBank:
     """All propellers, in canonical order."""
 
     count: int
-    axis: wp.array(dtype=wp.vec3)
+    axis: wp.array(dtype=wp.vec3)  # unit vector of the thrust, body frame
     place: wp.array(dtype=wp.vec3)  # body frame [m]
     c_plus: wp.array(dtype=float)  # as built, less the thrust deduction [N s²/rad²]
-    c_minus: wp.array(dtype=float)
-    own_share: float
+    c_minus: wp.array(dtype=float)  # the same for reverse [N s²/rad²]
+    own_share: float  # share of a propeller's own induced speed
     share: wp.array2d(dtype=float)  # part of neighbour j's induced speed that enters propeller k
     stall: float  # J0 D / 2π: inflow at which a shaft speed gives no thrust, per shaft speed [m]
     disc: float  # 2 ρ times the disc's area [kg/m]
@@ -268,14 +268,14 @@ class MotorBank:
     """Parameters and memory of all motors, in canonical order; speeds are canonical too (positive pushes forward)."""
 
     count: int
-    alpha: wp.array(dtype=float)  # 1 - exp(-motor step / time constant)
+    alpha: wp.array(dtype=float)  # share 1 - exp(-motor step / time constant) of the way in one step
     delay: wp.array(dtype=int)  # motor steps from throttle to shaft
     full: wp.array(dtype=float)  # steady speed at full throttle on a full battery [rad/s]
     dead_plus: wp.array(dtype=float)  # slowest speed that turns the shaft [rad/s]
-    dead_minus: wp.array(dtype=float)  # as a magnitude
+    dead_minus: wp.array(dtype=float)  # the same in reverse, as a magnitude [rad/s]
 
     full_voltage: float  # [V]
-    fade: float
+    fade: float  # share of the thrust that warm motors lose
     fade_time: float  # [s]
     resistance: float  # [ohm]
     motor_power: float  # at full speed [W]
@@ -288,8 +288,10 @@ class MotorBank:
         dtype=float
     )  # speed that a motor as described has at full throttle on a full battery [rad/s]
     scale: wp.array(dtype=float)  # speed that the firmware believes full throttle gives [rad/s]
-    model_alpha: wp.array(dtype=float)  # of the response that the firmware expects, per run of the loop
-    kp: float
+    model_alpha: wp.array(
+        dtype=float
+    )  # share of the way in one run of the loop, in the response of the firmware
+    kp: float  # gain of the relative deviation [-]
     ki: float  # [1/s]
     kd: float  # [s]
     noise: float  # of one speed measurement [rad/s]
@@ -298,11 +300,11 @@ class MotorBank:
     target: wp.array(dtype=float)  # [rad/s]
     speed: wp.array(dtype=float)  # true shaft speed [rad/s]
     measured: wp.array(dtype=float)  # newest measurement [rad/s]
-    smooth: wp.array(dtype=float)  # for the derivative
+    smooth: wp.array(dtype=float)  # smoothed deviation for the derivative [-]
     expected: wp.array(dtype=float)  # response that the firmware expects [rad/s]
-    integral: wp.array(dtype=float)
-    throttle: wp.array(dtype=float)  # newest, -1 to 1
-    line: wp.array2d(dtype=float)  # throttles on their way
+    integral: wp.array(dtype=float)  # integral part of the throttle [-]
+    throttle: wp.array(dtype=float)  # newest [-1, 1]
+    line: wp.array2d(dtype=float)  # throttles on their way [-1, 1]
     electric: wp.array(dtype=float)  # battery voltage [V], current [A]
 
 
@@ -319,7 +321,7 @@ def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
         noise: A standard normal number.
 
     Returns:
-        Throttle, -1 to 1.
+        Throttle [-1, 1].
     """
     measured = motors.speed[k] + motors.noise * noise
     if motors.speed[k] == 0.0:
@@ -444,15 +446,15 @@ MOTOR_STEP = 0.001
 class Hidden:
     """Forces on the body besides the engine's own."""
 
-    T: mat66  # body twist to the damping's axes
-    D1: mat66
-    D2: mat66
+    T: mat66  # body twist to the damping's axes [-, m]
+    D1: mat66  # linear damping [N s/m, N m s]
+    D2: mat66  # quadratic damping [N s²/m², N m s²]
     r_b: wp.vec3  # centre of buoyancy, body frame [m]
     half_height: float  # of the surface transition [m]
     drifts: int
     drift: wp.array(dtype=float)  # amplitude of each slow change of buoyancy [N]
     drift_rate: wp.array(dtype=float)  # [rad/s]
-    drift_phase: wp.array(dtype=float)
+    drift_phase: wp.array(dtype=float)  # [rad]
 
 
 @wp.func
@@ -553,8 +555,8 @@ class Plant:
             spec: What is hidden.
             seed: Of the speed measurements' noise.
             period: Time that the physics step must divide [s], such as the sensors' period.
-            position: Start, world frame [m].
-            quaternion: Start, body to world, xyzw.
+            position: Body origin at the start, world frame [m], (3,).
+            quaternion: Attitude at the start, body to world, xyzw, (4,).
             speed_loop: Whether the firmware holds shaft speeds; if not, `target` is what it expects at full voltage.
             world: One copy of a world, whose things the hull meets; with its basin in place of that of `spec`.
             dock: A funnel in the water, at `simulator.funnel`.

@@ -66,7 +66,10 @@ class PrincipalAxes(Section):
     """Roll, pitch, yaw of the axes in the body [deg]."""
 
     def to_axes(self) -> Array:
-        """T with x = T nu: the twist at the point, in the tilted axes, from that of the body origin; (6, 6)."""
+        """T with x = T nu: the twist at the point, in the tilted axes, from that of the body origin; (6, 6).
+
+        The angles have no unit, the arms are in [m].
+        """
         tilt = quat_to_matrix(quat_from_euler(*np.radians(self.tilt_deg)))
         return np.asarray(np.kron(np.eye(2), tilt.T) @ twist_shift(self.center))
 
@@ -78,7 +81,10 @@ class CoupledMatrix(PrincipalAxes):
     """[kg, kg m²] or [N s/m, N m s]; above 0."""
 
     def matrix(self) -> Array:
-        """About the body origin, body axes: Tᵀ diag T; positive definite for a positive diagonal, (6, 6)."""
+        """About the body origin, body axes: Tᵀ diag T; positive definite for a positive diagonal, (6, 6).
+
+        The unit is that of the diagonal.
+        """
         T = self.to_axes()
         return np.asarray(T.T @ np.diag(self.diagonal) @ T)
 
@@ -105,7 +111,7 @@ class AddedMass(PrincipalAxes):
         return self
 
     def about_origin(self) -> Array:
-        """M_A about the body origin, (6, 6)."""
+        """M_A about the body origin, (6, 6) [kg, kg m, kg m²]."""
         T = self.to_axes()
         return np.asarray(T.T @ np.array(self.matrix) @ T)
 
@@ -134,7 +140,9 @@ class HullDrag(Section):
     """Drag of the hull mesh's panels (paper, eq. 4), besides the damping."""
 
     form_drag: float = Field(default=0.0, ge=0.0)
+    """Form drag coefficient [-]."""
     skin_drag: float = Field(default=0.0, ge=0.0)
+    """Skin drag coefficient [-]."""
 
 
 class BuoyancyDrift(Section):
@@ -172,7 +180,7 @@ class SlackTether(Section):
     diameter: float = Field(default=0.004, gt=0.0)
     """[m]"""
     drag_coefficient: float = Field(default=0.5, ge=0.0)
-    """Drag coefficient of a cylinder; less than 1.2, since a slack line follows only in part."""
+    """Drag coefficient of a cylinder [-]; less than 1.2, since a slack line follows only in part."""
     wet_weight: float = 0.0
     """[N/m]; negative floats."""
 
@@ -277,7 +285,7 @@ class TrueThruster(Section):
     gain_plus: float = Field(gt=0.0)
     """Thrust over the file's, forward [-]."""
     gain_minus: float = Field(gt=0.0)
-    """Gain in reverse."""
+    """Gain in reverse, the ratio of true to nominal thrust."""
     deduction: float = Field(ge=0.0, lt=1.0)
     """Part of the thrust that its own jet takes back from the hull [-]."""
     time_constant: float = Field(gt=0.0)
@@ -363,7 +371,7 @@ class FirmwareSpec(Section):
     uplink: tuple[float, float] = (0.001, 0.003)
     """Shortest and longest way of a telemetry frame to the robot [s]."""
     downlink: tuple[float, float] = (0.0008, 0.0014)
-    """Delay of a command."""
+    """Delay of a command [s]."""
 
     @field_validator("uplink", "downlink")
     @classmethod

@@ -40,7 +40,7 @@ class Exposure:
     start: tuple[Array, Array]
     """Pose when the shutter opened, as of `PoseAt`."""
     end: tuple[Array, Array]
-    """Pose when it closed."""
+    """Position [m], (3,), and attitude when it closed."""
     source: str = ""
     """Name of the vehicle's sensor; the overhead camera if empty."""
 
@@ -68,7 +68,10 @@ class Shutter:
         self._last_arrival = -math.inf
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Exposure]:
-        """Exposures that ended in (t0, t1], without those that are lost; `pose_at` is asked for times in it alone."""
+        """Exposures that ended in (t0, t1], without those that are lost; `pose_at` is asked for times in it alone.
+
+        Times are in [s].
+        """
         done: list[Exposure] = []
         while True:
             middle = (self._sequence + 1) / self._rate

@@ -73,6 +73,7 @@ class Clocked(Protocol):
     """A camera that must know when the pool's clock began."""
 
     start: float
+    """Time at which the pool's clock began, on the clock of the process [s]."""
 
 
 @dataclass

@@ -71,11 +71,11 @@ class TrueState:
         """
 
     def picture(self, now: float, picture: Any) -> str:
-        """Nothing that is not known already."""
+        """Nothing that is not known already. `now` is the time [s]."""
         return "not used"
 
     def reading(self, now: float) -> Reading:
-        """The plant's state."""
+        """The plant's state. `now` is the time [s]."""
         plant = self._world.plant
         parts = (plant.position, plant.quaternion, plant.nu)
         position, quaternion, nu = (np.asarray(part, float).copy() for part in parts)
@@ -438,7 +438,7 @@ class TaskSite(Fleet):
         """Play until the task ends, or for a time from the start of the last robot [s]; its time limit if None.
 
         Returns:
-            The task's metrics.
+            The task's metrics, in the units that `finssim tasks show` states.
         """
         step = self.task.control_step
 

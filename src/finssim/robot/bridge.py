@@ -231,13 +231,16 @@ class Commander:
         self._heard: dict[str, float] = {}
 
     def rival(self, now: float, source: str) -> str:
-        """Return another source that sent a command within the timeout; "" if there is none."""
+        """Return another source that sent a command within the timeout; "" if there is none.
+
+        `now` is the time [s].
+        """
         self._heard[source] = now
         self._heard = {name: time for name, time in self._heard.items() if now - time <= self._timeout}
         return next((name for name in self._heard if name != source), "")
 
     def sources(self, now: float) -> list[str]:
-        """Everybody heard within the timeout."""
+        """Everybody heard within the timeout. `now` is the time [s]."""
         return [name for name, time in self._heard.items() if now - time <= self._timeout]
 
     def accept(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None) -> str:
@@ -310,6 +313,8 @@ class TelemetryWatch:
 
     def accept(self, now: float, message: Telemetry) -> str:
         """Takes a well-formed message; a repeated or overtaken one refreshes nothing.
+
+        `now` is the time [s].
 
         Returns:
             "restarted" if the controller's clock went back, "old" if the message brings nothing new, "" otherwise.
@@ -423,7 +428,7 @@ class TiltWatch:
         self._tilted.look(now, up < self._cosine * square)
 
     def over(self, now: float) -> bool:
-        """Return whether it lasted too long."""
+        """Return whether it lasted too long. `now` is the time [s]."""
         return self._tilted.longer(self._duration, now)
 
 
@@ -447,7 +452,7 @@ class StateWatch:
         self._pose: tuple[Array, Array] | None = None
 
     def accept(self, now: float, reading: Reading) -> None:
-        """Takes a reading."""
+        """Takes a reading. `now` is the time [s]."""
         self._oldest = min(now, reading.time)
         self._why = self._unfit(reading)
         self._pose = None if self._why else (np.asarray(reading.position), np.asarray(reading.quaternion))
@@ -457,7 +462,7 @@ class StateWatch:
         return None if self.missing(now) else self._pose
 
     def missing(self, now: float) -> str:
-        """Return why there is no state to act on; "" if there is."""
+        """Return why there is no state to act on; "" if there is. `now` is the time [s]."""
         if self._why:
             return self._why
         return (
@@ -579,7 +584,7 @@ class Clock:
         self._started = False
 
     def wrong(self, now: float) -> str:
-        """Note the time of a call, and return what is wrong with it; "" if nothing."""
+        """Note the time of a call, and return what is wrong with it; "" if nothing. `now` is the time [s]."""
         if not math.isfinite(now):
             return "the clock is not a number"
         step = now - self.now if self._started else 0.0
@@ -620,7 +625,10 @@ class Supervision:
             tilt.forget()
 
     def take_telemetry(self, now: float, message: Telemetry, armed: bool) -> str:
-        """Note a well-formed message that came while `armed` or not; return "restarted" if the controller did."""
+        """Note a well-formed message that came while `armed` or not; return "restarted" if the controller did.
+
+        `now` is the time [s].
+        """
         news = self.telemetry.accept(now, message)
         if news != "old":
             # Frames may be lost unseen; a firmware that sets no status bits does not report it.
@@ -629,7 +637,7 @@ class Supervision:
         return news if news == "restarted" else ""
 
     def take_reading(self, now: float, reading: Reading) -> None:
-        """Takes a reading of the estimator."""
+        """Takes a reading of the estimator. `now` is the time [s]."""
         self.state.accept(now, reading)
         pose = self.state.pose(now)
         if pose is None:
@@ -638,7 +646,10 @@ class Supervision:
             self.tilts["estimator"].accept(now, pose[1])
 
     def danger(self, now: float) -> str:
-        """Return what must stop the thrusters until an operator has acknowledged it; "" if nothing."""
+        """Return what must stop the thrusters until an operator has acknowledged it; "" if nothing.
+
+        `now` is the time [s].
+        """
         limits = self.settings
         if self.telemetry.age(now) > limits.telemetry_timeout:
             return f"no fresh telemetry from the {self.peer} for {limits.telemetry_timeout:g} s"
@@ -667,7 +678,7 @@ class Supervision:
         return f"no command for {self.settings.command_timeout:g} s" if late else ""
 
     def unfit(self, now: float) -> str:
-        """Return why arming is refused; "" if it is not."""
+        """Return why arming is refused; "" if it is not. `now` is the time [s]."""
         reason = self.danger(now) or self._estimator(now)
         if reason:
             return reason
@@ -708,7 +719,10 @@ class Autopilot(Protocol):
         reason."""
 
     def alarm(self, now: float) -> str:
-        """Asked at every tick of an armed bridge: why the vehicle is no longer ours; "" while it is."""
+        """Asked at every tick of an armed bridge: why the vehicle is no longer ours; "" while it is.
+
+        `now` is the time [s].
+        """
 
 
 class Bridge:
@@ -751,7 +765,10 @@ class Bridge:
     # -- what the operator says -------------------------------------------------------------------------------
 
     def arm(self, now: float, source: str) -> str:
-        """Let commands through from now on. Returns "" or, in one sentence, why it is refused."""
+        """Let commands through from now on. Returns "" or, in one sentence, why it is refused.
+
+        `now` is the time [s].
+        """
         refusal = self._refusal(now)
         reason = refusal or (self.autopilot.prepare(now) if self.autopilot is not None else "")
         self.getting_ready = bool(reason) and not refusal
@@ -766,31 +783,34 @@ class Bridge:
         return ""
 
     def disarm(self, now: float) -> None:
-        """Thrusters off; a fault stays until it is acknowledged."""
+        """Thrusters off; a fault stays until it is acknowledged. `now` is the time [s]."""
         self._at(now)
         if self.state in RUNNING:
             self._enter("disarmed", "", "disarmed")
 
     def stop(self, now: float, reason: str) -> None:
-        """Emergency stop, in every state."""
+        """Emergency stop, in every state. `now` is the time [s]."""
         self._at(now)
         self._fault(reason or "stopped")
 
     def acknowledge(self, now: float) -> None:
-        """End a fault; the bridge is disarmed then."""
+        """End a fault; the bridge is disarmed then. `now` is the time [s]."""
         self._at(now)
         if self.state == "fault":
             self._enter("disarmed", "", f"acknowledged: {self.reason}")
 
     def hold(self, now: float) -> None:
-        """Pause an armed vehicle without thrust until `resume`, for as long as the operator likes."""
+        """Pause an armed vehicle without thrust until `resume`, for as long as the operator likes.
+
+        `now` is the time [s].
+        """
         self._at(now)
         self._operator = self.state in RUNNING
         if self.state == "armed":
             self._hold("the operator holds")
 
     def resume(self, now: float) -> None:
-        """End the operator's hold; thrust returns with the first command after it."""
+        """End the operator's hold; thrust returns with the first command after it. `now` is the time [s]."""
         self._at(now)
         self._operator = False
 
@@ -820,7 +840,7 @@ class Bridge:
         return self._limited(now) if self.state == "armed" and not reason else unused
 
     def telemetry(self, now: float, telemetry: Telemetry) -> None:
-        """A message from the motor controller."""
+        """A message from the motor controller. `now` is the time [s]."""
         if not self._at(now):
             return
         reason = self._watchdogs.telemetry.malformed(telemetry)
@@ -830,7 +850,7 @@ class Bridge:
             self._alarm("restart", f"the {self._watchdogs.peer} restarted: its clock went back")
 
     def echo(self, now: float, echo: CommandEcho) -> None:
-        """Note the motor controller's echo of a command."""
+        """Note the motor controller's echo of a command. `now` is the time [s]."""
         if not self._at(now):
             return
         news = self._watchdogs.echo.accept(now, echo, self.state == "armed")
@@ -841,14 +861,14 @@ class Bridge:
             self.log.repeat(now, "command rejected", f"the {self._watchdogs.peer} refused a command: {flags}")
 
     def reading(self, now: float, reading: Reading) -> None:
-        """Note a reading of the estimator."""
+        """Note a reading of the estimator. `now` is the time [s]."""
         if self._at(now):
             self._watchdogs.take_reading(now, reading)
 
     # -- what goes out ----------------------------------------------------------------------------------------
 
     def tick(self, now: float) -> ThrusterCommand:
-        """The frame to send now; call it at every turn of the loop, in every state."""
+        """The frame to send now; call it at every turn of the loop, in every state. `now` is the time [s]."""
         dt = self._period(now)
         if self.state in RUNNING:
             self._watch(self._clock.now)

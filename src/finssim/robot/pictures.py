@@ -374,7 +374,7 @@ class NoPictures:
     """No camera."""
 
     def receive(self, now: float) -> list[Picture]:
-        """Nothing."""
+        """Nothing. `now` is the time [s]."""
         return []
 
     def close(self) -> None:

@@ -342,7 +342,7 @@ class Recorder:
         self._put("thrusters", at, self._messages.thrusters(at, state, values))
 
     def echo(self, now: float, echo: CommandEcho) -> None:
-        """Record the motor controller's echo of a command."""
+        """Record the motor controller's echo of a command. `now` is the time [s]."""
         at = self._ns(now)
         self._put("echo", at, self._messages.echo(at, echo))
 
@@ -353,7 +353,7 @@ class Recorder:
             self._put(message[0], self._ns(now), message[1])
 
     def policy(self, now: float, pilot: str, **values: Any) -> None:
-        """One decision of a controller; fields of `finssim_msgs/PolicyInfo`."""
+        """One decision of a controller; fields of `finssim_msgs/PolicyInfo`. `now` is the time [s]."""
         at = self._ns(now)
         self._put("policy", at, self._messages.policy(at, pilot, values))
 
@@ -363,14 +363,17 @@ class Recorder:
         self._put("goal", at, self._messages.goal(at, np.asarray(position, float), yaw))
 
     def event(self, now: float, kind: str, text: str = "", **values: Any) -> None:
-        """Something that happened, such as arm, disarm, fault, trial_start; or a `phase` of an experiment."""
+        """Something that happened, such as arm, disarm, fault, trial_start; or a `phase` of an experiment.
+
+        `now` is the time [s].
+        """
         at = self._ns(now)
         self._put("event", at, self._messages.words({"time": now, "kind": kind, "text": text, **values}))
 
     def diagnostics(
         self, now: float, name: str, level: str, message: str, values: Mapping[str, Any] | None = None
     ) -> None:
-        """The health of a part; level is ok, warn, error or stale."""
+        """The health of a part; level is ok, warn, error or stale. `now` is the time [s]."""
         at = self._ns(now)
         self._put("diagnostics", at, self._messages.diagnostics(at, name, level, message, values or {}))
 

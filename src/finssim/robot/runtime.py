@@ -330,7 +330,7 @@ class Runtime:
         self.counters.sent(now)
 
     def start(self, now: float) -> None:
-        """Let the guide's time begin."""
+        """Let the guide's time begin. `now` is the time [s]."""
         self.started = now
         self._ticks = Ticks(now)
         self.pilot.reset()
@@ -356,7 +356,7 @@ class Runtime:
         self.recorder = self.intake.recorder = recorder
 
     def stop(self, now: float, frames: int = 3) -> list[bytes]:
-        """Disarm; returns frames without thrust to send."""
+        """Disarm; returns frames without thrust to send. `now` is the time [s]."""
         self._arm = False
         self.bridge.disarm(now)
         last = [self.link.encode(now, self.bridge.tick(now), self.bridge.state) for _ in range(frames)]

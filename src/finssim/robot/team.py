@@ -101,7 +101,7 @@ class Team:
         self._ticks: Ticks | None = None
 
     def hear(self, now: float, datagrams: Sequence[bytes]) -> None:
-        """Take in what has come."""
+        """Take in what has come. `now` is the time [s]."""
         for data in datagrams:
             heard = decode_track(data, now)
             if heard is None or heard[0] not in self._others:
@@ -124,7 +124,10 @@ class Team:
         return replace(reading, ready=False, reason=f"nothing heard of {', '.join(missing)}")
 
     def tell(self, now: float, reading: Reading) -> list[bytes]:
-        """Return the datagrams to send now: none out of this vehicle's turn, or while its position is unknown."""
+        """Return the datagrams to send now: none out of this vehicle's turn, or while its position is unknown.
+
+        `now` is the time [s].
+        """
         if self._ticks is None:
             self._ticks = Ticks(now + self._turn)
         due, _ = self._ticks.due(now, self._period)

@@ -237,7 +237,7 @@ class Keys:
         self._gear = "cruise"
 
     def press(self, now: float, key: str) -> None:
-        """A key was pressed, or repeats; unknown keys do nothing."""
+        """A key was pressed, or repeats; unknown keys do nothing. `now` is the time [s]."""
         key = key if len(key) > 1 else key.lower()
         if key in KEY_AXES:
             axis, deflection = KEY_AXES[key]
@@ -250,7 +250,7 @@ class Keys:
             self._pressed.clear()
 
     def hands(self, now: float) -> Hands:
-        """Return the state of the held keys."""
+        """Return the state of the held keys. `now` is the time [s]."""
         held = {name: value for name, (at, value) in self._pressed.items() if 0.0 <= now - at < self.hold}
         axes: dict[str, Any] = {name: held.get(name, 0.0) for name in ("surge", "sway", "heave", "yaw")}
         buttons: dict[str, Any] = {name: name in held for name in KEY_BUTTONS.values()}
@@ -325,7 +325,10 @@ class Keyboard:
         return keys
 
     def read(self, now: float) -> Hands:
-        """Return the state of the held keys; never waits. A terminal that was closed is a lost device."""
+        """Return the state of the held keys; never waits. A terminal that was closed is a lost device.
+
+        `now` is the time [s].
+        """
         for key in self.pressed():
             self.keys.press(now, key)
         return self.keys.hands(now) if self._open else Hands(present=False)
@@ -442,7 +445,7 @@ class Gamepad:
         self._pygame.display.quit()
 
     def read(self, now: float = 0.0) -> Hands:
-        """Return the state of the pad; never waits."""
+        """Return the state of the pad; never waits. `now` is the time [s]."""
         for event in self._pygame.event.get():
             if event.type == self._pygame.JOYDEVICEREMOVED:
                 self._device = None

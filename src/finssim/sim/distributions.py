@@ -88,7 +88,7 @@ class Distribution(Part):
     within: Pair | None = None
     """[low, high] where a normal distribution is cut; 4 standard deviations from the mean if None."""
     choice: tuple[float, ...] | None = Field(default=None, min_length=1, max_length=MAX_CHOICES)
-    """One of these."""
+    """One of these, in the unit of the entry."""
     weights: tuple[float, ...] | None = None
     """Probabilities of the choices, in any unit; equal if None."""
     probability: float = Field(default=1.0, ge=0.0, le=1.0)

@@ -52,7 +52,7 @@ class Motion:
     """Result of the equation of motion in one state."""
 
     nu_dot: vec6  # body frame [m/s², rad/s²]
-    relaxation: vec6  # θ of each axis
+    relaxation: vec6  # share θ by which each axis relaxes
     wet: float  # part of the vehicle under water
 
 
@@ -86,7 +86,7 @@ def relaxed(nu_dot: vec6, guess: vec6, theta: vec6, r: wp.vec3) -> vec6:
 
     Args:
         nu_dot: Derivative of the twist in the middle of the substep, body frame [m/s², rad/s²].
-        guess: The same as extrapolated, g of this module's head.
+        guess: The same as extrapolated, g of this module's head [m/s², rad/s²].
         theta: θ of each axis at r [-].
         r: The point, body frame [m].
 

@@ -37,18 +37,18 @@ class DrawTable:
     count: int
     drawn: wp.array(dtype=int)  # the entries that vary
     kind: wp.array(dtype=int)
-    ends: wp.array(dtype=wp.vec4)  # low, high, mean, standard deviation
-    probability: wp.array(dtype=float)  # of being drawn at all
-    nominal: wp.array(dtype=float)
+    ends: wp.array(dtype=wp.vec4)  # low, high, mean, standard deviation, in the unit of the entry
+    probability: wp.array(dtype=float)  # probability of being drawn at all
+    nominal: wp.array(dtype=float)  # value where nothing is drawn, in the unit of the entry
     stream: wp.array(dtype=int)
     first_choice: wp.array(dtype=int)
     choices: wp.array(dtype=int)
-    choice: wp.array(dtype=float)
-    cumulative: wp.array(dtype=float)
+    choice: wp.array(dtype=float)  # values to choose from, in the unit of the entry
+    cumulative: wp.array(dtype=float)  # cumulative probability of each choice
     first_tie: wp.array(dtype=int)
     ties: wp.array(dtype=int)  # number of normal numbers that its own is a sum of; 0: it is independent
     tied: wp.array(dtype=int)  # entries of these
-    tie_weight: wp.array(dtype=float)
+    tie_weight: wp.array(dtype=float)  # weight of each normal number in the sum
 
 
 @wp.func
@@ -83,7 +83,7 @@ def quantile(t: DrawTable, k: int, u: float) -> float:
 
 @wp.func
 def draw_entry(t: DrawTable, k: int, key: int) -> float:
-    """Return entry k from its own stream of a key, which does not depend on other entries."""
+    """Return entry k in its unit, from its own stream of a key, which does not depend on other entries."""
     rng = wp.rand_init(key, 2 * t.stream[k])
     u = wp.randf(rng)
     gate = wp.randf(rng)
@@ -107,7 +107,7 @@ def widened(distribution: Distribution, nominal: float, part: float) -> tuple[li
 
     Args:
         distribution: At its full width.
-        nominal: Where nothing is drawn.
+        nominal: Value where nothing is drawn, in the unit of the distribution.
         part: Of the way to both ends, of the standard deviation and of probabilities, in [0, 1].
     """
     low, high = distribution.bounds()
@@ -143,7 +143,7 @@ def draw_table(
 
     Args:
         drawn: Entry -> distribution, of those that vary.
-        nominal: Of every entry, (len(ENTRIES),).
+        nominal: Value of every entry where nothing is drawn, in its unit, (len(ENTRIES),).
         ranges: For the correlations.
         device: Where.
     """
@@ -197,11 +197,11 @@ class Nominal:
     """The vehicles as their files have them, by vehicle; and the given water."""
 
     plant: wp.array2d(dtype=VehicleParameters)  # one world
-    M_A: wp.array(dtype=mat66)  # added mass about the point where its coefficients hold
-    H: wp.array(dtype=mat66)  # twist at that point from the twist at the body origin
+    M_A: wp.array(dtype=mat66)  # added mass about the point where its coefficients hold [kg, kg m²]
+    H: wp.array(dtype=mat66)  # twist at that point from the twist at the body origin [-, m]
     current: wp.vec3  # of the given water; what is drawn adds to it [m/s]
     waves: int  # waves of the given water stay in the first slots
-    extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms, one world
+    extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms in their units, one world
     factor: wp.array(dtype=int)  # entry that multiplies each of them, -1 for none
     added: wp.array(dtype=int)  # entry that is added to it
 
@@ -227,7 +227,7 @@ def factors(x: wp.array3d(dtype=float), w: int, v: int, column: int) -> vec6:
 
 @wp.func
 def offset(x: wp.array3d(dtype=float), w: int, v: int, column: int) -> wp.vec3:
-    """Three numbers that follow each other."""
+    """Three numbers that follow each other. They keep their unit."""
     return wp.vec3(x[w, v, column], x[w, v, column + 1], x[w, v, column + 2])
 
 
@@ -241,7 +241,7 @@ def drawn_delay(x: wp.array3d(dtype=float), w: int, v: int, nominal: float) -> f
 def write_body(
     plant: wp.array2d(dtype=VehicleParameters), n: Nominal, x: wp.array3d(dtype=float), w: int, v: int
 ):
-    """Mass, centres, inertia, added mass and damping."""
+    """Write mass, centres, inertia, added mass and damping from the drawn entries x, each in its unit."""
     mass = x[w, v, wp.static(COLUMN["mass"])] * n.plant[0, v].mass
     r_n = n.plant[0, v].r_g
     r_g = r_n + offset(x, w, v, wp.static(COLUMN["center_of_gravity.x"]))
@@ -273,7 +273,7 @@ def write_body(
 
 @wp.func
 def write_terms(extra: wp.array3d(dtype=float), n: Nominal, x: wp.array3d(dtype=float), w: int, v: int):
-    """The parameters of the vehicle's terms."""
+    """Write the parameters of the vehicle's terms from the drawn entries x, each in its unit, into `extra`."""
     for i in range(n.factor.shape[0]):
         y = n.extra[0, v, i]
         if n.factor[i] >= 0:
@@ -287,7 +287,7 @@ def write_terms(extra: wp.array3d(dtype=float), n: Nominal, x: wp.array3d(dtype=
 def write_thrusters(
     plant: wp.array2d(dtype=VehicleParameters), n: Nominal, x: wp.array3d(dtype=float), w: int, v: int
 ):
-    """Gain, lag, delay, slew and dead zone."""
+    """Write gain, lag, delay, slew and dead zone from the drawn entries x, each in its unit."""
     gain = vec8()
     lag = vec8()
     added = vec8()
@@ -315,7 +315,7 @@ def write_thrusters(
 
 @wp.func
 def write_water(water: WaterArrays, n: Nominal, x: wp.array3d(dtype=float), w: int, drift: int):
-    """Current, drift and waves of a world."""
+    """Write current, drift and waves of a world from the drawn entries x, each in its unit."""
     water.current[w] = n.current + wp.vec3(
         x[w, 0, wp.static(COLUMN["current.x"])],
         x[w, 0, wp.static(COLUMN["current.y"])],
@@ -339,7 +339,7 @@ def write_water(water: WaterArrays, n: Nominal, x: wp.array3d(dtype=float), w: i
 
 @wp.func
 def write_tether(tether: wp.array2d(dtype=Tether), x: wp.array3d(dtype=float), w: int, v: int):
-    """The line to a vehicle."""
+    """Write the line to a vehicle from the drawn entries x, each in its unit."""
     tether[w, v].diameter = x[w, v, wp.static(COLUMN["tether.diameter"])]
     tether[w, v].drag_coefficient = x[w, v, wp.static(COLUMN["tether.drag_coefficient"])]
     tether[w, v].wet_weight = x[w, v, wp.static(COLUMN["tether.wet_weight"])]
@@ -347,7 +347,7 @@ def write_tether(tether: wp.array2d(dtype=Tether), x: wp.array3d(dtype=float), w
 
 @wp.func
 def write_sensors(measurement: wp.array2d(dtype=Measurement), x: wp.array3d(dtype=float), w: int, v: int):
-    """Write noise, delay and dropouts of what a controller observes of a vehicle."""
+    """Write noise, delay and dropouts of what a controller observes of a vehicle from entries x, each in its unit."""
     measurement[w, v].position_std = x[w, v, wp.static(COLUMN["sensors.position_std"])]
     measurement[w, v].yaw_std = x[w, v, wp.static(COLUMN["sensors.yaw_std"])]
     measurement[w, v].velocity_std = x[w, v, wp.static(COLUMN["sensors.velocity_std"])]
@@ -374,7 +374,7 @@ VEHICLE = wp.constant(122949823)
 class DrawnArrays:
     """Drawn numbers, and the arrays that they are written to."""
 
-    values: wp.array3d(dtype=float)  # (worlds, vehicles, entries)
+    values: wp.array3d(dtype=float)  # in the unit of each entry, (worlds, vehicles, entries)
     volume_with_mass: int
     water: int  # 1: write the water's numbers
     drift: int
@@ -382,10 +382,10 @@ class DrawnArrays:
     sensors: int
     agents: int  # vehicles whose privileged numbers are observed
     told: wp.array(dtype=int)  # columns of these numbers
-    told_nominal: wp.array(dtype=float)
-    told_scale: wp.array(dtype=float)
+    told_nominal: wp.array(dtype=float)  # nominal value in the unit of the entry
+    told_scale: wp.array(dtype=float)  # one over the unit that observed numbers are counted in
     privileged: wp.array2d(dtype=float)  # (worlds, agents * observed), (value - nominal) * scale
-    final_privileged: wp.array2d(dtype=float)  # the same of the episode before
+    final_privileged: wp.array2d(dtype=float)  # the same of the episode before [-]
 
 
 @wp.func
@@ -563,8 +563,8 @@ class Randomization:
             simulator: The worlds.
             measurement: What the controllers see of the vehicles, by (world, vehicle), as it is without randomisation.
             agents: The first vehicles, which are told what was drawn.
-            privileged: Where they are told it, and where that of the episode before is kept: (worlds, agents * P) with
-                P = `len(told(...))`.
+            privileged: Where they are written scaled [-], and where that of the episode before is kept: (worlds, agents
+                * P) with P = `len(told(...))`.
         """
         return Draws(self, simulator, measurement, agents, privileged)
 
@@ -665,7 +665,10 @@ class Draws:
             pipeline.add(jitter_commands, inputs, vehicles=len(s.vehicles))
 
     def numpy(self, names: Sequence[str] | None = None) -> NDArray[np.float32]:
-        """Return a copy of some entries of the running episodes, or of all that vary if None: (worlds, vehicles, n)."""
+        """Return a copy of some entries of the running episodes, or of all that vary if None: (worlds, vehicles, n).
+
+        Each entry has its own unit.
+        """
         columns = [INDEX[name] for name in (self.names if names is None else names)]
         return np.asarray(self.values.numpy()[..., columns])
 

@@ -221,7 +221,7 @@ class Success(Part):
     held: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     """The task's tolerance was kept for so long when the episode ended [s]."""
     episode_return: float | None = Field(default=None, allow_inf_nan=False)
-    """The return was at least this."""
+    """The return, a sum of rewards, was at least this."""
 
     @model_validator(mode="after")
     def _single(self) -> "Success":

@@ -27,7 +27,7 @@ class Entry:
     unit: str = "1"
     """`1` is a factor on the vehicle file's number."""
     nominal: float = 1.0
-    """Value if nothing is drawn."""
+    """Value if nothing is drawn, in the unit of the entry."""
     world: bool = False
     """Drawn once for a world and not for each vehicle in it."""
     angle: bool = False
@@ -111,7 +111,7 @@ def added_entry(path: str) -> str:
 
 
 def varies(distribution: Distribution, nominal: float) -> bool:
-    """True if a distribution gives numbers other than the nominal one."""
+    """Return whether a distribution gives numbers other than the nominal one, both in one unit."""
     return distribution.probability > 0.0 and distribution.bounds() != (nominal, nominal)
 
 

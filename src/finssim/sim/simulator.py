@@ -459,7 +459,7 @@ def shared_water(vehicles: Sequence[Vehicle]) -> Fluid:
 
 
 def broadcast(array: NDArray[Any], shape: tuple[int, int, int], label: str) -> NDArray[Any]:
-    """The array for every world and vehicle."""
+    """Return the array, of any unit, for every world and vehicle."""
     try:
         return np.broadcast_to(array, shape)
     except ValueError:

@@ -136,6 +136,7 @@ class Pool:
     damping: float = 100.0
     """Against approach, per corner [N s/m]."""
     friction: float = 0.2
+    """Coulomb coefficient of walls and floor [-]."""
 
     def __post_init__(self) -> None:
         numbers = (self.length, self.width, self.depth, self.stiffness, self.damping, self.friction)
@@ -168,6 +169,7 @@ class TetherLine:
     diameter: float = 0.0076
     """[m]; the default is Blue Robotics' Fathom tether."""
     drag_coefficient: float = 1.2
+    """Drag coefficient of a cylinder [-]."""
     wet_weight: float = 0.0
     """Weight in water per length [N/m]; 0 is neutral."""
 
@@ -208,6 +210,7 @@ class Dock:
     damping: float
     """Against approach, per point [N s/m]."""
     friction: float = 0.2
+    """Coulomb coefficient of its surface [-]."""
     slip: float = 0.05
     """Speed below which friction is linear [m/s]."""
 

@@ -141,7 +141,10 @@ def refresh_clearing(
     control_step: float,
     world_offset: int,
 ):
-    """Search again for the nearest solids of vehicles that may leave their ball of free water in this control step."""
+    """Search again for the nearest solids of vehicles that may leave their ball of free water in this control step.
+
+    `control_step` is its length [s].
+    """
     i, v = wp.tid()
     w = world_offset + i
     solids.force[w, v] = 0.0

@@ -19,10 +19,8 @@ class VehicleState:
     quaternion: wp.quat  # body to world, xyzw
     velocity: vec6  # nu, body frame [m/s, rad/s]
     acceleration: vec6  # nu_dot in this state, body frame [m/s², rad/s²]
-    coasting: (
-        vec6  # mean nu_dot of the last substep without thrust and contacts: what the next one extrapolates
-    )
-    pressed: vec6  # mean nu_dot of the last substep by contacts
+    coasting: vec6  # mean nu_dot of the last substep without thrust and contacts [m/s², rad/s²], extrapolated
+    pressed: vec6  # mean nu_dot of the last substep by contacts [m/s², rad/s²]
     actuator: vec8  # lagged force [N] or propeller speed [rad/s]
     thrust: vec8  # delivered by each thruster [N]
     clearing: wp.vec4  # a ball without solids of the world: centre, world frame, and radius [m]
@@ -37,17 +35,21 @@ class State:
     quaternion: wp.array2d(dtype=wp.quat)  # body to world, xyzw
     velocity: wp.array2d(dtype=vec6)  # nu, body frame [m/s, rad/s]
     acceleration: wp.array2d(dtype=vec6)  # nu_dot in this state, body frame [m/s², rad/s²]
-    coasting: wp.array2d(dtype=vec6)  # mean nu_dot of the last substep without thrust and contacts
-    pressed: wp.array2d(dtype=vec6)  # mean nu_dot of the last substep by contacts
+    coasting: wp.array2d(
+        dtype=vec6
+    )  # mean nu_dot of the last substep without thrust and contacts [m/s², rad/s²]
+    pressed: wp.array2d(dtype=vec6)  # mean nu_dot of the last substep by contacts [m/s², rad/s²]
     actuator: wp.array2d(dtype=vec8)  # lagged force [N] or propeller speed [rad/s]
     thrust: wp.array2d(dtype=vec8)  # delivered by each thruster [N]
     clearing: wp.array2d(dtype=wp.vec4)  # a ball without solids: centre, world frame, and radius [m]
-    commands: wp.array3d(dtype=vec8)  # delay line: past commands, a ring over control steps
+    commands: wp.array3d(dtype=vec8)  # delay line: past commands [N], a ring over control steps
     steps: wp.array(dtype=int)  # control steps since the world's reset
     episode: wp.array(dtype=int)  # resets so far
     broken: wp.array(dtype=int)  # 1: a number stopped being finite in this control step
     frozen: wp.array(dtype=int)  # 1: the world has been frozen since that happened
-    history: wp.array3d(dtype=vec13)  # (slot, world, vehicle): position, quaternion, velocity
+    history: wp.array3d(
+        dtype=vec13
+    )  # (slot, world, vehicle): position [m], quaternion, velocity [m/s, rad/s]
 
 
 def new_state(vehicles: Packed, slots: int) -> State:

@@ -100,7 +100,7 @@ def delayed_command(
     """Mean of the delayed command over the coming substep.
 
     Args:
-        commands: The delay line, by world, vehicle and slot.
+        commands: The delay line [N], by world, vehicle and slot.
         w: World.
         v: Vehicle.
         head: Slot of the delay line that holds the newest command.
@@ -139,17 +139,17 @@ MODULE_OPTIONS = {
 class Course:
     """A vehicle on its way through the substeps of a control step."""
 
-    position: wp.vec3
+    position: wp.vec3  # body origin, world frame [m]
     quaternion: wp.quat
-    velocity: vec6
-    actuator: vec8
-    coasting: vec6  # mean acceleration of the last substep without thrust and contacts
+    velocity: vec6  # nu, body frame [m/s, rad/s]
+    actuator: vec8  # lagged force [N] or propeller speed [rad/s]
+    coasting: vec6  # mean acceleration of the last substep without thrust and contacts [m/s², rad/s²]
     x_dot: wp.vec3  # rate of the position, world frame [m/s]
-    jerk: vec6  # by how much the last acceleration was another than expected
-    pressed: vec6  # mean acceleration by contacts in the last substep
+    jerk: vec6  # by how much the last acceleration was another than expected [m/s², rad/s²]
+    pressed: vec6  # mean acceleration by contacts in the last substep [m/s², rad/s²]
     greatest: float  # force of the dock so far [N]
     impulse: float  # of the dock so far [N s]
-    clearing: wp.vec4  # as in the state
+    clearing: wp.vec4  # a ball without solids: centre, world frame, and radius [m]
     struck: float  # greatest force of the world's solids so far [N]
 
 

@@ -72,7 +72,7 @@ class RadialTangential:
         return np.moveaxis(columns.view(float).reshape(3, *z.shape, 2), 0, -1)
 
     def parameter_jacobian(self, points_c: Array) -> Array:
-        """Derivative of `project` with respect to the coefficients that were given, (..., 2, k)."""
+        """Derivative of `project` with respect to the coefficients that were given, (..., 2, k) [-]."""
         z = _plane(points_c)
         s = (z * z.conj()).real
         R, _, denominator = self._radial(s)
@@ -96,7 +96,8 @@ class RadialTangential:
 
     @cached_property
     def fold(self) -> float:
-        """Undistorted radius within which the distortion maps one to one, in every direction; inf if everywhere.
+        """Return the undistorted radius, at unit focal length, within which the distortion maps one to one; inf if
+        everywhere.
 
         Beyond it the image runs back towards the centre: a point there would appear where another one is seen.
         """
@@ -217,7 +218,7 @@ def _plane(points_c: Array) -> Complex:
 
 
 class Fisheye:
-    """A fisheye lens with distortion k1, k2, k3, k4; none means exactly equidistant."""
+    """Describe a fisheye lens with distortion k1, k2, k3, k4 [-]; none means exactly equidistant."""
 
     def __init__(self, distortion: tuple[float, ...]) -> None:
         self._k = (*distortion, *(0.0,) * (4 - len(distortion)))
@@ -248,7 +249,7 @@ class Fisheye:
         return out
 
     def parameter_jacobian(self, points_c: Array) -> Array:
-        """Derivative of `project` with respect to the coefficients that were given, (..., 2, k)."""
+        """Derivative of `project` with respect to the coefficients that were given, (..., 2, k) [-]."""
         _, theta, scale = self._angle(points_c)
         powers = (theta[..., None] ** 2) ** np.arange(1, self._count + 1)
         return np.asarray((points_c[..., :2] * scale[..., None])[..., :, None] * powers[..., None, :])
@@ -372,7 +373,7 @@ class Lens:
     model: str = "plumb_bob"
     """plumb_bob (k1 k2 p1 p2 [k3]), rational (k1 k2 p1 p2 k3 k4 k5 k6) or fisheye (k1 k2 k3 k4), as OpenCV."""
     distortion: tuple[float, ...] = ()
-    """Coefficients in OpenCV's order; none for a lens without distortion."""
+    """Coefficients [-] in OpenCV's order; none for a lens without distortion."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "distortion", tuple(float(k) for k in self.distortion))
@@ -509,5 +510,5 @@ class Camera:
 
     @cached_property
     def R_pc(self) -> Array:
-        """Optical axes to pool axes, (3, 3)."""
+        """Return the rotation matrix from optical axes to pool axes, (3, 3)."""
         return quat_to_matrix(self.orientation / np.linalg.norm(self.orientation))

@@ -112,12 +112,15 @@ class StackDerivatives:
     """k = tan(theta)/r next to the camera, and its derivatives, (...) each."""
 
     k: Array
+    """tan(theta)/r next to the camera [1/m]."""
     by_r2: Array
+    """Derivative with respect to r² [1/m³]."""
     by_near: Array
-    """Derivative with respect to the camera's distance from the interface."""
+    """Derivative with respect to the camera's distance from the interface [1/m²]."""
     by_far: Array
-    """Derivative with respect to the point's distance from the far face."""
+    """Derivative with respect to the point's distance from the far face [1/m²]."""
     by_far_index: Array
+    """Derivative with respect to the refractive index beyond the far face [1/m]."""
 
 
 def solve_stack(r2: Array, thickness: Sequence[Array | float], index: list[float]) -> Stack:
@@ -181,7 +184,7 @@ class Refraction:
     slope: Array
     """k: tangent of the incidence angle over |across| [1/m], (...)."""
     direction: Array
-    """Direction from the camera to the surface, pool frame, (..., 3); its part along the normal is -1."""
+    """Direction from the camera to the surface, pool frame, (..., 3); its part along the unit normal is -1."""
     right_side: npt.NDArray[np.bool_]
     """True if camera and point are on their sides of the interface, (...)."""
 
@@ -433,7 +436,10 @@ class Jacobians:
 
     @cached_property
     def lens(self) -> Array:
-        """Return the derivative with respect to fx, fy, cx, cy and the distortion coefficients, (..., 2, 4 + k)."""
+        """Return the derivative with respect to fx, fy, cx, cy and the distortion coefficients, (..., 2, 4 + k).
+
+        Each is in pixels per unit of the number.
+        """
         return self._camera.lens.parameter_jacobian(self._direction_c)
 
     @cached_property

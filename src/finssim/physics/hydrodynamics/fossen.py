@@ -42,7 +42,7 @@ def fossen_wrench(
         v: Vehicle.
         position: Body origin, world frame [m].
         q: Attitude, body to world.
-        up: World z axis in the body frame.
+        up: World z axis in the body frame, a unit vector.
         nu: Twist, body frame [m/s, rad/s].
         nu_r: The same relative to the water, body frame [m/s, rad/s].
         flow: Water at the body origin.

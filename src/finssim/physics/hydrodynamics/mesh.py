@@ -35,9 +35,11 @@ class HullMesh:
     face: wp.array(dtype=vec8)
     """Centroid [m], outward unit normal and area [m²] of each face (faces,), side by side for one read; then 0."""
     slope_form: wp.array(dtype=mat66)
-    """Slope of the form drag on each axis, by the columns of `drag_slope` (kinds,)."""
+    """Slope of the form drag on each axis, by the columns of `drag_slope` (kinds,), for a density and a coefficient of
+    1 [m², m³, m⁴ and m⁵]."""
     slope_skin: wp.array(dtype=mat66)
-    """Slope of the skin drag on each axis, by the columns of `drag_slope` (kinds,)."""
+    """Slope of the skin drag on each axis, by the columns of `drag_slope` (kinds,), for a density and a coefficient of
+    1 [m², m³, m⁴ and m⁵]."""
     corners: wp.array(dtype=wp.mat33)
     """Corners of each face, a row each (faces,) [m]; only read near the surface."""
 
@@ -117,8 +119,8 @@ def drag_slope(hull: HullMesh, kind: int, nu_r: vec6, density: float, form: floa
         kind: Which of them.
         nu_r: Twist relative to the water, body frame [m/s, rad/s].
         density: Of the water [kg/m³].
-        form: Form drag coefficient.
-        skin: Skin drag coefficient.
+        form: Form drag coefficient [-].
+        skin: Skin drag coefficient [-].
     """
     x = vec6(wp.length(linear(nu_r)), wp.length(angular(nu_r)), 0.0, 0.0, 0.0, 0.0)
     return 0.5 * density * (form * (hull.slope_form[kind] * x) + skin * (hull.slope_skin[kind] * x))
@@ -368,7 +370,7 @@ def mesh_wrench(
         v: Vehicle.
         position: Body origin, world frame [m].
         q: Attitude, body to world.
-        up: World z axis in the body frame.
+        up: World z axis in the body frame, a unit vector.
         nu: Twist, body frame [m/s, rad/s].
         nu_r: The same relative to the water, body frame [m/s, rad/s].
         flow: Water at the body origin.

@@ -39,7 +39,7 @@ def simplified_wrench(
         v: Vehicle.
         position: Body origin, world frame [m].
         q: Attitude, body to world.
-        up: World z axis in the body frame.
+        up: World z axis in the body frame, a unit vector.
         nu: Twist, body frame [m/s, rad/s].
         nu_r: The same relative to the water, body frame [m/s, rad/s]; not used here.
         flow: Water at the body origin; of its velocity only the vertical part counts here.

@@ -153,7 +153,8 @@ def row_length(terms: tuple[Term, ...]) -> int:
 
 
 def parameter_row(terms: tuple[Term, ...], numbers: Mapping[str, Any]) -> NDArray[np.float64]:
-    """The row of parameters by path, zero where one is not given, (`row_length`,)."""
+    """Return the row of parameters by path, each in the unit of its term, zero where one is not given,
+    (`row_length`,)."""
     row = np.zeros(row_length(terms))
     for slot in layout(terms):
         row[slot.first : slot.first + slot.size] = np.ravel(numbers.get(slot.path, 0.0))
@@ -231,9 +232,9 @@ def term_wrenches(
 
     Args:
         terms: The terms.
-        rows: Their parameters, in several versions, (k, `row_length`).
+        rows: Their parameters in the units of the terms, in several versions, (k, `row_length`).
         nu_r: Relative to the water at the reference point, body frame [m/s, rad/s], (n, 6).
-        up: World z in the body frame, (n, 3).
+        up: World z in the body frame, unit vectors, (n, 3).
         depth: Of the body origin [m], (n,) or one number.
         density: Of the water [kg/m³].
 

@@ -496,11 +496,14 @@ class McuLink:
         return self._decoder.feed(data)
 
     def prepare(self, now: float) -> str:
-        """Return "": no device is between the bridge and the motors."""
+        """Return "": no device is between the bridge and the motors. `now` is the time [s]."""
         return ""
 
     def alarm(self, now: float) -> str:
-        """Return "": no other device can control the vehicle; the bridge checks its telemetry."""
+        """Return "": no other device can control the vehicle; the bridge checks its telemetry.
+
+        `now` is the time [s].
+        """
         return ""
 
     def encode(self, now: float, command: ThrusterCommand, state: str) -> list[bytes]:

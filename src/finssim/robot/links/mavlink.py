@@ -339,7 +339,10 @@ class MavlinkLink:
 
     def alarm(self, now: float) -> str:
         """Return why the vehicle is no longer under our control, in a sentence; "" while it is. Called while it is
-        armed."""
+        armed.
+
+        `now` is the time [s].
+        """
         if now - self._alive > HEARTBEAT_LOST:
             return f"no heartbeat from the autopilot for {HEARTBEAT_LOST:g} s"
         if self._others:

@@ -23,13 +23,8 @@ def fresnel(cos_near: float, cos_far: float, n_near: float, n_far: float) -> flo
 
 @wp.func
 def refracted(ray: wp.vec3, normal: wp.vec3, ratio: float) -> wp.vec3:
-    """Direction after refraction (paper, eq. 9), or zero for total reflection.
-
-    Args:
-        ray: Unit direction of the incident ray, any frame.
-        normal: Unit normal against it, same frame [-].
-        ratio: Index on its side over the index on the other, η.
-    """
+    """Return the unit direction after refraction, in the frame of the ray (paper, eq. 9), or zero for total
+    reflection."""
     c = -wp.dot(normal, ray)
     kappa = 1.0 - ratio * ratio * (1.0 - c * c)
     if kappa <= 0.0:
@@ -43,10 +38,12 @@ def through_water(radiance: wp.vec3, attenuation: wp.vec3, veil: wp.vec3, path: 
 
     L = L0 exp(-c s) + B (1 - exp(-c s))
 
+    Radiances are relative to that of white [-].
+
     Args:
-        radiance: L0 at the start, (red, green, blue).
+        radiance: L0 at the start, (red, green, blue) [-].
         attenuation: c [1/m].
-        veil: B, radiance of water without end.
+        veil: B, radiance of water without end [-].
         path: s [m].
     """
     out = wp.vec3()

@@ -27,7 +27,7 @@ class Surfel:
     """The first thing on a ray's way."""
 
     distance: float  # [m], NOTHING if there is none
-    radiance: wp.vec3  # that it sends back
+    radiance: wp.vec3  # radiance that it sends back [-]
 
 
 @wp.struct
@@ -35,7 +35,7 @@ class TagData:
     """A tag, surface frame, at the start and the end of the exposure."""
 
     start: wp.vec3  # middle [m]
-    end: wp.vec3
+    end: wp.vec3  # middle at the end of the exposure [m]
     q_start: wp.quat  # tag to surface frame, xyzw
     q_end: wp.quat
     moving: int
@@ -43,24 +43,24 @@ class TagData:
     half: float  # from the middle to the rim's edge [m]
     cells: int  # along one side of the bitmap
     offset: int  # of its bitmap in the array of all cells
-    white: float
-    black: float
+    white: float  # reflectance of white cells
+    black: float  # reflectance of black cells
 
 
 @wp.struct
 class BasinData:
     """The tiled box. Basin axes are the pool's, its origin the lower corner."""
 
-    R_bs: wp.mat33  # surface frame to basin axes
+    R_bs: wp.mat33  # rotation matrix from surface frame to basin axes
     origin: wp.vec3  # surface frame [m]
     size: wp.vec3  # [m]
     up: int  # axis closest to the interface's normal
     tile: float  # [m], 0 for none
     joint: float  # [m]
-    colour: wp.vec3
-    joint_colour: wp.vec3
-    variation: float
-    deck_colour: wp.vec3
+    colour: wp.vec3  # reflectance of the tiles
+    joint_colour: wp.vec3  # reflectance of the joints
+    variation: float  # share by which tiles differ
+    deck_colour: wp.vec3  # reflectance of the deck
 
 
 @wp.func
@@ -186,7 +186,7 @@ def tiles(basin: BasinData, x: float, y: float, face: int, spread: float) -> wp.
 
 @wp.func
 def on_deck(basin: BasinData, p: wp.vec3) -> bool:
-    """Return whether a point of the surface, basin axes, lies beside the pool."""
+    """Return whether a point of the surface, basin axes, lies beside the pool. The point is in [m]."""
     beside = bool(False)
     for a in range(3):
         if a != basin.up and (p[a] < 0.0 or p[a] > basin.size[a]):
@@ -233,14 +233,14 @@ class SceneData:
     """All that rays can meet, surface frame."""
 
     camera_height: float  # above the still surface [m]
-    index_near: float
-    index_far: float
+    index_near: float  # refractive index on the camera's side
+    index_far: float  # refractive index of the water
     layer_thickness: wp.array(dtype=float)  # of the window, from the camera [m]
-    layer_index: wp.array(dtype=float)
+    layer_index: wp.array(dtype=float)  # refractive index of each layer
     waves: wp.array(dtype=Wave)
     attenuation: wp.vec3  # [1/m]
-    veil: wp.vec3
-    sky: float
+    veil: wp.vec3  # radiance of water without end [-]
+    sky: float  # radiance of the sky [-]
     basin: BasinData
     tags: wp.array(dtype=TagData)
     cells: wp.array(dtype=wp.uint8)
@@ -325,7 +325,7 @@ def enter_water(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3
 def under_water(
     scene: SceneData, origin: wp.vec3, ray: wp.vec3, t: float, angle: float, travelled: float, tagged: bool
 ) -> wp.vec3:
-    """Radiance that reaches the surface from below.
+    """Radiance that reaches the surface from below [-].
 
     Args:
         scene: What is there.
@@ -349,7 +349,7 @@ def under_water(
 def radiance_along(
     scene: SceneData, patch: Patch, ray: wp.vec3, t: float, angle: float, tagged: bool
 ) -> wp.vec3:
-    """Radiance that the camera receives from one direction at one moment.
+    """Radiance that the camera receives from one direction at one moment [-].
 
     Args:
         scene: What is there.
@@ -446,7 +446,7 @@ def cast(
         samples: Rays along each axis of each pixel; 0 for one ray that passes by all tags.
         first_row: Of the rectangle.
         first_column: Of the rectangle.
-        radiance: Result over the rectangle.
+        radiance: Result over the rectangle [-].
     """
     i, j = wp.tid()
     row = 2 * (first_row // 2 + i)

@@ -149,7 +149,10 @@ def pack_scene(scene: Scene, frame: SurfaceFrame, device: Any) -> SceneData:
 
 
 def on_device(table: NDArray[Any], dtype: Any, device: Any) -> wp.array[Any]:
-    """A contiguous table as Warp's array: its own memory on the CPU, where Warp would look at it for 0.6 ms first."""
+    """Return a contiguous table of any unit as Warp's array.
+
+    On a CPU it shares the memory; Warp itself would look at it for 0.6 ms first.
+    """
     if not table.size:
         return wp.empty(table.shape, dtype=dtype, device=device)
     if not wp.get_device(device).is_cpu:

@@ -93,6 +93,7 @@ class Basin:
     colour: Triple = (0.62, 0.80, 0.86)
     """Reflectance of the tiles."""
     joint_colour: Triple = (0.80, 0.84, 0.84)
+    """Reflectance of the joints, (red, green, blue)."""
     variation: float = 0.05
     """Relative standard deviation of the reflectance from tile to tile."""
     deck_colour: Triple = (0.62, 0.60, 0.56)
@@ -114,7 +115,7 @@ class Water:
     """Beam attenuation c [1/m]. Pure water absorbs 0.35 of red, 0.06 of green and 0.01 of blue; a filtered pool
     scatters some 0.05 to 0.1 more."""
     veil: Triple = (0.10, 0.28, 0.33)
-    """Radiance B of water without end: backscattered light."""
+    """Radiance B of water without end [-]: backscattered light."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +123,8 @@ class Ripples:
     """A water surface of small gravity-capillary waves that run in all directions."""
 
     rms_slope: float
-    """Root mean square of the surface's slope |∇h|. Still indoor water has below 0.005, a pool in use 0.02 to 0.06."""
+    """Root mean square of the surface's slope |∇h| [-]. Still indoor water has below 0.005, a pool in use 0.02 to
+    0.06."""
     wavelengths: tuple[float, float] = (0.08, 0.60)
     """Shortest and longest [m]."""
     waves: int = 16
@@ -154,7 +156,7 @@ class Sensor:
     noise: bool = True
     """Shot and read noise."""
     gamma: float = 1.0
-    """Numbers are (charge)^(1/gamma): 1 for linear, 2.2 for video, where dark tags look smaller."""
+    """Numbers are (charge)^(1/gamma): 1 for linear, 2.2 for video, where dark tags look smaller [-]."""
     spot: float = 1.0
     """Width of the square from which a pixel gathers light [px]: 1 for perfect optics, 1.5 to 2 for a cheap lens."""
     colour: bool = False
@@ -177,8 +179,8 @@ class Scene:
     basin: Basin
     water: Water = field(default_factory=Water)
     sky: float = 0.3
-    """Radiance of ceiling or sky, of which the surface shows 2 % at normal incidence. Light on the scene is even, from
-    above."""
+    """Radiance [-] of ceiling or sky, of which the surface shows 2 % at normal incidence. Light on the scene is even,
+    from above."""
     ripples: Ripples | None = None
     tags: tuple[TagInScene, ...] = ()
     """Tags that do not move: surveyed tags on the floor."""
@@ -210,7 +212,7 @@ class SurfaceFrame:
     origin_p: Array
     """[m], (3,)."""
     R_sp: Array
-    """(3, 3)."""
+    """Rotation matrix from pool frame to surface frame, (3, 3)."""
     camera_height: float
     """Height of the camera above the plane [m]."""
 
@@ -219,7 +221,7 @@ class SurfaceFrame:
         return np.asarray((np.asarray(point_p, float) - self.origin_p) @ self.R_sp.T)
 
     def quaternion(self, R_px: Array) -> Array:
-        """Axes of a thing x in the surface frame, q_sx xyzw, (4,)."""
+        """Return the quaternion q_sx (xyzw), (4,), of axes x given by a rotation matrix to the pool frame, (3, 3)."""
         return matrix_to_quat(self.R_sp @ R_px)
 
     @property
@@ -263,6 +265,6 @@ def corner_rays(lens: Lens) -> Array:
 
 
 def corner_rays_s(camera: Camera, frame: SurfaceFrame) -> NDArray[np.float32]:
-    """`corner_rays` in the surface frame, single precision."""
+    """Return the unit rays of `corner_rays` in the surface frame, single precision."""
     R_sc = frame.R_sp @ np.asarray(camera.R_pc, float)
     return np.asarray(corner_rays(camera.lens) @ R_sc.T, dtype=np.float32)

@@ -48,7 +48,7 @@ class Waves:
 
     @property
     def steepest(self) -> float:
-        """A slope that the surface never exceeds."""
+        """Return a slope [-] that the surface never exceeds."""
         return float(np.sum(self.amplitude * np.linalg.norm(self.k, axis=1)))
 
 
@@ -94,16 +94,16 @@ class Patch:
     """The surface around one point: a Taylor series in place and time. All zero for a flat surface."""
 
     x: float  # the point [m]
-    y: float
+    y: float  # [m]
     h: float  # height [m]
-    hx: float  # slope
-    hy: float
+    hx: float  # slope [-]
+    hy: float  # [-]
     hxx: float  # curvature [1/m]
-    hxy: float
-    hyy: float
+    hxy: float  # [1/m]
+    hyy: float  # [1/m]
     ht: float  # rise [m/s]
     hxt: float  # rate of the slope [1/s]
-    hyt: float
+    hyt: float  # [1/s]
 
 
 @lru_cache
@@ -113,13 +113,7 @@ def layout_of(struct: Any) -> np.dtype[Any]:
 
 
 def pack_waves(waves: Waves | None, origin: ArrayLike, time: float) -> NDArray[Any]:
-    """Waves as structs for the kernel.
-
-    Args:
-        waves: The surface; None for a flat one.
-        origin: Of the surface frame, in its own axes from the pool's origin [m], (2,).
-        time: Middle of the exposure [s].
-    """
+    """Return waves as structs for the kernel, in the units of `Wave`."""
     count = 0 if waves is None else len(waves.omega)
     table = np.zeros(count, dtype=layout_of(Wave))
     if waves is not None:
@@ -130,7 +124,7 @@ def pack_waves(waves: Waves | None, origin: ArrayLike, time: float) -> NDArray[A
 
 @wp.func
 def surface_at(waves: wp.array(dtype=Wave), x: float, y: float) -> Patch:
-    """The surface around a point, mid-exposure."""
+    """The surface around a point, mid-exposure. The point (x, y) is in [m]."""
     p = Patch()
     p.x = x
     p.y = y
@@ -158,7 +152,7 @@ def surface_hit(waves: wp.array(dtype=Wave), height: float, ray: wp.vec3) -> Pat
     Args:
         waves: Of the surface.
         height: Of the camera above the still surface [m]; it stands at (0, 0, height).
-        ray: Direction, surface frame, with ray_z < 0.
+        ray: Unit direction, surface frame, with ray_z < 0.
     """
     s = -height / ray[2]
     p = surface_at(waves, s * ray[0], s * ray[1])

@@ -123,11 +123,17 @@ class SensorBatch:
         self.set(vehicle, **{**values, **self.derived(entry, site)})
 
     def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
-        """Parameters that the file does not give as they are, or that replace what it gives; none by default."""
+        """Parameters that the file does not give as they are, or that replace what it gives; none by default.
+
+        Each is in the unit of the kernel's parameter.
+        """
         return {}
 
     def numpy(self) -> dict[str, NDArray[Any]]:
-        """Copies of the readings with `stamp` and `fresh`, each (W, V, ...)."""
+        """Copies of the readings with `stamp` and `fresh`, each (W, V, ...).
+
+        Units are those of the readings; stamps are in [s].
+        """
         return {name: getattr(self, name).numpy().copy() for name in (*self.readings, "stamp", "fresh")}
 
     def set(self, vehicle: int | slice = slice(None), **values: Any) -> None:

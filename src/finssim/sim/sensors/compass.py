@@ -26,7 +26,7 @@ class CompassArrays:
 
     heading: wp.array2d(dtype=float)  # left positive from world x [rad]
     bias: wp.array2d(dtype=float)  # true offset [rad]
-    ring: wp.array3d(dtype=float)  # samples on their way
+    ring: wp.array3d(dtype=float)  # headings on their way [rad]
 
 
 @wp.func

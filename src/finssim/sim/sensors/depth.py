@@ -32,7 +32,7 @@ class DepthArrays:
     depth: wp.array2d(dtype=float)  # below the still surface [m]
     pressure: wp.array2d(dtype=float)  # absolute [Pa]
     bias: wp.array2d(dtype=float)  # true bias [m]
-    ring: wp.array3d(dtype=float)  # samples on their way
+    ring: wp.array3d(dtype=float)  # pressures on their way [Pa]
 
 
 @wp.func

@@ -34,7 +34,7 @@ class DvlArrays:
     bias: wp.array2d(dtype=wp.vec3)  # true bias, sensor frame [m/s]
     scale_error: wp.array2d(dtype=float)  # true scale error
     lock: wp.array2d(dtype=int)  # whether the beams find the bottom of a described world
-    ring: wp.array3d(dtype=wp.vec3)  # samples on their way
+    ring: wp.array3d(dtype=wp.vec3)  # velocities on their way [m/s]
 
 
 @wp.func
@@ -109,7 +109,7 @@ class DvlBatch(SensorBatch):
     scale_error: "wp.array[Any]"
     """Truth: the scale error in it; float (W, V)."""
     lock: "wp.array[Any]"
-    """Flag of the beams finding the bottom, int (W, V): 1, unless beams of a described world write it."""
+    """Flag [-] of the beams finding the bottom, int (W, V): 1, unless beams of a described world write it."""
 
     def _new_arrays(self) -> Any:
         arrays = super()._new_arrays()
@@ -117,6 +117,6 @@ class DvlBatch(SensorBatch):
         return arrays
 
     def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
-        """Reach of the beams; without a known floor it is always near."""
+        """Reach of the beams; without a known floor it is always near [m]."""
         tilt = {"tilt_cosine": math.cos(min(entry.max_tilt, math.pi)), "floor_depth": site.floor_depth}
         return tilt if math.isfinite(site.floor_depth) else {**tilt, "altitude_max": math.inf}

@@ -35,7 +35,7 @@ class ImuArrays:
     accel: wp.array2d(dtype=wp.vec3)  # specific force, sensor frame [m/s²]
     gyro_bias: wp.array2d(dtype=wp.vec3)  # true bias, sensor frame [rad/s]
     accel_bias: wp.array2d(dtype=wp.vec3)  # true bias, sensor frame [m/s²]
-    gyro_ring: wp.array3d(dtype=wp.vec3)  # samples on their way
+    gyro_ring: wp.array3d(dtype=wp.vec3)  # angular velocities on their way [rad/s]
     accel_ring: wp.array3d(dtype=wp.vec3)
 
 
@@ -120,6 +120,9 @@ class ImuBatch(SensorBatch):
     """Truth: the bias in it, sensor frame [m/s²]; vec3 (W, V)."""
 
     def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
-        """Gravity; white noise of density σ deviates by σ √rate in each of `rate` samples a second."""
+        """Gravity; white noise of density σ deviates by σ √rate in each of `rate` samples a second.
+
+        Gravity is in [m/s²].
+        """
         noise = {name: getattr(entry, f"{name}_density") for name in ("gyro_noise", "accel_noise")}
         return {"gravity": site.gravity, **{name: std * math.sqrt(entry.rate) for name, std in noise.items()}}

@@ -69,8 +69,10 @@ def lost(key: wp.uint32, dropout: float) -> bool:
 def digitised(x: float, quantum: float, limit: float) -> float:
     """The number a converter gives for x: the nearest multiple of its quantum, within its range.
 
+    The unit is kept.
+
     Args:
-        x: Exact value.
+        x: Exact value, of any unit.
         quantum: Size of one count, unit of x; 0 for none.
         limit: Largest magnitude that can be reported, unit of x; infinite for none.
     """
@@ -82,7 +84,7 @@ def digitised(x: float, quantum: float, limit: float) -> float:
 
 @wp.func
 def digitised3(x: wp.vec3, quantum: float, limit: float) -> wp.vec3:
-    """`digitised` of each component."""
+    """Return `digitised` of each component, all in one unit."""
     return wp.vec3(
         digitised(x[0], quantum, limit), digitised(x[1], quantum, limit), digitised(x[2], quantum, limit)
     )
@@ -109,7 +111,7 @@ class SensedState(Protocol):
 class Timing:
     """When one sensor of one vehicle samples."""
 
-    samples_per_step: wp.float64  # rate times control step; 0: the vehicle has no such sensor
+    samples_per_step: wp.float64  # samples in a control step [-]
     latency: int  # control steps between a sample and its arrival
 
 

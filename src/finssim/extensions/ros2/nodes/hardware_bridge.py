@@ -51,7 +51,7 @@ class BridgeTopics:
         node.create_service(ros_type(service.type), node.below(service.name), self._on_service)
 
     def tell(self, now: float, **values: Any) -> None:
-        """Publish state and events; `values` are further fields of ThrusterState."""
+        """Publish state and events; `values` are further fields of ThrusterState. `now` is the time [s]."""
         bridge, node = self._bridge, self._node
         state_values = {
             "reason": bridge.reason,
@@ -161,11 +161,11 @@ class HardwareBridge(RobotNode):
         self.send("shafts", self._speeds(stamp, telemetry.motor_rpm))
 
     def echo(self, now: float, echo: CommandEcho) -> None:
-        """Publish a command as executed by the motor controller."""
+        """Publish a command as executed by the motor controller. `now` is the time [s]."""
         self.send("echo", self.make.echo(self.ns(now), echo))
 
     def aid(self, now: float, aid: NavigationAid) -> None:
-        """Publish what a navigation instrument measured, stamped with its measurement."""
+        """Publish what a navigation instrument measured, stamped with its measurement. `now` is the time [s]."""
         message = self.make.aid(self.ns(now - aid.age), aid)
         if message is not None:
             self.send(*message)

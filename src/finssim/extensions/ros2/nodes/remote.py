@@ -76,7 +76,7 @@ class RemoteState:
         Readings(node, self._take)
 
     def reading(self, now: float) -> Reading:
-        """The state."""
+        """The state. `now` is the time [s]."""
         age = now - self._newest.time
         if age > self._oldest:
             return replace(self._newest, ready=False, reason=f"the estimator is silent for {age:.1f} s")
@@ -123,21 +123,21 @@ class RemoteBridge:
         return self._node.now() - self._at > SILENT
 
     def arm(self, now: float, source: str) -> str:
-        """Ask for arming; whether it is granted shows in the state."""
+        """Ask for arming; whether it is granted shows in the state. `now` is the time [s]."""
         self._node.send("arm", ros_type("std_msgs/msg/Bool")(data=True))
         return ""
 
     def disarm(self, now: float) -> None:
-        """Thrusters off."""
+        """Thrusters off. `now` is the time [s]."""
         self._node.send("arm", ros_type("std_msgs/msg/Bool")(data=False))
 
     def stop(self, now: float, reason: str) -> None:
-        """Emergency stop."""
+        """Emergency stop. `now` is the time [s]."""
         self._node.send("stop", ros_type("std_msgs/msg/Empty")())
         self._node.event("stop", reason, now)
 
     def acknowledge(self, now: float) -> None:
-        """End a fault."""
+        """End a fault. `now` is the time [s]."""
         self._node.send("acknowledge", ros_type("std_msgs/msg/Empty")())
 
     def command(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None = None) -> Array:
@@ -147,13 +147,13 @@ class RemoteBridge:
         return requested
 
     def reading(self, now: float, reading: Reading) -> None:
-        """Ignore a reading: the bridge receives the estimator's directly."""
+        """Ignore a reading: the bridge receives the estimator's directly. `now` is the time [s]."""
 
     def telemetry(self, now: float, telemetry: Telemetry) -> None:
-        """None comes here."""
+        """None comes here. `now` is the time [s]."""
 
     def tick(self, now: float) -> ThrusterCommand:
-        """Frames are the bridge's own affair."""
+        """Frames are the bridge's own affair. `now` is the time [s]."""
         return ThrusterCommand(False, (0.0,) * 8)
 
     def drain(self) -> list[Event]:

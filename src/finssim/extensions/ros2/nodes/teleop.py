@@ -86,7 +86,10 @@ class JoyDevice:
         self._newest = message
 
     def read(self, now: float) -> Hands | None:
-        """Return the content of the newest message; None without one since the last call, or if it is too short."""
+        """Return the content of the newest message; None without one since the last call, or if it is too short.
+
+        `now` is the time [s].
+        """
         message, self._newest = self._newest, None
         if message is None or len(message.axes) < AXIS_COUNT or len(message.buttons) < BUTTON_COUNT:
             return None
