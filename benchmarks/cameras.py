@@ -23,7 +23,7 @@ from finssim.evaluation.tables import Table
 from finssim.extensions.perception import CameraBatch, SonarBatch, WorldBatch, load_world, poses_of
 from finssim.sim import Simulator
 from finssim.sim.launch import default_threads
-from finssim.vehicles.devices import CameraDevice, SonarDevice, load_device
+from finssim.vehicles.device_files import CameraDevice, SonarDevice, load_device
 
 SIZES = (16, 32, 64, 128)
 """Edge lengths of the images [px]."""

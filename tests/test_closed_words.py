@@ -26,7 +26,7 @@ from finssim.tasks.sensing import load_sensing
 from finssim.trials.importers.assemble import read_map
 from finssim.trials.trial_files import read_header
 from finssim.vehicles import load_vehicle
-from finssim.vehicles.devices import DEVICES, load_device
+from finssim.vehicles.device_files import DEVICES, load_device
 
 VEHICLES = Path(vehicles.__file__).parent / "catalogue"
 WORLDS = Path(worlds.__file__).parent

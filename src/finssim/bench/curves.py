@@ -103,6 +103,7 @@ class DeadZone:
     speed: float
     """[rad/s], at least 0."""
     interval: tuple[float, float]
+    """95 % interval of the speed [rad/s]."""
     measured: bool
     """True if the table shows a gap; otherwise `speed` is 0 and the interval ends at the slowest speed of the table."""
     note: str = ""
@@ -142,7 +143,7 @@ class EscFit:
 
     esc: Esc
     intervals: dict[str, tuple[float, float]]
-    """95 % interval of every fitted field of `esc`."""
+    """95 % interval of every fitted field of `esc`, in the unit of the field."""
     rmse: float
     """Root mean square of the error of the speed [rad/s]."""
     fastest: float

@@ -38,13 +38,17 @@ class Step(NamedTuple):
     end: float
     """Time of the last sample before the next change, or of the log [s]."""
     before: float
+    """Level before the change, in the unit of the signal."""
     after: float
+    """Level after the change, in the unit of the signal."""
 
 
 def levels(x: Array, tolerance: float) -> list[tuple[int, int]]:
     """Return runs of samples within `tolerance` of their running median, as [first, last), which cover all samples.
 
     A single stray sample does not end a run; two do.
+
+    Both have the unit of the signal.
     """
     runs, first = [], 0
     values = x.tolist()
@@ -70,7 +74,8 @@ def settled_rows(values: dict[str, Array]) -> tuple[dict[str, Array], Finding]:
         values: `time` [s] and any of speed [rad/s], force [N], pulse [µs] and voltage [V], (n,) each.
 
     Returns:
-        The columns without `time`, one row per level, and a finding; all rows if the log is a slow sweep.
+        The columns without `time` in their units, one row per level, and a finding; all rows if the log is a slow
+        sweep.
     """
     times = values["time"]
     others = {key: value for key, value in values.items() if key != "time"}
@@ -98,7 +103,7 @@ def settled_rows(values: dict[str, Array]) -> tuple[dict[str, Array], Finding]:
 
 
 def finite_mean(values: Array) -> float:
-    """Return the mean of the finite values, NaN if there are none."""
+    """Return the mean of the finite values, NaN if there are none. The unit is kept."""
     good = values[np.isfinite(values)]
     return float(np.mean(good)) if good.size else float("nan")
 
@@ -108,7 +113,7 @@ def find_steps(t: Array, command: Array) -> list[Step]:
 
     Args:
         t: Times [s], (n,).
-        command: Values of the command, finite, (n,).
+        command: Values of the command in its own unit, finite, (n,).
 
     Returns:
         Steps in order of time; none if the command never holds a level.

@@ -53,7 +53,7 @@ class StepRecord:
     t: Array
     """Times since the step [s], (n,)."""
     y: Array
-    """Response, (n,)."""
+    """Response, thrust [N] or shaft speed [rad/s], (n,)."""
     sample: float
     """Sampling period of the command [s], to which the time of its change is known."""
 
@@ -64,7 +64,7 @@ class Log:
 
     records: list[StepRecord]
     levels: list[tuple[float, float]]
-    """Held commands and the response at the end of each."""
+    """Held commands, in the unit of the command, and the response at the end of each."""
     measured: str
     """Column of the response."""
     same_unit: bool
@@ -132,7 +132,7 @@ def cut_steps(
     Args:
         trial: Name of the trial.
         t: Times of the response's samples [s], (n,).
-        y: Response, (n,).
+        y: Response, thrust [N] or shaft speed [rad/s], (n,).
         command_times: Times of the command's samples [s], (m,).
         steps: Last time before the change, first after it, and last before the next [s].
     """
@@ -198,13 +198,15 @@ class Response:
     time_constant: float
     """Time constant τ [s]."""
     delay_interval: tuple[float, float]
+    """95 % interval of the delay [s]."""
     time_constant_interval: tuple[float, float]
+    """95 % interval of the time constant [s]."""
     sample: float
     """Median sampling period of the response [s]."""
     nrmse: Array
-    """Error of every step over its height, (n,)."""
+    """Error of every step as a share of its height, (n,)."""
     overshoot: Array
-    """Overshoot of every step beyond its final level over its height, without noise, (n,)."""
+    """Overshoot of every step beyond its final level as a share of its height, without noise, (n,)."""
     moved: NDArray[np.bool_]
     """True if the response follows a step at all, which it does not inside a dead zone, (n,)."""
     accepted: NDArray[np.bool_]
@@ -219,7 +221,7 @@ class Response:
 
     @property
     def error(self) -> float:
-        """Median error of the steps used, over their height."""
+        """Return the median error of the steps used, as a share of their height."""
         return float(np.median(self.nrmse[self.used]))
 
 
@@ -273,6 +275,8 @@ def fit_response(records: Sequence[StepRecord]) -> Response:
 
 def unit_response(t: Array, x: Array) -> Array:
     """Return 1 - e^(-(t - T_d) / τ) from T_d on, and 0 before, (n,).
+
+    Times are in [s].
 
     Args:
         t: Time since the step [s], (n,).
@@ -350,7 +354,7 @@ class Study:
     logs: tuple[Log, ...]
     response: Response
     other_error: float
-    """Error of the same fit in the other domain, over the steps' height; NaN if it could not be made."""
+    """Error of the same fit in the other domain, as a share of the steps' height; NaN if it could not be made."""
 
     @property
     def records(self) -> list[StepRecord]:
@@ -369,14 +373,18 @@ class Study:
 
     @property
     def levels(self) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-        """Commands and responses of all levels, and of the levels at which the shaft turns."""
+        """Return commands and responses of all levels, and of the levels at which the shaft turns, in the units of the
+        log."""
         pairs = [pair for log in self.logs for pair in log.levels]
         largest = max((abs(y) for _, y in pairs), default=0.0)
         return pairs, [(u, y) for u, y in pairs if u != 0.0 and abs(y) > STANDING * largest]
 
     @property
     def gain(self) -> tuple[float, float]:
-        """Steady response over command by least squares, and the half-width of its interval."""
+        """Steady response over command by least squares, and the half-width of its interval.
+
+        Both are in the unit of the response over that of the command.
+        """
         _, moving = self.levels
         if not moving:
             return math.nan, math.inf
@@ -475,7 +483,10 @@ def _dead_zones(result: Study, thruster: Thruster) -> list[Estimate]:
 
 
 def quality_of(result: Study) -> dict[str, float]:
-    """Return figures of the fit: overshoot and steady error of the steps, and their error over the height."""
+    """Return figures of the fit: overshoot and steady error of the steps, and their error over the height.
+
+    Each is a share.
+    """
     response, (_, moving) = result.response, result.levels
     errors = [abs(y - u) / abs(u) for u, y in moving]
     return {

@@ -17,9 +17,10 @@ class Solution(NamedTuple):
     """Estimates of a least-squares problem."""
 
     x: Array
-    """Estimates, (P,)."""
+    """Estimates in the units of the parameters, (P,)."""
     half: Array
-    """Half-widths of their 95 % intervals, (P,); infinite where the rows do not determine them."""
+    """Half-widths of their 95 % intervals, in the units of the parameters, (P,); infinite where the rows do not
+    determine them."""
 
 
 def solve(
@@ -39,7 +40,7 @@ def solve(
 
     Args:
         residual: Residuals of all rows as a function of the parameters, (P,) -> (N,).
-        start: First guess, (P,).
+        start: First guess in the units of the parameters, (P,).
         groupings: Group of every row, (N,) each, such as blocks of neighbours, tables or trials.
         breaks: Rows at which a new series begins.
         rows_too: Whether an interval is at least that from the scatter of the rows, of which neighbours that are alike
@@ -89,7 +90,7 @@ def blocks(order: Array, count: int, weight: Array | None = None) -> NDArray[np.
     """Return the block of each row when rows are sorted by a quantity and cut into parts of equal weight.
 
     Args:
-        order: Quantity by which rows are neighbours, (N,).
+        order: Quantity of any unit by which rows are neighbours, (N,).
         count: Number of blocks; of fewer than twice as many rows each is a block.
         weight: Weight of each row, (N,); equal weights if None.
 

@@ -289,7 +289,7 @@ def find_targets(
 def quality_of(name: str, result: Bench) -> dict[str, dict[str, float]]:
     """Return figures of the fitted rows, and under `NAME at V V` those of every voltage if there are several.
 
-    `rmse` is in N or rad/s, `nrmse` is the rmse over the greatest magnitude in the rows compared.
+    `rmse` is in [N] or [rad/s], `nrmse` is the rmse over the greatest magnitude in the rows compared.
     """
     rows, figures = result.rows, dict[str, float]()
     if result.speeds_measured:

@@ -168,7 +168,7 @@ def show_vehicle(
         raise ValueError(f"{picture} ends in '{picture.suffix}', expected one of {' '.join(PICTURES)}")
     vehicle = load_vehicle(name)
     if "perception" not in vehicle.defaults:
-        from finssim.vehicles.devices import device_of
+        from finssim.vehicles.device_files import device_of
 
         for sensor in vehicle.perception:
             device_of(vehicle, sensor)

@@ -14,12 +14,12 @@ def fan_picture(levels: NDArray[Any], sector: float, side: int = 720) -> NDArray
     """A sonar's picture as a fan seen from above, the sonar at the bottom, ahead upwards; NaN outside.
 
     Args:
-        levels: By beam, 0 at the left, and range cell, (beams, bins).
+        levels: Levels of a picture, by beam, 0 at the left, and range cell, (beams, bins).
         sector: Field of view [rad].
         side: Rows of the result, one range long [-].
 
     Returns:
-        (side, columns).
+        The picture, (side, columns).
     """
     rows, columns, inside = _fan_cells(*levels.shape, sector, side)
     return np.where(inside, levels[rows, columns], np.nan)

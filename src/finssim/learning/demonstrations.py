@@ -38,15 +38,15 @@ class Episode:
     """One episode of one agent: T actions, T + 1 observations."""
 
     observation: NDArray[np.float32]
-    """(T + 1, n); the last one was not acted on."""
+    """Observations, (T + 1, n); the last one was not acted on."""
     action: NDArray[np.float32]
     """(T, m), what the expert wanted, in [-1, 1]."""
     reward: NDArray[np.float32]
-    """(T,)"""
+    """Rewards, (T,)."""
     terminated: bool
     """Ended by the task; else by its time."""
     metrics: Mapping[str, float]
-    """Metrics of the task, such as success."""
+    """Metrics of the task in their units, such as success."""
     pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     """Pictures of a task with pictures, by name; (T + 1, height, width, 3)."""
 
@@ -56,13 +56,14 @@ class Demonstrations:
     """All steps of a data set in a row."""
 
     observation: NDArray[np.float32]
-    """(N, n)"""
+    """Observations, (N, n)."""
     action: NDArray[np.float32]
-    """(N, m)"""
+    """Actions, (N, m)."""
     following: NDArray[np.float32]
     """Observation after the action, (N, n)."""
     episodes: int
     mean_return: float
+    """Mean over episodes of the sum of rewards."""
     about: Mapping[str, Any]
     """Description of the demonstrations: task, observation, action, vehicle, expert, seed, provenance."""
     pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)

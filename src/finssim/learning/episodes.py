@@ -66,7 +66,8 @@ class EpisodeEnds:
         return self._environment.task.earned(self._copy)
 
     def metrics(self) -> tuple[NDArray[np.bool_], dict[str, NDArray[np.float64]]]:
-        """Return where an episode ended, and the task's measures by world, as NumPy: the one copy through the host."""
+        """Return where an episode ended, and the task's measures by world in their units, as NumPy: the one copy
+        through the host."""
         ended = self._arrays.numpy(self.ended)
         return ended, self._environment.task.metrics(self._copy)
 

@@ -106,7 +106,7 @@ class Arrays:
         return self.xp.randperm(n, generator=self._noise, device=self.device)
 
     def orthogonal(self, rows: int, columns: int, gain: float) -> Any:
-        """An orthogonal matrix (Saxe et al. 2014), as NumPy."""
+        """An orthogonal matrix (Saxe et al. 2014), as NumPy. `gain` is a factor."""
         q, r = np.linalg.qr(self._rng.standard_normal((max(rows, columns), min(rows, columns))))
         q *= np.sign(np.diag(r))
         return (gain * (q if rows >= columns else q.T)).astype(np.float32)

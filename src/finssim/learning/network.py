@@ -29,7 +29,7 @@ class Activation:
 
     kind: str
     alpha: float = 1.0
-    """Slope of Elu alone."""
+    """Factor of Elu below zero; the others have none."""
 
 
 @dataclass(frozen=True)

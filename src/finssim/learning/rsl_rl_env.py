@@ -50,7 +50,10 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Control steps since the episode began, (num_envs,); assigned to, it ages them. A world has one age."""
+        """Return the number of control steps since the episode began, (num_envs,); assigned to, it ages them.
+
+        A world has one age.
+        """
         return self._by_row(self._steps.long())
 
     @episode_length_buf.setter

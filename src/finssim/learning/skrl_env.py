@@ -191,7 +191,7 @@ class SkrlTeamEnv(MultiAgentEnvWrapper):
         return self._by_agent(observation), self._by_agent(reward[:, :, None]), *ends, infos
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Everything that the agents see, (worlds, agents * size), the same for each."""
+        """Return the observations of all agents, (worlds, agents * size), the same for each."""
         return dict.fromkeys(self.possible_agents, self._worlds.tensors.observation.flatten(1).clone())
 
     def _by_agent(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:

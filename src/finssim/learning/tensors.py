@@ -36,7 +36,7 @@ class Tensors:
                 limited.
 
         Returns:
-            Terminated and truncated, bool, (worlds,); new tensors.
+            Flags terminated and truncated [bool], (worlds,); new tensors.
 
         Raises:
             EnvironmentSetupError: The shape is wrong or a number is not finite.

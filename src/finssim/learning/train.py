@@ -78,7 +78,7 @@ def train(
         seed: Seed of every random number; equal seeds give equal results.
         worlds: Worlds simulated at once.
         steps: Control steps of the training, summed over all worlds; the task's default if not given.
-        until (SHARE): Success rate, such as 0.95, that ends the training early if reached in two consecutive
+        until (SHARE): Share of successes, such as 0.95, that ends the training early if reached in two consecutive
             evaluations.
         init (NAME|DIR): Controller to imitate first (ppo only): a baseline of the task, such as pid, a policy
             directory, informed (a policy trained first that observes the parameters drawn by --randomize), or none;

@@ -283,7 +283,7 @@ REORDERED = 1000
 
 
 class TelemetryWatch:
-    """Silence, repetition and restarts of the motor controller."""
+    """Watch telemetry for silence, repetition and restarts; `timeout` is in [s]."""
 
     def __init__(self, outputs: int, timeout: float) -> None:
         self._outputs = outputs
@@ -527,10 +527,13 @@ class Workspace:
         return ""
 
     def outward(self, position: Array) -> Array:
-        """Direction out of the box on each axis where the vehicle is near a face, else 0: -1, 0 or 1, (3,).
+        """Return the direction out of the box on each axis where the vehicle is near a face, else 0: -1, 0 or 1, (3,).
 
         Args:
             position: World frame [m], (3,).
+
+        Returns:
+            The unit direction, (3,).
         """
         return (position > self._inner[1]).astype(float) - (position < self._inner[0])
 
@@ -545,7 +548,7 @@ class Workspace:
             quaternion: Body to world, xyzw, (4,).
 
         Returns:
-            (n,); zeros where the thrusters cannot give the wrench without pushing out.
+            Thrusts [N], (n,); zeros where the thrusters cannot give the wrench without pushing out.
         """
         outward = self.outward(position)
         if not outward.any():

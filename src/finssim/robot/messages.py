@@ -57,7 +57,9 @@ class CommandEcho:
     accepted: bool
     reject_flags: int
     received: tuple[float, ...]
+    """Commands as they came, in the unit of the command."""
     applied: tuple[float, ...]
+    """Commands that the motors were given, in the unit of the command."""
     debug_mask: int
     decimation: int
 

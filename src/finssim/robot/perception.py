@@ -167,7 +167,7 @@ class Aboard:
         return VisionSample(time, (x, y), z if aid.kind == POSE else None, rows, arrival)
 
     def to_body(self, vector_s: Three) -> Three:
-        """A vector of the IMU's frame in body axes."""
+        """Return a vector of the IMU's frame in body axes; the unit is kept."""
         x, y, z = (self._R_bs @ vector_s).tolist()
         return x, y, z
 
@@ -301,7 +301,7 @@ class Unlocated:
             self._nu[3:] = gyro
 
     def aid(self, arrival: float, aid: NavigationAid) -> None:
-        """Nothing is located, so nothing is aided."""
+        """Nothing is located, so nothing is aided. `arrival` is a time [s]."""
 
     def picture(self, now: float, picture: Picture) -> Any:
         """Pictures say nothing without a pool file."""

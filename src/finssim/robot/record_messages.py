@@ -35,7 +35,7 @@ from finssim.robot.pictures import jpeg
 from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import with_navigation
-from finssim.vehicles.devices import CameraDevice, Device, RangeDevice, SonarDevice, device_of
+from finssim.vehicles.device_files import CameraDevice, Device, RangeDevice, SonarDevice, device_of
 
 # Names, types, frames and policies of all data of a robot: one table, for topics, records and the page.
 
@@ -654,12 +654,15 @@ def fields_of(kind: str) -> list[tuple[str, Callable[[Any], Any], Any]]:
 
 
 def floats(values: Any) -> npt.NDArray[np.float64]:
-    """A copy of numbers as rosbags wants them."""
+    """Return a copy of numbers, of any unit, as rosbags wants them."""
     return np.array(values, dtype=np.float64).ravel()
 
 
 def numbers_of(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """A covariance (6, 6) row by row, (36,): unknown variances large and uncorrelated, for filters take no NaN."""
+    """A covariance (6, 6) row by row, (36,): unknown variances large and uncorrelated, for filters take no NaN.
+
+    The units are kept.
+    """
     unknown = ~np.isfinite(covariance.sum(axis=0))
     covariance[unknown], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = UNKNOWN

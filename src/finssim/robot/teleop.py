@@ -386,7 +386,10 @@ class Pad:
         self._moved = set[int]()
 
     def hands(self, axes: Sequence[float], buttons: Sequence[Any]) -> Hands:
-        """Return the pad's state, with SDL's signs: right and backwards are positive, a trigger goes from -1 to 1."""
+        """Return the pad's state, with SDL's signs: right and backwards are positive, a trigger goes from -1 to 1.
+
+        Axes are in [-1, 1].
+        """
         return Hands(
             surge=-axes[STICKS["left_y"]],
             sway=-axes[STICKS["left_x"]],

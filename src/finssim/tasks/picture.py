@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.vehicles import Vehicle
-from finssim.vehicles.devices import CameraDevice, RangeDevice, SonarDevice, device_of
+from finssim.vehicles.device_files import CameraDevice, RangeDevice, SonarDevice, device_of
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
     from finssim.vehicles.check import Finding, check_vehicle
-    from finssim.vehicles.devices import device_of, devices, load_device
+    from finssim.vehicles.device_files import device_of, devices, load_device
     from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensor, Sensors, Tags
     from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
     from finssim.vehicles.loader import catalogue, catalogue_vehicle, load_vehicle

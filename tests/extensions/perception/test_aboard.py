@@ -6,7 +6,7 @@ import pytest
 from finssim.core.rotations import quat_rotate
 from finssim.extensions.perception import CameraBatch, RangeBatch, SonarBatch, sensor_of
 from finssim.vehicles import catalogue, load_vehicle
-from finssim.vehicles.devices import DeviceError, device_of, load_device
+from finssim.vehicles.device_files import DeviceError, device_of, load_device
 
 
 @pytest.mark.parametrize("name", catalogue())

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from finssim.core.frames import TO_OPTICAL
 from finssim.core.optics import Camera, Interface, Layer, project
 from finssim.extensions.perception import CameraBatch, Headlight, RangeBatch, SonarBatch, WorldBatch
-from finssim.vehicles.devices import CameraDevice, Mount, Port, load_device
+from finssim.vehicles.device_files import CameraDevice, Mount, Port, load_device
 
 pytestmark = pytest.mark.slow
 

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from finssim.extensions.perception import Delivery, RangeBatch, WorldBatch, WorldError, load_world
-from finssim.vehicles.devices import RangeDevice
+from finssim.vehicles.device_files import RangeDevice
 
 pytestmark = pytest.mark.slow
 

@@ -17,7 +17,7 @@ from finssim.extensions.perception.description import (
     sites,
 )
 from finssim.sim.overhead_camera import Water
-from finssim.vehicles.devices import DEVICES, DeviceError, devices, load_device
+from finssim.vehicles.device_files import DEVICES, DeviceError, devices, load_device
 
 WORLD = """
 about: A ball over a floor.

@@ -13,7 +13,7 @@ import mitsuba as mi
 from finssim.core.frames import FROM_OPTICAL
 from finssim.core.rotations import quat_to_matrix
 from finssim.extensions.perception import CameraBatch, WorldBatch, load_world
-from finssim.vehicles.devices import CameraDevice, Port
+from finssim.vehicles.device_files import CameraDevice, Port
 
 pytestmark = pytest.mark.slow
 

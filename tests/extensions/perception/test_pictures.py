@@ -9,7 +9,7 @@ import warp as wp
 from finssim.extensions.perception import CameraBatch, WorldBatch, WorldError, load_world
 from finssim.extensions.perception.description import JERLOV, WorldWater
 from finssim.physics.types import vec6
-from finssim.vehicles.devices import CameraDevice
+from finssim.vehicles.device_files import CameraDevice
 
 cv2 = pytest.importorskip("cv2", reason="finssim[vision] is not installed")
 pytestmark = pytest.mark.slow

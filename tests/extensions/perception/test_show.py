@@ -10,7 +10,7 @@ from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.core.sonar_fan import fan_picture
 from finssim.extensions.perception.description import sites
-from finssim.vehicles.devices import devices
+from finssim.vehicles.device_files import devices
 
 
 def finssim(*words):

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from finssim.core.rotations import quat_from_euler, quat_rotate
 from finssim.extensions.perception import DopplerBatch, RangeBatch, SonarBatch, WorldError
 from finssim.physics.types import vec6
-from finssim.vehicles.devices import Mount, RangeDevice, SonarDevice, load_device
+from finssim.vehicles.device_files import Mount, RangeDevice, SonarDevice, load_device
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,7 @@ import warp as wp
 
 from finssim.extensions.perception import CameraBatch, RangeBatch, WorldBatch, WorldLayout, load_world
 from finssim.sim import Simulator
-from finssim.vehicles.devices import load_device
+from finssim.vehicles.device_files import load_device
 
 WATER = "water: {attenuation: [0, 0, 0], veil: [0, 0, 0], daylight_attenuation: [0, 0, 0]}\n"
 

@@ -20,7 +20,7 @@ from finssim.core.budget import read_bytes
 from finssim.core.files import plain_name
 from finssim.core.mesh import MeshError, load_stl
 from finssim.core.rotations import quat_from_euler, quat_from_yaw
-from finssim.vehicles.devices import Count, Pair
+from finssim.vehicles.device_files import Count, Pair
 from finssim.vehicles.part import (
     NonNegative,
     Number,

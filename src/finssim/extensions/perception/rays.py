@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finssim.core.frames import FROM_OPTICAL
 from finssim.core.optics import Camera, Interface, Layer, Lens, back_project
-from finssim.vehicles.devices import Port, RangeDevice, SonarDevice
+from finssim.vehicles.device_files import Port, RangeDevice, SonarDevice
 
 Array = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from finssim.physics.types import angular, linear, vec6
 from finssim.sim.overhead_camera.photometry import fresnel, noise_key, refracted, through_water
 from finssim.sim.sensors.dvl import sensed_velocity
 from finssim.vehicles import Vehicle
-from finssim.vehicles.devices import CameraDevice, Mount, RangeDevice, SonarDevice, device_of
+from finssim.vehicles.device_files import CameraDevice, Mount, RangeDevice, SonarDevice, device_of
 
 wp.set_module_options({"enable_backward": False})
 

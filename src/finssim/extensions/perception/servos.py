@@ -30,7 +30,7 @@ from finssim.extensions.perception.pipeline import Pipeline
 from finssim.extensions.perception.seeing import DEPTH_SCALE
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
-from finssim.vehicles.devices import device_of
+from finssim.vehicles.device_files import device_of
 
 
 def camera_of(vehicle: Vehicle, task: Task) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from finssim.core.sonar_fan import fan_picture
 from finssim.evaluation.figures import DPI, new_figure
 from finssim.evaluation.tables import Table
 from finssim.extensions.perception.description import World, WorldError, load_world, sites
-from finssim.vehicles.devices import CameraDevice, SonarDevice, devices, load_device
+from finssim.vehicles.device_files import CameraDevice, SonarDevice, devices, load_device
 
 WIDTH = 800
 """Width of the camera's part of a picture [px], each the mean of 2 x 2 rays."""

@@ -13,7 +13,7 @@ from finssim.core.rotations import quat_inverse_rotate
 from finssim.sim.simulator import Simulator
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
-from finssim.vehicles.devices import CameraDevice, RangeDevice, SonarDevice, device_of
+from finssim.vehicles.device_files import CameraDevice, RangeDevice, SonarDevice, device_of
 
 if TYPE_CHECKING:
     from finssim.extensions.perception.description import World

@@ -14,7 +14,7 @@ from finssim.extensions.viewer.frame import Body, Pose
 from finssim.robot.messages import Picture
 from finssim.robot.record_messages import FAN_ROWS
 from finssim.vehicles import Vehicle, VehicleError
-from finssim.vehicles.devices import SonarDevice, device_of
+from finssim.vehicles.device_files import SonarDevice, device_of
 
 Array = npt.NDArray[np.float64]
 

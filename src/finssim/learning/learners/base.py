@@ -132,9 +132,11 @@ class OnPolicySettings:
     learning_rate: float = 1.5e-3
     """Learning rate at the start; it falls linearly to zero, which gives the last centimetres."""
     discount: float = 0.98
-    """Per control step: 5 s of foresight at 10 Hz, a few time constants of the vehicle."""
+    """Discount factor per control step: 5 s of foresight at 10 Hz, a few time constants of the vehicle."""
     gae_lambda: float = 0.95
+    """Factor λ of the generalised advantage."""
     clip: float = 0.2
+    """Bound ε on the ratio of probabilities, less 1."""
     value_weight: float = 0.5
     """Weight of the value's squared error relative to the policy's objective, if both share a gradient norm."""
     largest_gradient: float = 0.5

@@ -60,11 +60,11 @@ def varied(pictures: torch.Tensor, amount: float) -> torch.Tensor:
     by a power, and noise is added.
 
     Args:
-        pictures: uint8 (N, height, width, channels).
+        pictures: Pictures, uint8 (N, height, width, channels).
         amount: Standard deviation of the changes [-].
 
     Returns:
-        float32 of the same shape, 0 to 255.
+        Pictures, float32 of the same shape, 0 to 255.
     """
     n, rows, _, channels = pictures.shape
     draw = {"device": pictures.device, "dtype": torch.float32}
@@ -131,7 +131,10 @@ class Distill(ActingLearner):
         self.teacher, self.teacher_held = ppo.network(), row["held"]
 
     def update(self) -> dict[str, float]:
-        """One rollout, labelled by the teacher, and regression on what is kept."""
+        """One rollout, labelled by the teacher, and regression on what is kept.
+
+        Its row of the training curve has the units of the curve.
+        """
         if self.teacher is None:
             self._train_teacher()
         s, fresh = self.settings, self.environment.worlds * self.settings.rollout

@@ -65,7 +65,7 @@ class DaggerSettings:
     kept: int = 500_000
     """Samples that are kept, the newest."""
     passes: float = 2.0
-    """Over what is kept, in each round."""
+    """Number of passes over what is kept, in each round."""
     batch: int = 512
     learning_rate: float = 1.0e-3
     """Learning rate at the start; it falls linearly to zero."""
@@ -184,7 +184,10 @@ class Bc(_Cloner):
         self._shown = {name: torch.from_numpy(x).to(device) for name, x in data.pictures.items()}
 
     def update(self) -> dict[str, float]:
-        """One round of regression, then a while of driving, which only measures."""
+        """One round of regression, then a while of driving, which only measures.
+
+        The result is a row of the training curve, in the units of the curve.
+        """
         count = min(self.settings.rollout, self.settings.steps - self.steps)
         loss = self._fit(self._observation, self._action, count, self._shown)
         self.steps += max(count, 1)
@@ -220,7 +223,10 @@ class Dagger(_Cloner):
         self._action = torch.cat([self._action, action])[-limit:]
 
     def update(self) -> dict[str, float]:
-        """One rollout, labelled by the expert, and regression on all that is kept."""
+        """One rollout, labelled by the expert, and regression on all that is kept.
+
+        The result is a row of the training curve, in the units of the curve.
+        """
         with torch.no_grad():
             self._keep(*self._rollout())
         self._rounds += 1

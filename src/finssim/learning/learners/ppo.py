@@ -56,10 +56,11 @@ class PpoSettings:
     learning_rate: float = 4.0e-3
     """Learning rate at the start; it falls linearly to zero, which gives the last centimetres."""
     discount: float = 0.98
-    """γ, per control step: 5 s of foresight at 10 Hz, a few time constants of the vehicle."""
+    """Discount factor γ per control step: 5 s of foresight at 10 Hz, a few time constants of the vehicle."""
     gae_lambda: float = 0.95
+    """Factor λ of the generalised advantage."""
     clip: float = 0.2
-    """ε."""
+    """Bound ε on the ratio of probabilities, less 1."""
     largest_gradient: float = 0.5
     """Longer gradients, of policy and value each, are shortened to this norm: an odd batch must not undo many."""
     entropy_weight: float = 0.0
@@ -234,7 +235,10 @@ class Ppo(ActingLearner):
         return self.arrays.view(getattr(self.environment.arrays, name)).reshape(self._rows, -1)
 
     def update(self) -> dict[str, float]:
-        """One rollout, and `epochs` passes over it; a row of the training curve."""
+        """One rollout, and `epochs` passes over it; a row of the training curve.
+
+        The row has the units of the curve.
+        """
         if isinstance(self._teacher, InformedTeacher) and not self._teacher.trained:
             self._teacher.train()
         rate = self.settings.learning_rate * self.remaining

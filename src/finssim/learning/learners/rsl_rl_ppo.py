@@ -85,7 +85,10 @@ class RslRlPpo(ActingLearner):
         )
 
     def update(self) -> dict[str, float]:
-        """One rollout, and `epochs` passes over it."""
+        """One rollout, and `epochs` passes over it.
+
+        The result is a row of the training curve, in the units of the curve.
+        """
         self.ppo.train_mode()
         groups = self._observe()
         with torch.inference_mode():
@@ -156,8 +159,9 @@ def _begin(mlp: Any, last_gain: float) -> None:
 
 
 def privileged_rows(environment: Environment, name: str = "privileged") -> torch.Tensor | None:
-    """Return what only a critic may observe, one row per agent: a view of the environment's memory; None if there is
-    nothing.
+    """Return the observations that only a critic may have, one row per agent; None if there is nothing.
+
+    They are a view of the environment's memory.
 
     Args:
         environment: The worlds.

@@ -73,7 +73,10 @@ class Sb3Ppo(ActingLearner):
         self.callback: BaseCallback = callback
 
     def update(self) -> dict[str, float]:
-        """One rollout, and `epochs` passes over it."""
+        """One rollout, and `epochs` passes over it.
+
+        The result is a row of the training curve, in the units of the curve.
+        """
         m = self.model
         m.collect_rollouts(m.env, self.callback, m.rollout_buffer, n_rollout_steps=m.n_steps)
         self._count()

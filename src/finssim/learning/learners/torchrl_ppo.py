@@ -38,6 +38,7 @@ class Head(nn.Module):
         self.mean, self.log_std = mean, nn.Parameter(torch.full((size,), log_std))
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the mean of the action for each observation, and its standard deviation."""
         mean = self.mean(observation)
         return mean, self.log_std.exp().expand_as(mean)
 
@@ -50,6 +51,7 @@ class OwnValue(nn.Module):
         self.value = stack(environment.observation_size, hidden, 1, 1.0)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return the value of each observation, a sum of rewards."""
         value: torch.Tensor = self.value(observation)
         return value
 
@@ -64,6 +66,7 @@ class TeamValue(nn.Module):
         self.value = stack(n * environment.observation_size + n, hidden, 1, 1.0)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return the value of each observation, a sum of rewards."""
         *batch, n, size = observation.shape
         everyone = observation.reshape(*batch, 1, n * size).expand(*batch, n, n * size)
         value: torch.Tensor = self.value(torch.cat([everyone, self.who.expand(*batch, n, n)], dim=-1))
@@ -114,7 +117,10 @@ class TorchRlPpo(ActingLearner):
         )
 
     def update(self) -> dict[str, float]:
-        """One rollout, and `epochs` passes over it."""
+        """One rollout, and `epochs` passes over it.
+
+        The result is a row of the training curve, in the units of the curve.
+        """
         with torch.no_grad():
             samples = self._rollout()
         self.steps += self.environment.worlds * self.settings.rollout

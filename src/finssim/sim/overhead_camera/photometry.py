@@ -23,8 +23,13 @@ def fresnel(cos_near: float, cos_far: float, n_near: float, n_far: float) -> flo
 
 @wp.func
 def refracted(ray: wp.vec3, normal: wp.vec3, ratio: float) -> wp.vec3:
-    """Return the unit direction after refraction, in the frame of the ray (paper, eq. 9), or zero for total
-    reflection."""
+    """Return the unit direction after refraction (paper, eq. 9), or zero for total reflection.
+
+    Args:
+        ray: Unit direction of the incident ray, any frame.
+        normal: Unit normal against it, same frame [-].
+        ratio: Index on its side over the index on the other, η.
+    """
     c = -wp.dot(normal, ray)
     kappa = 1.0 - ratio * ratio * (1.0 - c * c)
     if kappa <= 0.0:

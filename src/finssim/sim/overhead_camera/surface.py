@@ -113,7 +113,13 @@ def layout_of(struct: Any) -> np.dtype[Any]:
 
 
 def pack_waves(waves: Waves | None, origin: ArrayLike, time: float) -> NDArray[Any]:
-    """Return waves as structs for the kernel, in the units of `Wave`."""
+    """Return waves as structs for the kernel, in the units of `Wave`.
+
+    Args:
+        waves: The surface; None for a flat one.
+        origin: Of the surface frame, in its own axes from the pool's origin [m], (2,).
+        time: Middle of the exposure [s].
+    """
     count = 0 if waves is None else len(waves.omega)
     table = np.zeros(count, dtype=layout_of(Wave))
     if waves is not None:

@@ -33,7 +33,7 @@ from finssim.extensions.ros2.topics import own_topics, quality_profile
 from finssim.pool.pictures import UdpSender
 from finssim.robot.messages import Picture
 from finssim.vehicles import load_vehicle
-from finssim.vehicles.devices import device_of, load_device
+from finssim.vehicles.device_files import device_of, load_device
 from finssim.vehicles.equipment import RaySensor
 from reference.policies import seeing
 

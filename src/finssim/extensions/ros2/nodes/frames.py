@@ -27,7 +27,7 @@ from finssim.localization.poses import axes_of_up
 from finssim.robot.reading import Reading
 from finssim.robot.record_messages import own_kind
 from finssim.vehicles import Vehicle
-from finssim.vehicles.devices import device_of
+from finssim.vehicles.device_files import device_of
 
 Array = npt.NDArray[np.float64]
 
