@@ -42,7 +42,7 @@ class Cause:
     title: str
     unit: str
     amounts: tuple[float, ...]
-    """Amounts, the first of which is zero."""
+    """Amounts in the unit of the parameter, the first of which is zero."""
     plant: Callable[[float], Mapping[str, Any]]
     """Amount -> keys of the plant."""
 
@@ -188,7 +188,10 @@ def _figures(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def tolerated(cause: Mapping[str, Any], row: str) -> float | None:
-    """Return the amount up to which a row holds `HELD` of its trials at every amount; None: not even at 0."""
+    """Return the amount up to which a row holds `HELD` of its trials at every amount; None: not even at 0.
+
+    It has the unit of the cause.
+    """
     largest = None
     for amount, figures in zip(cause["amounts"], cause["rows"][row], strict=True):
         if figures["success"]["value"] < HELD:

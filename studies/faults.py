@@ -63,7 +63,7 @@ class Course(NamedTuple):
     thrust: Array
     """Delivered, canonical order [N], (k, n)."""
     enabled: Array
-    """1 where the robot sent a frame that enables the motors, else 0, (k,); NaN where it was not observed."""
+    """Flag [-]: 1 where the robot sent a frame that enables the motors, else 0, (k,); NaN where it was not observed."""
 
 
 class FaultyWire:
@@ -97,7 +97,7 @@ class FaultyWire:
         self._rows: list[tuple[float, Array, Array, bool]] = []
 
     def exchange(self, until: float, sent: Sequence[bytes]) -> Delivery:
-        """Advance the pool by one period; `until`, a time of the robot's clock, is ignored."""
+        """Advance the pool by one period; `until`, a time of the robot's clock, is ignored. Times are in [s]."""
         self._note(sent)
         self._turns += 1
         more = self.others(self.pool.time) if self.others is not None else ()

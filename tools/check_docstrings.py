@@ -66,21 +66,10 @@ SHAPE = re.compile(r"\((?:[A-Za-z0-9_.+* -]+,)+[A-Za-z0-9_.+* ,-]*\)")
 FRAME = re.compile(r"\b(frame|axes|body|world|pool|camera|optical|map|reference)\b", re.IGNORECASE)
 
 PENDING = {
-    "finssim.agents",
-    "finssim.evaluation",
     "finssim.extensions.perception",
-    "finssim.extensions.ros2",
-    "finssim.extensions.teams",
-    "finssim.extensions.viewer",
     "finssim.identification",
     "finssim.localization",
-    "finssim.studies",
-    "finssim.survey",
     "finssim.tasks",
-    "finssim.trials",
-    "finssim.vehicles",
-    "studies.anatomy",
-    "studies.faults",
 }
 """Packages of which only parameters that are named as a quantity are judged yet."""
 

@@ -33,6 +33,7 @@ class DockingPid(WrenchPid):
     gap: float
     """Greatest distance of the nose from the axis in the tube [m]; towards the mouth it grows by `slope`."""
     slope: float
+    """Growth of that distance towards the mouth, per distance from the tube [m/m]."""
     lead: float
     """Distance of the goal ahead of the nose [m], which sets the speed."""
     turn: float = np.radians(15.0)
@@ -53,7 +54,7 @@ class DockingPid(WrenchPid):
             vehicle: Its file.
             period: Time between two actions [s].
             task: Whose dock it is; None: that of `Docking`.
-            lead: How far the goal runs ahead of the nose, in lengths of the vehicle.
+            lead: Distance by which the goal runs ahead of the nose, as a share of the vehicle's length.
             more: Further fields.
         """
         task = (task or Docking()).fitted([vehicle])
@@ -80,7 +81,7 @@ class DockingPid(WrenchPid):
         Args:
             memory: Of the PID.
             nose: From the throat, dock axes [m], (n, 3).
-            q: Body to dock axes, xyzw, (n, 4).
+            q: Quaternion from body to dock axes, xyzw, (n, 4).
             nu: Twist, body frame [m/s, rad/s], (n, 6).
         """
         arm = np.array([self.nose, 0.0, 0.0])

@@ -58,7 +58,10 @@ def drive(d: Any, q: wp.quat, nu: vec6, target: wp.vec4) -> wp.vec4:
 
 @wp.func
 def shared(a: wp.vec4) -> wp.vec4:
-    """Surge, sway and yaw limited together, for the same thrusters give them: yaw up to half, the others the rest."""
+    """Return actions of surge, sway and yaw limited together, for the same thrusters give them.
+
+    Yaw gets up to half, the others the rest.
+    """
     yaw = wp.clamp(a[3], -0.5, 0.5)
     part = wp.min(1.0, (1.0 - wp.abs(yaw)) / wp.max(wp.abs(a[0]) + wp.abs(a[1]), 1.0e-6))
     return wp.vec4(part * a[0], part * a[1], wp.clamp(a[2], -1.0, 1.0), yaw)
@@ -85,7 +88,7 @@ class DriveNumbers:
     d1: tuple[float, float, float, float]
     """Linear damping [N s/m, N m s]."""
     d2: tuple[float, float, float, float]
-    """Quadratic damping."""
+    """Quadratic damping [N s²/m², N m s²]."""
     mass: tuple[float, float, float, float]
     """Inertia with added mass [kg, kg m²]."""
     limit: tuple[float, float, float, float]
@@ -128,7 +131,7 @@ class DriveNumbers:
 
         Args:
             velocity: Surge, sway, heave, yaw rate [m/s, rad/s], (n, 4).
-            target: The same, wanted.
+            target: The wanted velocity, body frame [m/s, rad/s], of the same shape.
 
         Returns:
             Parts of the limits on the four axes, (n, 4), each in [-1, 1].
@@ -154,6 +157,7 @@ class DriveBaseline:
 
     drive: DriveNumbers
     period: float = PERIOD
+    """Time between two commands [s]."""
     turn_first: float = math.inf
     """A heading error above this is turned away before anything else [rad]."""
 

@@ -59,7 +59,7 @@ class Lqr:
     body: Pid = field(repr=False)
     """Model, limits, allocation and feed-forward."""
     gains: Array
-    """Gains of e, e', f and the delayed commands, per axis, (6, 3 + delays)."""
+    """Gains of e [m, rad], e' [m/s, rad/s], f [N, N m] and the delayed commands [N, N m], per axis, (6, 3 + delays)."""
     error_limit: Array
     """Largest error that is acted on, (6,) [m, rad]."""
     lag: float

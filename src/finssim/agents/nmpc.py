@@ -46,7 +46,8 @@ class NmpcMemory(NamedTuple):
     queue: Array
     """Thrusts commanded and not yet at the thrusters, oldest first [N], (..., delays, n)."""
     plan: Array
-    """Solution of the last problem, from which the next one starts; NaN at first, (..., variables)."""
+    """Solution of the last problem in the units of its variables, from which the next one starts; NaN at first, (...,
+    variables)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +72,7 @@ class Nmpc:
     mass: Array
     """M about the body origin [kg, kg m, kg m²], (6, 6)."""
     bounds: tuple[Array, Array]
-    """Bounds of the constraints, (constraints,) each."""
+    """Bounds of the constraints, in the units of these, (constraints,) each."""
     delays: int
     """Commands under way."""
     period: float

@@ -271,13 +271,13 @@ class PaperProfile(NamedTuple):
     ki: tuple[float, float, float, float]
     kd: tuple[float, float, float, float]
     output_limit: tuple[float, float, float, float]
-    """Bound of each PID's output."""
+    """Bound of each PID's output, in the unit of `axis_range`."""
     axis_range: tuple[float, float, float, float]
     """Divisor that turns each output into an effort in [-1, 1]: smaller is stronger."""
     integral_decay: float = 0.95
     """Factor on the integral per period."""
     integral_limit: float = 100.0
-    """Bound of the integral of the error."""
+    """Bound of the integral of the error [m s, deg s]."""
     derivative_memory: float = math.exp(-4.0)
     """Factor on the filtered derivative per period."""
     yaw_dead_band: float = 5.0
@@ -315,11 +315,11 @@ class PaperMemory(NamedTuple):
     """Memory of the controller, in the order depth, surge, sway, yaw [m, deg]."""
 
     integral: Array
-    """Decaying integral of the error, (..., 4)."""
+    """Decaying integral of the error [m s, deg s], (..., 4)."""
     error: Array
-    """Error at the last command; NaN before the first, (..., 4)."""
+    """Error at the last command [m, deg]; NaN before the first, (..., 4)."""
     derivative: Array
-    """Filtered derivative of the error, (..., 4)."""
+    """Filtered derivative of the error [m/s, deg/s], (..., 4)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -93,6 +93,7 @@ class Form(NamedTuple):
     """Kind of goal: the key of its name in a row."""
     targets: Sequence[str]
     columns: Columns
+    """Columns of the table: key -> heading with its unit, format, and a factor."""
     caption: str
     summarize: Callable[[Sequence[Mapping[str, Any]]], dict[str, Any]]
     paper: Callable[[str], dict[str, dict[str, Any]]]

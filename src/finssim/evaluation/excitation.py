@@ -214,7 +214,7 @@ class Start:
 
 
 def box_of(surroundings: Basin | Vehicle) -> Box:
-    """The water of a basin, or the workspace of a vehicle, which is taken for walls."""
+    """The water of a basin, or the workspace of a vehicle, which is taken for walls [m]."""
     if isinstance(surroundings, Basin):
         half = 0.5 * surroundings.length, 0.5 * surroundings.width
         return (-half[0], -half[1], -surroundings.depth), (*half, 0.0)
@@ -230,7 +230,7 @@ def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> Start:
     Args:
         programme: On one axis; several at once begin in the middle.
         vehicle: Whose envelope keeps off the walls.
-        box: The water.
+        box: The water: lower and upper corner [m].
 
     Raises:
         CalibrationError: The water has no room for it.
@@ -324,7 +324,7 @@ class PoolRun(PoolJob):
 
     @property
     def water(self) -> Box:
-        """Return the water of the pool."""
+        """Return the water of the pool: lower and upper corner [m]."""
         standing = load_vehicle(self.pool_vehicle)
         return box_of(site_of(self.site, draw_plant(standing, self.plant, self.severity)).basin)  # type: ignore[arg-type]
 

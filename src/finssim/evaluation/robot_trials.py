@@ -61,8 +61,10 @@ APPROACH = 60.0
 
 
 def start_bounds(site: str, exact: bool) -> tuple[tuple[float, ...], ...]:
-    """Return the bounds that are near enough to a start, any of them: `EXACTLY`, in open water `AFLOAT`; `ROUGHLY`
-    unless exact."""
+    """Return the bounds [m, rad, m/s, rad/s] that are near enough to a start, any of them.
+
+    They are `EXACTLY`, in open water `AFLOAT`; `ROUGHLY` unless exact.
+    """
     near = AFLOAT if site == "open-water" else EXACTLY
     return (near,) if exact else (near, ROUGHLY)
 
@@ -138,7 +140,7 @@ class Stages:
             trial: What to do.
             vehicle: As the robot knows it.
             start: Where the trial begins.
-            bounds: Of `start_bounds`, any of which is near enough.
+            bounds: Bounds as of `start_bounds`, any of which is near enough.
             by_hand: Somebody carries it there, and presses enter. False: the tuned PID steers it there.
             attendant: Nobody is asked if None: the way to the start begins as soon as the state is known.
             recorder: Takes down the trial itself, not the way to its start.

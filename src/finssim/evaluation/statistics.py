@@ -35,7 +35,8 @@ def bootstrap(redraw: Callable[[np.random.Generator], ArrayLike]) -> Array:
         redraw: Draws the data with replacement and returns its figure, or figures.
 
     Returns:
-        2.5 and 97.5 %, (2, ...), each one of the redrawn figures: nothing lies between a finite and an infinite one.
+        2.5 and 97.5 %, (2, ...), in the unit of the figures, each one of the redrawn figures: nothing lies between a
+        finite and an infinite one.
     """
     random = np.random.default_rng(SEED)
     drawn = np.array([redraw(random) for _ in range(RESAMPLES)], float)
@@ -51,7 +52,7 @@ def with_interval(
     bootstrap draws whole clusters with replacement.
 
     Args:
-        values: Cluster -> its values.
+        values: Cluster -> its values, all in one unit.
         statistic: Function of all values.
 
     Returns:
@@ -78,7 +79,7 @@ def paired_difference(
 
     Args:
         ours: (plant, seed, target) -> figure of the reference.
-        theirs: The same of the row that is compared with it.
+        theirs: The same of the row that is compared with it, in the same unit.
     """
     clusters: dict[Hashable, list[float]] = {}
     for pair in sorted(ours.keys() & theirs.keys()):

@@ -147,7 +147,10 @@ Columns = Mapping[str, tuple[str, str] | tuple[str, str, float]]
 
 
 def figure_text(figure: Mapping[str, Any] | float | None, form: str, factor: float = 1.0) -> str:
-    """A figure as text, with its interval in brackets where it has one; – where there is none."""
+    """A figure as text, with its interval in brackets where it has one; – where there is none.
+
+    `factor` takes the unit of the figure to that of the text.
+    """
     value = figure["value"] if isinstance(figure, Mapping) else figure
     if value is None:
         return "–"
@@ -157,7 +160,10 @@ def figure_text(figure: Mapping[str, Any] | float | None, form: str, factor: flo
 
 
 def cells(row: Mapping[str, Any], columns: Columns) -> list[str]:
-    """A row's figures as text, in the order of the columns."""
+    """A row's figures as text, in the order of the columns.
+
+    A column has a heading with its unit, a format, and a factor.
+    """
     return [
         figure_text(row.get(key), *form) if form[0] else f"{row[key]}/{row['trials']}" if key in row else ""
         for key, (_, *form) in columns.items()

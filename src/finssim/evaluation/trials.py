@@ -127,7 +127,10 @@ class Motion:
 
 
 def interpolated(t: ArrayLike, times: Array, columns: Array) -> Array:
-    """Columns (T, n) between their times (T,), at one time (n,) or at several (k, n)."""
+    """Columns (T, n) between their times (T,), at one time (n,) or at several (k, n).
+
+    The units of times and columns are kept.
+    """
     return np.stack([np.interp(t, times, column) for column in columns.T], axis=-1)
 
 
@@ -205,7 +208,7 @@ def guide_of(
     Args:
         target: What is to be done.
         vehicle: In whose room; one that cannot follow the trajectory is refused.
-        size: Of the room, where no vehicle is named: 1 for FinsROV.
+        size: Factor on lengths, of the room where no vehicle is named: 1 for FinsROV.
         site: By which setpoints grow, where a vehicle is named.
     """
     if str(target) in T1_SETPOINTS:

@@ -275,7 +275,7 @@ class MotorBank:
     dead_minus: wp.array(dtype=float)  # the same in reverse, as a magnitude [rad/s]
 
     full_voltage: float  # [V]
-    fade: float  # share of the thrust that warm motors lose
+    fade: float  # share of the voltage that is lost after fade_time
     fade_time: float  # [s]
     resistance: float  # [ohm]
     motor_power: float  # at full speed [W]
@@ -300,7 +300,7 @@ class MotorBank:
     target: wp.array(dtype=float)  # [rad/s]
     speed: wp.array(dtype=float)  # true shaft speed [rad/s]
     measured: wp.array(dtype=float)  # newest measurement [rad/s]
-    smooth: wp.array(dtype=float)  # smoothed deviation for the derivative [-]
+    smooth: wp.array(dtype=float)  # smoothed measurement for the derivative [rad/s]
     expected: wp.array(dtype=float)  # response that the firmware expects [rad/s]
     integral: wp.array(dtype=float)  # integral part of the throttle [-]
     throttle: wp.array(dtype=float)  # newest [-1, 1]

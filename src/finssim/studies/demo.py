@@ -182,6 +182,7 @@ class Identification:
     """The vehicle of the catalogue that made the trials, or around which the pool's own was drawn."""
     findings: tuple[Finding, ...]
     seconds: float
+    """Time that the trials took [s]."""
 
 
 def rough_vehicle(truth: Vehicle) -> Vehicle:
@@ -411,9 +412,9 @@ class Scope:
     levels: dict[str, list[float]]
     """Axis -> levels of the steps and pulses that the fit is made from, for FinsROV [N, N m]."""
     shuttles: dict[str, list[float]]
-    """Levels of the square waves."""
+    """Levels of the square waves by axis [N, N m]."""
     held_out: dict[str, list[float]]
-    """Levels of the replayed trials."""
+    """Levels of the replayed trials by axis [N, N m]."""
     setpoints: tuple[str, ...]
     """Tried by every controller, with the tags' corners computed."""
     pictures: tuple[str, ...]

@@ -93,7 +93,9 @@ class Visit:
     depth_read: float
     """Depth of the tag by the pressure sensor [m]."""
     roll_read: float
+    """Roll as read [rad]."""
     pitch_read: float
+    """Pitch as read [rad]."""
     images: int
     """Pictures taken there."""
 
@@ -307,7 +309,7 @@ class Calibrated:
     frames: list[Frame]
     """Detections of the half that calibrates."""
     survey: list[Row]
-    """Surveyed place of the tag in each of them."""
+    """Surveyed place of the tag in each of them [m]."""
 
 
 def calibrate(campaign: Campaign, observed: Sequence[Picture]) -> Calibrated:
@@ -352,7 +354,7 @@ def survey_rows(campaign: Campaign, chosen: Sequence[Picture]) -> list[Row]:
 
 
 def write_survey(rows: Sequence[Row], path: Path) -> None:
-    """Write the table of the surveyed tags."""
+    """Write the table of the surveyed tags. Places are in [m]."""
     write_csv(path, list(rows[0]), [list(row.values()) for row in rows])
 
 

@@ -101,7 +101,7 @@ class Spec:
     by_target: bool
     """True if the table has a line for each target."""
     columns: Columns
-    """Columns of a row."""
+    """Columns of a row: key -> heading with its unit, format, and a factor."""
     note: str
     bases: Sequence[str]
     """The rows that the others are compared with, a table for each that was played."""
@@ -117,7 +117,10 @@ class Spec:
     """File of that figure, and what it shows."""
 
     def paper_differences(self, row: Row, base: str) -> dict[str, float] | None:
-        """Key of `differences` -> the paper's row less that of a base; None where it has not both."""
+        """Key of `differences` -> the paper's row less that of a base; None where it has not both.
+
+        Units are those of the rows.
+        """
         if row.paper is None or self.rows[base].paper is None:
             return None
         targets = self.targets if self.by_target else [""]

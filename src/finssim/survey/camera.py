@@ -317,7 +317,7 @@ def lens_names(model: str) -> tuple[str, ...]:
 
 
 def lens_vector(lens: Lens) -> Array:
-    """The lens's numbers in that order."""
+    """The lens's numbers in that order. Focal lengths and centre are in pixels."""
     return np.array([lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion])
 
 
@@ -653,7 +653,10 @@ def pixel_error(lens: Lens, at: Array, corners: Array, covariance: Covariance) -
 def camera_findings(
     lens: Lens, views: Sequence[View], estimates: Mapping[str, Estimate], error95: tuple[float, float]
 ) -> tuple[Finding, ...]:
-    """Return findings on coverage, tilt and undetermined numbers, and what to photograph; none if all is well."""
+    """Return findings on coverage, tilt and undetermined numbers, and what to photograph; none if all is well.
+
+    `error95` is in pixels.
+    """
     tilts, findings = np.array([view.tilt for view in views]), []
     tilted = int(np.sum(tilts > TILTED))
     if tilts.max() < FLAT:

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 def rms(errors: Array) -> float:
-    """Return the root mean square length of vectors (K, n); NaN without any."""
+    """Return the root mean square length of vectors (K, n); NaN without any. The unit is kept."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else float("nan")
 
 
@@ -25,18 +25,23 @@ def huber_weight(size: Array, limit: float) -> Array:
 
 
 def huber_cost(size: Array, limit: float) -> float:
-    """Return the sum of squares of sizes within a limit, which grows linearly beyond."""
+    """Return the sum of squares of sizes within a limit, which grows linearly beyond.
+
+    Sizes and limit have one unit.
+    """
     return float(np.sum(np.where(size <= limit, size**2, limit * (2.0 * size - limit))))
 
 
 def boxed(normal: Array, right: Array, low: Array, high: Array) -> Array:
     """Return the minimum of ½ xᵀ N x - gᵀ x in a box, by bounded-variable least squares; on a bound exactly.
 
+    Bounds and x have the unit of the unknowns.
+
     Args:
         normal: N, positive definite, in any units [-] and frame, (P, P).
-        right: g, (P,).
-        low: Below `high`, (P,).
-        high: (P,)
+        right: g, (P,), in the unit of N x.
+        low: In the unit of x, below `high`, (P,).
+        high: In the unit of x, (P,).
     """
     from scipy.optimize import lsq_linear
 
@@ -55,12 +60,12 @@ class Pose(NamedTuple):
     """Pose of a frame in another one."""
 
     R: Array
-    """(3, 3)"""
+    """Rotation matrix from the inner to the outer frame, (3, 3)."""
     t: Array
     """[m], (3,)"""
 
     def at(self, points: Array) -> Array:
-        """Return points of the inner frame in the outer one, (..., 3)."""
+        """Return points of the inner frame in the outer one, (..., 3) [m]."""
         return np.asarray(points @ self.R.T + self.t)
 
     def then(self, inner: Pose) -> Pose:
@@ -73,7 +78,7 @@ class Pose(NamedTuple):
         return Pose(self.R.T.copy(), -self.R.T @ self.t)
 
     def stepped(self, step: Array) -> Pose:
-        """Return the pose after a small turn about the outer axes (3) and a shift (3)."""
+        """Return the pose after a small turn about the outer axes [rad] (3) and a shift [m] (3)."""
         return Pose(quat_to_matrix(quat_from_rotvec(step[:3])) @ self.R, self.t + step[3:])
 
 
@@ -81,24 +86,25 @@ class Block(NamedTuple):
     """Weighted normal equations of one group, such as a picture with its pose."""
 
     aa: Array
-    """Shared by shared, (P, P)."""
+    """Shared by shared, per product of the units of the unknowns, (P, P)."""
     ab: Array
-    """Shared by own, (P, Q)."""
+    """Shared by own, per product of the units of the unknowns, (P, Q)."""
     bb: Array
-    """Own by own, (Q, Q)."""
+    """Own by own, per product of the units of the unknowns, (Q, Q)."""
     a: Array
-    """Right side of the shared, (P,)."""
+    """Right side of the shared, per unit of the unknown, (P,)."""
     b: Array
-    """Right side of the own, (Q,)."""
+    """Right side of the own, per unit of the unknown, (Q,)."""
 
 
 def block_of(shared: Array, local: Array, residual: Array) -> Block:
     """Return a block from whitened rows.
 
     Args:
-        shared: Derivatives of the prediction with respect to the shared unknowns, (n, P).
-        local: And to the group's own, (n, Q).
-        residual: Measured less predicted, (n,).
+        shared: Derivatives of the prediction, over its standard error, with respect to the shared unknowns, per unit of
+            these, (n, P).
+        local: And to the group's own, per unit of these, (n, Q).
+        residual: Measured less predicted, over its standard error [-], (n,).
     """
     return Block(
         shared.T @ shared, shared.T @ local, local.T @ local, shared.T @ residual, local.T @ residual
@@ -109,6 +115,8 @@ def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Arr
     """Return one damped Gauss-Newton step (Marquardt), (P,) and (Q,) each, and the decrease it promises.
 
     A shared direction that no row determines gets no step. The decrease is that of the sum of squares.
+
+    Steps are in the units of the unknowns.
 
     Args:
         blocks: Normal equations of the groups.

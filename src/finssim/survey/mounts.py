@@ -68,7 +68,7 @@ class Moment:
     corners: Mapping[int, Array]
     """Tag -> pixels of its corners as printed, (4, 2)."""
     up: Array | None = None
-    """Direction of up by the IMU, in body axes as its mount in the vehicle file has them, (3,)."""
+    """Unit direction of up by the IMU, in body axes as its mount in the vehicle file has them, (3,)."""
     depth: float | None = None
     """Depth of the pressure port [m]."""
 
@@ -126,7 +126,10 @@ class MountState:
 
 
 def moved(state: MountState, shared: Array, pose_steps: Sequence[Array]) -> MountState:
-    """After a step of the shared unknowns, in the order of `names`, and of each moment's pose."""
+    """After a step of the shared unknowns, in the order of `names`, and of each moment's pose.
+
+    Steps are in [m] and [rad].
+    """
     return replace(
         state,
         reference=state.reference.stepped(shared[:6]),
@@ -139,7 +142,7 @@ def moved(state: MountState, shared: Array, pose_steps: Sequence[Array]) -> Moun
 
 
 def corner_points(rig: Rig, state: MountState, moments: Sequence[Moment]) -> Array:
-    """Corners of all tags of all moments in the pool, tags in each moment's order, (n, 4, 3)."""
+    """Corners of all tags of all moments in the pool, tags in each moment's order, (n, 4, 3) [m]."""
     mounts = {
         tag: state.mount(tag, rig.reference).at(rig.corners_t) for tag in (rig.reference, *state.others)
     }
@@ -225,11 +228,11 @@ def rotation_between(a: Array, b: Array) -> Array:
     """Rotation q_ab with a = R_ab b in least squares; where the vectors leave it open, the smallest  (Kabsch 1976).
 
     Args:
-        a: (n, 3).
-        b: The same vectors in other axes, (n, 3).
+        a: Vectors of any unit, (n, 3).
+        b: The same vectors in other axes and the same unit, (n, 3).
 
     Returns:
-        xyzw, (4,).
+        Quaternion, xyzw, (4,).
     """
     B = a.T @ b
     U, _, right = np.linalg.svd(B + 1e-6 * np.linalg.norm(B) * np.eye(3))
@@ -353,7 +356,7 @@ def as_before(state: MountState, origin: MountState, frozen: Sequence[str]) -> M
 
 
 def change(before: MountState, after: MountState, free: Sequence[str]) -> Array:
-    """Total step of each free unknown from one state to the other."""
+    """Return the total step of each free unknown from one state to the other [m, rad, s]."""
 
     def turn(a: Array, b: Array) -> Array:
         return np.asarray(quat_to_rotvec(matrix_to_quat(b @ a.T)))
@@ -408,7 +411,10 @@ class MountFit:
     """Moments left out as far off."""
 
     def half_width(self, name: str) -> float:
-        """Return the half width of the 95 % interval of a shared unknown; infinite if it is not free."""
+        """Return the half width of the 95 % interval of a shared unknown; infinite if it is not free.
+
+        It has the unit of the unknown.
+        """
         if name not in self.free:
             return math.inf
         return float(intervals(np.zeros(len(self.free)), self.covariance)[self.free.index(name), 1])
@@ -913,7 +919,7 @@ def imu_clock(
     Args:
         t_picture: Times of the pictures, increasing [s], (n,).
         attitude: From the pixels, body to pool, unit xyzw [-], (n, 4); its tilt may be poor.
-        up_p: n, upwards in the pool, (3,).
+        up_p: Unit vector n, upwards in the pool, (3,).
         t_imu: Times of the IMU, increasing [s], (m,).
         vertical_rate: ω · up [rad/s], (m,).
 

@@ -85,11 +85,11 @@ class Row:
 
     @property
     def pixel(self) -> Array:
-        """(2,)"""
+        """Return the pixel, (2,)."""
         return np.array([self.numbers["u"], self.numbers["v"]])
 
     def placed(self, name: str, points: Array) -> Placed:
-        """Return points with the other cells of the row."""
+        """Return points with the other cells of the row. Points are in [m]."""
         return Placed(
             name,
             points,
@@ -110,7 +110,7 @@ class Table:
     """True if the file or its reader states the unit of lengths."""
 
     def refuse_other_units(self, spread: float) -> None:
-        """Refuse coordinates that would be metres only in a lake."""
+        """Refuse coordinates that would be metres only in a lake. `spread` is in the unit of the table."""
         if spread > WIDEST and not self.united:
             raise CalibrationError(
                 f"{self.path}: the points spread over {spread:.0f} m: if they are not in metres, write the unit into "

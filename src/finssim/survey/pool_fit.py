@@ -223,7 +223,7 @@ def plane_starts(
 
     Args:
         pinhole: Straight-line pose.
-        normals: Directions to try, each turned to the camera's side.
+        normals: Unit directions to try, each turned to the camera's side.
         plane: Holds indices and window.
         observed: Of which the points under water count.
         depth: Distance of the plane from the reference point where it is known [m], or NaN.
@@ -286,7 +286,7 @@ def prior_of(model: PoolModel, start: PoolModel, settings: Settings, stds: tuple
         model: Model whose camera gives the side of the points.
         start: Model with the index and the lens as given.
         settings: Options.
-        stds: Standard deviations of the lens's parameters, in the order of `LENS_NAMES`.
+        stds: Standard deviations of the lens's parameters in their units, in the order of `LENS_NAMES`.
     """
     normal, depth = stated_plane(model, settings)
     tilt = settings.tilt_sigma
@@ -499,11 +499,11 @@ def estimate_noise(
 
     Args:
         residual: Measured minus predicted [px], (N, 2).
-        J: Derivative of the prediction by the fitted parameters, (N, 2, P).
-        J_point: By the point, (N, 2, 3).
+        J: Derivative of the prediction in pixels by the fitted parameters, per unit of these, (N, 2, P).
+        J_point: The same by the point [px/m], (N, 2, 3).
         observed: The rows.
         noise: What is believed before.
-        prior: Information of the priors on the parameters, (P, P).
+        prior: Information of the priors on the parameters, per unit of these squared, (P, P).
         fixed_pixel: The pixel's error is given and stays.
     """
     if len(observed) > NOISE_ROWS:  # enough for two numbers; complete locations, evenly
@@ -569,11 +569,11 @@ class Refined:
     """Parameters fitted, (18,)."""
     prior: Prior
     covariance: Array
-    """Covariance of all parameters, zero where held, (18, 18)."""
+    """Covariance of all parameters in their units, zero where held, (18, 18)."""
     cost: float
-    """Half the sum of squares that was minimised."""
+    """Half the sum of squares that was minimised [-]."""
     dof: float
-    """Rows of residuals less parameters."""
+    """Number of rows of residuals less that of parameters."""
 
 
 def refine(
@@ -719,7 +719,7 @@ class HeldOut:
     folds: int
 
     def as_json(self) -> dict[str, float | int | None]:
-        """Root mean squares and 95th percentiles; the error of the survey is in them."""
+        """Root mean squares and 95th percentiles; the error of the survey is in them. Units are in the names."""
         size = np.linalg.norm(self.points, axis=1)
         size = size[np.isfinite(size)]
         return {
@@ -1035,6 +1035,7 @@ class PoolFit(Refined):
     held_out: HeldOut | None
     pinhole: Refined
     pinhole_residual: Array
+    """Residuals of the straight-line fit, (N, 2), in pixels."""
     pinhole_held_out: HeldOut | None
     lens_fitted: tuple[str, ...]
     """Groups of `FITTED` that the lens gave up."""
@@ -1051,7 +1052,7 @@ class PoolFit(Refined):
         return [self.observed.names[i] for i in rows[np.argsort(-size[rows])]]
 
     def residual_json(self) -> dict[str, float | int]:
-        """Figures of the rows used."""
+        """Figures of the rows used. Units are in the names."""
         error = self.error[self.used]
         error = error[np.isfinite(error).all(axis=1)]
         return {

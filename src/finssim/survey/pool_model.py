@@ -66,7 +66,7 @@ class PoolModel:
 
     @cached_property
     def tangents(self) -> Array:
-        """Directions that the plane's normal tilts towards, (2, 3)."""
+        """Return the unit directions that the plane's normal tilts towards, (2, 3)."""
         return np.stack([np.asarray(e, float) for e in self.interface.tangents()])
 
     @property
@@ -107,7 +107,7 @@ class PoolModel:
         return J, J_point
 
     def moved(self, step: Array) -> PoolModel:
-        """Return the model a small step away, (18,) in the order of `NAMES`."""
+        """Return the model a small step away, (18,) in the order and the units of `NAMES`."""
         camera, plane = self.camera, self.interface
         turn = quat_to_matrix(quat_from_rotvec(step[3:6]))
         orientation = matrix_to_quat(turn @ np.asarray(camera.R_pc))
@@ -218,7 +218,7 @@ class Settings:
     fit: tuple[str, ...] | None = None
     """Groups of `FITTED`; None: pose, height, tilt and index, and the lens where held-out points get better by it."""
     focal_sigma: float = 0.0
-    """Relative standard deviation of the camera file's focal length; 0 holds it unless `fit` names it."""
+    """Relative standard deviation of the camera file's focal length; 0 holds it unless `fit` names it [-]."""
     center_sigma: float = 0.0
     """Standard deviation of the camera file's optical centre along each axis [px]; 0 holds it unless `fit` names it."""
     pixel_sigma: float | None = None
@@ -332,14 +332,19 @@ class Prior:
     depth: float = np.nan
     """Distance of the plane from the reference point [m]."""
     depth_std: float = np.inf
+    """Standard deviation of the water's depth [m]."""
     start: PoolModel
     """Model with the index and lens to which `index_std` and `lens_std` refer."""
     index_std: float = np.inf
+    """Standard deviation of the refractive index [-]."""
     lens_std: tuple[float, ...] = (np.inf,) * 8
     """Standard deviations of log focal, centre [px] and distortion."""
 
     def rows(self, model: PoolModel) -> tuple[Array, Array]:
-        """Return the residuals (M,) of the priors, each over its standard deviation, and their derivatives (M, 18)."""
+        """Return the residuals (M,) of the priors, each over its standard deviation, and their derivatives (M, 18).
+
+        Derivatives are per unit of each parameter.
+        """
         r, J = np.zeros(12), np.eye(len(NAMES))[6:]
         std = np.array([np.inf, np.inf, self.depth_std, self.index_std, *self.lens_std])
         if self.normal is not None:
@@ -360,7 +365,7 @@ class Solution(NamedTuple):
 
     model: PoolModel
     cost: float
-    """Half the sum of squares of whitened residuals and priors."""
+    """Half the sum of squares of whitened residuals and priors [-]."""
 
 
 def residuals(model: PoolModel, observed: Observations) -> tuple[Array, NDArray[np.bool_]]:
@@ -389,7 +394,7 @@ def solve(
         active: Which of `NAMES` move, (18,).
         prior: Of those and of the others.
         iterations: At most.
-        tolerance: Relative change of the cost at which the search ends.
+        tolerance: Relative change of the cost at which the search ends [-].
     """
     free = np.flatnonzero(active)
 

@@ -97,7 +97,7 @@ class StreamReport:
     rate: float
     """Samples per second while there are any [Hz]."""
     jitter: float
-    """Standard deviation of the time between samples, gaps aside, over its mean."""
+    """Standard deviation of the time between samples, gaps aside, as a share of its mean."""
     gaps: int
     longest_gap: float
     """[s]"""
@@ -125,7 +125,7 @@ class AxisReport:
     noise: float = np.nan
     """Noise of one velocity sample [m/s, rad/s]."""
     decades: float = 0.0
-    """log10 of the fastest over the slowest speed above the noise."""
+    """Logarithm (base 10) of the ratio of the fastest to the slowest speed above the noise."""
     strongest: float = 0.0
     """95th percentile of the wrench [N, N m]."""
     work: float = 0.0

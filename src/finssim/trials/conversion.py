@@ -177,10 +177,10 @@ def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.i
 
     Args:
         t: Finite times [s], (n,).
-        columns: Column -> values, (n,); two pieces that fill different columns do not collide.
+        columns: Column -> values in any unit, (n,); two pieces that fill different columns do not collide.
 
     Returns:
-        Times not decreasing (n,), row numbers in that order (n,), and findings.
+        Times not decreasing [s], (n,), row numbers in that order (n,), and findings.
     """
     back = np.flatnonzero(np.diff(t) < 0.0) + 1
     rows = np.arange(len(t))
@@ -229,10 +229,10 @@ def sampled(
 
     Args:
         t: Not decreasing [s], (n,).
-        columns: Column -> values, (n,).
+        columns: Column -> values in any unit, (n,).
 
     Returns:
-        Times, strictly increasing (m,), columns (m,), the row each came from (m,), and findings.
+        Times [s], strictly increasing (m,), columns (m,), the row each came from (m,), and findings.
     """
     starts = np.concatenate([[True], np.diff(t) > 0.0])
     selected = np.flatnonzero(starts)
@@ -268,8 +268,10 @@ LENGTH_TOLERANCE = 1e-6
 def in_our_frames(channels: Channels, body: str, world: str) -> Channels:
     """Columns in x forward, y left, z up of the body and a world with z up.
 
+    The units are kept.
+
     Args:
-        channels: By canonical name.
+        channels: By canonical name, in the units of a trial.
         body: FLU or FRD, of the log.
         world: z_up or NED, of the log.
     """
@@ -339,7 +341,10 @@ def tidy_quaternions(channels: Channels) -> list[Finding]:
 
 
 def upside_down(channels: Mapping[str, Array]) -> bool:
-    """Return whether the vehicle is on its back most of the time, as with one axis convention left out."""
+    """Return whether the vehicle is on its back most of the time, as with one axis convention left out.
+
+    Channels have the units of a trial.
+    """
     if all(name in channels for name in QUATERNION):
         q = np.stack([channels[name] for name in QUATERNION], axis=-1)
     elif "roll" in channels:

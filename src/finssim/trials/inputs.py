@@ -469,7 +469,7 @@ def applied_wrench(drive: Drive, vehicle: Vehicle, t: Array) -> Array:
         t: Times [s], (m,).
 
     Returns:
-        (m, 6); NaN outside the recorded inputs and inside their gaps.
+        Wrench [N, N m], (m, 6); NaN outside the recorded inputs and inside their gaps.
     """
     if drive.commanded:
         motors = thruster_motors(vehicle) if drive.thrusters else wrench_motors(vehicle)

@@ -113,7 +113,7 @@ def attitude_signal(trial: Trial, at: Array) -> AttitudeSignal:
 
 
 def up_in_body(quaternion: Array) -> Array:
-    """World z in the body frame, (m, 4) -> (m, 3)."""
+    """Return the unit vector of world z in the body frame, (m, 4) -> (m, 3)."""
     return quat_rotate(quat_conjugate(quaternion), np.array([0.0, 0.0, 1.0]))
 
 
@@ -313,7 +313,7 @@ class Motion:
     """u, v, w, p, q, r, smoothed [m/s, rad/s], (n, 6); NaN where unknown. Relative to the ground, or to the water where
     the header says so and gives no current."""
     raw: Array
-    """Velocities of measured axes, not smoothed, linear between samples, (n, 6); NaN if not measured."""
+    """Velocities of measured axes [m/s, rad/s], not smoothed, linear between samples, (n, 6); NaN if not measured."""
     quaternion: Array
     """Rotation from body to world, (n, 4); NaN without roll and pitch. The heading is 0 if it was not measured."""
     position: Array
@@ -328,7 +328,8 @@ class Motion:
     """Source of each axis: `measured`, `derived from position`, `derived from depth`, `derived from attitude`, or
     nothing."""
     noise_std: Array
-    """Standard deviation by axis of one sample of a measured velocity, or of the value of a derived one, (6,)."""
+    """Standard deviation by axis of one sample of a measured velocity, or of the value of a derived one [m/s, rad/s],
+    (6,)."""
     findings: tuple[Finding, ...] = ()
     """Assumptions."""
 
@@ -418,7 +419,10 @@ class Offset(NamedTuple):
 
 
 def on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int = 2) -> tuple[Array, Array]:
-    """Columns of a trial, smoothed, and their slopes at times t (m,), (m, c) each; NaN where there are none."""
+    """Columns of a trial, smoothed, and their slopes at times t (m,), (m, c) each; NaN where there are none.
+
+    Times are in [s]; columns have the units of a trial, slopes these per second.
+    """
     value, slope = np.full((len(t), len(columns)), np.nan), np.full((len(t), len(columns)), np.nan)
     for i, name in enumerate(columns):
         at, y = trial.series(name)
@@ -432,8 +436,8 @@ def offset(fixed: Array, moved: Array) -> Offset | None:
     """The offset of a signal to another of the same motion, from the peak of their correlation.
 
     Args:
-        fixed: At `RATE`, NaN where unknown, (m, c).
-        moved: The same of the signal whose times are in question, (m, c).
+        fixed: Signals in any unit at `RATE`, NaN where unknown, (m, c).
+        moved: The same signals in the same unit, whose times are in question, (m, c).
 
     Returns:
         None if they do not agree on any motion.
@@ -535,13 +539,13 @@ class Smooth(NamedTuple):
     """Signals on a grid; NaN where no stretch of samples reaches."""
 
     value: Array
-    """(m, c)"""
+    """Values in the unit of the signal, (m, c)."""
     slope: Array
-    """Its time derivative, (m, c)."""
+    """Time derivative, unit of the signal per second, (m, c)."""
     noise: Array
-    """Standard deviation of one sample, (c,)."""
+    """Standard deviation of one sample, in the unit of the signal, (c,)."""
     slope_std: Array
-    """Standard deviation of `slope`, of what noise remains and what signal was lost (Wahba 1983), (c,)."""
+    """Standard deviation of `slope`, in its unit, of what noise remains and what signal was lost (Wahba 1983), (c,)."""
 
 
 def longest_step(t: Array) -> float:
@@ -550,7 +554,7 @@ def longest_step(t: Array) -> float:
 
 
 def stretches(t: Array, max_gap: float) -> list[slice]:
-    """Runs of samples with no step longer than `max_gap`."""
+    """Runs of samples with no step longer than `max_gap`. Times are in [s]."""
     edges = [0, *(np.flatnonzero(np.diff(t) > max_gap) + 1), len(t)]
     return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False) if b > a]
 
@@ -565,10 +569,10 @@ def white_noise(values: Array) -> float:
     """Standard deviation of white noise on a signal that is smooth from sample to sample, from its second differences.
 
     Args:
-        values: Evenly sampled, finite, (n,).
+        values: Evenly sampled, finite, in any unit, (n,).
 
     Returns:
-        NaN for fewer than ten samples.
+        In the unit of the values; NaN for fewer than ten samples.
     """
     if len(values) < 10:
         return math.nan
@@ -581,7 +585,7 @@ def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:
 
     Args:
         t: Times [s], (n,).
-        y: Values, (n, c).
+        y: Values in any unit, (n, c).
 
     Returns:
         (n,); at most a twentieth is refused, for what happens more often is no spike.
@@ -604,7 +608,7 @@ def smooth(t: Array, y: Array, at: Array, *, order: int = 2, together: bool = Fa
 
     Args:
         t: Times of the samples, increasing [s], (n,).
-        y: Finite values, (n, c).
+        y: Finite values in any unit, (n, c).
         at: Times asked for [s], (m,).
         order: m, the difference that is penalised: 2 for signals whose slope may jump, as velocities under a step of
             force; 3 for their integrals.

@@ -18,6 +18,7 @@ class Relation(NamedTuple):
     """Slope of y over x through zero, and how sure it is."""
 
     slope: float
+    """Slope in the unit of y over that of x."""
     correlation: float
     """Cosine of the two signals, -1 to 1."""
     chance: float
@@ -38,9 +39,9 @@ def relation(x: ArrayLike, y: ArrayLike, *, nuisances: ArrayLike | None = None) 
     that it consists of.
 
     Args:
-        x: Evenly sampled; NaN where it must not count, (n,).
-        y: The same, (n,).
-        nuisances: Signals whose part in x and y is removed first, for instance ones for a constant, (n, k).
+        x: Evenly sampled, in any unit; NaN where it must not count, (n,).
+        y: The same of the other signal, in any unit, (n,).
+        nuisances: Signals of any unit whose part in x and y is removed first, for instance ones for a constant, (n, k).
     """
     x, y = np.array(x, float), np.array(y, float)
     known = np.isfinite(x) & np.isfinite(y)

@@ -195,9 +195,9 @@ class Trial:
     name: str
     """Unique among the trials used together; the folder's name."""
     t: Array
-    """Seconds, strictly increasing, (n,)."""
+    """Times [s], strictly increasing, (n,)."""
     channels: dict[str, Array] = field(default_factory=dict)
-    """Canonical column -> values, NaN where there is no sample, (n,) each."""
+    """Canonical column -> values in the unit of `COLUMNS`, NaN where there is no sample, (n,) each."""
     phase: NDArray[np.str_] | None = None
     """A word of `PHASES` or "" for every row, (n,); None where the log names no phases."""
     header: Header = field(default_factory=Header)

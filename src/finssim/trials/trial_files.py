@@ -44,7 +44,7 @@ class Table:
     """Columns of one file, all of one length."""
 
     numbers: dict[str, Array] = field(default_factory=dict)
-    """Column -> values, NaN for empty cells and cells that hold no number."""
+    """Column -> values in any unit, NaN for empty cells and cells that hold no number."""
     words: dict[str, list[str]] = field(default_factory=dict)
     """Column -> text, for columns in which no cell is a number (and for `phase`)."""
     findings: list[Finding] = field(default_factory=list)
@@ -83,7 +83,7 @@ def write_table(path: Path, numbers: dict[str, Array], phase: NDArray[np.str_] |
 
     Args:
         path: Of the file.
-        numbers: Column -> values, (n,) each.
+        numbers: Column -> values in any unit, (n,) each.
         phase: A word for each row, (n,); no such column if None.
     """
     if path.suffix == ".parquet":

@@ -109,7 +109,7 @@ class Autopilot(Part):
         return np.array(named[self.frame] if isinstance(self.frame, str) else self.frame, float)
 
     def signs(self, motors: int) -> Array:
-        """Direction of each motor, -1 or 1, (motors,)."""
+        """Return the sign of each motor's direction, -1 or 1 [-], (motors,)."""
         return np.array([*self.directions, *[1] * (motors - len(self.directions))], float)
 
 
@@ -119,7 +119,7 @@ def refuse_misfit(autopilot: Autopilot, thrusters: dict[str, Any], control_matri
     Args:
         autopilot: Its frame and directions.
         thrusters: `Thruster` by name, canonical order, n of them.
-        control_matrix: Wrench = B f, body frame, (6, n).
+        control_matrix: Wrench = B f, body frame [-, m], (6, n).
     """
     factors = autopilot.factors
     if len(factors) != len(thrusters) or len(autopilot.directions) > len(thrusters):

@@ -33,13 +33,13 @@ class WrenchCapability:
     """Largest pure wrenches about `wrench_reference`, order surge sway heave roll pitch yaw [N, N m]."""
 
     positive: Array
-    """Greatest value in the positive direction, (6,)."""
+    """Greatest value in the positive direction [N, N m], (6,)."""
     negative: Array
-    """Greatest value in the negative direction, as magnitudes, (6,)."""
+    """Greatest value in the negative direction, as magnitudes [N, N m], (6,)."""
 
     @property
     def symmetric(self) -> Array:
-        """Reachable in both directions, (6,)."""
+        """Return what is reachable in both directions [N, N m], (6,)."""
         return np.minimum(self.positive, self.negative)
 
 
@@ -72,10 +72,10 @@ def largest(gain: Array, zero: Array, lower: Array, upper: Array) -> Array:
     (Karush, Kuhn and Tucker). The lowest index goes first, so that it cannot cycle (Bland).
 
     Args:
-        gain: Wrench component per thrust, (n,).
-        zero: Rows that have to stay zero, (m, n).
-        lower: Least thrusts, at most 0, (n,).
-        upper: Greatest thrusts, at least 0, (n,).
+        gain: Wrench component per thrust [- or m], (n,).
+        zero: Rows that have to stay zero [- or m], (m, n).
+        lower: Least thrusts [N], at most 0, (n,).
+        upper: Greatest thrusts [N], at least 0, (n,).
 
     Raises:
         VehicleError: Numbers so unlike each other that rounding hides the optimum.

@@ -79,7 +79,7 @@ class Mount(Part):
 
     @property
     def quaternion(self) -> Array:
-        """q_body<sensor>, xyzw, (4,)."""
+        """Return the quaternion q_body<sensor>, xyzw, (4,)."""
         if self.orientation is not None:
             return self.orientation
         return quat_from_euler(0.0, self.pitch, self.yaw)
@@ -118,7 +118,7 @@ class CameraDevice(Part):
     read_noise: NonNegative = 5.0
     """[electrons]"""
     gamma: Positive = 2.2
-    """Numbers are (charge)^(1/gamma)."""
+    """Numbers are (charge)^(1/gamma) [-]."""
     exposure_time: NonNegative = 0.0
     """During which a picture that knows the vehicle's motion blurs [s]."""
     rate: Positive

@@ -85,12 +85,15 @@ class HydrodynamicSet(Part):
 
     @property
     def term_scalars(self) -> dict[str, tuple[float, float]]:
-        """Path -> least and greatest value of the parameters of its terms that are one number: fits may move these."""
+        """Path -> least and greatest value of the parameters of its terms that are one number: fits may move these.
+
+        Each has the unit of its parameter.
+        """
         return {path: ends for name in self.terms for path, ends in TERMS[name].scalars().items()}
 
     @property
     def axis_drag(self) -> NDArray[np.float64]:
-        """d2 of steady motion along each axis alone, where drag is d1 v + d2 v|v|, (6,)."""
+        """Return d2 [N s²/m², N m s²] of steady motion along each axis alone, where drag is d1 v + d2 v|v|, (6,)."""
         shares = (TERMS[name].quadratic(value) for name, value in self.terms.items())
         return np.asarray(sum(shares, start=np.diag(self.quadratic_damping)))
 

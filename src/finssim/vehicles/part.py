@@ -178,7 +178,7 @@ Symmetric6 = Annotated[NDArray[np.float64], BeforeValidator(lambda v: _frozen(_s
 
 
 def zeros(*shape: int) -> NDArray[np.float64]:
-    """Read-only zeros, for defaults that mean "none"."""
+    """Read-only zeros, for defaults that mean "none". They have the unit of the field."""
     return _frozen(np.zeros(shape))
 
 

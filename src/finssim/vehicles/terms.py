@@ -80,7 +80,10 @@ class Term:
         }
 
     def scalars(self) -> dict[str, tuple[float, float]]:
-        """Path -> lowest and highest value that the schema allows, of the parameters that are one number."""
+        """Path -> lowest and highest value that the schema allows, of the parameters that are one number.
+
+        Each has the unit of its parameter.
+        """
         if self.name in self.parameters:
             fields = self.section.model_fields
         else:

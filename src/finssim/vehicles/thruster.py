@@ -206,7 +206,7 @@ class Thruster(Part):
     delay: NonNegative = 0.0
     """Pure delay of the command [s]."""
     slew: Positive = math.inf
-    """Fastest change, N/s (`domain: force`) or rad/s² (`domain: speed`); no limit where the file gives none."""
+    """Fastest change [N/s] (`domain: force`) or [rad/s²] (`domain: speed`); no limit where the file gives none."""
     group: str = ""
     """Name of the `thruster_groups` entry that gave the common numbers."""
     motor_index: Annotated[int, Field(strict=True, ge=0)] | None = None
@@ -223,7 +223,7 @@ class Thruster(Part):
             shaft_speed: ω [rad/s], (...,).
 
         Returns:
-            (...,); force and speed limits and the dead zone do not enter.
+            Thrust [N], (...,); force and speed limits and the dead zone do not enter.
         """
         omega = np.asarray(shaft_speed, dtype=np.float64)
         return np.where(omega >= 0.0, self.c_plus, self.c_minus) * omega * np.abs(omega)

@@ -97,7 +97,7 @@ class Hull(Part):
 
 
 def skew(r: NDArray[np.float64]) -> NDArray[np.float64]:
-    """S(r) with S(r) x = r × x."""
+    """S(r) with S(r) x = r × x. The unit is kept."""
     return np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
 
 
@@ -279,7 +279,7 @@ class Vehicle(Part):
 
     @property
     def control_matrix(self) -> Array:
-        """B about `wrench_reference`, (6, n)."""
+        """Return the matrix B of wrench = B f about `wrench_reference` [-, m], (6, n)."""
         return self.thruster_matrix(self.wrench_reference)
 
     @cached_property

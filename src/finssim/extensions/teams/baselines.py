@@ -26,6 +26,7 @@ class LeadPursuit(DriveBaseline):
     lead: float = 0.30
     """[s]"""
     turn_first: float = math.radians(15.0)
+    """Angle to the prey beyond which it turns first [rad]."""
     approach: float = 0.5
     """[1/s]"""
     stand_off: float = 0.5
@@ -78,7 +79,7 @@ class ConsensusFormation(DriveBaseline):
         return self.shaping(mates) + self.going(o, mates.sum(axis=1) / 3.0), PI * o[:, 13]
 
     def shaping(self, mates: Array) -> Array:
-        """Velocity towards equal sides and equal heights, from the team-mates' places, (n, 2, 3)."""
+        """Return the velocity [m/s] towards equal sides and heights, from the team-mates' places [m], (n, 2, 3)."""
         length = np.maximum(np.linalg.norm(mates, axis=2, keepdims=True), 1e-6)
         pull = np.sum((length - self.side) * mates / length, axis=1)
         pull[:, 2] = mates[:, :, 2].sum(axis=1)
@@ -100,7 +101,7 @@ class ConsensusFormation(DriveBaseline):
 
 
 def level_unit(x: Array) -> Array:
-    """Level directions of vectors (n, 3); zero where there is none."""
+    """Return the level unit directions of vectors (n, 3); zero where there is none."""
     level = x * np.array([1.0, 1.0, 0.0])
     length = np.linalg.norm(level, axis=1, keepdims=True)
     return level / np.maximum(length, 1e-6)

@@ -147,13 +147,13 @@ def outward(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -
 
 @wp.func
 def seen_net(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> wp.vec4:
-    """`spanned` of the target, as far as the agent has heard."""
+    """Return `spanned` of the target, as far as the agent has heard, with the other corners as of `corner_gap` [m]."""
     return spanned(arrays.net.target[w], arrays.position[w, a], left, right)
 
 
 @wp.func
 def edge_errors(p: Any, net: wp.vec4) -> wp.vec3:
-    """Lengths of the edges less the side, in sides, the shortest first."""
+    """Return lengths of the edges less the side [sides], the shortest first, of a net as of `spanned`."""
     side = wp.vec3(p.side, p.side, p.side)
     return (wp.vec3(net[1], net[2], net[3]) - side) / p.side
 
@@ -221,13 +221,16 @@ class FormationReward:
 
 @wp.func
 def true_net(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
-    """`spanned` of the target."""
+    """Return the target's distance and edges, as of `spanned`."""
     return spanned(arrays.net.target[w], state.position[w, 0], state.position[w, 1], state.position[w, 2])
 
 
 @wp.func
 def holds(p: Any, net: wp.vec4) -> bool:
-    """Return whether the net holds the target: near enough, and neither stretched too far nor slack."""
+    """Return whether the net holds the target: near enough, and neither stretched too far nor slack.
+
+    The net is as of `spanned`.
+    """
     return net[0] <= p.reach and net[1] >= p.slack * p.side and net[3] <= p.stretch * p.side
 
 
@@ -246,7 +249,7 @@ def move_target(state: State, arrays: TaskArrays, p: Any, w: int):
 
 @wp.func
 def misshape(p: Any, net: wp.vec4) -> float:
-    """Mean error of an edge, in sides."""
+    """Return the mean error of an edge [sides] of a net as of `spanned`."""
     error = float(0.0)
     for i in range(3):
         error += wp.abs(net[i + 1] - p.side) / (3.0 * p.side)
@@ -255,7 +258,7 @@ def misshape(p: Any, net: wp.vec4) -> float:
 
 @wp.func
 def shape_error(state: State, p: Any, w: int, net: wp.vec4, was: float) -> float:
-    """Mean of the error of an edge, in sides."""
+    """Return the mean of the error of an edge [sides], of a net as of `spanned` and what it `was` before."""
     return was + (misshape(p, net) - was) / float(state.steps[w])
 
 
@@ -265,7 +268,7 @@ STRETCHED = "wp.where(net[3] > p.stretch * p.side, stretched + p.control_step, 0
 
 @wp.func
 def away_from(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
-    """A place at a level distance from x that is drawn, up to 0.5 m higher or lower."""
+    """A place at a level distance from x that is drawn, up to 0.5 m higher or lower. Both in [m]."""
     level = x + wp.randf(rng, p.nearest, p.farthest) * level_direction(wp.randf(rng, -PI, PI))
     return wp.vec3(level[0], level[1], wp.clamp(x[2] + wp.randf(rng, -0.5, 0.5), p.low, p.high))
 
@@ -327,7 +330,7 @@ class Formation(Team):
     jitter: float = 0.05
     """Largest shift of a vehicle from its corner at the start, per axis [m]."""
     nearest: float = 1.0
-    """The target starts this far from the net's middle, and the goal from the target ..."""
+    """The target starts this far from the net's middle, and the goal from the target [m] ..."""
     farthest: float = 2.0
     """... to this far [m]."""
     reward: FormationReward = field(default_factory=FormationReward)

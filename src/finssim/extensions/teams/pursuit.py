@@ -147,7 +147,7 @@ class Prey:
     range: float = 9.0
     """Distance from the origin at which it turns along the border [m]."""
     low: float = -5.0
-    """It stays above this height ..."""
+    """It stays above this height [m] ..."""
     high: float = -1.0
     """... and below this one [m]."""
 
@@ -185,7 +185,8 @@ def wander(p: Any, key: int, w: int, draw: int) -> wp.vec3:
 
 @wp.func
 def flight(state: State, arrays: TaskArrays, w: int, reach: float) -> wp.vec3:
-    """Away from all pursuers within reach, each weighted by 1/d²; zero where there is none."""
+    """Return the sum of unit directions away from all pursuers within reach [m], each over d² [1/m²]; zero where there
+    is none."""
     pursuers = arrays.agent_reward.shape[1]
     x = state.position[w, pursuers]
     away = wp.vec3()
@@ -210,7 +211,10 @@ def nearest_pursuer(state: State, arrays: TaskArrays, w: int) -> float:
 
 @wp.func
 def kept_inside(p: Any, x: wp.vec3, v: wp.vec3) -> wp.vec3:
-    """The velocity without what leads out of the prey's range: it slides along the border, at the same speed."""
+    """Return the velocity v [m/s] at x [m] without what leads out of the prey's range.
+
+    It slides along the border, at the same speed.
+    """
     pace = wp.sqrt(v[0] * v[0] + v[1] * v[1])
     r = wp.sqrt(x[0] * x[0] + x[1] * x[1])
     out = wp.vec3(x[0], x[1], 0.0) / wp.max(r, 1.0e-6)
@@ -272,21 +276,21 @@ class OpenWater(Task):
 
     time_limit: float = 60.0
     spawn_radius: float = 2.5
-    """Agents start this near to the origin."""
+    """Agents start this near to the origin [m]."""
     low: float = -4.0
-    """Everybody starts between this height ..."""
+    """Everybody starts between this height [m] ..."""
     high: float = -2.0
-    """... and this one."""
+    """... and this one [m]."""
     bounds: float = 12.0
-    """Going farther from the origin than this ends the episode."""
+    """Going farther from the origin than this ends the episode [m]."""
     ceiling: float = 0.3
-    """So does rising above this height."""
+    """So does rising above this height [m]."""
     depth: float = 8.0
-    """And sinking below this depth."""
+    """And sinking below this depth [m]."""
     nearest: float = 2.0
-    """Least distance of what is to be caught from the agents at the start ..."""
+    """Least distance of what is to be caught from the agents at the start [m] ..."""
     farthest: float = 5.0
-    """... to this far."""
+    """... to this far [m]."""
     speed: float = 0.0
     """Speed of what is to be caught [m/s]: follows from the vehicles."""
 
@@ -308,7 +312,7 @@ class Chase(OpenWater):
         """The task with the prey's thrust from its vehicle, and its speed.
 
         Args:
-            part: Of what the slowest agent can hold.
+            part: Share of the speed that the slowest agent can hold.
             vehicles: Agents, then the prey.
             changes: Of other settings.
         """
@@ -350,7 +354,7 @@ def any_outside(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 
 @wp.func
 def bumps(state: State, arrays: TaskArrays, p: Any, w: int, a: int) -> float:
-    """Agents nearer than `collision`."""
+    """Return the number of agents nearer than `collision`."""
     count = float(0.0)
     for b in range(arrays.agent_reward.shape[1]):
         if b != a and wp.length(state.position[w, b] - state.position[w, a]) < p.collision:
@@ -360,7 +364,10 @@ def bumps(state: State, arrays: TaskArrays, p: Any, w: int, a: int) -> float:
 
 @wp.func
 def prey_start(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
-    """A place for the prey: at a distance from x that is drawn, in any direction, at about the same height."""
+    """A place for the prey: at a distance from x that is drawn, in any direction, at about the same height.
+
+    Both in [m].
+    """
     angle = wp.randf(rng, -3.14159265, 3.14159265)
     away = wp.randf(rng, p.nearest, p.farthest)
     height = wp.clamp(x[2] + wp.randf(rng, -0.5, 0.5), p.low, p.high)
@@ -438,6 +445,7 @@ class Pursuit(Chase):
     prey_speed: float = 0.6
     """Speed of the prey, as a part of what the pursuer can hold (published: 2 m/s, four times that speed)."""
     radius: float = 0.8
+    """Greatest distance of a capture [m]."""
     relative_speed: float = 0.35
     """[m/s]"""
     hold: float = 0.5
@@ -549,7 +557,7 @@ def other(a: int, k: int) -> int:
 
 @wp.func
 def mate_role(a: int, k: int) -> wp.vec2:
-    """(1, 0): the k-th team-mate is the herder; (0, 1): it is a netter."""
+    """Return an index of the k-th team-mate's role: (1, 0) a herder, (0, 1) a netter."""
     herds = other(a, k) == 0
     return wp.vec2(wp.where(herds, 1.0, 0.0), wp.where(herds, 0.0, 1.0))
 
@@ -613,8 +621,8 @@ def net_distance(x: wp.vec3, left: wp.vec3, right: wp.vec3, height: float) -> fl
 
     Args:
         x: The point, world frame [m].
-        left: One netter.
-        right: The other.
+        left: Place of one netter, world frame [m].
+        right: Place of the other, world frame [m].
         height: Of the net [m].
     """
     span = right - left
@@ -664,7 +672,7 @@ def driving(state: State, w: int, a: int) -> float:
 
 @wp.func
 def straying(state: State, w: int, a: int) -> float:
-    """Herder: min(d / 8 m, 1), d its distance to the prey."""
+    """Return the herder's share min(d / 8 m, 1), d its distance to the prey."""
     away = wp.length(state.position[w, PREY] - state.position[w, a])
     return wp.where(a == 0, wp.min(away / 8.0, 1.0), 0.0)
 
@@ -679,7 +687,10 @@ def misfit(state: State, p: Any, w: int, a: int) -> float:
 @wp.func
 def is_captured(p: Any, net: float, near: float, held: float) -> bool:
     """Return whether it is captured by the mode's rule; the net of modes net and either must have it for `hold`,
-    without a break."""
+    without a break.
+
+    Distances `net` and `near` are in [m], the time `held` in [s].
+    """
     netted = held > 0.0 and held >= p.rules.hold - 0.1 * p.control_step
     caught = netted and (p.rules.mode == 0 or p.rules.mode == 3)
     if p.rules.mode == 1:

@@ -274,7 +274,7 @@ class Playback:
         """
         Args:
             duration: Of the source [s]; infinite for a live one.
-            speed: Times as fast as real.
+            speed: Factor on the speed of time.
             playing: Whether it runs from the start.
         """
         self.duration, self.speed, self.playing = duration, speed, playing
@@ -599,7 +599,7 @@ class View:
             source: What is shown; it belongs to the view from now on.
             bind: Address to serve at; this machine alone by default.
             port: To serve at, or the next one that is free.
-            speed: Times as fast as real.
+            speed: Factor on the speed of time.
             playing: Whether it runs from the start.
         """
         self.source, self.playback = source, Playback(source.duration, speed=speed, playing=playing)

@@ -43,7 +43,7 @@ class Pose(NamedTuple):
 
 
 def nowhere() -> Array:
-    """No points, (0, 3)."""
+    """Return no points, (0, 3) [m]."""
     return np.zeros((0, 3))
 
 
@@ -112,7 +112,7 @@ class Curve(NamedTuple):
     time: Array
     """[s], (k,)"""
     value: Array
-    """NaN where there is none, (k,)."""
+    """Values in the unit of the plot, NaN where there is none, (k,)."""
 
 
 class Source(Protocol):

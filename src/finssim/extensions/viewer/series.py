@@ -31,7 +31,7 @@ SAMPLE = 0.1
 
 
 class Series:
-    """Values in the order of their times."""
+    """Keep values of any unit in the order of their times [s], (n,)."""
 
     def __init__(self, time: npt.ArrayLike = (), values: Sequence[Any] | Array = ()) -> None:
         self.time = np.asarray(time, float)
@@ -44,7 +44,7 @@ class Series:
 
 
 class PoseSeries:
-    """A recorded motion."""
+    """Keep a recorded motion: times [s], (n,), positions [m], (n, 3), and quaternions, (n, 4), world frame."""
 
     def __init__(self, time: npt.ArrayLike, position: npt.ArrayLike, quaternion: npt.ArrayLike) -> None:
         self.time = np.asarray(time, float)

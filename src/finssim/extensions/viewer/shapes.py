@@ -66,7 +66,10 @@ def tag_plates(vehicle: Vehicle) -> tuple[Mesh, Mesh] | None:
 
 
 def wall_mesh(lower: Array, upper: Array) -> Mesh:
-    """Floor and four walls of a box, seen from inside alone: those between the eye and the water vanish."""
+    """Floor and four walls of a box, seen from inside alone: those between the eye and the water vanish.
+
+    Corners are in [m].
+    """
     vertices, faces = _box(lower, upper)
     lid = (vertices[faces][..., 2] > 0.5 * (lower[2] + upper[2])).all(axis=1)
     return Mesh(vertices, faces[~lid][:, ::-1])
@@ -92,13 +95,13 @@ def force_arrows(vehicle: Vehicle, force: Array, pose: Pose) -> Array:
 
 
 def line_of(points: Array) -> Array:
-    """Segments of a line through points, (k - 1, 2, 3)."""
+    """Segments of a line through points, (k - 1, 2, 3) [m]."""
     points = points[np.isfinite(points).all(axis=1)] if len(points) else points
     return np.stack([points[:-1], points[1:]], axis=1) if len(points) > 1 else np.zeros((0, 2, 3))
 
 
 def box_edges(lower: Array, upper: Array) -> Array:
-    """The twelve edges of a box, (12, 2, 3)."""
+    """The twelve edges of a box, (12, 2, 3) [m]."""
     corners = _box(lower, upper).vertices
     pairs = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
     return np.array([[corners[a], corners[b]] for a, b in pairs])

@@ -55,18 +55,18 @@ class Log:
     messages: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
     """Kind -> fields of each message, n of them."""
     parameters: dict[str, float] = field(default_factory=dict)
-    """Parameters of the autopilot, with their latest values."""
+    """Parameters of the autopilot in its units, with their latest values."""
 
     def has(self, kind: str) -> bool:
         """Return whether there are at least two such messages."""
         return len(self.messages.get(kind, ())) >= 2
 
     def numbers(self, kind: str, name: str) -> Array:
-        """A field of every message of a kind, NaN where it has none, (n,)."""
+        """A field of every message of a kind, NaN where it has none, (n,). It has the unit of the log."""
         return np.array([_number(message.get(name)) for message in self.messages[kind]], dtype=float)
 
     def stream(self, kind: str, channels: dict[str, Array], *findings: Finding) -> Stream:
-        """Columns at the times of a kind of message."""
+        """Columns at the times of a kind of message. Channels have the units of a trial."""
         source = f"{self.shown} {kind}"
         return Stream(source=source, t=self.times[kind], channels=channels, findings=findings)
 

@@ -38,6 +38,8 @@ def outputs_of(
     From `requested` (`C1: T1`, `C2: -T2`), else from the vehicle's motor_index, else from the frame and the motor
     directions that the autopilot's parameters name, matched with where the vehicle's thrusters sit.
 
+    Parameters have the autopilot's units.
+
     Raises:
         CalibrationError: Outputs or thrusters that do not exist, or nothing to go by.
     """

@@ -52,7 +52,7 @@ class ColumnSource(Part):
     column: str | None = None
     """Name of a column, or dotted path of a field such as `twist.twist.linear.x` or `data[3]`."""
     value: float | None = None
-    """A constant in place of a column."""
+    """A constant in `unit`, in place of a column."""
     scale: float = 1.0
     offset: float = 0.0
     """Offset in `unit`, added after scaling."""
@@ -225,7 +225,8 @@ class ArduSubMap(Part):
     frame: Literal["VECTORED", "VECTORED_6DOF"] | None = None
     """Frame of the mixer that `stick_*` columns went through."""
     gain: float = Field(default=1.0, gt=0.0, le=1.0)
-    """Pilot gain (PilotGain, JS_GAIN_DEFAULT) of `stick_*` columns, where they are the joystick's, not scaled yet."""
+    """Pilot gain, a factor (PilotGain, JS_GAIN_DEFAULT), of `stick_*` columns, where they are the joystick's, not
+    scaled yet."""
     motor_directions: tuple[Literal[1, -1], ...] = ()
     """MOT_n_DIRECTION of motors 1, 2, ..., for `stick_*` columns; 1 where not given."""
 
@@ -460,14 +461,14 @@ class Stream:
     t: Array
     """Times on the clock of the log [s], (n,)."""
     channels: dict[str, Array] = field(default_factory=dict)
-    """Canonical or extra column -> values, (n,) each."""
+    """Canonical or extra column -> values in the units of a trial, (n,) each."""
     words: dict[str, Texts] = field(default_factory=dict)
     """`phase`, `split` or `arming` -> a word for every sample, (n,) each; a word holds until the next."""
     findings: tuple[Finding, ...] = ()
     """Repairs, and data that was left out."""
 
     def selected(self, rows: NDArray[np.intp] | NDArray[np.bool_], t: Array | None = None) -> Stream:
-        """Some of the samples, in that order; at times `t` where given."""
+        """Some of the samples, in that order; at times `t` where given. Times are in [s]."""
         return replace(
             self,
             t=self.t[rows] if t is None else t,
@@ -489,7 +490,7 @@ class Table:
     t: Array
     """Strictly increasing from 0 [s], (n,)."""
     channels: dict[str, Array]
-    """NaN where a stream has no sample, (n,) each."""
+    """Canonical column -> values in the units of a trial, NaN where a stream has no sample, (n,) each."""
     words: dict[str, Texts]
     """(n,) each."""
     findings: tuple[Finding, ...]

@@ -47,7 +47,7 @@ def nanoseconds(stamp: Any) -> int:
 
 
 def xyz(v: Any) -> tuple[float, float, float]:
-    """A vector's or point's numbers."""
+    """Return the numbers of a vector or point, in its unit."""
     return float(v.x), float(v.y), float(v.z)
 
 

@@ -153,7 +153,7 @@ class RobotNode(Node):
     # -- what every node says of itself ---------------------------------------------------------------------------
 
     def event(self, kind: str, text: str, at: float | None = None) -> None:
-        """Something that happened, on the topic `events` and in the log."""
+        """Something that happened, on the topic `events` and in the log. `at` is a time [s]."""
         now = self.now() if at is None else at
         values = {"stamp_ns": self.ns(now), "time": now, "kind": kind, "text": text, "node": self.get_name()}
         self.send("event", self.make.words(values))

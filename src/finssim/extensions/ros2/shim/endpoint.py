@@ -365,7 +365,7 @@ class Client(Endpoint):
         return self._end.ready()
 
     def wait_for_service(self, timeout_sec: float | None = None) -> bool:
-        """Wait until a server is known; whether one is."""
+        """Wait until a server is known; whether one is. The timeout is in [s]."""
         end = time.monotonic() + (float("inf") if timeout_sec is None else timeout_sec)
         while not self._end.ready():
             if time.monotonic() >= end or not self.node.context.ok():

@@ -131,7 +131,7 @@ class SingleThreadedExecutor(Limited):
         self._waiter.wake()
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Stop spinning."""
+        """Stop spinning. The timeout is in [s] and ignored."""
         self._stopped = True
         self.wake()
         return True

@@ -27,7 +27,7 @@ class ClockType(IntEnum):
 
 @total_ordering
 class Duration:
-    """A span of time, kept in nanoseconds."""
+    """Hold a span of time, kept in nanoseconds; `seconds` is in [s]."""
 
     def __init__(self, *, seconds: float = 0, nanoseconds: int = 0) -> None:
         self.nanoseconds = int(seconds * 10**9) + int(nanoseconds)
@@ -64,7 +64,10 @@ Infinite = Duration(nanoseconds=2**63 - 1)
 
 @total_ordering
 class Time:
-    """A point in time of one clock, kept in nanoseconds; those of different clocks do not compare."""
+    """Hold a point in time of one clock, kept in nanoseconds; those of different clocks do not compare.
+
+    `seconds` is in [s].
+    """
 
     def __init__(
         self, *, seconds: float = 0, nanoseconds: int = 0, clock_type: ClockType = ClockType.SYSTEM_TIME
