@@ -32,7 +32,7 @@ QUANTITIES = DIRECTED | set(
     "damping power energy rpm pulse".split()
 )
 """Names of quantities whose shape must be stated where they are arrays."""
-NAMED = {"quaternion", "orientation", "pixel", "pixels", "mask"}
+NAMED = {"quaternion", "orientation", "rotation", "pixel", "pixels", "mask"}
 """Names that state a unit, or that there is none."""
 REAL = re.compile(r"float(16|32|64)?|floating|(vec|mat)\d*[df]?|transform")
 VECTORS = re.compile(r"(vec|mat|quat)\d*[df]?")
@@ -66,10 +66,7 @@ SHAPE = re.compile(r"\((?:[A-Za-z0-9_.+* -]+,)+[A-Za-z0-9_.+* ,-]*\)")
 FRAME = re.compile(r"\b(frame|axes|body|world|pool|camera|optical|map|reference)\b", re.IGNORECASE)
 
 PENDING = {
-    "finssim.extensions.perception",
     "finssim.identification",
-    "finssim.localization",
-    "finssim.tasks",
 }
 """Packages of which only parameters that are named as a quantity are judged yet."""
 

@@ -47,6 +47,8 @@ class Fields:
     def number(self, key: str, default: float | None = None) -> float:
         """Return a finite number.
 
+        The unit is that of the key.
+
         Raises:
             LocalizationError: It is missing without a default, or not a finite number.
         """

@@ -63,7 +63,7 @@ class PriorSources:
 
     @property
     def settings(self) -> dict[str, float]:
-        """Standard deviations, as plain values."""
+        """Standard deviations, as plain values. Units are in the names."""
         return {
             "depth_std": self.base.z_std,
             "tilt_std_deg": math.degrees(self.base.tilt_std),
@@ -456,7 +456,7 @@ def run(
         imu (FILE): Table with columns t and roll, pitch [rad] or qx, qy, qz, qw; level if not given.
         method (METHOD): refractive, refractive-weighted, refractive-6dof, pinhole-depth or pinhole.
         refine (WAY): Corner refinement: fit, or AprilTag's own edges or none.
-        gamma: Gamma of the images: 1 linear, 2.2 video.
+        gamma: Exponent gamma of the images: 1 linear, 2.2 video.
         times (FILE): Table with columns image, time [s], if the image names contain none.
         pixel_std: Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
             given.

@@ -51,7 +51,7 @@ class Pool:
 
     @property
     def T_pw(self) -> Array:
-        """World frame to pool frame, (4, 4)."""
+        """Return the transformation from world frame to pool frame [m], (4, 4)."""
         T = np.eye(4)
         T[:3, :3] = quat_to_matrix(self.world_orientation)
         if self.world_position is not None:
@@ -62,7 +62,7 @@ class Pool:
 
     @property
     def T_wp(self) -> Array:
-        """Pool frame to world frame, (4, 4)."""
+        """Return the transformation from pool frame to world frame [m], (4, 4)."""
         T = self.T_pw
         R, t = T[:3, :3], T[:3, 3].copy()
         T[:3, :3], T[:3, 3] = R.T.copy(), -R.T @ t

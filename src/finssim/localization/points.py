@@ -37,7 +37,7 @@ class PointTable:
     rows: list[list[str]]
     """All cells, as the file writes them."""
     numbers: dict[str, Array]
-    """The columns that were asked for and are there, (n,) each."""
+    """The columns that were asked for and are there, in the unit of the table, (n,) each."""
 
     def with_columns(self, columns: dict[str, Sequence[str]]) -> tuple[list[str], list[list[str]]]:
         """Names and rows with columns added; one of the file that has the name of an added one becomes NAME_given."""

@@ -17,7 +17,7 @@ class ReferenceTable:
     velocity: wp.array2d(dtype=wp.vec3)  # there [m/s]
     spacing: float  # time between two knots [s]
     duration: wp.array(dtype=float)  # time from progress 0 to 1; held from then on [s]
-    offset: wp.array(dtype=float)  # progress at the start
+    offset: wp.array(dtype=float)  # share of the way at the start
     given: wp.array(dtype=int)  # 1: filled from outside; an episode that starts keeps it
 
 
@@ -47,7 +47,7 @@ class MessageTable:
     sent_velocity: wp.array2d(dtype=wp.vec3)  # world frame [m/s]
     sent_step: wp.array2d(dtype=int)
     arrival: wp.array3d(dtype=int)  # (worlds, sender * slots + slot, receiver): control step; -1: never
-    position: wp.array2d(dtype=wp.vec3)  # (worlds, receiver * agents + sender): of the newest that arrived
+    position: wp.array2d(dtype=wp.vec3)  # places of the other agents as last heard, world frame [m]
     velocity: wp.array2d(dtype=wp.vec3)
     step: wp.array2d(dtype=int)  # control step at which that was sent
 
@@ -65,17 +65,17 @@ class NetTable:
 class Answers:
     """Answers of the functions of a task in plain torch, for the kernels that follow; see `torch_task`."""
 
-    reward: wp.array2d(dtype=float)  # (worlds, agents)
+    reward: wp.array2d(dtype=float)  # reward, (worlds, agents)
     terminated: wp.array(dtype=int)
     inside: wp.array(dtype=int)  # 1: within the tolerance of success
-    counted: wp.array2d(dtype=float)  # (worlds, task.totals): what this step adds to them
+    counted: wp.array2d(dtype=float)  # (worlds, task.totals): what this step adds to them, in their units
     position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), where an episode would start; world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
     goal_position: wp.array(dtype=wp.vec3)
     goal_quaternion: wp.array(dtype=wp.quat)
-    begun: wp.array2d(dtype=float)  # (worlds, numbers): memory at the start
-    memory: wp.array2d(dtype=float)  # (worlds, numbers): what the task keeps within an episode
+    begun: wp.array2d(dtype=float)  # (worlds, numbers): memory at the start, in the units of the task
+    memory: wp.array2d(dtype=float)  # (worlds, numbers): what the task keeps within an episode, in its units
 
 
 @wp.struct
@@ -91,27 +91,25 @@ class TaskArrays:
     previous_action: wp.array2d(dtype=float)
     time: wp.array(dtype=float)  # in the episode [s]
     scripted: wp.array2d(dtype=float)  # (worlds, others * size): actions of the vehicles that do not learn
-    observation: wp.array2d(dtype=float)  # (worlds, agents * size)
-    taught: wp.array2d(
-        dtype=float
-    )  # (worlds, agents * size): the task's `teacher` parts, for who may know more
+    observation: wp.array2d(dtype=float)  # observation, (worlds, agents * size)
+    taught: wp.array2d(dtype=float)  # (worlds, agents * size): observation of a teacher
     final_observation: wp.array2d(dtype=float)  # last observation of the episode that ended in this step
-    reward: wp.array(dtype=float)  # of all agents together: their mean
+    reward: wp.array(dtype=float)  # reward of all agents together: their mean
     agent_reward: wp.array2d(dtype=float)  # (worlds, agents); of a single agent the same memory as `reward`
     terminated: wp.array(dtype=int)  # 1: ended by the task (left the pool, broke)
     truncated: wp.array(dtype=int)  # 1: ended by the time limit
     done: wp.array(dtype=int)  # terminated or truncated: reset in this step
-    episode_return: wp.array(dtype=float)  # of the running episode
-    final_return: wp.array(dtype=float)  # of the episode that ended last
+    episode_return: wp.array(dtype=float)  # sum of rewards of the running episode
+    final_return: wp.array(dtype=float)  # sum of rewards of the episode that ended last
     final_length: wp.array(dtype=int)  # its control steps
     held: wp.array(dtype=float)  # time inside the success tolerance so far [s]
     final_held: wp.array(dtype=float)  # the same when the last episode ended [s]
     totals: wp.array2d(dtype=float)  # (worlds, task.totals): what the task counts in the episode, from 0
-    final_totals: wp.array2d(dtype=float)  # the same when the last episode ended
+    final_totals: wp.array2d(dtype=float)  # the same when the last episode ended, in their units
     earned: wp.array2d(
         dtype=float
     )  # (worlds, rewards and ends): what each added to the return, mean over agents
-    final_earned: wp.array2d(dtype=float)  # the same when the last episode ended
+    final_earned: wp.array2d(dtype=float)  # the same rewards when the last episode ended
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
     reference: ReferenceTable  # of tasks that follow one
@@ -120,14 +118,14 @@ class TaskArrays:
     messages: MessageTable  # of tasks whose agents talk to each other
     net: NetTable  # of tasks whose agents hold a net
     answers: Answers  # of tasks in plain torch
-    position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured: the truth, or the truth with noise
+    position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured, maybe with noise; world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
     ranges: wp.array2d(
         dtype=float
     )  # (worlds, task.ranges), as measured [m]; infinite where nothing is in reach
     privileged: wp.array2d(dtype=float)  # (worlds, agents * P): what was drawn, from nominal, unit scale
-    final_privileged: wp.array2d(dtype=float)  # the same of the episode that ended last
+    final_privileged: wp.array2d(dtype=float)  # the same of the episode that ended last [-]
 
 
 def allocated(kind: Any, worlds: int, device: wp.Device, **columns: int | tuple[int, ...]) -> Any:

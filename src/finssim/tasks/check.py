@@ -35,11 +35,11 @@ class Played(NamedTuple):
     observation: NDArray[np.float32]
     """(steps, worlds, numbers of all agents)"""
     reward: NDArray[np.float32]
-    """(steps, worlds, agents)"""
+    """Rewards, (steps, worlds, agents)."""
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     metrics: dict[str, NDArray[np.float64]]
-    """Values at the end."""
+    """Values at the end, in the units of the metrics."""
 
     @property
     def ended(self) -> NDArray[np.bool_]:

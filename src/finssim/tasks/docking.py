@@ -114,7 +114,7 @@ class DockingReward:
 
 @wp.func
 def off_corridor(p: Any, x: wp.vec3) -> float:
-    """off: how far the nose is outside the cone that leads to the berth, in vehicle lengths."""
+    """Return how far the nose at x [m] is outside the cone that leads to the berth [vehicle lengths]."""
     room = p.gap + wp.tan(p.cone) * wp.max(-x[0], 0.0)
     return wp.max(wp.length(wp.vec2(x[1], x[2])) - room, 0.0) / p.hull.length
 
@@ -141,7 +141,7 @@ def is_lost(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 
 @wp.func
 def is_docked(state: State, p: Any, w: int, x: wp.vec3) -> bool:
-    """The nose far enough in the tube, and slow."""
+    """The nose far enough in the tube, and slow. `x` is in [m]."""
     nu = state.velocity[w, 0]
     still = wp.length(wp.vec3(nu[0], nu[1], nu[2])) <= p.slow * p.hull.speed
     deep = x[0] >= p.inside * p.funnel.tube_length
@@ -194,17 +194,17 @@ class Docking(Task):
     hull: Hull = Hull()
     """Hull of the vehicle; the environment sets it."""
     throat: float = 1.2
-    """Radius of the tube, in girths."""
+    """Radius of the tube [girths]."""
     mouth: float = 2.0
-    """Radius of the cone's wide end, in girths."""
+    """Radius of the cone's wide end [girths]."""
     cone: float = math.radians(35.0)
     """Half angle of the cone [rad]."""
     tube: float = 0.5
-    """Length of the tube."""
+    """Length of the tube [lengths]."""
     rim: float = 0.5
-    """Thickness of the block, in girths."""
+    """Thickness of the block [girths]."""
     give: float = 0.15
-    """Depth to which a hull point sinks in at the speed that the dock is built for, in girths."""
+    """Depth to which a hull point sinks in at the speed that the dock is built for [girths]."""
     damping: float = 0.2
     """Damping of a contact point that carries the vehicle's mass, as a share of the critical damping."""
     berth: float = 0.75
@@ -212,19 +212,19 @@ class Docking(Task):
     inside: float = 0.5
     """Place from which it counts as inside, as a share of the tube."""
     dock_spread: tuple[float, float, float] = (1.5, 1.5, 0.8)
-    """Greatest distance of the dock from the middle of the tank."""
+    """Greatest distance of the dock from the middle of the tank [lengths]."""
     start: tuple[float, float] = (1.5, 4.0)
-    """The nose starts this far before the mouth, ..."""
+    """The nose starts this far before the mouth [lengths], ..."""
     start_aside: tuple[float, float] = (1.5, 0.8)
-    """... this far beside the axis and above or below it at most, ..."""
+    """... this far beside the axis and above or below it at most [lengths], ..."""
     turn: float = math.radians(60.0)
     """... turned away from it by this at most [rad]."""
     tilt: float = math.radians(10.0)
     """Largest roll and pitch at the start [rad]."""
     tank: tuple[float, float] = (18.0, 6.0)
-    """Width and depth of the tank."""
+    """Width and depth of the tank [lengths]."""
     slow: float = 0.1
-    """Success: the nose inside, at most this fast, in parts of the speed the dock is built for, ..."""
+    """Success: the nose inside, at most this fast, as a share of the speed the dock is built for, ..."""
     hold: float = 2.0
     """... for this long [s]."""
     hard: float = 0.5

@@ -44,7 +44,7 @@ class Step:
     task that sees a dictionary: `state`, which is that, and by each picture's name uint8 (worlds, height, width, 3),
     or of a sonar (worlds, beams, range cells, 1)."""
     reward: NDArray[np.float32]
-    """(worlds,), or (worlds, agents)."""
+    """Rewards, (worlds,), or (worlds, agents)."""
     terminated: NDArray[np.bool_]
     """Ended by the task, (worlds,)."""
     truncated: NDArray[np.bool_]
@@ -459,6 +459,8 @@ class Environment:
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from the `state()` of an environment made with the same arguments, bit for bit.
+
+        Each array has the unit of its attribute.
 
         Raises:
             EnvironmentSetupError: It was made with other arguments: a name or shape does not fit.

@@ -97,9 +97,9 @@ class FittedTask(Task):
     fit: Fit = Fit()
     """Factors of the vehicle; the environment sets them."""
     tilt: float = math.radians(20.0)
-    """Largest roll and pitch at the start."""
+    """Largest roll and pitch at the start [rad]."""
     ceiling: float = 0.3
-    """Rising above this height ends the episode."""
+    """Rising above this height ends the episode [m]."""
     training_noise: MeasurementNoise = TRAINING
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> FittedTask:
@@ -116,9 +116,10 @@ class PoolTask(FittedTask):
     """Base of those that start anywhere in the pool."""
 
     spawn_low: tuple[float, float, float] = (-1.4, -0.6, -0.80)
-    """The vehicle starts in this box, with any heading."""
+    """The vehicle starts in this box, with any heading [m]."""
     spawn_high: tuple[float, float, float] = (1.4, 0.6, -0.20)
+    """Opposite corner of this box [m]."""
     bounds: tuple[float, float] = (2.5, 1.5)
-    """Leaving |x|, |y| beyond these ends the episode."""
+    """Leaving |x|, |y| beyond these ends the episode [m]."""
     depth: float = 1.5
-    """So does sinking below this depth."""
+    """So does sinking below this depth [m]."""

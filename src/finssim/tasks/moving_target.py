@@ -73,7 +73,10 @@ class TargetReward:
 
 @wp.func
 def new_course(arrays: TaskArrays, p: Any, w: int, t: float):
-    """Draw a velocity that the target is to have, and until when; from the world's own stream."""
+    """Draw a velocity that the target is to have, and until when; from the world's own stream.
+
+    `t` is the time [s].
+    """
     rng = arrays.target.rng[w]
     z = wp.randf(rng, -1.0, 1.0)
     angle = wp.randf(rng, -3.14159265, 3.14159265)
@@ -151,7 +154,7 @@ class MovingTarget(PoolTask):
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0
     low: tuple[float, float, float] = (-1.25, -0.50, -0.675)
-    """The target starts in this box, and turns back where it leaves it; with 0.08 m/s² it needs 0.06 m for that."""
+    """The target starts in this box [m], and turns back where it leaves it; with 0.08 m/s² it needs 0.06 m for that."""
     high: tuple[float, float, float] = (1.25, 0.50, -0.325)
     fastest: float = 0.10
     """Its speed is drawn up to this [m/s] ..."""
@@ -164,7 +167,7 @@ class MovingTarget(PoolTask):
     speed: float = 0.1
     """Largest starting speed per axis [m/s]."""
     tolerance: float = 0.25
-    """Success: within this distance, ..."""
+    """Success: within this distance [m], ..."""
     slip_tolerance: float = 0.12
     """... with at most this speed relative to the target [m/s] ..."""
     rate_tolerance: float = 0.3

@@ -23,7 +23,7 @@ class Counts:
     tried: wp.array(dtype=int)
     succeeded: wp.array(dtype=int)
     held: float  # a success has held at least this [s] ...
-    episode_return: float  # ... and returned at least this
+    episode_return: float  # ... and earned at least this sum of rewards
 
 
 @wp.kernel(enable_backward=False)
@@ -93,7 +93,7 @@ class Schedule:
             self._set(self.plan.width(float(self._steps * self._draws.simulator.worlds)))
 
     def arrays(self) -> Iterator[tuple[str, wp.array]]:
-        """Yield the arrays that determine its further course, by name."""
+        """Yield the arrays that determine its further course, by name. Each has the unit of its attribute."""
         counts, table = self.counts, self._draws.table
         yield from (("width", self._width), ("tried", counts.tried), ("succeeded", counts.succeeded))
         yield from (("ends", table.ends), ("probability", table.probability))

@@ -145,9 +145,9 @@ class Aboard:
     """State of the filter of one vehicle: a doubt is variance, covariance, variance of a value and its rate."""
 
     gauge: wp.bool  # whether z comes from a pressure gauge
-    plane: wp.vec3  # settled doubt of x, and of y
-    height: wp.vec3  # of z
-    yaw: wp.vec3  # of yaw
+    plane: wp.vec3  # settled doubt of x, and of y [m², m²/s, m²/s²]
+    height: wp.vec3  # of z [m², m²/s, m²/s²]
+    yaw: wp.vec3  # of yaw [rad², rad²/s, rad²/s²]
 
 
 @wp.struct
@@ -182,7 +182,10 @@ class Readings:
 
 @wp.func
 def grown(P: wp.vec3, q: float, dt: float) -> wp.vec3:
-    """Doubt of a value and its rate a time later, P <- A P A' + Q, of a rate driven by white noise of density q."""
+    """Doubt of a value and its rate a time later, P <- A P A' + Q, of a rate driven by white noise of density q.
+
+    `dt` is in [s]; P and q have the unit of the value squared.
+    """
     return wp.vec3(
         P[0] + 2.0 * dt * P[1] + dt * dt * P[2] + q * dt * dt * dt / 3.0,
         P[1] + dt * P[2] + 0.5 * q * dt * dt,
@@ -192,33 +195,36 @@ def grown(P: wp.vec3, q: float, dt: float) -> wp.vec3:
 
 @wp.func
 def value_gain(P: wp.vec3, R: float) -> wp.vec2:
-    """Gain of value and rate for a measured value of variance R."""
+    """Gain of value and rate for a measured value of variance R. P and R have the unit of the value squared."""
     return wp.vec2(P[0], P[1]) / (P[0] + R)
 
 
 @wp.func
 def value_known(P: wp.vec3, R: float) -> wp.vec3:
-    """Doubt after it."""
+    """Doubt after it. P and R have the unit of the value squared."""
     s = P[0] + R
     return wp.vec3(P[0] * R / s, P[1] * R / s, P[2] - P[1] * P[1] / s)
 
 
 @wp.func
 def rate_gain(P: wp.vec3, R: float) -> wp.vec2:
-    """Gain of value and rate for a measured rate of variance R."""
+    """Gain of value and rate for a measured rate of variance R. P and R have the unit of the value squared."""
     return wp.vec2(P[1], P[2]) / (P[2] + R)
 
 
 @wp.func
 def rate_known(P: wp.vec3, R: float) -> wp.vec3:
-    """Doubt after it."""
+    """Doubt after it. P and R have the unit of the value squared."""
     s = P[2] + R
     return wp.vec3(P[0] - P[1] * P[1] / s, P[1] * R / s, P[2] * R / s)
 
 
 @wp.func
 def counted(noise: float, quantum: float) -> float:
-    """Variance of what has this noise and is rounded to a multiple of the quantum; never 0."""
+    """Variance of what has this noise and is rounded to a multiple of the quantum; never 0.
+
+    Noise and quantum have one unit.
+    """
     return noise * noise + quantum * quantum / 12.0 + 1.0e-10
 
 
@@ -291,7 +297,10 @@ def begin(
 @wp.func
 def go_on(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
     """Advance the state by a control step: the gyro turns it, the accelerometer gives the vertical, velocity is
-    integrated."""
+    integrated.
+
+    `dt` is in [s].
+    """
     before = (step - 1) % e.position.shape[2]
     now = step % e.position.shape[2]
     imu = r.imu_errors[w, v]
@@ -326,7 +335,10 @@ def measured_at(e: Estimates, latency: int, step: int) -> int:
 def shift(
     e: Estimates, w: int, v: int, at: int, step: int, dt: float, dx: wp.vec3, dv: wp.vec3, turn: wp.vec2
 ):
-    """Apply a correction of control step `at`: offsets, which have grown since then, and the gyro's bias."""
+    """Apply a correction of control step `at`: offsets, which have grown since then, and the gyro's bias.
+
+    `dt` is in [s], `dx` in [m], `dv` in [m/s], `turn` in [rad, rad/s].
+    """
     up = wp.quat_rotate_inv(e.quaternion[w, v, step % e.position.shape[2]], wp.vec3(0.0, 0.0, 1.0))
     e.bias[w, v] = e.bias[w, v] - turn[1] * up
     e.rate[w, v] = e.rate[w, v] + turn[1] * up
@@ -386,7 +398,7 @@ def take_fix(
 
 @wp.func
 def take_depth(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
-    """A depth that has come: of the gauge's port, -z - (R r)_z."""
+    """A depth that has come: of the gauge's port, -z - (R r)_z. `dt` is in [s]."""
     at = measured_at(e, r.gauge_samples.timing[v].latency, step)
     k = at % e.position.shape[2]
     gauge = r.gauge_errors[w, v]
@@ -401,7 +413,10 @@ def take_depth(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
 
 @wp.func
 def take_velocity(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
-    """A velocity of the DVL that has come: of the body's origin, v = R_bs z - ω × r, in world axes."""
+    """A velocity of the DVL that has come: of the body's origin, v = R_bs z - ω × r, in world axes.
+
+    `dt` is in [s].
+    """
     at = measured_at(e, r.dvl_samples.timing[v].latency, step)
     k = at % e.position.shape[2]
     dvl = r.dvl_errors[w, v]

@@ -126,7 +126,7 @@ class StationKeeping(PoolTask):
     name: str = "t1"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     goal_low: tuple[float, float, float] = (-1.2, -0.5, -0.82)
-    """Goals are uniform in this box; yaw is uniform over the circle, roll and pitch are level."""
+    """Goals are uniform in this box [m]; yaw is uniform over the circle, roll and pitch are level."""
     goal_high: tuple[float, float, float] = (1.2, 0.5, -0.28)
     max_tilt: float = math.radians(45.0)
     """Tilt that the vehicle should stay well below [rad]: the default `safety.max_tilt`, where a bridge stops it."""
@@ -138,9 +138,9 @@ class StationKeeping(PoolTask):
     """A robot is shown a goal farther away than this as one so far ahead on the straight way to it: training saw few
     that were farther, and a policy that hurries to one leans beyond what its sensors bear [m]."""
     tolerance: float = 0.10
-    """Success: every axis within this ..."""
+    """Success: every axis within this [m] ..."""
     yaw_tolerance: float = math.radians(10.0)
-    """... and yaw within this ..."""
+    """... and yaw within this [rad] ..."""
     hold: float = 10.0
     """... for this long [s]."""
     reward: Reward = field(default_factory=Reward)

@@ -145,7 +145,7 @@ def remember_actions(arrays: TaskArrays, w: int):
 
 @wp.func
 def uniform3(rng: wp.uint32, low: wp.vec3, high: wp.vec3) -> wp.vec3:
-    """Return a point drawn uniformly from a box; the caller passes a separate stream."""
+    """Return a point drawn uniformly from a box; the caller passes a separate stream. It has the unit of the box."""
     a = wp.randf(rng)
     b = wp.randf(rng)
     c = wp.randf(rng)
@@ -312,7 +312,7 @@ def goal_offset(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
 
 @wp.func
 def goal_columns(arrays: TaskArrays, w: int, a: int) -> vec6:
-    """First two columns of the goal's rotation relative to an agent's body."""
+    """Return the first two columns of the goal's rotation matrix relative to an agent's body."""
     R = wp.quat_to_matrix(wp.quat_inverse(arrays.quaternion[w, a]) * arrays.goal_quaternion[w])
     return vec6(R[0, 0], R[1, 0], R[2, 0], R[0, 1], R[1, 1], R[2, 1])
 

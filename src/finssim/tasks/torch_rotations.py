@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def multiply(p: Tensor, q: Tensor) -> Tensor:
-    """The rotation q, then p, (..., 4)."""
+    """Return the quaternion of the rotation q, then p, (..., 4)."""
     px, py, pz, pw = p.unbind(-1)
     qx, qy, qz, qw = q.unbind(-1)
     return torch.stack(
@@ -28,19 +28,19 @@ def multiply(p: Tensor, q: Tensor) -> Tensor:
 
 
 def conjugate(q: Tensor) -> Tensor:
-    """The rotation back, (..., 4)."""
+    """Return the quaternion of the rotation back, (..., 4)."""
     return torch.cat((-q[..., :3], q[..., 3:]), dim=-1)
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:
-    """A vector of the body written in the world frame, (..., 3); q is body to world."""
+    """A vector of the body written in the world frame, (..., 3); q is body to world. The unit is kept."""
     axis, w = q[..., :3], q[..., 3:]
     twice = 2.0 * torch.linalg.cross(axis, v)
     return v + w * twice + torch.linalg.cross(axis, twice)
 
 
 def rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
-    """A vector of the world written in the body frame, (..., 3); q is body to world."""
+    """A vector of the world written in the body frame, (..., 3); q is body to world. The unit is kept."""
     return rotate(conjugate(q), v)
 
 

@@ -141,11 +141,11 @@ class Worlds:
         return self._steps * self._control_step
 
     def zeros(self, *size: int) -> Tensor:
-        """Zeros, (worlds, *size)."""
+        """Zeros, (worlds, *size). They have the unit of what is put there."""
         return torch.zeros((self.count, *size), device=self.device)
 
     def full(self, row: float | Sequence[float]) -> Tensor:
-        """Return the same number, (worlds,), or the same row, (worlds, size), for every world."""
+        """Return the same number, (worlds,), or the same row, (worlds, size), for every world. The unit is kept."""
         values = torch.as_tensor(row, dtype=torch.float32, device=self.device)
         return values.expand(self.count, *values.shape)
 
@@ -210,7 +210,7 @@ class Start:
     goal_quaternion: Tensor | None = None
     """(worlds, 4)"""
     memory: Mapping[str, Tensor] = field(default_factory=dict)
-    """The task's own numbers that do not begin at zero, (worlds, size)."""
+    """The task's own numbers that do not begin at zero, in its units, (worlds, size)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,11 +251,14 @@ class TorchTask(Task):
         return w.zeros()
 
     def inside(self, w: Worlds) -> Tensor:
-        """Return where the tolerance of success is met, bool, (worlds,); nowhere unless defined."""
+        """Return where the tolerance of success is met [bool], (worlds,); nowhere unless defined."""
         return w.zeros()
 
     def counted(self, w: Worlds) -> Mapping[str, Tensor]:
-        """Return what this step adds to the `totals` of the episode, (worlds,) by name."""
+        """Return what this step adds to the `totals` of the episode, (worlds,) by name.
+
+        Each has the unit of its total.
+        """
         return {}
 
     def script(self, w: Worlds) -> Tensor:

@@ -42,13 +42,13 @@ def reference_table(worlds: int, knots: int, spacing: float, device: wp.Device) 
 
 @wp.func
 def reference_knot(r: ReferenceTable, w: int, t: float) -> int:
-    """The knot at or before a time."""
+    """The knot at or before a time. `t` is the time [s]."""
     return wp.clamp(int(wp.floor(t / r.spacing)), 0, r.position.shape[1] - 2)
 
 
 @wp.func
 def held_time(r: ReferenceTable, w: int, t: float) -> float:
-    """The time, held at the end of the reference and of its table."""
+    """The time, held at the end of the reference and of its table [s]."""
     return wp.min(wp.min(t, r.duration[w]), float(r.position.shape[1] - 1) * r.spacing)
 
 
@@ -166,7 +166,7 @@ def shape_point(kind: int, phase: float, lift: float) -> wp.vec3:
 
 @wp.func
 def shape_slope(kind: int, phase: float, lift: float) -> wp.vec3:
-    """Derivative of `shape_point` by the phase."""
+    """Derivative of `shape_point` by the phase. It is in shares of the half axes; `phase` is in [rad]."""
     s = wp.sin(phase)
     c = wp.cos(phase)
     d = 1.0 + s * s
@@ -335,7 +335,7 @@ def lead_reference(arrays: TaskArrays, w: int):
 
 @wp.func
 def posture(state: State, p: Any, w: int, pose: float) -> float:
-    """pose · (0.5 / (1 + (tilt / tilt_scale)²) + 0.5 / (1 + (r / spin_scale)⁴))."""
+    """Return the reward pose · (0.5 / (1 + (tilt / tilt_scale)²) + 0.5 / (1 + (r / spin_scale)⁴))."""
     rate = state.velocity[w, 0][5]
     lean = tilt_angle(state, w) / p.reward.tilt_scale
     spun = rate * rate / (p.reward.spin_scale * p.reward.spin_scale)
@@ -344,7 +344,7 @@ def posture(state: State, p: Any, w: int, pose: float) -> float:
 
 @wp.func
 def is_lost(state: State, p: Any, w: int, e: float) -> bool:
-    """Farther than `lost` from the reference, above `ceiling`, or beyond `range`."""
+    """Farther than `lost` from the reference, above `ceiling`, or beyond `range`. The error `e` is in [m]."""
     x = state.position[w, 0]
     size = p.fit.size
     return e > size * p.lost or x[2] > size * p.ceiling or wp.length(x) > size * p.range
@@ -402,9 +402,9 @@ class TrajectoryTracking(FittedTask):
     level: int = 3
     """Index of the `LEVELS` that the shapes are drawn from: 0 to 2 as published, 3 all of them."""
     scale_low: tuple[float, float, float] = (0.3, 0.2, 0.04)
-    """Half axes of a shape are drawn from here, along, across and up ..."""
+    """Half axes of a shape are drawn from here [m], along, across and up ..."""
     scale_high: tuple[float, float, float] = (1.2, 0.6, 0.12)
-    """... to here."""
+    """... to here [m]."""
     speed_limit: tuple[float, float, float] = (0.30, 0.20, 0.10)
     """Greatest speed of a reference along, across and up [m/s]; never more than one turn in `time_limit` either."""
     slowest: float = 0.2
@@ -412,17 +412,17 @@ class TrajectoryTracking(FittedTask):
     lift: float = 0.6
     """Greatest part of the upward half axis by which a shape is tilted."""
     depth: float = -0.5
-    """Height of the middle of a shape."""
+    """Height of the middle of a shape [m]."""
     jitter: tuple[float, float, float] = (0.15, 0.15, 0.15)
-    """Largest shift of a shape, and of the start from its first point."""
+    """Largest shift of a shape, and of the start from its first point [m]."""
     speed: float = 0.1
     """Largest starting speed per axis [m/s]."""
     lost: float = 4.0
-    """A greater distance to the reference ends the episode."""
+    """A greater distance to the reference ends the episode [m]."""
     range: float = 12.0
-    """So does going this far from the world's origin."""
+    """So does going this far from the world's origin [m]."""
     tolerance: float = 0.05
-    """The time within this distance is counted, without a break."""
+    """The time within this distance [m] is counted, without a break."""
     hold: float = 10.0
     """An episode counts as held when it ends with this long within the tolerance [s]."""
     knot_spacing: float = 0.25

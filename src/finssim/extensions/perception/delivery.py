@@ -111,7 +111,7 @@ class Delivery:
     """
 
     reading: wp.array
-    """Reading that arrived last; zero before the first. Its type and shape are the sensor's."""
+    """Reading that arrived last; zero before the first. Its type, shape and unit are the sensor's."""
     age: wp.array
     """Time since that was measured [s], infinite before the first; float (worlds, vehicles)."""
 
@@ -157,12 +157,12 @@ class Delivery:
         """Measure what is due, and let arrive what has come.
 
         Args:
-            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
             steps: Control steps since each world's reset, as a simulator's `state.steps`; int (worlds,).
             episode: Resets of each world so far, as its `state.episode`; int (worlds,).
 
         Returns:
-            `reading`, which the next update overwrites.
+            `reading` in the unit of the sensor, which the next update overwrites.
         """
         inputs = [steps, episode, self._begun, self.sampling, self.loss, self.seed]
         inputs += [self._due, self._stored, self._arrived, self.age]
@@ -181,12 +181,15 @@ class Delivery:
         self._begun.fill_(-1)
 
     def arrays(self) -> Iterator[tuple[str, wp.array]]:
-        """The arrays that decide what arrives next, by name; with `updates`, and the sensor's own, they are all."""
+        """The arrays that decide what arrives next, by name; with `updates`, and the sensor's own, they are all.
+
+        Each has the unit of its attribute.
+        """
         yield from (("measured", self.sensor.reading), ("reading", self.reading), ("age", self.age))
         yield from (("begun", self._begun), ("ring", self._ring))
         fields = ((name, getattr(self.sampling, name)) for name in self.sampling._cls.vars)
         yield from ((name, x) for name, x in fields if isinstance(x, wp.array) and name != "timing")
 
     def numpy(self) -> np.ndarray:
-        """A copy of `reading`."""
+        """Return a copy of `reading`, in the unit of the sensor."""
         return self.reading.numpy().copy()

@@ -112,7 +112,7 @@ class Finish(Part):
     """Diffuse reflectance."""
     texture: Texture | None = None
     glow: NonNegative3 = Field(default_factory=lambda: zeros(3))
-    """Emitted radiance, as of a beacon."""
+    """Emitted radiance [-], as of a beacon."""
     backscatter_strength_db: Annotated[float, Field(strict=True, ge=-200.0, le=100.0)] = -27.0
     """10 log10 of Lambert's parameter mu [dB]: echo strength of 1 m² seen head-on. The default is that of sea floors
     (Mackenzie 1961); hard and rough walls have -15 to -5."""
@@ -159,7 +159,7 @@ class Object(Finish):
     orientation: Quaternion | None = None
     """q_world<shape> (or q_frame<shape>), xyzw; at most one of orientation, axis and yaw."""
     axis: Vector3 | None = None
-    """Direction of the shape's z axis: along a cylinder or capsule, out of a plane; any length but 0."""
+    """Direction of the shape's z axis: along a cylinder or capsule, out of a plane; any length but 0 [-]."""
     yaw: Number | None = None
     """Turn about z [rad]."""
     frame: str | None = None
@@ -198,7 +198,8 @@ class Object(Finish):
 
     @property
     def quaternion(self) -> Array:
-        """Shape to its frame, xyzw, (4,); a shape with an axis is turned to it the shortest way."""
+        """Return the quaternion from shape to its frame, xyzw, (4,); a shape with an axis is turned to it the shortest
+        way."""
         if self.orientation is not None:
             return self.orientation
         if self.axis is None:
@@ -242,7 +243,7 @@ class Seabed(Finish):
     depth: Positive
     """Below the surface at x = y = 0, of the plane that the heights are added to [m]."""
     slope: Pair = (0.0, 0.0)
-    """dz/dx, dz/dy of that plane."""
+    """Slopes dz/dx, dz/dy of that plane [-]."""
     size: Pair | None = None
     """Extent along x and y about the origin [m]; without it the bottom is a plane without end."""
     spacing: Positive = 0.5
@@ -300,7 +301,7 @@ class WorldWater(Part):
     attenuation: NonNegative3
     """Beam attenuation c of red, green, blue [1/m], (3,)."""
     veil: NonNegative3
-    """Radiance B of water without end just below the surface: backscattered daylight, (3,)."""
+    """Radiance B [-] of water without end just below the surface: backscattered daylight, (3,)."""
     daylight_attenuation: NonNegative3
     """K_d: daylight at depth h is exp(-K_d h) of that just below the surface [1/m], at most c, (3,)."""
     temperature: Annotated[float, Field(strict=True, ge=-2.0, le=40.0)] = 15.0
@@ -377,13 +378,13 @@ class Light(Part):
     """Daylight just below the surface."""
 
     daylight: NonNegative3 = Field(default_factory=lambda: zeros(3) + 1.0)
-    """Irradiance of a level surface, relative to that which gives white paper radiance 1, (3,)."""
+    """Irradiance of a level surface [-], relative to that which gives white paper radiance 1, (3,)."""
     sun: Vector3 = Field(default_factory=lambda: zeros(3) + np.array([0.3, 0.2, 0.93]))
-    """Direction towards the sun as seen from below the surface, any length but 0, (3,)."""
+    """Direction towards the sun as seen from below the surface, any length but 0 [-], (3,)."""
     diffuse: Probability = 0.5
     """Share of the irradiance that comes evenly from above rather than from the sun."""
     sky: NonNegative3 = Field(default_factory=lambda: zeros(3) + 1.0)
-    """Radiance of the sky, or the ceiling, as seen through the surface from below, (3,)."""
+    """Radiance [-] of the sky, or the ceiling, as seen through the surface from below, (3,)."""
     vary: LightVariation = Field(default_factory=lambda: LightVariation())
 
     @model_validator(mode="after")
@@ -401,7 +402,7 @@ class Contact(Part):
     damping: NonNegative = 100.0
     """Against approach [N s/m]."""
     friction: NonNegative = 0.2
-    """Coulomb coefficient."""
+    """Coulomb coefficient [-]."""
 
 
 class Viewpoint(Part):

@@ -86,7 +86,10 @@ def off_axis(p: Any, place: wp.vec3) -> float:
 
 @wp.func
 def is_lost(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -> bool:
-    """Half a length from the surface or the floor, or farther from the gate than an episode can need."""
+    """Half a length from the surface or the floor, or farther from the gate than an episode can need.
+
+    `place` is in [m].
+    """
     z = state.position[w, 0][2]
     margin = 0.5 * p.hull.length
     return z > -margin or z < margin - p.depth or wp.length(place) > p.begin[1] + 2.5
@@ -148,6 +151,7 @@ class Gate(SeeingTask):
     name: str = "gate"
     world: str = "gate"
     time_limit: float = 25.0
+    """Length of an episode [s]."""
     hull: Hull = Hull()
     """Hull of the vehicle; the environment sets it, ..."""
     half: tuple[float, float, float] = (0.28, 0.19, 0.15)
@@ -157,7 +161,7 @@ class Gate(SeeingTask):
     begin: tuple[float, float] = (2.0, 4.0)
     """So far before the gate at the start [m], ..."""
     aside: float = 0.3
-    """... beside its axis, in parts of that, ..."""
+    """... beside its axis, as a share of that, ..."""
     over: float = 0.3
     """... above or below it [m] at most, ..."""
     turn: float = math.radians(15.0)

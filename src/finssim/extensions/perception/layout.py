@@ -27,7 +27,7 @@ class Shape:
     """Name of its object; `basin` or `seabed` for those, which no draw moves."""
     finish: Finish
     rest: np.ndarray
-    """Its pose, in the axes of the object that it moves with or of the world, (7,)."""
+    """Its pose [m, quaternion], in the axes of the object that it moves with or of the world, (7,)."""
     anchor: int = -1
     """Index of the drawn object that it moves with; -1: none."""
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -35,7 +35,7 @@ class Shape:
     vertices: np.ndarray | None = None
     """Vertices of a mesh, shape axes [m], (n, 3)."""
     faces: np.ndarray | None = None
-    """(m, 3)"""
+    """Faces by index of their corners, (m, 3)."""
     heights: np.ndarray | None = None
     """Heights of a heightfield: z [m], (ny, nx), row 0 at the least y."""
 
@@ -50,7 +50,7 @@ class WorldLayout:
     """
 
     transforms: wp.array
-    """Shape to world of every shape; transform (worlds, shapes)."""
+    """Shape to world of every shape [m, quaternion]; transform (worlds, shapes)."""
     scales: wp.array
     """Factor on the size of every shape [-]; float (worlds, shapes)."""
     draws: wp.array
@@ -89,7 +89,7 @@ class WorldLayout:
         """Draw poses of objects, water, look and colours of worlds; world w depends on its seed and w alone.
 
         Args:
-            seed: Of the draw, one for all worlds or one for each.
+            seed: Seed of the draw, one for all worlds or one for each.
             mask: Which worlds; all if None. (worlds,)
             held_out: From the looks that the file holds out of training, in place of the others; the file's own look
                 where it holds out none.

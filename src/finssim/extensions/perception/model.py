@@ -84,14 +84,14 @@ class Surface:
     """Optical and acoustic properties of a shape."""
 
     colour: wp.vec3  # diffuse reflectance
-    second: wp.vec3  # of every other square or band, and of joints
+    second: wp.vec3  # reflectance of every other square or band, and of joints
     texture: int  # a value of TEXTURES
     size: float  # of the pattern [m]
     contrast: float  # of a picture: its height over its width
     picture: int  # which
-    backscatter: float  # Lambert's parameter mu
-    glow: wp.vec3  # emitted radiance
-    inverse: wp.transform  # from world axes to the shape's
+    backscatter: float  # Lambert's parameter mu [-]
+    glow: wp.vec3  # emitted radiance [-]
+    inverse: wp.transform  # from world axes to the shape's [m, quaternion]
 
 
 @wp.struct
@@ -100,11 +100,11 @@ class Optics:
 
     attenuation: wp.array(dtype=wp.vec3)  # c [1/m]
     daylight_attenuation: wp.array(dtype=wp.vec3)  # K_d [1/m]
-    veil: wp.array(dtype=wp.vec3)  # B just below the surface
-    daylight: wp.array(dtype=wp.vec3)  # irradiance there
+    veil: wp.array(dtype=wp.vec3)  # B just below the surface [-]
+    daylight: wp.array(dtype=wp.vec3)  # irradiance there [-]
     sun: wp.array(dtype=wp.vec3)  # unit vector towards it
     diffuse: float  # share of the irradiance from everywhere above
-    sky: wp.array(dtype=wp.vec3)  # radiance through the surface
+    sky: wp.array(dtype=wp.vec3)  # radiance through the surface [-]
     snow: float  # particles per volume [1/m³]
     snow_size: float  # their diameter [m]
 

@@ -75,7 +75,7 @@ def to_side(arrays: TaskArrays, w: int, k: int, last: int, place: wp.vec3) -> wp
 
 @wp.func
 def place_now(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
-    """`by_net` of the vehicle."""
+    """Return `by_net` of the vehicle, in its units."""
     return by_net(arrays, w, state.position[w, 0])
 
 
@@ -267,7 +267,7 @@ class Net(SeeingTask):
     begin: tuple[float, float] = (-2.6, -2.1)
     """Along the net from its first corner at the start [m], ..."""
     off: float = 0.4
-    """... nearer or farther, ..."""
+    """... nearer or farther [m], ..."""
     over: float = 0.3
     """... above or below the line [m] at most, ..."""
     turn: float = math.radians(15.0)

@@ -50,7 +50,7 @@ class ModelPart:
     vertices: np.ndarray | None = None
     """Vertices of a mesh, shape axes [m], (n, 3)."""
     faces: np.ndarray | None = None
-    """(m, 3)"""
+    """Faces by index of their corners, (m, 3)."""
     colour: np.ndarray | None = None
     """Diffuse reflectance of red, green and blue; None if the file gives none, (3,)."""
 

@@ -163,6 +163,7 @@ class Pipeline(SeeingTask):
     name: str = "pipeline"
     world: str = "pipeline"
     time_limit: float = 45.0
+    """Length of an episode [s]."""
     hull: Hull = Hull()
     """Hull of the vehicle; the environment sets it."""
     height: float = 0.9
@@ -176,12 +177,13 @@ class Pipeline(SeeingTask):
     begin: tuple[float, float] = (2.0, 18.0)
     """Along the pipe at the start [m], ..."""
     aside: float = 0.5
-    """Greatest distance beside it, ..."""
+    """Greatest distance beside it [m], ..."""
     over: float = 0.2
     """... above or below the line [m] at most, ..."""
     turn: float = math.radians(20.0)
     """... turned from it by this at most [rad]."""
     ahead: tuple[float, float, float] = AHEAD
+    """The teacher sees where the pipe is so far ahead along it [m]."""
     reward: PipelineReward = field(default_factory=PipelineReward)
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Pipeline":
@@ -257,11 +259,11 @@ class Pipeline(SeeingTask):
 
 @wp.func
 def place_now(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
-    """`beside` of the vehicle."""
+    """Return `beside` of the vehicle, in its units."""
     return beside(arrays, w, state.position[w, 0])
 
 
 @wp.func
 def place_seen(arrays: TaskArrays, w: int) -> wp.vec4:
-    """`beside` of the vehicle, as measured."""
+    """Return `beside` of the vehicle, as measured, in its units."""
     return beside(arrays, w, arrays.position[w, 0])

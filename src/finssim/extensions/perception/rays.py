@@ -50,7 +50,8 @@ def camera_rays(lens: Lens, port: Port | None = None, samples: int = 1) -> Array
 
 
 def fan(device: SonarDevice, beams: int | None = None) -> Array:
-    """Rays of an imaging sonar, (elevations, beams, 2, 3): beam 0 at the left, elevation 0 at the bottom.
+    """Return the unit rays of an imaging sonar, (elevations, beams, 2, 3): beam 0 at the left, elevation 0 at the
+    bottom.
 
     Args:
         device: The sonar.

@@ -19,7 +19,7 @@ DEPTH_SCALE = 5.0
 
 @wp.func
 def up(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """The world's up, body frame."""
+    """Return the world's up, a unit vector, body frame."""
     return wp.quat_rotate_inv(arrays.quaternion[w, a], wp.vec3(0.0, 0.0, 1.0))
 
 

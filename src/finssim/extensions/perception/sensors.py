@@ -84,10 +84,10 @@ def poses_of(state: Any, poses: wp.array | None = None) -> wp.array:
 
     Args:
         state: Its `state`: `position` and `quaternion` by (world, vehicle).
-        poses: Filled, where given.
+        poses: Array for the poses [m, quaternion], filled where given.
 
     Returns:
-        Body to world of each vehicle, in order of world; transform (worlds · vehicles,).
+        Body to world of each vehicle [m, quaternion], in order of world; transform (worlds · vehicles,).
     """
     if poses is None:
         poses = wp.zeros(state.position.size, dtype=wp.transform, device=state.position.device)
@@ -101,13 +101,13 @@ class RayBatch:
 
     Args:
         batch: The worlds. Vehicles are in order of world, as many in each.
-        rays: The bundle, sensor axes, (rows, columns, 2, 3).
+        rays: The bundle of unit vectors, sensor axes, (rows, columns, 2, 3).
         mount: Where the sensor sits on its vehicle.
         vehicles: In each world.
     """
 
     reading: wp.array
-    """Result of `update`; one row for each vehicle."""
+    """Result of `update` in the unit of the sensor; one row for each vehicle."""
 
     def __init__(self, batch: WorldBatch, rays: np.ndarray, mount: Mount, vehicles: int = 1) -> None:
         self.batch, self.device, self.count = batch, batch.device, batch.worlds * vehicles
@@ -136,7 +136,7 @@ class RayBatch:
         """Trace the rays: depth from where each enters the water [m], index of the shape, normal.
 
         Args:
-            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
             mask: Which vehicles' sensors measure; the others' outputs stay. int (N,); all if None.
 
         Raises:
@@ -176,8 +176,10 @@ class Lamp:
 
     position: wp.vec3  # body axes [m]
     axis: wp.vec3  # of its beam, body axes, unit
-    intensity: wp.vec3  # irradiance at 1 m on its axis, without water, relative to daylight at the surface
-    cosine: float  # of the beam's half angle
+    intensity: (
+        wp.vec3
+    )  # irradiance [-] at 1 m on its axis, without water, relative to daylight at the surface
+    cosine: float  # cosine of the beam's half angle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,9 +200,11 @@ class Headlight:
 def mottled(local: wp.vec3, grain: wp.array2d(dtype=float)) -> float:
     """Random brightness at a point, about 0.
 
+    Brightness has no unit [-].
+
     Args:
-        local: Shape axes, in sizes of the pattern.
-        grain: A periodic field, sixteen patches along each side.
+        local: Point in shape axes, in sizes of the pattern [-].
+        grain: A periodic field [-], sixteen patches along each side.
     """
     # Skewed along z, so that upright faces have a pattern too.
     u = (local[0] + 0.37 * local[2]) / 16.0
@@ -224,10 +228,10 @@ def patterned(kind: int, local: wp.vec3, colour: wp.vec3, second: wp.vec3, contr
 
     Args:
         kind: A value of `TEXTURES`.
-        local: The point, shape axes, in sizes of the pattern.
-        colour: Of the one.
-        second: Of the other, or of joints.
-        contrast: From tile to tile.
+        local: The point, shape axes, in sizes of the pattern [-].
+        colour: Reflectance of the one.
+        second: Reflectance of the other, or of joints.
+        contrast: Contrast from tile to tile.
     """
     # A hair inside the face, so that points on it fall on one side of the pattern.
     cx = int(wp.floor(local[0] + 1.0e-3))
@@ -255,7 +259,7 @@ def painted(
     """Reflectance at a point of a face with a picture in its middle.
 
     Args:
-        pictures: All of them, row 0 at the top.
+        pictures: All pictures, row 0 at the top.
         index: Which.
         local: The point, shape axes, in widths of the picture.
         normal: Of the face, shape axes, unit [-].
@@ -292,10 +296,12 @@ def painted(
 def below_surface(ray: wp.vec3, veil: wp.vec3, sky: wp.vec3) -> wp.vec3:
     """Radiance that comes down through the still water surface, or is thrown back by it (Fresnel, Snell's window).
 
+    Radiances are relative to that of white paper [-].
+
     Args:
         ray: Unit direction from the eye upwards, world frame [-].
-        veil: Radiance of the water itself.
-        sky: Of what lies above.
+        veil: Radiance of the water itself [-].
+        sky: Radiance of what lies above [-].
     """
     out = refracted(ray, wp.vec3(0.0, 0.0, -1.0), WATER_INDEX)
     if out[2] <= 0.0:
@@ -309,6 +315,8 @@ def lamp_light(point: wp.vec3, lamp: Lamp, position: wp.vec3, axis: wp.vec3, att
     """Irradiance of a lamp at a point, and in the fourth number the distance.
 
     E = I f(angle) exp(-c r)/r², with f = 1/(1 + ((1 - cos angle)/(1 - cos half))²)
+
+    Irradiance is relative to daylight [-], the distance in [m].
 
     Args:
         point: World frame [m].
@@ -331,7 +339,7 @@ def lamp_light(point: wp.vec3, lamp: Lamp, position: wp.vec3, axis: wp.vec3, att
 
 @wp.func
 def rgb(light: wp.vec4) -> wp.vec3:
-    """Its first three numbers."""
+    """Return the first three numbers of a light, in its unit."""
     return wp.vec3(light[0], light[1], light[2])
 
 
@@ -350,11 +358,11 @@ def lamps_seen(
         ray: Unit direction, world frame.
         path: s, to the surface or the end of the water [m].
         normal: Of the surface, world frame, unit [-].
-        reflectance: rho; 0 where there is none.
+        reflectance: Reflectance rho; 0 where there is none.
         c: Beam attenuation [1/m].
-        veil: B.
+        veil: Radiance B [-].
         lamps: On the vehicle.
-        pose: Of the vehicle, body to world.
+        pose: Pose of the vehicle, body to world [m, quaternion].
     """
     radiance = wp.vec3(0.0)
     far = wp.min(path, 8.0)
@@ -394,12 +402,12 @@ def snow_seen(
         ray: Unit direction, world frame.
         path: To the surface or the end of the water [m].
         c: Beam attenuation [1/m].
-        daylight: At the eye's depth.
+        daylight: Irradiance at the eye's depth [-].
         density: Particles per volume [1/m³].
         size: Their diameter [m].
         pixel: Angle from pixel to pixel [rad].
         lamps: On the vehicle.
-        pose: Of the vehicle, body to world.
+        pose: Pose of the vehicle, body to world [m, quaternion].
     """
     cell = wp.pow(SNOW_SHARE / density, 1.0 / 3.0)
     light = wp.vec3(0.0)
@@ -662,9 +670,10 @@ class CameraBatch(RayBatch):
     """
 
     picture: wp.array
-    """Red, green, blue, row 0 at the top; uint8 (N, height, width, 3)."""
+    """Picture: red, green, blue, row 0 at the top; uint8 (N, height, width, 3)."""
     radiance: wp.array
-    """Before noise and gain, relative to white paper just below the surface; vec3 (N, height, width), or empty."""
+    """Radiance before noise and gain [-], relative to white paper just below the surface; vec3 (N, height, width), or
+    empty."""
     gain: wp.array
     """Share of the full scale that radiance 1 reaches in red, green, blue; vec3 (N,)."""
 
@@ -700,7 +709,7 @@ class CameraBatch(RayBatch):
         """Take a picture of each world.
 
         Args:
-            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
             seed: Of the noise; None for none.
             time: Of the pictures [s]: pictures of other times have other noise.
             mask: Which vehicles measure; the others keep their last. int (N,); all if None.
@@ -1045,9 +1054,9 @@ class SonarBatch(RayBatch):
     """
 
     intensity: wp.array
-    """Power after gain, relative to the source's level at 1 m; float (N, beams, bins), beam 0 at the left."""
+    """Power after gain [-], relative to the source's level at 1 m; float (N, beams, bins), beam 0 at the left."""
     picture: wp.array
-    """Its level between the device's `display` levels; uint8 (N, beams, bins)."""
+    """Picture: its level between the device's `display` levels; uint8 (N, beams, bins)."""
     ranges: wp.array
     """Range of a profiling sonar: first range with a level of `detection_db` and within 6 dB of the beam's loudest [m],
     infinite if there is none; float (N, beams)."""
@@ -1112,7 +1121,7 @@ class SonarBatch(RayBatch):
         """One ping of each vehicle.
 
         Args:
-            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
             seed: Of speckle and noise; None for the mean power.
             time: Of the ping [s]: pings of other times have other speckle.
             mask: Which vehicles measure; the others keep their last. int (N,); all if None.
@@ -1288,13 +1297,13 @@ class RangeBatch(RayBatch):
         """Measure.
 
         Args:
-            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
             seed: Of the noise; None for none.
             time: Of the measurement [s]: others have other noise.
             mask: Which vehicles measure; the others keep their last. int (N,); all if None.
 
         Returns:
-            `ranges`, which the next update overwrites.
+            `ranges` [m], which the next update overwrites.
         """
         self.cast(poses, mask)
         ranger, key = self.ranger, -1 if seed is None else noise_key(seed, time)
@@ -1370,7 +1379,8 @@ class DopplerBatch(RangeBatch):
         device: At least three beams; the speeds are those along the beams' middles.
         twists: nu of the vehicles, body frame [m/s, rad/s], read in each update, as a simulator's `state.velocity`;
             vec6 (worlds, vehicles).
-        lock: Filled in place of its own; that of a `finssim.sim.sensors.DvlBatch` makes that one lose the bottom too.
+        lock: Flags [0, 1] filled in place of its own; those of a `finssim.sim.sensors.DvlBatch` make that one lose the
+            bottom too.
 
     Raises:
         WorldError: The device has fewer beams.
@@ -1381,7 +1391,7 @@ class DopplerBatch(RangeBatch):
     velocity: wp.array
     """Velocity of the sensor, in its own axes [m/s], NaN without lock; float (N, 3)."""
     lock: wp.array
-    """Flag of at least three beams finding the bottom; int (worlds, vehicles)."""
+    """Flag [-] of at least three beams finding the bottom; int (worlds, vehicles)."""
 
     def __init__(
         self, batch: WorldBatch, device: RangeDevice, twists: wp.array, *, lock: wp.array | None = None
@@ -1402,13 +1412,13 @@ class DopplerBatch(RangeBatch):
         """Measure.
 
         Args:
-            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device.
+            poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
             seed: Of the noise; None for none.
             time: Of the measurement [s]: others have other noise.
             mask: Which vehicles measure; the others keep their last. int (N,); all if None.
 
         Returns:
-            `reading`: velocity, speeds and ranges in a row; float (N, 3 + 2 beams).
+            `reading`: velocity [m/s], speeds [m/s] and ranges [m] in a row; float (N, 3 + 2 beams).
         """
         super().update(poses, seed=seed, time=time, mask=mask)
         key = -1 if seed is None else noise_key(seed + 1, time)

@@ -251,7 +251,7 @@ class LineFollower(DriveBaseline):
         )  # fmt: skip
 
     def reset(self, n: int) -> Array:  # type: ignore[override]
-        """The line straight below and ahead, (n, 2)."""
+        """Return the line straight below and ahead as of `line`, (n, 2)."""
         return np.zeros((n, 2))
 
     def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
@@ -317,7 +317,7 @@ class Side(NamedTuple):
     right: Array
     """Along the line to the left from the point nearest to the vehicle: where it begins [m], (n,), ..."""
     left: Array
-    """... and where it ends."""
+    """... and where it ends [m]."""
 
     @property
     def nearest(self) -> Array:
@@ -394,7 +394,7 @@ class WallFollower(DriveBaseline):
         )  # fmt: skip
 
     def reset(self, n: int) -> Array:  # type: ignore[override]
-        """The net square ahead at its distance, and no integral of the speeds along x, y, z, (n, 5)."""
+        """Return the net square ahead at its distance [m, rad], and no integral of the speeds [m], (n, 5)."""
         return np.tile([self.distance, 0.0, 0.0, 0.0, 0.0], (n, 1))
 
     def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
@@ -460,7 +460,7 @@ class WallFollower(DriveBaseline):
 
         Args:
             x: Of the points, from the body origin [m], (n, points).
-            y: Likewise.
+            y: Likewise [m].
             weight: Likewise [-].
         """
         n, angles, step, rows = len(x), np.radians(np.arange(-48.0, 49.0, 3.0)), 0.05, 80

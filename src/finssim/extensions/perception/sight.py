@@ -206,18 +206,18 @@ class Sight:
         return out
 
     def arrays(self) -> Iterator[tuple[str, wp.array]]:
-        """The arrays on the device that decide what is seen next, by name."""
+        """The arrays on the device that decide what is seen next, by name. Each has the unit of its attribute."""
         yield from ((f"sight.{name}.gain", camera.gain) for name, camera in self._metered.items())
         for name, sensor in self._sensors.items():
             yield from ((f"sight.{name}.{key}", array) for key, array in sensor.arrays())
 
     def counters(self) -> dict[str, NDArray[Any]]:
-        """Return the remaining counters, as copies."""
+        """Return the remaining counts, as copies."""
         updates = np.array([sensor.updates for sensor in self._sensors.values()])
         return {"drawn": self.batch.drawn, "episodes": self._episodes.copy(), "updates": updates}
 
     def load_counters(self, saved: dict[str, NDArray[Any]]) -> None:
-        """Take what `counters` gave."""
+        """Take the counts that `counters` gave."""
         self.batch.drawn, self._episodes[:] = saved["drawn"], saved["episodes"]
         for sensor, updates in zip(self._sensors.values(), saved["updates"], strict=True):
             sensor.updates = int(updates)

@@ -42,17 +42,18 @@ class Pattern:
     """A tag as it should look, at n = m² points of a grid on its own plane."""
 
     points: Array
-    """x right, y down from the top left of the measured square, in edges; (n, 2)."""
+    """x right, y down from the top left of the measured square [edges]; (n, 2)."""
     values: Array
-    """0 black to 1 white, blurred; (n,)."""
+    """Grey, 0 black to 1 white, blurred; (n,)."""
     surround: Array
     """Weights of the local mean along a side of the grid, (m, m)."""
     columns: Array
     """Derivatives of the gray by 8 parameters of a homography, blur and gain, less their local means, (n, 10)."""
     solver: Array
-    """Their pseudo-inverse, (10, n)."""
+    """Their pseudo-inverse, parameters per grey level [-], (10, n)."""
     plain: Array
-    """Pseudo-inverse of derivatives by 8 parameters, offset and two slopes of the light, blur and gain, (13, n)."""
+    """Pseudo-inverse of derivatives by 8 parameters, offset and two slopes of the light, blur and gain, per grey level
+    [-], (13, n)."""
 
     def even(self, gray: Array) -> Array:
         """Gray at the points as under even light: less its local mean, over its local contrast, (n,)."""
@@ -77,7 +78,7 @@ class Pattern:
 
 
 def nearest_blur(blur: float) -> float:
-    """The blur of a pattern that comes nearest."""
+    """The blur of a pattern that comes nearest. Both in pixels."""
     return float(BLURS[np.abs(BLURS - blur).argmin()])
 
 
@@ -361,6 +362,7 @@ class Detector:
     family: str
     refine: str
     gamma: float
+    """Exponent gamma of the pictures: 1 linear, 2.2 video."""
     max_hamming: int
 
     def detect(self, image: npt.ArrayLike, region: Region | None = None) -> list[Detection]:

@@ -47,8 +47,10 @@ class Tilt:
 def in_body_axes(vector_s: npt.ArrayLike, orientation: npt.ArrayLike) -> Array:
     """Return the reading of an IMU in body axes.
 
+    The unit is kept.
+
     Args:
-        vector_s: Angular rate or specific force, sensor frame, (..., 3).
+        vector_s: Angular rate [rad/s] or specific force [m/s²], sensor frame, (..., 3).
         orientation: Sensor frame to body frame, xyzw: `sensors.imu.orientation` of the vehicle file.
     """
     return quat_rotate(orientation, vector_s)
@@ -131,7 +133,7 @@ class YawState:
 
     @property
     def P(self) -> Array:
-        """Covariance of yaw and bias, (..., 2, 2)."""
+        """Return the covariance of yaw [rad] and bias [rad/s], (..., 2, 2)."""
         rows = np.array([self.variance, self.cross, self.cross, self.bias_variance]).T
         return rows.reshape(*rows.shape[:-1], 2, 2)
 
@@ -176,7 +178,7 @@ class YawNoise:
 
 
 def yaw_rate(q: float, r: float, roll: float, pitch: float) -> float:
-    """Rate of yaw from body rates.
+    """Rate of yaw from body rates [rad/s].
 
     psi_dot = (q sin φ + r cos φ) / cos θ
 

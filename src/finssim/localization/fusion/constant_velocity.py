@@ -46,10 +46,13 @@ class PlaneTrack(Track):
     position_time: float = math.nan
     """Time of the position [s]; the IMU's samples advance yaw alone."""
     yaw_time: float = math.nan
+    """Time of the yaw [s]."""
     rate: float | None = None
     """Latest yaw rate [rad/s]."""
     roll: float = 0.0
+    """Latest roll [rad]."""
     pitch: float = 0.0
+    """Latest pitch [rad]."""
     tilt: Tilt | None = None
     """State of the tilt filter, for an IMU without an orientation."""
     compass: bool = False
@@ -104,7 +107,10 @@ class ConstantVelocity(Filter[PlaneTrack]):
     def update(
         self, track: PlaneTrack, name: str, sample: Sample, reading: Array
     ) -> tuple[PlaneTrack, Outcome]:
-        """Return the track after a sensor's reading (m,), and the verdict of its gate."""
+        """Return the track after a sensor's reading (m,), and the verdict of its gate.
+
+        The reading has the unit of the sensor.
+        """
         track, outcome = super().update(track, name, sample, reading)
         if name == "heading" and self.settings.aids is not None:
             # The compass's offset is in every sample: many are no better than one.

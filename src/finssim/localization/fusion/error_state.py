@@ -64,7 +64,10 @@ class InertialState(PositionState):
     """Offset of the compass [rad], scale error [-] and offset of the Doppler log [m/s], (..., 5); none: (0,)."""
 
     def moved(self, error: Array, P: Array) -> Self:
-        """Return the state corrected by an error (..., n), with a new covariance (..., n, n)."""
+        """Return the state corrected by an error (..., n), with a new covariance (..., n, n).
+
+        Errors have the units of the state.
+        """
         q = quat_multiply(quat_from_rotvec(error[..., A]), self.q)
         return changed(
             self,
@@ -170,7 +173,7 @@ def depth_model(state: InertialState, lever: Array, up: Array, offset: float) ->
     Args:
         state: The state.
         lever: The point from the IMU, body frame [m], (3,).
-        up: Normal of the surface, pool frame, (3,).
+        up: Unit normal of the surface, pool frame, (3,).
         offset: Height of p is up . p + offset [m].
     """
     point, H, *_ = position_model(state, lever)
@@ -239,6 +242,7 @@ class InertialTrack(Track):
     before: PlaneTrack
     """Track of the constant-velocity filters, from which this one starts once every sensor has given a sample."""
     time: float = math.nan
+    """Time of the state [s]."""
     omega: Vector = (0.0, 0.0, 0.0)
     """Latest angular rate, body frame [rad/s]."""
     force: Vector | None = None

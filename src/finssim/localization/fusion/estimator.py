@@ -196,14 +196,17 @@ class Health:
     age_vision: float
     """[s]; NaN before the first."""
     age_imu: float
+    """Age of the latest IMU sample [s]."""
     age_depth: float
+    """Age of the latest depth [s]."""
     reject_reason: str
     """Stream and reason of the latest refusal; empty before the first."""
     mahalanobis: dict[str, float]
-    """Squared distance of each stream's latest measurement."""
+    """Squared Mahalanobis distance [-] of each stream's latest measurement."""
     position_covariance: tuple[float, ...]
-    """Diagonal, position then velocity, (6,)."""
+    """Diagonal, position [m²] then velocity [m²/s²], (6,)."""
     yaw_covariance: float
+    """Variance of yaw [rad²]."""
     velocity_world: tuple[float, ...]
     """World axes [m/s]."""
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -241,7 +244,7 @@ def health_of(
         estimate: The estimate.
         settings: Limits of ages and variances.
         site: Turns velocities into world axes.
-        latest: Squared Mahalanobis distance of each stream's latest measurement.
+        latest: Squared Mahalanobis distance [-] of each stream's latest measurement.
         reason: Stream and reason of the latest refusal.
         counts: Stream -> verdict -> samples.
     """

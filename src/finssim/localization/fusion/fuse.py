@@ -88,7 +88,7 @@ def summary_of(
     Args:
         rows: Of the table.
         health: At the end.
-        nis: Stream -> sum of squared Mahalanobis distances and of their dimensions.
+        nis: Stream -> sum of squared Mahalanobis distances [-] and of their dimensions.
         truth: Where the vehicle really was, if known.
     """
     modes = Counter(row[COLUMNS.index("state")] for row in rows)

@@ -42,7 +42,7 @@ class StreamTable:
     t: Array
     """Times as in the file, (n,) [s]."""
     numbers: dict[str, Array]
-    """Column, in lower case -> values, (n,)."""
+    """Column, in lower case -> values in the unit of the table, (n,)."""
     words: dict[str, list[str]]
     """Columns that hold words."""
     notes: list[str] = field(default_factory=list)
@@ -52,7 +52,7 @@ class StreamTable:
         return all(name in self.numbers and np.isfinite(self.numbers[name]).any() for name in names)
 
     def columns(self, *names: str) -> Array:
-        """Columns side by side, (n, len(names))."""
+        """Return columns side by side in the unit of the table, (n, len(names))."""
         return np.stack([self.numbers[name] for name in names], axis=-1)
 
     def angle(self, name: str) -> Array:
@@ -100,7 +100,7 @@ class Series:
     t: Array
     """[s], rising, (n,)."""
     values: Array
-    """(n, k)"""
+    """Values in the unit of the quantity, (n, k)."""
     longest_gap: float
     """Longest gap between samples that is interpolated [s]."""
 
@@ -131,6 +131,8 @@ class Series:
 
 def series(quantity: str, t: Array, values: Array, longest_gap: float, *, label: str) -> Series:
     """Sort samples by time and leave out those without any number; of equal times the last is taken.
+
+    Times are in [s], values in the unit of the quantity.
 
     Raises:
         LocalizationError: None is left.
@@ -295,7 +297,7 @@ class ImuColumns(NamedTuple):
     up: Array | None
     """Unit vectors upwards, (n, 3); None without an attitude."""
     mount: Array
-    """Axes of the columns to body axes, xyzw, (4,)."""
+    """Quaternion from the axes of the columns to body axes, xyzw, (4,)."""
 
 
 def imu_columns(table: StreamTable, sensor: Imu | None) -> ImuColumns:
@@ -434,5 +436,5 @@ def _three(values: Array) -> tuple[float, float, float]:
 
 
 def rows_of(R: Array) -> tuple[tuple[float, float, float], ...]:
-    """The rows of a matrix (3, 3) as plain numbers."""
+    """The rows of a matrix (3, 3) as plain numbers. The unit is kept."""
     return tuple(_three(row) for row in R)

@@ -41,21 +41,21 @@ class Settings:
     """Settings of the estimator. Times in seconds."""
 
     fresh: float = 0.25
-    """Age of vision up to which the state is called fresh."""
+    """Age of vision up to which the state is called fresh [s]."""
     coast: float = 0.75
-    """Time up to which velocity is extrapolated."""
+    """Time up to which velocity is extrapolated [s]."""
     hold: float = 3.0
-    """Time up to which velocity decays; beyond it the position is constant and its covariance grows."""
+    """Time [s] up to which velocity decays; beyond it the position is constant and its covariance grows."""
     imu_fresh: float = 0.10
     depth_fresh: float = 0.30
     horizon: float = 1.0
-    """Greatest delay of a sample that is still inserted at its time."""
+    """Greatest delay of a sample that is still inserted at its time [s]."""
     jump: float = 1.0
-    """Greatest lead of a stamp over its arrival before the clock is doubted."""
+    """Greatest lead of a stamp over its arrival before the clock is doubted [s]."""
     gate: Gate = Gate()
     motion: Motion = Motion()
     half_life: float = 1.0
-    """Half-life of velocity while the state is held."""
+    """Half-life of velocity while the state is held [s]."""
     speed_std: float = 0.3
     """Speed per axis that the vehicle may have when nothing is known [m/s]."""
     largest_variance: float = 100.0
@@ -102,7 +102,7 @@ class Site:
     """Numbers of pool and vehicle that the fusion needs."""
 
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Normal of the still surface, upwards, pool frame."""
+    """Unit normal of the still surface, upwards, pool frame."""
     offset: float = 0.0
     """Height of a point p above the surface is up . p + offset [m]."""
     depth_port: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -114,7 +114,7 @@ class Site:
     gravity: float = 9.81
     """[m/s²]"""
     R_wp: tuple[tuple[float, float, float], ...] = field(default=((1, 0, 0), (0, 1, 0), (0, 0, 1)))
-    """Pool axes to world axes, for velocities in the report."""
+    """Rotation matrix from pool axes to world axes, for velocities in the report."""
 
 
 def site_of(pool: Pool | None, vehicle: Vehicle) -> Site:

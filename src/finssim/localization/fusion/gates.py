@@ -37,7 +37,7 @@ class Gate:
     """Least number of these measurements."""
 
     def limit(self, dimension: int) -> float:
-        """Return the largest squared Mahalanobis distance that passes, for a measurement of that many numbers."""
+        """Return the largest squared Mahalanobis distance that passes, for a measurement of that many numbers [-]."""
         return _quantile(dimension, self.probability)
 
 
@@ -50,9 +50,9 @@ class Suspects:
     time: float
     """Time of the latest [s]."""
     value: tuple[float, ...]
-    """Latest value."""
+    """Latest value, in the unit of the measurement."""
     covariance: tuple[tuple[float, ...], ...]
-    """Covariance of the latest value."""
+    """Covariance of the latest value, in its unit."""
     hits: int = 1
     """Number of measurements that agree."""
     misses: int = 0
@@ -70,8 +70,8 @@ def remember(
     Args:
         suspects: Run so far; None after an accepted measurement.
         time: Time of the measurement [s].
-        value: The measurement, (n,).
-        covariance: Its covariance, (n, n).
+        value: The measurement in its unit, (n,).
+        covariance: Its covariance in its unit, (n, n).
         drift: Largest rate of change of the quantity [units/s].
         gate: The gate.
     """
@@ -149,8 +149,8 @@ def judge(
         gate: The gate.
         memory: Memory before; support 0 where there is no state yet.
         time: Time of the measurement [s].
-        value: Number or numbers compared among refused measurements, (n,).
-        covariance: Covariance of `value`, (n, n).
+        value: Number or numbers compared among refused measurements, in the unit of the measurement, (n,).
+        covariance: Covariance of `value` in its unit, (n, n).
         distance: Squared Mahalanobis distance of the measurement from its prediction [-].
         drift: Largest rate of change of `value` [units/s].
 

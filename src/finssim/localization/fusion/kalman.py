@@ -19,11 +19,11 @@ class Innovation:
     """Difference between a measurement and its prediction."""
 
     residual: Array
-    """Measured minus predicted, (..., m)."""
+    """Measured minus predicted, in the unit of the measurement, (..., m)."""
     H: Array
-    """Jacobian of the prediction with respect to the errors, (..., m, n)."""
+    """Jacobian of the prediction with respect to the errors, in their units, (..., m, n)."""
     R: Array
-    """Covariance of the measurement, (..., m, m)."""
+    """Covariance of the measurement in its unit, (..., m, m)."""
     mahalanobis: Number
     """Squared Mahalanobis distance, (...)."""
     gain: Any
@@ -34,19 +34,22 @@ class MatrixState:
     """State of a filter with n errors and the covariance of them."""
 
     P: Array
-    """Covariance of the errors, (..., n, n)."""
+    """Covariance of the errors in their units, (..., n, n)."""
 
     def moved(self, error: Array, P: Array) -> Self:
-        """Return the state corrected by an error (..., n), with a new covariance (..., n, n)."""
+        """Return the state corrected by an error (..., n), with a new covariance (..., n, n).
+
+        Errors have the units of the state.
+        """
         raise NotImplementedError
 
     def innovation(self, residual: Array, H: Array, R: Array) -> Innovation:
         """Compare a measurement with its prediction.
 
         Args:
-            residual: Measured minus predicted, (..., m).
-            H: Jacobian of the prediction with respect to the errors, (..., m, n).
-            R: Covariance of the measurement, (..., m, m).
+            residual: Measured minus predicted, in the unit of the measurement, (..., m).
+            H: Jacobian of the prediction with respect to the errors, in their units, (..., m, n).
+            R: Covariance of the measurement in its unit, (..., m, m).
         """
         PHt = self.P @ H.swapaxes(-1, -2)
         inverse = _inverse(H @ PHt + R)
@@ -85,7 +88,10 @@ def _identity(n: int) -> Array:
 
 
 def bounded(P: Array, limits: Array) -> Array:
-    """Return a covariance (..., n, n) with variances up to `limits` (n,): rows and columns beyond are scaled down."""
+    """Return a covariance (..., n, n) with variances up to `limits` (n,): rows and columns beyond are scaled down.
+
+    The units are those of the errors.
+    """
     d = P.diagonal(axis1=-2, axis2=-1)
     if (d <= limits).all():
         return P
@@ -94,7 +100,10 @@ def bounded(P: Array, limits: Array) -> Array:
 
 
 def isolated(P: Array, rows: list[int], block: Array) -> Array:
-    """Return a covariance (..., n, n) with some errors uncorrelated with the others, and `block` as their own."""
+    """Return a covariance (..., n, n) with some errors uncorrelated with the others, and `block` as their own.
+
+    The units are those of the errors.
+    """
     P = P.copy()
     P[..., rows, :] = 0.0
     P[..., :, rows] = 0.0

@@ -25,10 +25,13 @@ class PositionState(MatrixState):
     x: Array
     """Position [m] and velocity [m/s], pool frame, (..., 6)."""
     P: Array
-    """Covariance of the errors, those of `x` first, (..., n, n)."""
+    """Covariance of the errors in their units, those of `x` first, (..., n, n)."""
 
     def moved(self, error: Array, P: Array) -> Self:
-        """Return the state corrected by an error (..., n), with a new covariance (..., n, n)."""
+        """Return the state corrected by an error (..., n), with a new covariance (..., n, n).
+
+        Errors have the units of the state.
+        """
         return changed(self, x=self.x + error, P=P)
 
 

@@ -128,11 +128,12 @@ class Prediction(NamedTuple):
     """Quantity that a filter predicts."""
 
     value: Array
-    """Value, (m,)."""
+    """Value in the unit of the measurement, (m,)."""
     H: Array
-    """Jacobian with respect to the errors of `part`, (m, n)."""
+    """Jacobian with respect to the errors of `part`, in their units, (m, n)."""
     doubt: Array | float | None = None
-    """Covariance of errors that the filter does not estimate, such as an offset of the sensor, (m, m); None: zero."""
+    """Covariance of errors that the filter does not estimate, such as an offset of the sensor, in the unit of the
+    measurement, (m, m); None: zero."""
     turning: float = 0.0
     """Variance of a rotation that the filter does not estimate [rad²]; it is multiplied by the reading's square."""
     part: str = "state"
@@ -148,6 +149,7 @@ class Track:
     seen: Mapping[str, float] = field(default_factory=dict)
     """Sensor -> time of its latest accepted reading [s]."""
     imu_time: float | None = None
+    """Time of the latest IMU sample [s]; None before the first."""
 
     @property
     def aided(self) -> float:
@@ -252,6 +254,8 @@ class Filter(ABC, Generic[T]):
         """Return the track after a sensor's reading (m,), and the verdict of its gate.
 
         A run of refused readings starts what the sensor's entry names, or corrects where it names nothing.
+
+        The reading has the unit of the sensor.
         """
         sensor = SENSORS[name]
         predicted: Prediction | str = getattr(self, sensor.quantity)(track)

@@ -157,7 +157,7 @@ class Outcome:
     verdict: str
     """`accepted`, `initialized` or `reacquired`; else why it was refused: `gate`, `duplicate`, `too late`, ..."""
     mahalanobis: float = math.nan
-    """Squared distance from the prediction."""
+    """Squared Mahalanobis distance from the prediction [-]."""
     dimension: int = 0
 
     @property
@@ -171,24 +171,30 @@ class Estimate:
     """Pose of the vehicle at one time. NaN: not known yet."""
 
     time: float
+    """Time of the pose [s]."""
     x: Array
     """Position [m] and velocity [m/s] of the body origin, pool frame, (6,)."""
     P: Array
-    """Covariance of `x`, (6, 6)."""
+    """Covariance of `x` [m, m/s], (6, 6)."""
     yaw: float
     """[rad]"""
     yaw_variance: float
+    """Variance of yaw [rad²]."""
     yaw_rate: float
     """[rad/s]"""
     roll: float
+    """[rad]"""
     pitch: float
+    """[rad]"""
     vision_time: float | None
     """Time of the latest position fix that was believed [s]."""
     depth_time: float | None
+    """Time of the latest depth [s]."""
     imu_time: float | None
+    """Time of the latest IMU sample [s]."""
     velocity_time: float | None = None
     """Time of the latest Doppler velocity that was believed [s]."""
 
     def std(self) -> Array:
-        """Standard deviations of position, velocity and yaw, (7,)."""
+        """Return the standard deviations of position [m], velocity [m/s] and yaw [rad], (7,)."""
         return np.asarray(np.sqrt(np.array([*self.P.diagonal().tolist(), self.yaw_variance])))

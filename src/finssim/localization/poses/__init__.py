@@ -106,7 +106,7 @@ class Measurement:
 
     @property
     def quaternion(self) -> Array:
-        """q_pb, xyzw, (4,)."""
+        """Return the quaternion q_pb, xyzw, (4,)."""
         return matrix_to_quat(self.rotation)
 
     @property
@@ -132,9 +132,9 @@ def tilt_matrix(roll: float, pitch: float) -> Array:
 
 
 def axes_of_up(up: npt.ArrayLike) -> Array:
-    """R_pg: a frame g with z along `up`, turned as little as possible from the pool frame, (3, 3).
+    """Return the rotation matrix R_pg of a frame g with z along the vector `up`, (3, 3).
 
-    Straight upside down it is a half turn about x.
+    It is turned as little as possible from the pool frame; straight upside down it is a half turn about x.
     """
     x, y, z = (float(a) for a in np.asarray(up, float))
     if z < -1.0 + 1e-12:

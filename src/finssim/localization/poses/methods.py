@@ -52,7 +52,7 @@ class RigidFit:
     inverse: Array
     """Inverse of the weighted J'J [m², rad² per px²], (3, 3)."""
     weighted_J: Array
-    """The curvature of rho times J, (n, 2, 3)."""
+    """The curvature of rho times J [-, m], (n, 2, 3)."""
     A: Array
     """[px/m], (n, 2, 2)."""
     missed: Array
@@ -72,7 +72,7 @@ class RigidFit:
             shared: Change of each point Q - P per unit of each error, (k, n, 2).
 
         Returns:
-            (3, k)
+            Changes [m, m, rad] per unit of the errors, (3, k).
         """
         in_pixels = (self.A @ shared[..., None])[..., 0].reshape(len(shared), -1)
         return np.asarray(-self.inverse @ (in_pixels @ self.weighted_J.reshape(-1, 3)).T)
@@ -276,7 +276,7 @@ def corner_points(pool: Pool, R_pg: Array, pixels: Array, heights: Array, *, str
 
     Args:
         pool: Camera and interface.
-        R_pg: Frame g, whose z axis points up, to the pool frame, (3, 3).
+        R_pg: Rotation matrix from frame g, whose z axis points up, to the pool frame, (3, 3).
         pixels: (n, 2).
         heights: Along the z axis of g, from the pool's origin [m], (n,).
         straight: Leave the water out.
@@ -595,7 +595,7 @@ def tag_poses(rays_p: Array, centre_p: Array, points_b: Array) -> list[tuple[Arr
         points_b: Its corners, body frame [m], (4, 3).
 
     Returns:
-        t_pb and R_pb of each; none where the corners show no square.
+        t_pb [m] and R_pb of each; none where the corners show no square.
     """
     x, y = points_b[1] - points_b[0], points_b[0] - points_b[3]
     x, z = x / np.linalg.norm(x), np.cross(x, y)
@@ -612,7 +612,7 @@ def mirrored(R_pb: Array, sight_p: Array, normal_b: Array) -> Array:
     """The other attitude in which something flat looks the same from far.
 
     Args:
-        R_pb: The one, (3, 3).
+        R_pb: Rotation matrix of the one, (3, 3).
         sight_p: Unit vector along the line of sight, pool frame [-], (3,).
         normal_b: Unit normal of the flat thing, body frame [-], (3,).
     """
@@ -652,12 +652,13 @@ class RefinedPose:
     missed: Array
     """Distance of each point from its pixel [px], (n,)."""
     H: Array
-    """Weighted J'J by position, a turn about pool axes and, with prior knowledge, the shift, (6, 6) or (8, 8)."""
+    """Weighted J'J by position [m], a turn about pool axes [rad] and, with prior knowledge, the shift, (6, 6) or (8,
+    8)."""
     curvature: Array
-    """Matrix of the steps: H, with prior knowledge without the part along the residual of far points, where Huber's rho
-    is not curved."""
+    """Matrix of the steps, as H: with prior knowledge it is without the part along the residual of far points, where
+    Huber's rho is not curved. The units are those of `H`."""
     g: Array
-    """Slope of half the cost, (6,) or (8,)."""
+    """Slope of half the cost by the unknowns of `H`, per unit of these, (6,) or (8,)."""
     iterations: int = 0
     converged: bool = False
 
@@ -667,8 +668,10 @@ class RefinedPose:
         return math.sqrt(float(self.missed @ self.missed) / len(self.missed))
 
     def covariance(self, pixel_std: float) -> Array:
-        """Return the covariance of position and a turn about pool axes, (6, 6); without prior knowledge it is enlarged
-        if the residuals exceed the noise by far."""
+        """Return the covariance of position [m] and a turn about pool axes [rad], (6, 6).
+
+        Without prior knowledge it is enlarged if the residuals exceed the noise by far.
+        """
         factor = _inflation(self.missed, 6, pixel_std) if len(self.H) == 6 else 1.0
         scale = 1.0 / np.sqrt(np.diagonal(self.H))
         inverse = np.linalg.pinv(self.H * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
@@ -768,7 +771,7 @@ def through_lens(lens: Lens, R: Array | None = None, position: Array | None = No
 
     Args:
         lens: Of the camera.
-        R: Optical axes to those of the points, (3, 3).
+        R: Rotation matrix from optical axes to those of the points, (3, 3).
         position: Of the camera in their frame [m], (3,).
     """
     R, position = np.eye(3) if R is None else R, np.zeros(3) if position is None else position
@@ -817,7 +820,7 @@ def minima_from(
     Args:
         see: Where points appear.
         pairs: The corners.
-        starts: t_pb and R_pb of each.
+        starts: t_pb [m] and R_pb of each.
         huber: Distance [px] from which on Huber's rho grows linearly.
     """
     points, pixels = pairs.points_b, pairs.pixels
@@ -832,7 +835,7 @@ class Choice:
     best: RefinedPose
     second: RefinedPose | None
     gap: float
-    """Difference of chi² of the second solution; infinite if there is none."""
+    """Difference of chi² of the second solution; infinite if there is none [-]."""
 
     @property
     def turned(self) -> float:
@@ -880,7 +883,7 @@ def choose(minima: list[RefinedPose], constraints: Constraints | None, pixel_std
 def measured(
     method: str, pose: RefinedPose, covariance: Array, pairs: Correspondences, medium: str = ""
 ) -> Measurement:
-    """The measurement that a pose is, with its covariance (6, 6)."""
+    """The measurement that a pose is, with its covariance (6, 6). The covariance is in [m] and [rad]."""
     x, y, z = pose.rotation[:, 0]
     rows = np.zeros((3, 6))
     rows[0, 0] = rows[1, 1] = 1.0
@@ -960,9 +963,9 @@ def pinhole_depth(
     constraints: Constraints | None,
     pixel_std: float = 0.5,
 ) -> Measurement:
-    """Measure x, y and yaw at a known height and tilt with straight rays, as if there were no water.
+    """Measure x, y [m] and yaw [rad] at a known height and tilt with straight rays, as if there were no water.
 
-    It is `planar_fit` with rays that do not bend; arguments as there.
+    It is `planar_fit` with rays that do not bend; arguments as of `planar_fit`.
     """
     return planar_fit(detections, pool, tags_b, constraints, pixel_std, straight=True)
 
