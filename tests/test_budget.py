@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from finssim.core import budget
-from finssim.core.mcap_files import CHUNK, MAGIC, _record_end
+from finssim.core.mcap_files import CHUNK, MAGIC, _record
 from finssim.localization import LocalizationError
 from finssim.localization.detection.pictures import read_picture, write_picture
 from finssim.robot.pictures import picture_of
@@ -77,7 +77,7 @@ def test_a_chunk_is_unpacked_up_to_its_bound():
         chunk = struct.pack("<QQQII", 0, 0, size, zlib.crc32(bytes(size)), 4) + b"zstd"
         chunk += struct.pack("<Q", len(packed)) + packed
         data = MAGIC + struct.pack("<BQ", CHUNK, len(chunk)) + chunk
-        assert (_record_end(data, len(MAGIC)) is not None) == sound
+        assert (_record(data, len(MAGIC)) is not None) == sound
 
 
 def test_a_packed_table_says_how_long_it_is(tmp_path):

@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 
 from finssim.robot.messages import Telemetry
 from finssim.robot.record_messages import RecordError, types
-from finssim.robot.record_reader import info, open_record, play_record, repair_record, write_whole
+from finssim.robot.record_reader import info, open_record, play_record, repair_record
 from finssim.robot.recorder import Recorder
 from finssim.vehicles import load_vehicle
 
@@ -125,15 +125,14 @@ def test_a_record_without_its_header_is_read(run, tmp_path):
     assert depths(damaged) == depths(run)
 
 
-def test_damage_that_has_no_message_is_named_by_its_kind(run, tmp_path):
-    """The reader raises an error without one where a file ends between two of its records."""
-    cut, notes, data, at = tmp_path / "cut.mcap", [], run.read_bytes(), 8
+def test_a_file_that_ends_between_two_records_is_cut(run, tmp_path):
+    """Nothing in it is broken; its end is missing."""
+    cut, data, at = tmp_path / "cut.mcap", run.read_bytes(), 8
     while at < run.stat().st_size // 2:
         at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
     cut.write_bytes(data[:at])
-    write_whole(cut, tmp_path / "copy.mcap", notes)
-    assert notes == ["cut.mcap is damaged and was read up to there: EndOfFile"]
-    assert depths(tmp_path / "copy.mcap")
+    assert repair_record(cut, tmp_path / "copy.mcap") == ["cut.mcap is cut off and was read up to the cut"]
+    assert depths(tmp_path / "copy.mcap") == depths(cut) != []
 
 
 @pytest.mark.parametrize("repeated", [True, False])

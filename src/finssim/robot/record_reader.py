@@ -10,15 +10,14 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from finssim.core.files import atomic_write
-from finssim.core.mcap_files import MAGIC, intact_mcap
+from finssim.core.mcap_files import MAGIC, intact_mcap, write_intact
 from finssim.core.yaml_file import json_value
 from finssim.robot.record_messages import METADATA, RecordError, types
 
@@ -63,8 +62,8 @@ def repair_record(path: Path, out: Path) -> list[str]:
     if out.resolve() == path.resolve():
         raise RecordError(f"{path}: cannot be repaired into itself: give another file with --out")
     notes: list[str] = []
-    with intact_mcap(path, notes) as complete, atomic_write(out) as temporary:
-        write_whole(complete, temporary, notes)
+    with atomic_write(out) as temporary:
+        write_intact(path, temporary, notes)
     return notes
 
 
@@ -81,48 +80,6 @@ def refuse_foreign(path: Path) -> None:
         raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None
     if begins != MAGIC:
         raise RecordError(f"{path}: is no MCAP file: expected a record that FinsSim or rosbag2 wrote")
-
-
-def write_whole(source: Path, target: Path, notes: list[str]) -> None:
-    """Copy every record of a file, as far as it can be read, into one with an index."""
-    from mcap import records
-    from mcap.stream_reader import StreamReader
-    from mcap.writer import CompressionType, Writer
-
-    schemas, channels, started = {0: 0}, dict[int, int](), False  # numbered again
-    with source.open("rb") as reading, target.open("wb") as writing:
-        writer = Writer(writing, compression=CompressionType.LZ4)
-        try:
-            for record in StreamReader(reading, validate_crcs=True).records:
-                if not started:  # a header comes first, unless it was damaged
-                    header = record if isinstance(record, records.Header) else records.Header("", "")
-                    writer.start(header.profile, header.library)
-                    started = True
-                match record:
-                    case records.Schema() if record.id not in schemas:
-                        schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
-                    case records.Channel() if record.id not in channels:
-                        kind, schema = record.message_encoding, schemas[record.schema_id]
-                        channels[record.id] = writer.register_channel(
-                            record.topic, kind, schema, record.metadata
-                        )
-                    case records.Message() if record.channel_id in channels:
-                        channel = channels[record.channel_id]
-                        writer.add_message(
-                            channel, record.log_time, record.data, record.publish_time, record.sequence
-                        )
-                    case records.Metadata():
-                        writer.add_metadata(record.name, record.metadata)
-                    case records.Attachment():
-                        writer.add_attachment(
-                            record.create_time, record.log_time, record.name, record.media_type, record.data
-                        )
-        except Exception as error:  # damage shows in whatever layer meets it
-            reason = str(error).partition("\n")[0] or type(error).__name__
-            notes.append(f"{source.name} is damaged and was read up to there: {reason}")
-        if not started:
-            writer.start()
-        writer.finish()
 
 
 class Entry(NamedTuple):
@@ -231,27 +188,8 @@ def open_record(path: Path | str) -> Iterator[Record]:
     path = Path(path)
     refuse_foreign(path)
     notes: list[str] = []
-    with ExitStack() as stack:
-        complete = stack.enter_context(intact_mcap(path, notes))
-        file = stack.enter_context(complete.open("rb"))
-        if not _indexed(file):
-            copy = Path(stack.enter_context(TemporaryDirectory())) / path.name
-            write_whole(complete, copy, notes)
-            file = stack.enter_context(copy.open("rb"))
+    with intact_mcap(path, notes) as complete, complete.open("rb") as file:
         yield Record(path, make_reader(file), tuple(notes))
-
-
-def _indexed(file: Any) -> bool:
-    """Return whether the file has a readable summary, with the schemas of all its channels."""
-    from mcap.reader import make_reader
-
-    try:
-        summary = make_reader(file).get_summary()
-        return summary is not None and all(
-            c.schema_id in (0, *summary.schemas) for c in summary.channels.values()
-        )
-    except Exception:  # a damaged summary breaks in whatever layer reads it; the data are read without it
-        return False
 
 
 # What a record holds, in figures: topics, rates, gaps, events.
