@@ -133,6 +133,7 @@ HOMES = {
     "pupil_apriltags": {"localization/detection/families.py"},
     "serial": {"robot/links/transports.py"},
     "mcap": {
+        "core/mcap_files.py",
         "trials/importers/ardusub.py",
         "robot/recorder.py",
         "robot/record_reader.py",
