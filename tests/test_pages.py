@@ -6,6 +6,7 @@ import re
 import runpy
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -152,29 +153,40 @@ def test_files_that_a_page_names_exist(page):
     assert missing == []
 
 
-def imports_of(text: str) -> set[str]:
-    """Modules of FinsSim that Python code imports or imports from."""
+def texts() -> dict[Path, str]:
+    """Python code of every page, example and notebook by its file."""
+    found = {page: "\n".join(blocks(page, "py(?:thon)?")) for page in [*PAGES, ROOT / "README.md"]}
+    found |= {file: file.read_text(encoding="utf-8") for file in (ROOT / "examples").rglob("*.py")}
+    for file in (ROOT / "examples").rglob("*.ipynb"):
+        cells = json.loads(file.read_text(encoding="utf-8"))["cells"]
+        lines = [line for cell in cells if cell["cell_type"] == "code" for line in [*cell["source"], "\n"]]
+        found[file] = "".join(line for line in lines if not line.startswith("%"))
+    return found
+
+
+def imports_of(text: str) -> set[tuple[str, str]]:
+    """Modules of FinsSim that Python code imports, and what it imports from them; "" for the module itself."""
     names = set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            names |= {(alias.name, "") for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            names.add(str(node.module))
-    return {name for name in names if name.partition(".")[0] == "finssim"}
+            names |= {(str(node.module), alias.name) for alias in node.names}
+    return {(module, name) for module, name in names if module.partition(".")[0] == "finssim"}
 
 
 def test_pages_and_examples_import_from_finssim_or_one_of_its_packages():
     """Readers see the names that packages export; where these are defined may change."""
-    texts = {page: "\n".join(blocks(page, "py(?:thon)?")) for page in [*PAGES, ROOT / "README.md"]}
-    texts |= {file: file.read_text(encoding="utf-8") for file in (ROOT / "examples").rglob("*.py")}
-    for file in (ROOT / "examples").rglob("*.ipynb"):
-        cells = json.loads(file.read_text(encoding="utf-8"))["cells"]
-        lines = [line for cell in cells if cell["cell_type"] == "code" for line in [*cell["source"], "\n"]]
-        texts[file] = "".join(line for line in lines if not line.startswith("%"))
-    deeper = {
-        (file.relative_to(ROOT).as_posix(), name)
-        for file, text in texts.items()
-        for name in imports_of(text)
-        if name.count(".") > (2 if name.startswith("finssim.extensions.") else 1)
-    }
-    assert not deeper
+    deeper, unknown = set(), set()
+    for file, text in texts().items():
+        for module, name in imports_of(text):
+            about = (file.relative_to(ROOT).as_posix(), module, name)
+            if module.count(".") > (2 if module.startswith("finssim.extensions.") else 1):
+                deeper.add(about)
+            folder = ROOT / "src" / module.replace(".", "/")
+            modules = {path.stem for path in folder.glob("*.py")} | {
+                path.parent.name for path in folder.glob("*/__init__.py")
+            }
+            if name not in {"", *modules, *import_module(module).__all__}:
+                unknown.add(about)
+    assert not deeper and not unknown

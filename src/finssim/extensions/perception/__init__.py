@@ -5,18 +5,13 @@
 reads what its devices are starts without Warp.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from finssim.extensions.perception.description import (
-    World,
-    WorldError,
-    load_world,
-    sites,
-)
+from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
     from finssim.extensions.perception.delivery import Delivery
+    from finssim.extensions.perception.description import World, WorldError, load_world, sites
     from finssim.extensions.perception.layout import WorldLayout
     from finssim.extensions.perception.model import WorldBatch
     from finssim.extensions.perception.sensors import (
@@ -46,9 +41,4 @@ __all__ = [
     "sites",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = {"Delivery": "delivery", "WorldBatch": "model", "WorldLayout": "layout"}.get(name, "sensors")
-    return getattr(import_module(f"finssim.extensions.perception.{home}"), name)
+__getattr__, __dir__ = exports(__name__)
