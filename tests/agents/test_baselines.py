@@ -165,4 +165,4 @@ def test_a_subclass_under_another_name_has_the_baselines_alone_that_it_defines()
 
 def test_every_task_has_a_baseline():
     """Something honest to beat."""
-    assert all(baselines_of(task) for task in TASKS)
+    assert all(baselines_of(task) for task in TASKS.usable())

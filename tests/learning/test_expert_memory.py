@@ -6,13 +6,11 @@ import pytest
 from finssim.agents.catalogue import baseline, baselines_of
 from finssim.agents.memory import memory_from, memory_leaves
 from finssim.learning.resume import read_state, write_state
-from finssim.tasks import TASKS, make
+from finssim.tasks import make, numeric_tasks
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "task", [task for task in TASKS if not TASKS[task]().pictures and baselines_of(task)]
-)
+@pytest.mark.parametrize("task", [task for task in numeric_tasks() if baselines_of(task)])
 def test_every_baselines_memory_survives(task, tmp_path):
     """After one action of three rows: from disk it gives the same second action."""
     who = baseline(task, next(iter(baselines_of(task))))

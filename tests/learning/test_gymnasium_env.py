@@ -11,9 +11,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from finssim.extensions.perception.camera_docking import CameraDocking
 from finssim.learning.gymnasium_env import Env, VectorEnv
-from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping, numeric_tasks
+from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping, numeric_tasks, task_named
 
 SHORT = StationKeeping(time_limit=0.5)
 ALONE = [name for name in numeric_tasks() if len(TASKS[name].agents) == 1]
@@ -217,7 +216,7 @@ def test_a_task_that_sees_has_a_dictionary_of_observations():
     assert net.observation_space["sonar"].shape == (128, 48, 1)
     assert net.reset(seed=1)[0] in net.observation_space
     for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
-        batch = VectorEnv(2, CameraDocking(time_limit=0.2), autoreset_mode=mode)
+        batch = VectorEnv(2, task_named("camera-docking", time_limit=0.2), autoreset_mode=mode)
         first, _ = batch.reset(seed=3)
         second = batch.step(np.zeros((2, 6)))[0]
         third, _, _, ended, info = batch.step(np.zeros((2, 6)))

@@ -7,12 +7,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import VecCheckNan
 
-from finssim.extensions.perception.camera_docking import CameraDocking
-from finssim.extensions.perception.net import Net
 from finssim.learning.gymnasium_env import Env
 from finssim.learning.sb3 import Sb3VecEnv
 from finssim.sim import Pool
-from finssim.tasks import TASKS, Environment, EnvironmentSetupError, StationKeeping, numeric_tasks
+from finssim.tasks import TASKS, Environment, EnvironmentSetupError, StationKeeping, numeric_tasks, task_named
 from reference.pair import Pair
 
 NUMERIC = numeric_tasks()
@@ -155,13 +153,13 @@ def test_an_environment_that_does_not_reset_itself_is_refused():
 @pytest.mark.parametrize(
     ("task", "name", "shape"),
     [
-        (CameraDocking(time_limit=0.2), "front_camera", (27, 48, 3)),
-        (Net(time_limit=0.2), "sonar", (128, 48, 1)),
+        ("camera-docking", "front_camera", (27, 48, 3)),
+        ("net", "sonar", (128, 48, 1)),
     ],
 )
 def test_a_task_that_sees_gives_dictionaries(task, name, shape):
     pytest.importorskip("newton")
-    env = Sb3VecEnv(task, worlds=2, seed=1)
+    env = Sb3VecEnv(task_named(task, time_limit=0.2), worlds=2, seed=1)
     assert env.reset()[name].shape == (2, *shape)
     still = np.zeros((2, env.action_space.shape[0]))
     env.step(still)

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+pytest.importorskip("finssim.extensions.perception")
+
 from finssim.extensions.perception import WorldLayout, load_world
 from finssim.sim import Pool, Simulator, SimulatorError
 from finssim.sim.step import physics_kernel

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 
+pytest.importorskip("finssim.extensions.teams")
+
 from finssim.extensions.teams.pursuit import TeamPursuit
 from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.tasks.communication import Communication

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 pytest.importorskip("newton")
+pytest.importorskip("finssim.extensions.perception")
 
 from finssim.agents.agent import NOWHERE, agent_for
 from finssim.control.guidance import Known

@@ -12,7 +12,7 @@ from finssim.learning.episodes import HeldEvaluation
 from finssim.learning.learners import LEARNERS, LearningError, learner_named
 from finssim.learning.network import Network, answer_of, first_memory
 from finssim.learning.resume import read_state, write_state
-from finssim.tasks import TASKS, numeric_tasks, task_named
+from finssim.tasks import numeric_tasks, task_named
 from reference.guess import BEST, Guess, GuessTogether
 
 IMITATING = ("bc", "dagger", "distill")
@@ -26,8 +26,7 @@ TRAINED = [
     *((name, "team-pursuit") for name in SEVERAL if name not in ONE),
     *(
         ("ppo" if len(task_named(task).agents) == 1 else "torchrl-ippo", task)
-        for task in TASKS
-        if task in numeric_tasks()
+        for task in numeric_tasks()
         if task != "t1"
     ),
 ]
