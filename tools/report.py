@@ -1,4 +1,4 @@
-"""Fill the tables of pages from results: `python tools/report.py results/*.json --into docs/experiments.md`."""
+"""Fill the tables of pages from results: `python tools/report.py results/*.json --into docs/evidence.md`."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def report(results: Sequence[Path], *, into: Annotated[Sequence[Path], "--into"]
     the name are table=2 (the second table of the result), columns=0,1,3, rows=calibrated;paper: calibrated (names
     as in the table), and headline=yes. A result in sentences, such as soak, becomes a list.
 
-    Example: python tools/report.py results/t1.json results/anatomy.json --into docs/experiments.md --into README.md
+    Example: python tools/report.py results/t1.json results/anatomy.json --into docs/evidence.md --into README.md
 
     Args:
         results (FILE.json...): Results of experiments t1, t2, anatomy, faults and soak, and `seeing.json`.
