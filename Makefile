@@ -9,7 +9,7 @@ STRICT := $(wildcard $(addprefix src/finssim/,core physics control localization)
 STAMP := $(VENV)/.installed-$(shell cat pyproject.toml constraints.txt | cksum | cut -d ' ' -f 1)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test quick check format bench docs clean
+.PHONY: help demo test quick core check format bench docs clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*##/make \1\t/p' Makefile | expand -t 16
@@ -25,6 +25,13 @@ test: check  ## check, then run every test
 
 quick: $(STAMP)  ## the tests that take little time and start no process
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" -q
+
+core: $(STAMP)  ## the quick tests of the core, in a copy without the extensions
+	rm -rf build/core && mkdir -p build/core
+	cp -r src tests examples docs studies benchmarks tools pyproject.toml build/core
+	rm -r build/core/src/finssim/extensions build/core/tests/extensions
+	cd build/core && PYTHONPATH=src OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -n 2 --dist loadfile -q -m "not slow" \
+		$(filter-out tests/extensions tests/data tests/reference tests/benchmarks tests/studies,$(patsubst %/,%,$(wildcard tests/*/)))
 
 check: $(STAMP)  ## lint, format, types and docstrings
 	$(BIN)/ruff check .

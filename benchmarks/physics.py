@@ -17,9 +17,9 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from engine import MUJOCO_BODY
 from finssim.sim import Simulator
 from finssim.tasks import Environment, StationKeeping
-from sim import MUJOCO_BODY
 
 VEHICLES = ("finsrov", "bluerov2_heavy", "bluerov2")
 WORLDS = 4096

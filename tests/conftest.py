@@ -11,7 +11,7 @@ import multiprocessing.process
 import sys
 import time
 from collections import defaultdict
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -100,15 +100,30 @@ def slow_clock(monkeypatch) -> float:
 ALONE = importlib.util.find_spec("finssim.extensions") is None
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_call():
-    """Skip a test whose task, command or world belongs to an extension that is not there."""
+@contextmanager
+def extensions_missing():
+    """Skip a test in which the registry refuses a task, command or world of an extension that is not there."""
     try:
-        return (yield)
-    except ValueError as error:
-        if ALONE and "No module named 'finssim.extensions'" in str(error):
+        yield
+    except Exception as error:
+        said = str(error)
+        if ALONE and "cannot be used" in said and "No module named 'finssim.extensions'" in said:
             pytest.skip("needs an extension")
         raise
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup():
+    """See `extensions_missing`."""
+    with extensions_missing():
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call():
+    """See `extensions_missing`."""
+    with extensions_missing():
+        return (yield)
 
 
 # ---- `make quick`: no test starts a process

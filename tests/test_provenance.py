@@ -35,8 +35,8 @@ def test_the_revision_is_the_checkout_s_commit():
 def test_an_installed_copy_does_not_claim_another_project_s_revision(tmp_path):
     """A package installed inside someone else's repository reports no revision."""
     package = tmp_path / "site-packages" / "finssim"
-    package.mkdir(parents=True)
-    for name in ("__init__.py", "core/provenance.py"):
+    (package / "core").mkdir(parents=True)
+    for name in ("__init__.py", "core/__init__.py", "core/lazy.py", "core/provenance.py"):
         (package / name).write_text((ROOT / "src" / "finssim" / name).read_text())
     git = ["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b"]
     subprocess.run([*git, "init", "-q"], check=True)

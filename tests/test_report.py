@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS = sorted((ROOT / "results").glob("*.json"))
 PAGES = [
     ROOT / "README.md",
-    *(ROOT / f"docs/{name}.md" for name in ("experiments", "learning", "reliability", "seeing")),
+    *(ROOT / f"docs/{name}.md" for name in ("evidence", "learning")),
 ]
 
 

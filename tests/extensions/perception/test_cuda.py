@@ -30,4 +30,5 @@ def test_every_kernel_compiles_for_cuda(tmp_path):
     assert compiled == {
         "finssim.extensions.perception.delivery": [True],
         "finssim.extensions.perception.sensors": [True],
+        "finssim.extensions.perception.sight": [True],
     }
