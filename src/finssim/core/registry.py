@@ -182,6 +182,8 @@ def _entry_points(group: str, path: tuple[str, ...]) -> dict[str, list[tuple[Any
     points: dict[str, list[tuple[Any, str]]] = {}
     for point in entry_points(group=group):
         package = "unknown" if point.dist is None else f"{point.dist.name} {point.dist.version}"
+        if point.dist is not None and point.dist.name == "finssim":  # an extension
+            package = "finssim"
         points.setdefault(point.name, []).append((point, package))
     return points
 
