@@ -37,7 +37,7 @@ class Policy(GaussianMixin, Model):
 
 
 class Value(DeterministicMixin, Model):
-    """What the observation is worth."""
+    """Estimate the value of an observation."""
 
     def __init__(self) -> None:
         Model.__init__(self, **spaces)

@@ -1,4 +1,4 @@
-"""A thousand worlds at once, each with its own damping, in a current: how much does a dive differ?"""
+"""Simulate a thousand worlds together, each with its own damping, in a current, and compare their dives."""
 
 import numpy as np
 

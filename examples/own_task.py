@@ -22,7 +22,7 @@ from finssim.tasks import (
 
 @wp.func
 def way_up(arrays: TaskArrays, w: int) -> float:
-    """How far up the depth is [m]: what is seen comes from what is *measured*, `arrays.position`."""
+    """Return the distance up to the depth [m]; observations come from what is *measured*, `arrays.position`."""
     return arrays.goal_position[w][2] - arrays.position[w, 0][2]
 
 
@@ -52,7 +52,7 @@ def there(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """Where an episode starts: draw it from the episode's key and the world alone."""
+    """Draw the start of an episode, from the episode's key and the world alone."""
     rng = wp.rand_init(key, w)
     arrays.goal_position[w] = wp.vec3(0.0, 0.0, -wp.randf(rng, 0.3, p.deepest))
     place_at_rest(state, w, 0, wp.vec3(0.0, 0.0, -wp.randf(rng, 0.3, p.deepest)), 0.0)

@@ -40,11 +40,11 @@ class KeepDepth(TorchTask):
         return self.way(w).abs() < 0.05
 
     def terminated(self, w: Worlds) -> Tensor:
-        """Out of the water: a failure."""
+        """Return where the vehicle is out of the water, which is a failure."""
         return w.position[:, 2] > 0.3
 
     def way(self, w: Worlds) -> Tensor:
-        """How far up the depth is [m], (worlds,)."""
+        """Return the distance up to the depth [m], (worlds,)."""
         return w.goal_position[:, 2] - w.position[:, 2]
 
 

@@ -9,7 +9,7 @@ from finssim.vehicles import NonNegative, Number, Part, load_vehicle
 
 
 class Wing(Part):
-    """What a vehicle file says of it, under the key `wing` of a hydrodynamic set."""
+    """Section of a vehicle file under the key `wing` of a hydrodynamic set."""
 
     lift: NonNegative
     """[N s²/m²]"""
@@ -32,7 +32,7 @@ def wing_slope(nu_r: vec6, lift: float, moment: float) -> vec6:
 
 
 def check_wing(wing: Wing) -> tuple[bool, str]:
-    """What `finssim vehicles show` lists among the checks."""
+    """Yield the findings that `finssim vehicles show` lists among the checks."""
     return (
         wing.lift < 500.0,
         f"lift {wing.lift:g} N s²/m², expected < 500: the wing would be larger than the vehicle",

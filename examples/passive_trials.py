@@ -56,7 +56,7 @@ def draw(curves: list[Curve], path: Path) -> None:
 
 
 def main() -> None:
-    """Print what the trials tell, with the file of a BlueROV2 Heavy for what they cannot."""
+    """Print what the trials determine, with the file of a BlueROV2 Heavy for the rest."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?", default=HINSDALE)
     parser.add_argument("--picture", type=Path)

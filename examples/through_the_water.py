@@ -43,7 +43,7 @@ from finssim.sim import overhead_camera
 from finssim.vehicles import load_vehicle
 
 DURATION, PERIOD = 8.0, 24.0
-"""Of the run and of one round [s]."""
+"""Length of the run and of one round [s]."""
 Z, TURN = -0.45, 2.0 * math.pi / PERIOD
 
 

@@ -1,4 +1,4 @@
-"""Run the robot's whole software against a virtual pool, and compare what it believed with the truth.
+"""Run the robot's whole software against a virtual pool, and compare its estimate with the truth.
 
     python examples/virtual_pool.py
 

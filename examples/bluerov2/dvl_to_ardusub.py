@@ -1,4 +1,4 @@
-"""Tell ArduSub the velocities of a Water Linked DVL: python dvl_to_ardusub.py 127.0.0.1:16171 tcp:127.0.0.1:5762
+"""Send ArduSub the velocities of a Water Linked DVL: python dvl_to_ardusub.py 127.0.0.1:16171 tcp:127.0.0.1:5762
 
 The DVL is real, or that of `finssim ardusub-sitl --dvl` or of the virtual pool; ArduSub is behind any MAVLink address,
 here the second serial port of SITL. Each velocity goes out as VISION_POSITION_DELTA, as BlueOS' driver sends it. Ctrl-C
@@ -17,7 +17,8 @@ from finssim.core import TO_FOSSEN
 from finssim.robot import DvlClient, decode_line, host_port
 
 SHORTEST, LONGEST = 0.05, 1.0
-"""ArduSub's EKF drops what comes faster; a longer gap is a lost bottom, over which nobody knows the way [s]."""
+"""Time between messages [s]: below the first ArduSub's EKF drops them; beyond the second the bottom was lost, and the
+distance since then is unknown."""
 WORST = 0.4
 """Figure of merit that means no confidence [m/s]."""
 

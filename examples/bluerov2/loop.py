@@ -1,4 +1,4 @@
-"""From no model to a policy of ArduSub's axes in the virtual tank, by the commands of docs/bluerov2.md.
+"""Run the commands of docs/bluerov2.md, from no model to a policy of ArduSub's axes in the virtual tank.
 
 On a vehicle `--robot mavlink://...` takes the place of the virtual one, `--lockstep` goes, and levels and steps are the
 commands' own: these are for a look at all of it within a minute, and teach nobody to swim.
@@ -15,7 +15,7 @@ TANK = "--site tank --lockstep --pool-file none --let-in 0,0 --arm --robot mavli
 
 
 def finssim(line: str, **options) -> subprocess.Popen:
-    """One command, begun."""
+    """Start one command."""
     print(f"finssim {line}", flush=True)
     return subprocess.Popen([sys.executable, "-m", "finssim", *line.split()], **options)
 
