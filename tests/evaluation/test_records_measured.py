@@ -183,12 +183,13 @@ def test_a_record_is_scored_as_the_episode_was(task, tmp_path, capsys):
 
     The truth's clock is found to 10 ms, and at 0.5 m/s that is 5 mm; the return is a mean over hundreds of steps.
     """
-    who = next(iter(baselines_of(task)), "")
     if task.startswith("own"):
         task = f"{EXAMPLES / task}.py:KeepDepth"
         gain = np.zeros((6, 2), np.float32)
         gain[2] = 5.0, -2.0
         who = str(written(linear(gain), tmp_path / "depth", task_named(task), 6))
+    else:
+        who = next(iter(baselines_of(task)))
     live = site_of(task, who, [FINSROV], seed=3, record=tmp_path / "episode").run()
     record, truth = (tmp_path / "episode" / f"vehicle.{kind}" for kind in ("mcap", "truth"))
     assert boundary.run(app, ["evaluate", str(record), "--task", task, "--truth", str(truth), "--json"]) == 0
