@@ -52,7 +52,7 @@ class Motion:
     """Result of the equation of motion in one state."""
 
     nu_dot: vec6  # body frame [m/s², rad/s²]
-    relaxation: vec6  # share θ by which each axis relaxes
+    relaxation: vec6  # ratio θ of each axis
     wet: float  # part of the vehicle under water
 
 

@@ -394,7 +394,7 @@ class WallFollower(DriveBaseline):
         )  # fmt: skip
 
     def reset(self, n: int) -> Array:  # type: ignore[override]
-        """Return the net square ahead at its distance [m, rad], and no integral of the speeds [m], (n, 5)."""
+        """Return the net square ahead at its distance [m, rad], and no correction of the speeds [m/s], (n, 5)."""
         return np.tile([self.distance, 0.0, 0.0, 0.0, 0.0], (n, 1))
 
     def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
