@@ -452,20 +452,20 @@ def make(folder: Path, run: Callable[..., None]) -> None:
     (folder / "wreck").mkdir()
     for file, made in (
         (FINSROV, "vehicle.yaml"),
-        (source / "engine" / "ranges" / "pool.yaml", "ranges.yaml"),
-        (source / "experiments" / "plants" / "current.yaml", "plant.yaml"),
-        (source / "worlds" / "catalogue" / "dock.yaml", "world.yaml"),
-        (source / "worlds" / "catalogue" / "wreck.yaml", "wreck/wreck.yaml"),
-        (source / "worlds" / "catalogue" / "wreck.stl", "wreck/wreck.stl"),
-        (source / "worlds" / "devices" / "low_light_camera.yaml", "camera-device.yaml"),
-        (source / "worlds" / "devices" / "gemini_720is.yaml", "sonar-device.yaml"),
+        (source / "sim" / "ranges" / "pool.yaml", "ranges.yaml"),
+        (source / "evaluation" / "plants" / "current.yaml", "plant.yaml"),
+        (source / "extensions" / "perception" / "catalogue" / "dock.yaml", "world.yaml"),
+        (source / "extensions" / "perception" / "catalogue" / "wreck.yaml", "wreck/wreck.yaml"),
+        (source / "extensions" / "perception" / "catalogue" / "wreck.stl", "wreck/wreck.stl"),
+        (source / "vehicles" / "catalogue" / "devices" / "low_light_camera.yaml", "camera-device.yaml"),
+        (source / "vehicles" / "catalogue" / "devices" / "gemini_720is.yaml", "sonar-device.yaml"),
         (DATA / "opencv_chessboards" / "left_intrinsics.yml", "left_intrinsics.yml"),
         (DATA / "t200" / "t200_16V_bluerobotics_2019.csv", "thrust.csv"),
         (DATA / "hinsdale" / "traj026-0_imu.csv", "logs/small_imu.csv"),
         (DATA / "ardusub" / "small.BIN", "small.BIN"),
         (DATA / "ardusub" / "small_cut.tlog", "small.tlog"),
         (ROOT / "examples" / "own_task_torch.py", "own.py"),
-        (source / "worlds" / "devices" / "ping.yaml", "seeing/altimeter.yaml"),
+        (source / "vehicles" / "catalogue" / "devices" / "ping.yaml", "seeing/altimeter.yaml"),
         *(
             (DATA / "opencv_chessboards" / f"left{k:02}.jpg", f"board/left{k:02}.jpg")
             for k in (1, 2, 3, 4, 5)
