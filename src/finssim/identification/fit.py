@@ -31,8 +31,9 @@ class Estimate:
     `thrust_scale`, `thrust_lag`, `thrust_delay`, `CC.c_plus`, ...; coupled terms `added_mass.surge.pitch`,
     `d1.sway.yaw`."""
     estimate: float
+    """Value in `unit`."""
     ci95: tuple[float, float]
-    """95 % interval; infinite or NaN ends where the data say nothing."""
+    """95 % interval in `unit`; infinite or NaN ends where the data say nothing."""
     unit: str
     identifiable: bool
     """True if the data determine it; False also if it rests on a bound."""
@@ -43,7 +44,10 @@ class Estimate:
 
     @classmethod
     def within(cls, name: str, value: float, half: float, unit: str, sure: bool, note: str = "") -> Estimate:
-        """An estimate with an interval of `half` to each side, and a note where it is not `sure`."""
+        """An estimate with an interval of `half` to each side, and a note where it is not `sure`.
+
+        Numbers are in `unit`.
+        """
         ci95 = (float(value - half), float(value + half))
         note = "" if sure else note
         return cls(name=name, estimate=float(value), ci95=ci95, unit=unit, identifiable=bool(sure), note=note)
@@ -60,7 +64,7 @@ class Correlation:
 
     names: tuple[str, ...]
     matrix: Array
-    """(n, n)"""
+    """Correlations, (n, n)."""
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -75,8 +79,11 @@ class Curve:
     x_label: str
     y_label: str
     x: Array
+    """Abscissa in the unit of its label, (n,)."""
     measured: Array
+    """Measured values in the unit of the label, (n,)."""
     fitted: Array
+    """Fitted values in the unit of the label, (n,)."""
     kind: str = "line"
     """`line` (against time) or `scatter`."""
 
@@ -108,7 +115,7 @@ class Fit:
     changes: dict[str, Any]
     """For `Vehicle.replace`: dotted path -> value, only of what the data determine."""
     quality: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Axis or thruster -> figures of the fit: r2, rmse, nrmse, samples, rejected, ..."""
+    """Axis or thruster -> figures of the fit: r2 and nrmse [-], rmse in the unit of the axis, samples, rejected, ..."""
     correlation: Correlation | None = None
     findings: tuple[Finding, ...] = ()
     """Bounds, degeneracies, speeds of less than a decade, trials left out."""

@@ -71,15 +71,16 @@ class Pair:
     tau: Array
     """Wrench that acted, from the log, about the vehicle's `wrench_reference` [N, N m], (n, 6)."""
     measured: dict[str, Array]
-    """Response (of `RESPONSES`) -> (n,); velocities and angles smoothed as for a fit."""
+    """Response (of `RESPONSES`) -> values in the unit of the response, (n,); velocities and angles smoothed as for a
+    fit."""
     raw: dict[str, Array] = field(default_factory=dict)
-    """Measured values, not smoothed."""
+    """Measured values in the unit of the response, not smoothed."""
     source: dict[str, str] = field(default_factory=dict)
     """Response -> "measured", or what it was derived from."""
     noise: dict[str, float] = field(default_factory=dict)
     """Response -> standard deviation of the noise of one measured sample, in its unit."""
     simulated: dict[str, dict[str, Array]] = field(default_factory=dict)
-    """Model -> response -> (n,)."""
+    """Model -> response -> values in the unit of the response, (n,)."""
     segment: NDArray[np.int64] | None = None
     """Uninterrupted replay that a sample belongs to, -1 for none, (n,); None for a single one."""
     diverged: dict[str, float] = field(default_factory=dict)
@@ -171,7 +172,10 @@ def models_of(pairs: Sequence[Pair]) -> tuple[str, ...]:
 
 
 def resampled(t: Array, values: Array, times: Array) -> Array:
-    """Linear interpolation that leaves holes holes: NaN where a neighbour is, or is far, or there is none."""
+    """Linear interpolation that leaves holes holes: NaN where a neighbour is, or is far, or there is none.
+
+    Units are kept.
+    """
     if values.ndim == 2:
         return np.stack([resampled(t, column, times) for column in values.T], axis=-1)
     good = np.isfinite(values)
@@ -205,11 +209,12 @@ class Score(NamedTuple):
     """A number, or the reason why there is none."""
 
     value: float | None
+    """The score [-], or None."""
     why: str = ""
 
 
 def span(values: ArrayLike) -> float:
-    """P95 - P5 of the finite values; NaN if there are none."""
+    """P95 - P5 of the finite values; NaN if there are none. The unit is kept."""
     x = np.asarray(values, dtype=np.float64)
     x = x[np.isfinite(x)]
     return float(np.subtract(*np.percentile(x, (95.0, 5.0)))) if len(x) else float("nan")
@@ -219,7 +224,7 @@ def nrmse(measured: Array, simulated: Array, scale: float, mask: NDArray[np.bool
     """RMSE / (P95 - P5 of the measurement)                                            (paper, section IV-B)
 
     Args:
-        measured: (n,), NaN where there is no measurement.
+        measured: Values in the unit of the response, (n,), NaN where there is no measurement.
         simulated: (n,), same unit.
         scale: P95 - P5 of the measurement over the scored part of the trial, same unit.
         mask: Samples to take; all if None.
@@ -283,9 +288,11 @@ class Aggregate(NamedTuple):
     """One number for many trials."""
 
     value: float | None
+    """Mean NRMSE [-], or None."""
     ci95: tuple[float, float] | None
-    """Trial-level bootstrap, 2.5 and 97.5 %."""
+    """Trial-level bootstrap [-], 2.5 and 97.5 %."""
     by_axis: dict[str, float]
+    """Axis -> median NRMSE [-]."""
     trials: int
     why: str = ""
     """Reason why there is no number, or no interval."""
@@ -303,7 +310,7 @@ def aggregate(
     many trials as it has. An axis with one trial has nothing to draw from: then there is no interval.
 
     Args:
-        scores: For each trial, axis -> NRMSE or None.
+        scores: For each trial, axis -> NRMSE [-] or None.
         resamples: How many.
         seed: Of the draws.
     """
@@ -337,19 +344,19 @@ class Ahead(NamedTuple):
     """Error of predictions made from measured states, by how far they look ahead."""
 
     seconds: Array
-    """(H,)"""
+    """Times ahead [s], (H,)."""
     rmse: Array
     """Root mean square errors in the response's unit, (H,); NaN if nothing could be compared."""
     persistence: Array
-    """Errors of the prediction that nothing changes, (H,)."""
+    """Errors of the prediction that nothing changes, in the unit of the response, (H,)."""
     nrmse: Array
-    """Root mean square of error / span, (H,)"""
+    """Root mean square of error over span [-], (H,)."""
     count: NDArray[np.int64]
     """Predictions compared, (H,)."""
 
     @property
     def skill(self) -> Array:
-        """1 - rmse / persistence: 1 is perfect, 0 is no better than to say that nothing changes, (H,)."""
+        """1 - rmse / persistence: 1 is perfect, 0 is no better than to say that nothing changes, (H,) [-]."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(np.where(self.persistence > 0.0, 1.0 - self.rmse / self.persistence, np.nan))
 
@@ -360,10 +367,10 @@ def error_ahead(
     """Root mean square over all predictions of the error a given time after each start.
 
     Args:
-        starts: Response in the state that each prediction starts from, (S,).
+        starts: Response, in its unit, in the state that each prediction starts from, (S,).
         ahead: Times since the start [s], (T,).
-        measured: (T, S), NaN where there is no measurement.
-        simulated: (T, S).
+        measured: Response in its unit, (T, S), NaN where there is no measurement.
+        simulated: Response in its unit, (T, S).
         width: Span that `nrmse` is relative to [unit of the response], of all or for each prediction, (S,).
         seconds: Times of interest [s], (H,); the nearest of `ahead` is taken.
     """
@@ -877,7 +884,7 @@ def normalised(pair: Pair, values: Array, axis: Axis) -> tuple[Array, Array] | N
 
     Args:
         pair: The trial.
-        values: Measured or simulated response of the axis, (n,).
+        values: Measured or simulated response of the axis in its unit, (n,).
         axis: The axis.
 
     Returns:

@@ -196,8 +196,8 @@ def draw_arrows(
 
     Args:
         axes: To draw into.
-        at: (N, 2).
-        vectors: (N, 2).
+        at: Places in the unit of the axes, (N, 2).
+        vectors: Arrows in `unit`, (N, 2).
         used: Which rows the calibration used, (N,).
         unit: Of the arrows.
         per: Arrow units in one of the axes' units.
@@ -285,7 +285,7 @@ def _cells(e: Estimate, fit: Fit, vehicle: Vehicle) -> tuple[str, ...]:
 
 
 def number_text(value: float | None) -> str:
-    """Four significant digits, small numbers as 3.71e-4; – where there is none."""
+    """Four significant digits, small numbers as 3.71e-4; – where there is none. Any unit."""
     if value is None or not math.isfinite(value):
         return "–"
     mantissa, _, exponent = f"{value:.3e}".partition("e")
@@ -303,7 +303,10 @@ def interval_text(estimate: Estimate) -> str:
 
 
 def file_number(estimate: Estimate, vehicle: Vehicle) -> float | None:
-    """The vehicle's own number for an estimate; None where the file holds something else that follows from it."""
+    """The vehicle's own number for an estimate; None where the file holds something else that follows from it.
+
+    It has the unit of the estimate.
+    """
     if estimate.path is None or estimate.path.startswith("body."):
         return None
     return number_in(vehicle, estimate.path)
@@ -329,7 +332,7 @@ def quality_text(figures: Mapping[str, float], *, every: bool = True) -> str:
     """`R² 0.998, NRMSE 0.021, samples 1204`.
 
     Args:
-        figures: By key.
+        figures: By key, in the units of a fit's quality.
         every: All of them, or those of `QUALITY` alone.
     """
     keys = [key for key in QUALITY if key in figures]

@@ -86,7 +86,8 @@ def record(
         vehicle: The vehicle; its thrusters are commanded by the allocator of `finssim.control.allocation`.
         seed: Of the initial conditions.
         hydrodynamics: Key of the vehicle's hydrodynamic sets.
-        plant: Where the real plant differs from the file: field of `VehicleParameters` -> value, or one for each world.
+        plant: Where the real plant differs from the file: field of `VehicleParameters` -> value in its unit, or one for
+            each world.
         disturbance: Extra wrench about the body origin, body frame [N, N m], (6,) or (W, 6).
         water: Currents and waves; still water if None.
         tether: None if None.
@@ -281,7 +282,7 @@ def measure(
         seed: Of all errors.
 
     Returns:
-        Canonical column -> values (rows, worlds); NaN where a sensor had no new sample.
+        Canonical column -> values in the unit of the column (rows, worlds); NaN where a sensor had no new sample.
     """
     rng = np.random.default_rng(seed)
     nu = recording.velocity[::every].astype(float)

@@ -42,17 +42,18 @@ class Evidence:
     names: tuple[str, ...]
     """(P,)"""
     normal: Array
-    """N_g with W the inverse variance of the residuals, (G, P, P)."""
+    """N_g with W the inverse variance of the residuals, per product of the units of theta, (G, P, P)."""
     score: Array
-    """s_g, (G, P); they add up to zero where no bound is active."""
+    """s_g per unit of theta, (G, P); they add up to zero where no bound is active."""
     unit: str = "trials"
     """Unit of the groups: `trials`, or `blocks` of consecutive samples if there are too few trials."""
     prior: Array | None = None
-    """Inverse covariance of what was known before any trial, (P, P); None without."""
+    """Inverse covariance of what was known before any trial, per product of the units of theta, (P, P); None
+    without."""
 
     @property
     def information(self) -> Array:
-        """Σ_g N_g and the prior's, (P, P)."""
+        """Σ_g N_g and the prior's, (P, P). It is per product of the units of theta."""
         total = np.asarray(self.normal, float).sum(axis=0)
         return total if self.prior is None else total + self.prior
 
@@ -63,17 +64,21 @@ class Covariance:
 
     names: tuple[str, ...]
     local: Array
-    """Inverse information Σ_g N_g: errors independent and of the stated variance, (P, P)."""
+    """Inverse information Σ_g N_g: errors independent and of the stated variance, in the units of theta, (P, P)."""
     trials: Array
-    """Covariance from the disagreement of the trials, (P, P): valid for any noise within a trial."""
+    """Covariance from the disagreement of the trials in the units of theta, (P, P): valid for any noise within a
+    trial."""
     dof: Array
-    """Degrees of freedom of each variance in `trials`, (P,); infinite where `local` has to serve."""
+    """Degrees of freedom [-] of each variance in `trials`, (P,); infinite where `local` has to serve."""
     alone: NDArray[np.bool_]
     """True if a parameter rests on one trial, so that no disagreement can show, (P,)."""
 
     @property
     def std(self) -> Array:
-        """Standard errors, (P,): from the trials, from `local` for what rests on one trial."""
+        """Standard errors, (P,): from the trials, from `local` for what rests on one trial.
+
+        They have the units of theta.
+        """
         local, trials = np.diagonal(self.local), np.diagonal(self.trials)
         return np.asarray(np.sqrt(np.where(self.alone, np.maximum(local, trials), trials)))
 
@@ -164,11 +169,11 @@ def intervals(theta: Array, covariance: Covariance) -> Array:
     """Student's 95 % intervals of the estimates.
 
     Args:
-        theta: Estimates, (P,).
+        theta: Estimates in their units, (P,).
         covariance: Theirs.
 
     Returns:
-        Lower and upper ends, (P, 2); infinite where nothing is known.
+        Lower and upper ends in the units of theta, (P, 2); infinite where nothing is known.
     """
     from scipy.stats import norm, t
 
@@ -183,11 +188,11 @@ def correlated_samples(residual: Array, breaks: Sequence[int] = ()) -> float:
     1992).
 
     Args:
-        residual: Equally spaced, (n,).
+        residual: Equally spaced, in any unit, (n,).
         breaks: Indices at which a new stretch begins; no product runs across.
 
     Returns:
-        At least 1.
+        The number of samples, at least 1.
     """
     stretches = [part - np.mean(residual) for part in np.split(residual, list(breaks)) if len(part)]
     longest = max(len(part) for part in stretches)
@@ -213,7 +218,7 @@ def correlation(names: Sequence[str], covariance: Array) -> Correlation:
 
     Args:
         names: (P,)
-        covariance: (P, P)
+        covariance: Covariance in the units of theta, (P, P).
     """
     variance = np.diagonal(covariance)
     good = np.isfinite(variance) & (variance > 0.0)
@@ -233,7 +238,8 @@ def degeneracy(
 
     Args:
         names: (P,)
-        covariance: Of the estimates, best the local one, (P, P); infinite variances name unknown parameters.
+        covariance: Covariance of the estimates in their units, best the local one, (P, P); infinite variances name
+            unknown parameters.
         theta: Estimates, to tell which are known well; all count as loose where not given, (P,).
 
     Returns:

@@ -47,7 +47,7 @@ def file_tree(vehicle: Vehicle) -> dict[str, Any]:
 
 
 def leaves(node: Any, path: Key = ()) -> Iterator[tuple[Key, float]]:
-    """Path and value of every number below a node of plain values."""
+    """Path and value of every number below a node of plain values. Values have the units of the file."""
     if isinstance(node, Mapping):
         for key, value in node.items():
             yield from leaves(value, (*path, str(key)))
@@ -493,6 +493,8 @@ def calibrated(fit: Fit) -> Vehicle:
 def retained_values(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
     """Parameters with a place in the vehicle file that the fit left as they were, with the number they keep.
 
+    They have the units of the file.
+
     Args:
         fit: The fit.
         vehicle: `calibrated(fit)`.
@@ -530,7 +532,10 @@ def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
 
 
 def number_in(vehicle: Vehicle, path: str) -> float | None:
-    """The number at a dotted path of the vehicle file, `*` and groups by their first thruster; None where none is."""
+    """The number at a dotted path of the vehicle file, `*` and groups by their first thruster; None where none is.
+
+    It has the unit of the file.
+    """
     keys = tuple(path.split("."))
     for leaf, full_path, value in numbers(vehicle):
         if _same_number(keys, leaf, vehicle) or keys == full_path:
