@@ -12,7 +12,7 @@ import time
 
 from finssim.pool.ardusub_sitl import SitlServer, SitlWorld
 from finssim.robot.links.water_linked import DvlServer
-from finssim.sim import Pool
+from finssim.sim import RectangularPool
 from finssim.vehicles import load_vehicle
 
 RATE = 400
@@ -22,7 +22,7 @@ PULSES = (1400, 1400, 1600, 1600, 1550, 1550, 1550, 1550, *[1500] * 8)
 def serve(wire, dvl: bool, duration: float) -> None:
     """In the server's process: tell the address, serve, tell the processor's time and the frames."""
     log = DvlServer(("127.0.0.1", 0)) if dvl else None
-    tank = Pool(length=2000.0, width=2000.0, depth=20.0)
+    tank = RectangularPool(length=2000.0, width=2000.0, depth=20.0)
     world = SitlWorld(load_vehicle("bluerov2_heavy"), pool=tank, position=(0.0, 0.0, -10.0), dvl=log)
     server = SitlServer(world, ("127.0.0.1", 0))
     wire.send(server.address)

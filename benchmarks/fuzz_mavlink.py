@@ -25,7 +25,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.pool import draw_plant
 from finssim.pool.ardusub import ArduSub
-from finssim.pool.firmware import Sample
+from finssim.pool.firmware import FirmwareSample
 from finssim.pool.virtual_pool import Faults
 from finssim.robot.links.mavlink import MavlinkLink
 from finssim.robot.links.water_linked import encode_velocity
@@ -35,7 +35,7 @@ from finssim.vehicles.defaults import vehicle_at
 
 HEAVY = load_vehicle("bluerov2_heavy")
 SPEC = draw_plant(HEAVY, 1, "nominal")
-REST = Sample((0.0, 0.0, 0.0), (0.0, 0.0, 9.81), 0.6, 107000.0)
+REST = FirmwareSample((0.0, 0.0, 0.0), (0.0, 0.0, 9.81), 0.6, 107000.0)
 ZEROS = (0.0,) * 5
 ARMING = (
     mavlink.MAVLink_command_long_message(1, 1, 400, 0, 1.0, 0.0, *ZEROS),

@@ -18,13 +18,13 @@ import numpy as np
 from finssim.core.optics import Camera, Interface, Lens
 from finssim.localization.detection.families import bitmap
 from finssim.sim.overhead_camera import (
-    Basin,
+    ImageSensor,
+    ObjectPose,
     OverheadCamera,
-    Pose,
     Ripples,
     Scene,
-    Sensor,
     TagInScene,
+    TiledBasin,
 )
 
 DISTORTION = (0.02944176, -0.05975546, 0.00088098, 0.00179148, 0.01256862)
@@ -41,7 +41,7 @@ TAGS = tuple(
         bitmap=bitmap("tag25h9", number),
         edge=0.093,
         margin=0.0133,
-        pose=Pose(position=(x, 0.2, 0.7), orientation=(0.0, 0.0, 0.7071068, 0.7071068)),
+        pose=ObjectPose(position=(x, 0.2, 0.7), orientation=(0.0, 0.0, 0.7071068, 0.7071068)),
     )
     for number, x in ((15, 0.37), (16, 0.23))
 )
@@ -55,8 +55,8 @@ def published_scene() -> Scene:
     return Scene(
         camera=camera,
         interface=Interface.water(0.96),
-        basin=Basin(lower=(-2.0, -1.5, 0.0), upper=(2.0, 1.5, 1.2)),
-        sensor=Sensor(shutter=0.005),
+        basin=TiledBasin(lower=(-2.0, -1.5, 0.0), upper=(2.0, 1.5, 1.2)),
+        sensor=ImageSensor(shutter=0.005),
     )
 
 

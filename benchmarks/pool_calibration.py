@@ -18,7 +18,7 @@ from finssim.core.rotations import matrix_to_quat, quat_from_rotvec, quat_from_y
 from finssim.localization.detection.families import corners
 from finssim.survey.points import Observations
 from finssim.survey.pool_fit import PoolFit, calibrate_pool
-from finssim.survey.pool_model import Settings
+from finssim.survey.pool_model import PoolFitSettings
 
 DISTORTION = (0.02944176, -0.05975546, 0.00088098, 0.00179148, 0.01256862)
 LENS = Lens(1280, 720, 540.9305, 540.9305, 682.2341, 348.6136, "plumb_bob", DISTORTION)
@@ -57,7 +57,7 @@ CASES = {
 }
 
 
-def draw(case: Case, rng: np.random.Generator) -> tuple[Camera, Interface, Observations, Settings]:
+def draw(case: Case, rng: np.random.Generator) -> tuple[Camera, Interface, Observations, PoolFitSettings]:
     """One pool with its survey, and what its owner knows."""
     index = 1.333 + 0.003 * rng.standard_normal()
     if case.window is not None:
@@ -69,7 +69,7 @@ def draw(case: Case, rng: np.random.Generator) -> tuple[Camera, Interface, Obser
     water = Interface.water(1.0, tilt_x=tilt_x, tilt_y=tilt_y, n_water=index)
     seen = _tags(case, rng, camera, water)
     height = float(water.height(*seen.points[:, :2].mean(axis=0)))
-    settings = Settings(
+    settings = PoolFitSettings(
         water_height=height + TAPE * rng.standard_normal() if case.tape else None,
         place_sigma=TAPE,
         fit=FIT + (("focal",) if case.focal else ()),
@@ -80,7 +80,7 @@ def draw(case: Case, rng: np.random.Generator) -> tuple[Camera, Interface, Obser
 
 def _tank(
     case: Case, rng: np.random.Generator, index: float
-) -> tuple[Camera, Interface, Observations, Settings]:
+) -> tuple[Camera, Interface, Observations, PoolFitSettings]:
     """Return points in a tank seen through 10 mm of glass, with z up and the window at y = 0."""
     angle = np.radians(case.window or 0.0)
     position = np.array([0.6 * np.sin(angle), -0.6 * np.cos(angle), 0.2])
@@ -95,7 +95,7 @@ def _tank(
     seen = _seen(points[:, None, :], 0.0005, 0.0, rng, camera, window, case.locations)
     lean = 1e-3 * rng.standard_normal(2)
     known = (float(lean[0]), -1.0, float(lean[1]), TAPE * rng.standard_normal()) if case.plane else None
-    settings = Settings(
+    settings = PoolFitSettings(
         window=glass, plane=known, place_sigma=TAPE, tilt_sigma=1e-3 if case.plane else None,
         survey_sigma=0.0005, fit=FIT,
     )  # fmt: skip

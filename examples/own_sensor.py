@@ -5,10 +5,10 @@ import warp as wp
 
 from finssim.sim import (
     WHITE,
+    SampledState,
     SensorBatch,
     SensorSuite,
     Simulator,
-    Truth,
     add_sensor,
     normal,
     parameters_of,
@@ -37,8 +37,8 @@ class PingerArrays:
 
 @wp.func
 def measure_range(
-    truth: Truth, p: PingerParameters, key: wp.uint32, root: float, restarting: bool, pinger: PingerArrays, w: int,
-    v: int, slot: int,
+    truth: SampledState, p: PingerParameters, key: wp.uint32, root: float, restarting: bool,
+    pinger: PingerArrays, w: int, v: int, slot: int,
 ) -> bool:  # fmt: skip
     """Write one sample into its slot; return False where there is none."""
     point = truth.position + wp.quat_rotate(truth.quaternion, p.position)

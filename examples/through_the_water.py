@@ -67,7 +67,7 @@ def main() -> None:
     scene = overhead_camera.Scene(
         camera=pool.camera,
         interface=pool.interface,
-        basin=overhead_camera.Basin(lower=(-2.0, -1.0, -1.0), upper=(2.0, 1.0, 0.1)),
+        basin=overhead_camera.TiledBasin(lower=(-2.0, -1.0, -1.0), upper=(2.0, 1.0, 0.1)),
         ripples=overhead_camera.Ripples(rms_slope=0.01, seed=2),
     )
     overhead = overhead_camera.OverheadCamera(scene)
@@ -77,7 +77,7 @@ def main() -> None:
     def tag(number: int, position: NDArray[np.float64], q: NDArray[np.float64]) -> overhead_camera.TagInScene:
         mount = vehicle.tags.mounts[number]
         at = position + quat_to_matrix(q) @ mount.position
-        pose = overhead_camera.Pose(
+        pose = overhead_camera.ObjectPose(
             position=tuple(at.tolist()), orientation=tuple(quat_multiply(q, mount.orientation).tolist())
         )
         return overhead_camera.TagInScene(

@@ -14,9 +14,9 @@ from finssim.cli.command_line import run_script
 from finssim.core.progress import Progress
 from finssim.core.provenance import provenance
 from finssim.evaluation.campaign import check_choices, run_jobs, write_json
-from finssim.evaluation.evaluate import Job, play
+from finssim.evaluation.evaluate import ControllerTrials, play
 from finssim.evaluation.figures import COLORS, clean, legend_below, new_figure, save_figure
-from finssim.evaluation.plants import Plant, load_plant
+from finssim.evaluation.plants import PlantChanges, load_plant
 from finssim.evaluation.statistics import with_interval
 from finssim.evaluation.tables import Columns, Table, cells
 from finssim.studies.transfer import T1, controllers_of
@@ -136,13 +136,13 @@ def anatomy(
         progress=lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
     )  # fmt: skip
     plants = {
-        (name, k): Plant(name=f"{name}-{k}", **CAUSES[name].plant(amount))
+        (name, k): PlantChanges(name=f"{name}-{k}", **CAUSES[name].plant(amount))
         for name in chosen
         for k, amount in enumerate(CAUSES[name].amounts)
     }
     plants[FOREIGN, 0] = load_plant(FOREIGN)
     jobs = [
-        Job(
+        ControllerTrials(
             row=row, target=name, plant=k, seed=s, noise=s, controller=controllers[row, s], vehicle=vehicle,
             water=water, trials=trials * (10 if name == FOREIGN else 1),
         )

@@ -25,7 +25,7 @@ from finssim.localization.detection.families import bitmap, tag_corners_b
 from finssim.localization.detection.pictures import write_picture
 from finssim.localization.overhead_camera import load_pool, write_pool
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
-from finssim.sim.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene
+from finssim.sim.overhead_camera import ImageSensor, ObjectPose, OverheadCamera, Scene, TagInScene, TiledBasin
 from finssim.vehicles import load_vehicle
 from localization.fusion.known_streams import SITE, attitude, position, streams
 
@@ -137,8 +137,10 @@ def seen(files):
     cv2 = pytest.importorskip("cv2")
     pytest.importorskip("pupil_apriltags")
     pool = load_pool(files / "pool.yaml")
-    basin = Basin(lower=(-2.0, -1.5, -0.02), upper=(2.0, 1.5, 1.1))
-    camera = OverheadCamera(Scene(camera=pool.camera, interface=pool.interface, basin=basin, sensor=Sensor()))
+    basin = TiledBasin(lower=(-2.0, -1.5, -0.02), upper=(2.0, 1.5, 1.1))
+    camera = OverheadCamera(
+        Scene(camera=pool.camera, interface=pool.interface, basin=basin, sensor=ImageSensor())
+    )
     folder = files / "seen"
     (folder / "pictures").mkdir(parents=True)
     way = [np.array([0.1 + 0.04 * i, -0.1, 0.5]) for i in range(4)]
@@ -175,7 +177,7 @@ def tags_at(where):
                 bitmap=cells,
                 edge=FINSROV.tags.edge,
                 margin=0.02,
-                pose=Pose(position=(x, y, z), orientation=tuple(q)),
+                pose=ObjectPose(position=(x, y, z), orientation=tuple(q)),
             )
         )
     return tuple(tags)

@@ -15,7 +15,7 @@ from finssim.localization.camera_file import load_camera, write_camera
 from finssim.localization.detection.families import bitmap
 from finssim.localization.detection.pictures import read_picture, write_picture
 from finssim.localization.overhead_camera import load_pool, write_pool
-from finssim.sim.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene
+from finssim.sim.overhead_camera import ImageSensor, ObjectPose, OverheadCamera, Scene, TagInScene, TiledBasin
 from finssim.vehicles import Provenance, load_vehicle
 from survey.board_views import PHOTOGRAPHS
 from survey.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
@@ -233,14 +233,14 @@ def tag_files(pool_files):
                 bitmap=bitmap("tag36h11", i).astype(bool),
                 edge=TAG_EDGE,
                 margin=0.03,
-                pose=Pose(position=(x, y, 0.0), orientation=q),
+                pose=ObjectPose(position=(x, y, 0.0), orientation=q),
             )
         )
         off = 0.004 * rng.standard_normal(2)
         rows.append(f"{i},{x + off[0]},{y + off[1]},0,{np.degrees(yaw) + rng.normal()}")
-    basin = Basin(lower=(-2.0, -1.0, -0.02), upper=(2.0, 1.0, 1.1))
+    basin = TiledBasin(lower=(-2.0, -1.0, -0.02), upper=(2.0, 1.0, 1.1))
     scene = Scene(
-        camera=overhead(), interface=Interface.water(1.0), basin=basin, tags=tuple(tags), sensor=Sensor()
+        camera=overhead(), interface=Interface.water(1.0), basin=basin, tags=tuple(tags), sensor=ImageSensor()
     )
     write_picture(OverheadCamera(scene).render(seed=1), pool_files / "tags.png")
     (pool_files / "tags.csv").write_text("\n".join(rows) + "\n")

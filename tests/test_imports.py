@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from functools import cache
 from graphlib import TopologicalSorter
@@ -197,6 +198,26 @@ def below(name: str) -> set[str]:
 def test_every_module_has_its_place():
     """Each package and top module stands in the drawing of the layers."""
     assert LAYERS - {"", "extensions"} == ARROWS.keys() | TOP
+
+
+TWICE = {
+    "Clock": "rclpy has it",
+    "Linear": "pending: identification",
+    "Solution": "pending: identification",
+    "_Dumper": "pending: identification",
+}
+"""Names of classes that several modules define, with the reason."""
+
+
+def test_a_class_has_a_name_of_its_own():
+    """One meaning for each name: no two classes of the package share theirs."""
+    names = Counter(
+        node.name
+        for path in MODULES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef)
+    )
+    assert {name for name, count in names.items() if count > 1} == TWICE.keys()
 
 
 def test_imports_follow_the_arrows():

@@ -230,7 +230,7 @@ def run_in_pool(
     """
     from finssim.control.policy import Policy
     from finssim.evaluation.evaluate import FORMS, EvaluationError, Evaluations, evaluation
-    from finssim.evaluation.robot_trials import Job, play_trial
+    from finssim.evaluation.robot_trials import RobotJob, play_trial
     from finssim.robot.pilots import make_pilot
 
     if task not in FORMS:
@@ -245,7 +245,7 @@ def run_in_pool(
     with silent(not progress), progress_bar(f"virtual pool, plant {plant}") as show:
         for k, target in enumerate(names):
             show(k / len(names), target)
-            job = Job(
+            job = RobotJob(
                 row=name, target=target, plant=plant, seed=seed, controller=name, vehicle=body, pool_vehicle=body,
                 severity=severity, camera=camera, duration=duration,
             )  # fmt: skip

@@ -6,7 +6,7 @@ import pytest
 
 from finssim.evaluation import metrics
 from finssim.evaluation.records import read_record
-from finssim.evaluation.robot_trials import Job
+from finssim.evaluation.robot_trials import RobotJob
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -23,6 +23,6 @@ def brief_t1():
     is tested."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(metrics, "EVALUATION_WINDOW", (14.0, 24.0))
-        for function in (Job.__init__, read_record):
+        for function in (RobotJob.__init__, read_record):
             patch.setitem(function.__kwdefaults__, "duration", 24.0)
         yield

@@ -16,11 +16,11 @@ import pytest
 
 from finssim.evaluation import campaign
 from finssim.evaluation.campaign import ResultError, keep_result, load_result, run_jobs, write_json
-from finssim.evaluation.robot_trials import Job
+from finssim.evaluation.robot_trials import RobotJob
 from reference import played
 
 ROOT = Path(__file__).resolve().parents[2]
-JOBS = [Job(row="pid", controller="pid", target=target) for target in ("P01", "P02", "P03")]
+JOBS = [RobotJob(row="pid", controller="pid", target=target) for target in ("P01", "P02", "P03")]
 
 
 def marks(folder):
@@ -125,7 +125,7 @@ def test_a_key_names_everything_that_decides_the_result():
     """Another noise, camera or plant is another trial; another row of the same trial differs in its name alone."""
     base = JOBS[0]
     others = [
-        Job(row="pid", controller="pid", target="P01", **change)
+        RobotJob(row="pid", controller="pid", target="P01", **change)
         for change in (
             {"plant": 2},
             {"seed": 2},
@@ -140,9 +140,9 @@ def test_a_key_names_everything_that_decides_the_result():
         )
     ]
     assert len({job.key() for job in (base, *others)}) == len(others) + 1
-    assert Job(row="x", controller="pid", target="P01").key().removeprefix("x") == base.key().removeprefix(
-        "pid"
-    )
+    assert RobotJob(row="x", controller="pid", target="P01").key().removeprefix(
+        "x"
+    ) == base.key().removeprefix("pid")
 
 
 def test_a_result_with_nan_is_refused_and_nothing_is_written(tmp_path):

@@ -17,9 +17,9 @@ from finssim.control.policy import Policy
 from finssim.evaluation.figures import new_figure, save_figure
 from finssim.evaluation.metrics import T1_SETPOINTS
 from finssim.evaluation.robot_trials import RobotError
-from finssim.evaluation.trials import Motion
+from finssim.evaluation.trials import VehicleMotion
 from finssim.identification.vehicle_file import write_vehicle
-from finssim.learning.training_loop import Loop
+from finssim.learning.training_loop import TrainingLoop
 from finssim.pool import load_plant_spec
 from finssim.studies import demo as demo_module
 from finssim.studies.demo import FULL, Scope, demo, identify
@@ -110,7 +110,7 @@ def test_controllers_met_the_plant_that_the_trials_came_from_through_the_whole_s
         assert (
             trial["job"]["plant"] == 1 and trial["fault"] == "" and trial["localization"]["position_m"] < 0.05
         )
-        motion = Motion.read(folder / "t1" / "trials" / trial["key"])
+        motion = VehicleMotion.read(folder / "t1" / "trials" / trial["key"])
         assert abs(motion.position[0]).max() < 0.6
 
 
@@ -159,7 +159,7 @@ def test_an_interrupted_demonstration_goes_on(tmp_path, monkeypatch, made):
         return made[1]
 
     monkeypatch.setattr(demo_module, "identify", identified)
-    update = Loop._update
+    update = TrainingLoop._update
 
     def stop(self, total):
         if len(self.curves) == 2:
@@ -168,7 +168,7 @@ def test_an_interrupted_demonstration_goes_on(tmp_path, monkeypatch, made):
 
     options = {"steps": 65_536, "scope": replace(SMALL, pictures=()), "console": Console(quiet=True)}
     with monkeypatch.context() as patch:
-        patch.setattr(Loop, "_update", stop)
+        patch.setattr(TrainingLoop, "_update", stop)
         with pytest.raises(KeyboardInterrupt):
             demo(tmp_path / "demo", **options)
     assert demo(tmp_path / "demo", **options) == tmp_path / "demo" / "report.html"

@@ -11,7 +11,7 @@ from finssim.control.guidance import Station
 from finssim.core.files import OutputError
 from finssim.core.rotations import quat_from_yaw
 from finssim.evaluation.figures import draw_envelopes, error_envelope, save_figure
-from finssim.evaluation.trials import Motion, Trial
+from finssim.evaluation.trials import GoalTrial, VehicleMotion
 
 GOAL = np.array([1.0, 0.3, -0.5, math.pi])
 T = np.arange(601) / 10.0
@@ -22,7 +22,9 @@ def at_distance(distance, turn=0.0, t=T):
     position = np.tile(GOAL[:3], (len(t), 1)) - np.outer(np.broadcast_to(distance, t.shape), [0.0, 0.0, 1.0])
     quaternion = quat_from_yaw(np.full(len(t), GOAL[3] - 2 * math.pi) + turn)
     guide = Station(tuple(GOAL[:3]), GOAL[3])
-    return Trial(name="P", guide=guide, motion=Motion(t=t, position=position, quaternion=quaternion))
+    return GoalTrial(
+        name="P", guide=guide, motion=VehicleMotion(t=t, position=position, quaternion=quaternion)
+    )
 
 
 def test_five_constant_errors_have_their_own_quartiles():

@@ -19,7 +19,7 @@ from finssim.core.files import OutputError
 from finssim.evaluation import trials as trials_module
 from finssim.evaluation.evaluate import EvaluationError, evaluate, evaluate_controller
 from finssim.evaluation.metrics import PAPER_T1, T1_SETPOINTS, T1_START
-from finssim.evaluation.plants import Plant, PlantError, available_plants, load_plant
+from finssim.evaluation.plants import PlantChanges, PlantError, available_plants, load_plant
 from finssim.evaluation.trials import run_trials
 from finssim.learning.export import export_policy
 from finssim.robot.run import run
@@ -220,7 +220,7 @@ def test_a_policy_for_another_vehicle_is_refused(tmp_path):
 def test_a_plant_may_change_what_a_policy_was_trained_for(policy, monkeypatch):
     """That is what plants are for: the policy is checked against the vehicle's file."""
     monkeypatch.setattr(trials_module, "DURATION", 1.0)
-    heavy = Plant(name="heavy", vehicle={"body.mass": 12.5})
+    heavy = PlantChanges(name="heavy", vehicle={"body.mass": 12.5})
     assert evaluate_controller(policy, heavy, trials=1).result["plant"]["vehicle"] == {"body.mass": 12.5}
 
 

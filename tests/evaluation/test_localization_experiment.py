@@ -19,7 +19,7 @@ from finssim.studies.localization import (
     CONDITIONS,
     METHOD_TITLES,
     PAPER_TABLE_2,
-    Picture,
+    CampaignPicture,
     localization_experiment,
 )
 
@@ -174,7 +174,7 @@ def test_a_method_that_locates_nothing_is_no_error(tmp_path, monkeypatch):
     def blind(campaign, renderer):
         for picture in draw(campaign, renderer):
             gone = not campaign.calibrates.any()
-            yield Picture(picture.visit, picture.name, None if gone else picture.detection)
+            yield CampaignPicture(picture.visit, picture.name, None if gone else picture.detection)
 
     monkeypatch.setattr(module, "pictures", blind)
     result = localization_experiment(out=tmp_path / "out", renderer="geometry", seeds=1, **TINY)

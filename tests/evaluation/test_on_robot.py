@@ -8,7 +8,7 @@ import pytest
 
 from finssim.control.guidance import Station
 from finssim.core.rotations import quat_from_yaw
-from finssim.evaluation.robot_trials import RobotTrial, Stages, start_bounds
+from finssim.evaluation.robot_trials import RobotTrial, TrialStages, start_bounds
 from finssim.robot.pilots import WrenchPilot
 from finssim.robot.reading import Reading
 from finssim.vehicles import load_vehicle
@@ -35,7 +35,9 @@ def waited(attendant):
             if until(runtime):
                 return
 
-    outcome = Stages(trial, FINSROV, START, start_bounds("pool", True), attendant=attendant).play(drive, None)
+    outcome = TrialStages(trial, FINSROV, START, start_bounds("pool", True), attendant=attendant).play(
+        drive, None
+    )
     return outcome.ended, outcome.fault, outcome.runtime.reading.time
 
 
@@ -50,7 +52,7 @@ def begins(exact, off, turn_deg, speed, rate_deg, site="pool"):
     """When a vehicle that circles its start, so far off and so fast, may begin [s]; None within 20 s."""
     pilot = WrenchPilot(lambda: np.zeros(6), FINSROV, name="idle")
     trial = RobotTrial(name="x", pilot=pilot, guide=START, duration=1.0, over=lambda runtime: False)
-    stages = Stages(trial, FINSROV, START, start_bounds(site, exact))
+    stages = TrialStages(trial, FINSROV, START, start_bounds(site, exact))
     for now in np.arange(0.0, 20.0, 0.1):
         reading = Reading(
             time=now,

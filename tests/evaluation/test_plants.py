@@ -9,7 +9,7 @@ from finssim.agents.agent import agent_for
 from finssim.control.modes import MODES
 from finssim.control.trajectories import load_trajectory
 from finssim.evaluation import trials as trials_module
-from finssim.evaluation.plants import Plant, PlantError, available_plants, load_plant
+from finssim.evaluation.plants import PlantChanges, PlantError, available_plants, load_plant
 from finssim.evaluation.trials import run_episodes, run_trials
 from finssim.sim import read_run
 from finssim.sim.ranges_file import load_ranges
@@ -50,7 +50,7 @@ def test_a_plant_is_seen_with_what_is_asked_for():
     with pytest.raises(PlantError, match="observe is 'eyes', expected truth, estimator, sensors"):
         load_plant("nominal").with_view("eyes")
     with pytest.raises(ValueError, match="noise and observe: sensors are both given"):
-        Plant(name="both", noise={"yaw_std": 0.1}, observe="sensors")
+        PlantChanges(name="both", noise={"yaw_std": 0.1}, observe="sensors")
 
 
 def test_nominal_changes_nothing():
@@ -71,7 +71,7 @@ def test_the_current_is_ten_centimetres_per_second():
 
 
 def test_lag_is_added_to_every_thruster():
-    changed = Plant(name="slow", extra_time_constant=0.1, extra_delay=0.02).changed(FINSROV)
+    changed = PlantChanges(name="slow", extra_time_constant=0.1, extra_delay=0.02).changed(FINSROV)
     before, after = (list(v.thrusters.values()) for v in (FINSROV, changed))
     np.testing.assert_allclose(
         [a.time_constant - b.time_constant for a, b in zip(after, before, strict=True)], 0.1
@@ -88,7 +88,7 @@ def test_any_number_of_the_vehicle_can_differ(tmp_path):
     assert plant.name == "heavy" and plant.hydrodynamics == "simplified"
     assert plant.changed(FINSROV).body.mass == 13.0
     with pytest.raises(VehicleError, match="body: unknown key 'weight'"):
-        Plant(name="x", vehicle={"body.weight": 1.0}).changed(FINSROV)
+        PlantChanges(name="x", vehicle={"body.weight": 1.0}).changed(FINSROV)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def thruster_limits(factor):
         for name, t in FINSROV.thrusters.items()
         for key in ("force_min", "force_max")
     }
-    return Plant(name="limits", vehicle=changes)
+    return PlantChanges(name="limits", vehicle=changes)
 
 
 def commands_and_thrusts(run, plant, folder):

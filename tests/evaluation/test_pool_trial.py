@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from finssim.evaluation.metrics import T1_SETPOINTS, T1_START, in_room
-from finssim.evaluation.robot_trials import Job, OnRobot, RobotError, play, play_jobs
-from finssim.evaluation.trials import Motion
+from finssim.evaluation.robot_trials import OnRobot, RobotError, RobotJob, play, play_jobs
+from finssim.evaluation.trials import VehicleMotion
 from finssim.robot.goals import GoalError
 from finssim.robot.wiring import Wiring
 from finssim.vehicles import load_vehicle
 
-SHORT = Job(row="pid", controller="pid", target="P03", camera="corners", duration=6.0)
+SHORT = RobotJob(row="pid", controller="pid", target="P03", camera="corners", duration=6.0)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def played(tmp_path_factory):
         job = dataclasses.replace(SHORT, **changes)
         if job not in known:
             path = folder / str(len(known))
-            known[job] = play(job, path), Motion.read(path)
+            known[job] = play(job, path), VehicleMotion.read(path)
         return known[job]
 
     return of
@@ -45,7 +45,7 @@ def test_equal_jobs_give_equal_results(played, tmp_path):
     again = play(SHORT, tmp_path / "again")
     told = ("localization", "success", "t_s_s", "valid")
     assert {key: again[key] for key in told} == {key: played()[0][key] for key in told}
-    assert np.array_equal(Motion.read(tmp_path / "again").position, played()[1].position)
+    assert np.array_equal(VehicleMotion.read(tmp_path / "again").position, played()[1].position)
 
 
 @pytest.mark.slow
@@ -106,7 +106,7 @@ def test_other_vehicles_hold_a_setpoint_of_their_own_pool(played, name):
 
 def test_a_robot_in_a_tank_may_go_where_the_tank_is(tmp_path):
     """Setpoints three times as far lie outside the workspace of the vehicle's file, inside that of the site."""
-    job = Job(row="pid", controller="pid", target="P01", vehicle="bluerov2_heavy", plant=0, severity="hardware",
+    job = RobotJob(row="pid", controller="pid", target="P01", vehicle="bluerov2_heavy", plant=0, severity="hardware",
               camera="hardware", site="tank", firmware="ardusub")  # fmt: skip
     there = OnRobot(wiring=Wiring(robot="mavlink", lockstep=True), pool_file=None, site="tank")
     with pytest.raises(RobotError, match="give --arm"):

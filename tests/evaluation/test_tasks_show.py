@@ -66,7 +66,7 @@ def test_a_task_is_shown_for_a_vehicle(capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["action"]["size"] == 8 and told["action"]["components"][0]["unit"] == "N"
     settings = {one["name"]: one for one in told["settings"]}
-    assert settings["tilt"]["told"] == "Largest roll and pitch at the start."
+    assert settings["tilt"]["told"] == "Largest roll and pitch at the start [rad]."
     assert finssim("tasks", "show", "pursuit", "--vehicle", "warpauv", "--json") == 0
     settings = {one["name"]: one["value"] for one in json.loads(capsys.readouterr().out)["settings"]}
     assert settings["prey_drive"]["level"] is None  # it never tips over

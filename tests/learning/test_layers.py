@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from finssim.learning.export import write_graph
-from finssim.learning.layers import Adam, Arrays, Gru, Parameters, Row, Stack
+from finssim.learning.layers import Adam, Arrays, FreeRow, Gru, NetworkParameters, TanhLayers
 from finssim.learning.network import (
     INTEGRAL_LIMIT,
     INTEGRAL_RATE,
@@ -26,8 +26,8 @@ LIBRARIES = pytest.mark.parametrize("device", [None, "cpu"], ids=["numpy", "torc
 def test_a_stacks_gradient_is_torchs(device):
     """Of weights, biases and inputs, in two calls of different size: what the first left behind has no part in it."""
     arrays, rng = Arrays(1, device), np.random.default_rng(2)
-    stack = Stack(arrays, [5, 7, 6, 3])
-    Parameters(arrays, stack)
+    stack = TanhLayers(arrays, [5, 7, 6, 3])
+    NetworkParameters(arrays, stack)
     stack.initialize(1.0)
     linear = [nn.Linear(a, b) for a, b in ((5, 7), (7, 6), (6, 3))]
     with torch.no_grad():
@@ -59,7 +59,7 @@ def test_a_grus_gradient_is_torchs_through_time(device):
     arrays, rng = Arrays(1, device), np.random.default_rng(3)
     n, k, T, rows = 4, 5, 6, 3
     gru = Gru(arrays, n, k)
-    Parameters(arrays, gru)
+    NetworkParameters(arrays, gru)
     gru.initialize()
     for bias in (gru.weights[1], gru.weights[3]):
         bias[:] = arrays.array(rng.normal(size=3 * k))
@@ -89,8 +89,8 @@ def test_a_grus_gradient_is_torchs_through_time(device):
 def test_adam_is_torchs(device):
     """Over steps whose gradient is longer than the limit, and shorter."""
     arrays, rng = Arrays(1, device), np.random.default_rng(4)
-    row = Row(9)
-    parameters = Parameters(arrays, row)
+    row = FreeRow(9)
+    parameters = NetworkParameters(arrays, row)
     row.values[:] = arrays.array(rng.normal(size=9))
     theirs = torch.from_numpy(arrays.numpy(row.values)).clone().requires_grad_()
     ours, torchs = Adam(parameters, arrays, 0.5), torch.optim.Adam([theirs], lr=0.01, eps=1e-5)

@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecCheckNan
 
 from finssim.learning.gymnasium_env import Env
 from finssim.learning.sb3 import Sb3VecEnv
-from finssim.sim import Pool
+from finssim.sim import RectangularPool
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, StationKeeping, numeric_tasks, task_named
 from reference.pair import Pair
 
@@ -74,7 +74,7 @@ def test_an_end_by_time_is_a_truncation_with_its_observation():
 
 
 def test_leaving_the_pool_is_no_truncation():
-    venv = adapter(1, pool=Pool(length=20.0, width=20.0))
+    venv = adapter(1, pool=RectangularPool(length=20.0, width=20.0))
     venv.reset()
     venv.environment.start((2.6, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0))
     _, _, done, infos = venv.step(np.zeros((1, 6), np.float32))

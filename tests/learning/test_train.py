@@ -24,7 +24,7 @@ from finssim.learning.export import onnx_bytes
 from finssim.learning.learners import LEARNERS, LearningError
 from finssim.learning.resume import ResumeError, read_state, write_state
 from finssim.learning.train import TrainingError, train
-from finssim.learning.training_loop import Loop
+from finssim.learning.training_loop import TrainingLoop
 from finssim.sim.ranges_file import RangesError
 from finssim.tasks import EnvironmentSetupError, StationKeeping, Task, TrajectoryTracking
 from finssim.vehicles import VehicleError, load_vehicle
@@ -117,14 +117,14 @@ def test_options_reach_the_policy(tmp_path):
 
 def interrupt_after(updates, monkeypatch):
     """Ctrl-C in the update that follows so many."""
-    update = Loop._update
+    update = TrainingLoop._update
 
     def interrupt(self, total):
         if len(self.curves) == updates:
             raise KeyboardInterrupt
         return update(self, total)
 
-    monkeypatch.setattr(Loop, "_update", interrupt)
+    monkeypatch.setattr(TrainingLoop, "_update", interrupt)
 
 
 @pytest.mark.slow
@@ -186,14 +186,14 @@ def test_checkpoints_of_an_earlier_and_longer_training_go(tmp_path):
 
 def die_in_the_sixth_update(out, learner, options):
     """A training that kill -9 ends."""
-    update = Loop._update
+    update = TrainingLoop._update
 
     def dying(self, total):
         if len(self.curves) == 5:
             os.kill(os.getpid(), signal.SIGKILL)
         return update(self, total)
 
-    Loop._update = dying
+    TrainingLoop._update = dying
     train("t1", out=out, learner=learner, **options)
 
 

@@ -9,11 +9,11 @@ from hypothesis.extra.numpy import arrays
 
 from finssim.physics.contact import contact_wrench, wall_force
 from finssim.physics.types import vec6
-from finssim.sim import Pool, SurroundingsError
+from finssim.sim import RectangularPool, SurroundingsError
 from reference.body import rotation
 from reference.cases import random_attitudes
 
-WALLS = Pool(length=4.0, width=2.0, depth=1.0).walls()
+WALLS = RectangularPool(length=4.0, width=2.0, depth=1.0).walls()
 HALF = np.array([0.28, 0.21, 0.125])
 velocities = arrays(np.float32, 3, elements=st.floats(-2.0, 2.0, width=32))
 normals = st.sampled_from([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1)])
@@ -76,6 +76,6 @@ def test_contact_is_the_sum_over_corners_and_walls():
 def test_pools_that_cannot_be_are_refused():
     """No size, or walls that pull."""
     with pytest.raises(SurroundingsError, match="pool: length, width and depth must exceed 0 m"):
-        Pool(depth=0.0)
+        RectangularPool(depth=0.0)
     with pytest.raises(SurroundingsError, match="pool: wall coefficients must not be negative"):
-        Pool(stiffness=-1.0)
+        RectangularPool(stiffness=-1.0)

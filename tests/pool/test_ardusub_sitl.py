@@ -18,7 +18,7 @@ from finssim.pool.ardusub_sitl import GRAVITY, Pulses, SitlServer, SitlWorld, de
 from finssim.pool.plant_spec import Battery
 from finssim.robot.links.frames import LinkError
 from finssim.robot.links.water_linked import DvlClient, DvlServer, decode_line, encode_velocity
-from finssim.sim import Pool, Simulator, Water
+from finssim.sim import RectangularPool, Simulator, Water
 from finssim.vehicles import load_vehicle
 
 HEAVY = load_vehicle("bluerov2_heavy")
@@ -184,7 +184,9 @@ def test_other_packets_are_refused_with_a_word(data, reason):
 
 def test_the_answer_of_a_vehicle_at_rest_is_this_line():
     """Every byte: newline, compact, the order of the names, specific force (0, 0, -9.80665), depth down, newline."""
-    world = SitlWorld(NEUTRAL, pool=Pool(length=10.0, width=6.0, depth=5.0), position=(1.0, 0.5, -2.0))
+    world = SitlWorld(
+        NEUTRAL, pool=RectangularPool(length=10.0, width=6.0, depth=5.0), position=(1.0, 0.5, -2.0)
+    )
     assert world.answer() == (
         b'\n{"timestamp":0.0,"imu":{"gyro":[0.0,0.0,0.0],"accel_body":[0.0,0.0,-9.80665]},"position":[1.0,-0.5,2.0],'
         b'"attitude":[0.0,0.0,0.0],"quaternion":[1.0,0.0,0.0,0.0],"velocity":[0.0,0.0,0.0],'
@@ -424,7 +426,10 @@ def test_the_doppler_log_beside_it_measures_the_same_world():
     """Velocities in our axes of the log, altitude, and its latency as age, at 8 Hz of the world's clock."""
     log = DvlServer(("127.0.0.1", 0))
     client = DvlClient(*log.address)
-    pool, water = Pool(length=50.0, width=50.0, depth=5.0), Water(current=(0.2, 0.4, 0.0), depth=5.0)
+    pool, water = (
+        RectangularPool(length=50.0, width=50.0, depth=5.0),
+        Water(current=(0.2, 0.4, 0.0), depth=5.0),
+    )
     world = SitlWorld(NEUTRAL, pool=pool, water=water, position=(0.0, 0.0, -3.5), dvl=log)
     while not client.connected:
         client.receive()

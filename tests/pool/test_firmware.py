@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.pool import draw_plant
-from finssim.pool.firmware import Firmware, Sample
+from finssim.pool.firmware import Firmware, FirmwareSample
 from finssim.pool.plant import RPM
 from finssim.robot.links.frames import (
     HOST,
@@ -21,7 +21,7 @@ from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
 SPEC = draw_plant(FINSROV, 1, "realistic")
-REST = Sample((0.0, 0.0, 0.0), (0.0, 0.0, 9.81), 0.6, 107000.0)
+REST = FirmwareSample((0.0, 0.0, 0.0), (0.0, 0.0, 9.81), 0.6, 107000.0)
 
 
 def firmware(**clock):

@@ -7,7 +7,7 @@ from finssim.core.rotations import quat_to_matrix
 from finssim.pool import draw_plant
 from finssim.pool.plant import Plant
 from finssim.pool.plant_spec import Basin, Battery, BuoyancyDrift, Circulation
-from finssim.sim import Pool, Simulator
+from finssim.sim import RectangularPool, Simulator
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
@@ -18,7 +18,7 @@ def test_the_nominal_plant_moves_as_the_engine_does():
     """Driven with the thrusts that its motors deliver, the calibrated simulation follows it for five seconds."""
     spec = draw_plant(FINSROV, 0, "nominal")
     plant = Plant(FINSROV, spec)
-    engine = Simulator(FINSROV, control_step=plant.step, substeps=1, pool=Pool(), max_delay=0.1)
+    engine = Simulator(FINSROV, control_step=plant.step, substeps=1, pool=RectangularPool(), max_delay=0.1)
     engine.plant.time_constant.zero_()
     engine.plant.delay.zero_()
     engine.plant.dead_plus.zero_()

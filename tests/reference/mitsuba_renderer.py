@@ -16,7 +16,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.core.rotations import quat_to_matrix
-from finssim.sim.overhead_camera import Pose, Rectangle, Scene, TagInScene
+from finssim.sim.overhead_camera import ObjectPose, Rectangle, Scene, TagInScene
 from finssim.sim.overhead_camera.photometry import digitise, noise_key
 from finssim.sim.overhead_camera.scene import SurfaceFrame, surface_frame
 from finssim.sim.overhead_camera.surface import waves_of
@@ -179,7 +179,7 @@ def _glowing(mi: Any, radiance: Any, gain: float) -> dict[str, Any]:
     return {"bsdf": black, "light": {"type": "area", "radiance": light}}
 
 
-def _gain(scene: Scene, pose: Pose) -> float:
+def _gain(scene: Scene, pose: ObjectPose) -> float:
     """What brings radiance behind the surface to the camera's side: light spreads by the indices squared."""
     wet = float(scene.interface.distance(np.asarray(pose.position))) < 0.0
     return (scene.interface.index_far / scene.interface.index_near) ** 2 if wet else 1.0

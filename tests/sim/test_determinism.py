@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.sim import Pool, Simulator, TetherLine, Water, Wave
+from finssim.sim import RectangularPool, Simulator, TetherLine, Water, Wave
 from reference.cases import random_attitudes
 
 FIELDS = ("position", "quaternion", "velocity", "acceleration", "thrust", "actuator")
@@ -18,7 +18,7 @@ CASES = [
     ("calibrated", "rk4", {}),
     ("mesh", "midpoint", {}),
     ("simplified", "midpoint", {}),
-    ("calibrated", "midpoint", {"pool": Pool(), "tether": TetherLine(wet_weight=0.1)}),
+    ("calibrated", "midpoint", {"pool": RectangularPool(), "tether": TetherLine(wet_weight=0.1)}),
 ]
 EVERY_CASE = pytest.mark.parametrize(
     ("model", "integrator", "surroundings"),

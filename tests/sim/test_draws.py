@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.sim import TetherLine, Water, Wave
-from finssim.sim.measured import SENSORS, Measurement
+from finssim.sim.measured import SENSORS, MeasurementErrors
 from finssim.sim.packed import Packed
 from finssim.sim.ranges_file import AXES, available, load_ranges
 from finssim.sim.ranges_table import ENTRIES, INDEX, drawn_entries
@@ -122,7 +122,7 @@ def test_surge_damping_scales_what_the_vehicle_has():
 
 @pytest.mark.parametrize("name", [f"sensors.{name}" for name in SENSORS])
 def test_a_sensors_entry_replaces_its_own_number_and_keeps_the_others(name):
-    seen = Packed(Measurement, (12, 1), "cpu")
+    seen = Packed(MeasurementErrors, (12, 1), "cpu")
     for i, array in enumerate(seen.fields.values()):
         array.fill_(0.01 * (i + 1))
     given = {field: array.numpy().copy() for field, array in seen.fields.items()}

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from finssim.physics.contact import PoolWalls
-from finssim.sim import Pool, Simulator, TetherLine
+from finssim.sim import RectangularPool, Simulator, TetherLine
 from finssim.sim.lanes import LANES, LaneError, StructArray, Trace, UniformStruct, lane_function
 from reference.cases import PAIRS, random_states
 
@@ -60,7 +60,7 @@ def test_blocks_compute_what_single_worlds_do(monkeypatch, name, model):
 
 def test_several_vehicles_a_pool_and_tethers_go_in_blocks_too(monkeypatch):
     """Two in a world, walls that are not touched, and lines."""
-    options = {"pool": Pool(length=40.0, width=40.0, depth=12.0), "tether": TetherLine()}
+    options = {"pool": RectangularPool(length=40.0, width=40.0, depth=12.0), "tether": TetherLine()}
     blocks, single = (
         simulate(monkeypatch, ["finsrov", "finsrov"], lanes=lanes, **options) for lanes in (True, False)
     )
@@ -96,7 +96,7 @@ def test_a_world_that_leaves_the_block_is_the_single_worlds_and_disturbs_nobody(
     quiet = random_states(np.random.default_rng(5), LANES, depth=(-6.0, -4.0), speed=0.3, turn=0.3)
     odd = [x.copy() for x in quiet]
     odd[0][3], odd[1][3], odd[2][3] = position, (0.0, 0.0, 0.0, 1.0), twist
-    pool = Pool(length=40.0, width=40.0, depth=10.0)
+    pool = RectangularPool(length=40.0, width=40.0, depth=10.0)
     first, beside, single = (
         simulate(monkeypatch, "finsrov", worlds=LANES, states=states, pool=pool, lanes=lanes, steps=2)
         for states, lanes in ((quiet, True), (odd, True), (odd, False))

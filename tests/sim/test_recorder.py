@@ -8,14 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from finssim.sim import Recorder, Simulator, SimulatorError, read_run
+from finssim.sim import Simulator, SimulatorError, StateRecorder, read_run
 
 
 def run(folder: Path, steps: int, chunk: int, worlds: list[int] | None = None) -> Simulator:
     """Simulate three worlds under different thrusts and record them."""
     simulator = Simulator("finsrov", worlds=3, control_step=0.1, seed=7)
     simulator.set_thrust(np.linspace(-1.0, 1.0, 24).reshape(3, 1, 8))
-    with Recorder(simulator, folder, worlds=worlds, chunk=chunk) as recorder:
+    with StateRecorder(simulator, folder, worlds=worlds, chunk=chunk) as recorder:
         for _ in range(steps):
             simulator.step()
             recorder.record()
@@ -51,7 +51,7 @@ def test_a_run_says_what_it_was(tmp_path: Path) -> None:
 def test_a_run_cut_short_opens_up_to_its_last_part(tmp_path: Path) -> None:
     """Parts are whole files: without a close, all but the rows that waited are there."""
     simulator = Simulator("finsrov", worlds=3)
-    recorder = Recorder(simulator, tmp_path / "run", chunk=6)
+    recorder = StateRecorder(simulator, tmp_path / "run", chunk=6)
     for _ in range(5):
         simulator.step()
         recorder.record()  # three rows each: two parts, and three rows that are never written
@@ -63,7 +63,7 @@ def test_a_run_cut_short_opens_up_to_its_last_part(tmp_path: Path) -> None:
 def test_an_error_in_the_run_keeps_its_rows(tmp_path: Path) -> None:
     """Leaving the context by an exception, Ctrl-C included, writes what was recorded."""
     simulator = Simulator("finsrov")
-    with pytest.raises(KeyboardInterrupt), Recorder(simulator, tmp_path / "run") as recorder:
+    with pytest.raises(KeyboardInterrupt), StateRecorder(simulator, tmp_path / "run") as recorder:
         simulator.step()
         recorder.record()
         raise KeyboardInterrupt
@@ -76,8 +76,8 @@ def test_a_used_folder_and_a_missing_world_are_refused(tmp_path: Path) -> None:
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "notes.txt").write_text("mine")
     with pytest.raises(SimulatorError, match="not empty"):
-        Recorder(simulator, tmp_path / "used")
+        StateRecorder(simulator, tmp_path / "used")
     with pytest.raises(SimulatorError, match="worlds \\[5\\]: there are 0 to 1"):
-        Recorder(simulator, tmp_path / "new", worlds=[5])
+        StateRecorder(simulator, tmp_path / "new", worlds=[5])
     with pytest.raises(SimulatorError, match="no recorded run"):
         read_run(tmp_path / "used")

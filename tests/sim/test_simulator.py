@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from finssim.sim import Pool, Simulator, SimulatorError
+from finssim.sim import RectangularPool, Simulator, SimulatorError
 from finssim.vehicles import VehicleError
 from reference.cases import EVERY_VEHICLE_AND_MODEL, ONE_VEHICLE_PER_MODEL, disturb, load, random_states
 
@@ -160,7 +160,7 @@ def test_a_quaternion_is_made_of_unit_length():
 
 def test_a_new_simulator_has_its_vehicles_in_the_water_at_rest():
     """Level, at rest, in the middle of the pool's depth."""
-    simulator = Simulator("finsrov", worlds=2, pool=Pool(depth=3.0))
+    simulator = Simulator("finsrov", worlds=2, pool=RectangularPool(depth=3.0))
     assert simulator.numpy("position")[0, 0].tolist() == [0.0, 0.0, -1.5]
     assert not simulator.numpy("velocity").any()
 

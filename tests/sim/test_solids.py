@@ -7,7 +7,7 @@ import warp as wp
 pytest.importorskip("finssim.extensions.perception")
 
 from finssim.extensions.perception import WorldLayout, load_world
-from finssim.sim import Pool, Simulator, SimulatorError
+from finssim.sim import RectangularPool, Simulator, SimulatorError
 from finssim.sim.step import physics_kernel
 from reference.body import rotation
 from reference.cases import disturb, load, neutral, undamped
@@ -244,7 +244,7 @@ def test_every_world_has_its_own_solids_and_a_draw_moves_them(world):
 def test_a_basin_is_a_pool(world):
     """A world that is a basin alone: bit by bit what the pool of its size does."""
     site = world("basin: {size: [4, 2, 1]}\ncontact: {stiffness: 3000, damping: 80, friction: 0.1}")
-    pool = Pool(length=4.0, width=2.0, depth=1.0, stiffness=3000.0, damping=80.0, friction=0.1)
+    pool = RectangularPool(length=4.0, width=2.0, depth=1.0, stiffness=3000.0, damping=80.0, friction=0.1)
     runs = []
     for options in ({"world": site}, {"pool": pool}):
         simulator = Simulator("finsrov", worlds=3, threads=1, **options)
@@ -271,7 +271,7 @@ def test_boxes_around_a_vehicle_are_the_walls_of_a_pool(world):
         )
     )  # fmt: skip
     runs = []
-    for options in ({"world": world(slabs)}, {"pool": Pool(length=4.0, width=2.0, depth=1.0)}):
+    for options in ({"world": world(slabs)}, {"pool": RectangularPool(length=4.0, width=2.0, depth=1.0)}):
         simulator = Simulator("finsrov", worlds=1, threads=1, substeps=20, **options)
         simulator.place((1.6, 0.0, -0.6), velocity=(0.2, 0.0, -0.1, 0.0, 0.0, 0.0))
         for _ in range(8):

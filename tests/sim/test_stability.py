@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.sim import Pool, Simulator
+from finssim.sim import RectangularPool, Simulator
 from reference.body import rotation
 from reference.cases import EVERY_VEHICLE_AND_MODEL, load, random_attitudes
 from reference.motion import energy, numbers
@@ -92,7 +92,7 @@ def test_a_vehicle_put_half_into_a_wall_comes_out():
     In the air it would leave with sqrt(2 E / m); the water takes from that.
     """
     vehicle = load("finsrov")
-    pool, rng = Pool(), np.random.default_rng(2)
+    pool, rng = RectangularPool(), np.random.default_rng(2)
     simulator = Simulator(vehicle, worlds=64, pool=pool)
     side = rng.choice([-1.0, 1.0], 64)
     position = np.stack([side * pool.length / 2, rng.uniform(-0.5, 0.5, 64), np.full(64, -0.5)], axis=1)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from finssim.sim import Pool, Simulator, TetherLine
+from finssim.sim import RectangularPool, Simulator, TetherLine
 from reference.body import rotation
 from reference.cases import ONE_VEHICLE_PER_MODEL, disturb, load, random_attitudes
 from reference.motion import energy, numbers
 
-POOL = Pool(length=4.0, width=2.0, depth=1.0)
+POOL = RectangularPool(length=4.0, width=2.0, depth=1.0)
 
 
 def sinking(name, model, net=0.05):

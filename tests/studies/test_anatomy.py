@@ -8,7 +8,7 @@ import pytest
 
 from finssim.agents.agent import agent_for
 from finssim.evaluation import evaluate
-from finssim.evaluation.plants import Plant
+from finssim.evaluation.plants import PlantChanges
 from finssim.tasks.catalogue import task_named
 from finssim.vehicles import load_vehicle
 from studies import anatomy as module
@@ -23,7 +23,7 @@ def test_every_cause_begins_with_nothing_and_changes_something():
     agent = agent_for("pid", FINSROV, task)
 
     def plant_of(cause, amount):
-        made = Plant(name="x", **cause.plant(amount))
+        made = PlantChanges(name="x", **cause.plant(amount))
         environment = made.environment(agent, task, FINSROV, worlds=2, seed=1)
         fields = {name: field.numpy() for name, field in environment.simulator.plant.fields.items()}
         water = environment.simulator.water.current.numpy()

@@ -7,7 +7,7 @@ import pytest
 
 from finssim.core.optics import Interface, Lens
 from finssim.survey.pool_fit import _numbers, calibrate_pool, doubted
-from finssim.survey.pool_model import Settings
+from finssim.survey.pool_model import PoolFitSettings
 from finssim.trials.findings import CalibrationError
 
 from .surveyed_pools import (
@@ -46,7 +46,7 @@ def test_wrong_rows_are_named_and_left_out(box):
     points = seen.points.copy()
     points[[3, 11, 20, 30]] = points[[11, 3, 30, 20]]
     points[7, 0] += 0.2
-    fit = calibrate_pool(replace(seen, points=points), PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
+    fit = calibrate_pool(replace(seen, points=points), PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0))
     assert set(fit.outliers) == {"p3", "p7", "p11", "p20", "p30"}
     assert fit.model.camera.position[2] == pytest.approx(2.2, abs=0.01)
 
@@ -56,23 +56,23 @@ def test_a_rough_camera_file_is_found_out():
     """A focal length 3 % off and no distortion: the lens is fitted here, and said to be."""
     rough = Lens(1280, 720, 557.0, 557.0, 640.0, 360.0, "plumb_bob", ())
     seen = survey(overhead(), WATER, SOLID, 80)
-    fit = calibrate_pool(seen, rough, Settings(water_height=1.0))
+    fit = calibrate_pool(seen, rough, PoolFitSettings(water_height=1.0))
     assert "focal" in fit.lens_fitted
     assert "lens_refitted" in codes(fit)
     assert fit.held_out.as_json()["rms_cm"] < 0.6
-    held = calibrate_pool(seen, rough, Settings(fit=FIT, water_height=1.0))
+    held = calibrate_pool(seen, rough, PoolFitSettings(fit=FIT, water_height=1.0))
     assert held.held_out.as_json()["rms_cm"] > 2.0 * fit.held_out.as_json()["rms_cm"]
 
 
 def test_a_good_camera_file_is_left_alone():
     seen = survey(overhead(), WATER, FLOOR, 60)
-    assert calibrate_pool(seen, PLUMB_BOB, Settings(water_height=1.0)).lens_fitted == ()
+    assert calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(water_height=1.0)).lens_fitted == ()
 
 
 def test_points_near_the_axis_tell_no_height():
     """Seen from above, water only brings the floor nearer: the height is said to be unknown, and the map is right."""
     seen = survey(overhead(), WATER, ((-0.2, -0.4, 0.0), (0.2, 0.0, 1e-12)), 40)
-    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT))
+    fit = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT))
     assert not fit.estimates["camera_height"].identifiable
     assert any(
         one.code == "points_narrow" and "surface: height" in one.values["remedy"] for one in fit.findings
@@ -88,7 +88,7 @@ def test_a_sloping_floor_taken_for_level_is_noticed():
     water = Interface.water(1.0, tilt_x=0.02)
     camera = looking((-2.5, 0.0, 2.5), (0.0, 0.0, 0.0), PLUMB_BOB, (0.0, 0.0, 1.0))
     seen = survey(camera, water, ((-2.0, -1.5, 0.0), (2.0, 1.5, 0.5)), 80, error=0.001)
-    told = Settings(fit=FIT, water_height=1.0, place_sigma=0.02, survey_sigma=0.001)
+    told = PoolFitSettings(fit=FIT, water_height=1.0, place_sigma=0.02, survey_sigma=0.001)
     fit = calibrate_pool(seen, PLUMB_BOB, told)
     assert "plane_tilted" in codes(fit)
     assert tilt_error(fit, water) < 0.5
@@ -97,7 +97,7 @@ def test_a_sloping_floor_taken_for_level_is_noticed():
 @pytest.mark.slow
 def test_a_wrong_tape_is_contradicted():
     seen = survey(overhead(), WATER, SOLID, 80)
-    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=1.3, place_sigma=0.005))
+    fit = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.3, place_sigma=0.005))
     assert "plane_contradicted" in codes(fit)
 
 
@@ -121,7 +121,7 @@ def test_dry_points_help():
         arm=np.zeros((52, 3)),
         dry=np.arange(52) >= 40,
     )
-    told = Settings(fit=FIT)
+    told = PoolFitSettings(fit=FIT)
     half = [np.ptp(calibrate_pool(s, PLUMB_BOB, told).estimates["water_height"].ci95) for s in (wet, both)]
     assert half[1] < half[0] / 1.5
 
@@ -132,11 +132,11 @@ def test_a_guessed_focal_length_is_enough(factor):
     """Points at many depths give the focal length back within 2 % from a guess 30 or 40 % off."""
     guess = Lens(1280, 720, 541.0 * factor, 541.0 * factor, 640.0, 360.0, "plumb_bob", ())
     seen = survey(overhead(), WATER, SOLID, 80)
-    fit = calibrate_pool(seen, guess, Settings(water_height=1.0, focal_sigma=0.3))
+    fit = calibrate_pool(seen, guess, PoolFitSettings(water_height=1.0, focal_sigma=0.3))
     assert fit.model.camera.lens.fx == pytest.approx(540.93, rel=0.02)
     assert np.linalg.norm(fit.model.camera.position - overhead().position) < 0.03
     assert fit.held_out.as_json()["rms_cm"] < 0.5
-    unsaid = calibrate_pool(seen, guess, Settings(water_height=1.0))
+    unsaid = calibrate_pool(seen, guess, PoolFitSettings(water_height=1.0))
     assert "focal_pulled" in codes(unsaid)
 
 
@@ -157,7 +157,7 @@ def test_marks_above_the_water_are_told_from_wrong_rows():
     wrong = wet.points.copy()
     wrong[7, 0] += 0.2
     seen = observations(np.concatenate([wrong, points]), np.concatenate([wet.pixels, pixels]))
-    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
+    fit = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0))
     of = {one.code: one.values for one in fit.findings}
     assert of["marks_dry"]["marks"] == tuple(f"p{i}" for i in range(40, 48))
     assert of["rows_wrong"] == {"rows": 1}
@@ -169,7 +169,9 @@ def test_points_without_water_are_noticed():
     points = survey(camera, window(), TANK, 60, error=0.0).points
     pixels, _ = camera.lens.project((points - camera.position) @ camera.R_pc)
     pixels = pixels + 0.25 * np.random.default_rng(1).standard_normal(pixels.shape)
-    told = Settings(fit=FIT, window=GLASS, plane=(0.0, 1.0, 0.0, 0.0), index_sigma=0.0, survey_sigma=0.0005)
+    told = PoolFitSettings(
+        fit=FIT, window=GLASS, plane=(0.0, 1.0, 0.0, 0.0), index_sigma=0.0, survey_sigma=0.0005
+    )
     fit = doubted(calibrate_pool(observations(points, pixels), TANK_LENS, told))
     assert codes(fit)[0] == "straight_better"
 
@@ -177,7 +179,9 @@ def test_points_without_water_are_noticed():
 @pytest.mark.slow
 @pytest.mark.parametrize("box", [FLOOR, SOLID], ids=["floor", "solid"])
 def test_points_in_water_raise_no_doubt(box):
-    fit = calibrate_pool(survey(overhead(), WATER, box, 60), PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
+    fit = calibrate_pool(
+        survey(overhead(), WATER, box, 60), PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0)
+    )
     assert doubted(fit).findings == fit.findings
 
 
@@ -185,7 +189,7 @@ def test_points_in_water_raise_no_doubt(box):
 @pytest.mark.parametrize(("option", "value"), [("water_height", 100.0), ("water_depth", 100.0)])
 def test_centimetres_for_metres_are_refused(option, value):
     seen = survey(overhead(), WATER, FLOOR, 40)
-    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, **{option: value}))
+    fit = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT, **{option: value}))
     with pytest.raises(
         CalibrationError, match=f"surface: {option.removeprefix('water_')} 100 puts the plane 100 m.*unit"
     ):
@@ -196,7 +200,9 @@ def test_centimetres_for_metres_are_refused(option, value):
 def test_a_camera_on_the_plane_with_large_residuals_is_doubted(pixels, refused):
     """A sound calibration moved on to its plane: 4 px are doubted, 30 px refused, and 0.3 px are a camera at a
     window."""
-    fit = calibrate_pool(survey(overhead(), WATER, FLOOR, 40), PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
+    fit = calibrate_pool(
+        survey(overhead(), WATER, FLOOR, 40), PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0)
+    )
     plane = replace(
         fit.model.interface, offset=-float(fit.model.interface.normal @ fit.model.camera.position)
     )
@@ -216,7 +222,7 @@ def test_a_flat_left_handed_survey_is_warned_of():
     turn = np.array([1.0, -1.0, 1.0])
     left = survey(overhead(), WATER, FLOOR, 40)
     left = replace(left, points=left.points * turn)
-    told = Settings(fit=FIT)
+    told = PoolFitSettings(fit=FIT)
     assert codes(doubted(calibrate_pool(left, PLUMB_BOB, told)))[0] == "handedness_open"
     with pytest.raises(CalibrationError, match="other side"):
         calibrate_pool(left, PLUMB_BOB, replace(told, water_height=1.0))
@@ -233,7 +239,7 @@ def test_a_lens_that_misfits_before_a_known_window_may_be_fitted(factor):
     """Window and index known, the lens not: index or window gives way, and the advice says how to free the lens."""
     rough = replace(TANK_LENS, fx=TANK_LENS.fx * factor, fy=TANK_LENS.fy * factor)
     seen = survey(before_tank(30.0), window(), TANK, 60, error=0.0005)
-    told = Settings(fit=FIT, window=GLASS, plane=(0.0, 1.0, 0.0, 0.0), survey_sigma=0.0005)
+    told = PoolFitSettings(fit=FIT, window=GLASS, plane=(0.0, 1.0, 0.0, 0.0), survey_sigma=0.0005)
     fit = calibrate_pool(seen, rough, told)
     assert any(
         one.code in ("index_pulled", "tilt_pulled") and "index, focal, center" in one.values["remedy"]
@@ -248,7 +254,7 @@ def test_correlations_bear_the_names_of_the_table(plane):
         seen, lens = survey(overhead(), WATER, SOLID, 40), PLUMB_BOB
     else:
         seen, lens = survey(before_tank(30.0), window(), TANK, 40, error=0.0005), TANK_LENS
-    fit = calibrate_pool(seen, lens, Settings(fit=FIT, window=GLASS if plane else None, plane=plane))
+    fit = calibrate_pool(seen, lens, PoolFitSettings(fit=FIT, window=GLASS if plane else None, plane=plane))
     fitted = [name for name, estimate in fit.estimates.items() if estimate.note != "as given"]
     assert list(fit.correlation.names) == fitted
     np.testing.assert_allclose(np.diagonal(fit.correlation.matrix), 1.0)
@@ -259,7 +265,7 @@ def test_correlations_bear_the_names_of_the_table(plane):
 def test_a_survey_that_is_rougher_than_stated_is_noticed_with_its_error():
     """Errors of three times the assumed 2 mm are reported as 6 mm."""
     seen = survey(overhead(), WATER, SOLID, 40)
-    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
+    fit = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0))
     assert "survey_rough" not in codes(fit)
     rough = replace(fit, noise=replace(fit.noise, survey=0.002, scale=3.0))
     (found,) = (one for one in _numbers(rough, seen) if one.code == "survey_rough")

@@ -7,7 +7,7 @@ import pytest
 
 from finssim.core.optics import Camera, Interface, Layer, project
 from finssim.survey.pool_fit import calibrate_pool
-from finssim.survey.pool_model import Settings
+from finssim.survey.pool_model import PoolFitSettings
 from finssim.trials.findings import CalibrationError
 
 from .surveyed_pools import (
@@ -41,7 +41,7 @@ def test_noise_free_surveys_give_the_truth(lens, box):
     """Without errors nothing is left over, whatever the lens, and no guess is needed."""
     camera = overhead(lens)
     seen = survey(camera, WATER, box, 40, pixel=0.0, error=0.0)
-    fit = calibrate_pool(seen, lens, Settings(fit=FIT, index_sigma=0.0, survey_sigma=1e-6))
+    fit = calibrate_pool(seen, lens, PoolFitSettings(fit=FIT, index_sigma=0.0, survey_sigma=1e-6))
     np.testing.assert_allclose(fit.model.camera.position, camera.position, atol=1e-4)
     assert fit.model.clearance == pytest.approx(clearance(camera, WATER), abs=1e-4)
     assert np.linalg.norm(fit.residual, axis=1).max() < 1e-2
@@ -54,7 +54,7 @@ def test_published_geometry_with_a_tape():
     for seed in range(6):
         seen = survey(camera, WATER, FLOOR, 160, seed, pixel=0.25, error=0.002)
         tape = 1.0 + 0.002 * np.random.default_rng(seed).standard_normal()
-        told = Settings(fit=FIT, water_height=tape, place_sigma=0.002)
+        told = PoolFitSettings(fit=FIT, water_height=tape, place_sigma=0.002)
         fit = calibrate_pool(seen, PLUMB_BOB, told)
         normal = fit.model.interface.normal
         errors.append([fit.model.camera.position[2] - camera.position[2], *np.degrees(normal[:2])])
@@ -75,7 +75,7 @@ def test_intervals_hold_the_truth():
         camera = overhead()
         water = Interface.water(1.0, tilt_x=tilts[0], tilt_y=tilts[1], n_water=index)
         seen = survey(camera, water, SOLID, 30, seed)
-        table = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, seed=seed)).estimates
+        table = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT, seed=seed)).estimates
         truth = {"camera_x": 0.03, "camera_z": 2.2, "index": index, "camera_height": clearance(camera, water)}
         inside += sum(table[n].ci95[0] < value < table[n].ci95[1] for n, value in truth.items())
     assert inside >= 20
@@ -85,7 +85,7 @@ def test_z_down_is_a_frame_like_any_other():
     """x forward, y right, z down: the water lies at negative z."""
     camera, seen = overhead(), survey(overhead(), WATER, FLOOR, 60)
     down = replace(seen, points=seen.points * np.array([1.0, -1.0, -1.0]))
-    fit = calibrate_pool(down, camera.lens, Settings(fit=FIT, water_height=-1.0))
+    fit = calibrate_pool(down, camera.lens, PoolFitSettings(fit=FIT, water_height=-1.0))
     assert fit.model.interface.normal[2] < -0.999
     np.testing.assert_allclose(fit.model.camera.position, camera.position * [1.0, -1.0, -1.0], atol=0.01)
 
@@ -95,7 +95,7 @@ def test_a_left_handed_solid_is_refused():
     seen = survey(overhead(), WATER, SOLID, 40)
     mirrored = replace(seen, points=seen.points * np.array([1.0, -1.0, 1.0]))
     with pytest.raises(CalibrationError, match="left-handed.*negate one axis"):
-        calibrate_pool(mirrored, PLUMB_BOB, Settings(fit=FIT))
+        calibrate_pool(mirrored, PLUMB_BOB, PoolFitSettings(fit=FIT))
 
 
 def test_a_left_handed_floor_contradicts_its_tape():
@@ -103,8 +103,8 @@ def test_a_left_handed_floor_contradicts_its_tape():
     seen = survey(overhead(), WATER, FLOOR, 40)
     mirrored = replace(seen, points=seen.points * np.array([1.0, -1.0, 1.0]))
     with pytest.raises(CalibrationError, match="other side.*negate y"):
-        calibrate_pool(mirrored, PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
-    depth = calibrate_pool(mirrored, PLUMB_BOB, Settings(fit=FIT, water_depth=1.0))
+        calibrate_pool(mirrored, PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0))
+    depth = calibrate_pool(mirrored, PLUMB_BOB, PoolFitSettings(fit=FIT, water_depth=1.0))
     assert depth.held_out.as_json()["rms_cm"] < 0.5
 
 
@@ -125,7 +125,7 @@ def test_too_little_is_refused(points, words):
 @pytest.mark.slow
 def test_equal_seeds_give_equal_fits():
     seen = survey(overhead(), WATER, FLOOR, 30)
-    a, b = (calibrate_pool(seen, PLUMB_BOB, Settings(water_height=1.0, seed=4)) for _ in range(2))
+    a, b = (calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(water_height=1.0, seed=4)) for _ in range(2))
     assert a.estimates == b.estimates
     assert a.held_out.as_json() == b.held_out.as_json()
 
@@ -146,7 +146,7 @@ def test_equal_seeds_give_equal_fits():
 )
 def test_senseless_options_are_refused(options, words):
     with pytest.raises(CalibrationError, match=words):
-        Settings(**options)
+        PoolFitSettings(**options)
 
 
 @pytest.mark.slow
@@ -166,7 +166,7 @@ def test_intervals_allow_for_a_lens_that_is_not_sure():
             cy=PLUMB_BOB.cy + y,
         )
         for name, sigma in (("told", (0.003, 4.0)), ("not told", (0.0, 0.0))):
-            told = Settings(
+            told = PoolFitSettings(
                 fit=FIT,
                 water_height=1.0,
                 place_sigma=0.002,
@@ -194,5 +194,5 @@ def test_a_flat_floor_with_two_dry_marks_is_not_taken_for_left_handed(seed):
     pixels = np.concatenate([project(camera, Interface.water(2.29), floor).pixels, straight])
     seen = observations(np.concatenate([floor, marks]), pixels + random.normal(0.0, 1.0, (12, 2)))
     seen = replace(seen, dry=np.arange(12) >= 10)
-    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=2.29, survey_sigma=0.01))
+    fit = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=2.29, survey_sigma=0.01))
     assert np.linalg.norm(fit.model.camera.position - camera.position) < 0.2

@@ -8,7 +8,7 @@ import pytest
 from finssim.core.optics import Interface, Status, project
 from finssim.core.rotations import quat_from_rotvec, quat_to_matrix
 from finssim.survey.pool_fit import CAMERA, calibrate_pool
-from finssim.survey.pool_model import Settings
+from finssim.survey.pool_model import PoolFitSettings
 
 from .surveyed_pools import (
     GLASS,
@@ -45,7 +45,7 @@ def test_points_behind_a_window(degrees):
     """A vertical window at any angle to the camera, its plane unknown: held-out points to about a millimetre."""
     camera, plane = before_tank(degrees), window()
     seen = survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005)
-    fit = calibrate_pool(seen, camera.lens, Settings(fit=FIT, window=GLASS, survey_sigma=0.0005))
+    fit = calibrate_pool(seen, camera.lens, PoolFitSettings(fit=FIT, window=GLASS, survey_sigma=0.0005))
     table = fit.estimates
     assert table["camera_distance"].ci95[0] < clearance(camera, plane) < table["camera_distance"].ci95[1]
     assert tilt_error(fit, plane) < 2.5
@@ -58,7 +58,7 @@ def test_a_window_in_the_frame_of_a_target():
     """Any frame will do: that of a target that lies askew in the water."""
     camera, plane = before_tank(30.0), window()
     camera, plane, seen = carried(camera, plane, survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005))
-    told = Settings(fit=FIT, window=GLASS, survey_sigma=0.0005)
+    told = PoolFitSettings(fit=FIT, window=GLASS, survey_sigma=0.0005)
     fit = calibrate_pool(seen, camera.lens, told)
     assert tilt_error(fit, plane) < 2.5
     assert np.linalg.norm(fit.model.camera.position - camera.position) < 0.03
@@ -68,7 +68,9 @@ def test_a_window_in_the_frame_of_a_target():
 def test_a_surveyed_plane_makes_a_window_exact():
     camera, plane = before_tank(20.0), window()
     seen = survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005)
-    told = Settings(fit=FIT, window=GLASS, survey_sigma=0.0005, plane=(0.0, 1.0, 0.0, 0.0), place_sigma=0.001)
+    told = PoolFitSettings(
+        fit=FIT, window=GLASS, survey_sigma=0.0005, plane=(0.0, 1.0, 0.0, 0.0), place_sigma=0.001
+    )
     fit = calibrate_pool(seen, camera.lens, told)
     assert np.linalg.norm(fit.model.camera.position - camera.position) < 0.004
     assert tilt_error(fit, plane) < 0.5
@@ -96,7 +98,7 @@ def boards(camera, plane, seed=5, nearest=0.02):
 
 
 def told(**options):
-    return Settings(fit=FIT, survey_sigma=SURVEY, **options)
+    return PoolFitSettings(fit=FIT, survey_sigma=SURVEY, **options)
 
 
 def tilt_sigma(fit):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.core.optics import Layer
-from finssim.survey.pool_model import Settings
+from finssim.survey.pool_model import PoolFitSettings
 from finssim.survey.survey_file import load_survey_file
 from finssim.trials.findings import CalibrationError
 
@@ -32,7 +32,7 @@ def written(folder, text):
 
 def test_every_key_is_a_setting_in_si(tmp_path):
     file = load_survey_file(written(tmp_path, WHOLE))
-    assert file.fit_settings(seed=3) == Settings(
+    assert file.fit_settings(seed=3) == PoolFitSettings(
         survey_sigma=0.001,
         survey_yaw_sigma=np.radians(2.0),
         water_height=1.02,
@@ -53,7 +53,7 @@ def test_every_key_is_a_setting_in_si(tmp_path):
 
 def test_a_window_and_its_plane(tmp_path):
     file = load_survey_file(written(tmp_path, WINDOW))
-    assert file.fit_settings() == Settings(
+    assert file.fit_settings() == PoolFitSettings(
         window=Layer(0.010, 1.52),
         plane=(0.0, 1.0, 0.0, 0.3),
         place_sigma=0.002,
@@ -63,9 +63,9 @@ def test_a_window_and_its_plane(tmp_path):
 
 @pytest.mark.parametrize("text", ["surface: {}\n", "surface:\n"])
 def test_the_shortest_file_keeps_every_default(tmp_path, text):
-    """What the file leaves out is the caller's, or else that of `Settings`."""
+    """What the file leaves out is the caller's, or else that of `PoolFitSettings`."""
     file = load_survey_file(written(tmp_path, text))
-    assert file.fit_settings() == Settings()
+    assert file.fit_settings() == PoolFitSettings()
     assert file.fit_settings(focal_sigma=0.01).focal_sigma == 0.01
     assert load_survey_file(written(tmp_path, WHOLE)).fit_settings(focal_sigma=0.01).focal_sigma == 0.003
 

@@ -10,8 +10,8 @@ from finssim.localization.detection.families import corners
 from finssim.survey.least_squares import Pose
 from finssim.survey.mounts import (
     Moment,
+    MountNoise,
     MountState,
-    Noise,
     Rig,
     change,
     fit_mounts,
@@ -49,7 +49,7 @@ def test_derivatives_are_those_of_the_prediction(rocked):
     """Every column of the normal equations' right side against a numerical derivative of the cost."""
     some = [replace(m, corners=dict(m.corners)) for m in rocked[:3]]
     state, _ = start_state(RIG, FILE, some)
-    rig = replace(RIG, noise=Noise(pixel=1e3))  # no corner is far off
+    rig = replace(RIG, noise=MountNoise(pixel=1e3))  # no corner is far off
 
     def cost(s):
         pixels, _, rest = residuals(rig, s, some)

@@ -10,7 +10,7 @@ import warp as wp
 
 from finssim.control.modes import action_mode
 from finssim.sim.randomize import Randomization
-from finssim.sim.site import Pool
+from finssim.sim.site import RectangularPool
 from finssim.sim.state import State
 from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, StationKeeping
 from finssim.tasks.terms import place_at_rest
@@ -230,7 +230,7 @@ class Walled(Steady):
     """It begins where it cannot."""
 
     name: str = "walled"
-    pool: Pool | None = Pool()
+    pool: RectangularPool | None = RectangularPool()
 
     def terms(self):
         return replace(super().terms(), start=in_the_wall)
@@ -242,7 +242,7 @@ def test_a_start_outside_the_arena_is_refused_with_its_place():
         EnvironmentSetupError, match=r"'walled' starts .* in world 2 at \(2.1, 0, -0.5\) m, outside"
     ):
         Environment(Walled(), worlds=4)
-    assert Environment(replace(Walled(), pool=Pool(length=6.0)), worlds=4).worlds == 4
+    assert Environment(replace(Walled(), pool=RectangularPool(length=6.0)), worlds=4).worlds == 4
 
 
 def test_of_many_worlds_that_break_three_are_written(tmp_path, capsys):

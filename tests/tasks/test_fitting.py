@@ -12,7 +12,7 @@ from finssim.control.modes import mode_from_dict
 from finssim.control.policy import Policy
 from finssim.evaluation.metrics import T1_SETPOINTS, in_room
 from finssim.learning.train import train
-from finssim.sim import Pool
+from finssim.sim import RectangularPool
 from finssim.tasks import TASKS, EnvironmentSetupError, numeric_tasks
 from finssim.tasks.fitting import authority
 from finssim.tasks.given import crew
@@ -31,7 +31,7 @@ SIZE = 2.6 / 0.6
 def test_lengths_of_t1_and_t2_grow_with_the_vehicle_and_their_tolerance_stays(name):
     """FinsROV has the paper's pool; starts of RexROV's episodes fill one that is 4.3 times as large, under water."""
     small, large = make(name, worlds=200), make(name, worlds=200, vehicle="rexrov")
-    assert small.simulator.surroundings[1] == Pool()
+    assert small.simulator.surroundings[1] == RectangularPool()
     assert large.simulator.surroundings[1].depth == pytest.approx(SIZE)
     assert large.task.tolerance == small.task.tolerance
     starts = [e.simulator.state.position.numpy()[:, 0] for e in (small, large)]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from finssim.sim import Pool
+from finssim.sim import RectangularPool
 from finssim.tasks import Environment, make
 from finssim.tasks.moving_target import MovingTarget
 
 TASK = MovingTarget()
-LARGE = Pool(length=20.0, width=20.0, depth=10.0)
+LARGE = RectangularPool(length=20.0, width=20.0, depth=10.0)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -147,7 +147,7 @@ def test_leaving_the_pool_terminates_with_a_loss(position, left):
 def test_a_longer_vehicle_has_a_larger_pool_and_a_faster_target():
     """Everything grows with the vehicle; FinsROV's is the paper's pool."""
     small, large = make("t3"), make("t3", vehicle="rexrov")
-    assert small.simulator.surroundings[1] == Pool(stiffness=4000.0)
+    assert small.simulator.surroundings[1] == RectangularPool(stiffness=4000.0)
     size, pace = large.task.fit.size, large.task.fit.pace
     assert size == pytest.approx(2.6 / 0.6) and 1.0 < pace <= size
     assert large.simulator.surroundings[1].length == pytest.approx(4.0 * size)

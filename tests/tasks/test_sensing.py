@@ -72,7 +72,7 @@ def test_doubts_grow_and_shrink_as_in_the_filters_of_the_robot():
     square[:3, :3], square[3:, 3:] = np.eye(3) * P[0], np.eye(3) * P[2]
     square[:3, 3:] = square[3:, :3] = np.eye(3) * P[1]
     there = position_filter.PositionState(np.zeros(6), square)
-    motion = position_filter.Motion(density=(q, q, q))
+    motion = position_filter.MotionModel(density=(q, q, q))
     later = position_filter.predict(there, dt, motion)
     np.testing.assert_allclose(grown(wp.vec3(*P), q, dt), later.P[[0, 0, 3], [0, 3, 3]], rtol=1e-5)
     for column, known in ((0, value_known), (3, rate_known)):

@@ -8,13 +8,13 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from finssim.sim import Pool
+from finssim.sim import RectangularPool
 from finssim.tasks import Environment, StationKeeping
 from finssim.tasks.station_keeping import Reward
 from finssim.tasks.task import kernels_of, settings_of
 
 TASK = StationKeeping()
-LARGE = Pool(length=20.0, width=20.0, depth=10.0)
+LARGE = RectangularPool(length=20.0, width=20.0, depth=10.0)
 """Its walls are out of reach, so that the task's own bounds can be left."""
 SINGLE = 2e-6  # float32, a few operations on numbers of order one
 

@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from finssim.control.trajectories import TRAJECTORIES, load_trajectory
-from finssim.sim import Pool
+from finssim.sim import RectangularPool
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping, TrajectoryTracking, follow
 from finssim.tasks.trajectory_tracking import LEVELS
 from tests.reference.observed import published_t2
 
 TASK = TrajectoryTracking()
 GUIDES = tuple(TRAJECTORIES.values())
-LARGE = Pool(length=60.0, width=60.0, depth=30.0)
+LARGE = RectangularPool(length=60.0, width=60.0, depth=30.0)
 """Its walls are out of reach, so that references can be left."""
 
 

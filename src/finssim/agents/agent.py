@@ -15,7 +15,7 @@ from finssim.agents.controllers import CONTROLLERS, controller_for
 from finssim.control.guidance import Goal, Known
 from finssim.control.modes import mode_from_dict
 from finssim.control.policy import DESCRIPTION_FILE, Policy
-from finssim.sim import Recorder
+from finssim.sim import StateRecorder
 from finssim.tasks.environment import Environment, Step
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
@@ -250,7 +250,7 @@ def rollout(
     shape = (worlds, -1) if agents == 1 else (worlds, agents, -1)
     memory = agent.reset(worlds * agents)
     step: Step | None = None
-    with nullcontext() if record is None else Recorder(environment.simulator, record) as recorder:
+    with nullcontext() if record is None else StateRecorder(environment.simulator, record) as recorder:
         for k in range(steps + 1):
             yield k, step
             if recorder is not None:

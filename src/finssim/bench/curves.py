@@ -14,7 +14,7 @@ from finssim.bench.tables import STANDING
 from finssim.trials.findings import CalibrationError
 from finssim.vehicles import Esc
 
-__all__ = ["DeadZone", "EscFit", "Side", "dead_zone", "fit_esc", "fit_side"]
+__all__ = ["DeadZone", "EscFit", "DirectionCurve", "dead_zone", "fit_esc", "fit_side"]
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ LEAST_ROWS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Side:
+class DirectionCurve:
     """The thrust curve of one direction of rotation."""
 
     c: float
@@ -45,7 +45,7 @@ class Side:
     rejected: int
 
 
-def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
+def fit_side(tables: Sequence[tuple[Array, Array]]) -> DirectionCurve | None:
     """Fit |T| = c ω² (paper, eq. 16) to one direction of rotation by least squares.
 
     The residuals of real tables are the curve's own misfit, alike in neighbouring rows, so the interval comes from the
@@ -86,7 +86,7 @@ def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
     )
     error, spread = f - found.x[0] * x, f - np.mean(f)
     total = float(spread @ spread)
-    return Side(
+    return DirectionCurve(
         c=float(found.x[0]),
         half_width=float(found.half[0]),
         r2=1.0 - float(error @ error) / total if total > 0.0 else math.nan,

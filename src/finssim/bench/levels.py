@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from finssim.trials.findings import Finding, finding
 
-__all__ = ["Step", "find_steps", "levels", "settled_rows"]
+__all__ = ["LevelStep", "find_steps", "levels", "settled_rows"]
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ TOLERANCE = 0.02
 """Band around a level within which a measured signal counts as held, as a share of its range."""
 
 
-class Step(NamedTuple):
+class LevelStep(NamedTuple):
     """A change of a held signal and the level that follows it."""
 
     start: float
@@ -108,7 +108,7 @@ def finite_mean(values: Array) -> float:
     return float(np.mean(good)) if good.size else float("nan")
 
 
-def find_steps(t: Array, command: Array) -> list[Step]:
+def find_steps(t: Array, command: Array) -> list[LevelStep]:
     """Return the changes between held levels of a command.
 
     Args:
@@ -126,7 +126,7 @@ def find_steps(t: Array, command: Array) -> list[Step]:
     if len(runs) > 4 * len(held):  # a command that moves all the time
         return []
     return [
-        Step(
+        LevelStep(
             float(t[a2 - 1]),
             float(t[a2]),
             float(t[b2 - 1]),

@@ -59,7 +59,7 @@ class StepRecord:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Log:
+class MotorLog:
     """Steps and levels of one thruster in one trial, in thrust [N] or shaft speed [rad/s]."""
 
     records: list[StepRecord]
@@ -72,7 +72,7 @@ class Log:
     findings: tuple[Finding, ...]
 
 
-def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Log | None:
+def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> MotorLog | None:
     """Return command and response of a thruster; None if the trial lacks one of them.
 
     The command is the first of `rpm_command_NAME` [rpm], `command_NAME` [N] and `pwm_NAME` [µs] in the trial, or
@@ -117,7 +117,7 @@ def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Log | No
             level = float(command[np.searchsorted(times, step.time)])
             levels.append((level, float(np.mean(response[rows]))))
     records = cut_steps(trial.name, t, response, times, [(s.start, s.time, s.end) for s in steps])
-    return Log(
+    return MotorLog(
         records=records, levels=levels, measured=measured, same_unit=same_unit, findings=tuple(findings)
     )
 
@@ -190,7 +190,7 @@ FEWEST_TRIALS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Response:
+class MotorResponse:
     """The response that all steps have in common."""
 
     delay: float
@@ -225,7 +225,7 @@ class Response:
         return float(np.median(self.nrmse[self.used]))
 
 
-def fit_response(records: Sequence[StepRecord]) -> Response:
+def fit_response(records: Sequence[StepRecord]) -> MotorResponse:
     """Fit one dead time and one time constant to all steps, with separate levels for every step.
 
     y = a + b (1 - e^(-(t - T_d) / τ)) from t = T_d on, with a and b of each step by least squares (variable
@@ -259,7 +259,7 @@ def fit_response(records: Sequence[StepRecord]) -> Response:
     blur = 0.5 * float(np.median([record.sample for record, on in zip(records, used, strict=True) if on]))
     (delay, log_tau), (late, slow) = found.x, found.half
     ends = np.exp(np.clip([log_tau - slow, log_tau + slow], -50.0, 50.0))
-    return Response(
+    return MotorResponse(
         delay=float(delay),
         time_constant=math.exp(log_tau),
         delay_interval=(max(float(delay - late) - blur, 0.0), float(delay + late) + blur),
@@ -351,8 +351,8 @@ class Study:
 
     name: str
     domain: str
-    logs: tuple[Log, ...]
-    response: Response
+    logs: tuple[MotorLog, ...]
+    response: MotorResponse
     other_error: float
     """Error of the same fit in the other domain, as a share of the steps' height; NaN if it could not be made."""
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.bench.curves import DeadZone, EscFit, Side, dead_zone, fit_esc, fit_side
+from finssim.bench.curves import DeadZone, DirectionCurve, EscFit, dead_zone, fit_esc, fit_side
 from finssim.bench.tables import QUANTITIES, STANDING, ThrustTable, read_table
 from finssim.identification.fit import Curve, Estimate, Fit
 from finssim.identification.report import finish, refuse_places
@@ -51,7 +51,7 @@ class Bench:
     """Voltage at which the numbers hold [V]; NaN if it is not known."""
     rows: ThrustTable
     """Rows that were fitted; the others only check the prediction."""
-    sides: dict[str, Side]
+    sides: dict[str, DirectionCurve]
     """Thrust curves of `plus` and `minus`."""
     dead: dict[str, DeadZone]
     fastest: dict[str, tuple[float, bool, float]]

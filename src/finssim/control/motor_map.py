@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from finssim.control import ControlError
 
-__all__ = ["AT_REST", "Motor", "MotorMap", "MotorMemory", "PulseMemory", "Side"]
+__all__ = ["AT_REST", "Motor", "MotorMap", "MotorMemory", "PulseMemory", "TurningDirection"]
 
 
 # One motor: the shaft speed to command for a thrust, small thrusts as pulses that are right on average.
@@ -42,7 +42,7 @@ AT_REST = PulseMemory(0.0, 0.0, 0.0)
 """State of a motor at rest that owes no impulse."""
 
 
-class Side(NamedTuple):
+class TurningDirection(NamedTuple):
     """One direction of turning."""
 
     c: float
@@ -57,8 +57,8 @@ class Side(NamedTuple):
 class Motor:
     """Numbers of one motor."""
 
-    plus: Side
-    minus: Side
+    plus: TurningDirection
+    minus: TurningDirection
     lag: float
     """Time constant of the shaft speed [s]."""
 
@@ -241,7 +241,7 @@ class MotorMap:
     def _motor(self, k: int, lag: float) -> Motor:
         shortest = max(lag, SHORTEST_PULSE)
         minus, plus = (
-            Side(c, slowest, 0.5 * slowest * shortest)
+            TurningDirection(c, slowest, 0.5 * slowest * shortest)
             for c, slowest in zip(self._c[:, k].tolist(), self.slowest[:, k].tolist(), strict=True)
         )
         return Motor(plus=plus, minus=minus, lag=lag)

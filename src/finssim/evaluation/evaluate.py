@@ -26,12 +26,12 @@ from finssim.evaluation.metrics import (
     summarize,
     summarize_tracking,
 )
-from finssim.evaluation.plants import Plant, load_plant
+from finssim.evaluation.plants import PlantChanges, load_plant
 from finssim.evaluation.tables import Columns, Table, cells, figure_text, html_of
 from finssim.evaluation.trials import (
     EPISODES,
     T2_TRAJECTORIES,
-    Trial,
+    GoalTrial,
     guide_of,
     run_episodes,
     run_trials,
@@ -86,7 +86,7 @@ def paper_name(result: Mapping[str, Any]) -> str:
     return f"{controller['hydrodynamics']}{randomized}"
 
 
-class Form(NamedTuple):
+class SummaryForm(NamedTuple):
     """Summary and display of a task that is measured as in the paper."""
 
     kind: str
@@ -100,15 +100,15 @@ class Form(NamedTuple):
     """Name of the paper's row -> its rows by their names in our table."""
     figure: str
     """Name of its file."""
-    draw: Callable[[Mapping[str, Sequence[Trial]], str], Any]
+    draw: Callable[[Mapping[str, Sequence[GoalTrial]], str], Any]
 
 
-FORMS: Mapping[str, Form] = {
-    "t1": Form(
+FORMS: Mapping[str, SummaryForm] = {
+    "t1": SummaryForm(
         "setpoint", tuple(T1_SETPOINTS), T1_COLUMNS, CAPTION, summarize, lambda name: {"": paper_row(name)},
         "error_envelope.png", draw_envelopes,
     ),
-    "t2": Form(
+    "t2": SummaryForm(
         "trajectory", T2_TRAJECTORIES, T2_COLUMNS, T2_CAPTION, summarize_tracking,
         lambda name: {target: paper_t2_row(name, target) or {} for target in PAPER_T2[name]},
         "trajectories.png", draw_tracking,
@@ -188,7 +188,7 @@ class Evaluation:
 
     result: dict[str, Any]
     """Result that `--json` prints: controller, place, measures over all trials, `per_trial`, provenance."""
-    trials: Sequence[Trial] = ()
+    trials: Sequence[GoalTrial] = ()
     """Trials of T1 and T2, for figures."""
 
     def __repr__(self) -> str:
@@ -255,7 +255,7 @@ def evaluation(
     vehicle: Vehicle,
     plant: Mapping[str, Any],
     measures: Sequence[dict[str, Any]],
-    trials: Sequence[Trial] = (),
+    trials: Sequence[GoalTrial] = (),
     **about: Any,
 ) -> Evaluation:
     """The evaluation of trials that were measured.
@@ -452,7 +452,7 @@ def _recorded(
     return evaluation(controller, task, body, plant, measures, trials, **about)
 
 
-def _plants(names: Sequence[str | Path]) -> list[Plant]:
+def _plants(names: Sequence[str | Path]) -> list[PlantChanges]:
     """Return the plants; each must have a unique name, which separates its results."""
     if not names:
         raise EvaluationError("no plant is given: name at least one, such as 'nominal'")
@@ -467,7 +467,7 @@ def _plants(names: Sequence[str | Path]) -> list[Plant]:
 
 def evaluate_controller(
     controller: str | Path,
-    plant: Plant,
+    plant: PlantChanges,
     *,
     task: str = "t1",
     vehicle: str | Vehicle = "finsrov",
@@ -495,7 +495,7 @@ def evaluate_controller(
     start_warp()
     body = load_vehicle(vehicle)
     agent = agent_for(controller, body, the_task)
-    played: list[Trial] = []
+    played: list[GoalTrial] = []
     with progress_bar(f"{trials} trials") as show:
         options: dict[str, Any] = {
             "trials": trials, "hydrodynamics": hydrodynamics, "seed": seed, "record": record, "show": show,
@@ -517,19 +517,19 @@ def evaluate_controller(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job(campaign.Job):
+class ControllerTrials(campaign.Job):
     """Trials of one controller in one plant, as a campaign plays them."""
 
     controller: str
     vehicle: str
-    water: Plant
+    water: PlantChanges
     trials: int | None
     noise: int
     """Seed of the trials."""
     task: str = "t1"
 
 
-def play(job: Job, _: Path) -> dict[str, Any]:
+def play(job: ControllerTrials, _: Path) -> dict[str, Any]:
     """Run the trials of a job, and return the result of their evaluation."""
     options: dict[str, Any] = {"vehicle": job.vehicle, "trials": job.trials, "seed": job.noise}
     return evaluate_controller(job.controller, job.water, task=job.task, **options).result

@@ -26,9 +26,9 @@ from finssim.evaluation.campaign import Show, run_jobs
 from finssim.evaluation.robot_trials import (
     Attendant,
     OnRobot,
-    Outcome,
     PoolJob,
     RobotTrial,
+    TrialOutcome,
     check_starts,
     noise_seed,
     play_in_pool,
@@ -202,7 +202,7 @@ LEAST_ROOM = 0.15
 
 
 @dataclass(frozen=True)
-class Start:
+class ProgrammeStart:
     """Start of a programme."""
 
     position: tuple[float, float, float]
@@ -222,7 +222,7 @@ def box_of(surroundings: Basin | Vehicle) -> Box:
     return tuple(map(float, lower)), tuple(map(float, upper))  # type: ignore[return-value]
 
 
-def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> Start:
+def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> ProgrammeStart:
     """The start of a programme: its way then lies in the middle of the water, surge and sway along x.
 
     One that goes both ways begins in the middle itself, and has half of the way to either side.
@@ -242,7 +242,7 @@ def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> Start:
     x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (top + bottom)
     axis = programme.axes[0]
     if len(programme.axes) != 1 or axis in ("roll", "pitch", "yaw"):
-        return Start((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
+        return ProgrammeStart((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
     column = programme.tau_desired[:, AXES.index(axis)]
     sign = float(column.max() > 0.0) - float(column.min() < 0.0)  # 0 where it goes both ways
     # Heading along x for surge; across it for sway, so that its left is where x falls.
@@ -259,7 +259,7 @@ def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> Start:
             f"{programme.name}: the pool leaves {way:.2f} m to go along {axis}, expected {LEAST_ROOM} m or more: use a "
             "larger pool"
         )
-    return Start((x, y, z), yaw, way)
+    return ProgrammeStart((x, y, z), yaw, way)
 
 
 ESTIMATOR = "error-state"
@@ -267,7 +267,7 @@ ESTIMATOR = "error-state"
 
 
 def programme_trial(
-    programme: Programme, vehicle: Vehicle, start: Start, *, hold: str | None = "pid"
+    programme: Programme, vehicle: Vehicle, start: ProgrammeStart, *, hold: str | None = "pid"
 ) -> RobotTrial:
     """The trial that plays a programme, and ends with it; its record has the phases.
 
@@ -440,7 +440,7 @@ def _on_robot(
             write_trial_of(record, path, role)
 
 
-def fastest_text(programme: Programme, outcome: Outcome) -> str:
+def fastest_text(programme: Programme, outcome: TrialOutcome) -> str:
     """Return the greatest speed of a programme, and its duration, as text."""
     pilot, t = outcome.trial.pilot, outcome.runtime.t
     assert isinstance(pilot, ProgrammePilot)

@@ -19,7 +19,7 @@ from finssim.evaluation.metrics import (
     pose_error,
     resample,
 )
-from finssim.evaluation.trials import Trial
+from finssim.evaluation.trials import GoalTrial
 
 Array = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def png(figure: Any) -> bytes:
     return buffer.getvalue()
 
 
-def error_envelope(trials: Sequence[Trial]) -> tuple[Array, Array, Array]:
+def error_envelope(trials: Sequence[GoalTrial]) -> tuple[Array, Array, Array]:
     """Pointwise quartiles of the errors of one controller's trials, on the 10 Hz evaluation grid.
 
     Args:
@@ -105,7 +105,7 @@ def error_envelope(trials: Sequence[Trial]) -> tuple[Array, Array, Array]:
     return grids[0][:length], position, yaw
 
 
-def draw_envelopes(runs: Mapping[str, Sequence[Trial]], title: str = "") -> Any:
+def draw_envelopes(runs: Mapping[str, Sequence[GoalTrial]], title: str = "") -> Any:
     """The figure: position error above, yaw error below, a colour for each controller.
 
     The success limits are drawn dashed and the evaluation window is gray. Scales are logarithmic, since errors fall
@@ -160,7 +160,7 @@ def _scale(axes: Any, bottom: float, limit: float, label: str) -> None:
     note.set_bbox({"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 1.0})
 
 
-def draw_tracking(runs: Mapping[str, Sequence[Trial]], title: str = "") -> Any:
+def draw_tracking(runs: Mapping[str, Sequence[GoalTrial]], title: str = "") -> Any:
     """The figure: a row for each trajectory, its way from above on the left, distances to the reference on the right.
 
     Args:

@@ -29,7 +29,7 @@ class PlantError(ValueError):
     """A plant that is not there, or whose file cannot be used."""
 
 
-class Plant(BaseModel):
+class PlantChanges(BaseModel):
     """Differences of a plant; keys that are left out are as in the vehicle file, in still water, without noise."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -62,14 +62,14 @@ class Plant(BaseModel):
         return load_ranges(value) if isinstance(value, str) else value
 
     @model_validator(mode="after")
-    def _single_view(self) -> Plant:
+    def _single_view(self) -> PlantChanges:
         if self.observe is not None:
             observed(self.observe)  # which refuses what there is not
         if self.observe and self.noise:
             raise ValueError(f"noise and observe: {self.observe} are both given, expected one of them")
         return self
 
-    def with_view(self, observe: str) -> Plant:
+    def with_view(self, observe: str) -> PlantChanges:
         """Return the same plant with another observation.
 
         Raises:
@@ -77,7 +77,9 @@ class Plant(BaseModel):
         """
         title = f"{self.title}; seen: {observe}".removeprefix("; ")
         try:
-            return Plant.model_validate({**dict(self), "noise": None, "observe": observe, "title": title})
+            return PlantChanges.model_validate(
+                {**dict(self), "noise": None, "observe": observe, "title": title}
+            )
         except ValidationError as error:
             raise PlantError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
 
@@ -143,7 +145,7 @@ def available_plants() -> list[str]:
     return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
 
 
-def load_plant(name_or_path: str | Path) -> Plant:
+def load_plant(name_or_path: str | Path) -> PlantChanges:
     """A plant by name or from a file.
 
     Raises:
@@ -159,6 +161,6 @@ def load_plant(name_or_path: str | Path) -> Plant:
         raise PlantError(f"no plant '{name_or_path}': give a YAML file or one of {available}{hint}")
     data = read_mapping(path, PlantError, such_as="hydrodynamics: mesh")
     try:
-        return Plant.model_validate({"name": path.stem, **data})
+        return PlantChanges.model_validate({"name": path.stem, **data})
     except ValidationError as error:
         raise PlantError(f"{path}: {first_problem(error)}") from None

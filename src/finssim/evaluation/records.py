@@ -24,7 +24,14 @@ from finssim.evaluation.campaign import Progress
 from finssim.evaluation.clocks import ClockError, clock_offset
 from finssim.evaluation.metrics import MAX_GAP, T1_SETPOINTS, in_room
 from finssim.evaluation.tables import Table
-from finssim.evaluation.trials import DURATION, Motion, Trial, follows, interpolated, localization_errors
+from finssim.evaluation.trials import (
+    DURATION,
+    GoalTrial,
+    VehicleMotion,
+    follows,
+    interpolated,
+    localization_errors,
+)
 from finssim.learning.demonstrations import DatasetError, Episode, about, data_sets_in, save
 from finssim.learning.demonstrations import collect as collect_episodes
 from finssim.learning.lerobot import export_lerobot
@@ -60,7 +67,7 @@ class DriveError(ValueError):
 
 
 @dataclass(frozen=True)
-class Drive:
+class RecordedDecisions:
     """The N decisions of a record at which there was an estimate, in their order."""
 
     path: Path
@@ -72,7 +79,7 @@ class Drive:
     """Period of the decisions [s]."""
     time: Array
     """Robot's clock [s], (N,)."""
-    motion: Motion
+    motion: VehicleMotion
     """Estimated motion, with the thrusts and the pilot's actions, which have size 0 if the record lacks them, as of a
     person; its times are NaN if the record lacks the guide's start."""
     guide: str
@@ -89,7 +96,7 @@ class Drive:
         return self.driver != "teleop" or bool(np.any(self.goal != NO_GOAL))
 
 
-def read_drive(path: Path, vehicle: Vehicle) -> Drive:
+def read_drive(path: Path, vehicle: Vehicle) -> RecordedDecisions:
     """Read a record of `finssim teleop` or `finssim run`; one that was cut is read up to the cut.
 
     Args:
@@ -121,7 +128,7 @@ def read_drive(path: Path, vehicle: Vehicle) -> Drive:
     goals = [message.pose for message in rows["goal"]]
     actions = [np.asarray(message.action, dtype=float) for message in rows["policy_info"]]
     alike = len({len(action) for action in actions}) == 1
-    motion = Motion(
+    motion = VehicleMotion(
         t=time - began,
         position=np.array([_xyz(p.pose.position) for p in poses]),
         quaternion=np.array([(*_xyz(p.pose.orientation), p.pose.orientation.w) for p in poses]),
@@ -129,7 +136,7 @@ def read_drive(path: Path, vehicle: Vehicle) -> Drive:
         thrust=np.array([message.force for message in rows["thruster_cmd"]], dtype=float),
         action=np.array(actions) if alike else np.zeros((len(complete), 0)),
     )
-    return Drive(
+    return RecordedDecisions(
         path=path,
         driver="teleop" if teleop else str(first.pilot),
         pilot=pilot,
@@ -259,7 +266,7 @@ SAME_GOAL = 1.0e-3
 
 
 def episodes_of(
-    drive: Drive, observer: Observer, mode: ActionMode, vehicle: Vehicle, *,
+    drive: RecordedDecisions, observer: Observer, mode: ActionMode, vehicle: Vehicle, *,
     goal: Station | str | None = None,
 ) -> list[Episode]:  # fmt: skip
     """Demonstrations of a drive; none where it has no stretch of two decisions.
@@ -313,7 +320,7 @@ def episodes_of(
     return episodes
 
 
-def indices_of(drive: Drive, period: float, *, split_goals: bool) -> list[Indices]:
+def indices_of(drive: RecordedDecisions, period: float, *, split_goals: bool) -> list[Indices]:
     """Decisions, one a period, of each stretch that has at least two.
 
     Args:
@@ -346,7 +353,7 @@ def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
 
 
 def _guides(
-    drive: Drive, vehicle: Vehicle, moving: bool, goal: Station | str | None
+    drive: RecordedDecisions, vehicle: Vehicle, moving: bool, goal: Station | str | None
 ) -> Callable[[Indices], Guide]:
     """Return a function from the indices of decisions to the guide of a stretch."""
     if moving:
@@ -374,7 +381,7 @@ def station_at(goal: Sequence[float] | Array) -> Station:
     return Station((x, y, z), yaw)
 
 
-def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Guide:
+def trajectory_of(drive: RecordedDecisions, vehicle: Vehicle, name: str | None = None) -> Guide:
     """The trajectory that was followed, checked against the recorded goals.
 
     Args:
@@ -580,13 +587,13 @@ EARLY = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedTrial(Trial):
+class RecordedTrial(GoalTrial):
     """Content of one record."""
 
     path: Path
     pilot: dict[str, Any]
     """Pilot as the record describes it."""
-    estimate: Motion
+    estimate: VehicleMotion
     """The robot's estimate at its decisions; the motion is the truth, if there is one, or the estimate."""
     stopped: bool
     """True if it ended before its time."""
@@ -705,7 +712,7 @@ def read_record(
     )
 
 
-def _goal_history(drive: Drive, steered: NDArray[np.bool_], duration: float) -> Trajectory:
+def _goal_history(drive: RecordedDecisions, steered: NDArray[np.bool_], duration: float) -> Trajectory:
     """Return the course of a moving goal by the record; held after its end, up to a time [s].
 
     Raises:
@@ -722,14 +729,14 @@ def _goal_history(drive: Drive, steered: NDArray[np.bool_], duration: float) -> 
     )
 
 
-def _goals(drive: Drive, steered: NDArray[np.bool_]) -> Array:
+def _goals(drive: RecordedDecisions, steered: NDArray[np.bool_]) -> Array:
     """Return the goals of the vehicle, by decision."""
     if not drive.has_goal:
         raise DriveError(f"{drive.path}: was driven by hand to no goal: a record of finssim run has one")
     return drive.goal[steered & (drive.motion.t >= 0.0)]
 
 
-def _station(drive: Drive, steered: NDArray[np.bool_], task: str) -> Guide:
+def _station(drive: RecordedDecisions, steered: NDArray[np.bool_], task: str) -> Guide:
     """The one goal that was held, or the dock."""
     goals = _goals(drive, steered)
     if float(np.abs(goals - goals[0]).max()) > SAME_GOAL:
@@ -749,7 +756,7 @@ def _setpoint(guide: Guide, vehicle: Vehicle) -> str:
     return next(near, ",".join(f"{x:.3g}" for x in (*goal[:3], math.degrees(goal[3]))))
 
 
-def _truth(path: Path, drive: Drive, until: float) -> tuple[Motion, float]:
+def _truth(path: Path, drive: RecordedDecisions, until: float) -> tuple[VehicleMotion, float]:
     """The true motion from the guide's start to a time after it [s], and what was added to its times."""
     motion = _table(path)
     try:
@@ -760,11 +767,11 @@ def _truth(path: Path, drive: Drive, until: float) -> tuple[Motion, float]:
     return replace(motion, t=t).between((t >= 0.0) & (t <= until + 1e-6)), offset
 
 
-def _table(path: Path) -> Motion:
+def _table(path: Path) -> VehicleMotion:
     """A truth, by its own clock."""
     if path.suffix.lower() not in (".csv", ".txt", ".tsv", ".parquet"):
         truth = read_truth(path)
-        return Motion(t=truth.time, position=truth.position, quaternion=truth.quaternion, nu=truth.nu)
+        return VehicleMotion(t=truth.time, position=truth.position, quaternion=truth.quaternion, nu=truth.nu)
     columns = read_table(path).numbers
     attitude = ("qx", "qy", "qz", "qw")
     turned = set(attitude) <= set(columns)
@@ -779,4 +786,4 @@ def _table(path: Path) -> Motion:
     if len(rows) < 2 or np.any(np.diff(rows[:, 0]) <= 0.0):
         raise DriveError(f"{path}: {len(rows)} rows with all numbers, expected 2 or more with t increasing")
     quaternion = rows[:, 4:8] if turned else quat_from_yaw(rows[:, 4])
-    return Motion(t=rows[:, 0], position=rows[:, 1:4], quaternion=quaternion, heading_only=not turned)
+    return VehicleMotion(t=rows[:, 0], position=rows[:, 1:4], quaternion=quaternion, heading_only=not turned)

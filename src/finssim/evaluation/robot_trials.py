@@ -30,7 +30,7 @@ from finssim.core.yaml_file import yaml_text
 from finssim.evaluation import campaign
 from finssim.evaluation.metrics import SITE_SIZES, T1_SETPOINTS, T1_START, in_room
 from finssim.evaluation.records import DriveError, read_record
-from finssim.evaluation.trials import PERIOD, Motion, Trial, guide_of, localization_errors
+from finssim.evaluation.trials import PERIOD, GoalTrial, VehicleMotion, guide_of, localization_errors
 from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.pool import read_truth
 from finssim.pool.run import PoolPlan, make_plan
@@ -43,7 +43,7 @@ from finssim.robot.reading import Reading
 from finssim.robot.recorder import Recorder, recording
 from finssim.robot.runtime import Runtime
 from finssim.robot.teleop import Keyboard
-from finssim.robot.wiring import Drive, Wiring, connected, link_of
+from finssim.robot.wiring import RobotDriver, Wiring, connected, link_of
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import room, vehicle_at
 
@@ -100,7 +100,7 @@ class RobotTrial:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class TrialOutcome:
     """Result of a trial."""
 
     trial: RobotTrial
@@ -121,7 +121,7 @@ def fault_of(trial: RobotTrial, runtime: Runtime) -> str:
     return "" if trial.over(runtime) else "not finished"
 
 
-class Stages:
+class TrialStages:
     """Waits for the vehicle and its attendant, sees it to the start, hands over to the trial, and ends it."""
 
     def __init__(
@@ -155,7 +155,9 @@ class Stages:
         self._reason = ""
         self._begun = False
 
-    def play(self, drive: Drive, site: Pool | None, perception: Perception | None = None) -> Outcome:
+    def play(
+        self, drive: RobotDriver, site: Pool | None, perception: Perception | None = None
+    ) -> TrialOutcome:
         """Play the trial.
 
         Args:
@@ -168,7 +170,9 @@ class Stages:
         drive(runtime, duration=math.inf, show=self._look, until=self._over)
         fault = self._reason or (fault_of(self._trial, runtime) if self._begun else runtime.bridge.reason)
         fault = fault or ("" if self._ended == "over" else "not finished")
-        return Outcome(trial=self._trial, runtime=runtime, fault=fault, ended=self._ended, begun=self._begun)
+        return TrialOutcome(
+            trial=self._trial, runtime=runtime, fault=fault, ended=self._ended, begun=self._begun
+        )
 
     def _look(self, runtime: Runtime) -> None:
         """After every step."""
@@ -418,7 +422,7 @@ class Session:
     robot: OnRobot
     vehicle: Vehicle
     site: Pool | None
-    drive: Drive
+    drive: RobotDriver
     attendant: Attendant | None
     console: Console
 
@@ -447,7 +451,7 @@ class Session:
         exact: bool = True,
         perception: Callable[[], Perception] | None = None,
         about: Mapping[str, Any] | None = None,
-    ) -> Outcome | None:
+    ) -> TrialOutcome | None:
         """Play a trial until it is done, the operator skips it, or it cannot be.
 
         Args:
@@ -484,7 +488,7 @@ class Session:
                 partial, self.vehicle, meta, pool_file=self.robot.pool_file, lockstep=wiring.lockstep, pictures="none"
             )  # fmt: skip
             with context as recorder:
-                stages = Stages(
+                stages = TrialStages(
                     trial, self.equipped, start, start_bounds(self.robot.site, exact), by_hand=self.robot.by_hand,
                     attendant=self.attendant, recorder=recorder,
                 )  # fmt: skip
@@ -510,7 +514,7 @@ class Session:
                 )
             self.notify(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
 
-    def _put_away(self, partial: Path, record: Path, outcome: Outcome) -> None:
+    def _put_away(self, partial: Path, record: Path, outcome: TrialOutcome) -> None:
         """Keep the record of a started trial; nothing was recorded of one that was not."""
         if not outcome.begun:
             partial.unlink(missing_ok=True)
@@ -596,7 +600,7 @@ HARDWARE = "hardware"
 """Replacement of the severity of a pool and of its camera's mode, on a robot."""
 
 
-class Firmware(NamedTuple):
+class FirmwareTrials(NamedTuple):
     """Trials of a vehicle with a kind of firmware."""
 
     action: str | None
@@ -605,7 +609,10 @@ class Firmware(NamedTuple):
     camera: str
 
 
-FIRMWARES = {"mcu": Firmware(None, "pool", "corners"), "ardusub": Firmware("pilot6", "tank", "none")}
+FIRMWARES = {
+    "mcu": FirmwareTrials(None, "pool", "corners"),
+    "ardusub": FirmwareTrials("pilot6", "tank", "none"),
+}
 """Firmwares: a controller that takes shaft speeds, in the pool under a camera, or an autopilot that takes axes, in a
 tank by Doppler log, depth and compass."""
 
@@ -656,7 +663,7 @@ class PoolJob(campaign.Job):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job(PoolJob):
+class RobotJob(PoolJob):
     """A controller and what it is to do: a setpoint of T1 or a trajectory of T2."""
 
     controller: str
@@ -693,7 +700,7 @@ def play_in_pool(
     truth: Path | None = None,
     recorder: Recorder | None = None,
     **estimator: Any,
-) -> Outcome:
+) -> TrialOutcome:
     """Play a trial by the robot's complete software in lock-step with a pool.
 
     Args:
@@ -720,10 +727,10 @@ def play_in_pool(
         run_lockstep(
             runtime, world, longest, show=trial.watch, until=lambda r: r.bridge.state == "fault" or trial.over(r)
         )  # fmt: skip
-    return Outcome(trial=trial, runtime=runtime, fault=fault_of(trial, runtime))
+    return TrialOutcome(trial=trial, runtime=runtime, fault=fault_of(trial, runtime))
 
 
-def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial, Station]:
+def job_trial(job: RobotJob, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial, Station]:
     """The trial of a job, which ends when its time is over, and where it starts.
 
     Args:
@@ -767,14 +774,14 @@ class _Estimates:
             return
         self._rows.append((t, reading.position, reading.quaternion))
 
-    def motion(self) -> Motion:
+    def motion(self) -> VehicleMotion:
         """All of it."""
         t, position, quaternion = zip(*self._rows, strict=True) if self._rows else ((), (), ())
         columns = (np.reshape(x, (-1, n)) for x, n in ((position, 3), (quaternion, 4)))
-        return Motion(t=np.array(t), **dict(zip(("position", "quaternion"), columns, strict=True)))
+        return VehicleMotion(t=np.array(t), **dict(zip(("position", "quaternion"), columns, strict=True)))
 
 
-def play(job: Job, path: Path) -> dict[str, Any]:
+def play(job: RobotJob, path: Path) -> dict[str, Any]:
     """Play a job in its pool.
 
     Args:
@@ -789,7 +796,7 @@ def play(job: Job, path: Path) -> dict[str, Any]:
     return result
 
 
-def play_trial(job: Job) -> tuple[dict[str, Any], Trial]:
+def play_trial(job: RobotJob) -> tuple[dict[str, Any], GoalTrial]:
     """Play a job in its pool and measure it by the true motion.
 
     Args:
@@ -819,16 +826,18 @@ def play_trial(job: Job) -> tuple[dict[str, Any], Trial]:
     rows = np.flatnonzero((t >= 0.0) & (t <= trial.duration + 1e-6))
     rows = rows[:: max(1, round(PERIOD / np.median(np.diff(t))))]
     states = {name: getattr(truth, name) for name in ("position", "quaternion", "nu", "thrust")}
-    motion = Motion(t=t, **states).between(rows)
+    motion = VehicleMotion(t=t, **states).between(rows)
     assert isinstance(trial.watch, _Estimates)
     localization = localization_errors(motion, trial.watch.motion())
     result, played = _measured(job, motion, outcome, began)
     return result | {"localization": localization}, played
 
 
-def _measured(job: Job, motion: Motion, outcome: Outcome, began: float) -> tuple[dict[str, Any], Trial]:
+def _measured(
+    job: RobotJob, motion: VehicleMotion, outcome: TrialOutcome, began: float
+) -> tuple[dict[str, Any], GoalTrial]:
     """Return the measures of a trial and the trial with its motion."""
-    trial = Trial(name=job.target, guide=outcome.trial.guide, motion=motion)
+    trial = GoalTrial(name=job.target, guide=outcome.trial.guide, motion=motion)
     limits = load_vehicle(job.vehicle).force_limits
     result = {
         **trial.measures(job.task, limits, stopped=bool(outcome.fault)),
@@ -842,7 +851,7 @@ def _measured(job: Job, motion: Motion, outcome: Outcome, began: float) -> tuple
     return result, trial
 
 
-def played_trial(result: Mapping[str, Any], folder: Path) -> Trial:
+def played_trial(result: Mapping[str, Any], folder: Path) -> GoalTrial:
     """The trial of a result, with its motion.
 
     Args:
@@ -851,11 +860,11 @@ def played_trial(result: Mapping[str, Any], folder: Path) -> Trial:
     """
     target = result["job"]["target"]
     guide = guide_of(target, size=result.get("room", 1.0))
-    return Trial(name=target, guide=guide, motion=Motion.read(folder / result["key"]))
+    return GoalTrial(name=target, guide=guide, motion=VehicleMotion.read(folder / result["key"]))
 
 
 def play_jobs(
-    jobs: Sequence[Job],
+    jobs: Sequence[RobotJob],
     folder: Path,
     robot: OnRobot | None = None,
     *,
@@ -892,7 +901,7 @@ def play_jobs(
     for trial, _ in trials.values():
         check_reachable(trial.guide, equipped)
 
-    def show(job: Job, result: Mapping[str, Any]) -> None:
+    def show(job: RobotJob, result: Mapping[str, Any]) -> None:
         held = "done" if result["success"] else result["fault"] or "not held"
         console.print(f"  {held}", highlight=False, markup=False)
         if result["fault"] and robot.unattended:
@@ -904,7 +913,7 @@ def play_jobs(
     with ExitStack() as stack:
         opened: list[Session] = []
 
-        def play_next(job: Job, path: Path) -> dict[str, Any] | None:
+        def play_next(job: RobotJob, path: Path) -> dict[str, Any] | None:
             if not opened:
                 opened.append(
                     stack.enter_context(session(robot, vehicle, attendant=attendant, console=console))
@@ -917,7 +926,7 @@ def play_jobs(
     return results
 
 
-def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | None:
+def _play_on_robot(job: RobotJob, path: Path, opened: Session) -> dict[str, Any] | None:
     """One job; PATH.mcap takes the record, PATH.npz the estimate of the motion. None if it was skipped."""
     began, vehicle, record = time.perf_counter(), opened.vehicle, path.with_name(f"{path.name}.mcap")
     trial, start = job_trial(job, vehicle, seed=job.seed)
@@ -935,7 +944,7 @@ def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | No
         motion = read_record(record, job.task, vehicle, guide=trial.guide, duration=trial.duration).estimate
     except DriveError:  # stopped before its first decision
         nowhere = np.full((2, 4), np.nan)
-        motion = Motion(t=np.array([0.0, 0.1]), position=nowhere[:, :3], quaternion=nowhere)
+        motion = VehicleMotion(t=np.array([0.0, 0.1]), position=nowhere[:, :3], quaternion=nowhere)
     origin = {"robot": opened.robot.title, "record": record.name}
     result, played = _measured(job, motion, outcome, began)
     played.motion.write(path)

@@ -38,7 +38,7 @@ from finssim.evaluation.metrics import (
     measure_tracking,
     measure_trial,
 )
-from finssim.evaluation.plants import Plant
+from finssim.evaluation.plants import PlantChanges
 from finssim.evaluation.statistics import with_interval
 from finssim.tasks import Task, follow
 from finssim.vehicles import Vehicle
@@ -58,7 +58,7 @@ T2_TRAJECTORIES = ("straight", "broken", "ellipse", "lemniscate")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion:
+class VehicleMotion:
     """Samples of a vehicle's motion in the order of their times; world frame, SI, NaN where unknown."""
 
     t: Array
@@ -81,7 +81,7 @@ class Motion:
         """Heading [rad], (T,)."""
         return np.asarray(quat_yaw(self.quaternion))
 
-    def between(self, rows: NDArray[Any]) -> Motion:
+    def between(self, rows: NDArray[Any]) -> VehicleMotion:
         """Some of the samples: a mask or indices of (T,)."""
         arrays = {
             field.name: getattr(self, field.name) for field in fields(self) if field.name != "heading_only"
@@ -120,7 +120,7 @@ class Motion:
             np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
     @classmethod
-    def read(cls, path: Path) -> Motion:
+    def read(cls, path: Path) -> VehicleMotion:
         """Read PATH.npz, which a trial leaves for figures, at 10 Hz."""
         with np.load(path.with_name(f"{path.name}.npz")) as file:
             return cls(**{field.name: file[field.name] for field in fields(cls) if field.name in file.files})
@@ -134,7 +134,7 @@ def interpolated(t: ArrayLike, times: Array, columns: Array) -> Array:
     return np.stack([np.interp(t, times, column) for column in columns.T], axis=-1)
 
 
-def localization_errors(truth: Motion, estimate: Motion) -> dict[str, float] | None:
+def localization_errors(truth: VehicleMotion, estimate: VehicleMotion) -> dict[str, float] | None:
     """Errors of an estimate at its own times: rms in 3-D and horizontally [m], and in heading [°]; None without any."""
     t = estimate.t
     inside = (t >= truth.t[:1].max(initial=0.0)) & (t <= truth.t[-1:].max(initial=-1.0))
@@ -151,13 +151,13 @@ def localization_errors(truth: Motion, estimate: Motion) -> dict[str, float] | N
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class GoalTrial:
     """Motion of a vehicle to its goal, in the simulator, in the virtual pool, on a robot or in a record."""
 
     name: str
     """Name of its setpoint or trajectory."""
     guide: Guide
-    motion: Motion
+    motion: VehicleMotion
     """Motion that is measured, from the guide's start."""
 
     @property
@@ -224,7 +224,7 @@ def run_trials(
     agent: Agent,
     task: Task,
     vehicle: Vehicle,
-    plant: Plant,
+    plant: PlantChanges,
     *,
     guides: Sequence[Guide] | None = None,
     trials: int | None = None,
@@ -232,7 +232,7 @@ def run_trials(
     record: Path | None = None,
     show: Show = lambda part: None,
     **world: Any,
-) -> list[Trial]:
+) -> list[GoalTrial]:
     """Run trials of T1, each 60 s from the published start, level and at rest; or of T2, from rest on the first pose.
 
     Args:
@@ -282,10 +282,11 @@ def run_trials(
         show(k / steps)
     t = np.arange(steps + 1, dtype=np.float64) * agent.period
     motions = (
-        Motion(t=t, **{name: column[:, i] for name, column in columns.items()}) for i in range(len(chosen))
+        VehicleMotion(t=t, **{name: column[:, i] for name, column in columns.items()})
+        for i in range(len(chosen))
     )
     return [
-        Trial(name=guide.name, guide=guide, motion=motion)
+        GoalTrial(name=guide.name, guide=guide, motion=motion)
         for guide, motion in zip(chosen, motions, strict=True)
     ]
 
@@ -315,7 +316,7 @@ def run_episodes(
     agent: Agent,
     task: Task,
     vehicle: Vehicle,
-    plant: Plant,
+    plant: PlantChanges,
     *,
     trials: int = EPISODES,
     seed: int = 1,

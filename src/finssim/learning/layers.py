@@ -125,7 +125,7 @@ class Arrays:
             self._noise.set_state(self.xp.from_numpy(np.asarray(state["torch"])))
 
 
-class Parameters:
+class NetworkParameters:
     """All numbers of some networks in one row, and their gradient in another: an optimiser needs no more."""
 
     def __init__(self, arrays: Arrays, *networks: Any) -> None:
@@ -144,7 +144,7 @@ class Parameters:
             network.bind(*views)
 
 
-class Row:
+class FreeRow:
     """Numbers that depend on no input."""
 
     def __init__(self, size: int) -> None:
@@ -160,7 +160,7 @@ class Row:
         self.values, self.gradient = weights[0], gradients[0]
 
 
-class Stack:
+class TanhLayers:
     """Linear layers with tanh between them: tanh(... tanh(x W_1 + b_1) ...) W_n + b_n."""
 
     def __init__(self, arrays: Arrays, sizes: Sequence[int]) -> None:
@@ -318,7 +318,7 @@ class Gru:
 class Adam:
     """Adam (Kingma and Ba 2015), after shortening gradients that are longer than `largest`."""
 
-    def __init__(self, parameters: Parameters, arrays: Arrays, largest: float) -> None:
+    def __init__(self, parameters: NetworkParameters, arrays: Arrays, largest: float) -> None:
         """Take what to optimise."""
         self.parameters, self.xp, self.largest = parameters, arrays.xp, largest
         n = len(parameters.values)

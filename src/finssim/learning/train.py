@@ -127,7 +127,7 @@ def train(
     from finssim.learning.episodes import HELD_WORLDS, HeldEvaluation, held_seed
     from finssim.learning.export import description_of
     from finssim.learning.layers import single_thread
-    from finssim.learning.training_loop import Loop, TrainingView, last_checkpoint
+    from finssim.learning.training_loop import TrainingLoop, TrainingView, last_checkpoint
 
     checkpoint = last_checkpoint(side) if resume else None
     randomized = randomization is not None
@@ -162,7 +162,7 @@ def train(
     with single_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a last small batch does no harm
         warnings.filterwarnings("ignore", message=".*on the GPU.*")
-        loop = Loop(
+        loop = TrainingLoop(
             kind(environment, values, seed=seed, device=device), description, side,
             evaluate=HeldEvaluation(worlds_of(HELD_WORLDS, full, held_seed(seed)), device),
             show=view.update, progress=environment.set_progress,

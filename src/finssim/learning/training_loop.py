@@ -126,7 +126,7 @@ class Best:
 
 
 @dataclass
-class Loop:
+class TrainingLoop:
     """Trains a learner to its end, or until Ctrl-C."""
 
     learner: Learner

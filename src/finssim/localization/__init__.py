@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from finssim.localization.detection.pictures import pictures, write_picture
     from finssim.localization.fusion.estimator import Estimator
     from finssim.localization.fusion.fuse_settings import Site, site_of
-    from finssim.localization.fusion.sensors import SENSORS, Sensor
+    from finssim.localization.fusion.sensors import SENSORS, SensorModel
     from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
     from finssim.localization.overhead_camera import Pool, load_pool, write_pool
     from finssim.localization.poses import Constraints
@@ -28,7 +28,7 @@ __all__ = [
     "Pool",
     "RegionTracker",
     "SENSORS",
-    "Sensor",
+    "SensorModel",
     "Site",
     "VisionSample",
     "bitmap",

@@ -28,7 +28,7 @@ from finssim.localization.detection.families import family_named
 from finssim.localization.fusion.attitude import roll_pitch, up_of
 from finssim.localization.fusion.fuse_log import Series, counted, read_stream_table, series
 from finssim.localization.overhead_camera import Pool, load_pool
-from finssim.localization.poses import Constraints, Measurement, refused
+from finssim.localization.poses import Constraints, PoseMeasurement, refused
 from finssim.localization.poses.methods import NEEDS_DEPTH, TagLocator
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -230,7 +230,7 @@ class Locator:
         """Ids of the vehicle's tags."""
         self.family = family_named(self._locate.family).name
 
-    def locate(self, frame: Frame) -> Measurement:
+    def locate(self, frame: Frame) -> PoseMeasurement:
         """The pose in one picture, or why there is none."""
         locate = self._locate
         of_family = [
@@ -259,7 +259,7 @@ def _name(family: str) -> str:
 
 # The table that `finssim localize` writes, and its summary.
 
-Row = tuple[Frame, Measurement]
+Row = tuple[Frame, PoseMeasurement]
 
 COLUMNS = (
     *("time", "image", "x", "y", "z", "yaw", "std_x", "std_y", "std_yaw", "roll", "pitch"),
@@ -279,7 +279,7 @@ def write_rows(rows: Sequence[Row], out: Path) -> None:
     write_csv(out, COLUMNS, (_cells(frame, measurement) for frame, measurement in rows))
 
 
-def _cells(frame: Frame, measurement: Measurement) -> list[Any]:
+def _cells(frame: Frame, measurement: PoseMeasurement) -> list[Any]:
     time = "" if math.isnan(frame.time) else repr(float(frame.time))
     tags = " ".join(map(str, measurement.tags))
     if not measurement.ok:
@@ -418,7 +418,7 @@ def _count(inputs: Sequence[Path]) -> int | None:
 
 
 @dataclass
-class Run:
+class LocalizeResult:
     """Result of the pictures."""
 
     rows: list[Row] = field(default_factory=list)
@@ -442,7 +442,7 @@ def run(
     shared_pixel_std: float = 0.0,
     tilt_std_deg: float | None = None,
     as_json: bool = False,
-) -> Run:
+) -> LocalizeResult:
     """Measure position and yaw in every image: x, y, z [m], yaw [rad], pool frame, with standard deviations.
 
     Example: finssim localize video.mp4 --pool pool.yaml --vehicle finsrov --depth depth.csv --out poses.csv
@@ -507,9 +507,9 @@ def run(
     return result
 
 
-def _measure(frames: Iterator[Frame], count: int | None, locator: Locator) -> Run:
+def _measure(frames: Iterator[Frame], count: int | None, locator: Locator) -> LocalizeResult:
     """Measure one frame after the other, until the end or Ctrl-C."""
-    result = Run()
+    result = LocalizeResult()
     screen = Console(stderr=True)
     columns = (TextColumn("localize"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
     bars = Progress(

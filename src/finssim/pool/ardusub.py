@@ -21,7 +21,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from finssim.control.ardusub import Mixer
 from finssim.core.frames import TO_FOSSEN
 from finssim.core.rotations import quat_rotate, quat_to_euler, quat_to_matrix, wrap_angle
-from finssim.pool.firmware import AttitudeFilter, Sample
+from finssim.pool.firmware import AttitudeFilter, FirmwareSample
 from finssim.pool.plant_spec import PlantSpec
 from finssim.robot.links.water_linked import encode_velocity
 from finssim.robot.messages import HEADING, VELOCITY, NavigationAid
@@ -193,7 +193,7 @@ class ArduSub:
         self._gain, self._buttons = self._within("JS_GAIN_DEFAULT", 0.1, 1.0), 0
         self._filter = AttitudeFilter(self._spec.attitude_gain, self._spec.attitude_integral, self._gravity)
         self._rates_sum, self._rates_count, self._fastest = np.zeros(3), 0, 0.0
-        self._sample: Sample | None = None
+        self._sample: FirmwareSample | None = None
         self._sampled, self._headed = now, False
         self._attitude, self._quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         self._rates, self._gyro, self._force = np.zeros(3), np.zeros(3), np.zeros(3)
@@ -272,7 +272,7 @@ class ArduSub:
         self._drive()
 
     def frames(
-        self, now: float, sample: Sample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
+        self, now: float, sample: FirmwareSample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
     ) -> list[bytes]:
         """Return what is sent at a sample of the IMU: telemetry that is due, and the lines of the Doppler log.
 
@@ -309,7 +309,7 @@ class ArduSub:
 
     # Instruments, and what it makes of them.
 
-    def _sense(self, now: float, sample: Sample, aids: Sequence[NavigationAid]) -> None:
+    def _sense(self, now: float, sample: FirmwareSample, aids: Sequence[NavigationAid]) -> None:
         dt, self._sampled, self._sample = now - self._sampled, now, sample
         gyro, accel = (self._body_from_imu @ np.array(v) for v in (sample.gyro, sample.accel))
         if now - self._boot < CALIBRATION:

@@ -31,7 +31,7 @@ from finssim.robot.goals import station_of
 from finssim.robot.links.frames import LinkError
 from finssim.robot.links.transports import host_port
 from finssim.robot.links.water_linked import DvlServer, encode_velocity
-from finssim.sim import Pool, Simulator, Water, Wave
+from finssim.sim import RectangularPool, Simulator, Water, Wave
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import POOL, SITES, with_navigation
 
@@ -100,7 +100,7 @@ class SitlWorld:
         self,
         vehicle: Vehicle,
         *,
-        pool: Pool | None = None,
+        pool: RectangularPool | None = None,
         water: Water | None = None,
         position: tuple[float, float, float] = (0.0, 0.0, -1.0),
         yaw: float = 0.0,
@@ -438,7 +438,7 @@ def run(
             stack.callback(log.close)
         world = SitlWorld(
             load_vehicle(vehicle),
-            pool=Pool(length=length, width=width, depth=depth),
+            pool=RectangularPool(length=length, width=width, depth=depth),
             water=Water(current=_three(current, "current"), waves=waves, depth=depth),
             position=tuple(begin.position),
             yaw=begin.yaw,

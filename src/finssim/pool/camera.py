@@ -596,12 +596,12 @@ class PictureCamera:
         scene = oc.Scene(
             camera=site.camera,
             interface=site.interface,
-            basin=oc.Basin(
+            basin=oc.TiledBasin(
                 lower=(-reach[0], -reach[1], surface - basin.depth),
                 upper=(reach[0], reach[1], surface + FREEBOARD),
             ),
             ripples=ripples,
-            sensor=oc.Sensor(shutter=exposure),
+            sensor=oc.ImageSensor(shutter=exposure),
             samples=1,
         )
         self._slow = oc.OverheadCamera(scene)
@@ -642,12 +642,12 @@ class PictureCamera:
         )
 
 
-def _placed(body: tuple[Array, Array], position: npt.ArrayLike, orientation: npt.ArrayLike) -> oc.Pose:
+def _placed(body: tuple[Array, Array], position: npt.ArrayLike, orientation: npt.ArrayLike) -> oc.ObjectPose:
     """Pose of a thing fixed to the body, pool frame."""
     x, y, z = (body[0] + quat_rotate(body[1], np.asarray(position))).tolist()
     q = np.asarray(quat_multiply(body[1], orientation))
     a, b, c, d = (q / np.linalg.norm(q)).tolist()
-    return oc.Pose(position=(x, y, z), orientation=(a, b, c, d))
+    return oc.ObjectPose(position=(x, y, z), orientation=(a, b, c, d))
 
 
 class PoolCamera:

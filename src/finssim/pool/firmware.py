@@ -32,7 +32,7 @@ from finssim.vehicles import Vehicle
 if TYPE_CHECKING:
     from finssim.pool.virtual_pool import Faults
 
-__all__ = ["AttitudeFilter", "Firmware", "PoolSensors", "Sample"]
+__all__ = ["AttitudeFilter", "Firmware", "PoolSensors", "FirmwareSample"]
 
 
 # The instruments aboard: the simulator's IMU and pressure gauge, sampled on the motor controller's clock.
@@ -48,7 +48,7 @@ IMU_ERRORS = (
 )
 
 
-class Sample(NamedTuple):
+class FirmwareSample(NamedTuple):
     """Readings of the motor controller at one time."""
 
     gyro: tuple[float, float, float]
@@ -107,11 +107,11 @@ class PoolSensors:
         ]
         self._sent = 0
 
-    def sample(self) -> Sample:
+    def sample(self) -> FirmwareSample:
         """Read both; the gauge gives its newest sample that has arrived."""
         self._count[0] += 1
         self._update()
-        return Sample(
+        return FirmwareSample(
             tuple(self._gyro.tolist()),
             tuple(self._accel.tolist()),
             float(self._depth[0]),
@@ -393,7 +393,7 @@ class Firmware:
             self._aim(np.zeros(self._outputs))
 
     def frames(
-        self, now: float, sample: Sample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
+        self, now: float, sample: FirmwareSample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
     ) -> list[bytes]:
         """Return what is sent at a sample of the IMU: a snapshot and the navigation aids; nothing while it starts.
 
@@ -409,7 +409,9 @@ class Firmware:
             return []
         return [faults.encode(telemetry), *[encode_navigation(aid) for aid in aids]]
 
-    def telemetry(self, now: float, sample: Sample, speed: Array, throttle: Array) -> Telemetry | None:
+    def telemetry(
+        self, now: float, sample: FirmwareSample, speed: Array, throttle: Array
+    ) -> Telemetry | None:
         """A snapshot for the wire; None while it starts.
 
         Args:

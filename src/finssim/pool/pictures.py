@@ -121,7 +121,7 @@ class CameraPlan:
         return self.settings.shutter(self.seed)
 
 
-class Plan(Protocol):
+class PictureSourcePlan(Protocol):
     """Arguments of a camera, or of the vehicle's own sensors."""
 
     def camera(self) -> Any:
@@ -134,7 +134,7 @@ class Plan(Protocol):
 class PictureProcess:
     """The cameras of a `VirtualPool` in real time: expose here, draw and send elsewhere; `advance` gives nothing."""
 
-    def __init__(self, plans: Sequence[Plan], bind: Address, peer: Address) -> None:
+    def __init__(self, plans: Sequence[PictureSourcePlan], bind: Address, peer: Address) -> None:
         """Start the process and wait until it can draw.
 
         Args:
@@ -215,7 +215,9 @@ def _deaf() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _draw(plans: Sequence[Plan], bind: Address, peer: Address, undrawn: Any, ready: Any, parent: int) -> None:
+def _draw(
+    plans: Sequence[PictureSourcePlan], bind: Address, peer: Address, undrawn: Any, ready: Any, parent: int
+) -> None:
     """The process: draw each exposure as it comes, and send it when it is to arrive."""
     signal.signal(
         signal.SIGINT, signal.SIG_IGN

@@ -15,7 +15,7 @@ from finssim.physics.motors import thrust_of_speed
 from finssim.physics.terms.composed import layout
 from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
 from finssim.pool.plant_spec import HEADROOM, Basin, Circulation, PlantSpec, PlantSpecError, SlackTether
-from finssim.sim import Dock, Pool, Simulator, TetherLine, Water, Wave
+from finssim.sim import Dock, RectangularPool, Simulator, TetherLine, Water, Wave
 from finssim.sim.plant_arrays import NO_LIMIT
 from finssim.vehicles import Vehicle
 from finssim.vehicles.hydrodynamics import MeshSet
@@ -595,7 +595,7 @@ class Plant:
         self, position: ArrayLike, quaternion: ArrayLike, world: Any | None, dock: Dock | None
     ) -> Simulator:
         spec, hull = self.spec, self.spec.hull
-        basin = Pool(length=spec.basin.length, width=spec.basin.width, depth=spec.basin.depth)
+        basin = RectangularPool(length=spec.basin.length, width=spec.basin.width, depth=spec.basin.depth)
         meshed = hull.form_drag > 0.0 or hull.skin_drag > 0.0
         vehicle = self.vehicle
         if meshed:

@@ -24,7 +24,7 @@ from finssim.localization.overhead_camera import Pool, write_pool
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.drawn_plant import draw_plant, positioning_of, site_of, site_of_world
 from finssim.pool.fleet import Fleet, Medium, one_picture
-from finssim.pool.pictures import CameraPlan, Cameras, PictureProcess, Plan, UdpSender
+from finssim.pool.pictures import CameraPlan, Cameras, PictureProcess, PictureSourcePlan, UdpSender
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
 from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
@@ -869,7 +869,7 @@ def _camera(
     plan: PoolPlan, bind: tuple[str, int], peer: tuple[str, int]
 ) -> tuple[PictureProcess | None, UdpSender | None, Any]:
     """The process that draws, or the sink for what is computed here, and the camera for the world."""
-    plans: list[Plan] = [
+    plans: list[PictureSourcePlan] = [
         plan_or_none for plan_or_none in (plan.camera, plan.onboard) if plan_or_none is not None
     ]
     if not plans:

@@ -34,7 +34,7 @@ from finssim.robot.reading import Reading
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.team import Team, encode_track
-from finssim.sim.launch import Pipeline
+from finssim.sim.launch import KernelSequence
 from finssim.sim.site import described_world
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
@@ -115,7 +115,7 @@ class ScriptedPilot:
         state, self._arrays = one_world(task, len(self._mode.labels))
         unscored(self._arrays)
         self._state = state
-        self._pipeline = Pipeline(1, wp.get_device("cpu"))
+        self._pipeline = KernelSequence(1, wp.get_device("cpu"))
         task.add_command(self._pipeline, Batch(state, self._arrays, seed))
 
     def describe(self) -> dict[str, Any]:
@@ -231,7 +231,7 @@ class Referee:
         elif task.world:
             self.world = described_world(task.world).drawn_for(task, self.arrays, seed)
         batch, mask = Batch(self._state, self.arrays, seed), wp.ones(1, dtype=wp.int32, device=device)
-        self._evaluate, opening = Pipeline(1, device), Pipeline(1, device)
+        self._evaluate, opening = KernelSequence(1, device), KernelSequence(1, device)
         task.add_spawn(opening, batch, mask)
         task.add_observe(opening, batch, mask)
         opening.run()

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.core.budget import read_bytes
 from finssim.core.yaml_file import json_value
-from finssim.pool.firmware import Firmware, PoolSensors, Sample
+from finssim.pool.firmware import Firmware, FirmwareSample, PoolSensors
 from finssim.pool.plant import RPM, Plant
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError
 from finssim.pool.positioning import Positioning
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from finssim.sim import Dock
 
 __all__ = [
-    "Camera",
+    "VehicleObserver",
     "FaultError",
     "Faults",
     "PoolClockError",
@@ -236,7 +236,7 @@ class Faults:
     def _happens(self, probability: float) -> bool:
         return probability > 0.0 and self._random.random() < probability
 
-    def reading(self, sample: Sample) -> Sample:
+    def reading(self, sample: FirmwareSample) -> FirmwareSample:
         """Return the readings of the instruments, with the pressure gauge frozen if so."""
         if not self.freeze_depth:
             self._frozen_depth = None
@@ -307,7 +307,7 @@ class PoolClockError(ValueError):
     """The pool was asked to go back in time."""
 
 
-class Camera(Protocol):
+class VehicleObserver(Protocol):
     """An observer of the vehicle from outside."""
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> Sequence[Picture]:
@@ -329,7 +329,7 @@ class VirtualPool:
         vehicle: Vehicle,
         spec: PlantSpec,
         *,
-        camera: Camera | None = None,
+        camera: VehicleObserver | None = None,
         positioning: Positioning | None = None,
         start: tuple[ArrayLike, ArrayLike] = ((0.0, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0)),
         seed: int = 0,

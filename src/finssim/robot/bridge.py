@@ -573,7 +573,7 @@ BACK = 0.05
 """The clock may seem to go back by this much, where messages are handed over out of the order of their arrival [s]."""
 
 
-class Clock:
+class BridgeClock:
     """The time of the latest call, and whether time runs as it should."""
 
     def __init__(self, step: float) -> None:
@@ -711,7 +711,7 @@ RUNNING = ("armed", "hold")
 """States in which the watchdogs bite."""
 
 
-class Autopilot(Protocol):
+class MotorDevice(Protocol):
     """The device between a bridge and the motors, which may act independently (`robot.runtime.Link`)."""
 
     peer: str
@@ -737,7 +737,7 @@ class Bridge:
         self.motors = MotorMap.from_vehicle(vehicle)
         if len(self.settings.slew) != self.motors.thrusters:
             raise BridgeError(f"slew has {len(self.settings.slew)} rates, expected {self.motors.thrusters}")
-        self._autopilot: Autopilot | None = None
+        self._autopilot: MotorDevice | None = None
         self.getting_ready = False
         """Whether arming was last refused by nothing but an autopilot that has yet to get ready."""
         self.state = "disarmed"
@@ -748,7 +748,7 @@ class Bridge:
         """Thrusts of the last tick after all limits, delivered on average, canonical order [N], (n,)."""
         self._watchdogs = Supervision(vehicle, self.settings, self.motors.outputs)
         self._commander = self._watchdogs.commander
-        self._clock = Clock(self.settings.clock_step)
+        self._clock = BridgeClock(self.settings.clock_step)
         self._off = ThrusterCommand(False, (0.0,) * self.motors.outputs)
         self._memory = self.motors.reset()
         self._ticked: float | None = None
@@ -757,12 +757,12 @@ class Bridge:
         self._operator = False
 
     @property
-    def autopilot(self) -> Autopilot | None:
+    def autopilot(self) -> MotorDevice | None:
         """Has to be ready before the bridge arms, and may end it; None: there is none."""
         return self._autopilot
 
     @autopilot.setter
-    def autopilot(self, autopilot: Autopilot) -> None:
+    def autopilot(self, autopilot: MotorDevice) -> None:
         self._autopilot, self._watchdogs.peer = autopilot, autopilot.peer
 
     # -- what the operator says -------------------------------------------------------------------------------

@@ -27,9 +27,9 @@ from finssim.localization.fusion.estimator import Estimator, Fixes, Health, heal
 from finssim.localization.fusion.fuse_settings import Settings, settings_of, site_of
 from finssim.localization.fusion.streams import (
     DepthSample,
-    Estimate,
     HeadingSample,
     ImuSample,
+    PoseEstimate,
     Sample,
     VelocitySample,
     VisionSample,
@@ -86,7 +86,7 @@ class Stuck:
         return time - self._since > self.longest
 
 
-class Aboard:
+class VehicleSensors:
     """The sensors aboard one vehicle. The methods return a sample, or in a word why there is none ("" for no news)."""
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -371,7 +371,7 @@ class Perception:
         mode = mode or ("constant-velocity" if vehicle.sensors.imu is None else "error-state")
         self.estimator = Estimator(settings or settings_of(vehicle), site_of(pool, vehicle), mode=mode)
         self.unfused = None if fusion else Unfused()
-        self._aboard = Aboard(vehicle)
+        self._aboard = VehicleSensors(vehicle)
         self._tracker: RegionTracker | None = None
         self._frame = _WorldFrame(pool, self.estimator.site.up)
         self._omega, self._omega_time = (math.nan,) * 3, -math.inf
@@ -475,14 +475,14 @@ class Perception:
             self._let_in = None
             self.aid(now, NavigationAid(0, POSITION, 0.1, (x, y, 0.0), (LET_IN_STD, 0.0)))
 
-    def _estimate(self, now: float) -> Estimate:
+    def _estimate(self, now: float) -> PoseEstimate:
         estimate = self.estimator.estimate(now)
         if self.unfused is None:
             return estimate
         raw = self.unfused
         return replace(estimate, x=raw.x, yaw=raw.yaw, vision_time=raw.vision_time)
 
-    def _turning(self, estimate: Estimate) -> Array:
+    def _turning(self, estimate: PoseEstimate) -> Array:
         """Return the angular velocity, body frame [rad/s], minus the known gyro bias about the vertical."""
         if not math.isfinite(estimate.yaw_rate):
             return np.full(3, math.nan)
@@ -536,13 +536,13 @@ class _WorldFrame:
         yaw = None if sample.yaw is None else math.remainder(sample.yaw - self._yaw, math.tau)
         return replace(sample, position=(cos * x + sin * y, cos * y - sin * x), yaw=yaw)
 
-    def state(self, estimate: Estimate) -> tuple[Array, Array, Array]:
+    def state(self, estimate: PoseEstimate) -> tuple[Array, Array, Array]:
         """Position [m], attitude xyzw, velocity in body axes [m/s]."""
         position = self._R_wp @ estimate.x[:3] + self._t
         q = quat_multiply(self._q_wg, quat_from_euler(estimate.roll, estimate.pitch, estimate.yaw))
         return position, q, quat_inverse_rotate(q, self._R_wp @ estimate.x[3:])
 
-    def std(self, estimate: Estimate) -> Array:
+    def std(self, estimate: PoseEstimate) -> Array:
         """Standard deviations of position, velocity (world axes) and yaw, (7,)."""
         if self._plain:
             return estimate.std()

@@ -21,7 +21,7 @@ from finssim.core.mcap_files import MAGIC, intact_mcap, write_intact
 from finssim.core.yaml_file import json_value
 from finssim.robot.record_messages import METADATA, RecordError, types
 
-__all__ = ["Entry", "Record", "describe_record", "events_of", "open_record", "repair_record"]
+__all__ = ["RecordedMessage", "Record", "describe_record", "events_of", "open_record", "repair_record"]
 
 
 def repair(file: Path, *, out: Path | None = None, as_json: bool = False) -> None:
@@ -82,7 +82,7 @@ def refuse_foreign(path: Path) -> None:
         raise RecordError(f"{path}: is no MCAP file: expected a record that FinsSim or rosbag2 wrote")
 
 
-class Entry(NamedTuple):
+class RecordedMessage(NamedTuple):
     """One message of a record."""
 
     time: float
@@ -136,7 +136,9 @@ class Record:
         for _, channel, message in self._reader.iter_messages():
             yield self._seconds(message.log_time), channel.topic, len(message.data)
 
-    def messages(self, topics: Collection[str] | None = None, start: float | None = None) -> Iterator[Entry]:
+    def messages(
+        self, topics: Collection[str] | None = None, start: float | None = None
+    ) -> Iterator[RecordedMessage]:
         """Messages in time order.
 
         Args:
@@ -165,7 +167,7 @@ class Record:
                 raise RecordError(
                     f"{self.path}: a message of {channel.topic} at {time:.3f} s is no {schema.name}: {error}"
                 ) from None
-            yield Entry(time, channel.topic, schema.name, decoded)
+            yield RecordedMessage(time, channel.topic, schema.name, decoded)
 
     def _known(self, topic: str) -> str:
         if topic not in self.topics:
@@ -277,7 +279,7 @@ def plain(value: Any) -> Any:
     return value
 
 
-def json_line(entry: Entry) -> str:
+def json_line(entry: RecordedMessage) -> str:
     """One line of JSON."""
     line = {"time": entry.time, "topic": entry.topic, "type": entry.kind, "message": plain(entry.message)}
     return json.dumps(line)

@@ -34,7 +34,7 @@ from finssim.robot.pilots import Pilot, make_pilot
 from finssim.robot.recorder import Recorder, recording
 from finssim.robot.runtime import USED, Runtime
 from finssim.robot.team import Team
-from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
+from finssim.robot.wiring import POOL_ADDRESS, RobotDriver, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
@@ -510,8 +510,8 @@ def _team(pilot: Pilot, wiring: Wiring) -> Team | None:
 
 @contextmanager
 def _opened(
-    link: AbstractContextManager[Drive], record: AbstractContextManager[Recorder | None]
-) -> Iterator[tuple[Drive, Recorder | None]]:
+    link: AbstractContextManager[RobotDriver], record: AbstractContextManager[Recorder | None]
+) -> Iterator[tuple[RobotDriver, Recorder | None]]:
     """Yield the connection of the robot, and a record; no record remains of a run that could not be connected."""
     with ExitStack() as stack:
         recorder = stack.enter_context(record)

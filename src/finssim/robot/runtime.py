@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from finssim.control.guidance import Guide
 from finssim.localization.overhead_camera import Pool
-from finssim.robot.bridge import Autopilot, Bridge
+from finssim.robot.bridge import Bridge, MotorDevice
 from finssim.robot.links.clock import ClockMap
 from finssim.robot.links.frames import McuLink, Message
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry, ThrusterCommand
@@ -147,7 +147,7 @@ def _percentiles(times: deque[float]) -> dict[str, float | None]:
 USED = ("accepted", "initialized", "reacquired")
 
 
-class Link(Autopilot, Protocol):
+class Link(MotorDevice, Protocol):
     """Conversion of the bridge's commands for the other end of the wire: a motor controller or an autopilot."""
 
     def feed(self, now: float, data: bytes) -> list[Message]:

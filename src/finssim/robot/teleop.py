@@ -28,7 +28,7 @@ from finssim.robot.perception import Perception, Unlocated
 from finssim.robot.pilots import ModeSwitch, Pilot, WrenchPilot, make_pilot
 from finssim.robot.recorder import Recorder, recording
 from finssim.robot.runtime import Runtime
-from finssim.robot.wiring import Drive, Wiring, connected
+from finssim.robot.wiring import RobotDriver, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 
 Array = npt.NDArray[np.float64]
@@ -478,7 +478,7 @@ SHOWN_EVERY = 0.2
 def drive(
     vehicle: Vehicle,
     device: Device,
-    connection: Drive,
+    connection: RobotDriver,
     *,
     pool: Pool | None = None,
     recorder: Recorder | None = None,

@@ -28,7 +28,7 @@ from finssim.robot.pictures import DEFAULT_CAMERA, NoPictures, PictureSource, Ta
 from finssim.robot.runtime import Link, Runtime
 from finssim.vehicles import Vehicle
 
-__all__ = ["POOL_ADDRESS", "Drive", "Wiring", "connected", "link_of", "open_camera", "run_realtime"]
+__all__ = ["POOL_ADDRESS", "RobotDriver", "Wiring", "connected", "link_of", "open_camera", "run_realtime"]
 
 
 # The outermost loop of a robot in real time: the only place that reads a clock and waits.
@@ -166,7 +166,7 @@ def link_of(robot: str, vehicle: Vehicle) -> Link:
     return MavlinkLink(vehicle, key=MavlinkAddress.of(robot).key)
 
 
-class Drive(Protocol):
+class RobotDriver(Protocol):
     """Runs a robot on its connection, until the time is over or `until` returns true; returns the duration [s]."""
 
     def __call__(
@@ -181,7 +181,7 @@ class Drive(Protocol):
 
 
 @contextmanager
-def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[Drive]:
+def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[RobotDriver]:
     """Everything open, for as long as it is needed: for one run, or for several one after the other.
 
     A later run goes on at the clock at which the one before ended, and is given nothing that came between them.

@@ -6,18 +6,18 @@ from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
     from finssim.sim.plant_arrays import SimulatorError
-    from finssim.sim.recorder import Recorder, read_run
+    from finssim.sim.recorder import StateRecorder, read_run
     from finssim.sim.sensors.batch import SensorBatch
-    from finssim.sim.sensors.sampling import WHITE, Truth, normal, parameters_of, sampling_kernel
+    from finssim.sim.sensors.sampling import WHITE, SampledState, normal, parameters_of, sampling_kernel
     from finssim.sim.sensors.suite import SensorSuite, add_sensor
     from finssim.sim.simulator import Simulator
-    from finssim.sim.site import Dock, Pool, SurroundingsError, TetherLine, Water, Wave
+    from finssim.sim.site import Dock, RectangularPool, SurroundingsError, TetherLine, Water, Wave
     from finssim.sim.state import State
 
 __all__ = [
     "Dock",
-    "Pool",
-    "Recorder",
+    "RectangularPool",
+    "StateRecorder",
     "SensorBatch",
     "SensorSuite",
     "Simulator",
@@ -25,7 +25,7 @@ __all__ = [
     "State",
     "SurroundingsError",
     "TetherLine",
-    "Truth",
+    "SampledState",
     "WHITE",
     "Water",
     "Wave",

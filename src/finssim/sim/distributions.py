@@ -29,7 +29,7 @@ EXAMPLE = "{normal: [1.0, 0.1]}"
 Pair: TypeAlias = tuple[float, float]
 
 
-class Part(BaseModel):
+class RangesPart(BaseModel):
     """Frozen, and no unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -76,7 +76,7 @@ def _is_number(x: object) -> bool:
     return isinstance(x, int | float) and not isinstance(x, bool)
 
 
-class Distribution(Part):
+class Distribution(RangesPart):
     """One of four distributions, which is drawn from with a probability; the vehicle file's number stays otherwise."""
 
     uniform: Pair | None = None

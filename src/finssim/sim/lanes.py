@@ -41,7 +41,7 @@ class Lane:
         self.trace, self.kind, self.name, self.example, self.level = trace, kind, name, example, level
 
     def _with(self, other: Any, symbol: str, function: Callable[[Any, Any], Any], kind: str = "") -> Any:
-        if isinstance(other, Row):
+        if isinstance(other, LaneRow):
             return NotImplemented
         return self.trace.apply(kind or self.kind, f"({{}} {symbol} {{}})", function, self, other)
 
@@ -107,15 +107,15 @@ def _divide(a: Any, b: Any) -> Any:
     return a / b if b else math.copysign(math.inf, a)
 
 
-class Row:
+class LaneRow:
     """A vector, quaternion or matrix of lane numbers and constants, row by row."""
 
     def __init__(self, shape: tuple[int, ...], numbers: Sequence[Any], quaternion: bool = False) -> None:
         self.shape, self.numbers, self.quaternion = shape, list(numbers), quaternion
 
-    def like(self, numbers: Sequence[Any]) -> Row:
+    def like(self, numbers: Sequence[Any]) -> LaneRow:
         """Other numbers in the same shape."""
-        return Row(self.shape, numbers, self.quaternion)
+        return LaneRow(self.shape, numbers, self.quaternion)
 
     def _index(self, index: Any) -> int:
         return int(index[0] * self.shape[1] + index[1]) if isinstance(index, tuple) else int(index)
@@ -123,29 +123,29 @@ class Row:
     def __getitem__(self, index: Any) -> Any:
         if len(self.shape) == 2 and not isinstance(index, tuple):
             columns = self.shape[1]
-            return Row((columns,), self.numbers[columns * index : columns * (index + 1)])
+            return LaneRow((columns,), self.numbers[columns * index : columns * (index + 1)])
         return self.numbers[self._index(index)]
 
     def __setitem__(self, index: Any, value: Any) -> None:
         self.numbers[self._index(index)] = value
 
-    def __add__(self, other: Row) -> Row:
+    def __add__(self, other: LaneRow) -> LaneRow:
         return self.like([a + b for a, b in zip(self.numbers, other.numbers, strict=True)])
 
-    def __sub__(self, other: Row) -> Row:
+    def __sub__(self, other: LaneRow) -> LaneRow:
         return self.like([a - b for a, b in zip(self.numbers, other.numbers, strict=True)])
 
-    def __neg__(self) -> Row:
+    def __neg__(self) -> LaneRow:
         return self.like([-a for a in self.numbers])
 
-    def __truediv__(self, other: Any) -> Row:
+    def __truediv__(self, other: Any) -> LaneRow:
         return self.like([a / other for a in self.numbers])
 
-    def __rmul__(self, other: Any) -> Row:
+    def __rmul__(self, other: Any) -> LaneRow:
         return self.like([other * a for a in self.numbers])
 
-    def __mul__(self, other: Any) -> Row:
-        if not isinstance(other, Row):
+    def __mul__(self, other: Any) -> LaneRow:
+        if not isinstance(other, LaneRow):
             return self.like([a * other for a in self.numbers])
         if self.quaternion:
             (ax, ay, az, aw), (bx, by, bz, bw) = self.numbers, other.numbers
@@ -159,9 +159,13 @@ class Row:
             )
         if len(self.shape) == 2:
             rows, columns = self.shape
-            return Row((rows,), [_sum([self[i, j] * other[j] for j in range(columns)]) for i in range(rows)])
+            return LaneRow(
+                (rows,), [_sum([self[i, j] * other[j] for j in range(columns)]) for i in range(rows)]
+            )
         rows, columns = other.shape
-        return Row((columns,), [_sum([self[i] * other[i, j] for i in range(rows)]) for j in range(columns)])
+        return LaneRow(
+            (columns,), [_sum([self[i] * other[i, j] for i in range(rows)]) for j in range(columns)]
+        )
 
 
 def _sum(terms: Sequence[Any]) -> Any:
@@ -231,9 +235,9 @@ def _each(form: str, function: Callable[..., Any], kind: str = "F") -> Callable[
     """A function of numbers, or of rows number by number."""
 
     def apply(*arguments: Any) -> Any:
-        first = next((a for a in arguments if isinstance(a, Row)), None)
+        first = next((a for a in arguments if isinstance(a, LaneRow)), None)
         if first is not None:
-            columns = [a.numbers if isinstance(a, Row) else [a] * len(first.numbers) for a in arguments]
+            columns = [a.numbers if isinstance(a, LaneRow) else [a] * len(first.numbers) for a in arguments]
             return first.like([apply(*numbers) for numbers in zip(*columns, strict=True)])
         lane = next((a for a in arguments if isinstance(a, Lane)), None)
         if lane is None:
@@ -263,20 +267,20 @@ class _Library:
     static = staticmethod(lambda value: value)
 
     @staticmethod
-    def vec3(*numbers: Any) -> Row:
-        return Row((3,), numbers if len(numbers) == 3 else (numbers or (0.0,)) * 3)
+    def vec3(*numbers: Any) -> LaneRow:
+        return LaneRow((3,), numbers if len(numbers) == 3 else (numbers or (0.0,)) * 3)
 
     @staticmethod
-    def quat(*numbers: Any) -> Row:
-        return Row((4,), numbers or (0.0,) * 4, quaternion=True)
+    def quat(*numbers: Any) -> LaneRow:
+        return LaneRow((4,), numbers or (0.0,) * 4, quaternion=True)
 
     @staticmethod
-    def quat_identity() -> Row:
-        return Row((4,), (0.0, 0.0, 0.0, 1.0), quaternion=True)
+    def quat_identity() -> LaneRow:
+        return LaneRow((4,), (0.0, 0.0, 0.0, 1.0), quaternion=True)
 
     @classmethod
     def where(cls, truth: Any, a: Any, b: Any) -> Any:
-        if isinstance(a, Row):
+        if isinstance(a, LaneRow):
             return a.like([cls.where(truth, x, y) for x, y in zip(a.numbers, b.numbers, strict=True)])
         if not isinstance(truth, Lane):
             return a if truth else b
@@ -292,34 +296,36 @@ class _Library:
         return cls.min(cls.max(low, x), high)
 
     @classmethod
-    def length(cls, a: Row) -> Any:
+    def length(cls, a: LaneRow) -> Any:
         return cls.sqrt(cls.dot(a, a))
 
     @classmethod
-    def normalize(cls, a: Row) -> Row:
+    def normalize(cls, a: LaneRow) -> LaneRow:
         return a / cls.length(a)
 
     @staticmethod
-    def cross(a: Row, b: Row) -> Row:
-        return Row((3,), [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    def cross(a: LaneRow, b: LaneRow) -> LaneRow:
+        return LaneRow(
+            (3,), [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+        )
 
     @staticmethod
-    def get_diag(M: Row) -> Row:
-        return Row((M.shape[0],), [M[i, i] for i in range(M.shape[0])])
+    def get_diag(M: LaneRow) -> LaneRow:
+        return LaneRow((M.shape[0],), [M[i, i] for i in range(M.shape[0])])
 
     @classmethod
-    def quat_rotate(cls, q: Row, x: Row) -> Row:
+    def quat_rotate(cls, q: LaneRow, x: LaneRow) -> LaneRow:
         return cls._rotated(q, x, 1.0)
 
     @classmethod
-    def quat_rotate_inv(cls, q: Row, x: Row) -> Row:
+    def quat_rotate_inv(cls, q: LaneRow, x: LaneRow) -> LaneRow:
         return cls._rotated(q, x, -1.0)
 
     @staticmethod
-    def quat_to_matrix(q: Row) -> Row:
+    def quat_to_matrix(q: LaneRow) -> LaneRow:
         x, y, z, w = q.numbers
         c = 2.0 * w * w - 1.0
-        return Row(
+        return LaneRow(
             (3, 3),
             [
                 *(c + 2.0 * x * x, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
@@ -329,8 +335,8 @@ class _Library:
         )
 
     @classmethod
-    def _rotated(cls, q: Row, x: Row, way: float) -> Row:
-        i, c = Row((3,), q.numbers[:3]), 2.0 * q[3] * q[3] - 1.0
+    def _rotated(cls, q: LaneRow, x: LaneRow, way: float) -> LaneRow:
+        i, c = LaneRow((3,), q.numbers[:3]), 2.0 * q[3] * q[3] - 1.0
         return c * x + (2.0 * cls.dot(i, x)) * i + (way * 2.0 * q[3]) * cls.cross(i, x)
 
 
@@ -343,7 +349,7 @@ def zero_of(kind: Any) -> Any:
     if kind in (bool, wp.bool):
         return False
     shape = tuple(kind._shape_)
-    return Row(shape, [0.0] * math.prod(shape), quaternion=issubclass(kind, wp.quat))
+    return LaneRow(shape, [0.0] * math.prod(shape), quaternion=issubclass(kind, wp.quat))
 
 
 class _Struct:
@@ -356,15 +362,15 @@ class _Struct:
         return SimpleNamespace(**{name: zero_of(kind) for name, kind in self.fields.items()})
 
 
-class _Type:
+class _LaneType:
     """A vector or matrix type, whose call makes one."""
 
     def __init__(self, kind: Any) -> None:
         self.kind = kind
 
-    def __call__(self, *numbers: Any) -> Row:
-        row: Row = zero_of(self.kind)
-        if len(numbers) == 1 and isinstance(numbers[0], Row):
+    def __call__(self, *numbers: Any) -> LaneRow:
+        row: LaneRow = zero_of(self.kind)
+        if len(numbers) == 1 and isinstance(numbers[0], LaneRow):
             return row.like(numbers[0].numbers)
         if numbers:
             row.numbers = list(numbers) if len(numbers) > 1 else list(numbers) * len(row.numbers)
@@ -397,7 +403,7 @@ def lane_function(function: Any) -> Callable[..., Any]:
 
     def traced(*arguments: Any) -> Any:
         # Warp passes vectors by value: what a function writes into one, its caller does not see.
-        return plain(*(a.like(a.numbers) if isinstance(a, Row) else a for a in arguments))
+        return plain(*(a.like(a.numbers) if isinstance(a, LaneRow) else a for a in arguments))
 
     _FUNCTIONS[function] = traced
     for name in python.__code__.co_names:
@@ -414,7 +420,7 @@ def _exchanged(value: Any) -> Any:
     if hasattr(value, "numpy_dtype") and hasattr(value, "cls"):
         return _Struct(value)
     if isinstance(value, type) and hasattr(value, "_shape_"):
-        return _Type(value)
+        return _LaneType(value)
     return value
 
 
@@ -443,7 +449,7 @@ class StructArray:
     def __getattr__(self, field: str) -> Any:
         kind, offset = self._fields[field]
         value = zero_of(kind)
-        row = value if isinstance(value, Row) else Row((1,), [value])
+        row = value if isinstance(value, LaneRow) else LaneRow((1,), [value])
         example = self._examples.get(field, 1)
         examples = np.broadcast_to(np.asarray(example, float).reshape(-1), len(row.numbers)).tolist()
         for i, x in enumerate(examples):
@@ -451,7 +457,7 @@ class StructArray:
             row.numbers[i] = (
                 self._trace.apply("I", "(I){}", int, number) if isinstance(value, int) else number
             )
-        return row if isinstance(value, Row) else row.numbers[0]
+        return row if isinstance(value, LaneRow) else row.numbers[0]
 
     def _place(self, index: int) -> str:
         """C++ of the number at that index of the struct, read with its seven neighbours."""
@@ -464,7 +470,7 @@ class StructArray:
 
     def __setattr__(self, field: str, value: Any) -> None:
         _, offset = self._fields[field]
-        for i, number in enumerate(value.numbers if isinstance(value, Row) else [value]):
+        for i, number in enumerate(value.numbers if isinstance(value, LaneRow) else [value]):
             self._assigned[offset // 4 + i] = _word(number)
 
     def stores(self) -> list[str]:
@@ -501,10 +507,10 @@ class VectorArray:
     def __init__(self, trace: Trace, name: str, kind: Any, slot: int) -> None:
         """Take its name in C++, its type, and which index the lane number is."""
         self._trace, self._name, self._size, self._slot = trace, name, math.prod(kind._shape_), slot
-        self._written: list[tuple[Lane, Row]] = []
+        self._written: list[tuple[Lane, LaneRow]] = []
         self._read: set[str] = set()
 
-    def __getitem__(self, index: Any) -> Row:
+    def __getitem__(self, index: Any) -> LaneRow:
         slot = index[self._slot]
         name = f"{self._name}_{slot.name}"
         if name not in self._read:
@@ -512,14 +518,14 @@ class VectorArray:
             self._trace.sections[slot.level].append(
                 f"F {name}[LANES]; gather({self._name}_at, {slot.name}, {name});"
             )
-        row = Row(
+        row = LaneRow(
             (self._size,), [self._trace.line("F", f"{name}[{i}]", 0.0, slot.level) for i in range(LANES)]
         )
         for written_slot, value in self._written:
             row = _Library.where(slot == written_slot, value, row)
         return row
 
-    def __setitem__(self, index: Any, value: Row) -> None:
+    def __setitem__(self, index: Any, value: LaneRow) -> None:
         slot = index[self._slot]
         self._written.append((slot, value))
 
@@ -548,13 +554,13 @@ class UniformStruct:
 
     def __getattr__(self, field: str) -> Any:
         value = zero_of(self._fields[field])
-        if isinstance(value, Row):
+        if isinstance(value, LaneRow):
             raise LaneError(f"field {field} of {self._name} is not a number")
         kind, call = ("I", "all_i") if isinstance(value, int) else ("F", "all")
         return self._trace.line(kind, f"{call}({self._name}.{field})", self._examples.get(field, 1), 0)
 
 
-class Loop:
+class LaneLoop:
     """Variables that a C++ loop carries from one pass to the next: a struct of lane numbers."""
 
     def __init__(self, trace: Trace, name: str, start: SimpleNamespace) -> None:
@@ -575,7 +581,7 @@ class Loop:
         return SimpleNamespace(
             **{
                 field: value.like([next(lanes) for _ in value.numbers])
-                if isinstance(value, Row)
+                if isinstance(value, LaneRow)
                 else next(lanes)
                 for field, value in vars(self._start).items()
             }
@@ -595,7 +601,7 @@ def _numbers(struct: SimpleNamespace) -> list[Any]:
     return [
         number
         for value in vars(struct).values()
-        for number in (value.numbers if isinstance(value, Row) else [value])
+        for number in (value.numbers if isinstance(value, LaneRow) else [value])
     ]
 
 

@@ -118,7 +118,7 @@ class _Kernels:
                 raise failure
 
 
-class Pipeline:
+class KernelSequence:
     """A fixed sequence of kernels over all worlds, recorded once and run every step.
 
     Every kernel takes `world_offset` as its last argument and is launched over its slice's worlds, or over (worlds,

@@ -4,7 +4,7 @@ import warp as wp
 
 
 @wp.struct
-class Measurement:
+class MeasurementErrors:
     """Errors of what is seen of one vehicle; all 0 is the truth."""
 
     position_std: float  # noise drawn every control step, per axis [m]
@@ -19,5 +19,5 @@ class Measurement:
     delay: float  # age of what is seen [s], taken to the nearest control step
 
 
-SENSORS = tuple(Measurement.cls.__annotations__)
+SENSORS = tuple(MeasurementErrors.cls.__annotations__)
 """Names of its fields."""

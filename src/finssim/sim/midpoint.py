@@ -48,7 +48,7 @@ DOCK_STEP = 0.005
 
 
 @wp.struct
-class Motion:
+class StateDerivative:
     """Result of the equation of motion in one state."""
 
     nu_dot: vec6  # body frame [m/s², rad/s²]

@@ -36,7 +36,7 @@ def twist_shift(r: Sequence[float]) -> Matrix:
 
 
 def vehicle_parameters(vehicle: "Vehicle", model: str) -> dict[str, Any]:
-    """Every field of a `Plant` but the derived ones, for one vehicle and one hydrodynamic model.
+    """Every field of a `PlantArrays` but the derived ones, for one vehicle and one hydrodynamic model.
 
     Args:
         vehicle: The vehicle.
@@ -86,7 +86,7 @@ def terms_of(vehicles: Sequence["Vehicle"], model: str) -> tuple["Term", ...]:
     return tuple(TERMS[name] for name in sorted(names))
 
 
-class Plant(Packed):
+class PlantArrays(Packed):
     """Parameters of vehicles by (world, vehicle): those of `VehicleParameters`, and those of the vehicles' terms."""
 
     def __init__(self, terms: tuple["Term", ...], shape: tuple[int, int], device: wp.Device) -> None:
@@ -149,10 +149,10 @@ def _force_at(rpm: float | None, c: float | None) -> float:
 
 def build_plant(
     vehicles: Sequence["Vehicle"], model: str, worlds: int, hulls: Sequence[int], device: wp.Device
-) -> Plant:
+) -> PlantArrays:
     """Parameters of `worlds` equal worlds that hold these vehicles; derived fields are zero until refreshed."""
     parameters = [{**vehicle_parameters(v, model), "hull": h} for v, h in zip(vehicles, hulls, strict=True)]
-    plant = Plant(terms_of(vehicles, model), (worlds, len(vehicles)), device)
+    plant = PlantArrays(terms_of(vehicles, model), (worlds, len(vehicles)), device)
     for name in dict.fromkeys(name for p in parameters for name in p):
         shape = next(np.shape(p[name]) for p in parameters if name in p)
         row = np.stack([np.broadcast_to(p.get(name, 0.0), shape) for p in parameters])

@@ -15,8 +15,8 @@ from finssim.physics.tether import Tether
 from finssim.physics.types import MAX_THRUSTERS, mat66, vec6, vec8
 from finssim.physics.water import WaterArrays
 from finssim.sim.distributions import KINDS, Distribution, bounds_of
-from finssim.sim.launch import Pipeline
-from finssim.sim.measured import SENSORS, Measurement
+from finssim.sim.launch import KernelSequence
+from finssim.sim.measured import SENSORS, MeasurementErrors
 from finssim.sim.packed import Packed
 from finssim.sim.plant_arrays import build_plant, twist_shift, vehicle_parameters
 from finssim.sim.ranges_file import MAX_WAVES, Ranges, load_ranges
@@ -346,7 +346,9 @@ def write_tether(tether: wp.array2d(dtype=Tether), x: wp.array3d(dtype=float), w
 
 
 @wp.func
-def write_sensors(measurement: wp.array2d(dtype=Measurement), x: wp.array3d(dtype=float), w: int, v: int):
+def write_sensors(
+    measurement: wp.array2d(dtype=MeasurementErrors), x: wp.array3d(dtype=float), w: int, v: int
+):
     """Write noise, delay and dropouts of what a controller observes of a vehicle from entries x, each in its unit."""
     measurement[w, v].position_std = x[w, v, wp.static(COLUMN["sensors.position_std"])]
     measurement[w, v].yaw_std = x[w, v, wp.static(COLUMN["sensors.yaw_std"])]
@@ -440,7 +442,7 @@ def draw_episode(
     plant: wp.array2d(dtype=VehicleParameters),
     extra: wp.array3d(dtype=float),
     tether: wp.array2d(dtype=Tether),
-    measurement: wp.array2d(dtype=Measurement),
+    measurement: wp.array2d(dtype=MeasurementErrors),
     water: WaterArrays,
     nominal: Nominal,
     table: DrawTable,
@@ -606,7 +608,9 @@ class Draws:
         self.table = draw_table(self.distributions, self.nominal, randomization.ranges, device)
         full = np.broadcast_to(self.nominal.astype(np.float32), (*shape, len(ENTRIES)))
         self.values = wp.array(np.ascontiguousarray(full), dtype=wp.float32, device=device)
-        self._seen = measurement.array if measurement else wp.zeros((1, 1), dtype=Measurement, device=device)
+        self._seen = (
+            measurement.array if measurement else wp.zeros((1, 1), dtype=MeasurementErrors, device=device)
+        )
         self._nominal = _nominal_vehicles(simulator)
         self._arrays = self._drawn_arrays(agents, privileged)
 
@@ -650,14 +654,14 @@ class Draws:
         self.table.ends.assign(ends)
         self.table.probability.assign(probability)
 
-    def add(self, pipeline: Pipeline, mask: wp.array, seed: int) -> None:
+    def add(self, pipeline: KernelSequence, mask: wp.array, seed: int) -> None:
         """Append the draw for the worlds where mask (by world, int32) is not 0; refresh the plant afterwards."""
         s = self.simulator
         places = [s.plant.array, s.plant.extra, s.tether.array, self._seen, s.water]
         inputs = [*places, self._nominal, self.table, self._arrays, s.state, seed, mask]
         pipeline.add(draw_episode, inputs, vehicles=len(s.vehicles))
 
-    def add_step(self, pipeline: Pipeline, seed: int) -> None:
+    def add_step(self, pipeline: KernelSequence, seed: int) -> None:
         """Append what is drawn for every control step, before the simulator's step: when the command arrives."""
         if "command_jitter" in self.distributions:
             s = self.simulator

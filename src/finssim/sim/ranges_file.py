@@ -22,7 +22,7 @@ from finssim.sim.distributions import (
     Above0,
     Distribution,
     Interval,
-    Part,
+    RangesPart,
     Scale,
     Share,
     bounds_of,
@@ -89,7 +89,7 @@ Time = Annotated[Scale, AfterValidator(_short)]
 ONE, NONE = (1.0, 1.0), (0.0, 0.0)
 
 
-class AxisScales(Part):
+class AxisScales(RangesPart):
     """A common factor and one factor per axis; an axis not named keeps its own factor at 1."""
 
     all: Scale = ONE
@@ -101,7 +101,7 @@ class AxisScales(Part):
         return [p[0] for p in pairs], [p[1] for p in pairs]
 
 
-class Offsets(Part):
+class Offsets(RangesPart):
     """An offset along each axis [m]."""
 
     x: Interval = NONE
@@ -109,7 +109,7 @@ class Offsets(Part):
     z: Interval = NONE
 
 
-class EachScales(Part):
+class EachScales(RangesPart):
     """A factor common to all thrusters and one for each."""
 
     all: Scale = ONE
@@ -123,7 +123,7 @@ class ThrustScales(EachScales):
     """Remaining share of a thruster's thrust; give it a probability, with which each thruster fails independently."""
 
 
-class WaveRanges(Part):
+class WaveRanges(RangesPart):
     """Waves of random number, size and direction; the period follows from the length and the depth."""
 
     count: Annotated[tuple[int, int], AfterValidator(_count)]
@@ -145,7 +145,7 @@ class WaveRanges(Part):
         return self
 
 
-class DriftRanges(Part):
+class DriftRanges(RangesPart):
     """A slow random part of the current, along each horizontal axis."""
 
     deviation: Scale
@@ -154,7 +154,7 @@ class DriftRanges(Part):
     """Its correlation time [s]."""
 
 
-class TetherRanges(Part):
+class TetherRanges(RangesPart):
     """The line to the vehicle; a line of the environment's own keeps what is not named here."""
 
     diameter: Above0 | None = None
@@ -164,7 +164,7 @@ class TetherRanges(Part):
     """Weight in water per length [N/m]; negative floats."""
 
 
-class SensorRanges(Part):
+class SensorRanges(RangesPart):
     """Noise, delay and dropouts of what the controller observes; omitted keys keep the environment's values."""
 
     position_std: Scale | None = None
@@ -189,7 +189,7 @@ class SensorRanges(Part):
     """Age of what is seen [s]."""
 
 
-class Correlated(Part):
+class Correlated(RangesPart):
     """Entries whose draws are correlated by rank, so that each keeps its distribution."""
 
     entries: tuple[str, ...] = Field(min_length=2)
@@ -215,7 +215,7 @@ class Correlated(Part):
         return self
 
 
-class Success(Part):
+class Success(RangesPart):
     """When an episode counts as a success: exactly one of the two."""
 
     held: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
@@ -230,7 +230,7 @@ class Success(Part):
         return self
 
 
-class Curriculum(Part):
+class Curriculum(RangesPart):
     """Schedule by which all ranges grow together from a part of their width to the full width."""
 
     by: Literal["progress", "steps", "success"] = "progress"
@@ -269,7 +269,7 @@ class Curriculum(Part):
         return self.start + part * (1.0 - self.start)
 
 
-class Ranges(Part):
+class Ranges(RangesPart):
     """Distributions drawn for every episode: factors on the vehicle file's numbers, unless a unit is given."""
 
     name: str

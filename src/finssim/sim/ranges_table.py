@@ -19,7 +19,7 @@ TETHER = ("diameter", "drag_coefficient", "wet_weight")
 
 
 @dataclass(frozen=True)
-class Entry:
+class DrawnNumber:
     """One number that is drawn for every episode."""
 
     name: str
@@ -38,38 +38,44 @@ class Entry:
     """Stream of its random numbers, which other entries do not change."""
 
 
-def _table() -> Iterator[Entry]:
-    yield from (Entry("mass"), Entry("volume"), Entry("inertia"))
+def _table() -> Iterator[DrawnNumber]:
+    yield from (DrawnNumber("mass"), DrawnNumber("volume"), DrawnNumber("inertia"))
     for center in ("center_of_gravity", "center_of_buoyancy"):
-        yield from (Entry(f"{center}.{axis}", "m", 0.0) for axis in "xyz")
+        yield from (DrawnNumber(f"{center}.{axis}", "m", 0.0) for axis in "xyz")
     for family in ("added_mass", "linear_damping", "quadratic_damping"):
-        yield from (Entry(f"{family}.{axis}") for axis in ("all", *AXES))
-    yield from (Entry("buoyancy"), Entry("mesh_drag"), Entry("thrust.all"))
+        yield from (DrawnNumber(f"{family}.{axis}") for axis in ("all", *AXES))
+    yield from (DrawnNumber("buoyancy"), DrawnNumber("mesh_drag"), DrawnNumber("thrust.all"))
     for kind in ("thrust.each", "thrust.failure"):
-        yield from (Entry(f"{kind}.{k}") for k in range(MAX_THRUSTERS))
-    yield Entry("time_constant.all")
-    yield from (Entry(f"time_constant.each.{k}") for k in range(MAX_THRUSTERS))
-    yield from (Entry("added_time_constant", "s", 0.0), Entry("delay"), Entry("added_delay", "s", 0.0))
-    yield from (Entry("command_jitter", "s", 0.0), Entry("slew"), Entry("dead_zone"))
-    yield Entry("added_dead_zone", "N", 0.0)
-    for name, unit in zip(TETHER, ("m", "1", "N/m"), strict=True):
-        yield Entry(f"tether.{name}", unit, 0.0)
-    for name in SENSORS:
-        yield Entry(f"sensors.{name}", _sensor_unit(name), 0.0)
+        yield from (DrawnNumber(f"{kind}.{k}") for k in range(MAX_THRUSTERS))
+    yield DrawnNumber("time_constant.all")
+    yield from (DrawnNumber(f"time_constant.each.{k}") for k in range(MAX_THRUSTERS))
     yield from (
-        Entry("current", "m/s", 0.0, world=True, told=False),
-        Entry("vertical_current", "m/s", 0.0, world=True),
+        DrawnNumber("added_time_constant", "s", 0.0),
+        DrawnNumber("delay"),
+        DrawnNumber("added_delay", "s", 0.0),
     )
-    yield Entry("current.direction", "rad", 0.0, world=True, angle=True, told=False)
-    yield from (Entry(f"current.{axis}", "m/s", 0.0, world=True) for axis in "xy")  # from speed and direction
-    yield Entry("current_drift.deviation", "m/s", 0.0, world=True)
-    yield Entry("current_drift.time", "s", 0.0, world=True)
-    yield Entry("waves.count", "1", 0.0, world=True, told=False)
+    yield from (DrawnNumber("command_jitter", "s", 0.0), DrawnNumber("slew"), DrawnNumber("dead_zone"))
+    yield DrawnNumber("added_dead_zone", "N", 0.0)
+    for name, unit in zip(TETHER, ("m", "1", "N/m"), strict=True):
+        yield DrawnNumber(f"tether.{name}", unit, 0.0)
+    for name in SENSORS:
+        yield DrawnNumber(f"sensors.{name}", _sensor_unit(name), 0.0)
+    yield from (
+        DrawnNumber("current", "m/s", 0.0, world=True, told=False),
+        DrawnNumber("vertical_current", "m/s", 0.0, world=True),
+    )
+    yield DrawnNumber("current.direction", "rad", 0.0, world=True, angle=True, told=False)
+    yield from (
+        DrawnNumber(f"current.{axis}", "m/s", 0.0, world=True) for axis in "xy"
+    )  # from speed and direction
+    yield DrawnNumber("current_drift.deviation", "m/s", 0.0, world=True)
+    yield DrawnNumber("current_drift.time", "s", 0.0, world=True)
+    yield DrawnNumber("waves.count", "1", 0.0, world=True, told=False)
     for i in range(MAX_WAVES):
-        yield Entry(f"waves.{i}.amplitude", "m", 0.0, world=True)
-        yield Entry(f"waves.{i}.wavelength", "m", 1.0, world=True)
+        yield DrawnNumber(f"waves.{i}.amplitude", "m", 0.0, world=True)
+        yield DrawnNumber(f"waves.{i}.wavelength", "m", 1.0, world=True)
         for name in ("heading", "phase"):
-            yield Entry(f"waves.{i}.{name}", "rad", 0.0, world=True, angle=True, told=False)
+            yield DrawnNumber(f"waves.{i}.{name}", "rad", 0.0, world=True, angle=True, told=False)
 
 
 def _sensor_unit(name: str) -> str:
@@ -87,16 +93,16 @@ WORLD = next(i for i, entry in enumerate(ENTRIES) if entry.world)
 WORLD_END = len(ENTRIES)
 
 
-def term_entries(term: Term) -> list[Entry]:
+def term_entries(term: Term) -> list[DrawnNumber]:
     """Entries of a term: `lift.coefficient`, a factor on each parameter, and `lift.added_coefficient`, to be added.
 
     Only parameters that are one number in a section of their own can be added to. The streams follow from the names.
     """
     scalars, out = term.scalars(), []
     for name, path in term.parameters.items():
-        out.append(Entry(path))
+        out.append(DrawnNumber(path))
         if path in scalars and path != term.name:
-            out.append(Entry(added_entry(path), term.units[name], 0.0))
+            out.append(DrawnNumber(added_entry(path), term.units[name], 0.0))
     for entry in out:
         if entry.name not in INDEX:
             INDEX[entry.name] = len(ENTRIES)

@@ -32,7 +32,7 @@ ABOUT = "_run.json"
 `_`."""
 
 
-class Recorder:
+class StateRecorder:
     """Writes one row per recorded world, vehicle and call of `record`.
 
     A part is written whole every `chunk` rows, so a run that is cut short opens up to its last part:
@@ -122,7 +122,7 @@ class Recorder:
         self._rows, self._waiting = [], 0
         self._parts += 1
 
-    def __enter__(self) -> "Recorder":
+    def __enter__(self) -> "StateRecorder":
         return self
 
     def __exit__(
@@ -135,7 +135,7 @@ def read_run(folder: str | Path) -> "pandas.DataFrame":
     """Read a recorded run up to its last complete part.
 
     Args:
-        folder: What `Recorder` was given.
+        folder: What `StateRecorder` was given.
 
     Returns:
         One row per world, vehicle and time; `.attrs` holds what `_run.json` says.

@@ -23,15 +23,15 @@ from finssim.physics.tether import Tether
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.physics.water import advance_drift
 from finssim.sim.lanes import LANES
-from finssim.sim.launch import Pipeline
+from finssim.sim.launch import KernelSequence
 from finssim.sim.packed import Packed
 from finssim.sim.plant_arrays import SimulatorError, build_plant
-from finssim.sim.site import Dock, Pool, TetherLine, Water
+from finssim.sim.site import Dock, RectangularPool, TetherLine, Water
 from finssim.sim.solids import WorldSolids, layout_of, pool_of, refresh_clearing
 from finssim.sim.state import HISTORY, VehicleState, clear_actuators, new_state
 from finssim.sim.step import physics_kernel, tick
 from finssim.vehicles import Vehicle, load_vehicle
-from finssim.vehicles.vehicle import Water as Fluid
+from finssim.vehicles.vehicle import ReferenceWater as Fluid
 
 INTEGRATORS = ("midpoint", "rk4")
 
@@ -61,7 +61,7 @@ class Simulator:
         substeps: int = 4,
         integrator: str = "midpoint",
         water: Water | None = None,
-        pool: Pool | None = None,
+        pool: RectangularPool | None = None,
         tether: TetherLine | None = None,
         dock: Dock | None = None,
         world: Any = None,
@@ -156,7 +156,12 @@ class Simulator:
         self.place(position=start if self.world is None else self.world.world.viewpoint.position)
 
     def _surround(
-        self, water: Water, pool: Pool | None, tether: TetherLine | None, max_waves: int, moves: bool
+        self,
+        water: Water,
+        pool: RectangularPool | None,
+        tether: TetherLine | None,
+        max_waves: int,
+        moves: bool,
     ) -> None:
         fluid = shared_water(self.vehicles)
         self.surroundings = (water, pool, tether)
@@ -175,11 +180,11 @@ class Simulator:
                 meshes.append(vehicle.hull_mesh())
         self.hull = hull_mesh(meshes, self.device) if meshes else HullMesh()
 
-    def pipeline(self) -> Pipeline:
+    def pipeline(self) -> KernelSequence:
         """An empty pipeline over the simulator's worlds, for a caller that adds its own kernels around the step."""
-        return Pipeline(self.worlds, self.device, self._threads)
+        return KernelSequence(self.worlds, self.device, self._threads)
 
-    def add_step(self, pipeline: Pipeline) -> None:
+    def add_step(self, pipeline: KernelSequence) -> None:
         """Append the kernels of one control step."""
         if self._drifts:
             s = self.state
@@ -225,17 +230,17 @@ class Simulator:
         traceable = self.integrator == "midpoint" and self.hydrodynamics != "mesh"
         return self.device.is_cpu and traceable and not self.water.moving and self.dock is None
 
-    def add_reset(self, pipeline: Pipeline, mask: wp.array) -> None:
+    def add_reset(self, pipeline: KernelSequence, mask: wp.array) -> None:
         """Append the kernels that reset motors and clocks, where mask (by world, int32) is not 0."""
         pipeline.add(clear_actuators, [self.state, mask])
 
-    def add_refresh(self, pipeline: Pipeline, mask: wp.array) -> None:
+    def add_refresh(self, pipeline: KernelSequence, mask: wp.array) -> None:
         """Append the kernel that recomputes derived parameters of worlds that draw their own, where mask is not 0."""
         self._drawn = True
         self._shared.zero_()
         self._add_refresh(pipeline, mask)
 
-    def _add_refresh(self, pipeline: Pipeline, mask: wp.array) -> None:
+    def _add_refresh(self, pipeline: KernelSequence, mask: wp.array) -> None:
         h = self.control_step / self.substeps
         pipeline.add(refresh_plant, [self.plant.array, h, mask], vehicles=len(self.vehicles))
 

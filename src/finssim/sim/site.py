@@ -122,7 +122,7 @@ class Water:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pool:
+class RectangularPool:
     """A rectangular pool centred on the world's z axis. The default is the paper's: 4 × 2 m, 1 m of water."""
 
     length: float = 4.0

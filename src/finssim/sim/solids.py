@@ -16,7 +16,7 @@ from finssim.physics.solids import NEIGHBOURS, Solids, free_water
 from finssim.physics.types import linear
 from finssim.sim.midpoint import WALL_STEP
 from finssim.sim.plant_arrays import SimulatorError
-from finssim.sim.site import Pool, described_world
+from finssim.sim.site import RectangularPool, described_world
 from finssim.sim.state import State
 
 KINDS = ("box", "sphere", "capsule", "cylinder", "plane", "mesh", "heightfield")
@@ -39,13 +39,13 @@ def layout_of(world: Any, worlds: int, device: wp.Device) -> Any:
     return world
 
 
-def pool_of(world: Any) -> Pool | None:
+def pool_of(world: Any) -> RectangularPool | None:
     """The basin of a world as walls and a floor; None if it has none."""
     if world.basin is None:
         return None
     length, width, depth = map(float, world.basin.size)
     c = world.contact
-    return Pool(
+    return RectangularPool(
         length=length, width=width, depth=depth, stiffness=c.stiffness, damping=c.damping, friction=c.friction
     )
 

@@ -27,7 +27,7 @@ from finssim.physics.types import MAX_THRUSTERS, angular, join, linear, symmetri
 from finssim.physics.water import Flow, WaterArrays, flow_at
 from finssim.sim.lanes import (
     LANES,
-    Loop,
+    LaneLoop,
     NumberArray,
     StructArray,
     Trace,
@@ -39,7 +39,7 @@ from finssim.sim.lanes import (
 from finssim.sim.midpoint import (
     DOCK_STEP,
     WALL_STEP,
-    Motion,
+    StateDerivative,
     Touch,
     lead_of,
     relaxation_of,
@@ -193,7 +193,7 @@ def motion_function(
         t: float,
         t_step: float,
         h: float,
-    ) -> Motion:
+    ) -> StateDerivative:
         """Acceleration from the equation of motion, with nu_r = nu - [v_c; 0] and the water's v_c in the body frame.
 
         (M_RB + s M_A) nu_dot = tau_model + s tau_thrust + tau_other - C_RB(nu) nu - s C_A(nu_r) nu_r
@@ -206,7 +206,7 @@ def motion_function(
         is shared with more water (von Kármán 1929); where it falls, the water keeps what it has: neither adds energy.
         That term is taken at the middle of a substep h that starts with nu_start, implicitly: M_A sets no limit to h.
         """
-        out = Motion()
+        out = StateDerivative()
         up = up_in_body(q)
         momentum = rigid_body_momentum(plant[w, v].mass, plant[w, v].r_g, plant[w, v].inertia, nu)
         flow = Flow()
@@ -794,7 +794,7 @@ def lane_block(set_out: Any, substep: Any, arrive: Any, term_numbers: int) -> An
     numbers = command[0, 0].thrust.numbers + command[0, 0].disturbance.numbers
     for number in numbers:
         trace.require(trace.apply("M", "finite({})", math.isfinite, number))
-    loop = Loop(trace, "course", lane_function(set_out)(state, command, commands, plant, 0, 0, head))
+    loop = LaneLoop(trace, "course", lane_function(set_out)(state, command, commands, plant, 0, 0, head))
     trace.level = 1
     trace.sections[1].append("const I k = all_i(pass);")
     k = trace.symbol("I", "k", 1)

@@ -34,14 +34,14 @@ from finssim.evaluation.metrics import T1_SETPOINTS
 from finssim.evaluation.robot_trials import (
     FIRMWARES,
     Attendant,
-    Job,
     OnRobot,
+    RobotJob,
     firmware_of,
     played_trial,
     take_folder,
 )
 from finssim.evaluation.tables import Table, cells, html_of, print_tables
-from finssim.evaluation.trials import Trial
+from finssim.evaluation.trials import GoalTrial
 from finssim.identification.fit import Fit
 from finssim.identification.prediction import Replay, draw_response_envelopes, replay
 from finssim.identification.programme import RATE, STEADY, Programme, programmes, which_axes
@@ -50,7 +50,7 @@ from finssim.identification.report import interval_text, number_text, state_text
 from finssim.identification.vehicle_file import all_findings, calibrated, number_in, write_vehicle
 from finssim.pool import draw_plant
 from finssim.pool.drawn_plant import site_of
-from finssim.sim import Pool
+from finssim.sim import RectangularPool
 from finssim.studies.transfer import T1, Spec, transfer_experiment
 from finssim.trials.findings import Finding, sentences
 from finssim.trials.trial_files import load_trials
@@ -284,10 +284,12 @@ POOL_VEHICLE = (
 )
 
 
-def _paths(trials: Sequence[Trial], site: str) -> Any:
+def _paths(trials: Sequence[GoalTrial], site: str) -> Any:
     """The paths of all trials from above and from the side, in the water; start and goals with their headings."""
     size = SITES[site]
-    pool = Pool() if size is None else Pool(length=size[0], width=size[1], depth=size[2])
+    pool = (
+        RectangularPool() if size is None else RectangularPool(length=size[0], width=size[1], depth=size[2])
+    )
     figure = new_figure(7.2, 6.0, layout="compressed")
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(pool.width, pool.depth))
     spans = ((1, -pool.width / 2, pool.width), (2, -pool.depth, pool.depth))
@@ -637,7 +639,7 @@ class _Demonstration:
         )
         return result
 
-    def _show(self, job: Job, result: Mapping[str, Any]) -> None:
+    def _show(self, job: RobotJob, result: Mapping[str, Any]) -> None:
         held = "held" if result["success"] else result["fault"] or "not held"
         if result["e_p_m"] is not None:
             held += f", {result['e_p_m']:.3f} m and {result['e_psi_deg']:.1f}° off"

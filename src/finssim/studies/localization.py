@@ -30,10 +30,10 @@ from finssim.localization.detection.detections import Detection, Frame, write_de
 from finssim.localization.detection.families import bitmap, corners, tag_corners_b
 from finssim.localization.overhead_camera import Pool, write_pool
 from finssim.localization.poses.methods import METHODS, Constraints
-from finssim.sim.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
+from finssim.sim.overhead_camera import ObjectPose, OverheadCamera, Ripples, Scene, TagInScene, TiledBasin
 from finssim.survey.points import Observations, observe, read_survey
 from finssim.survey.pool_fit import PoolFit, calibrate_pool, pool_record
-from finssim.survey.pool_model import Settings
+from finssim.survey.pool_model import PoolFitSettings
 from finssim.vehicles import Mount, Tags
 
 Array = NDArray[np.float64]
@@ -219,7 +219,7 @@ RENDERERS = ("own", "geometry")
 
 
 @dataclass(frozen=True)
-class Picture:
+class CampaignPicture:
     """One picture of a campaign."""
 
     visit: int
@@ -228,7 +228,7 @@ class Picture:
     """None where the detector did not find the tag."""
 
 
-def pictures(campaign: Campaign, renderer: str = "own") -> Iterator[Picture]:
+def pictures(campaign: Campaign, renderer: str = "own") -> Iterator[CampaignPicture]:
     """All pictures of a campaign, visit by visit.
 
     Args:
@@ -244,7 +244,7 @@ def pictures(campaign: Campaign, renderer: str = "own") -> Iterator[Picture]:
     for k, visit in enumerate(campaign.visits):
         for _ in range(visit.images):
             seed = int(np.random.SeedSequence([campaign.seed, number]).generate_state(1)[0] % 2**31)
-            yield Picture(k, f"{number:04d}.png", render(visit, INTERVAL * number, seed))
+            yield CampaignPicture(k, f"{number:04d}.png", render(visit, INTERVAL * number, seed))
             number += 1
 
 
@@ -255,7 +255,7 @@ def scene_of(campaign: Campaign) -> Scene:
         camera=campaign.truth.camera,
         interface=campaign.truth.interface,
         # The tag lies on the tiles; a floor a little lower keeps tilted tags above it.
-        basin=Basin(lower=(-2.0, -1.0, -0.02), upper=(2.0, 1.0, WATER_HEIGHT + 0.1)),
+        basin=TiledBasin(lower=(-2.0, -1.0, -0.02), upper=(2.0, 1.0, WATER_HEIGHT + 0.1)),
         ripples=Ripples(rms_slope=slope, seed=campaign.seed) if slope else None,
     )
 
@@ -267,7 +267,7 @@ def tag_of(visit: Visit) -> TagInScene:
     return TagInScene(
         bitmap=bitmap(TAG.family, TAG_ID).astype(bool),
         edge=TAG.edge,
-        pose=Pose(position=(x, y, z), orientation=(q[0], q[1], q[2], q[3])),
+        pose=ObjectPose(position=(x, y, z), orientation=(q[0], q[1], q[2], q[3])),
         margin=MARGIN,
     )
 
@@ -312,7 +312,7 @@ class Calibrated:
     """Surveyed place of the tag in each of them [m]."""
 
 
-def calibrate(campaign: Campaign, observed: Sequence[Picture]) -> Calibrated:
+def calibrate(campaign: Campaign, observed: Sequence[CampaignPicture]) -> Calibrated:
     """Calibrate on the visits chosen for it; the truth is not looked at.
 
     Args:
@@ -322,7 +322,7 @@ def calibrate(campaign: Campaign, observed: Sequence[Picture]) -> Calibrated:
     chosen = [p for p in observed if campaign.calibrates[p.visit] and p.detection is not None]
     frames = [Frame(np.nan, p.name, (p.detection,)) for p in chosen if p.detection is not None]
     rows = survey_rows(campaign, chosen)
-    settings = Settings(
+    settings = PoolFitSettings(
         water_height=campaign.water_read,
         place_sigma=max(campaign.conditions.tape, 5e-4),
         survey_sigma=max(campaign.conditions.survey, 1e-4),
@@ -342,7 +342,7 @@ def calibrate(campaign: Campaign, observed: Sequence[Picture]) -> Calibrated:
     )
 
 
-def survey_rows(campaign: Campaign, chosen: Sequence[Picture]) -> list[Row]:
+def survey_rows(campaign: Campaign, chosen: Sequence[CampaignPicture]) -> list[Row]:
     """Return the survey as a table: the surveyed place of the tag in each picture."""
     rows: list[Row] = []
     for picture in chosen:
@@ -437,7 +437,7 @@ class Scores:
 
 
 def locate(
-    campaign: Campaign, observed: Sequence[Picture], pool: Pool, method: str, *, pixel_std: float
+    campaign: Campaign, observed: Sequence[CampaignPicture], pool: Pool, method: str, *, pixel_std: float
 ) -> Scores:
     """Locate the tag in every picture of the held-out visits and average over each visit.
 
@@ -592,7 +592,7 @@ def _gain(result: Mapping[str, Any]) -> str:
 
 
 @dataclass(frozen=True)
-class SeedResult:
+class LocalizationSeed:
     """One drawing of the test under one set of conditions."""
 
     campaign: Campaign
@@ -634,7 +634,7 @@ def localization_experiment(
         raise ValueError(f"seeds is {seeds}, expected at least 1")
     check_choices([renderer], RENDERERS, "renderer", ValueError)
     refuse_unwritable(atomic_directory(out, replaces=RESULT_FILE))
-    drawn: dict[str, list[SeedResult]] = {name: [] for name in CONDITIONS}
+    drawn: dict[str, list[LocalizationSeed]] = {name: [] for name in CONDITIONS}
     higher: list[Mapping[str, Scores]] = []
     runs = drawn["published"]
     for k in range(seeds):
@@ -670,7 +670,7 @@ def localization_experiment(
     return result
 
 
-def _write(result: Mapping[str, Any], out: Path, first: SeedResult) -> None:
+def _write(result: Mapping[str, Any], out: Path, first: LocalizationSeed) -> None:
     """Write the directory: result, page, figures, and what a user needs to do the first seed by hand."""
     with atomic_directory(out, replaces=RESULT_FILE) as folder:
         scores, calibration = first.scores, first.calibration
@@ -691,14 +691,16 @@ def _write(result: Mapping[str, Any], out: Path, first: SeedResult) -> None:
         write_json(folder / RESULT_FILE, result, tables_of(result))
 
 
-def _play_seed(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedResult:
+def _play_seed(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> LocalizationSeed:
     campaign = draw_campaign(CONDITIONS[name], seed, **size)
     observed = list(pictures(campaign, renderer))
     calibration = calibrate(campaign, observed)
-    return SeedResult(campaign, calibration, _scored(campaign, observed, calibration))
+    return LocalizationSeed(campaign, calibration, _scored(campaign, observed, calibration))
 
 
-def _scored(campaign: Campaign, observed: Sequence[Picture], calibration: Calibrated) -> dict[str, Scores]:
+def _scored(
+    campaign: Campaign, observed: Sequence[CampaignPicture], calibration: Calibrated
+) -> dict[str, Scores]:
     pools = {"refractive": calibration.refractive, "pinhole": calibration.pinhole}
     return {
         row: locate(campaign, observed, pools[kind], method, pixel_std=calibration.refractive.pixel_std)
@@ -706,7 +708,7 @@ def _scored(campaign: Campaign, observed: Sequence[Picture], calibration: Calibr
     }
 
 
-def _errors(seed_result: SeedResult) -> dict[str, Any]:
+def _errors(seed_result: LocalizationSeed) -> dict[str, Any]:
     """Return the errors of the calibration of one seed, whose truth is known here."""
     true, fit = seed_result.campaign.truth, seed_result.calibration.refractive
     (x, y, height), (x_fit, y_fit, height_fit) = true.camera.position, fit.camera.position

@@ -183,7 +183,7 @@ REPEATS = 8
 
 
 @dataclass(frozen=True)
-class SeedResult:
+class ReplaySeed:
     """One seed: the fit and its replays on trials it has not seen."""
 
     seed: int
@@ -276,14 +276,14 @@ def replay_experiment(
 
 def experiment_seed(
     vehicle: Vehicle, plant: ReplayPlant, seed: int, repeats: int = REPEATS, axes: Sequence[str] = AXES
-) -> SeedResult:
+) -> ReplaySeed:
     """One seed of the experiment; arguments as for `replay_experiment`."""
     trials = plant.trials(programmes(axes, vehicle, kind="published", repeats=repeats), vehicle, seed)
     fit = regress(trials[0::2], vehicle, axes=axes)
     fitted = calibrated(fit)
     same = replay(trials[1::2], fitted, hydrodynamics=MODELS)
     sweeps = plant.trials(programmes(axes, vehicle, kind="validation"), vehicle, seed + 1_000_000)
-    return SeedResult(seed, fit, fitted, same, replay(sweeps, fitted, hydrodynamics=MODELS))
+    return ReplaySeed(seed, fit, fitted, same, replay(sweeps, fitted, hydrodynamics=MODELS))
 
 
 def pooled(replays: Sequence[Replay]) -> dict[str, Any]:

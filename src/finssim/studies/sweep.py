@@ -21,7 +21,7 @@ from finssim.core.progress import Progress
 from finssim.core.provenance import provenance
 from finssim.core.yaml_file import first_problem, read_mapping
 from finssim.evaluation.campaign import run_jobs, write_json
-from finssim.evaluation.evaluate import Job, play
+from finssim.evaluation.evaluate import ControllerTrials, play
 from finssim.evaluation.plants import load_plant
 from finssim.evaluation.tables import Table, cells
 from finssim.learning.train import train
@@ -231,7 +231,7 @@ def sweep(
                 errors[policy] = f"{type(error).__name__}: {error}"
             progress(TRAINING_SHARE * (1.0 - remaining / len(missing)), f"{remaining} trainings left")
     jobs = [
-        Job(
+        ControllerTrials(
             row=training.setting, target=plan.task, plant=number, seed=training.seed, noise=EVALUATION_SEED,
             controller=str(policy), vehicle=plan.vehicle, water=load_plant(name), trials=plan.evaluate.trials,
             task=plan.task,

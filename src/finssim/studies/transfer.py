@@ -28,8 +28,8 @@ from finssim.evaluation.robot_trials import (
     FIRMWARES,
     HARDWARE,
     Attendant,
-    Job,
     OnRobot,
+    RobotJob,
     firmware_of,
     play_jobs,
     played_trial,
@@ -67,7 +67,7 @@ MEASURES: Columns = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class ControllerRow:
     """One row of a table: who steers and what is taken from it; see `rows.yaml`."""
 
     title: str
@@ -90,7 +90,7 @@ class Spec:
     name: str
     """Its command, and the name of its files."""
     title: str
-    rows: Mapping[str, Row]
+    rows: Mapping[str, ControllerRow]
     """Rows in the order of the table."""
     targets: Sequence[str]
     """Setpoints or trajectories that are played."""
@@ -116,7 +116,7 @@ class Spec:
     picture: tuple[str, str]
     """File of that figure, and what it shows."""
 
-    def paper_differences(self, row: Row, base: str) -> dict[str, float] | None:
+    def paper_differences(self, row: ControllerRow, base: str) -> dict[str, float] | None:
         """Key of `differences` -> the paper's row less that of a base; None where it has not both.
 
         Units are those of the rows.
@@ -270,7 +270,7 @@ def transfer_experiment(
     elif firmware == "ardusub":
         camera = sees
     jobs = [
-        Job(
+        RobotJob(
             row=name, controller=controllers[name, s], target=target, vehicle=vehicle,
             pool_vehicle=pool_vehicle or vehicle, plant=plant, severity=severity, seed=s, site=site, firmware=firmware,
             estimator=estimator, **{"camera": camera, **row.changes},
@@ -297,7 +297,7 @@ def transfer_experiment(
 
 def controllers_of(
     task: str,
-    rows: Mapping[str, Row],
+    rows: Mapping[str, ControllerRow],
     seeds: Sequence[int],
     folder: Path,
     vehicle: str,
@@ -452,8 +452,8 @@ def _by_trial(results: Sequence[Mapping[str, Any]], key: str) -> dict[tuple[int,
     }
 
 
-ROWS: Mapping[str, Mapping[str, Row]] = {
-    task: {name: Row(**row) for name, row in rows.items()}
+ROWS: Mapping[str, Mapping[str, ControllerRow]] = {
+    task: {name: ControllerRow(**row) for name, row in rows.items()}
     for task, rows in yaml.safe_load(
         Path(__file__).with_name("rows.yaml").read_text(encoding="utf-8")
     ).items()

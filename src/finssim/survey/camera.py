@@ -409,7 +409,7 @@ def evidence(bundle: Bundle, views: Sequence[BoardView]) -> Evidence:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class FittedView:
     """One picture after the fit."""
 
     name: str
@@ -440,7 +440,7 @@ class CameraFit:
     estimates: dict[str, Estimate]
     """fx, fy, cx, cy and the distortion, by name."""
     correlation: Correlation
-    views: tuple[View, ...]
+    views: tuple[FittedView, ...]
     """Every picture in which the board was seen, in the order given."""
     rms: float
     """Root of the mean squared distance of corners over the views used [px]."""
@@ -454,7 +454,7 @@ class CameraFit:
     settings: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def used(self) -> tuple[View, ...]:
+    def used(self) -> tuple[FittedView, ...]:
         """The views that the lens rests on."""
         return tuple(view for view in self.views if not view.left_out)
 
@@ -571,7 +571,7 @@ def _held_out(views: Sequence[BoardView], model: str, seed: int) -> float:
     return rms(np.concatenate(residuals)) if residuals else math.nan
 
 
-def _views(views: Sequence[BoardView], used: Mapping[str, int], bundle: Bundle) -> tuple[View, ...]:
+def _views(views: Sequence[BoardView], used: Mapping[str, int], bundle: Bundle) -> tuple[FittedView, ...]:
     median, every = float(np.median(bundle.rms)), []
     for view in views:
         pose = bundle.poses[used[view.name]] if view.name in used else board_pose(bundle.lens, view)
@@ -581,7 +581,7 @@ def _views(views: Sequence[BoardView], used: Mapping[str, int], bundle: Bundle) 
         reason = f"its corners miss by {rms(residual):.2f} px, those of the others by {median:.2f} px"
         exclusion = "" if view.name in used else reason
         every.append(
-            View(name=view.name, pixels=view.pixels, residuals=residual, pose=pose, left_out=exclusion)
+            FittedView(name=view.name, pixels=view.pixels, residuals=residual, pose=pose, left_out=exclusion)
         )
     return tuple(every)
 
@@ -651,7 +651,7 @@ def pixel_error(lens: Lens, at: Array, corners: Array, covariance: Covariance) -
 
 
 def camera_findings(
-    lens: Lens, views: Sequence[View], estimates: Mapping[str, Estimate], error95: tuple[float, float]
+    lens: Lens, views: Sequence[FittedView], estimates: Mapping[str, Estimate], error95: tuple[float, float]
 ) -> tuple[Finding, ...]:
     """Return findings on coverage, tilt and undetermined numbers, and what to photograph; none if all is well.
 
@@ -681,7 +681,7 @@ def camera_findings(
     return tuple(findings)
 
 
-def empty_edges(lens: Lens, views: Sequence[View]) -> dict[str, float]:
+def empty_edges(lens: Lens, views: Sequence[FittedView]) -> dict[str, float]:
     """Border of the picture without a corner at left, right, top and bottom, as a share of its width or height [-]."""
     pixels, size = np.concatenate([view.pixels for view in views]), np.array([lens.width, lens.height])
     low, high = (pixels.min(axis=0) + 0.5) / size, (size - 0.5 - pixels.max(axis=0)) / size

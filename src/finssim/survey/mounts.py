@@ -74,7 +74,7 @@ class Moment:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Noise:
+class MountNoise:
     """Standard deviations."""
 
     pixel: float = 0.3
@@ -96,7 +96,7 @@ class Rig:
     """Pressure port, body frame [m], (3,)."""
     reference: int
     """The reference tag."""
-    noise: Noise = field(default_factory=Noise)
+    noise: MountNoise = field(default_factory=MountNoise)
 
     @property
     def edge(self) -> float:

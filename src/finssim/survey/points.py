@@ -65,7 +65,7 @@ _UNIT_COMMENT = re.compile(
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """One line of a table."""
 
     line: int
@@ -100,12 +100,12 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Table:
+class SurveyTable:
     """A table of rows with standard column names."""
 
     path: str
     columns: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     united: bool
     """True if the file or its reader states the unit of lengths."""
 
@@ -117,12 +117,12 @@ class Table:
                 "the header (x_mm) or unit: mm into the survey file"
             )
 
-    def refuse(self, row: Row, sentence: str) -> CalibrationError:
+    def refuse(self, row: TableRow, sentence: str) -> CalibrationError:
         """Return the error for a sentence about a row."""
         return CalibrationError(f"{self.path}: line {row.line}: {sentence}")
 
 
-def read_table(path: str | Path, *, unit: str | None = None) -> Table:
+def read_table(path: str | Path, *, unit: str | None = None) -> SurveyTable:
     """Read a table of points, pixels or tags.
 
     Columns may have any case and order; lengths may carry their unit (`x_mm`, `x [mm]`, `X (cm)`) or a comment line may
@@ -158,7 +158,7 @@ def read_table(path: str | Path, *, unit: str | None = None) -> Table:
     return _table(str(path), table, "m" if stated and stated.startswith("met") else stated or unit)
 
 
-def _table(path: str, text: TextTable, default: str | None) -> Table:
+def _table(path: str, text: TextTable, default: str | None) -> SurveyTable:
     heads = [_column(word) for word in text.names]
     names = [name for name, _ in heads]
     twice = sorted({name for name in names if name and names.count(name) > 1})
@@ -176,14 +176,14 @@ def _table(path: str, text: TextTable, default: str | None) -> Table:
     for i, column_cells in zip(text.lines, cells, strict=True):
         columns = [(n, w, f) for n, w, f in zip(names, column_cells, factors, strict=False) if n and w]
         numbers = {n: x * f for n, w, f in columns if (x := _number(w)) is not None and math.isfinite(x)}
-        row = Row(i, {n: w for n, w, _ in columns}, numbers)
+        row = TableRow(i, {n: w for n, w, _ in columns}, numbers)
         _check(path, row)
         if columns:
             rows.append(row)
-    return Table(path, tuple(n for n in names if n), tuple(rows), united)
+    return SurveyTable(path, tuple(n for n in names if n), tuple(rows), united)
 
 
-def _check(path: str, row: Row) -> None:
+def _check(path: str, row: TableRow) -> None:
     """Refuse words where numbers belong; an empty cell or NaN is a missing number, which is the reader's affair."""
     for name in ("u", "v", *LENGTHS, *ANGLES):
         word = row.words.get(name, "0")
@@ -319,7 +319,9 @@ def read_survey(
     return replace(survey, findings=tuple(findings))
 
 
-def _surveyed(table: Table, row: Row, edge: float | None, z: float | None) -> tuple[str, int | None, Placed]:
+def _surveyed(
+    table: SurveyTable, row: TableRow, edge: float | None, z: float | None
+) -> tuple[str, int | None, Placed]:
     """Return the name of a row, the number of its tag (None: a point, or any tag), and its points."""
     edge = row.numbers.get("edge", edge)
     word = row.words.get("tag") or (row.words.get("id") if edge is not None else None)
@@ -524,7 +526,7 @@ def _match_frames(rows: _Rows, frames: Sequence[Frame], survey: Survey) -> None:
                     rows.add(_Match(frame.image, f"{placed.name}/{corner}", placed, corner, pixel))
 
 
-def _match_table(rows: _Rows, table: Table, survey: Survey) -> None:
+def _match_table(rows: _Rows, table: SurveyTable, survey: Survey) -> None:
     missing = [name for name in ("u", "v") if name not in table.columns]
     if missing or not {"id", "tag"} & set(table.columns):
         raise CalibrationError(

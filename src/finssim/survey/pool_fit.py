@@ -40,10 +40,10 @@ from finssim.survey.points import Observations
 from finssim.survey.pool_model import (
     LENS_NAMES,
     NAMES,
+    PoolFitSettings,
     PoolModel,
+    PoolSolution,
     Prior,
-    Settings,
-    Solution,
     active_names,
     clearances,
     extended_lens,
@@ -106,7 +106,7 @@ class RobustPixels:
         return np.asarray(scaled.reshape(-1, *values.shape[2:]))
 
 
-def pinhole_poses(observed: Observations, lens: Lens, seed: int = 0) -> list[Solution]:
+def pinhole_poses(observed: Observations, lens: Lens, seed: int = 0) -> list[PoolSolution]:
     """Poses of a camera that saw the points in straight lines, the best first; costs are comparable.
 
     Water between changes such a pose much, but not where the search from it ends.
@@ -180,12 +180,12 @@ def _candidates(X: Array, xy: Array, rng: np.random.Generator) -> list[tuple[Arr
     return [(R, C) for _, R, C in runs[:STARTS]]
 
 
-def _straightened(model: PoolModel, observed: Observations, iterations: int) -> Solution:
+def _straightened(model: PoolModel, observed: Observations, iterations: int) -> PoolSolution:
     """The straight-line pose nearby that suits the pixels better, judged by a scale common to all."""
     active = np.array([name in NAMES[:6] for name in NAMES])
     whiten, prior = RobustPixels(model, observed), Prior(start=model)
     model = solve(model, observed, whiten, active, prior, iterations=iterations, tolerance=1e-6).model
-    return Solution(model, _score(model, observed))
+    return PoolSolution(model, _score(model, observed))
 
 
 def _sizes(model: PoolModel, observed: Observations) -> Array:
@@ -199,9 +199,9 @@ def _score(model: PoolModel, observed: Observations) -> float:
     return float(np.minimum(size, 3.0 * np.median(size)).mean())
 
 
-def _distinct(solutions: list[Solution]) -> list[Solution]:
+def _distinct(solutions: list[PoolSolution]) -> list[PoolSolution]:
     """The best first, without those that are another's pose to a degree and a hundredth of the distance."""
-    selected: list[Solution] = []
+    selected: list[PoolSolution] = []
     for s in sorted(solutions, key=lambda s: s.cost):
         here, reach = s.model.camera, 0.01 * np.linalg.norm(s.model.camera.position - s.model.reference)
         others = (k.model.camera for k in selected)
@@ -257,7 +257,7 @@ class BestStart:
     pinhole: PoolModel
 
 
-def search(observed: Observations, lens: Lens, settings: Settings) -> BestStart:
+def search(observed: Observations, lens: Lens, settings: PoolFitSettings) -> BestStart:
     """The best of many starts, with robust weights.
 
     Raises:
@@ -279,7 +279,7 @@ def search(observed: Observations, lens: Lens, settings: Settings) -> BestStart:
     return BestStart(runs[0][1], near[0])
 
 
-def prior_of(model: PoolModel, start: PoolModel, settings: Settings, stds: tuple[float, ...]) -> Prior:
+def prior_of(model: PoolModel, start: PoolModel, settings: PoolFitSettings, stds: tuple[float, ...]) -> Prior:
     """Return the prior of plane, index and lens.
 
     Args:
@@ -309,7 +309,7 @@ def prior_of(model: PoolModel, start: PoolModel, settings: Settings, stds: tuple
     )
 
 
-def stated_plane(model: PoolModel, settings: Settings) -> tuple[Array | None, float]:
+def stated_plane(model: PoolModel, settings: PoolFitSettings) -> tuple[Array | None, float]:
     """Return the normal towards the camera, pool frame (3,), and the distance of the plane from the reference point
     [m]; None and NaN where unknown."""
     towards, depth = model.camera.position - model.reference, settings.water_depth
@@ -325,7 +325,7 @@ def stated_plane(model: PoolModel, settings: Settings) -> tuple[Array | None, fl
     return normal, np.nan if depth is None else depth
 
 
-def _normals(pinhole: PoolModel, observed: Observations, settings: Settings) -> list[Array]:
+def _normals(pinhole: PoolModel, observed: Observations, settings: PoolFitSettings) -> list[Array]:
     """Return the normals to try, pool frame, each (3,): z for a surface, the measured one or several for a window."""
     if settings.surface:
         return [UP]
@@ -343,7 +343,7 @@ def _normals(pinhole: PoolModel, observed: Observations, settings: Settings) -> 
 
 
 def _descents(
-    poses: Sequence[PoolModel], normals: Sequence[Array], observed: Observations, settings: Settings
+    poses: Sequence[PoolModel], normals: Sequence[Array], observed: Observations, settings: PoolFitSettings
 ) -> list[tuple[float, PoolModel]]:
     """Return the ends of the search from all starts: residual [px] and model, the best first."""
     plane = Interface(UP, 0.0, settings.index_near, settings.index, settings.layers)
@@ -362,7 +362,7 @@ def _descents(
 
 
 def _descend(
-    model: PoolModel, observed: Observations, settings: Settings, counts: tuple[int, int]
+    model: PoolModel, observed: Observations, settings: PoolFitSettings, counts: tuple[int, int]
 ) -> PoolModel | None:
     """Fit the pose alone, then pose and plane; return None where the search is lost."""
     start = model
@@ -393,7 +393,7 @@ def _refuse_mirrored(observed: Observations, lens: Lens, best: float) -> None:
         )
 
 
-def _refuse_wrong_side(pinhole: PoolModel, settings: Settings) -> None:
+def _refuse_wrong_side(pinhole: PoolModel, settings: PoolFitSettings) -> None:
     """Refuse a plane on the other side of the points than the camera."""
     _, depth = stated_plane(pinhole, settings)
     if np.isfinite(depth) and depth <= 0.0:
@@ -423,7 +423,7 @@ STATED_PIXEL, USUAL_PIXEL = 1.2, 0.4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Noise:
+class StandardErrors:
     """Standard errors."""
 
     pixel: float
@@ -453,7 +453,7 @@ class Whitener:
     V_l = sigma² 1 + J_l B_l S B_lᵀ J_lᵀ: a location is displaced as a whole, and a tag turned, by the survey's error.
     """
 
-    def __init__(self, J_point: Array, observed: Observations, noise: Noise) -> None:
+    def __init__(self, J_point: Array, observed: Observations, noise: StandardErrors) -> None:
         """
         Args:
             J_point: Derivative of the pixel by the point, (N, 2, 3).
@@ -490,11 +490,11 @@ def estimate_noise(
     J: Array,
     J_point: Array,
     observed: Observations,
-    noise: Noise,
+    noise: StandardErrors,
     prior: Array,
     *,
     fixed_pixel: bool,
-) -> Noise:
+) -> StandardErrors:
     """Most likely standard errors of pixels and survey (restricted likelihood: what the fit swallowed is given back).
 
     Args:
@@ -512,7 +512,7 @@ def estimate_noise(
         if len(rows) > NOISE_ROWS // 4:
             residual, J, J_point, observed = residual[rows], J[rows], J_point[rows], observed.subset(rows)
 
-    def at(x: Array) -> Noise:
+    def at(x: Array) -> StandardErrors:
         pixel = noise.pixel if fixed_pixel else max(LEAST_PIXEL, math.exp(x[1]))
         return replace(noise, pixel=pixel, scale=math.exp(x[0]))
 
@@ -560,7 +560,7 @@ class Refined:
     """A fit and what it rests on."""
 
     model: PoolModel
-    noise: Noise
+    noise: StandardErrors
     used: NDArray[np.bool_]
     """Rows that are not outliers, (N,)."""
     whiten: Whitener
@@ -581,7 +581,7 @@ def refine(
     observed: Observations,
     active: NDArray[np.bool_],
     prior: Prior,
-    noise: Noise,
+    noise: StandardErrors,
     *,
     fixed_pixel: bool = False,
 ) -> Refined:
@@ -647,7 +647,7 @@ def touched(fit: Refined, observed: Observations) -> tuple[str, ...]:
     return (*((CAMERA,) if fit.model.clearance < TOUCHING else ()), *names)
 
 
-def _plausible(model: PoolModel, observed: Observations, noise: Noise) -> NDArray[np.bool_]:
+def _plausible(model: PoolModel, observed: Observations, noise: StandardErrors) -> NDArray[np.bool_]:
     """Rows whose residual is of the size that the errors of pixel and survey make, whatever it shares with others."""
     d2 = surprise(model, observed, noise)
     inner = max(1.0, float(np.median(d2)) / float(chi2.ppf(0.5, 2)))
@@ -655,7 +655,7 @@ def _plausible(model: PoolModel, observed: Observations, noise: Noise) -> NDArra
 
 
 def surprise(
-    model: PoolModel, observed: Observations, noise: Noise, covariance: Array | None = None
+    model: PoolModel, observed: Observations, noise: StandardErrors, covariance: Array | None = None
 ) -> Array:
     """Squared residuals over what the errors of pixel and survey make of them, (N,); infinite where there is none.
 
@@ -801,7 +801,7 @@ STEPS = np.array([1e-5] * 3 + [1e-6] * 5 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-6, 
 """Steps of the derivatives by the parameters."""
 
 
-def estimates(fit: Refined, settings: Settings) -> tuple[dict[str, Estimate], Correlation]:
+def estimates(fit: Refined, settings: PoolFitSettings) -> tuple[dict[str, Estimate], Correlation]:
     """Return the table of estimates and the correlation of their errors; the latter without what was not fitted.
 
     Args:
@@ -846,7 +846,7 @@ def _quantities(model: PoolModel, surface: bool) -> dict[str, tuple[str, float]]
     return rows | {name: ("1", x) for name, x in zip(LENS_NAMES[3:], lens.distortion, strict=False)}
 
 
-def _doubt(name: str, std: float, fit: Refined, settings: Settings) -> str:
+def _doubt(name: str, std: float, fit: Refined, settings: PoolFitSettings) -> str:
     """Return the basis of a number that the pictures do not determine; empty where they do."""
     model, prior = fit.model, fit.prior
     reach = model.clearance + max(model.depth, 0.0)
@@ -884,7 +884,7 @@ FULL_LENS = "fit: [pose, height, tilt, index, focal, center, distortion]"
 def advice(
     fit: Refined,
     observed: Observations,
-    settings: Settings,
+    settings: PoolFitSettings,
     table: Mapping[str, Estimate],
     touching: Sequence[str],
     contradicted: Sequence[Finding],
@@ -909,7 +909,7 @@ def advice(
 
 
 def _separability(
-    fit: Refined, observed: Observations, settings: Settings, table: Mapping[str, Estimate]
+    fit: Refined, observed: Observations, settings: PoolFitSettings, table: Mapping[str, Estimate]
 ) -> Iterator[Finding]:
     """Yield findings on camera height, water height and index, which few points cannot separate."""
     model, wet = fit.model, observed.subset(fit.used & ~observed.dry)
@@ -945,7 +945,7 @@ def _separability(
         yield finding("focal_of_one_depth")
 
 
-def _conflicts(fit: Refined, settings: Settings) -> Iterator[Finding]:
+def _conflicts(fit: Refined, settings: PoolFitSettings) -> Iterator[Finding]:
     """Yield findings where the pixels pull an estimate far from its prior."""
     prior, model = fit.prior, fit.model
     focal = NAMES.index("focal")
@@ -1024,7 +1024,7 @@ BETTER = 0.9
 class PoolFit(Refined):
     """The result, in the survey's frame."""
 
-    settings: Settings
+    settings: PoolFitSettings
     estimates: dict[str, Estimate]
     correlation: Correlation
     observed: Observations
@@ -1066,18 +1066,18 @@ class PoolFit(Refined):
         }
 
 
-def calibrate_pool(observed: Observations, lens: Lens, settings: Settings | None = None) -> PoolFit:
+def calibrate_pool(observed: Observations, lens: Lens, settings: PoolFitSettings | None = None) -> PoolFit:
     """Find the camera and the plane from no guess of either.
 
     Args:
         observed: Pixels and surveyed points.
         lens: Of the camera.
-        settings: Options; those of `Settings` if None.
+        settings: Options; those of `PoolFitSettings` if None.
 
     Raises:
         CalibrationError: The points cannot tell a pose, or contradict each other or what is given; says which.
     """
-    settings = settings or Settings()
+    settings = settings or PoolFitSettings()
     if observed.dry.all():
         raise CalibrationError("every point is marked dry: at least 4 must be under water")
     best_start = search(observed, extended_lens(lens), settings)
@@ -1114,15 +1114,19 @@ def calibrate_pool(observed: Observations, lens: Lens, settings: Settings | None
 
 
 def _refined(
-    observed: Observations, model: PoolModel, settings: Settings, active: NDArray[np.bool_], prior: Prior
+    observed: Observations,
+    model: PoolModel,
+    settings: PoolFitSettings,
+    active: NDArray[np.bool_],
+    prior: Prior,
 ) -> Refined:
     pixel, survey = settings.pixel_sigma or 0.4, max(settings.survey_sigma, 1e-7)
-    noise = Noise(pixel=pixel, survey=survey, survey_yaw=settings.survey_yaw_sigma)
+    noise = StandardErrors(pixel=pixel, survey=survey, survey_yaw=settings.survey_yaw_sigma)
     return refine(model, observed, active, prior, noise, fixed_pixel=settings.pixel_sigma is not None)
 
 
 def _best_lens(
-    observed: Observations, best_start: BestStart, settings: Settings, notes: list[Finding]
+    observed: Observations, best_start: BestStart, settings: PoolFitSettings, notes: list[Finding]
 ) -> Refined:
     """Return the fit as set; unless set, lens parameters are fitted if the error at held-out points decreases."""
     start = replace(best_start.model, interface=replace(best_start.model.interface, index_far=settings.index))
@@ -1152,7 +1156,7 @@ def _best_lens(
     return best
 
 
-def _generalisation(fit: Refined, observed: Observations, settings: Settings, normal: Array) -> float:
+def _generalisation(fit: Refined, observed: Observations, settings: PoolFitSettings, normal: Array) -> float:
     """Held-out error in the picture [px], rows that the fit left out counted as far as they lie."""
     out = held_out(fit, observed, settings.folds, settings.seed, normal)
     if out is None:
@@ -1166,7 +1170,9 @@ def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
     return tuple(group for group, name in named.items() if active[NAMES.index(name)])
 
 
-def _released(observed: Observations, settings: Settings, fit: Refined, notes: list[Finding]) -> Refined:
+def _released(
+    observed: Observations, settings: PoolFitSettings, fit: Refined, notes: list[Finding]
+) -> Refined:
     """Let the plane tilt freely where the pixels contradict its prior direction and no tilt sigma is set."""
     if not np.isfinite(fit.prior.tilt_std) or settings.tilt_sigma is not None or not fit.active[6]:
         return fit
@@ -1188,7 +1194,7 @@ def _lean(model: PoolModel, normal: Array) -> float:
     return float(np.arccos(np.clip(model.interface.normal @ normal, -1.0, 1.0)))
 
 
-def _contradicted(observed: Observations, settings: Settings, fit: Refined) -> list[Finding]:
+def _contradicted(observed: Observations, settings: PoolFitSettings, fit: Refined) -> list[Finding]:
     """A finding where the pixels by themselves put the plane elsewhere than it was measured."""
     if not settings.stated_depth or not fit.active[NAMES.index("depth")]:
         return []
@@ -1200,7 +1206,7 @@ def _contradicted(observed: Observations, settings: Settings, fit: Refined) -> l
     return [finding("plane_contradicted", distance=abs(by), sense=sense)]
 
 
-def _without(observed: Observations, settings: Settings, fit: Refined, loose: Prior) -> Refined | None:
+def _without(observed: Observations, settings: PoolFitSettings, fit: Refined, loose: Prior) -> Refined | None:
     """The fit with a prior loosened, where the pixels contradict that prior; else None."""
     try:
         free = _refined(observed, fit.model, settings, fit.active, loose)
@@ -1210,13 +1216,15 @@ def _without(observed: Observations, settings: Settings, fit: Refined, loose: Pr
     return free if 2.0 * (held.cost - free.cost) > DOUBT else None
 
 
-def _pinhole(observed: Observations, best_start: BestStart, settings: Settings, fit: Refined) -> Refined:
+def _pinhole(
+    observed: Observations, best_start: BestStart, settings: PoolFitSettings, fit: Refined
+) -> Refined:
     """Straight lines fitted to the same rows, as plain calibrations do."""
     model = replace(best_start.pinhole, camera=replace(best_start.pinhole.camera, lens=fit.model.camera.lens))
     active = fit.active & np.array([name in NAMES[:6] or name in NAMES[10:] for name in NAMES])
     prior = replace(fit.prior, normal=None, depth=np.nan, depth_std=np.inf, index_std=np.inf)
     part = observed.subset(fit.used)
-    alike = Noise(pixel=1.0, survey=1e-7, survey_yaw=1e-7)
+    alike = StandardErrors(pixel=1.0, survey=1e-7, survey_yaw=1e-7)
     end = solve(model, part, Whitener(np.zeros((len(part), 2, 3)), part, alike), active, prior).model
     alike = replace(alike, pixel=max(0.05, rms(residuals(end, part)[0]) / np.sqrt(2.0)))
     whiten = Whitener(end.jacobians(part.points, part.dry)[1], part, alike)

@@ -191,7 +191,7 @@ THICKEST = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class PoolFitSettings:
     """Priors and options of the fit; standard deviations are those before the pictures.
 
     The interface is the water surface, with its normal along the survey's z, unless a window is given.
@@ -288,7 +288,7 @@ class Settings:
         return np.array(self.plane[:3]) / length, self.plane[3] / length
 
 
-def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.bool_]:
+def active_names(settings: PoolFitSettings, extra: tuple[str, ...] = ()) -> NDArray[np.bool_]:
     """Return a mask of the `NAMES` that are fitted, (18,)."""
     held = {
         "index": settings.index_sigma <= 0.0,
@@ -301,7 +301,7 @@ def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.
     return np.array([name in names for name in NAMES])
 
 
-def lens_std(settings: Settings, width: int) -> tuple[float, ...]:
+def lens_std(settings: PoolFitSettings, width: int) -> tuple[float, ...]:
     """Return the standard deviations of `LENS_NAMES` before the pictures."""
     focal, x, y, *distortion = LENS_STD
     center = settings.center_sigma
@@ -360,7 +360,7 @@ class Prior:
         return r[informative] / std[informative], J[informative] / std[informative, None]
 
 
-class Solution(NamedTuple):
+class PoolSolution(NamedTuple):
     """End of the search."""
 
     model: PoolModel
@@ -384,7 +384,7 @@ def solve(
     *,
     iterations: int = 60,
     tolerance: float = 1e-9,
-) -> Solution:
+) -> PoolSolution:
     """Minimise |whiten(measured - predicted)|² plus the priors.
 
     Args:
@@ -417,7 +417,7 @@ def solve(
         return 0.5 * float(e @ e + r @ r)
 
     end = descend(start, cost, linearise, steps=iterations, still=1e-12 * tolerance, share=tolerance)
-    return Solution(end.state, end.cost)
+    return PoolSolution(end.state, end.cost)
 
 
 def normal_equations(

@@ -25,7 +25,7 @@ from finssim.survey.points import (
     observe_combined,
     read_survey,
 )
-from finssim.survey.pool_model import Settings
+from finssim.survey.pool_model import PoolFitSettings
 from finssim.trials.findings import CalibrationError
 
 PRINTED = 0.0005
@@ -38,7 +38,7 @@ class SurveyFile:
 
     path: Path
     settings: Mapping[str, Any]
-    """Arguments of `Settings` that the file gives."""
+    """Arguments of `PoolFitSettings` that the file gives."""
     points: Path | None = None
     """Table of surveyed points or tags; None where a grid is given, or where the inputs contain the points."""
     grid: Mapping[int, Placed] = field(default_factory=dict)
@@ -59,17 +59,17 @@ class SurveyFile:
         """The file itself and its table."""
         return [self.path] if self.points is None else [self.path, self.points]
 
-    def fit_settings(self, **defaults: Any) -> Settings:
+    def fit_settings(self, **defaults: Any) -> PoolFitSettings:
         """Return the settings of the fit.
 
         Args:
-            defaults: Arguments of `Settings` for what the file does not give.
+            defaults: Arguments of `PoolFitSettings` for what the file does not give.
 
         Raises:
             CalibrationError: The arguments contradict each other, or one is out of its range.
         """
         try:
-            return Settings(**{**defaults, **self.settings})
+            return PoolFitSettings(**{**defaults, **self.settings})
         except CalibrationError as error:
             raise CalibrationError(f"{self.path}: {error}") from None
 
@@ -107,7 +107,7 @@ _SETTINGS = (
     ("camera", "center_sigma_px", "center_sigma"),
     ("camera", "pixel_sigma_px", "pixel_sigma"),
 )
-"""Section, key and argument of `Settings` of each number."""
+"""Section, key and argument of `PoolFitSettings` of each number."""
 
 
 def load_survey_file(path: str | Path) -> SurveyFile:

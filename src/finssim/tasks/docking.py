@@ -9,7 +9,7 @@ import warp as wp
 
 from finssim.control.axis_model import axis_model
 from finssim.physics.types import vec6
-from finssim.sim import Dock, Pool
+from finssim.sim import Dock, RectangularPool
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.fitting import coefficients_of
@@ -52,7 +52,7 @@ BRISK = 0.9
 
 
 @dataclass(frozen=True)
-class Hull:
+class HullNumbers:
     """Numbers of the vehicle that the task uses; the environment sets it. The defaults are FinsROV's, rounded."""
 
     length: float = 0.56
@@ -67,7 +67,7 @@ class Hull:
     """Greatest, forwards [N]."""
 
     @classmethod
-    def of(cls, vehicle: Vehicle) -> "Hull":
+    def of(cls, vehicle: Vehicle) -> "HullNumbers":
         """Return the numbers of a vehicle's file."""
         length, width, height = map(float, vehicle.body.size)
         model = coefficients_of(vehicle)
@@ -191,7 +191,7 @@ class Docking(Task):
     name: str = "docking"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 40.0
-    hull: Hull = Hull()
+    hull: HullNumbers = HullNumbers()
     """Hull of the vehicle; the environment sets it."""
     throat: float = 1.2
     """Radius of the tube [girths]."""
@@ -235,7 +235,7 @@ class Docking(Task):
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Docking":
         """Return the task with a dock that fits the vehicle."""
-        return replace(self, hull=Hull.of(vehicles[0]))
+        return replace(self, hull=HullNumbers.of(vehicles[0]))
 
     @property
     def force_limit(self) -> float:
@@ -259,10 +259,10 @@ class Docking(Task):
             slip=0.1 * self.hull.speed,
         )
 
-    def arena(self) -> Pool:
+    def arena(self) -> RectangularPool:
         """A tank with walls as stiff as the dock."""
         dock, (width, depth) = self.dock(), self.tank
-        return Pool(
+        return RectangularPool(
             length=width * self.hull.length, width=width * self.hull.length, depth=depth * self.hull.length,
             stiffness=dock.stiffness, damping=dock.damping,
         )  # fmt: skip

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
-from finssim.sim import Pool, Simulator, TetherLine, Water
-from finssim.sim.launch import Pipeline
+from finssim.sim import RectangularPool, Simulator, TetherLine, Water
+from finssim.sim.launch import KernelSequence
 from finssim.sim.randomize import Draws, Randomization
 from finssim.sim.site import described_world
 from finssim.tasks.arrays import TaskArrays
@@ -101,7 +101,7 @@ class Environment:
         randomization: Randomization | None = None,
         noise: MeasurementNoise | Sensing | None = None,
         water: Water | None = None,
-        pool: Pool | None = None,
+        pool: RectangularPool | None = None,
         tether: TetherLine | None = None,
         integrator: str = "midpoint",
         device: str = "cpu",
@@ -331,7 +331,7 @@ class Environment:
                 f"outside its arena: expected x within ±{half[0]:g}, y within ±{half[1]:g} and z above {low[2]:g} m"
             )
 
-    def _begin(self, pipeline: Pipeline, mask: NDArray[np.bool_]) -> None:
+    def _begin(self, pipeline: KernelSequence, mask: NDArray[np.bool_]) -> None:
         """Start episodes in the worlds of the pipeline's mask."""
         if self.sight is not None:
             self.sight.draw(mask)

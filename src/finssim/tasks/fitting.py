@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.axis_model import axis_model
-from finssim.sim import Pool
+from finssim.sim import RectangularPool
 from finssim.tasks.measurement import TRAINING, MeasurementNoise
 from finssim.tasks.task import Task
 from finssim.vehicles import HydrodynamicSet, Vehicle
@@ -32,7 +32,7 @@ MASS = 12.11
 
 
 @dataclass(frozen=True)
-class Fit:
+class TaskScaling:
     """Factors on what a task is for FinsROV."""
 
     size: float = 1.0
@@ -42,10 +42,10 @@ class Fit:
     weight: float = 1.0
     """Factor on masses and stiffnesses."""
 
-    def pool(self) -> Pool:
+    def pool(self) -> RectangularPool:
         """The paper's pool, in proportion, with walls as stiff for the vehicle as they are for FinsROV."""
         length, width, depth = (self.size * side for side in POOL)
-        return Pool(
+        return RectangularPool(
             length=length,
             width=width,
             depth=depth,
@@ -80,12 +80,12 @@ def coefficients_of(vehicle: Vehicle) -> str:
     return sets[0] if sets and "calibrated" not in sets else "calibrated"
 
 
-def fit(vehicle: Vehicle) -> Fit:
+def fit(vehicle: Vehicle) -> TaskScaling:
     """Room in proportion to the vehicle's length, speeds in proportion to the room or to what it can do, the lesser."""
     size = room(vehicle.body.size)
     speeds = terminal_speeds(vehicle, coefficients_of(vehicle))[list(driven_axes(vehicle))]
     slowest = float(speeds.min()) if len(speeds) else 0.0
-    return Fit(size, min(size, slowest / SLOWEST_SPEED), max(1.0, float(vehicle.body.mass) / MASS))
+    return TaskScaling(size, min(size, slowest / SLOWEST_SPEED), max(1.0, float(vehicle.body.mass) / MASS))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +94,7 @@ class FittedTask(Task):
 
     needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave")
 
-    fit: Fit = Fit()
+    fit: TaskScaling = TaskScaling()
     """Factors of the vehicle; the environment sets them."""
     tilt: float = math.radians(20.0)
     """Largest roll and pitch at the start [rad]."""
@@ -106,8 +106,8 @@ class FittedTask(Task):
         """Return the task in the size and speed that suit the vehicle."""
         return replace(self, fit=fit(vehicles[0]))
 
-    def arena(self) -> Pool:
-        """See `Fit.pool`."""
+    def arena(self) -> RectangularPool:
+        """See `TaskScaling.pool`."""
         return self.fit.pool()
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from finssim.physics.types import vec6
-from finssim.sim.measured import Measurement
+from finssim.sim.measured import MeasurementErrors
 from finssim.sim.packed import Packed
 from finssim.sim.state import HISTORY, State
 from finssim.tasks.arrays import TaskArrays
@@ -87,7 +87,7 @@ def connect_measured(present: bool, state: State, arrays: TaskArrays) -> None:
 
 def measurements(noise: MeasurementNoise, shape: tuple[int, int], device: wp.Device) -> Packed:
     """The errors of every vehicle of every world, (worlds, vehicles); randomisation writes others."""
-    packed = Packed(Measurement, shape, device)
+    packed = Packed(MeasurementErrors, shape, device)
     part = np.linspace(0.0, 1.0, shape[0])[:, None] if noise.graded and shape[0] > 1 else 1.0
     for name, array in packed.fields.items():
         array.assign(np.full(shape, getattr(noise, name) * part, dtype=np.float32))
@@ -98,7 +98,7 @@ def measurements(noise: MeasurementNoise, shape: tuple[int, int], device: wp.Dev
 def measure(
     state: State,
     arrays: TaskArrays,
-    measurement: wp.array2d(dtype=Measurement),
+    measurement: wp.array2d(dtype=MeasurementErrors),
     control_step: float,
     seed: int,
     world_offset: int,

@@ -17,7 +17,7 @@ from finssim.control.modes import MODES
 from finssim.control.policy import ObservationSchema
 from finssim.core.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate, quat_yaw
 from finssim.physics.types import vec6
-from finssim.sim.launch import Pipeline
+from finssim.sim.launch import KernelSequence
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.catalogue import task_named
@@ -168,7 +168,7 @@ class Observer:
         state, self._arrays = one_world(task, self._action_size)
         self._in_torch = unscored(self._arrays)
         self._steps = state.steps.numpy()
-        self._pipeline = Pipeline(1, state.steps.device)
+        self._pipeline = KernelSequence(1, state.steps.device)
         everywhere = wp.ones(1, dtype=wp.int32, device=state.steps.device)
         # In an episode's first observation, what has been received of the others is all that is known of them.
         task.add_observe(self._pipeline, Batch(state, self._arrays, 0), everywhere)

@@ -10,7 +10,7 @@ from finssim.vehicles.device_files import CameraDevice, RangeDevice, SonarDevice
 
 
 @dataclass(frozen=True)
-class Picture:
+class ObservedPicture:
     """A picture that a task observes: of a camera in colours, of a sonar the echoes by beam and range."""
 
     name: str

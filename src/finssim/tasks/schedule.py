@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import warp as wp
 
-from finssim.sim.launch import Pipeline
+from finssim.sim.launch import KernelSequence
 from finssim.sim.randomize import Draws
 from finssim.sim.ranges_file import Curriculum, Success
 from finssim.sim.ranges_table import ENTRIES, INDEX
@@ -72,7 +72,7 @@ class Schedule:
         self._steps = 0
         self._set(self.plan.start)
 
-    def add(self, pipeline: Pipeline, arrays: TaskArrays) -> None:
+    def add(self, pipeline: KernelSequence, arrays: TaskArrays) -> None:
         """Append the count of successes, after the task's evaluation and before the next draw."""
         if self.plan.by == "success":
             pipeline.add(count_successes, [arrays, self.counts])

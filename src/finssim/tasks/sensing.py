@@ -20,11 +20,11 @@ import warp as wp
 
 from finssim.core.yaml_file import read_mapping
 from finssim.localization.fusion.attitude import TiltGains, YawNoise
-from finssim.localization.fusion.position_filter import Motion
+from finssim.localization.fusion.position_filter import MotionModel
 from finssim.physics.types import join
 from finssim.sim import Simulator
-from finssim.sim.launch import Pipeline
-from finssim.sim.measured import Measurement
+from finssim.sim.launch import KernelSequence
+from finssim.sim.measured import MeasurementErrors
 from finssim.sim.packed import Packed
 from finssim.sim.sensors import SensorSuite
 from finssim.sim.sensors.depth import DepthArrays, DepthParameters
@@ -60,7 +60,7 @@ MOUNT = ("position", "orientation")
 PER_FIX = ("position_std", "yaw_std", "position_bias", "yaw_bias", "dropout", "delay")
 """Fields of a measurement noise that a fix has."""
 
-_q, _gyro, _tilt = Motion().density, YawNoise(), TiltGains()
+_q, _gyro, _tilt = MotionModel().density, YawNoise(), TiltGains()
 ACCELERATION = wp.vec3(*_q)
 """Spectral density of the acceleration that a vehicle may have, world axes [m²/s³]."""
 GYRO_FLOOR, GYRO_WALK = _gyro.rate, _gyro.bias_walk
@@ -141,7 +141,7 @@ def seen_with(noise: MeasurementNoise | Sensing, vehicle: Vehicle) -> dict[str, 
 
 
 @wp.struct
-class Aboard:
+class FilterState:
     """State of the filter of one vehicle: a doubt is variance, covariance, variance of a value and its rate."""
 
     gauge: wp.bool  # whether z comes from a pressure gauge
@@ -154,19 +154,19 @@ class Aboard:
 class Estimates:
     """Memory of the filters, by (world, vehicle); position, velocity and attitude of the last control steps, a ring."""
 
-    aboard: wp.array(dtype=Aboard)  # by vehicle
+    aboard: wp.array(dtype=FilterState)  # by vehicle
     position: wp.array3d(dtype=wp.vec3)  # world frame [m]
     velocity: wp.array3d(dtype=wp.vec3)  # world frame [m/s]
     quaternion: wp.array3d(dtype=wp.quat)  # body to world
     bias: wp.array2d(dtype=wp.vec3)  # of the gyro, body frame [rad/s]
     rate: wp.array2d(dtype=wp.vec3)  # of turn, a step ago, body frame [rad/s]
-    plane: wp.array2d(dtype=wp.vec3)  # doubts, as in `Aboard`
+    plane: wp.array2d(dtype=wp.vec3)  # doubts, as in `FilterState`
     height: wp.array2d(dtype=wp.vec3)
     yaw: wp.array2d(dtype=wp.vec3)
 
 
 @wp.struct
-class Readings:
+class InstrumentReadings:
     """Readings of the instruments; arrays of a kind that no vehicle has are empty."""
 
     imu_errors: wp.array2d(dtype=ImuParameters)
@@ -260,7 +260,14 @@ def doubted(P: wp.vec3, a: float, b: float) -> wp.vec2:
 
 @wp.func
 def begin(
-    state: State, m: Measurement, r: Readings, e: Estimates, has_fixes: bool, seed: int, w: int, v: int
+    state: State,
+    m: MeasurementErrors,
+    r: InstrumentReadings,
+    e: Estimates,
+    has_fixes: bool,
+    seed: int,
+    w: int,
+    v: int,
 ):
     """Start where the filter would be had it run before: off by its settled doubt and by what lasts."""
     key = sample_key(seed, FIX, w, v, state.episode[w], 0)
@@ -295,7 +302,7 @@ def begin(
 
 
 @wp.func
-def go_on(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
+def go_on(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
     """Advance the state by a control step: the gyro turns it, the accelerometer gives the vertical, velocity is
     integrated.
 
@@ -352,7 +359,7 @@ def shift(
 
 @wp.func
 def take_fix(
-    state: State, m: Measurement, e: Estimates, rate: wp.float64, dt: float, seed: int, w: int, v: int
+    state: State, m: MeasurementErrors, e: Estimates, rate: wp.float64, dt: float, seed: int, w: int, v: int
 ):
     """Apply the fixes of their delay ago, if any arrived: of several in a control step the mean.
 
@@ -397,7 +404,7 @@ def take_fix(
 
 
 @wp.func
-def take_depth(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
+def take_depth(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
     """A depth that has come: of the gauge's port, -z - (R r)_z. `dt` is in [s]."""
     at = measured_at(e, r.gauge_samples.timing[v].latency, step)
     k = at % e.position.shape[2]
@@ -412,7 +419,7 @@ def take_depth(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
 
 
 @wp.func
-def take_velocity(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
+def take_velocity(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
     """A velocity of the DVL that has come: of the body's origin, v = R_bs z - ω × r, in world axes.
 
     `dt` is in [s].
@@ -435,8 +442,8 @@ def take_velocity(r: Readings, e: Estimates, step: int, dt: float, w: int, v: in
 
 @wp.kernel(enable_backward=False)
 def estimate(
-    state: State, arrays: TaskArrays, noise: wp.array2d(dtype=Measurement), r: Readings, e: Estimates, rate: wp.float64,
-    dt: float, seed: int, mask: wp.array(dtype=int), starting: bool, world_offset: int,
+    state: State, arrays: TaskArrays, noise: wp.array2d(dtype=MeasurementErrors), r: InstrumentReadings, e: Estimates,
+    rate: wp.float64, dt: float, seed: int, mask: wp.array(dtype=int), starting: bool, world_offset: int,
 ):  # fmt: skip
     """Write every vehicle's estimate: after a control step of all, or where an episode starts and mask is not 0.
 
@@ -504,7 +511,7 @@ class SensingBatch:
             floor_depth=floor_depth,
         )  # fmt: skip
         self._rate = sensing.rate * dt
-        self.readings, slow = Readings(), [0]
+        self.readings, slow = InstrumentReadings(), [0]
         for name, batch in (("imu", self.suite.imu), ("gauge", self.suite.depth), ("dvl", self.suite.dvl)):
             if batch is not None:
                 setattr(self.readings, name, batch.arrays)
@@ -520,9 +527,9 @@ class SensingBatch:
             bias=vehicles, rate=vehicles, plane=vehicles, height=vehicles, yaw=vehicles,
         )  # fmt: skip
         aboard = [_aboard(vehicle, sensing, dt) for vehicle in simulator.vehicles]
-        self.estimates.aboard = wp.array(aboard, dtype=Aboard, device=simulator.device)
+        self.estimates.aboard = wp.array(aboard, dtype=FilterState, device=simulator.device)
 
-    def add(self, pipeline: Pipeline, seed: int, mask: wp.array | None = None) -> None:
+    def add(self, pipeline: KernelSequence, seed: int, mask: wp.array | None = None) -> None:
         """Append what comes after a control step; or where an episode starts, in the worlds where mask is not 0."""
         state, count = self._simulator.state, len(self._simulator.vehicles)
         for batch in self.suite.batches:
@@ -549,7 +556,7 @@ class SensingBatch:
 def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
     """Return the initial state of the filter of a vehicle; its doubt is that after many control steps."""
     sensors, fixes = vehicle.sensors, sensing.fixes
-    aboard = Aboard()
+    aboard = FilterState()
     aboard.gauge = sensors.depth is not None
     start = (0.0, 0.0, FASTEST**2)
     plane, height = (wp.vec3(*start) for _ in range(2))

@@ -16,14 +16,14 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.control.policy import ObservationEntry, ObservationSchema
-from finssim.sim import Dock, Pool
-from finssim.sim.launch import Pipeline
+from finssim.sim import Dock, RectangularPool
+from finssim.sim.launch import KernelSequence
 from finssim.sim.state import State
 from finssim.tasks import terms as library
 from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.picture import Picture
+from finssim.tasks.picture import ObservedPicture
 from finssim.tasks.terms import ObservationPart, Terms
 from finssim.vehicles import Vehicle
 
@@ -50,13 +50,13 @@ class Task:
     """Axes that every vehicle of the task must control; another is refused before anything is trained."""
     action: ClassVar[str] = "wrench6"
     """Action mode, unless another is asked for."""
-    pool: ClassVar[Pool | None] = Pool()
+    pool: ClassVar[RectangularPool | None] = RectangularPool()
     """Walls and floor, unless others are asked for; None is open water."""
     moving: ClassVar[bool] = False
     """True if the goal moves: a robot is then given a trajectory, otherwise a pose."""
     world: ClassVar[str] = ""
     """Site that its vehicle sees, of the catalogue or a file; empty: nothing."""
-    pictures: ClassVar[tuple[Picture, ...]] = ()
+    pictures: ClassVar[tuple[ObservedPicture, ...]] = ()
     """Pictures that are observed besides the row of numbers."""
     ranges: ClassVar[tuple[str, ...]] = ()
     """Altimeters and rangefinders of the vehicle's `perception` whose range the row has, as `arrays.ranges[w, i]`."""
@@ -163,7 +163,7 @@ class Task:
         """The task as these vehicles do it: itself, unless sizes and speeds follow from the vehicles."""
         return self
 
-    def arena(self) -> Pool | None:
+    def arena(self) -> RectangularPool | None:
         """Walls and floor, unless others are asked for; None is open water."""
         return self.pool
 
@@ -202,22 +202,22 @@ class Task:
         hold = getattr(self, "hold", None)
         return "as metrics tells" if hold is None else f"within its tolerance for {hold:g} s, at the end"
 
-    def add_command(self, pipeline: Pipeline, batch: Batch) -> None:
+    def add_command(self, pipeline: KernelSequence, batch: Batch) -> None:
         """Append what commands the `others`, before each step."""
         pipeline.add(kernels_of(self).command, [batch.state, batch.arrays, settings_of(self), batch.seed])
 
-    def add_evaluate(self, pipeline: Pipeline, batch: Batch) -> None:
+    def add_evaluate(self, pipeline: KernelSequence, batch: Batch) -> None:
         """Append what comes after each step: reward, ends, observation."""
         kernels, terms = kernels_of(self), self.terms()
         weights = [reward.weight for reward in terms.rewards] + [end.reward for end in terms.ends]
         inputs = [batch.state, batch.arrays, settings_of(self), kernels.weights(*(weights or [0.0]))]
         pipeline.add(kernels.evaluate, inputs)
 
-    def add_spawn(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
+    def add_spawn(self, pipeline: KernelSequence, batch: Batch, mask: wp.array) -> None:
         """Append the start of an episode where mask (by world, int32) is not 0."""
         pipeline.add(kernels_of(self).spawn, [batch.state, batch.arrays, settings_of(self), batch.seed, mask])
 
-    def add_observe(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
+    def add_observe(self, pipeline: KernelSequence, batch: Batch, mask: wp.array) -> None:
         """Append the first observation of the episodes that start where mask is not 0."""
         pipeline.add(kernels_of(self).observe, [batch.arrays, settings_of(self), mask])
 

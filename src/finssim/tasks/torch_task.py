@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from finssim.sim.launch import Pipeline
+from finssim.sim.launch import KernelSequence
 from finssim.sim.state import State
 from finssim.tasks.arrays import Answers, TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
@@ -295,14 +295,14 @@ class TorchTask(Task):
             quaternion=vehicles, velocity=vehicles, begun=memory, memory=memory,
         )  # fmt: skip
 
-    def add_command(self, pipeline: Pipeline, batch: Batch) -> None:
+    def add_command(self, pipeline: KernelSequence, batch: Batch) -> None:
         """Append what commands the `others`."""
         w, out = self._worlds(batch, SCRIPT), batch.arrays.scripted
         pipeline.call(
             partial(_run, batch, lambda: self._answer("script", self.script(w.begin()).flatten(1), out))
         )
 
-    def add_evaluate(self, pipeline: Pipeline, batch: Batch) -> None:
+    def add_evaluate(self, pipeline: KernelSequence, batch: Batch) -> None:
         """Append reward, ends and observation."""
         true, measured = self._worlds(batch, SCORE), self._worlds(batch, OBSERVE, measured=True)
 
@@ -315,13 +315,13 @@ class TorchTask(Task):
         pipeline.call(partial(_run, batch, score))
         super().add_evaluate(pipeline, batch)
 
-    def add_spawn(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
+    def add_spawn(self, pipeline: KernelSequence, batch: Batch, mask: wp.array) -> None:
         """Append the start of an episode where mask is not 0."""
         w = self._worlds(batch, RESET)
         pipeline.call(partial(_run, batch, lambda: self._begin(w.begin(), batch.arrays), mask))
         super().add_spawn(pipeline, batch, mask)
 
-    def add_observe(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
+    def add_observe(self, pipeline: KernelSequence, batch: Batch, mask: wp.array) -> None:
         """Append the first observation where mask is not 0."""
         measured = self._worlds(batch, OBSERVE, measured=True)
         starts = wp.to_torch(mask, requires_grad=False)[:, None, None]

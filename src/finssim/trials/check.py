@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from finssim.core.rotations import quat_rotate, quat_to_euler
 from finssim.trials.findings import SEVERITIES, CalibrationError, Finding, finding, listed, plain
-from finssim.trials.inputs import Drive, drive, implausible
+from finssim.trials.inputs import InputForces, drive, implausible
 from finssim.trials.motion import (
     AttitudeSignal,
     Motion,
@@ -422,7 +422,7 @@ OFTEN = 0.05
 """Part of the driven time at a limit above which care is needed."""
 
 
-def input_findings(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
+def input_findings(trial: Trial, vehicle: Vehicle, inputs: InputForces) -> list[Finding]:
     """Return findings about the inputs: assumptions, time at the limits, in the dead zones and beyond the thrusters'
     reach."""
     findings = list(inputs.findings)
@@ -441,7 +441,7 @@ def input_findings(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Findin
     return findings
 
 
-def _wrench_beyond(vehicle: Vehicle, inputs: Drive) -> list[Finding]:
+def _wrench_beyond(vehicle: Vehicle, inputs: InputForces) -> list[Finding]:
     findings = []
     for i, (axis, limit) in enumerate(zip(AXES, vehicle.wrench_limits, strict=True)):
         tau = np.abs(inputs.force[:, i])
@@ -465,7 +465,7 @@ def _wrench_beyond(vehicle: Vehicle, inputs: Drive) -> list[Finding]:
     return findings
 
 
-def _thrusters(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
+def _thrusters(trial: Trial, vehicle: Vehicle, inputs: InputForces) -> list[Finding]:
     findings = []
     at_limit: list[str] = []
     slow: list[str] = []
@@ -518,7 +518,9 @@ LEAST_INERTIA = 0.05
 """Part of the strongest wrench that went into a change of speed, for the effective mass to be seen."""
 
 
-def with_identifiability(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> AxisReport:
+def with_identifiability(
+    report: AxisReport, motion: Motion, inputs: InputForces, vehicle: Vehicle
+) -> AxisReport:
     """Return the report with the identifiability of the axis."""
     specific = {"k": ("roll", "pitch"), "buoyancy": ("heave",)}
     names = [name for name in PARAMETERS if report.axis in specific.get(name, AXES)]
@@ -534,7 +536,7 @@ def with_identifiability(report: AxisReport, motion: Motion, inputs: Drive, vehi
     )
 
 
-def _blocked(report: AxisReport, inputs: Drive) -> str:
+def _blocked(report: AxisReport, inputs: InputForces) -> str:
     """Return why the axis determines nothing at all, or nothing."""
     if not report.source:
         return f"no velocity: {NO_VELOCITY[report.axis]}"
@@ -940,7 +942,7 @@ ANSWERS = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Time constants of the speeds of vehicles [s]."""
 
 
-def axis_reports(motion: Motion, inputs: Drive, vehicle: Vehicle) -> list[AxisReport]:
+def axis_reports(motion: Motion, inputs: InputForces, vehicle: Vehicle) -> list[AxisReport]:
     """Return one report per axis, without identifiability."""
     passive = inputs.source == "passive"
     return [_axis(i, motion, passive, vehicle) for i in range(6)]

@@ -327,7 +327,7 @@ RPM = 2.0 * np.pi / 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drive:
+class InputForces:
     """The inputs of a trial as k forces."""
 
     t: Array
@@ -360,7 +360,7 @@ class Drive:
         return np.stack([np.interp(t, self.t, column) for column in self.force.T], axis=-1)
 
 
-def drive(trial: Trial, vehicle: Vehicle) -> Drive:
+def drive(trial: Trial, vehicle: Vehicle) -> InputForces:
     """The inputs of a trial: shaft speeds before forces before a wrench before pulse widths before commanded forces.
 
     A kind that is there for some thrusters only is passed over for a complete one. Axes of a wrench that have no column
@@ -390,7 +390,7 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
                 trial.name,
             )
         force, B, names = force @ B.T, np.eye(6), TAU
-    return Drive(
+    return InputForces(
         t=t,
         force=force,
         B=B,
@@ -405,9 +405,9 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
     )
 
 
-def _undriven(trial: Trial) -> Drive:
+def _undriven(trial: Trial) -> InputForces:
     """No wrench at any time, as in a passive trial."""
-    return Drive(
+    return InputForces(
         t=trial.t,
         force=np.zeros((len(trial.t), 6)),
         B=np.eye(6),
@@ -457,7 +457,7 @@ def _assumed(kind: str, present: dict[str, list[str]], stepped: bool) -> list[Fi
     return findings
 
 
-def applied_wrench(drive: Drive, vehicle: Vehicle, t: Array) -> Array:
+def applied_wrench(drive: InputForces, vehicle: Vehicle, t: Array) -> Array:
     """Wrench that acted, about the body origin, body frame [N, N m].
 
     Where the inputs are commands, the motors of the vehicle file lie between: limits, dead zone, delay, lag and slew,

@@ -24,7 +24,7 @@ from finssim.core.rotations import (
 )
 from finssim.trials.conversion import EULER, QUATERNION
 from finssim.trials.findings import Finding, finding
-from finssim.trials.inputs import Drive, applied_wrench, drive
+from finssim.trials.inputs import InputForces, applied_wrench, drive
 from finssim.trials.trial import COLUMNS, NU, Trial
 from finssim.vehicles import Vehicle
 
@@ -364,7 +364,7 @@ def motion(trial: Trial, vehicle: Vehicle) -> Motion:
     )
 
 
-def grid_rate(trial: Trial, inputs: Drive) -> float:
+def grid_rate(trial: Trial, inputs: InputForces) -> float:
     """Rate of the fastest stream of inputs or motion, up to `FASTEST` [Hz]."""
     steps = [float(np.median(np.diff(inputs.t)))] if inputs.source != "passive" else []
     for column in trial.channels:

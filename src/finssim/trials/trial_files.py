@@ -31,7 +31,15 @@ from finssim.trials.trial import (
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean, sentence_of
 
-__all__ = ["Table", "load_trial", "load_trials", "new_samples", "read_table", "trials_at", "write_trial"]
+__all__ = [
+    "ColumnTable",
+    "load_trial",
+    "load_trials",
+    "new_samples",
+    "read_table",
+    "trials_at",
+    "write_trial",
+]
 
 Array = NDArray[np.float64]
 
@@ -40,7 +48,7 @@ MAX_RAGGED = 0.1
 
 
 @dataclass
-class Table:
+class ColumnTable:
     """Columns of one file, all of one length."""
 
     numbers: dict[str, Array] = field(default_factory=dict)
@@ -58,7 +66,7 @@ class Table:
 
 def read_table(
     path: Path, *, skip: int = 0, names: Sequence[str] | None = None, spaces: bool = False
-) -> Table:
+) -> ColumnTable:
     """The columns of a `.csv` (`.txt`, `.tsv`) or `.parquet` file.
 
     A CSV file needs a line of column names; cells may be separated by commas, semicolons or tabs, lines that begin
@@ -102,9 +110,9 @@ def write_table(path: Path, numbers: dict[str, Array], phase: NDArray[np.str_] |
     write_csv(path, names, zip(*cells, strict=True))
 
 
-def _read_csv(path: Path, **options: Any) -> Table:
+def _read_csv(path: Path, **options: Any) -> ColumnTable:
     text = read_text_table(path, CalibrationError, **options)
-    table, names = Table(), text.names
+    table, names = ColumnTable(), text.names
     if text.zeros:
         table.findings.append(finding("zero_bytes"))
     _check_names(names, path)
@@ -143,7 +151,9 @@ def _check_names(names: list[str], path: Path) -> None:
     raise CalibrationError(f"{path}: begins with numbers, expected a line of column names such as t,tau_x,u")
 
 
-def _report_ragged(ragged: list[int], count: int, width: int, cut: bool, table: Table, path: Path) -> None:
+def _report_ragged(
+    ragged: list[int], count: int, width: int, cut: bool, table: ColumnTable, path: Path
+) -> None:
     if ragged == [count] and cut:
         table.findings.append(finding("last_line_cut"))
     elif len(ragged) > max(1.0, MAX_RAGGED * count):
@@ -155,7 +165,7 @@ def _report_ragged(ragged: list[int], count: int, width: int, cut: bool, table: 
         table.findings.append(finding("ragged_rows", rows=len(ragged), expected=width, first=ragged[0]))
 
 
-def _keep(table: Table, name: str, column: list[Any]) -> None:
+def _keep(table: ColumnTable, name: str, column: list[Any]) -> None:
     """File a column under numbers or words."""
     if not name:
         return
@@ -178,7 +188,7 @@ def _keep(table: Table, name: str, column: list[Any]) -> None:
     table.numbers[name] = np.array(column, dtype=float)
 
 
-def _read_parquet(path: Path) -> Table:
+def _read_parquet(path: Path) -> ColumnTable:
     try:
         import pyarrow.parquet
     except ImportError:
@@ -195,7 +205,7 @@ def _read_parquet(path: Path) -> Table:
         raise CalibrationError(
             f"{path}: is not a complete Parquet file: {' '.join(str(error).split())[:120]}"
         ) from None
-    table = Table()
+    table = ColumnTable()
     _check_names(content.column_names, path)
     of = pyarrow.types
     for name in content.column_names:
@@ -285,7 +295,7 @@ EPOCH = 1.0e8
 """Times later than this count from 1970 [s]; no vehicle has been on for three years."""
 
 
-def trial_from_table(name: str, table: Table, header: Header, path: Path | None = None) -> Trial:
+def trial_from_table(name: str, table: ColumnTable, header: Header, path: Path | None = None) -> Trial:
     """A trial from the columns of a table, in order of time, each repair a finding.
 
     Args:

@@ -5,14 +5,22 @@ from typing import TYPE_CHECKING
 from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
-    from finssim.vehicles.check import Finding, check_vehicle
+    from finssim.vehicles.check import CheckResult, check_vehicle
     from finssim.vehicles.device_files import device_of, devices, load_device
     from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensor, Sensors, Tags
     from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
     from finssim.vehicles.loader import catalogue, catalogue_vehicle, load_vehicle
     from finssim.vehicles.part import NonNegative, Number, Part, Positive, VehicleError
     from finssim.vehicles.thruster import Esc, Thruster
-    from finssim.vehicles.vehicle import AXES, Body, CalibrationRecord, Hull, Provenance, Vehicle, Water
+    from finssim.vehicles.vehicle import (
+        AXES,
+        Body,
+        CalibrationRecord,
+        Hull,
+        Provenance,
+        ReferenceWater,
+        Vehicle,
+    )
 
 __all__ = [
     "AXES",
@@ -21,7 +29,7 @@ __all__ = [
     "DepthSensor",
     "Dvl",
     "Esc",
-    "Finding",
+    "CheckResult",
     "Hull",
     "HydrodynamicSet",
     "Imu",
@@ -40,7 +48,7 @@ __all__ = [
     "Thruster",
     "Vehicle",
     "VehicleError",
-    "Water",
+    "ReferenceWater",
     "catalogue",
     "catalogue_vehicle",
     "check_vehicle",

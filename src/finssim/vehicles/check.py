@@ -15,7 +15,7 @@ from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import AXES, Vehicle
 
-__all__ = ["Finding", "check_vehicle"]
+__all__ = ["CheckResult", "check_vehicle"]
 
 CURVE_TOLERANCE = 0.01
 """Relative gap accepted between a force limit and the curve at the speed limit."""
@@ -24,7 +24,7 @@ CENTROID_TOLERANCE = 0.02
 """Distance accepted between the hull's centroid and the centre of buoyancy, relative to the longest side."""
 
 
-class Finding(NamedTuple):
+class CheckResult(NamedTuple):
     """One thing that was checked."""
 
     name: str
@@ -32,7 +32,7 @@ class Finding(NamedTuple):
     sentence: str
 
 
-def check_vehicle(vehicle: Vehicle) -> list[Finding]:
+def check_vehicle(vehicle: Vehicle) -> list[CheckResult]:
     """Check what no single number shows; the loader has already refused what cannot be simulated at all.
 
     Returns:
@@ -49,12 +49,12 @@ def check_vehicle(vehicle: Vehicle) -> list[Finding]:
     ]
 
 
-def _mass_matrices(vehicle: Vehicle) -> Iterator[Finding]:
+def _mass_matrices(vehicle: Vehicle) -> Iterator[CheckResult]:
     for name in vehicle.hydrodynamics:
         M = vehicle.mass_matrix(name)
         smallest = float(np.linalg.eigvalsh((M + M.T) / 2.0)[0])
         symmetric = bool(np.allclose(M, M.T, rtol=0.0, atol=1e-9 * np.abs(M).max()))
-        yield Finding(
+        yield CheckResult(
             f"mass matrix ({name})",
             symmetric and smallest > 0.0,
             f"M_RB + M_A is {'' if symmetric else 'not '}symmetric, "
@@ -62,7 +62,7 @@ def _mass_matrices(vehicle: Vehicle) -> Iterator[Finding]:
         )
 
 
-def _damping(vehicle: Vehicle) -> Iterator[Finding]:
+def _damping(vehicle: Vehicle) -> Iterator[CheckResult]:
     for name, chosen in vehicle.hydrodynamics.items():
         if not isinstance(chosen, HydrodynamicSet):
             continue
@@ -81,11 +81,11 @@ def _damping(vehicle: Vehicle) -> Iterator[Finding]:
                 f"; D2 couples axes: over sampled velocities it takes out at least {share:.3g} of the power "
                 "of its diagonal, expected >= 0"
             )
-        yield Finding(f"damping ({name})", passed, sentence)
+        yield CheckResult(f"damping ({name})", passed, sentence)
         for key, value in chosen.terms.items():
             check = TERMS[key].check
             if check is not None:
-                yield Finding(f"{key} ({name})", *check(value))
+                yield CheckResult(f"{key} ({name})", *check(value))
 
 
 def _least_power(D2: NDArray[np.float64], samples: int = 4000) -> float:
@@ -100,7 +100,7 @@ def _least_power(D2: NDArray[np.float64], samples: int = 4000) -> float:
     return float(np.min(power / np.einsum("ni,i,ni->n", nu, np.diag(D2), square)))
 
 
-def _allocation(vehicle: Vehicle) -> Finding:
+def _allocation(vehicle: Vehicle) -> CheckResult:
     rows = [AXES.index(axis) for axis in vehicle.controlled_axes]
     B = vehicle.control_matrix[rows]
     rank = int(np.linalg.matrix_rank(B))
@@ -116,10 +116,10 @@ def _allocation(vehicle: Vehicle) -> Finding:
     )
     if idle:
         sentence += f"; no pure {', '.join(idle)} in both directions: take it out of controlled_axes"
-    return Finding("allocation", rank == len(rows) and not idle, sentence)
+    return CheckResult("allocation", rank == len(rows) and not idle, sentence)
 
 
-def _thrust_curves(vehicle: Vehicle) -> Iterator[Finding]:
+def _thrust_curves(vehicle: Vehicle) -> Iterator[CheckResult]:
     worst, of_which = 0.0, ""
     for name, thruster in vehicle.thrusters.items():
         for side, force, c, rpm in (
@@ -129,20 +129,20 @@ def _thrust_curves(vehicle: Vehicle) -> Iterator[Finding]:
             excess = force / (c * (rpm * math.pi / 30.0) ** 2) - 1.0
             if excess > worst:
                 worst, of_which = excess, f" ({name}, {side})"
-    yield Finding(
+    yield CheckResult(
         "thrust curves",
         worst <= CURVE_TOLERANCE,
         f"force limits exceed the curve at the speed limit by at most {100.0 * worst:.2g} %{of_which}, expected <= 1 %",
     )
 
 
-def _trim(vehicle: Vehicle) -> Finding:
+def _trim(vehicle: Vehicle) -> CheckResult:
     level = trim(vehicle)
     net = vehicle.buoyancy - vehicle.weight
     drift = "rises" if net > 0.0 else "sinks"
     sentence = f"it {drift} with {abs(net):.3g} N; level at rest needs {_wrench(level.wrench)}"
     if level.forces is None:
-        return Finding("trim", False, f"{sentence}, more than the thrusters give")
+        return CheckResult("trim", False, f"{sentence}, more than the thrusters give")
     uncontrolled = [
         a
         for a, x in zip(AXES, level.wrench, strict=True)
@@ -152,7 +152,7 @@ def _trim(vehicle: Vehicle) -> Finding:
         sentence += f"; {', '.join(uncontrolled)} is not controlled and left to the water"
     lower, upper = vehicle.force_limits
     share = float(np.max(np.where(level.forces > 0.0, level.forces / upper, level.forces / lower)))
-    return Finding(
+    return CheckResult(
         "trim", share < 1.0, f"{sentence}; the hardest thruster gives {100.0 * share:.2g} % of its limit"
     )
 
@@ -167,9 +167,9 @@ def _wrench(wrench: NDArray[np.float64]) -> str:
     return " and ".join(parts) or "nothing"
 
 
-def _stability(vehicle: Vehicle) -> Finding:
+def _stability(vehicle: Vehicle) -> CheckResult:
     arm = float(vehicle.body.center_of_buoyancy[2] - vehicle.body.center_of_gravity[2])
-    return Finding(
+    return CheckResult(
         "upright",
         arm > 0.0,
         f"the centre of buoyancy lies {arm:.3g} m above the centre of gravity, expected > 0: "
@@ -177,7 +177,7 @@ def _stability(vehicle: Vehicle) -> Finding:
     )
 
 
-def _hull(vehicle: Vehicle) -> Iterator[Finding]:
+def _hull(vehicle: Vehicle) -> Iterator[CheckResult]:
     if vehicle.hull is None:
         return
     from finssim.core.mesh import mesh_centroid, mesh_volume
@@ -185,18 +185,18 @@ def _hull(vehicle: Vehicle) -> Iterator[Finding]:
     try:
         vertices, faces = vehicle.hull_mesh()
     except VehicleError as error:
-        yield Finding("hull", False, str(error))
+        yield CheckResult("hull", False, str(error))
         return
-    yield Finding("hull", True, f"the hull of {len(faces)} faces is closed and its normals point outward")
+    yield CheckResult("hull", True, f"the hull of {len(faces)} faces is closed and its normals point outward")
     volume, stated = mesh_volume(vertices, faces), vehicle.body.displaced_volume
-    yield Finding(
+    yield CheckResult(
         "hull volume",
         abs(volume / stated - 1.0) <= VOLUME_TOLERANCE,
         f"the hull encloses {volume:.6g} m³, the displaced volume is {stated:.6g} m³, "
         f"expected within {100.0 * VOLUME_TOLERANCE:g} %",
     )
     gap = float(np.linalg.norm(mesh_centroid(vertices, faces) - vehicle.body.center_of_buoyancy))
-    yield Finding(
+    yield CheckResult(
         "hull centroid",
         gap <= CENTROID_TOLERANCE * float(vehicle.body.size.max()),
         f"the hull's centroid is {gap:.3g} m from the centre of buoyancy",

@@ -65,7 +65,7 @@ Pair = Annotated[tuple[float, float], numbers(2, "2 numbers")]
 Pixels = Annotated[int, Field(strict=True, ge=1, le=8192)]
 
 
-class Mount(Part):
+class DeviceMount(Part):
     """Pose of a sensor on its vehicle."""
 
     position: Vector3 = Field(default_factory=lambda: zeros(3))
@@ -123,7 +123,7 @@ class CameraDevice(Part):
     """During which a picture that knows the vehicle's motion blurs [s]."""
     rate: Positive
     """[Hz]"""
-    mount: Mount = Field(default_factory=lambda: Mount())
+    mount: DeviceMount = Field(default_factory=lambda: DeviceMount())
 
     @model_validator(mode="after")
     def _optics(self) -> CameraDevice:
@@ -195,7 +195,7 @@ class SonarDevice(Part):
     come by it too, later than straight ones. Not given: no such echoes are computed."""
     rate: Positive
     """[Hz]"""
-    mount: Mount = Field(default_factory=lambda: Mount())
+    mount: DeviceMount = Field(default_factory=lambda: DeviceMount())
 
     @model_validator(mode="after")
     def _computable(self) -> SonarDevice:
@@ -243,7 +243,7 @@ class RangeDevice(Part):
     """Standard deviation of a DVL's velocity along a beam [m/s]."""
     rate: Positive
     """[Hz]"""
-    mount: Mount = Field(default_factory=lambda: Mount())
+    mount: DeviceMount = Field(default_factory=lambda: DeviceMount())
 
 
 Device = CameraDevice | SonarDevice | RangeDevice
@@ -302,7 +302,7 @@ def device_of(vehicle: Vehicle, name: str) -> Device:
         raise DeviceError(f"{label}: device: {error}") from None
     orientation = device.mount.quaternion if entry.orientation is None else entry.orientation
     changes: dict[str, Any] = {
-        "mount": Mount(position=entry.position, orientation=orientation),
+        "mount": DeviceMount(position=entry.position, orientation=orientation),
         "rate": entry.rate,
     }
     if isinstance(device, CameraDevice) and entry.width is not None:

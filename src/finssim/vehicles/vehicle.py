@@ -51,7 +51,7 @@ from finssim.vehicles.thruster import Thruster
 Array = NDArray[np.float64]
 
 
-class Water(Part):
+class ReferenceWater(Part):
     """The water the numbers of the file were given for."""
 
     density: Positive
@@ -161,7 +161,7 @@ class Vehicle(Part):
     """One line naming the vehicle and the set of numbers."""
     description: str
     """Description of the vehicle, and what to know before using the numbers."""
-    water: Water
+    water: ReferenceWater
     body: Body
     hull: Hull | None = None
     hydrodynamics: dict[str, AnyHydrodynamicSet]

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from finssim.core.frames import TO_OPTICAL
 from finssim.core.optics import Camera, Interface, Layer, project
 from finssim.extensions.perception import CameraBatch, Headlight, RangeBatch, SonarBatch, WorldBatch
-from finssim.vehicles.device_files import CameraDevice, Mount, Port, load_device
+from finssim.vehicles.device_files import CameraDevice, DeviceMount, Port, load_device
 
 pytestmark = pytest.mark.slow
 
@@ -87,7 +87,7 @@ def test_radiance_is_the_integral_of_what_the_water_adds_and_takes(scenes, level
 
 def test_snells_window_is_as_wide_as_total_reflection_begins(scenes, poses):
     """A camera that looks up sees the sky within asin(1/1.333) = 48.6° of the vertical, and the water outside."""
-    device = camera(width=80, height=80, focal_length=30.0, mount=Mount(pitch=-math.pi / 2))
+    device = camera(width=80, height=80, focal_length=30.0, mount=DeviceMount(pitch=-math.pi / 2))
     sensor = CameraBatch(scenes("wall"), device, linear=True)
     sensor.update(poses(((-20, 0, -0.01), (0, 0, 0, 1))))
     radiance, rays = sensor.radiance.numpy()[0], sensor.rays.numpy()[:, :, 0, 1]

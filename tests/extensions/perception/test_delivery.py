@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.extensions.perception import Delivery, RangeBatch, WorldBatch, WorldError, load_world
+from finssim.extensions.perception import DelayedSensor, RangeBatch, WorldBatch, WorldError, load_world
 from finssim.vehicles.device_files import RangeDevice
 
 pytestmark = pytest.mark.slow
@@ -27,7 +27,7 @@ def floors(tmp_path_factory):
 def altimeter(batch, vehicles=1, **options):
     down = {"pitch": 1.5707963}
     device = RangeDevice(about="-", source="-", minimum_range=0.0, range=50.0, rate=1.0, mount=down)
-    return Delivery(RangeBatch(batch, device, vehicles=vehicles), control_step=STEP, **options)
+    return DelayedSensor(RangeBatch(batch, device, vehicles=vehicles), control_step=STEP, **options)
 
 
 def play(delivery, steps, episodes=None):

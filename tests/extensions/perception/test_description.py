@@ -16,7 +16,7 @@ from finssim.extensions.perception.description import (
     load_world,
     sites,
 )
-from finssim.sim.overhead_camera import Water
+from finssim.sim.overhead_camera import WaterOptics
 from finssim.vehicles.device_files import DEVICES, DeviceError, devices, load_device
 
 WORLD = """
@@ -190,4 +190,4 @@ def test_the_catalogue_is_packaged_beside_the_module():
 
 def test_the_pool_has_the_water_of_the_overhead_camera():
     """One definition: what a camera under water sees through is what the one above it does."""
-    assert load_world("pool").water.optical == Water()
+    assert load_world("pool").water.optical == WaterOptics()

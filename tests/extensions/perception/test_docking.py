@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from finssim.tasks import Environment, make
-from finssim.tasks.docking import Docking, Hull
+from finssim.tasks.docking import Docking, HullNumbers
 from finssim.vehicles import catalogue, load_vehicle
 
 TASK = Docking()
@@ -157,7 +157,7 @@ def test_every_vehicle_gets_a_dock_it_fits_in(name):
     task = TASK.fitted([load_vehicle(name)])
     dock, hull, pool = task.dock(), task.hull, task.arena()
     half = 0.5 * np.array(load_vehicle(name).body.size)
-    assert hull == Hull.of(load_vehicle(name))
+    assert hull == HullNumbers.of(load_vehicle(name))
     assert dock.throat_radius > 1.1 * math.hypot(half[1], half[2])
     lowest = (0.5 * TASK.tank[1] + TASK.dock_spread[2]) * hull.length + dock.mouth_radius + dock.rim
     assert lowest < pool.depth
@@ -169,7 +169,7 @@ def test_every_vehicle_gets_a_dock_it_fits_in(name):
 
 def test_the_hull_that_stands_for_none_is_finsrovs():
     """A task that is asked before it is fitted answers for FinsROV."""
-    own = Hull.of(load_vehicle("finsrov"))
+    own = HullNumbers.of(load_vehicle("finsrov"))
     assert TASK.hull.length == own.length and TASK.hull.speed == pytest.approx(own.speed, rel=0.01)
     assert TASK.hull.girth == pytest.approx(own.girth, rel=0.01)
     assert TASK.hull.inertia == pytest.approx(own.inertia, rel=0.01)

@@ -19,6 +19,7 @@ from finssim.extensions.perception.pipeline import Pipeline
 from finssim.extensions.perception.servos import LightServo, LineFollower, PostServo, WallFollower
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, environment, make, measurement
 from finssim.tasks.check import check_task
+from finssim.tasks.picture import ObservedPicture
 from finssim.tasks.task import kernels_of
 from finssim.vehicles import load_vehicle
 
@@ -121,7 +122,7 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(
         EnvironmentSetupError, match="perception.altimeter measures ranges, expected a camera or"
     ):
-        Environment(Pipeline(pictures=(sight.Picture("altimeter"),)), worlds=1)
+        Environment(Pipeline(pictures=(ObservedPicture("altimeter"),)), worlds=1)
     four = load_vehicle("finsrov").replace({"perception.altimeter.device": "dvl_a50"})
     with pytest.raises(
         EnvironmentSetupError, match="perception.altimeter has no single beam, which task 'net'"

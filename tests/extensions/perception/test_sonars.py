@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from finssim.core.rotations import quat_from_euler, quat_rotate
 from finssim.extensions.perception import DopplerBatch, RangeBatch, SonarBatch, WorldError
 from finssim.physics.types import vec6
-from finssim.vehicles.device_files import Mount, RangeDevice, SonarDevice, load_device
+from finssim.vehicles.device_files import DeviceMount, RangeDevice, SonarDevice, load_device
 
 pytestmark = pytest.mark.slow
 
@@ -77,7 +77,7 @@ def test_a_wall_echoes_with_the_square_of_range(distance, scenes, level):
 
 def test_no_gaps_open_on_a_slanting_floor(scenes, level):
     """Sixteen rays of 20° over a floor 1.5 m below, cells of 1 cm: between first and last echo none is empty."""
-    device = sonar(elevations=16, range=12.0, bins=1200, mount=Mount(pitch=math.radians(15.0)))
+    device = sonar(elevations=16, range=12.0, bins=1200, mount=DeviceMount(pitch=math.radians(15.0)))
     _, intensity = echo(scenes("floor"), device, level(0, 0, -8.5))
     filled = intensity[60] > 0.0
     first, last = np.flatnonzero(filled)[[0, -1]]
@@ -151,7 +151,7 @@ def test_a_plate_leaves_the_way_by_the_surface_alone(scenes, poses):
 
 def test_speckle_is_rayleigh(scenes, level):
     """Power of noise alone is exponential: its standard deviation is its mean; amplitude has 0.52 of its own."""
-    device = sonar(noise_level_db=-60.0, mount=Mount(pitch=-0.6))
+    device = sonar(noise_level_db=-60.0, mount=DeviceMount(pitch=-0.6))
     _, intensity = echo(scenes("floor"), device, level(0, 0, -5), seed=3)
     power = intensity[:, 10:200]
     relative = power / power.mean(axis=0)
@@ -174,7 +174,7 @@ def test_equal_seeds_give_equal_pings(dock, poses):
 
 def ranger(**changes):
     values = {"about": "-", "source": "-", "minimum_range": 0.1, "range": 50.0, "rate": 10.0}
-    values["mount"] = Mount(pitch=math.pi / 2)
+    values["mount"] = DeviceMount(pitch=math.pi / 2)
     return RangeDevice(**{**values, **changes})
 
 
@@ -266,7 +266,7 @@ def dvl(**changes):
     values |= {
         "range": 8.0,
         "rate": 1.0,
-        "mount": Mount(position=np.array([0.3, 0.0, -0.1]), pitch=0.5 * math.pi),
+        "mount": DeviceMount(position=np.array([0.3, 0.0, -0.1]), pitch=0.5 * math.pi),
     }
     return RangeDevice(**{**values, **changes})
 

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from finssim.extensions.ros2 import Ros2Error
-from finssim.extensions.ros2.up import GRAPHS, NODES, Options, Plan, plan_of, topics_of
+from finssim.extensions.ros2.up import GRAPHS, NODES, GraphPlan, Options, plan_of, topics_of
 from finssim.robot.goals import GoalError
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "reference" / "ros2_nodes.md").read_text()
@@ -111,7 +111,7 @@ def test_what_cannot_be_started_is_refused_in_a_sentence(graph, choices, error, 
 
 def test_topics_are_those_of_the_nodes():
     """Full names; a simulator has no camera."""
-    names = {name for name, _ in topics_of(Plan("sim", "finsrov", "rov"))}
+    names = {name for name, _ in topics_of(GraphPlan("sim", "finsrov", "rov"))}
     assert {"/rov/odom", "/clock", "/rov/arm", "/rov/thruster_cmd"} <= names
     assert "/rov/camera/image" not in names and "/rov/telemetry" not in names
 

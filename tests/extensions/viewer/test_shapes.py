@@ -5,7 +5,7 @@ import pytest
 
 from finssim.core.rotations import quat_from_yaw
 from finssim.extensions.viewer.app import FIRST, LINE, blank, draw_picture, legend_of, plots_of
-from finssim.extensions.viewer.frame import Curve, Picture, Pose
+from finssim.extensions.viewer.frame import BodyPose, LatestPicture, PlotLine
 from finssim.extensions.viewer.shapes import ARROW, force_arrows, hull_of, line_of, tag_plates, wall_mesh
 from finssim.robot.messages import TagCorners
 from finssim.vehicles import load_vehicle
@@ -23,7 +23,7 @@ def test_arrows_push_where_thrusters_push():
     """Full thrust forward has the full length along the turned axis; nothing is drawn for no thrust."""
     force = np.zeros(len(FINSROV.thruster_names))
     force[0] = -np.max(np.abs(FINSROV.force_limits))
-    pose = Pose(np.array([1.0, 2.0, -0.5]), quat_from_yaw(np.pi / 2))
+    pose = BodyPose(np.array([1.0, 2.0, -0.5]), quat_from_yaw(np.pi / 2))
     (arrow,) = force_arrows(FINSROV, force, pose)
     thruster = FINSROV.thrusters[FINSROV.thruster_names[0]]
     x, y, z = -np.asarray(thruster.axis) * ARROW * np.max(FINSROV.body.size)
@@ -68,20 +68,27 @@ def test_tags_are_outlined_where_they_were_found():
     """The outline is on the corners, the enlarged part beside; a tag at the border or of NaN hurts nobody."""
     image = np.full((720, 1280), 90, np.uint8)
     corners = np.array([[600.0, 300.0], [640.0, 300.0], [640.0, 340.0], [600.0, 340.0]])
-    plain, drawn = draw_picture(Picture(image)), draw_picture(Picture(image, [TagCorners(3, corners)]))
+    plain, drawn = (
+        draw_picture(LatestPicture(image)),
+        draw_picture(LatestPicture(image, [TagCorners(3, corners)])),
+    )
     assert plain.shape == drawn.shape == (360, 640, 3) and (plain == 90).all()
     assert tuple(drawn[150, 310]) == FIRST and tuple(drawn[170, 310]) == LINE
     assert tuple(drawn[160, 310]) == (90, 90, 90)
     odd = [TagCorners(1, corners - [620.0, 320.0]), TagCorners(2, corners * np.nan)]
-    draw_picture(Picture(image, odd[:1]))
-    draw_picture(Picture(None, odd[:1]))
+    draw_picture(LatestPicture(image, odd[:1]))
+    draw_picture(LatestPicture(None, odd[:1]))
     assert blank().shape[2] == 3
 
 
 def test_plots_show_the_past_in_full():
     """Curves of one title stand in one plot; of each, the part up to now is drawn again."""
     time = np.arange(5.0)
-    curves = [Curve("a", "x", time, time), Curve("b", "x", time, -time), Curve("a", "y", time, 2 * time)]
+    curves = [
+        PlotLine("a", "x", time, time),
+        PlotLine("b", "x", time, -time),
+        PlotLine("a", "y", time, 2 * time),
+    ]
     first, second = plots_of(curves)
     assert [c.label for c in first.curves] == ["x", "y"] and second.title == "b"
     _, whole, past, *_ = first.data(2.0)
@@ -93,7 +100,10 @@ def test_plots_show_the_past_in_full():
 def test_a_plot_begins_where_all_its_curves_have_values():
     """The first estimate comes later than the first distance to the goal; the browser draws nothing from a NaN on."""
     time, late = np.arange(4.0), np.array([np.nan, 2.0, 3.0, 4.0])
-    curves = [Curve("position", "to the goal", time, time), Curve("position", "of the estimate", time, late)]
+    curves = [
+        PlotLine("position", "to the goal", time, time),
+        PlotLine("position", "of the estimate", time, late),
+    ]
     (plot,) = plots_of(curves)
     data = plot.data(0.0)
     assert [column[0] for column in data] == [1.0, 1.0, 1.0, 2.0, 2.0]

@@ -9,19 +9,19 @@ import pytest
 from finssim.extensions.perception import WorldLayout
 from finssim.extensions.viewer.app import draw_own
 from finssim.extensions.viewer.frame import ViewError
-from finssim.extensions.viewer.run import Choice, open_source
+from finssim.extensions.viewer.run import SourceChoice, open_source
 from finssim.extensions.viewer.sources import PoolSource, RunSource, SimulatorSource
 from finssim.robot.messages import Picture as Seen
 from finssim.robot.reading import Reading
 from finssim.robot.recorder import Recorder as RecordWriter
 from finssim.sim import Simulator
-from finssim.sim.recorder import Recorder
+from finssim.sim.recorder import StateRecorder
 from finssim.vehicles import VehicleError, load_vehicle
 
 
 def test_the_pool_lives_and_the_robot_in_it_goes_to_the_goal():
     """Truth and estimate are both shown, near each other, and nearer to the goal in time; equal seeds begin alike."""
-    source = open_source(Choice(source="pool", goal="0.5,0.2,-0.6,20"))
+    source = open_source(SourceChoice(source="pool", goal="0.5,0.2,-0.6,20"))
     first = source.frame(0.1)
     assert math.isinf(source.duration) and first.time == pytest.approx(0.1)
     frame = source.frame(6.0)
@@ -31,7 +31,7 @@ def test_the_pool_lives_and_the_robot_in_it_goes_to_the_goal():
     assert now < 0.5 * start
     assert {tag.tag_id for tag in frame.picture.tags} <= set(source.stage.vehicle.tags.mounts)
     assert len(frame.trail) > 20 and source.curves()[0].value[-1] == pytest.approx(now, abs=0.02)
-    twin = open_source(Choice(source="pool", goal="0.5,0.2,-0.6,20"))
+    twin = open_source(SourceChoice(source="pool", goal="0.5,0.2,-0.6,20"))
     assert np.array_equal(twin.frame(0.1).force, first.force)
     source.close()
 
@@ -39,32 +39,32 @@ def test_the_pool_lives_and_the_robot_in_it_goes_to_the_goal():
 @pytest.mark.slow
 def test_the_pool_is_the_one_that_was_asked_for():
     """Plant, severity, policy, trajectory and vehicle are heeded."""
-    plain = open_source(Choice(trajectory="ellipse", camera="pictures"))
+    plain = open_source(SourceChoice(trajectory="ellipse", camera="pictures"))
     assert isinstance(plain, PoolSource) and "realistic plant 1: pid, ellipse" in plain.stage.title
     assert len(plain.stage.path) > 100 and plain.frame(0.3).picture.image.shape == (720, 1280)
-    other = open_source(Choice(plant="3", severity="hard", policy="pid-paper", task="t2"))
+    other = open_source(SourceChoice(plant="3", severity="hard", policy="pid-paper", task="t2"))
     assert "hard plant 3: pid-paper, ellipse" in other.stage.title
 
 
 def test_the_simulator_is_a_source(tmp_path):
     """It holds a station from its state alone, in the model that was asked for."""
-    source = open_source(Choice(source="sim", goal="0.3,0.1,-0.6,30"))
+    source = open_source(SourceChoice(source="sim", goal="0.3,0.1,-0.6,30"))
     assert isinstance(source, SimulatorSource)
     frame = source.frame(10.0)
     assert frame.estimate is None and np.linalg.norm(frame.truth.position - [0.3, 0.1, -0.6]) < 0.1
-    other = open_source(Choice(source="sim", goal="0.3,0.1,-0.6,30", hydrodynamics="simplified"))
+    other = open_source(SourceChoice(source="sim", goal="0.3,0.1,-0.6,30", hydrodynamics="simplified"))
     assert not np.allclose(other.frame(2.0).truth.position, source.frame(2.0).truth.position)
 
 
 def test_a_run_of_the_engine_is_a_source(tmp_path):
     """The recorded pose of the chosen world is shown at its time."""
     simulator = Simulator("finsrov", worlds=2)
-    with Recorder(simulator, tmp_path / "run") as recorder:
+    with StateRecorder(simulator, tmp_path / "run") as recorder:
         simulator.set_thrust(np.stack([np.full((1, 8), 1.0), np.full((1, 8), -2.0)]))
         for _ in range(30):
             simulator.step()
             recorder.record()
-    source = open_source(Choice(source=str(tmp_path / "run"), world="1"))
+    source = open_source(SourceChoice(source=str(tmp_path / "run"), world="1"))
     assert isinstance(source, RunSource) and source.duration == pytest.approx(2.9)
     assert source.frame(2.9).truth.position == pytest.approx(simulator.numpy("position")[1, 0], abs=1e-6)
     assert source.frame(2.9).force == pytest.approx(simulator.numpy("thrust")[1, 0], abs=1e-5)
@@ -77,7 +77,7 @@ def test_the_vehicle_that_a_run_names_is_of_the_catalogue(tmp_path, monkeypatch,
     """A file of that name is not looked at."""
     (tmp_path / "mine.yaml").write_text("extends: finsrov\n", encoding="utf-8")
     simulator = Simulator("finsrov")
-    with Recorder(simulator, tmp_path / "run") as recorder:
+    with StateRecorder(simulator, tmp_path / "run") as recorder:
         recorder.record()
     about = json.loads((tmp_path / "run" / "_run.json").read_text(encoding="utf-8"))
     about["vehicles"][0]["name"] = name.format(tmp_path)
@@ -91,11 +91,11 @@ def test_the_vehicle_that_a_run_names_is_of_the_catalogue(tmp_path, monkeypatch,
 @pytest.mark.parametrize(
     ("choice", "sentence"),
     [
-        (Choice(source="nowhere.mcap"), "no such file or folder"),
-        (Choice(source="sim", plant="3"), "--plant is for pool, not for a sim"),
-        (Choice(source="pool", basin="4,2,1"), "--basin is for record, not for a pool"),
-        (Choice(source="pool", goal="5,0,-0.5,0"), "outside the workspace"),
-        (Choice(source="pool", camera="none"), "camera"),
+        (SourceChoice(source="nowhere.mcap"), "no such file or folder"),
+        (SourceChoice(source="sim", plant="3"), "--plant is for pool, not for a sim"),
+        (SourceChoice(source="pool", basin="4,2,1"), "--basin is for record, not for a pool"),
+        (SourceChoice(source="pool", goal="5,0,-0.5,0"), "outside the workspace"),
+        (SourceChoice(source="pool", camera="none"), "camera"),
     ],
 )
 def test_what_cannot_be_shown_is_refused_in_a_sentence(choice, sentence):
@@ -109,20 +109,20 @@ def test_what_cannot_be_shown_is_refused_in_a_sentence(choice, sentence):
 def test_a_pool_has_three_lengths(trial, basin):
     """Length, width and depth above zero."""
     with pytest.raises(ViewError, match=r"expected length,width,depth"):
-        open_source(Choice(source=str(trial.record), basin=basin))
+        open_source(SourceChoice(source=str(trial.record), basin=basin))
 
 
 def test_a_record_may_be_shown_with_another_vehicle(trial):
     """--vehicle overrides what the record says."""
-    assert open_source(Choice(source=str(trial.record))).stage.vehicle.name == "finsrov"
-    other = open_source(Choice(source=str(trial.record), vehicle="bluerov2_heavy"))
+    assert open_source(SourceChoice(source=str(trial.record))).stage.vehicle.name == "finsrov"
+    other = open_source(SourceChoice(source=str(trial.record), vehicle="bluerov2_heavy"))
     assert other.stage.vehicle.name == load_vehicle("bluerov2_heavy").name
 
 
 def test_a_world_is_seen_heard_and_drawn():
     """The pool with a world: its things stand where they were drawn, pictures and a fan come, ranges are told."""
     pytest.importorskip("newton", reason="finssim[perception] is not installed")
-    source = open_source(Choice(source="pool", world="dock", seed=3))
+    source = open_source(SourceChoice(source="pool", world="dock", seed=3))
     layout = WorldLayout("dock")
     layout.draw(3)
     back = next(body for body in source.stage.bodies if body.name == "back")
@@ -153,7 +153,7 @@ def test_a_record_shows_own_sensors_and_the_world_that_is_named(tmp_path):
                 recorder.picture(t, Seen(t, k, image, source="front_camera"))
                 recorder.picture(t, Seen(t, k, image[..., 0], source="sonar"))
                 recorder.picture(t, Seen(t, k, source="altimeter", ranges=np.array([2.5], np.float32)))
-    source = open_source(Choice(source=str(path), world="gate", seed=1))
+    source = open_source(SourceChoice(source=str(path), world="gate", seed=1))
     frame = source.frame(0.8)
     assert np.abs(frame.pictures["front_camera"].astype(int) - image).max() < 6
     assert frame.pictures["sonar"].ndim == 2 and frame.status["altimeter"] == "2.50 m"
@@ -161,4 +161,4 @@ def test_a_record_shows_own_sensors_and_the_world_that_is_named(tmp_path):
     assert {body.name for body in source.stage.bodies} >= {"near_left", "buoy_0"}
     assert source.stage.lower.tolist() == [-8.0, -5.0, -3.2]
     with pytest.raises(ViewError, match="--world dock: expected the number of a world"):
-        open_source(Choice(source=str(tmp_path), world="dock"))
+        open_source(SourceChoice(source=str(tmp_path), world="dock"))

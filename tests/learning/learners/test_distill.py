@@ -23,7 +23,7 @@ from finssim.learning.learners import LearningError, learner_named
 from finssim.learning.torch_networks import SeeingNetwork
 from finssim.learning.train import train
 from finssim.tasks import Environment, make
-from finssim.tasks.picture import Picture
+from finssim.tasks.picture import ObservedPicture
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow
@@ -161,6 +161,6 @@ def test_cloning_learns_from_pictures(tmp_path):
     while learner.steps < settings.steps:
         losses.append(learner.update()["imitation_loss"])
     assert losses[-1] < 0.1 * np.var((np.arange(4, 44) - 24) / 24)
-    wide = replace(TASK, pictures=(Picture("front_camera", 32),))
+    wide = replace(TASK, pictures=(ObservedPicture("front_camera", 32),))
     with pytest.raises(LearningError, match="is of pictures .*27, 48.*expected .*18, 32"):
         learner_named("bc")(make(wide, worlds=2, seed=1), settings, seed=1)

@@ -14,7 +14,7 @@ from finssim.localization.fusion.attitude import up_of
 from finssim.localization.fusion.estimator import MODELS, Estimator
 from finssim.localization.fusion.fuse_settings import Settings
 from finssim.localization.fusion.position_filter import PositionState
-from finssim.localization.fusion.sensors import SENSORS, Sensor, vision_covariance
+from finssim.localization.fusion.sensors import SENSORS, SensorModel, vision_covariance
 from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
 from localization.fusion.known_streams import (
     QUIET,
@@ -492,7 +492,7 @@ class AltitudeSample:
 @both
 def test_a_new_sensor_is_one_entry_of_the_table(mode, monkeypatch):
     """An instrument that measures the port's height to a millimetre is used, gated and counted by both filters."""
-    entry = Sensor(
+    entry = SensorModel(
         stream="altitude",
         quantity="height",
         reading=lambda sample: (sample.height,),

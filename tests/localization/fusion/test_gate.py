@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.localization.fusion.gates import Gate, GateMemory, due, judge, judge_carried, remember
+from finssim.localization.fusion.gates import GateMemory, OutlierGate, due, judge, judge_carried, remember
 
 
 @pytest.mark.parametrize("dimension", [1, 2, 3])
@@ -11,7 +11,7 @@ from finssim.localization.fusion.gates import Gate, GateMemory, due, judge, judg
 def test_the_limit_passes_its_share(dimension, probability):
     """Squared lengths of standard normal vectors of that dimension are below the limit with that probability."""
     draws = np.random.default_rng(0).standard_normal((200000, dimension))
-    passed = np.mean(np.sum(draws**2, axis=1) <= Gate(probability).limit(dimension))
+    passed = np.mean(np.sum(draws**2, axis=1) <= OutlierGate(probability).limit(dimension))
     assert passed == pytest.approx(probability, abs=4 * np.sqrt(probability * (1 - probability) / 200000))
 
 
@@ -22,8 +22,8 @@ def test_an_outlier_is_what_lies_beyond_the_limit(carried):
     def verdict(distance, dimension):
         memory, R = GateMemory(5), 1e-4 * np.eye(dimension)
         if dimension == 1 and carried:
-            return judge_carried(Gate(), memory, 0.0, 0.03, 1e-4, distance, 0.05)[0]
-        return judge(Gate(), memory, 0.0, np.zeros(dimension), R, distance, 0.3)[0]
+            return judge_carried(OutlierGate(), memory, 0.0, 0.03, 1e-4, distance, 0.05)[0]
+        return judge(OutlierGate(), memory, 0.0, np.zeros(dimension), R, distance, 0.3)[0]
 
     assert [verdict(10.82, 1), verdict(10.84, 1)] == ["accepted", "gate"]
     assert [verdict(13.8, 2), verdict(13.9, 2)] == ["accepted", "gate"]
@@ -40,39 +40,39 @@ def refused(gate, values, period=0.1, variance=1e-4, support=5):
 
 def test_a_run_that_agrees_takes_over_in_time():
     """Refused for a second at 10 Hz, the eleventh measurement ends the run."""
-    assert refused(Gate(), [(5.0, 1.0)] * 11) == ["gate"] * 10 + ["reacquired"]
+    assert refused(OutlierGate(), [(5.0, 1.0)] * 11) == ["gate"] * 10 + ["reacquired"]
 
 
 def test_a_slow_stream_needs_its_number():
     """At 1 Hz five measurements are asked for, not two."""
-    assert refused(Gate(), [(5.0, 1.0)] * 5, period=1.0) == ["gate"] * 4 + ["reacquired"]
+    assert refused(OutlierGate(), [(5.0, 1.0)] * 5, period=1.0) == ["gate"] * 4 + ["reacquired"]
 
 
 def test_scattered_outliers_never_take_over():
     """Measurements that agree with nothing stay refused for ever."""
     values = np.random.default_rng(2).uniform(-50, 50, (200, 2))
-    assert set(refused(Gate(), values)) == {"gate"}
+    assert set(refused(OutlierGate(), values)) == {"gate"}
 
 
 def test_outliers_in_between_do_not_stop_a_run():
     """With every third measurement an outlier, the run still ends in time."""
     values = [(5.0, 1.0) if k % 3 else (np.sin(k) * 40, 30.0) for k in range(1, 20)]
-    assert "reacquired" in refused(Gate(), values)[:13]
+    assert "reacquired" in refused(OutlierGate(), values)[:13]
 
 
 def test_the_run_may_move():
     """A vehicle that drives while it is refused agrees with itself."""
-    assert refused(Gate(), [(5.0 + 0.03 * k, 1.0) for k in range(11)])[-1] == "reacquired"
+    assert refused(OutlierGate(), [(5.0 + 0.03 * k, 1.0) for k in range(11)])[-1] == "reacquired"
 
 
 def test_a_gate_that_never_gives_in():
     """`reacquire_after` of infinity."""
-    assert set(refused(Gate(reacquire_after=np.inf), [(5.0, 1.0)] * 100)) == {"gate"}
+    assert set(refused(OutlierGate(reacquire_after=np.inf), [(5.0, 1.0)] * 100)) == {"gate"}
 
 
 def test_an_accepted_measurement_clears_the_memory():
     """A measurement that passes ends the run."""
-    gate, R = Gate(), np.eye(1)
+    gate, R = OutlierGate(), np.eye(1)
     suspects = remember(None, 0.0, np.ones(1), R, 0.3, gate)
     assert not due(suspects, gate)
     verdict, memory = judge(gate, GateMemory(5, suspects), 0.1, np.ones(1), R, 0.5, 0.3)
@@ -81,6 +81,6 @@ def test_an_accepted_measurement_clears_the_memory():
 
 def test_a_first_measurement_is_outvoted_by_the_next_two():
     """A state started from an outlier is taken over by two that agree, and then stays where five have supported it."""
-    assert refused(Gate(), [(5.0, 1.0)] * 2, support=1) == ["gate", "reacquired"]
-    assert refused(Gate(), [(5.0, 1.0)] * 4, support=3) == ["gate"] * 3 + ["reacquired"]
-    assert refused(Gate(reacquire_after=np.inf), [(5.0, 1.0)] * 9, support=1) == ["gate"] * 9
+    assert refused(OutlierGate(), [(5.0, 1.0)] * 2, support=1) == ["gate", "reacquired"]
+    assert refused(OutlierGate(), [(5.0, 1.0)] * 4, support=3) == ["gate"] * 3 + ["reacquired"]
+    assert refused(OutlierGate(reacquire_after=np.inf), [(5.0, 1.0)] * 9, support=1) == ["gate"] * 9

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from finssim.localization.fusion.position_filter import (
-    Motion,
+    MotionModel,
     PositionState,
     capped,
     frozen,
@@ -16,8 +16,8 @@ from finssim.localization.fusion.position_filter import (
 )
 
 RUNS = 200
-MOTION = Motion(density=(0.05, 0.05, 0.02))
-SLOWING = Motion(density=(0.12, 0.12, 0.12), decay=(0.7, 0.7, 0.0))
+MOTION = MotionModel(density=(0.05, 0.05, 0.02))
+SLOWING = MotionModel(density=(0.12, 0.12, 0.12), decay=(0.7, 0.7, 0.0))
 VISION, DEPTH = np.eye(6)[:2], np.eye(6)[2:3]
 
 
@@ -49,7 +49,7 @@ def test_process_noise_is_the_integral_of_white_acceleration():
     steps = rng.standard_normal((20000, n)) * np.sqrt(q * dt / n)
     v = np.cumsum(steps, axis=1)
     p = v.sum(axis=1) * dt / n
-    Q = process_noise(dt, Motion(density=(q, q, q)))
+    Q = process_noise(dt, MotionModel(density=(q, q, q)))
     measured = np.cov(np.stack([p, v[:, -1]]))
     np.testing.assert_allclose(measured, Q[np.ix_([0, 3], [0, 3])], rtol=0.05)
 
@@ -57,7 +57,7 @@ def test_process_noise_is_the_integral_of_white_acceleration():
 @pytest.mark.parametrize("dt", [1e-9, 1e-5, 1e-3, 0.1, 10.0])
 def test_slow_decay_ends_in_none(dt):
     """As the decay goes to zero, step and noise become those of constant velocity."""
-    nearly = Motion(density=MOTION.density, decay=(1e-7,) * 3)
+    nearly = MotionModel(density=MOTION.density, decay=(1e-7,) * 3)
     np.testing.assert_allclose(process_noise(dt, nearly), process_noise(dt, MOTION), rtol=1e-4)
     np.testing.assert_allclose(transition(dt, nearly), transition(dt, MOTION), rtol=1e-5)
 

@@ -10,10 +10,10 @@ from scipy.ndimage import map_coordinates
 
 from finssim.core.optics import Camera, Interface, Lens, project
 from finssim.core.rotations import matrix_to_quat, quat_from_euler, quat_rotate
-from finssim.sim.overhead_camera import Basin, Pose, Scene, Sensor, TagInScene, Water
+from finssim.sim.overhead_camera import ImageSensor, ObjectPose, Scene, TagInScene, TiledBasin, WaterOptics
 
 LENS = Lens(320, 240, 200.0, 201.0, 161.3, 118.2)
-CLEAR = Water(attenuation=(0.0, 0.0, 0.0))
+CLEAR = WaterOptics(attenuation=(0.0, 0.0, 0.0))
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 """Optical axes of a camera that looks straight down, pool frame."""
 
@@ -34,7 +34,7 @@ def square(
         bitmap=np.zeros((8, 8), bool),
         edge=edge,
         margin=edge / 3,
-        pose=Pose(position=(x, y, z), orientation=q),
+        pose=ObjectPose(position=(x, y, z), orientation=q),
         **more,
     )
 
@@ -44,10 +44,10 @@ def pool(**changes: Any) -> Scene:
     parts: dict[str, Any] = {
         "camera": camera_at(),
         "interface": Interface.water(1.0),
-        "basin": Basin(lower=(-4.0, -4.0, 0.0), upper=(4.0, 4.0, 3.0), tile=0.0),
+        "basin": TiledBasin(lower=(-4.0, -4.0, 0.0), upper=(4.0, 4.0, 3.0), tile=0.0),
         "water": CLEAR,
         "sky": 0.0,
-        "sensor": Sensor(noise=False),
+        "sensor": ImageSensor(noise=False),
     }
     return Scene(**{**parts, **changes})
 

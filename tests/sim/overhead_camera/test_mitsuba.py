@@ -10,7 +10,7 @@ import pytest
 from finssim.core.optics import Camera, Interface, Layer, Lens, project
 from finssim.localization.detection.detector import detector
 from finssim.localization.detection.families import bitmap
-from finssim.sim.overhead_camera import OverheadCamera, Pose, Ripples, Sensor, TagInScene
+from finssim.sim.overhead_camera import ImageSensor, ObjectPose, OverheadCamera, Ripples, TagInScene
 from finssim.sim.sensors import SensorError
 
 pytest.importorskip("mitsuba")
@@ -38,10 +38,10 @@ def scene_of(pool, water, distortion=()):
         bitmap=bitmap("tag36h11", 5),
         edge=0.16,
         margin=0.03,
-        pose=Pose(position=(1.25, 0.75, 0.05), orientation=(0.0, 0.0, np.sin(0.2), np.cos(0.2))),
+        pose=ObjectPose(position=(1.25, 0.75, 0.05), orientation=(0.0, 0.0, np.sin(0.2), np.cos(0.2))),
     )
     camera = Camera(lens, POSITION, ORIENTATION / np.linalg.norm(ORIENTATION))
-    return pool(camera=camera, tags=(tag,), samples=4, sensor=Sensor(noise=False), **water)
+    return pool(camera=camera, tags=(tag,), samples=4, sensor=ImageSensor(noise=False), **water)
 
 
 def detected(image, rectangle):
@@ -73,7 +73,7 @@ def test_corners_agree_with_mitsuba(pool, water, distortion):
 def test_brightness_agrees_with_mitsuba(pool):
     """Paper, print and floor have the same brightness in both pictures, Fresnel's losses included."""
     tag = TagInScene(
-        bitmap=np.eye(4, dtype=bool), edge=0.2, margin=0.05, pose=Pose(position=(0.2, 0.1, 0.26))
+        bitmap=np.eye(4, dtype=bool), edge=0.2, margin=0.05, pose=ObjectPose(position=(0.2, 0.1, 0.26))
     )
     scene = replace(scene_of(pool, WATER["level"]), tags=(tag,), sky=0.3)
     camera = OverheadCamera(scene)
@@ -93,6 +93,6 @@ def test_mitsuba_draws_several_regions_and_nothing_else(pool):
     for left, top, right, bottom in regions:
         assert (image[top:bottom, left:right] > 100).all()
     assert (image > 0).sum() == 4 * 3 + 3 * 6
-    moving = replace(scene.tags[0], end=Pose(position=(1.0, 0.0, 0.1)))
+    moving = replace(scene.tags[0], end=ObjectPose(position=(1.0, 0.0, 0.1)))
     with pytest.raises(SensorError, match="at rest"):
         render_with_mitsuba(replace(scene, tags=(moving,)), region=regions[0])

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from finssim.core.optics import Camera, Interface, Layer
-from finssim.sim.overhead_camera import Basin, OverheadCamera, Sensor, Water
+from finssim.sim.overhead_camera import ImageSensor, OverheadCamera, TiledBasin, WaterOptics
 from finssim.sim.overhead_camera.photometry import fresnel, noise_key
 
 AIR = 1.0003
@@ -31,8 +31,8 @@ def middle(scene):
 def test_light_decays_exponentially_along_its_way(pool):
     """On a uniform floor, L = T (L0 exp(-c s) + B (1 - exp(-c s))) with s the slanted way through the water."""
     c, veil, floor = np.array([0.4, 0.1, 0.05]), np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.6, 0.7])
-    basin = Basin(lower=(-9, -9, 0), upper=(9, 9, 3), tile=0.0, colour=tuple(floor))
-    water = Water(attenuation=tuple(c), veil=tuple(veil))
+    basin = TiledBasin(lower=(-9, -9, 0), upper=(9, 9, 3), tile=0.0, colour=tuple(floor))
+    water = WaterOptics(attenuation=tuple(c), veil=tuple(veil))
     flat = Interface.water(1.0, n_air=1.0, n_water=1.0)  # no bending, no Fresnel: the way alone counts
     scene = pool(basin=basin, water=water, interface=flat)
     image = OverheadCamera(scene).radiance()
@@ -46,7 +46,7 @@ def test_light_decays_exponentially_along_its_way(pool):
 
 def test_a_surface_mirrors_what_fresnel_says(pool):
     """At normal incidence a black pool shows ((n1 - n2) / (n1 + n2))² of the sky."""
-    black = Basin(lower=(-9, -9, 0), upper=(9, 9, 3), tile=0.0, colour=(0, 0, 0))
+    black = TiledBasin(lower=(-9, -9, 0), upper=(9, 9, 3), tile=0.0, colour=(0, 0, 0))
     for n in (1.1, 1.333, 1.5):
         scene = overhead(pool, basin=black, interface=Interface.water(1.0, n_air=AIR, n_water=n), sky=1.0)
         assert middle(scene) == pytest.approx(((AIR - n) / (AIR + n)) ** 2, rel=1e-3)
@@ -80,8 +80,8 @@ def test_fresnel_at_its_landmarks():
 @pytest.mark.parametrize("gain", [0.05, 0.3, 0.9])
 def test_noise_follows_the_photon_transfer_line(pool, gain):
     """The variance of the charge is its mean plus the square of the read noise, and 1/12 of a count squared."""
-    sensor = Sensor(gain=gain, full_well=2000.0, read_noise=12.0, colour=True)
-    white = Basin(lower=(-9, -9, 0), upper=(9, 9, 3), tile=0.0, colour=(0.5, 0.5, 0.5))
+    sensor = ImageSensor(gain=gain, full_well=2000.0, read_noise=12.0, colour=True)
+    white = TiledBasin(lower=(-9, -9, 0), upper=(9, 9, 3), tile=0.0, colour=(0.5, 0.5, 0.5))
     equal = Interface.water(1.0, n_air=1.0, n_water=1.0)
     image = OverheadCamera(pool(sensor=sensor, basin=white, interface=equal)).render(seed=3)
     mean = gain * 0.5 * 2000.0
@@ -95,11 +95,11 @@ def test_noise_follows_the_photon_transfer_line(pool, gain):
 
 def test_gamma_encodes_the_charge(pool):
     """A number is 255 (charge / full scale)^(1/gamma)."""
-    plain = Basin(lower=(-9, -9, 0), upper=(9, 9, 3), tile=0.0, colour=(0.4, 0.4, 0.4))
+    plain = TiledBasin(lower=(-9, -9, 0), upper=(9, 9, 3), tile=0.0, colour=(0.4, 0.4, 0.4))
     equal = Interface.water(1.0, n_air=1.0, n_water=1.0)
     for gamma in (1.0, 2.2):
         scene = pool(
-            basin=plain, interface=equal, sensor=Sensor(gain=0.5, gamma=gamma, noise=False, colour=True)
+            basin=plain, interface=equal, sensor=ImageSensor(gain=0.5, gamma=gamma, noise=False, colour=True)
         )
         assert (OverheadCamera(scene).render() == round(255 * 0.2 ** (1 / gamma))).all()
 

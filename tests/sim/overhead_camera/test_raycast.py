@@ -9,7 +9,7 @@ import pytest
 
 from finssim.core.optics import Camera, Interface, Layer, Lens, project
 from finssim.core.rotations import matrix_to_quat
-from finssim.sim.overhead_camera import Basin, OverheadCamera, Pose, TagInScene
+from finssim.sim.overhead_camera import ObjectPose, OverheadCamera, TagInScene, TiledBasin
 
 LENSES = {
     "pinhole": Lens(320, 240, 200.0, 201.0, 161.3, 118.2),
@@ -66,10 +66,10 @@ def test_a_wall_of_glass_is_an_interface_too(pool, square, edge_offsets):
     R = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # optical z along pool x
     camera = Camera(LENSES["pinhole"], np.array([-0.5, 0.0, 0.5]), matrix_to_quat(R))
     wall = Interface.through([0.0, 0.0, 0.0], [-1.0, 0.0, 0.0], window=(Layer(0.012, 1.52),))
-    basin = Basin(lower=(-0.01, -1.0, 0.0), upper=(1.5, 1.0, 1.0), tile=0.0)
+    basin = TiledBasin(lower=(-0.01, -1.0, 0.0), upper=(1.5, 1.0, 1.0), tile=0.0)
     scene = pool(camera=camera, interface=wall, basin=basin, samples=4)
     tag = square(0.6, 0.1, 0.5, edge=0.25)
-    turned = replace(tag, pose=Pose(position=(0.6, 0.1, 0.5), orientation=(0.5, -0.5, -0.5, 0.5)))
+    turned = replace(tag, pose=ObjectPose(position=(0.6, 0.1, 0.5), orientation=(0.5, -0.5, -0.5, 0.5)))
     offsets = shown(scene, turned, edge_offsets)
     assert np.abs(offsets.mean(axis=1)).max() < 0.02
 
@@ -104,7 +104,7 @@ def test_the_print_reads_as_printed(pool, camera_at):
     """Row 0 of the bitmap is at the tag's +y and column 0 at its -x: an L keeps its shape seen from above."""
     bitmap = np.zeros((4, 4), bool)
     bitmap[0, 0] = bitmap[1, 0] = bitmap[2, 0] = bitmap[2, 1] = True
-    tag = TagInScene(bitmap=bitmap, edge=0.4, pose=Pose(position=(0.1, 0.0, 0.2)))
+    tag = TagInScene(bitmap=bitmap, edge=0.4, pose=ObjectPose(position=(0.1, 0.0, 0.2)))
     scene = pool(tags=(tag,))
     image = OverheadCamera(scene).radiance()[..., 0]
     for row in range(4):

@@ -10,7 +10,14 @@ import warp as wp
 
 from finssim.core.optics import Camera
 from finssim.core.rotations import matrix_to_quat, quat_to_matrix
-from finssim.sim.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Sensor, TagInScene
+from finssim.sim.overhead_camera import (
+    ImageSensor,
+    ObjectPose,
+    OverheadCamera,
+    Ripples,
+    TagInScene,
+    TiledBasin,
+)
 from finssim.sim.sensors import SensorError
 
 
@@ -19,7 +26,7 @@ def lively(pool, square, **changes):
     scene = pool(
         tags=(square(-0.5, 0.3, edge=0.2),),
         ripples=Ripples(rms_slope=0.03, seed=1),
-        **{"sensor": Sensor(shutter=0.005), **changes},
+        **{"sensor": ImageSensor(shutter=0.005), **changes},
     )
     return scene, square(0.2, 0.1, edge=0.2)
 
@@ -27,7 +34,7 @@ def lively(pool, square, **changes):
 @pytest.mark.parametrize("colour", [False, True])
 def test_a_region_shows_what_the_complete_picture_shows(pool, square, colour):
     """Inside it the bytes are those of the complete picture, outside they are the background's."""
-    scene, tag = lively(pool, square, sensor=Sensor(colour=colour))
+    scene, tag = lively(pool, square, sensor=ImageSensor(colour=colour))
     camera = OverheadCamera(scene)
     background = camera.render(region=(0, 0, 0, 0), time=0.2, seed=1)
     complete = camera.render(tags=(tag,), time=0.4, seed=7)
@@ -43,9 +50,9 @@ def test_a_region_shows_what_the_complete_picture_shows(pool, square, colour):
 def test_the_neighbourhood_holds_all_that_moving_tags_change(pool, square):
     """Without noise and ripples, drawing around the tags alone gives the complete picture."""
     scene, tag = lively(pool, square)
-    camera = OverheadCamera(replace(scene, ripples=None, sensor=Sensor(noise=False)))
+    camera = OverheadCamera(replace(scene, ripples=None, sensor=ImageSensor(noise=False)))
     for position in ((0.2, 0.1, 0.3), (-0.1, -0.2, 0.5)):
-        tags = (replace(tag, pose=Pose(position=position)),)
+        tags = (replace(tag, pose=ObjectPose(position=position)),)
         np.testing.assert_array_equal(camera.render(region="tags", tags=tags), camera.render(tags=tags))
 
 
@@ -54,7 +61,7 @@ def test_the_neighbourhood_has_room_for_ripples(pool, square, seed):
     """No ripple moves a tag out of its rectangle: outside, the picture is the same with the tag and without."""
     ripples = Ripples(rms_slope=0.08, seed=seed, wavelengths=(0.3, 1.5))
     tag = square(0.4, 0.2, z=0.05, edge=0.2)
-    camera = OverheadCamera(pool(ripples=ripples, sensor=Sensor(noise=False)))
+    camera = OverheadCamera(pool(ripples=ripples, sensor=ImageSensor(noise=False)))
     differs = camera.render(tags=(tag,), time=1.0) != camera.render(time=1.0)
     for left, top, right, bottom in camera.neighbourhood((tag,)):
         differs[top:bottom, left:right] = False
@@ -126,7 +133,7 @@ def test_a_turning_tag_takes_the_short_way(pool, square):
     """Half-way through a turn given by opposite quaternions the tag still faces the camera."""
     tag = square(0.1, 0.0, yaw=0.1)
     q = tag.pose.orientation
-    turned = replace(tag, end=Pose(position=tag.pose.position, orientation=tuple(-x for x in q)))
+    turned = replace(tag, end=ObjectPose(position=tag.pose.position, orientation=tuple(-x for x in q)))
     pair = [OverheadCamera(pool(tags=(t,), samples=4)).radiance() for t in (tag, turned)]
     np.testing.assert_allclose(pair[0], pair[1], atol=1e-5)
 
@@ -134,9 +141,9 @@ def test_a_turning_tag_takes_the_short_way(pool, square):
 def test_a_wide_spot_softens_edges_in_place(pool, square, edge_offsets):
     """A lens that spreads each point over 2 px leaves sides where they were."""
     tag = square(0.15, 0.1)
-    scene = pool(tags=(tag,), samples=4, sensor=Sensor(spot=2.0, noise=False))
+    scene = pool(tags=(tag,), samples=4, sensor=ImageSensor(spot=2.0, noise=False))
     image = OverheadCamera(scene).radiance()
-    sharp = OverheadCamera(replace(scene, sensor=Sensor(noise=False))).radiance()
+    sharp = OverheadCamera(replace(scene, sensor=ImageSensor(noise=False))).radiance()
     assert np.abs(edge_offsets(image, scene.camera, scene.interface, tag).mean(axis=1)).max() < 0.015
     assert (np.diff(image[..., 1]) ** 2).sum() < 0.75 * (np.diff(sharp[..., 1]) ** 2).sum()
 
@@ -148,11 +155,11 @@ def test_what_cannot_be_drawn_is_refused(pool, square):
     with pytest.raises(SensorError, match="behind the interface"):
         OverheadCamera(below)
     with pytest.raises(SensorError, match="bitmap has shape"):
-        TagInScene(bitmap=np.zeros((4, 5), bool), edge=0.1, pose=Pose(position=(0, 0, 0)))
+        TagInScene(bitmap=np.zeros((4, 5), bool), edge=0.1, pose=ObjectPose(position=(0, 0, 0)))
     with pytest.raises(SensorError, match="left, top, right, bottom"):
         OverheadCamera(scene).render(region=(1, 2, 3))
     with pytest.raises(SensorError, match="unit quaternion"):
-        Pose(position=(0, 0, 0), orientation=(0, 0, 0, 2))
+        ObjectPose(position=(0, 0, 0), orientation=(0, 0, 0, 2))
 
 
 @pytest.mark.parametrize(
@@ -161,13 +168,13 @@ def test_what_cannot_be_drawn_is_refused(pool, square):
 def test_the_pool_frame_is_a_matter_of_taste(pool, square, R):
     """The same scene written in axes with z down, or y up, gives the same picture."""
     scene = pool(
-        basin=Basin(lower=(-0.9, -0.8, 0.0), upper=(0.9, 0.8, 1.5), tile=0.0),
+        basin=TiledBasin(lower=(-0.9, -0.8, 0.0), upper=(0.9, 0.8, 1.5), tile=0.0),
         tags=(square(0.2, 0.1, edge=0.2),),
     )
 
     def turned(thing):
         q = tuple(matrix_to_quat(R @ quat_to_matrix(thing.pose.orientation)).tolist())
-        return replace(thing, pose=Pose(position=tuple(R @ thing.pose.position), orientation=q))
+        return replace(thing, pose=ObjectPose(position=tuple(R @ thing.pose.position), orientation=q))
 
     camera, corners = scene.camera, R @ np.array([scene.basin.lower, scene.basin.upper]).T
     other = replace(

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from finssim.core.optics import Interface, Layer, project
-from finssim.sim.overhead_camera import OverheadCamera, Ripples, Sensor
+from finssim.sim.overhead_camera import ImageSensor, OverheadCamera, Ripples
 from finssim.sim.overhead_camera.surface import (
     SURFACE_TENSION,
-    Wave,
+    SurfaceWave,
     dispersion,
     pack_waves,
     surface_hit,
@@ -55,7 +55,10 @@ def test_waves_run_at_the_speed_of_gravity_and_tension():
 
 @wp.kernel
 def hits(
-    waves: wp.array(dtype=Wave), height: float, rays: wp.array(dtype=wp.vec3), found: wp.array(dtype=wp.vec3)
+    waves: wp.array(dtype=SurfaceWave),
+    height: float,
+    rays: wp.array(dtype=wp.vec3),
+    found: wp.array(dtype=wp.vec3),
 ):
     i = wp.tid()
     p = surface_hit(waves, height, rays[i])
@@ -68,7 +71,7 @@ def test_rays_meet_the_surface_where_it_is():
     rng = np.random.default_rng(1)
     angle, around = rng.uniform(0, math.radians(55), 500), rng.uniform(0, 2 * math.pi, 500)
     rays = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), -np.cos(angle)], axis=-1)
-    waves = wp.array(pack_waves(surface, [0.4, -0.2], 0.7), dtype=Wave, device="cpu")
+    waves = wp.array(pack_waves(surface, [0.4, -0.2], 0.7), dtype=SurfaceWave, device="cpu")
     found = wp.zeros(500, dtype=wp.vec3, device="cpu")
     wp.launch(
         hits, dim=500, inputs=[waves, 1.2, wp.array(rays, dtype=wp.vec3, device="cpu"), found], device="cpu"
@@ -120,7 +123,7 @@ def test_a_moving_surface_blurs(pool, square):
     """With a long exposure the ripples' motion softens the tag's sides."""
     scene = pool(tags=(square(0.2, 0.1),), ripples=Ripples(rms_slope=0.06, seed=1), samples=8)
     sharp = OverheadCamera(scene).radiance(time=0.5)[..., 1]
-    slow = replace(scene, sensor=Sensor(shutter=0.08, noise=False))
+    slow = replace(scene, sensor=ImageSensor(shutter=0.08, noise=False))
     soft = OverheadCamera(slow).radiance(time=0.5)[..., 1]
     steepness = [(np.diff(image, axis=1) ** 2).sum() for image in (sharp, soft)]
     assert steepness[1] < 0.9 * steepness[0]

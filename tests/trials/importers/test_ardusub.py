@@ -10,7 +10,7 @@ from finssim.core.frames import FROM_FOSSEN
 from finssim.core.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.trials.findings import CalibrationError
 from finssim.trials.importers import import_trials
-from finssim.trials.importers.ardusub import Log, velocity_stream
+from finssim.trials.importers.ardusub import ArduPilotLog, velocity_stream
 from finssim.trials.importers.ardusub_outputs import outputs_of
 from finssim.trials.importers.dispatch import read_trials
 from finssim.trials.trial_files import load_trial
@@ -186,7 +186,7 @@ def test_a_passive_trial_needs_no_outputs(tmp_path):
 def test_position_deltas_become_body_velocity():
     """A DVL that reports 5 cm forward, 2 cm right and 1 cm down in 0.1 s: u = 0.5, v = -0.2, w = -0.1 m/s."""
     deltas = [{"dt": 0.1, "PosDX": 0.05, "PosDY": 0.02, "PosDZ": 0.01}] * 5
-    log = Log("x.BIN", False, {"VISO": np.arange(5) * 0.1}, {"VISO": deltas})
+    log = ArduPilotLog("x.BIN", False, {"VISO": np.arange(5) * 0.1}, {"VISO": deltas})
     stream = velocity_stream(log, "auto")
     for column, expected in (("u", 0.5), ("v", -0.2), ("w", -0.1)):
         np.testing.assert_allclose(stream.channels[column], expected)

@@ -64,7 +64,7 @@ _THINNEST = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
-class Stack:
+class LayerRays:
     """The solution: thicknesses, indices, and the ray through them."""
 
     thickness: list[Array | float]
@@ -123,7 +123,7 @@ class StackDerivatives:
     """Derivative with respect to the refractive index beyond the far face [1/m]."""
 
 
-def solve_stack(r2: Array, thickness: Sequence[Array | float], index: list[float]) -> Stack:
+def solve_stack(r2: Array, thickness: Sequence[Array | float], index: list[float]) -> LayerRays:
     """Find the ray that crosses all layers and moves sideways by r in all.
 
     Args:
@@ -151,7 +151,7 @@ def solve_stack(r2: Array, thickness: Sequence[Array | float], index: list[float
         # The error after a step is at most 1.5 times the square of the step: nothing is left to gain.
         if not (np.abs(step) > 3e-8 * g).any():
             break
-    return Stack(layers, index, r2, g)
+    return LayerRays(layers, index, r2, g)
 
 
 Array = npt.NDArray[np.float64]
@@ -180,7 +180,7 @@ class Refraction:
     """Point minus camera, without its part along the normal, pool frame [m], (..., 3)."""
     height: float
     """Distance of the camera from the near face [m]."""
-    stack: Stack
+    stack: LayerRays
     slope: Array
     """k: tangent of the incidence angle over |across| [1/m], (...)."""
     direction: Array

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
-    from finssim.extensions.perception.delivery import Delivery
+    from finssim.extensions.perception.delivery import DelayedSensor
     from finssim.extensions.perception.description import World, WorldError, load_world, sites
     from finssim.extensions.perception.layout import WorldLayout
     from finssim.extensions.perception.model import WorldBatch
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CameraBatch",
-    "Delivery",
+    "DelayedSensor",
     "DopplerBatch",
     "Headlight",
     "RangeBatch",

@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 import warp as wp
 
 from finssim.extensions.perception.seeing import SeeingTask
-from finssim.sim import Dock, Pool
+from finssim.sim import Dock, RectangularPool
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.docking import OBSERVATION, Docking, Hull, start
+from finssim.tasks.docking import OBSERVATION, Docking, HullNumbers, start
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.terms import ObservationPart, Terms
 from finssim.vehicles import Vehicle
@@ -59,7 +59,7 @@ class CameraDocking(SeeingTask, Docking):
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "CameraDocking":
         """For the vehicle, if it fits into the dock."""
-        fitted = replace(self, hull=Hull.of(vehicles[0]))
+        fitted = replace(self, hull=HullNumbers.of(vehicles[0]))
         if fitted.hull.girth > 0.95 * THROAT:
             raise EnvironmentSetupError(
                 f"vehicle '{vehicles[0].name}' is {2.0 * fitted.hull.girth:.2f} m across its corners, and the dock of "
@@ -74,7 +74,7 @@ class CameraDocking(SeeingTask, Docking):
             mouth_radius=MOUTH, throat_radius=THROAT, cone_length=CONE, tube_length=TUBE, rim=0.06,
         )  # fmt: skip
 
-    def arena(self) -> Pool:
+    def arena(self) -> RectangularPool:
         """Up to the quay and the bottom; without the world, where the dock looks any way, as wide as long."""
         return replace(Docking.arena(self), length=24.0, width=7.8 if self.placed else 24.0, depth=4.95)
 

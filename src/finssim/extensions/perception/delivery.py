@@ -89,7 +89,7 @@ def _pass_on(
             reading[view, k] = ring[view, slot, k]
 
 
-class Delivery:
+class DelayedSensor:
     """A sensor that measures at its own rate, whose readings arrive late or not at all.
 
         camera = Delivery(CameraBatch(batch, device), control_step=0.1, rate=5.0, latency=0.2, loss=0.02)

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from finssim.extensions.perception.onlooker import Onlooker
     from finssim.extensions.perception.parts import ModelPart
     from finssim.extensions.perception.sight import Sight
-    from finssim.sim.overhead_camera import Water
+    from finssim.sim.overhead_camera import WaterOptics
     from finssim.sim.simulator import Simulator
     from finssim.tasks.arrays import TaskArrays
     from finssim.tasks.environment import Environment
@@ -218,7 +218,7 @@ class Object(Finish):
         return self.position + np.arange(self.repeat.count)[:, None] * self.repeat.step
 
 
-class Basin(Finish):
+class WorldBasin(Finish):
     """A rectangular tank: floor and four walls that reach above the water, centred on the world's z axis."""
 
     size: Positive3
@@ -329,11 +329,11 @@ class WorldWater(Part):
         return self
 
     @property
-    def optical(self) -> Water:
+    def optical(self) -> WaterOptics:
         """Return the water in the form of the overhead camera."""
-        from finssim.sim.overhead_camera import Water  # which imports Warp
+        from finssim.sim.overhead_camera import WaterOptics  # which imports Warp
 
-        return Water(attenuation=_triple(self.attenuation), veil=_triple(self.veil))
+        return WaterOptics(attenuation=_triple(self.attenuation), veil=_triple(self.veil))
 
     @property
     def sound_speed(self) -> float:
@@ -439,7 +439,7 @@ class World(Part):
     """One line for lists."""
     water: WorldWater
     light: Light = Field(default_factory=lambda: Light())
-    basin: Basin | None = None
+    basin: WorldBasin | None = None
     seabed: Seabed | None = None
     objects: dict[str, Object] = Field(default_factory=dict)
     contact: Contact = Field(default_factory=lambda: Contact())

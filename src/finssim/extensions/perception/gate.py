@@ -11,7 +11,7 @@ from finssim.extensions.perception.seeing import SeeingTask
 from finssim.physics.solids import box_distance
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.docking import Hull
+from finssim.tasks.docking import HullNumbers
 from finssim.tasks.terms import (
     End,
     ObservationPart,
@@ -152,7 +152,7 @@ class Gate(SeeingTask):
     world: str = "gate"
     time_limit: float = 25.0
     """Length of an episode [s]."""
-    hull: Hull = Hull()
+    hull: HullNumbers = HullNumbers()
     """Hull of the vehicle; the environment sets it, ..."""
     half: tuple[float, float, float] = (0.28, 0.19, 0.15)
     """... and half the extents of its envelope, which the body origin is the middle of as in contacts [m]."""
@@ -171,7 +171,7 @@ class Gate(SeeingTask):
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Gate":
         """Return the task with the envelope of the vehicle."""
         length, width, height = (0.5 * float(x) for x in vehicles[0].body.size)
-        return replace(self, hull=Hull.of(vehicles[0]), half=(length, width, height))
+        return replace(self, hull=HullNumbers.of(vehicles[0]), half=(length, width, height))
 
     @property
     def cruise(self) -> float:

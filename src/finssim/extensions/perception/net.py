@@ -13,7 +13,7 @@ from finssim.extensions.perception.seeing import SeeingTask, up
 from finssim.physics.types import vec6
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.picture import Picture
+from finssim.tasks.picture import ObservedPicture
 from finssim.tasks.terms import (
     End,
     ObservationPart,
@@ -244,7 +244,7 @@ class Net(SeeingTask):
         ),
     )
     world: str = "net"
-    pictures: tuple[Picture, ...] = (Picture("sonar", bins=48),)
+    pictures: tuple[ObservedPicture, ...] = (ObservedPicture("sonar", bins=48),)
     time_limit: float = 36.0
     half: tuple[float, float, float] = (0.28, 0.19, 0.15)
     """Half the extents of the vehicle's envelope [m]; the environment sets them."""

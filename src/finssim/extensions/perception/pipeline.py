@@ -13,7 +13,7 @@ from finssim.extensions.perception.description import load_world
 from finssim.extensions.perception.seeing import SeeingTask, up
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.docking import Hull
+from finssim.tasks.docking import HullNumbers
 from finssim.tasks.terms import (
     End,
     ObservationPart,
@@ -164,7 +164,7 @@ class Pipeline(SeeingTask):
     world: str = "pipeline"
     time_limit: float = 45.0
     """Length of an episode [s]."""
-    hull: Hull = Hull()
+    hull: HullNumbers = HullNumbers()
     """Hull of the vehicle; the environment sets it."""
     height: float = 0.9
     """Height of the body origin above the pipe's axis [m]."""
@@ -188,7 +188,7 @@ class Pipeline(SeeingTask):
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Pipeline":
         """Return the task with the speed of the vehicle."""
-        return replace(self, hull=Hull.of(vehicles[0]))
+        return replace(self, hull=HullNumbers.of(vehicles[0]))
 
     @property
     def cruise(self) -> float:

@@ -6,10 +6,10 @@ from typing import ClassVar
 
 import warp as wp
 
-from finssim.sim import Pool
+from finssim.sim import RectangularPool
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.measurement import TRAINING, MeasurementNoise
-from finssim.tasks.picture import Picture
+from finssim.tasks.picture import ObservedPicture
 from finssim.tasks.task import Task
 from finssim.tasks.terms import ObservationPart, own_velocity
 
@@ -37,7 +37,7 @@ class SeeingTask(Task):
 
     needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     observation: tuple[ObservationPart, ...] = OWN
-    pictures: tuple[Picture, ...] = (Picture("front_camera", 48),)
+    pictures: tuple[ObservedPicture, ...] = (ObservedPicture("front_camera", 48),)
     held_out: bool = False
     """Draw the looks of the site that are held out of training."""
     tilt: float = math.radians(4.0)
@@ -49,6 +49,6 @@ class SeeingTask(Task):
         """Return whether a world gives the place of the observed object; without one it is drawn."""
         return bool(self.world)
 
-    def arena(self) -> Pool | None:
+    def arena(self) -> RectangularPool | None:
         """Open water: an episode ends before floor and walls."""
         return None

@@ -28,7 +28,7 @@ from finssim.physics.types import angular, linear, vec6
 from finssim.sim.overhead_camera.photometry import fresnel, noise_key, refracted, through_water
 from finssim.sim.sensors.dvl import sensed_velocity
 from finssim.vehicles import Vehicle
-from finssim.vehicles.device_files import CameraDevice, Mount, RangeDevice, SonarDevice, device_of
+from finssim.vehicles.device_files import CameraDevice, DeviceMount, RangeDevice, SonarDevice, device_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -109,7 +109,7 @@ class RayBatch:
     reading: wp.array
     """Result of `update` in the unit of the sensor; one row for each vehicle."""
 
-    def __init__(self, batch: WorldBatch, rays: np.ndarray, mount: Mount, vehicles: int = 1) -> None:
+    def __init__(self, batch: WorldBatch, rays: np.ndarray, mount: DeviceMount, vehicles: int = 1) -> None:
         self.batch, self.device, self.count = batch, batch.device, batch.worlds * vehicles
         shape = (self.count, *rays.shape[:2])
         with wp.ScopedDevice(self.device):
@@ -1108,7 +1108,7 @@ class SonarBatch(RayBatch):
                 self._pattern = wp.array(np.float32(np.sqrt(two_way)), dtype=float)
                 self._image_weight = wp.array(np.float32(self._reflected**2 * two_way * solid), dtype=float)
                 self._images = wp.zeros(self.count, dtype=wp.transform)
-            self._image = RayBatch(batch, rays * [1.0, -1.0, 1.0], Mount(), vehicles)
+            self._image = RayBatch(batch, rays * [1.0, -1.0, 1.0], DeviceMount(), vehicles)
 
     @property
     def bin_length(self) -> float:

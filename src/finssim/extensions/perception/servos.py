@@ -307,7 +307,7 @@ class LineFollower(DriveBaseline):
 # Along a net the classical way: straight sides through the loudest echoes, and the altimeter for the height.
 
 
-class Side(NamedTuple):
+class NetSide(NamedTuple):
     """A straight side of a net, as a ping shows it, in the plane of the body's x and y axes."""
 
     angle: Array
@@ -326,7 +326,7 @@ class Side(NamedTuple):
         c, s = np.cos(self.angle), np.sin(self.angle)
         return np.column_stack([self.distance * c - along * s, self.distance * s + along * c])
 
-    def meets(self, other: Side, reach: float) -> Mask:
+    def meets(self, other: NetSide, reach: float) -> Mask:
         """Return whether the two lines cross within a distance beyond an end of each [m], at 3° to 40°, (n,)."""
         turn = other.angle - self.angle
         sine = np.where(np.abs(turn) < 0.05, 1.0, np.sin(turn))
@@ -455,7 +455,7 @@ class WallFollower(DriveBaseline):
             point = np.where(use[:, None], other.nearest, point)
         return point, found
 
-    def side(self, x: Array, y: Array, weight: Array) -> tuple[Side, Mask]:
+    def side(self, x: Array, y: Array, weight: Array) -> tuple[NetSide, Mask]:
         """The straight side on which the greatest weight lies, and which points lie on it.
 
         Args:
@@ -487,4 +487,4 @@ class WallFollower(DriveBaseline):
         along = y * np.cos(angle)[:, None] - x * np.sin(angle)[:, None]
         right = np.sort(np.where(on, along, np.inf), 1)[:, 3]  # not the last: one fish may lie on the line
         left = -np.sort(np.where(on, -along, np.inf), 1)[:, 3]
-        return Side(angle, distance, right, left), on
+        return NetSide(angle, distance, right, left), on

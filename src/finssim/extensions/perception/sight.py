@@ -140,10 +140,10 @@ class Sight:
         self._episodes = np.zeros(simulator.worlds, np.int64)
 
     def _delivered(self, name: str, sensor: Any) -> Any:
-        from finssim.extensions.perception import Delivery
+        from finssim.extensions.perception import DelayedSensor
 
         entry = self._vehicle.perception[name]
-        return Delivery(
+        return DelayedSensor(
             sensor, control_step=self._task.control_step, rate=entry.rate, latency=entry.latency, loss=entry.dropout,
             seed=self.seed,
         )  # fmt: skip

@@ -524,7 +524,7 @@ HEADER = b"\x00\x01\x00\x00"
 """Encapsulation: plain CDR, little endian."""
 
 
-class Service:
+class ServiceType:
     """A service type, as rclpy has it: two messages under one name."""
 
     TYPE: str
@@ -542,7 +542,7 @@ class Codec:
     def __init__(self, distro: str) -> None:
         self.definitions = Definitions(distro)
         self._classes: dict[str, type[Message]] = {}
-        self._services: dict[str, type[Service]] = {}
+        self._services: dict[str, type[ServiceType]] = {}
 
     def message(self, name: str) -> type[Message]:
         """Class of a message, named as `nav_msgs/msg/Odometry`.
@@ -558,7 +558,7 @@ class Codec:
             store.cache[name] = replace(store.cache[name], cls=make)  # type: ignore[arg-type]
         return self._classes[name]
 
-    def service(self, name: str) -> type[Service]:
+    def service(self, name: str) -> type[ServiceType]:
         """Class of a service, named as `std_srvs/srv/Trigger`.
 
         Raises:
@@ -572,7 +572,7 @@ class Codec:
             halves = {h: self.message(f"{name}_{h}") for h in ("Request", "Response")}
             package, kind, short = name.split("/")
             body = {"TYPE": name, "__module__": f"{package}.{kind}", **halves}
-            self._services[name] = type(short, (Service,), body)
+            self._services[name] = type(short, (ServiceType,), body)
         return self._services[name]
 
     def names(self, package: str, kind: str) -> list[str]:

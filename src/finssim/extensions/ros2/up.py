@@ -36,7 +36,7 @@ __all__ = [
     "MCU_PORT",
     "NODES",
     "Options",
-    "Plan",
+    "GraphPlan",
     "launch_arguments",
     "launched",
     "plan_of",
@@ -61,7 +61,7 @@ class Child:
 class Supervisor:
     """Runs the nodes of a plan. Use it as a context: whatever happens, no process is left."""
 
-    def __init__(self, plan: Plan, parameters: Path, notify: Callable[[str], None]) -> None:
+    def __init__(self, plan: GraphPlan, parameters: Path, notify: Callable[[str], None]) -> None:
         """
         Args:
             plan: Nodes and namespace.
@@ -242,7 +242,7 @@ def launched(graph: str, given: Mapping[str, str]) -> tuple[str, dict[str, dict[
     return plan.namespace, {node: {**shared, **plan.parameters.get(node, {})} for node in nodes}
 
 
-def plan_of(graph: str, options: Options, pool_file: Path | str | None) -> Plan:
+def plan_of(graph: str, options: Options, pool_file: Path | str | None) -> GraphPlan:
     """Return nodes and parameters; an option that is None leaves a parameter to the node.
 
     Args:
@@ -261,7 +261,7 @@ def plan_of(graph: str, options: Options, pool_file: Path | str | None) -> Plan:
     extra = (*(("recorder",) if o.record else ()), *(("teleop",) if o.teleop else ()))
     namespace = o.namespace or vehicle.name.replace("-", "_")
     sees = o.world is not None or o.pictures not in (None, "none")
-    plan = Plan(graph, o.vehicle, namespace, extra=extra, blind=blind, sees=sees)
+    plan = GraphPlan(graph, o.vehicle, namespace, extra=extra, blind=blind, sees=sees)
     if (
         graph == "robot" and not blind and o.pool_file is None and pool_file is not None
     ):  # our own, still unwritten
@@ -301,7 +301,7 @@ def plan_of(graph: str, options: Options, pool_file: Path | str | None) -> Plan:
     return plan
 
 
-def _wire(plan: Plan, o: Options) -> None:
+def _wire(plan: GraphPlan, o: Options) -> None:
     """Addresses: pictures come from the port after the motor controller's, to the port after our own end's."""
     if o.bind is not None:
         host, _, port = o.bind.rpartition(":")
@@ -405,8 +405,8 @@ def _watch(
 # Which nodes make up a robot, its virtual pool or a simulated vehicle, and with which parameters.
 
 NODES = {
-    "camera": "finssim.extensions.ros2.nodes.camera:Camera",
-    "controller": "finssim.extensions.ros2.nodes.controller:Controller",
+    "camera": "finssim.extensions.ros2.nodes.camera:CameraNode",
+    "controller": "finssim.extensions.ros2.nodes.controller:ControllerNode",
     "hardware_bridge": "finssim.extensions.ros2.nodes.hardware_bridge:HardwareBridge",
     "localizer": "finssim.extensions.ros2.nodes.localizer:Localizer",
     "recorder": "finssim.extensions.ros2.nodes.recorder:RecorderNode",
@@ -427,7 +427,7 @@ MCU_PORT = 58766
 
 
 @dataclass
-class Plan:
+class GraphPlan:
     """A graph before it lives."""
 
     graph: str
@@ -508,7 +508,7 @@ _Quoting.add_representer(
 )
 
 
-def topics_of(plan: Plan) -> list[tuple[str, Topic]]:
+def topics_of(plan: GraphPlan) -> list[tuple[str, Topic]]:
     """Full names of what a graph's nodes publish, and of what they take from people."""
     senders = {*plan.nodes, "you", "every node"}
     return [

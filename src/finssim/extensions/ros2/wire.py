@@ -384,7 +384,7 @@ def _handles(matched: Callable[[int, Any, int], int], endpoint: int) -> list[int
     return list(handles or ())[:count]
 
 
-class Endpoint:
+class DdsEndpoint:
     """Common part of writers and readers."""
 
     entity: Any
@@ -406,7 +406,7 @@ class Endpoint:
         return POLICY_NAMES.get(status.last_policy_id, f"policy {status.last_policy_id}")
 
 
-class Writer(Endpoint):
+class Writer(DdsEndpoint):
     """Sends ready CDR bytes."""
 
     def __init__(self, publisher: Publisher, topic: Topic, qos: Qos) -> None:
@@ -451,7 +451,7 @@ class Writer(Endpoint):
         return self._incompatible(self.entity.get_offered_incompatible_qos_status())
 
 
-class Reader(Endpoint):
+class Reader(DdsEndpoint):
     """Receives CDR bytes."""
 
     def __init__(self, subscriber: Subscriber, topic: Topic, qos: Qos) -> None:
@@ -827,9 +827,9 @@ class Waiter:
         self._guard = GuardCondition(participant.entity)
         self._set.attach(self._guard)
         self._closed = False
-        self._watched: set[Endpoint] = set()
+        self._watched: set[DdsEndpoint] = set()
 
-    def watch(self, endpoints: Iterable[Endpoint]) -> None:
+    def watch(self, endpoints: Iterable[DdsEndpoint]) -> None:
         """Watch exactly these from now on."""
         required = set(endpoints)
         for endpoint in self._watched - required:
@@ -864,7 +864,7 @@ class Waiter:
         self._guard.__del__()
 
     @staticmethod
-    def _each(endpoint: Endpoint, act: Callable[[Any], None]) -> None:
+    def _each(endpoint: DdsEndpoint, act: Callable[[Any], None]) -> None:
         act(endpoint.entity)
         if isinstance(endpoint, Reader):
             act(endpoint.condition)

@@ -9,7 +9,7 @@ import warp as wp
 from finssim.extensions.teams.pursuit import (
     PI,
     VELOCITY_CLIP,
-    Team,
+    TeamTask,
     any_outside,
     bumps,
     gap_to,
@@ -295,7 +295,7 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Formation(Team):
+class Formation(TeamTask):
     """Carry a virtual net. It is a triangle between the three vehicles, without weight or drag, and it can tear.
 
     The target is held while the net's surface is within `reach` of it, no edge is longer than `stretch` sides and none

@@ -326,7 +326,7 @@ class Chase(OpenWater):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Team(OpenWater):
+class TeamTask(OpenWater):
     """Base of the tasks of several agents."""
 
     collision: float = 0.6
@@ -719,7 +719,7 @@ def start_team(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TeamPursuit(Team, Chase):
+class TeamPursuit(TeamTask, Chase):
     """3-v-1 pursuit. What counts as a capture, the prey's speed and the stake are the level's, unless given here."""
 
     agents: ClassVar[tuple[str, ...]] = ("herder", "left_netter", "right_netter")

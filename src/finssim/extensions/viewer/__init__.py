@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
-    from finssim.extensions.viewer.run import Choice, open_source
+    from finssim.extensions.viewer.run import SourceChoice, open_source
 
 __all__ = [
-    "Choice",
+    "SourceChoice",
     "open_source",
 ]
 

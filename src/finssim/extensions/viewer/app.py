@@ -20,7 +20,15 @@ import numpy.typing as npt
 import viser
 import websockets.asyncio.server
 
-from finssim.extensions.viewer.frame import Curve, Frame, Picture, Pose, Source, Stage, ViewError
+from finssim.extensions.viewer.frame import (
+    BodyPose,
+    LatestPicture,
+    PlotLine,
+    Source,
+    ViewError,
+    ViewFrame,
+    ViewStage,
+)
 from finssim.extensions.viewer.shapes import (
     box_edges,
     force_arrows,
@@ -53,10 +61,10 @@ PICTURE_HEIGHT = 0.16
 """Size of the camera's frustum [m]."""
 
 
-class Scene:
+class StageScene:
     """Draws frames of one stage."""
 
-    def __init__(self, server: viser.ViserServer, stage: Stage) -> None:
+    def __init__(self, server: viser.ViserServer, stage: ViewStage) -> None:
         """
         Args:
             server: Of the page.
@@ -99,7 +107,7 @@ class Scene:
             )  # fmt: skip
         self._look(server)
 
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: ViewFrame) -> None:
         """Move everything to where it is in a frame."""
         self._place("truth", frame.truth, ghost=False)
         self._place("estimate", frame.estimate, ghost=frame.truth is not None)
@@ -109,14 +117,14 @@ class Scene:
         _set_points(self._arrows, arrows)
         _set_points(self._trail, line_of(frame.trail))
 
-    def _place(self, name: str, pose: Pose | None, *, ghost: bool) -> None:
+    def _place(self, name: str, pose: BodyPose | None, *, ghost: bool) -> None:
         """Put a body where it is; a ghost is a net of lines, which hides nothing of the body that it lies upon."""
         body, hull = self._bodies[name]
         self._show(body, pose)
         if hull.wireframe != ghost:
             hull.wireframe = ghost
 
-    def _show(self, node: Any, pose: Pose | None) -> None:
+    def _show(self, node: Any, pose: BodyPose | None) -> None:
         visible = pose is not None and bool(np.isfinite(pose.position).all())
         if visible and pose is not None:
             node.position, node.wxyz = tuple(pose.position), wxyz(pose.quaternion)
@@ -215,7 +223,7 @@ LINES = ("#d9480f", "#1c6ef2", "#2b8a3e", "#862e9c")
 class Plot:
     """Curves of one title, over the same times."""
 
-    def __init__(self, title: str, curves: Sequence[Curve]) -> None:
+    def __init__(self, title: str, curves: Sequence[PlotLine]) -> None:
         self.title, self.curves = title, list(curves)
 
     def data(self, now: float) -> tuple[Array, ...]:
@@ -241,7 +249,7 @@ class Plot:
         return tuple(drawn)
 
 
-def plots_of(curves: Sequence[Curve]) -> list[Plot]:
+def plots_of(curves: Sequence[PlotLine]) -> list[Plot]:
     """Curves by title, in the order in which titles first appear."""
     order = list(dict.fromkeys(curve.plot for curve in curves))
     sorted_curves = sorted(curves, key=lambda curve: order.index(curve.plot))
@@ -328,7 +336,7 @@ def blank() -> Image:
     return np.full((WIDTH * 9 // 16, WIDTH, 3), DARK, np.uint8)
 
 
-def draw_picture(picture: Picture) -> Image:
+def draw_picture(picture: LatestPicture) -> Image:
     """Return a picture in colours, reduced by an integer factor, (h, w, 3)."""
     rows, columns = picture.size if picture.image is None else picture.image.shape[:2]
     every = max(1, columns // WIDTH)
@@ -390,7 +398,7 @@ SLIDER_STEP = 0.02
 class Panel:
     """Controls and figures of one stage."""
 
-    def __init__(self, server: viser.ViserServer, stage: Stage, playback: Playback) -> None:
+    def __init__(self, server: viser.ViserServer, stage: ViewStage, playback: Playback) -> None:
         """
         Args:
             server: Of the page.
@@ -412,7 +420,7 @@ class Panel:
         if stage.site is not None:
             with self._gui.add_folder("camera"):
                 self._image = self._gui.add_image(blank(), jpeg_quality=70)
-        self._seen: Picture | None = None
+        self._seen: LatestPicture | None = None
         self._eyes = {}
         for name in stage.eyes:
             with self._gui.add_folder(name):
@@ -436,7 +444,7 @@ class Panel:
             playback.seek(float(self._slider.value))
             self._shown = float(self._slider.value)
 
-    def show(self, frame: Frame) -> None:
+    def show(self, frame: ViewFrame) -> None:
         """Put a frame's figures on the panel."""
         playback = self._playback
         if self._slider is None:
@@ -609,7 +617,7 @@ class View:
             _only_own_pages(bind),
         ):  # viser prints messages at start and end even if verbosity is off
             self.server = viser.ViserServer(host=bind, port=port, label="FinsSim", verbose=False)
-        self.scene = Scene(self.server, source.stage)
+        self.scene = StageScene(self.server, source.stage)
         self.panel = Panel(self.server, source.stage, self.playback)
         self._drawn, self._plotted, self._since_plot = math.nan, math.nan, math.inf
         host = "localhost" if bind in ("0.0.0.0", "::") else bind

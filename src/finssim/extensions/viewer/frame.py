@@ -21,7 +21,7 @@ class ViewError(ValueError):
     """Something that cannot be shown."""
 
 
-class Body(NamedTuple):
+class FixedBody(NamedTuple):
     """A fixed body of a world."""
 
     name: str
@@ -33,7 +33,7 @@ class Body(NamedTuple):
     """Red, green, blue, 0 to 255."""
 
 
-class Pose(NamedTuple):
+class BodyPose(NamedTuple):
     """Pose of the body."""
 
     position: Array
@@ -48,7 +48,7 @@ def nowhere() -> Array:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
+class ViewStage:
     """The part of a view that does not change."""
 
     vehicle: Vehicle
@@ -63,14 +63,14 @@ class Stage:
     """Camera, if one looks on."""
     path: Array = field(default_factory=nowhere)
     """Trajectory to follow, world frame [m], (k, 3)."""
-    bodies: Sequence[Body] = ()
+    bodies: Sequence[FixedBody] = ()
     """Bodies of the world around the vehicle."""
     eyes: Sequence[str] = ()
     """Names of the vehicle's own cameras and sonars, whose pictures frames have."""
 
 
 @dataclass(frozen=True)
-class Picture:
+class LatestPicture:
     """The camera's latest picture."""
 
     image: npt.NDArray[np.uint8] | None
@@ -81,19 +81,19 @@ class Picture:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Frame:
+class ViewFrame:
     """One moment."""
 
     time: float
     """Since the source's beginning [s]."""
-    truth: Pose | None = None
-    estimate: Pose | None = None
-    goal: Pose | None = None
+    truth: BodyPose | None = None
+    estimate: BodyPose | None = None
+    goal: BodyPose | None = None
     force: Array = field(default_factory=lambda: np.zeros(0))
     """Forces of the thrusters, canonical order [N], (n,), or none."""
     trail: Array = field(default_factory=nowhere)
     """Recent positions of the vehicle, world frame [m], (k, 3)."""
-    picture: Picture | None = None
+    picture: LatestPicture | None = None
     pictures: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
     """Latest pictures of the vehicle's own cameras, (rows, columns, 3), and of its sonars as fans from above, gray; by
     name."""
@@ -103,7 +103,7 @@ class Frame:
     """The latest, newest last."""
 
 
-class Curve(NamedTuple):
+class PlotLine(NamedTuple):
     """One line of a plot."""
 
     plot: str
@@ -118,14 +118,14 @@ class Curve(NamedTuple):
 class Source(Protocol):
     """Source of frames. A recorded one gives any time; a live one advances to the time, and never goes back."""
 
-    stage: Stage
+    stage: ViewStage
     duration: float
     """[s]; infinite for a live one."""
 
-    def frame(self, time: float) -> Frame:
+    def frame(self, time: float) -> ViewFrame:
         """The moment at a time since the beginning [s]."""
 
-    def curves(self) -> Sequence[Curve]:
+    def curves(self) -> Sequence[PlotLine]:
         """Errors over time, as far as they are known. Curves of one plot have the same times."""
 
     def close(self) -> None:

@@ -28,7 +28,7 @@ HEEDED = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choice:
+class SourceChoice:
     """Source that a person wants to view."""
 
     source: Annotated[str, "argument"] = "pool"
@@ -68,7 +68,7 @@ class Choice:
     """Seed of every random number; equal seeds give equal results."""
 
 
-def open_source(choice: Choice) -> Source:
+def open_source(choice: SourceChoice) -> Source:
     """The source that was asked for.
 
     Raises:
@@ -106,7 +106,7 @@ def open_source(choice: Choice) -> Source:
 
 
 def run(
-    choice: Annotated[Choice, "options"],
+    choice: Annotated[SourceChoice, "options"],
     *,
     speed: Annotated[float, (0.01, 100.0)] = 1.0,
     port: Annotated[int, (1, 65535)] = 8080,
@@ -143,18 +143,18 @@ def run(
         view.close()
 
 
-def _refuse_strangers(choice: Choice) -> None:
+def _refuse_strangers(choice: SourceChoice) -> None:
     """Refuse options that the source would not use."""
     path = Path(choice.source)
     kind = choice.source if choice.source in HEEDED else "folder" if path.is_dir() else "record"
-    usual = Choice()
+    usual = SourceChoice()
     for name in sorted(set().union(*HEEDED.values()) - HEEDED[kind]):
         if getattr(choice, name) != getattr(usual, name):
             takers = " and ".join(other for other in HEEDED if name in HEEDED[other])
             raise ViewError(f"--{name.replace('_', '-')} is for {takers}, not for a {kind}: omit it")
 
 
-def _pool(choice: Choice) -> Source:
+def _pool(choice: SourceChoice) -> Source:
     from finssim.extensions.viewer.sources import PoolSource
 
     name = choice.vehicle or "finsrov"
@@ -177,7 +177,7 @@ def _pool(choice: Choice) -> Source:
     )
 
 
-def _simulator(choice: Choice) -> Source:
+def _simulator(choice: SourceChoice) -> Source:
     from finssim.extensions.viewer.sources import SimulatorSource
 
     vehicle = load_vehicle(choice.vehicle or "finsrov")

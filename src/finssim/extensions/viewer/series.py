@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.core.rotations import quat_yaw
-from finssim.extensions.viewer.frame import Curve, Pose, nowhere
+from finssim.extensions.viewer.frame import BodyPose, PlotLine, nowhere
 
-__all__ = ["Errors", "HEADING", "POSITION", "PoseSeries", "Series", "errors_between"]
+__all__ = ["Errors", "HEADING", "POSITION", "PoseSeries", "TimeSeries", "errors_between"]
 
 
 Array = npt.NDArray[np.float64]
@@ -30,7 +30,7 @@ SAMPLE = 0.1
 """Between the points of a live curve [s]."""
 
 
-class Series:
+class TimeSeries:
     """Keep values of any unit in the order of their times [s], (n,)."""
 
     def __init__(self, time: npt.ArrayLike = (), values: Sequence[Any] | Array = ()) -> None:
@@ -54,10 +54,10 @@ class PoseSeries:
     def __len__(self) -> int:
         return len(self.time)
 
-    def at(self, time: float) -> Pose | None:
+    def at(self, time: float) -> BodyPose | None:
         """The newest pose that is not later than a time [s]; None before the first."""
         i = int(np.searchsorted(self.time, time, side="right")) - 1
-        return None if i < 0 else Pose(self.position[i], self.quaternion[i])
+        return None if i < 0 else BodyPose(self.position[i], self.quaternion[i])
 
     def trail(self, time: float) -> Array:
         """Return the positions in the half minute before a time [s], world frame [m], (k, 3)."""
@@ -86,7 +86,9 @@ class Errors:
         self._rows: deque[tuple[float, ...]] = deque(maxlen=KEPT)
         self._trail: deque[Array] = deque(maxlen=round(TRAIL / SAMPLE))
 
-    def add(self, time: float, true: Pose | None, estimate: Pose | None, goal: Pose | None) -> None:
+    def add(
+        self, time: float, true: BodyPose | None, estimate: BodyPose | None, goal: BodyPose | None
+    ) -> None:
         """Keep a moment, its time in [s], if the last one that was kept is old enough."""
         if self._rows and time < self._rows[-1][0] + SAMPLE - 1e-9:
             return
@@ -116,20 +118,20 @@ class Errors:
         """Distance of the estimate from the truth, in words."""
         return "-" if math.isnan(self.latest[2]) else f"{100.0 * self.latest[2]:.1f} cm"
 
-    def curves(self) -> list[Curve]:
+    def curves(self) -> list[PlotLine]:
         """Return the errors that have a value."""
         rows = np.array(self._rows).reshape(-1, 5)
         time = rows[:, 0]
         curves = [
-            Curve(POSITION, "to the goal", time, rows[:, 1]),
-            Curve(POSITION, "of the estimate", time, rows[:, 3]),
-            Curve(HEADING, "to the goal", time, rows[:, 2]),
-            Curve(HEADING, "of the estimate", time, rows[:, 4]),
+            PlotLine(POSITION, "to the goal", time, rows[:, 1]),
+            PlotLine(POSITION, "of the estimate", time, rows[:, 3]),
+            PlotLine(HEADING, "to the goal", time, rows[:, 2]),
+            PlotLine(HEADING, "of the estimate", time, rows[:, 4]),
         ]
         return [curve for curve in curves if np.isfinite(curve.value).any()]
 
 
-def _error(a: Pose | None, b: Pose | None) -> tuple[float, float]:
+def _error(a: BodyPose | None, b: BodyPose | None) -> tuple[float, float]:
     if a is None or b is None:
         return math.nan, math.nan
     of_a, of_b = ((p.position[None], np.atleast_1d(quat_yaw(p.quaternion))) for p in (a, b))

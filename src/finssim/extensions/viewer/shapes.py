@@ -10,7 +10,7 @@ import numpy.typing as npt
 from finssim.core.rotations import quat_to_matrix
 from finssim.core.sonar_fan import fan_picture
 from finssim.extensions.perception.layout import Shape, WorldLayout
-from finssim.extensions.viewer.frame import Body, Pose
+from finssim.extensions.viewer.frame import BodyPose, FixedBody
 from finssim.robot.messages import Picture
 from finssim.robot.record_messages import FAN_ROWS
 from finssim.vehicles import Vehicle, VehicleError
@@ -75,7 +75,7 @@ def wall_mesh(lower: Array, upper: Array) -> Mesh:
     return Mesh(vertices, faces[~lid][:, ::-1])
 
 
-def force_arrows(vehicle: Vehicle, force: Array, pose: Pose) -> Array:
+def force_arrows(vehicle: Vehicle, force: Array, pose: BodyPose) -> Array:
     """Start and end of an arrow for each thruster that pushes, world frame [m], (k, 2, 3).
 
     An arrow points where its thruster pushes the vehicle. Its length grows with the root of the force, as the shaft
@@ -118,7 +118,7 @@ def shown_of(vehicle: Vehicle, picture: Picture) -> npt.NDArray[np.uint8] | str:
     return np.nan_to_num(fan_picture(picture.image, device.sector, FAN_ROWS)).astype(np.uint8)
 
 
-def world_bodies(layout: WorldLayout) -> list[Body]:
+def world_bodies(layout: WorldLayout) -> list[FixedBody]:
     """Return the bodies of the first world of a layout; the copies in a row are one body.
 
     Planes end 15 m from their middle, and basins have no walls: the stage has.
@@ -136,7 +136,9 @@ def world_bodies(layout: WorldLayout) -> list[Body]:
     for name, meshes in parts.items():
         first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
         faces = np.concatenate([mesh.faces + i for mesh, i in zip(meshes, first, strict=False)])
-        bodies.append(Body(name, np.concatenate([mesh.vertices for mesh in meshes]), faces, colours[name]))
+        bodies.append(
+            FixedBody(name, np.concatenate([mesh.vertices for mesh in meshes]), faces, colours[name])
+        )
     return bodies
 
 

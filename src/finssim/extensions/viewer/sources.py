@@ -20,12 +20,12 @@ from finssim.extensions.perception import RangeBatch
 from finssim.extensions.perception.layout import WorldLayout
 from finssim.extensions.perception.onboard import OnboardSensors
 from finssim.extensions.viewer.frame import (
-    Curve,
-    Frame,
-    Picture,
-    Pose,
-    Stage,
+    BodyPose,
+    LatestPicture,
+    PlotLine,
     ViewError,
+    ViewFrame,
+    ViewStage,
     box_of,
     box_of_world,
     nowhere,
@@ -35,7 +35,7 @@ from finssim.extensions.viewer.series import (
     POSITION,
     Errors,
     PoseSeries,
-    Series,
+    TimeSeries,
     errors_between,
 )
 from finssim.extensions.viewer.shapes import shown_of, world_bodies
@@ -54,7 +54,7 @@ from finssim.robot.record_files import pool_of, vehicle_of
 from finssim.robot.record_messages import STATES
 from finssim.robot.record_reader import Record, open_record
 from finssim.robot.runtime import Runtime
-from finssim.sim import Pool as Walls
+from finssim.sim import RectangularPool as Walls
 from finssim.sim import Simulator, Water
 from finssim.sim.recorder import ABOUT, read_run
 from finssim.vehicles import Vehicle, catalogue_vehicle, load_vehicle
@@ -117,7 +117,7 @@ class PoolSource:
         self._runtime = Runtime(ours, plan.calibrated, pilot, guide, arm=True, bridge=Bridge(ours))
         self._guide, self._look = guide, TagLook(ours)
         self._errors, self._sent, self._steps = Errors(), list[bytes](), 0
-        self._picture: Picture | None = None
+        self._picture: LatestPicture | None = None
         lens = None if plan.calibrated is None else plan.calibrated.camera.lens
         self._size = (0, 0) if lens is None else (lens.height, lens.width)
         size = (basin.length, basin.width, basin.depth)
@@ -130,7 +130,7 @@ class PoolSource:
             }  # fmt: skip
         else:
             lower, upper = box_of(ours, size, np.zeros((0, 3)))
-        self.stage = Stage(
+        self.stage = ViewStage(
             vehicle=ours,
             title=f"virtual pool, {plan.spec.title}: {pilot.name}, {guide.name}",
             lower=lower,
@@ -140,12 +140,12 @@ class PoolSource:
             **around,
         )
 
-    def frame(self, time: float) -> Frame:
+    def frame(self, time: float) -> ViewFrame:
         """Let the pool and the robot live until a time [s]."""
         while self._steps < math.floor(time * RATE + 1e-6):
             self._step()
         runtime, plant = self._runtime, self._world.plant
-        return Frame(
+        return ViewFrame(
             time=self._steps / RATE,
             truth=self._truth(),
             estimate=self._estimate(),
@@ -158,7 +158,7 @@ class PoolSource:
             events=[f"{e.time:.1f} s  {e.kind}: {e.text}" for e in list(runtime.counters.events)[-EVENTS:]],
         )
 
-    def curves(self) -> Sequence[Curve]:
+    def curves(self) -> Sequence[PlotLine]:
         """Errors to the goal and of the estimate."""
         return self._errors.curves()
 
@@ -183,20 +183,20 @@ class PoolSource:
             return picture
         if picture.image is not None and not picture.tags:
             picture = replace(picture, tags=self._look.find(picture.image, picture.time))
-        self._picture = Picture(picture.image, picture.tags, self._size)
+        self._picture = LatestPicture(picture.image, picture.tags, self._size)
         return picture
 
-    def _truth(self) -> Pose:
+    def _truth(self) -> BodyPose:
         plant = self._world.plant
-        return Pose(np.array(plant.position, float), np.array(plant.quaternion, float))
+        return BodyPose(np.array(plant.position, float), np.array(plant.quaternion, float))
 
-    def _estimate(self) -> Pose | None:
+    def _estimate(self) -> BodyPose | None:
         reading = self._runtime.reading
         if reading is None or not np.isfinite(reading.position).all():
             return None
-        return Pose(reading.position, reading.quaternion)
+        return BodyPose(reading.position, reading.quaternion)
 
-    def _goal(self) -> Pose:
+    def _goal(self) -> BodyPose:
         t = self._runtime.t
         return goal_pose(self._guide, 0.0 if math.isnan(t) else t)
 
@@ -270,16 +270,16 @@ class SimulatorSource:
         self._errors = Errors()
         lower, upper = box_of(vehicle, size, np.zeros((0, 3)))
         title = f"simulator, {hydrodynamics}: {self._pilot.name}, {guide.name}"
-        self.stage = Stage(vehicle=vehicle, title=title, lower=lower, upper=upper, path=path_of(guide))
+        self.stage = ViewStage(vehicle=vehicle, title=title, lower=lower, upper=upper, path=path_of(guide))
         self._pilot.reset()
 
-    def frame(self, time: float) -> Frame:
+    def frame(self, time: float) -> ViewFrame:
         """Simulate up to a time [s]."""
         while self._steps < math.floor(time / STEP + 1e-6):
             self._step()
         now, pose = self._steps * STEP, self._pose()
         goal = goal_pose(self._guide, now)
-        return Frame(
+        return ViewFrame(
             time=now,
             truth=pose,
             goal=goal,
@@ -293,7 +293,7 @@ class SimulatorSource:
             },
         )
 
-    def curves(self) -> Sequence[Curve]:
+    def curves(self) -> Sequence[PlotLine]:
         """Errors to the goal."""
         return self._errors.curves()
 
@@ -312,9 +312,9 @@ class SimulatorSource:
         self._steps += 1
         self._errors.add(self._steps * STEP, self._pose(), None, goal_pose(self._guide, self._steps * STEP))
 
-    def _pose(self) -> Pose:
+    def _pose(self) -> BodyPose:
         s = self._simulator
-        return Pose(s.numpy("position")[0, 0].astype(float), s.numpy("quaternion")[0, 0].astype(float))
+        return BodyPose(s.numpy("position")[0, 0].astype(float), s.numpy("quaternion")[0, 0].astype(float))
 
     def _thrust(self) -> np.ndarray:
         return np.asarray(self._simulator.numpy("thrust")[0, 0, : self._n], float)
@@ -389,7 +389,7 @@ class RecordSource:
             layout.draw(seed)
             lower, upper = box_of_world(layout.world)
             around["bodies"] = world_bodies(layout)
-        self.stage = Stage(
+        self.stage = ViewStage(
             vehicle=self._vehicle,
             title=f"{Path(path).name}: {self._vehicle.name}",
             lower=lower,
@@ -402,17 +402,17 @@ class RecordSource:
         )
         self._size = (site.camera.lens.height, site.camera.lens.width) if site is not None else (720, 1280)
         self._look = TagLook(self._vehicle)
-        self._shown: tuple[int, Picture] | None = None
+        self._shown: tuple[int, LatestPicture] | None = None
         self._developed_own: dict[str, tuple[Any, Any]] = {}
         self._curves = self._all_curves()
 
-    def frame(self, time: float) -> Frame:
+    def frame(self, time: float) -> ViewFrame:
         """The moment at a time since the record's beginning [s]."""
         at = self.begin + time
         thrusters = self._thrusters.at(at)
         force = np.zeros(0) if thrusters is None else np.asarray(thrusters.force, float)
         poses = self._truth if self._truth is not None else self._odom
-        return Frame(
+        return ViewFrame(
             time=time,
             truth=None if self._truth is None else self._truth.at(at),
             estimate=self._odom.at(at),
@@ -429,7 +429,7 @@ class RecordSource:
             ][-EVENTS:],
         )
 
-    def curves(self) -> Sequence[Curve]:
+    def curves(self) -> Sequence[PlotLine]:
         """Return errors over the complete record."""
         return self._curves
 
@@ -455,20 +455,20 @@ class RecordSource:
         self.duration = max(t[-1] for t in times.values()) - self.begin
         self._odom = _poses(times["odom"], [m.pose.pose for m in by_name["odom"]])
         self._goal = _poses(times["goal"], [m.pose for m in by_name["goal"]])
-        self._health = Series(times["estimator_status"], by_name["estimator_status"])
-        self._thrusters = Series(times["thruster_state"], by_name["thruster_state"])
-        self._shafts = Series(times["joint_states"], by_name["joint_states"])
-        self._pictures = Series(times["camera/image/compressed"], by_name["camera/image/compressed"])
-        self._tags = Series(times["camera/tags"], by_name["camera/tags"])
+        self._health = TimeSeries(times["estimator_status"], by_name["estimator_status"])
+        self._thrusters = TimeSeries(times["thruster_state"], by_name["thruster_state"])
+        self._shafts = TimeSeries(times["joint_states"], by_name["joint_states"])
+        self._pictures = TimeSeries(times["camera/image/compressed"], by_name["camera/image/compressed"])
+        self._tags = TimeSeries(times["camera/tags"], by_name["camera/tags"])
         self._eyes, self._ranges = (
             {
-                name.removesuffix(kind): Series(times[name], by_name[name])
+                name.removesuffix(kind): TimeSeries(times[name], by_name[name])
                 for name in perceived
                 if name.endswith(kind) and by_name[name]
             }
             for kind in ("/image/compressed", "/range")
         )
-        self._events = Series(times["events"], [_event(m.data) for m in by_name["events"]])
+        self._events = TimeSeries(times["events"], [_event(m.data) for m in by_name["events"]])
 
     def _add_truth(self, truth: Truth, offset: float | None) -> None:
         if offset is None:
@@ -480,11 +480,11 @@ class RecordSource:
             )
         self._truth = PoseSeries(truth.time + offset, truth.position, truth.quaternion)
 
-    def _picture(self, at: float) -> Picture | None:
+    def _picture(self, at: float) -> LatestPicture | None:
         tags = self._tags.at(at) if _age(self._tags, at) < FRESH else None
         tags_of_picture = _tags_in(tags.data) if tags is not None else ()
         if _age(self._pictures, at) >= FRESH:
-            return Picture(None, tags_of_picture, self._size) if tags_of_picture else None
+            return LatestPicture(None, tags_of_picture, self._size) if tags_of_picture else None
         i = int(np.searchsorted(self._pictures.time, at, side="right")) - 1
         if self._shown is None or self._shown[0] != i:
             self._shown = i, self._developed(i, at, tags_of_picture)
@@ -500,12 +500,12 @@ class RecordSource:
             self._developed_own[name] = message, picture_of(message.data, colour=colour)
         return self._developed_own[name][1]
 
-    def _developed(self, i: int, at: float, tags: tuple[TagCorners, ...]) -> Picture:
+    def _developed(self, i: int, at: float, tags: tuple[TagCorners, ...]) -> LatestPicture:
         image = picture_of(self._pictures.values[i].data)
         # The tags of a record came with pictures of their own: those of another picture are not this one's.
         if image is not None and abs(_age(self._tags, at) - _age(self._pictures, at)) > 1e-3:
             tags = self._look.find(image, at)
-        return Picture(image, tags, self._size)
+        return LatestPicture(image, tags, self._size)
 
     def _status(self, at: float, thrusters: Any) -> dict[str, str]:
         health, shafts = self._health.at(at), self._shafts.at(at)
@@ -527,7 +527,7 @@ class RecordSource:
                 status[name] = f"{series.at(at).range:.2f} m"
         return status
 
-    def _all_curves(self) -> list[Curve]:
+    def _all_curves(self) -> list[PlotLine]:
         every = max(1, len(self._odom) // POINTS)
         time = self._odom.time[::every]
         estimate, goal = self._odom.on(time), self._goal.on(time)
@@ -538,12 +538,12 @@ class RecordSource:
         curves = []
         for label, (a, b) in pairs.items():
             distance, turn = errors_between(a, b)
-            curves += [Curve(POSITION, label, time - self.begin, distance)]
-            curves += [Curve(HEADING, label, time - self.begin, turn)]
+            curves += [PlotLine(POSITION, label, time - self.begin, distance)]
+            curves += [PlotLine(HEADING, label, time - self.begin, turn)]
         return [curve for curve in curves if np.isfinite(curve.value).any()]
 
 
-def _age(series: Series, at: float) -> float:
+def _age(series: TimeSeries, at: float) -> float:
     i = int(np.searchsorted(series.time, at, side="right")) - 1
     return math.inf if i < 0 else at - float(series.time[i])
 
@@ -620,19 +620,19 @@ class RunSource:
             raise ViewError(
                 f"{folder}: has no {missing[0]}: it was not recorded of {ours.name}; give --vehicle"
             )
-        self._thrust = Series(time - time[0], rows[names].to_numpy(float))
+        self._thrust = TimeSeries(time - time[0], rows[names].to_numpy(float))
         speed = np.linalg.norm(rows[["u", "v", "w"]].to_numpy(float), axis=1)
-        self._curves = [Curve("speed [m/s]", "through the water", time - time[0], speed)]
+        self._curves = [PlotLine("speed [m/s]", "through the water", time - time[0], speed)]
         self.duration = float(time[-1] - time[0])
         lower, upper = box_of(ours, None, self._poses.position)
         title = f"{Path(folder).name}: {ours.name}, world {chosen}"
-        self.stage = Stage(vehicle=ours, title=title, lower=lower, upper=upper, walls=False)
+        self.stage = ViewStage(vehicle=ours, title=title, lower=lower, upper=upper, walls=False)
 
-    def frame(self, time: float) -> Frame:
+    def frame(self, time: float) -> ViewFrame:
         """The moment at a time since the run's beginning [s]."""
         force = self._thrust.at(time)
         status = {} if force is None else {"thrust [N]": " ".join(f"{f:.1f}" for f in force)}
-        return Frame(
+        return ViewFrame(
             time=time,
             truth=self._poses.at(time),
             force=np.zeros(0) if force is None else force,
@@ -640,7 +640,7 @@ class RunSource:
             status=status,
         )
 
-    def curves(self) -> Sequence[Curve]:
+    def curves(self) -> Sequence[PlotLine]:
         """Its speed."""
         return self._curves
 
@@ -669,10 +669,10 @@ def guide_for(goal: str | None, trajectory: str | None, task: str | None, vehicl
     return guide
 
 
-def goal_pose(guide: Guide, t: float) -> Pose:
+def goal_pose(guide: Guide, t: float) -> BodyPose:
     """Return the goal at a time since the start [s]."""
     reference = guide.at(t)
-    return Pose(np.asarray(reference.position, float), np.asarray(quat_from_yaw(float(reference.yaw))))
+    return BodyPose(np.asarray(reference.position, float), np.asarray(quat_from_yaw(float(reference.yaw))))
 
 
 def path_of(guide: Guide) -> npt.NDArray[np.float64]:

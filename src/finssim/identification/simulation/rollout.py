@@ -17,7 +17,7 @@ from finssim.sim.simulator import Simulator
 from finssim.sim.site import Water
 from finssim.trials.conversion import EULER
 from finssim.trials.findings import CalibrationError
-from finssim.trials.inputs import Drive, drive
+from finssim.trials.inputs import InputForces, drive
 from finssim.trials.motion import Motion, attitude_samples, depth_place, motion
 from finssim.trials.trial import Trial
 from finssim.vehicles import Vehicle
@@ -104,7 +104,7 @@ class Streams:
     """A trial prepared for cutting: its drive, its motion and its comparable columns."""
 
     trial: Trial
-    drive: Drive
+    drive: InputForces
     motion: Motion
     measured: dict[str, tuple[Array, Array]]
     """Column of `CHANNELS` -> times on the trial's clock [s] and values."""
@@ -200,7 +200,7 @@ def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, i
     )
 
 
-def _told(d: Drive, edges: Array) -> Array:
+def _told(d: InputForces, edges: Array) -> Array:
     """Return the command of the motors in each step between `edges` [s], (steps, k); see `Segment.force`."""
     if d.commanded:
         return _means(d, edges)
@@ -212,7 +212,7 @@ def _told(d: Drive, edges: Array) -> Array:
     return _means(d, np.concatenate([edges[:1] + half[:1], edges[1:] + half]))
 
 
-def _means(d: Drive, edges: Array) -> Array:
+def _means(d: InputForces, edges: Array) -> Array:
     """Mean force between successive times [s], (m + 1,) -> (m, k); before and after the recording the nearest value."""
     span = np.diff(d.t)[:, None]
     area = span * (d.force[:-1] if d.held else 0.5 * (d.force[:-1] + d.force[1:]))

@@ -29,7 +29,7 @@ import numpy as np
 from finssim.agents.agent import NOWHERE
 from finssim.agents.memory import memory_from, memory_leaves, restarted
 from finssim.control.guidance import Known
-from finssim.learning.layers import Adam, Array, Arrays, Gru, Parameters, Row, Stack
+from finssim.learning.layers import Adam, Array, Arrays, FreeRow, Gru, NetworkParameters, TanhLayers
 from finssim.learning.learners.base import ActingLearner, expert_in
 from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.network import Activation, Cell, Linear, Network, advance_history, with_integrals
@@ -195,10 +195,10 @@ class Ppo(ActingLearner):
         inputs = n + self._window + (drawn if informed else 0)
         judged = inputs + s.memory + (0 if informed else drawn)
         self.gru = Gru(A, inputs, s.memory) if s.memory else None
-        self.actor, self.noise = Stack(A, [s.memory or inputs, *s.hidden, m]), Row(m)
-        self.critic = Stack(A, [judged, *s.hidden, 1])
-        self._policy = Parameters(A, self.actor, self.noise, *([self.gru] if self.gru else []))
-        self._value = Parameters(A, self.critic)
+        self.actor, self.noise = TanhLayers(A, [s.memory or inputs, *s.hidden, m]), FreeRow(m)
+        self.critic = TanhLayers(A, [judged, *s.hidden, 1])
+        self._policy = NetworkParameters(A, self.actor, self.noise, *([self.gru] if self.gru else []))
+        self._value = NetworkParameters(A, self.critic)
         self.actor.initialize(last_gain=0.01)  # begin at action 0, whatever is seen
         self.critic.initialize(last_gain=1.0)
         self.noise.values[:] = s.log_std

@@ -147,7 +147,7 @@ _SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class TagFit:
     """Fitted position of a tag in the picture."""
 
     corners: Array
@@ -158,7 +158,7 @@ class Fit:
     """White minus black [gray levels]."""
 
 
-def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> Fit | None:
+def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> TagFit | None:
     """Fit a tag near the place where it was found.
 
     Args:
@@ -193,8 +193,8 @@ def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> Fit | None:
                 _settle(pattern, patch, settled.corners, limit, solver=_solver(pattern, weights)) or settled
             )
     if coarse is None or settled is None:
-        return Fit(corners, _correlation(pattern.values, sampled), float(np.ptp(sampled)))
-    return Fit(settled.corners + shift, settled.correlation, coarse.gain)
+        return TagFit(corners, _correlation(pattern.values, sampled), float(np.ptp(sampled)))
+    return TagFit(settled.corners + shift, settled.correlation, coarse.gain)
 
 
 @dataclass(frozen=True, eq=False)

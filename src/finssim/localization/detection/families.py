@@ -89,7 +89,7 @@ Cells = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Family:
+class TagFamily:
     """Layout of the tags of a family."""
 
     name: str
@@ -112,16 +112,16 @@ class Family:
 FAMILIES = {
     family.name: family
     for family in (
-        Family("tag16h5", 6, 6, 30, 5),
-        Family("tag25h9", 7, 7, 35, 9),
-        Family("tag36h11", 8, 8, 587, 11),
-        Family("tagStandard41h12", 9, 5, 2115, 12),
+        TagFamily("tag16h5", 6, 6, 30, 5),
+        TagFamily("tag25h9", 7, 7, 35, 9),
+        TagFamily("tag36h11", 8, 8, 587, 11),
+        TagFamily("tagStandard41h12", 9, 5, 2115, 12),
     )
 }
 """Name -> family."""
 
 
-def family_named(name: str) -> Family:
+def family_named(name: str) -> TagFamily:
     """The family of that name; `25h9`, `Tag25h9` and `DICT_APRILTAG_25h9` are understood too.
 
     Raises:
@@ -136,7 +136,7 @@ def family_named(name: str) -> Family:
 
 @cache
 def bitmap(family: str, tag: int) -> Cells:
-    """Cells of a tag, rows from the top, 1 white and 0 black, (n, n) with n = `Family.cells`.
+    """Cells of a tag, rows from the top, 1 white and 0 black, (n, n) with n = `TagFamily.cells`.
 
     The black border is in it, the white margin around it is not.
 

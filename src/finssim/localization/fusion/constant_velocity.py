@@ -24,8 +24,8 @@ from finssim.localization.fusion.attitude import (
 )
 from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.position_filter import PositionState
-from finssim.localization.fusion.sensors import GYRO_HOLD, Filter, Prediction, Track, motion_of, steps
-from finssim.localization.fusion.streams import Estimate, ImuSample, Outcome, Sample, changed
+from finssim.localization.fusion.sensors import GYRO_HOLD, Filter, FilterMemory, Prediction, motion_of, steps
+from finssim.localization.fusion.streams import ImuSample, Outcome, PoseEstimate, Sample, changed
 
 Array = npt.NDArray[np.float64]
 
@@ -38,7 +38,7 @@ _H_XY, _H_YAW = np.eye(6)[:2], np.eye(2)[:1]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlaneTrack(Track):
+class PlaneTrack(FilterMemory):
     """States of the filters, whose errors are independent of each other, with their memory."""
 
     position: PositionState
@@ -160,7 +160,7 @@ class ConstantVelocity(Filter[PlaneTrack]):
         yaw = attitude.restarted(track.yaw, track.yaw.yaw + angle, variance, self.settings.bias_std)
         return changed(track, yaw=yaw)
 
-    def estimate(self, track: PlaneTrack, time: float) -> Estimate:
+    def estimate(self, track: PlaneTrack, time: float) -> PoseEstimate:
         """Return the estimate at a time [s], not before the track's own; values not yet known are NaN."""
         track, seen = self.advanced(track, time), track.seen
         x, P, yaw = track.position.x.copy(), track.position.P.copy(), track.yaw
@@ -170,7 +170,7 @@ class ConstantVelocity(Filter[PlaneTrack]):
             P[unknown, :] = math.nan
             P[:, unknown] = math.nan
         has_yaw, has_imu = "yaw" in seen, track.imu_time is not None
-        return Estimate(
+        return PoseEstimate(
             time=time,
             x=x,
             P=P,

@@ -34,8 +34,8 @@ from finssim.localization.fusion.constant_velocity import YAW_CAP, ConstantVeloc
 from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.kalman import bounded, isolated
 from finssim.localization.fusion.position_filter import PositionState, frozen, restarted
-from finssim.localization.fusion.sensors import GYRO_HOLD, Filter, Prediction, Track, motion_of, steps
-from finssim.localization.fusion.streams import Estimate, ImuSample, Outcome, Sample, changed
+from finssim.localization.fusion.sensors import GYRO_HOLD, Filter, FilterMemory, Prediction, motion_of, steps
+from finssim.localization.fusion.streams import ImuSample, Outcome, PoseEstimate, Sample, changed
 from finssim.localization.poses import axes_of_up
 
 Array = npt.NDArray[np.float64]
@@ -235,7 +235,7 @@ def limits(variance: float, n: int) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True)
-class InertialTrack(Track):
+class InertialTrack(FilterMemory):
     """State of the filter with its memory."""
 
     state: InertialState | None = None
@@ -341,7 +341,7 @@ class ErrorState(Filter[InertialTrack]):
         roll, pitch = roll_pitch(self._up @ quat_to_matrix(track.state.q))
         return float(roll), float(pitch)
 
-    def estimate(self, track: InertialTrack, time: float) -> Estimate:
+    def estimate(self, track: InertialTrack, time: float) -> PoseEstimate:
         """Return the estimate at a time [s], not before the track's own; values not yet known are NaN."""
         if track.state is None:
             return self._before.estimate(track.before, time)
@@ -355,7 +355,7 @@ class ErrorState(Filter[InertialTrack]):
         T = np.vstack([H, np.eye(n)[V]])
         yaw, H, *_ = yaw_model(state)
         roll, pitch = self.tilt(track)
-        return Estimate(
+        return PoseEstimate(
             time=time,
             x=x,
             P=T @ state.P @ T.T,

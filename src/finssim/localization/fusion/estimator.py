@@ -20,8 +20,8 @@ from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.sensors import SENSORS, Filter
 from finssim.localization.fusion.streams import (
     DepthSample,
-    Estimate,
     Outcome,
+    PoseEstimate,
     Sample,
     VisionSample,
     refusal,
@@ -40,7 +40,7 @@ SAME = 1e-7
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class OtherReadings:
     """Readings of the other sensors at the time of a picture."""
 
     roll: float
@@ -231,7 +231,7 @@ def mode_of(age: float, settings: Settings) -> str:
 
 
 def health_of(
-    estimate: Estimate,
+    estimate: PoseEstimate,
     settings: Settings,
     site: Site,
     latest: dict[str, float],
@@ -385,7 +385,7 @@ class Estimator:
         self._reason = f"{stream}: {reason}"
         return reason
 
-    def estimate(self, time: float | None = None) -> Estimate:
+    def estimate(self, time: float | None = None) -> PoseEstimate:
         """The state at a time [s]: predicted beyond the newest sample, which is the default.
 
         For a time within the horizon it is the state after the samples up to then, as far as they have come.
@@ -396,19 +396,19 @@ class Estimator:
         track = self._timeline.state_at(time) if time < self._timeline.head else self._timeline.state
         return self._model.estimate(track, time)
 
-    def health(self, estimate: Estimate) -> Health:
+    def health(self, estimate: PoseEstimate) -> Health:
         """The condition that goes with an estimate."""
         self._settle()
         return health_of(estimate, self.settings, self.site, self._latest, self._reason, self._counts)
 
-    def at(self, time: float) -> Surroundings:
+    def at(self, time: float) -> OtherReadings:
         """Roll, pitch and depth at the time of an exposure [s], for the fit of its pose: between samples in a straight
         line, else from one within the freshness of its stream.
         """
         self._settle()
         s = self.settings
         roll, pitch = self._timeline.tilt_at(time, s.imu_fresh, self._model.tilt)
-        return Surroundings(roll, pitch, self._timeline.depth_at(time, s.depth_fresh))
+        return OtherReadings(roll, pitch, self._timeline.depth_at(time, s.depth_fresh))
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:

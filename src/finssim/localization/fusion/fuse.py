@@ -21,7 +21,7 @@ from finssim.localization.detection.detections import Frame
 from finssim.localization.fusion.estimator import MODES, Estimator, Fixes, Health
 from finssim.localization.fusion.fuse_log import Log, NoFix, StreamTable, load_log, series
 from finssim.localization.fusion.fuse_settings import settings_of, site_of
-from finssim.localization.fusion.streams import Estimate, Sample
+from finssim.localization.fusion.streams import PoseEstimate, Sample
 from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.localization.poses.methods import TagLocator, check_method
 from finssim.vehicles import Vehicle, load_vehicle
@@ -43,7 +43,7 @@ GAP = 0.25
 """Truth is not interpolated over longer gaps [s]."""
 
 
-def row_of(estimate: Estimate, health: Health) -> list[Any]:
+def row_of(estimate: PoseEstimate, health: Health) -> list[Any]:
     """One row of the table, in the order of `COLUMNS`."""
     numbers = [
         estimate.time,
@@ -191,7 +191,7 @@ LONGEST = 4.0e6
 
 
 @dataclass
-class Run:
+class FuseResult:
     """Result of a log."""
 
     rows: list[list[Any]] = field(default_factory=list)
@@ -211,7 +211,7 @@ def run(
     method: str = "refractive",
     pixel_std: float | None = None,
     as_json: bool = False,
-) -> Run:
+) -> FuseResult:
     """Fuse vision, depth and IMU in the order of arrival: position [m], velocity [m/s], yaw [rad], health.
 
     Example: finssim fuse log --pool pool.yaml --vehicle finsrov --out fused.csv
@@ -265,7 +265,7 @@ def fuse(
     mode: str = "constant-velocity",
     method: str = "refractive",
     pixel_std: float = 0.5,
-) -> Run:
+) -> FuseResult:
     """Fuse a log at a rate of rows [Hz]; arguments as `run`. A row at time t rests on what had arrived by t.
 
     Raises:
@@ -283,7 +283,7 @@ def fuse(
     if log.frames:  # default tags are for the virtual world
         fixes = Fixes(TagLocator(pool, vehicle.file_tags, method=method, pixel_std=pixel_std))
     deliveries = _deliveries(log)
-    result = Run()
+    result = FuseResult()
     try:
         for t, arrived in _by_row(deliveries, rate):
             for item in arrived:

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from finssim.localization import LocalizationError
 from finssim.localization.fusion.attitude import YawNoise
-from finssim.localization.fusion.gates import Gate
-from finssim.localization.fusion.position_filter import Motion
+from finssim.localization.fusion.gates import OutlierGate
+from finssim.localization.fusion.position_filter import MotionModel
 from finssim.localization.overhead_camera import Pool
 from finssim.vehicles import Vehicle
 
@@ -52,8 +52,8 @@ class Settings:
     """Greatest delay of a sample that is still inserted at its time [s]."""
     jump: float = 1.0
     """Greatest lead of a stamp over its arrival before the clock is doubted [s]."""
-    gate: Gate = Gate()
-    motion: Motion = Motion()
+    gate: OutlierGate = OutlierGate()
+    motion: MotionModel = MotionModel()
     half_life: float = 1.0
     """Half-life of velocity while the state is held [s]."""
     speed_std: float = 0.3

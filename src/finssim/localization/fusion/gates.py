@@ -26,7 +26,7 @@ def _quantile(dimension: int, probability: float) -> float:
 
 
 @dataclass(frozen=True)
-class Gate:
+class OutlierGate:
     """Limit of an outlier, and conditions under which a run of refused measurements replaces the state."""
 
     probability: float = 0.999
@@ -60,7 +60,7 @@ class Suspects:
 
 
 def remember(
-    suspects: Suspects | None, time: float, value: Array, covariance: Array, drift: float, gate: Gate
+    suspects: Suspects | None, time: float, value: Array, covariance: Array, drift: float, gate: OutlierGate
 ) -> Suspects:
     """Return the run with one more refused measurement.
 
@@ -89,7 +89,7 @@ def remember(
     return replace(suspects, misses=suspects.misses + 1)
 
 
-def due(suspects: Suspects, gate: Gate) -> bool:
+def due(suspects: Suspects, gate: OutlierGate) -> bool:
     """Return whether the run is long enough, in time and number, to replace the state."""
     if math.isinf(gate.reacquire_after):
         return False
@@ -132,7 +132,7 @@ class GateMemory:
 
 
 def judge(
-    gate: Gate,
+    gate: OutlierGate,
     memory: GateMemory,
     time: float,
     value: Array,
@@ -170,7 +170,7 @@ def judge(
 
 
 def judge_carried(
-    gate: Gate,
+    gate: OutlierGate,
     memory: GateMemory,
     time: float,
     residual: float,

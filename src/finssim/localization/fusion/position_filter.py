@@ -39,7 +39,7 @@ S = TypeVar("S", bound=PositionState)
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionModel:
     """Model of a vehicle's motion between measurements, per axis of the pool frame.
 
     Position is the integral of velocity, and velocity that of white acceleration of density q, so that over dt
@@ -60,7 +60,7 @@ _I6 = np.eye(6)
 _SHIFT = np.eye(6, k=3)
 
 
-def transition(dt: float, motion: Motion) -> Array:
+def transition(dt: float, motion: MotionModel) -> Array:
     """Matrix A of one step, (6, 6): [I, dt I; 0, I] where nothing decays (paper, eq. 14)."""
     if not any(motion.decay):
         return _I6 + dt * _SHIFT
@@ -73,8 +73,8 @@ def transition(dt: float, motion: Motion) -> Array:
     return A
 
 
-def process_noise(dt: float, motion: Motion) -> Array:
-    """Covariance Q that one step adds, (6, 6); see `Motion`."""
+def process_noise(dt: float, motion: MotionModel) -> Array:
+    """Covariance Q that one step adds, (6, 6); see `MotionModel`."""
     if not any(motion.decay):
         powers = np.array([dt, 0.5 * dt**2, dt**3 / 3.0])
         return np.asarray((powers @ _noise_powers(motion)).reshape(6, 6))
@@ -94,7 +94,7 @@ def process_noise(dt: float, motion: Motion) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _noise_powers(motion: Motion) -> Array:
+def _noise_powers(motion: MotionModel) -> Array:
     """Return the coefficients of dt, dt²/2 and dt³/3 in the noise of a step without decay, (3, 36)."""
     first, second, third = powers = np.zeros((3, 6, 6))
     i, j = [0, 1, 2], [3, 4, 5]
@@ -102,7 +102,7 @@ def _noise_powers(motion: Motion) -> Array:
     return powers.reshape(3, 36)
 
 
-def predict(state: S, dt: float, motion: Motion) -> S:
+def predict(state: S, dt: float, motion: MotionModel) -> S:
     """Return the state after a time step.
 
     x <- A x,  P <- A P A' + Q                                                        (paper, eq. 14)

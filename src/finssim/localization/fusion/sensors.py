@@ -19,8 +19,15 @@ import numpy.typing as npt
 from finssim.localization.fusion.attitude import wrapped
 from finssim.localization.fusion.fuse_settings import Aids, Settings, Site
 from finssim.localization.fusion.gates import GateMemory, judge, judge_carried
-from finssim.localization.fusion.position_filter import Motion
-from finssim.localization.fusion.streams import Estimate, ImuSample, Outcome, Sample, VisionSample, changed
+from finssim.localization.fusion.position_filter import MotionModel
+from finssim.localization.fusion.streams import (
+    ImuSample,
+    Outcome,
+    PoseEstimate,
+    Sample,
+    VisionSample,
+    changed,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -29,7 +36,7 @@ GYRO_HOLD = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sensor:
+class SensorModel:
     """Model of one sensor."""
 
     stream: str
@@ -81,22 +88,22 @@ def _aids(settings: Settings) -> Aids:
     return settings.aids
 
 
-SENSORS: dict[str, Sensor] = {
-    "depth": Sensor(
+SENSORS: dict[str, SensorModel] = {
+    "depth": SensorModel(
         stream="depth",
         quantity="height",
         reading=lambda sample: (-sample.depth,),
         noise=lambda _, s: np.array([[s.depth_std**2]]),
         axes=(2,),
     ),
-    "vision": Sensor(
+    "vision": SensorModel(
         stream="vision",
         quantity="position",
         reading=lambda sample: sample.position,
         noise=lambda sample, s: vision_covariance(sample, s)[:2, :2],
         axes=(0, 1),
     ),
-    "yaw": Sensor(
+    "yaw": SensorModel(
         stream="vision",
         quantity="yaw",
         reading=lambda sample: None if sample.yaw is None else (sample.yaw,),
@@ -105,7 +112,7 @@ SENSORS: dict[str, Sensor] = {
         angle=True,
         turns=True,
     ),
-    "heading": Sensor(
+    "heading": SensorModel(
         stream="heading",
         quantity="heading",
         reading=lambda sample: (sample.yaw,),
@@ -113,7 +120,7 @@ SENSORS: dict[str, Sensor] = {
         drift=0.05,
         angle=True,
     ),
-    "velocity": Sensor(
+    "velocity": SensorModel(
         stream="velocity",
         quantity="velocity",
         reading=lambda sample: sample.velocity,
@@ -141,7 +148,7 @@ class Prediction(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Track:
+class FilterMemory:
     """States of a filter, in fields of its own, with its memory; nothing else remembers."""
 
     gates: Mapping[str, GateMemory] = field(default_factory=dict)
@@ -161,7 +168,7 @@ class Track:
         return self.gates[name].doubt if name in self.gates else 0.0
 
     def times(self) -> dict[str, float | None]:
-        """Return the times of the latest accepted samples [s], by their names in `Estimate`."""
+        """Return the times of the latest accepted samples [s], by their names in `PoseEstimate`."""
         seen = {f"{name}_time": self.seen.get(name) for name in ("vision", "depth", "velocity")}
         return {**seen, "imu_time": self.imu_time}
 
@@ -170,7 +177,7 @@ class Track:
         return self.imu_time is not None and time - self.imu_time <= GYRO_HOLD
 
 
-T = TypeVar("T", bound=Track)
+T = TypeVar("T", bound=FilterMemory)
 
 
 class Filter(ABC, Generic[T]):
@@ -204,7 +211,7 @@ class Filter(ABC, Generic[T]):
         """Return the track at a time [s]; it does not go backwards."""
 
     @abstractmethod
-    def estimate(self, track: T, time: float) -> Estimate:
+    def estimate(self, track: T, time: float) -> PoseEstimate:
         """Return the estimate at a time [s], not before the track's own; values not yet known are NaN."""
 
     @abstractmethod
@@ -304,7 +311,7 @@ class Filter(ABC, Generic[T]):
         return judge(gate, memory, time, value, R, distance, drift)
 
 
-def motion_of(settings: Settings, xy_slows: bool, z_slows: bool) -> Motion:
+def motion_of(settings: Settings, xy_slows: bool, z_slows: bool) -> MotionModel:
     """Return the motion model in which axes without measurements slow down to rest, within `speed_std`."""
     slows = (xy_slows, xy_slows, z_slows)
     rate, motion = settings.decay, settings.motion

@@ -167,7 +167,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class PoseEstimate:
     """Pose of the vehicle at one time. NaN: not known yet."""
 
     time: float

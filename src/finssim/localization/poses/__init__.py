@@ -13,7 +13,7 @@ from finssim.core.rotations import matrix_to_quat
 from finssim.localization.detection.detections import Detection, best_detections
 
 __all__ = [
-    "Constraints", "Correspondences", "Measurement", "axes_of_up", "correspondences", "refused", "tilt_matrix",
+    "Constraints", "Correspondences", "PoseMeasurement", "axes_of_up", "correspondences", "refused", "tilt_matrix",
 ]  # fmt: skip
 
 Array = npt.NDArray[np.float64]
@@ -46,7 +46,7 @@ class Constraints:
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
+class PoseMeasurement:
     """Pose of the vehicle from one picture, pool frame; NaN where it was refused."""
 
     method: str
@@ -117,10 +117,10 @@ class Measurement:
 
 def refused(
     method: str, reason: str, rejected: Mapping[str, int] | None = None, *, tags: tuple[int, ...] = ()
-) -> Measurement:
+) -> PoseMeasurement:
     """The measurement that is none, and why."""
     position, matrix = np.full(3, np.nan), np.full((3, 3), np.nan)
-    return Measurement(
+    return PoseMeasurement(
         method, False, reason, position, matrix, matrix, math.nan, tags, 0, dict(rejected or {})
     )
 

@@ -21,7 +21,7 @@ from finssim.localization.overhead_camera import Pool
 from finssim.localization.poses import (
     Constraints,
     Correspondences,
-    Measurement,
+    PoseMeasurement,
     axes_of_up,
     correspondences,
     refused,
@@ -354,7 +354,7 @@ def planar_fit(
     pixel_std: float = 0.5,
     *,
     straight: bool = False,
-) -> Measurement:
+) -> PoseMeasurement:
     """Measure x, y and yaw of a vehicle whose height, roll and pitch are known.
 
     Each corner's height z_i = z_b + e3 . R_y(θ) R_x(φ) P_b,i does not depend on the yaw sought, so that its ray meets
@@ -390,7 +390,7 @@ def planar_fit(
     fit = solved.fit
     if fit is None:
         return refused(method, solved.reason, rejected, tags=pairs.tags)
-    return Measurement(
+    return PoseMeasurement(
         method,
         True,
         "",
@@ -829,7 +829,7 @@ def minima_from(
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class BestMinimum:
     """The best of several minima."""
 
     best: RefinedPose
@@ -858,7 +858,7 @@ class Choice:
         return np.asarray((1.0 - share) * P + share * other)
 
 
-def choose(minima: list[RefinedPose], constraints: Constraints | None, pixel_std: float) -> Choice:
+def choose(minima: list[RefinedPose], constraints: Constraints | None, pixel_std: float) -> BestMinimum:
     """The best of the minima and the next one.
 
     Args:
@@ -875,20 +875,20 @@ def choose(minima: list[RefinedPose], constraints: Constraints | None, pixel_std
         scored.append(chi2)
     order = np.argsort(scored, kind="stable")
     if len(minima) == 1:
-        return Choice(minima[0], None, math.inf)
+        return BestMinimum(minima[0], None, math.inf)
     first, second = int(order[0]), int(order[1])
-    return Choice(minima[first], minima[second], float(scored[second] - scored[first]))
+    return BestMinimum(minima[first], minima[second], float(scored[second] - scored[first]))
 
 
 def measured(
     method: str, pose: RefinedPose, covariance: Array, pairs: Correspondences, medium: str = ""
-) -> Measurement:
+) -> PoseMeasurement:
     """The measurement that a pose is, with its covariance (6, 6). The covariance is in [m] and [rad]."""
     x, y, z = pose.rotation[:, 0]
     rows = np.zeros((3, 6))
     rows[0, 0] = rows[1, 1] = 1.0
     rows[2, 3:] = np.array([-x * z, -y * z, x * x + y * y]) / (x * x + y * y)
-    return Measurement(
+    return PoseMeasurement(
         method=method,
         ok=True,
         reason="",
@@ -932,7 +932,7 @@ def pinhole(
     tags_b: Mapping[int, Array],
     constraints: Constraints | None,
     pixel_std: float = 0.5,
-) -> Measurement:
+) -> PoseMeasurement:
     """Measure all six degrees of freedom with straight rays (perspective-n-point), as if there were no water.
 
     Of two attitudes that a flat tag leaves open, the one with the smaller misses is taken; roll and pitch of
@@ -962,7 +962,7 @@ def pinhole_depth(
     tags_b: Mapping[int, Array],
     constraints: Constraints | None,
     pixel_std: float = 0.5,
-) -> Measurement:
+) -> PoseMeasurement:
     """Measure x, y [m] and yaw [rad] at a known height and tilt with straight rays, as if there were no water.
 
     It is `planar_fit` with rays that do not bend; arguments as of `planar_fit`.
@@ -998,7 +998,7 @@ def refractive_bundle(
     tags_b: Mapping[int, Array],
     constraints: Constraints | None,
     pixel_std: float = 0.5,
-) -> Measurement:
+) -> PoseMeasurement:
     """Measure all six degrees of freedom by the reprojection error through the water.
 
     Starts are the poses that a pinhole camera would see, moved to their true depth, the same mirrored at the line of
@@ -1026,7 +1026,7 @@ def refractive_bundle(
     return measured(method, choice.best, choice.covariance(pixel_std), pairs)
 
 
-def _doubt(choice: Choice, pixel_std: float) -> str:
+def _doubt(choice: BestMinimum, pixel_std: float) -> str:
     """Return why the best pose is doubtful; empty if it is not."""
     best, second = choice.best, choice.second
     if not best.converged:
@@ -1106,7 +1106,7 @@ def weighted_fit(
     tags_b: Mapping[int, Array],
     constraints: Constraints | None,
     pixel_std: float = 0.5,
-) -> Measurement:
+) -> PoseMeasurement:
     """Measure a pose by the reprojection error through the water, and by how far it is from measured height and tilt.
 
     Minimises sum_i rho(|u_i - s - pi(P_i)| / sigma_px) + ((up . (t + R port) - z) / sigma_z)²
@@ -1169,7 +1169,7 @@ def _constraint_rows(constraints: Constraints, pixel_std: float) -> ExtraRows:
 
 
 Method: TypeAlias = Callable[
-    [Iterable[Detection], Pool, Mapping[int, Array], Constraints | None, float], Measurement
+    [Iterable[Detection], Pool, Mapping[int, Array], Constraints | None, float], PoseMeasurement
 ]
 """Function of the tags of one picture, pool, tag id -> corners in the body frame [m] (4, 3), prior knowledge of height
 and tilt, and the standard deviation of a corner per axis [px] -> the measurement; it refuses a bad picture with a
@@ -1224,6 +1224,6 @@ class TagLocator:
         self.pool, self.method, self.needs_height = pool, method, method in NEEDS_DEPTH
         self.tags_b, self.family, self._pixel_std = tag_corners_b(tags), tags.family, pixel_std
 
-    def __call__(self, detections: Iterable[Detection], constraints: Constraints | None) -> Measurement:
+    def __call__(self, detections: Iterable[Detection], constraints: Constraints | None) -> PoseMeasurement:
         """The pose in one picture, or why there is none."""
         return METHODS[self.method](detections, self.pool, self.tags_b, constraints, self._pixel_std)

@@ -61,7 +61,7 @@ class Layout:
     """Name of the last field if a frame may end before it; None is then decoded."""
 
 
-class Form:
+class TelemetryLayout:
     """A layout for one number of motor outputs, with or without its optional field: bytes of known length."""
 
     def __init__(self, layout: Layout, outputs: int, *, complete: bool = True) -> None:
@@ -159,10 +159,10 @@ class Form:
 
 
 @lru_cache(maxsize=64)
-def forms(layout: Layout, outputs: int) -> tuple[Form, ...]:
+def forms(layout: Layout, outputs: int) -> tuple[TelemetryLayout, ...]:
     """Every form a layout has for a number of motor outputs, the complete one first."""
-    complete = Form(layout, outputs)
-    return (complete, Form(layout, outputs, complete=False)) if layout.optional else (complete,)
+    complete = TelemetryLayout(layout, outputs)
+    return (complete, TelemetryLayout(layout, outputs, complete=False)) if layout.optional else (complete,)
 
 
 def _codes(fields: tuple[Field, ...], outputs: int) -> str:
@@ -353,19 +353,23 @@ def encode_command(command: ThrusterCommand) -> bytes:
 
 
 def encode_telemetry(telemetry: Telemetry) -> bytes:
-    """Frame of a snapshot, 66 + 4 n bytes, or 66 where `motor_rpm` is None; raises LinkError as `Form.encode`."""
+    """Return the frame of a snapshot, 66 + 4 n bytes, or 66 where `motor_rpm` is None.
+
+    Raises:
+        LinkError: See `TelemetryLayout.encode`.
+    """
     if telemetry.motor_rpm is None:
         return forms(TELEMETRY, 0)[1].encode(telemetry)
     return forms(TELEMETRY, _outputs(telemetry.motor_rpm))[0].encode(telemetry)
 
 
 def encode_echo(echo: CommandEcho) -> bytes:
-    """Frame of an echo, 36 + 8 n bytes; raises LinkError as `Form.encode`."""
+    """Frame of an echo, 36 + 8 n bytes; raises LinkError as `TelemetryLayout.encode`."""
     return forms(ECHO, _outputs(echo.received))[0].encode(echo)
 
 
 def encode_navigation(aid: NavigationAid) -> bytes:
-    """Frame of a navigation aid, 35 bytes; raises LinkError as `Form.encode`."""
+    """Frame of a navigation aid, 35 bytes; raises LinkError as `TelemetryLayout.encode`."""
     return forms(NAVIGATION, 0)[0].encode(aid)
 
 
@@ -452,7 +456,7 @@ class Decoder:
         self._rest = b""
         return messages
 
-    def _frame(self, data: bytes, at: int) -> Form | str | None:
+    def _frame(self, data: bytes, at: int) -> TelemetryLayout | str | None:
         """Return the frame that begins at a magic, why none does, or None while there are too few bytes to decide."""
         form = self._plain.get(data[at])
         if form is None:

@@ -6,18 +6,26 @@ from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
     from finssim.sim.overhead_camera.render import OverheadCamera, Rectangle
-    from finssim.sim.overhead_camera.scene import Basin, Pose, Ripples, Scene, Sensor, TagInScene, Water
+    from finssim.sim.overhead_camera.scene import (
+        ImageSensor,
+        ObjectPose,
+        Ripples,
+        Scene,
+        TagInScene,
+        TiledBasin,
+        WaterOptics,
+    )
 
 __all__ = [
-    "Basin",
+    "TiledBasin",
     "OverheadCamera",
-    "Pose",
+    "ObjectPose",
     "Rectangle",
     "Ripples",
     "Scene",
-    "Sensor",
+    "ImageSensor",
     "TagInScene",
-    "Water",
+    "WaterOptics",
 ]
 
 __getattr__, __dir__ = exports(__name__)

@@ -8,7 +8,7 @@ keep 0.001 px.
 import warp as wp
 
 from finssim.sim.overhead_camera.photometry import fresnel, refracted, through_water
-from finssim.sim.overhead_camera.surface import Patch, Wave, distance_to, normal_of, surface_hit
+from finssim.sim.overhead_camera.surface import Patch, SurfaceWave, distance_to, normal_of, surface_hit
 
 # What light meets in and around the pool: printed tags and the tiled basin, each for one ray.
 #
@@ -237,7 +237,7 @@ class SceneData:
     index_far: float  # refractive index of the water
     layer_thickness: wp.array(dtype=float)  # of the window, from the camera [m]
     layer_index: wp.array(dtype=float)  # refractive index of each layer
-    waves: wp.array(dtype=Wave)
+    waves: wp.array(dtype=SurfaceWave)
     attenuation: wp.vec3  # [1/m]
     veil: wp.vec3  # radiance of water without end [-]
     sky: float  # radiance of the sky [-]
@@ -256,7 +256,7 @@ HORIZON = wp.constant(-1.0e-3)
 
 
 @wp.struct
-class Refraction:
+class RefractedRay:
     """A ray after the surface."""
 
     origin: wp.vec3  # [m]
@@ -288,7 +288,7 @@ def meet_tags(
 
 
 @wp.func
-def enter_water(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3) -> Refraction:
+def enter_water(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3) -> RefractedRay:
     """A ray through the surface, or through the layers of a window, by Snell's and Fresnel's laws.
 
     Args:
@@ -297,7 +297,7 @@ def enter_water(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3
         ray: Unit direction in air.
         normal: Unit normal of the face towards the camera, surface frame [-].
     """
-    out = Refraction()
+    out = RefractedRay()
     out.origin = origin
     out.ray = ray
     out.transmitted = 1.0

@@ -16,14 +16,14 @@ from finssim.core.rotations import quat_rotate, quat_to_matrix
 from finssim.sim.overhead_camera.photometry import digitise, noise_key
 from finssim.sim.overhead_camera.raycast import BasinData, SceneData, TagData, cast
 from finssim.sim.overhead_camera.scene import (
-    Basin,
     Scene,
     SurfaceFrame,
     TagInScene,
+    TiledBasin,
     corner_rays_s,
     surface_frame,
 )
-from finssim.sim.overhead_camera.surface import Wave, layout_of, pack_waves, waves_of
+from finssim.sim.overhead_camera.surface import SurfaceWave, layout_of, pack_waves, waves_of
 from finssim.sim.sensors.batch import SensorError
 
 # Which pixels tags may touch: rectangles of the image, with room for ripples and motion.
@@ -182,7 +182,7 @@ def _tags(tags: Sequence[TagInScene], frame: SurfaceFrame) -> NDArray[Any]:
     return table
 
 
-def _basin(basin: Basin, frame: SurfaceFrame) -> BasinData:
+def _basin(basin: TiledBasin, frame: SurfaceFrame) -> BasinData:
     data = BasinData()
     data.R_bs = wp.mat33(*frame.R_sp.T.ravel())
     data.origin = wp.vec3(*frame.point(basin.lower))
@@ -291,7 +291,9 @@ class OverheadCamera:
         self._data.tags = on_device(_tags(tags, self._frame), TagData, self.device)
         cells = [np.asarray(tag.bitmap, np.uint8).ravel() for tag in tags]
         self._data.cells = on_device(np.concatenate([*cells, np.zeros(0, np.uint8)]), wp.uint8, self.device)
-        self._data.waves = on_device(pack_waves(self._waves, self._frame.offset, time), Wave, self.device)
+        self._data.waves = on_device(
+            pack_waves(self._waves, self._frame.offset, time), SurfaceWave, self.device
+        )
         samples = np.zeros((self._full.bottom, self._full.right), np.uint8)
         for r in self._rectangles(tags):
             samples[r.top : r.bottom, r.left : r.right] = self.scene.samples

@@ -24,7 +24,7 @@ UPRIGHT: Quadruple = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pose:
+class ObjectPose:
     """Pose of an object: its origin [m] and its axes, q_p<object> xyzw."""
 
     position: Triple
@@ -44,9 +44,9 @@ class TagInScene:
     """Cells as printed, row 0 at the top, column 0 at the left; true is white; (n, n)."""
     edge: float
     """Between the corners that a detector reports [m]."""
-    pose: Pose
+    pose: ObjectPose
     """Pose at the start of the exposure."""
-    end: Pose | None = None
+    end: ObjectPose | None = None
     """Pose at the end of the exposure; None for a tag at rest."""
     border_cells: int | None = None
     """Cells along `edge`; None for all of the bitmap. Some families print cells outside the border too."""
@@ -79,7 +79,7 @@ class TagInScene:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Basin:
+class TiledBasin:
     """The pool's tiled inside, an upright box between two corners; around it lies the deck."""
 
     lower: Triple
@@ -107,7 +107,7 @@ class Basin:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Water:
+class WaterOptics:
     """Water, which absorbs and adds light on the way from an object to the surface: L = L0 exp(-c s) + B (1 - exp(-c
     s))."""
 
@@ -142,7 +142,7 @@ class Ripples:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sensor:
+class ImageSensor:
     """Conversion of light to numbers. All pixels are exposed together, centred on the requested time."""
 
     shutter: float = 0.0
@@ -176,15 +176,15 @@ class Scene:
     camera: Camera
     interface: Interface
     """Between camera and water; its layers are flat, so ripples need an interface without window."""
-    basin: Basin
-    water: Water = field(default_factory=Water)
+    basin: TiledBasin
+    water: WaterOptics = field(default_factory=WaterOptics)
     sky: float = 0.3
     """Radiance [-] of ceiling or sky, of which the surface shows 2 % at normal incidence. Light on the scene is even,
     from above."""
     ripples: Ripples | None = None
     tags: tuple[TagInScene, ...] = ()
     """Tags that do not move: surveyed tags on the floor."""
-    sensor: Sensor = field(default_factory=Sensor)
+    sensor: ImageSensor = field(default_factory=ImageSensor)
     samples: int = 2
     """Rays per pixel along each image axis near tags (elsewhere one ray). Texture and tiles are filtered
     over each ray's share of the pixel, so 2 places a straight edge to about 0.01 px."""

@@ -80,7 +80,7 @@ def waves_of(ripples: Ripples) -> Waves:
 
 
 @wp.struct
-class Wave:
+class SurfaceWave:
     """One sine of the surface at the picture's time."""
 
     k: wp.vec2  # [rad/m]
@@ -113,7 +113,7 @@ def layout_of(struct: Any) -> np.dtype[Any]:
 
 
 def pack_waves(waves: Waves | None, origin: ArrayLike, time: float) -> NDArray[Any]:
-    """Return waves as structs for the kernel, in the units of `Wave`.
+    """Return waves as structs for the kernel, in the units of `SurfaceWave`.
 
     Args:
         waves: The surface; None for a flat one.
@@ -121,7 +121,7 @@ def pack_waves(waves: Waves | None, origin: ArrayLike, time: float) -> NDArray[A
         time: Middle of the exposure [s].
     """
     count = 0 if waves is None else len(waves.omega)
-    table = np.zeros(count, dtype=layout_of(Wave))
+    table = np.zeros(count, dtype=layout_of(SurfaceWave))
     if waves is not None:
         table["k"], table["omega"], table["amplitude"] = waves.k, waves.omega, waves.amplitude
         table["phase"] = np.remainder(waves._angle(origin, time), 2.0 * math.pi)
@@ -129,7 +129,7 @@ def pack_waves(waves: Waves | None, origin: ArrayLike, time: float) -> NDArray[A
 
 
 @wp.func
-def surface_at(waves: wp.array(dtype=Wave), x: float, y: float) -> Patch:
+def surface_at(waves: wp.array(dtype=SurfaceWave), x: float, y: float) -> Patch:
     """The surface around a point, mid-exposure. The point (x, y) is in [m]."""
     p = Patch()
     p.x = x
@@ -152,7 +152,7 @@ def surface_at(waves: wp.array(dtype=Wave), x: float, y: float) -> Patch:
 
 
 @wp.func
-def surface_hit(waves: wp.array(dtype=Wave), height: float, ray: wp.vec3) -> Patch:
+def surface_hit(waves: wp.array(dtype=SurfaceWave), height: float, ray: wp.vec3) -> Patch:
     """The surface around the point where a ray from the camera meets it, by a Newton step from the still surface.
 
     Args:

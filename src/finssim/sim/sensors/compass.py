@@ -9,7 +9,7 @@ from finssim.sim.sensors.batch import SensorBatch
 from finssim.sim.sensors.sampling import (
     TURN_ON,
     WHITE,
-    Truth,
+    SampledState,
     digitised,
     normal,
     parameters_of,
@@ -42,8 +42,8 @@ def heading_of(q_wb: wp.quat) -> float:
 
 @wp.func
 def measure_heading(
-    truth: Truth, p: CompassParameters, key: wp.uint32, root: float, restarting: bool, compass: CompassArrays, w: int,
-    v: int, slot: int,
+    truth: SampledState, p: CompassParameters, key: wp.uint32, root: float, restarting: bool,
+    compass: CompassArrays, w: int, v: int, slot: int,
 ) -> bool:  # fmt: skip
     """One sample of a compass; arguments as `sampling_kernel` has them."""
     if restarting:

@@ -10,7 +10,7 @@ from finssim.sim.sensors.sampling import (
     TURN_ON,
     WALK,
     WHITE,
-    Truth,
+    SampledState,
     digitised,
     normal,
     parameters_of,
@@ -53,8 +53,8 @@ def depth_of_point(position: wp.vec3, q_wb: wp.quat, r: wp.vec3) -> float:
 
 @wp.func
 def measure_depth(
-    truth: Truth, p: DepthParameters, key: wp.uint32, root: float, restarting: bool, gauge: DepthArrays, w: int, v: int,
-    slot: int,
+    truth: SampledState, p: DepthParameters, key: wp.uint32, root: float, restarting: bool,
+    gauge: DepthArrays, w: int, v: int, slot: int,
 ) -> bool:  # fmt: skip
     """One sample of a gauge; arguments as `sampling_kernel` has them."""
     if restarting:

@@ -13,7 +13,7 @@ from finssim.sim.sensors.sampling import (
     TURN_ON_2,
     WALK,
     WHITE,
-    Truth,
+    SampledState,
     digitised3,
     normal,
     normal3,
@@ -74,8 +74,8 @@ def has_echo(position: wp.vec3, q_wb: wp.quat, p: DvlParameters) -> bool:
 
 @wp.func
 def measure_velocity(
-    truth: Truth, p: DvlParameters, key: wp.uint32, root: float, restarting: bool, dvl: DvlArrays, w: int, v: int,
-    slot: int,
+    truth: SampledState, p: DvlParameters, key: wp.uint32, root: float, restarting: bool,
+    dvl: DvlArrays, w: int, v: int, slot: int,
 ) -> bool:  # fmt: skip
     """One sample of a DVL; arguments as `sampling_kernel` has them."""
     if restarting:

@@ -15,7 +15,7 @@ from finssim.sim.sensors.sampling import (
     WALK_2,
     WHITE,
     WHITE_2,
-    Truth,
+    SampledState,
     digitised3,
     normal3,
     parameters_of,
@@ -75,8 +75,8 @@ def angular_rate(nu: vec6, q_bs: wp.quat) -> wp.vec3:
 
 @wp.func
 def measure_motion(
-    truth: Truth, p: ImuParameters, key: wp.uint32, root: float, restarting: bool, imu: ImuArrays, w: int, v: int,
-    slot: int,
+    truth: SampledState, p: ImuParameters, key: wp.uint32, root: float, restarting: bool,
+    imu: ImuArrays, w: int, v: int, slot: int,
 ) -> bool:  # fmt: skip
     """One sample of an IMU; arguments as `sampling_kernel` has them."""
     if restarting:

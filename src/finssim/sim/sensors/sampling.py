@@ -229,7 +229,7 @@ def new_sampling(
 
 
 @wp.struct
-class Truth:
+class SampledState:
     """True state of one vehicle at the end of a control step."""
 
     position: wp.vec3  # body origin, world frame [m]
@@ -299,7 +299,7 @@ def sampling_kernel(parameters: Any, arrays: Any, measure: Any, display: Any) ->
             return
         if restarting or sample_due(sampling, w, v, step):
             key = sample_key(seed, number, w, v, episode[w], step)
-            truth = Truth()
+            truth = SampledState()
             truth.position = position[w, v]
             truth.quaternion = quaternion[w, v]
             truth.velocity = velocity[w, v]

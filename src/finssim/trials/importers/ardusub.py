@@ -21,12 +21,12 @@ from finssim.core.rotations import wrap_angle
 from finssim.trials.conversion import GRAVITY
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.importers.ardusub_outputs import mixed_pulses, outputs_of
-from finssim.trials.importers.assemble import ArduSubMap, Frame, Stream, in_our_axes
+from finssim.trials.importers.assemble import ArduSubMap, LogFrame, Stream, in_our_axes
 from finssim.trials.trial import Array
 from finssim.vehicles import Vehicle
 from finssim.vehicles.autopilot import DEMANDS, FRAMES
 
-__all__ = ["Log", "read_ardusub", "velocity_stream"]
+__all__ = ["ArduPilotLog", "read_ardusub", "velocity_stream"]
 
 # Messages of ArduPilot logs: DataFlash `.BIN` and telemetry `.tlog`, through pymavlink, and recordings of BlueOS.
 
@@ -44,7 +44,7 @@ WRONG_CLOCK = 5.0
 
 
 @dataclass(frozen=True)
-class Log:
+class ArduPilotLog:
     """Content of a log, by kind of message."""
 
     shown: str
@@ -70,7 +70,7 @@ class Log:
         source = f"{self.shown} {kind}"
         return Stream(source=source, t=self.times[kind], channels=channels, findings=findings)
 
-    def some(self, kind: str, name: str, value: int | str) -> Log:
+    def some(self, kind: str, name: str, value: int | str) -> ArduPilotLog:
         """The log with only those messages of a kind whose field has that value; all where none has the field."""
         if not any(name in message for message in self.messages.get(kind, ())):
             return self
@@ -82,7 +82,7 @@ class Log:
         )
 
 
-def read_log(path: Path, kinds: frozenset[str], *, received: bool = False) -> Log:
+def read_log(path: Path, kinds: frozenset[str], *, received: bool = False) -> ArduPilotLog:
     """The messages of some kinds; a log that was cut short is read up to the cut.
 
     Args:
@@ -99,7 +99,7 @@ def read_log(path: Path, kinds: frozenset[str], *, received: bool = False) -> Lo
             dataflash = file.read(2) == DATAFLASH
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from None
-    log = Log(path.name, not dataflash)
+    log = ArduPilotLog(path.name, not dataflash)
     clock = _Clock(received)
     for kind, message, receipt in _messages(path, dataflash, kinds | {"PARM", "PARAM_VALUE", "HEARTBEAT"}):
         if kind == "PARM":
@@ -295,7 +295,7 @@ LEAST_USABLE = 0.2
 """Part of the estimates that must rest on a measurement of position or velocity."""
 
 
-def velocity_stream(log: Log, source: Literal["auto", "ekf", "vision", "none"]) -> Stream | None:
+def velocity_stream(log: ArduPilotLog, source: Literal["auto", "ekf", "vision", "none"]) -> Stream | None:
     """Velocity from position deltas if there are any, else velocity and position from the autopilot's estimate.
 
     The estimate is left out where the filter had no measurement of horizontal position or velocity: what it says then
@@ -310,7 +310,7 @@ def velocity_stream(log: Log, source: Literal["auto", "ekf", "vision", "none"]) 
     return _estimate(log)
 
 
-def _position_deltas(log: Log) -> Stream | None:
+def _position_deltas(log: ArduPilotLog) -> Stream | None:
     """Position deltas over the time they took, body frame."""
     if log.has("VISO"):
         kind, dt = "VISO", log.numbers("VISO", "dt")
@@ -329,7 +329,7 @@ def _position_deltas(log: Log) -> Stream | None:
     return in_our_axes(replace(stream, t=stream.t - 0.5 * np.where(good, dt, 0.0)), FRD)
 
 
-def _estimate(log: Log) -> Stream | None:
+def _estimate(log: ArduPilotLog) -> Stream | None:
     kind = next((kind for kind in ESTIMATES if log.has(kind)), None)
     if kind is None:
         return None
@@ -349,7 +349,7 @@ def _estimate(log: Log) -> Stream | None:
     return in_our_axes(first_core.stream(kind, channels, finding("velocity_estimated", kind=kind)), FRD)
 
 
-def _held(log: Log, kind: str, name: str, t: Array, otherwise: float) -> Array:
+def _held(log: ArduPilotLog, kind: str, name: str, t: Array, otherwise: float) -> Array:
     """A field at other times, each value held until the next; the same everywhere where the log has none."""
     if not log.messages.get(kind):
         return np.full(len(t), otherwise)
@@ -357,7 +357,7 @@ def _held(log: Log, kind: str, name: str, t: Array, otherwise: float) -> Array:
     return log.numbers(kind, name)[np.maximum(held, 0)]
 
 
-FRD = Frame(body="FRD", world="NED")
+FRD = LogFrame(body="FRD", world="NED")
 
 INERTIAL = ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 PRESSURES = ("SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3")
@@ -410,7 +410,7 @@ def read_ardusub(
     return usable
 
 
-def _attitude(log: Log) -> Stream | None:
+def _attitude(log: ArduPilotLog) -> Stream | None:
     """Roll, pitch, yaw; in telemetry the rates too, which come without the bias that the autopilot found."""
     if log.has("ATT"):
         angles = [np.radians(log.numbers("ATT", name)) for name in ("Roll", "Pitch", "Yaw")]
@@ -430,7 +430,7 @@ def _attitude(log: Log) -> Stream | None:
     return replace(stream, channels={**stream.channels, **wrapped})
 
 
-def _inertial(log: Log, requested: ArduSubMap) -> Stream | None:
+def _inertial(log: ArduPilotLog, requested: ArduSubMap) -> Stream | None:
     """Specific force, and in DataFlash logs the rates."""
     if not log.telemetry:
         kind = (
@@ -456,7 +456,7 @@ def _inertial(log: Log, requested: ArduSubMap) -> Stream | None:
     return None
 
 
-def _depth(log: Log, requested: ArduSubMap) -> Stream | None:
+def _depth(log: ArduPilotLog, requested: ArduSubMap) -> Stream | None:
     """Depth of the pressure sensor that the autopilot takes for outside."""
     primary = int(log.parameters.get("BARO_PRIMARY", log.parameters.get("GND_PRIMARY", 1)))
     chosen = primary if requested.barometer is None else requested.barometer
@@ -472,7 +472,7 @@ def _depth(log: Log, requested: ArduSubMap) -> Stream | None:
     return instance.stream(kind, {"depth": -instance.numbers(kind, "Alt")}, of)
 
 
-def _depth_from_pressure(log: Log, chosen: int) -> Stream | None:
+def _depth_from_pressure(log: ArduPilotLog, chosen: int) -> Stream | None:
     kind = PRESSURES[chosen] if chosen < len(PRESSURES) else ""
     if not log.has(kind):
         return None
@@ -486,7 +486,7 @@ def _depth_from_pressure(log: Log, chosen: int) -> Stream | None:
     return log.stream(kind, {"depth": depth}, finding("depth_of_message", kind=kind, ground=ground))
 
 
-def _voltage(log: Log) -> Stream | None:
+def _voltage(log: ArduPilotLog) -> Stream | None:
     for kind, name, unit in (
         ("BAT", "Volt", 1.0),
         ("CURR", "Volt", 1.0),
@@ -502,7 +502,7 @@ def _voltage(log: Log) -> Stream | None:
     return None
 
 
-def _arming(log: Log) -> Stream | None:
+def _arming(log: ArduPilotLog) -> Stream | None:
     """Words `armed` and `disarmed`; what was before the first event is its opposite."""
     if log.has("HEARTBEAT"):
         armed = [bool(int(mode) & ARMED_FLAG) for mode in log.numbers("HEARTBEAT", "base_mode")]
@@ -521,12 +521,12 @@ def _arming(log: Log) -> Stream | None:
     return _arming_stream(log, "ARM", [min(begin, times[0] - 1e-3), *times], [not armed[0], *armed])
 
 
-def _arming_stream(log: Log, kind: str, times: list[float], armed: list[bool]) -> Stream:
+def _arming_stream(log: ArduPilotLog, kind: str, times: list[float], armed: list[bool]) -> Stream:
     labels = np.array(["armed" if on else "disarmed" for on in armed], dtype=np.str_)
     return Stream(source=f"{log.shown} {kind}", t=np.array(times), words={"arming": labels})
 
 
-def _pulses(log: Log, requested: ArduSubMap, vehicle: Vehicle | None) -> list[Stream]:
+def _pulses(log: ArduPilotLog, requested: ArduSubMap, vehicle: Vehicle | None) -> list[Stream]:
     """pwm_NAME of each thruster, turned about the neutral pulse where needed: longer pulses push along its axis."""
     kind, field = ("SERVO_OUTPUT_RAW", "servo{}_raw") if log.telemetry else ("RCOU", "C{}")
     port = log.some(kind, "port", 0)
@@ -556,7 +556,7 @@ USUAL_YAW = 3.375
 
 
 def _driven_by_sticks(
-    log: Log, requested: ArduSubMap, vehicle: Vehicle, streams: list[Stream]
+    log: ArduPilotLog, requested: ArduSubMap, vehicle: Vehicle, streams: list[Stream]
 ) -> list[Stream]:
     """The streams with pwm_NAME from the pilot's axes, where the log has no outputs, and without what other modes did.
 
@@ -596,7 +596,7 @@ def _frame_name(requested: ArduSubMap, vehicle: Vehicle) -> Any:
     return requested.frame or (vehicle.autopilot.frame if vehicle.autopilot is not None else None)
 
 
-def _axes(log: Log, requested: ArduSubMap) -> tuple[str, Array, Array] | None:
+def _axes(log: ArduPilotLog, requested: ArduSubMap) -> tuple[str, Array, Array] | None:
     """Kind of message, times and demands in the order of `DEMANDS`, (n, 6), from channels or from the joystick."""
     kind, name = ("RC_CHANNELS", "chan{}_raw") if log.telemetry else ("RCIN", "C{}")
     if log.has(kind):
@@ -615,7 +615,7 @@ def _axes(log: Log, requested: ArduSubMap) -> tuple[str, Array, Array] | None:
     return kind, log.times[kind], np.stack([sticks[demand] for demand in DEMANDS], axis=-1)
 
 
-def _gains(log: Log) -> Log:
+def _gains(log: ArduPilotLog) -> ArduPilotLog:
     """The log with PilotGain alone of the values that go by names."""
     kind = "NAMED_VALUE_FLOAT"
     if all(message.get("name") != "PilotGain" for message in log.messages.get(kind, ())):
@@ -623,13 +623,13 @@ def _gains(log: Log) -> Log:
     return log.some(kind, "name", "PilotGain")
 
 
-def _mode(log: Log, t: Array) -> Array:
+def _mode(log: ArduPilotLog, t: Array) -> Array:
     """Return the number of the autopilot's mode at times; MANUAL if the log has none."""
     kind, name = ("HEARTBEAT", "custom_mode") if log.telemetry else ("MODE", "ModeNum")
     return _held(log, kind, name, t, MANUAL)
 
 
-def _armed(log: Log, t: Array) -> NDArray[np.bool_]:
+def _armed(log: ArduPilotLog, t: Array) -> NDArray[np.bool_]:
     """Return whether it was armed at times; always if the log does not contain it."""
     arming = _arming(log)
     if arming is None:

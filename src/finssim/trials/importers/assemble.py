@@ -124,7 +124,7 @@ class PhaseColumn(Part):
         return labels
 
 
-class Frame(Part):
+class LogFrame(Part):
     """Axes that the log uses."""
 
     body: Literal["FLU", "FRD"] = "FLU"
@@ -156,7 +156,7 @@ class SourceMap(Part):
     """Needed for files; topics have stamps."""
     columns: dict[str, ColumnSource] = Field(default_factory=dict)
     """Canonical column -> its source; for topics of known types the usual ones where nothing is given."""
-    frame: Frame = Field(default_factory=Frame)
+    frame: LogFrame = Field(default_factory=LogFrame)
     time_offset: float = 0.0
     """Added to the times [s]."""
     phase: PhaseColumn | None = None
@@ -372,7 +372,7 @@ def split_rule(text: str) -> SplitRule:
 Rows = NDArray[np.bool_]
 
 
-def split_table(name: str, table: Table, rule: SplitRule | None) -> dict[str, Table]:
+def split_table(name: str, table: MergedStreams, rule: SplitRule | None) -> dict[str, MergedStreams]:
     """Name of a trial -> its part of the table, with times from 0; one part of that name without a rule.
 
     Raises:
@@ -395,7 +395,7 @@ def split_table(name: str, table: Table, rule: SplitRule | None) -> dict[str, Ta
     return {piece: _part(table, rows) for piece, rows in long_enough.items()}
 
 
-def _part(table: Table, rows: Rows) -> Table:
+def _part(table: MergedStreams, rows: Rows) -> MergedStreams:
     t = table.t[rows]
     return replace(
         table,
@@ -415,7 +415,7 @@ WORDED = {
 """Rule -> the words that it uses, and the message if there are none."""
 
 
-def _labels(name: str, table: Table, rule: SplitRule) -> NDArray[np.int64]:
+def _labels(name: str, table: MergedStreams, rule: SplitRule) -> NDArray[np.int64]:
     """Number of the piece that each row belongs to, -1 for none, (n,).
 
     A trial of `phase` begins with each baseline; without baselines, with each excitation after something else.
@@ -439,7 +439,7 @@ def _numbered(name: str, labels: NDArray[np.int64]) -> dict[str, Rows]:
     return {f"{name}_{i + 1:0{len(str(count))}d}": labels == i for i in range(count)}
 
 
-def _windows(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+def _windows(name: str, table: MergedStreams, rule: SplitRule) -> dict[str, Rows]:
     pieces = {window: (table.t >= low) & (table.t <= high) for window, (low, high) in rule.windows.items()}
     empty = [window for window, rows in pieces.items() if not rows.any()]
     if empty:
@@ -482,7 +482,7 @@ class Stream:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table:
+class MergedStreams:
     """Several streams on the union of their times."""
 
     start: float
@@ -562,7 +562,7 @@ def moved_in_time(streams: Sequence[Stream], offsets: Mapping[str, float]) -> li
     return out
 
 
-def merge(streams: Sequence[Stream]) -> Table:
+def merge(streams: Sequence[Stream]) -> MergedStreams:
     """All streams on the union of their times, which start at 0.
 
     Raises:
@@ -584,7 +584,9 @@ def merge(streams: Sequence[Stream]) -> Table:
     findings = [item for stream in each for item in stream.findings]
     if start > 1e8:
         findings.append(finding("clock_origin", start=start))
-    return Table(start=start, t=t, channels=channels, words=texts, findings=tuple(dict.fromkeys(findings)))
+    return MergedStreams(
+        start=start, t=t, channels=channels, words=texts, findings=tuple(dict.fromkeys(findings))
+    )
 
 
 def _refuse_doubles(streams: Sequence[Stream]) -> None:
@@ -615,7 +617,7 @@ LONGEST_BRIDGE = 0.5
 """Between two attitudes that a velocity of the world is turned with [s]."""
 
 
-def in_our_axes(stream: Stream, frame: Frame) -> Stream:
+def in_our_axes(stream: Stream, frame: LogFrame) -> Stream:
     """The stream in x forward, y left, z up and a world with z up."""
     channels = in_our_frames(stream.channels, frame.body, frame.world)
     if frame.world == "NED":
@@ -625,7 +627,7 @@ def in_our_axes(stream: Stream, frame: Frame) -> Stream:
     return replace(stream, channels=channels)
 
 
-def trial_of(name: str, table: Table, header: Header, column_map: ColumnMap) -> Trial:
+def trial_of(name: str, table: MergedStreams, header: Header, column_map: ColumnMap) -> Trial:
     """The trial that a table makes, with u v w and depth in place of world velocities and pressure.
 
     Raises:
@@ -656,7 +658,7 @@ def trial_of(name: str, table: Table, header: Header, column_map: ColumnMap) -> 
     )
 
 
-def _phase(table: Table) -> np.ndarray | None:
+def _phase(table: MergedStreams) -> np.ndarray | None:
     if "phase" not in table.words:
         return None
     labels = table.words["phase"]

@@ -35,7 +35,7 @@ from finssim.trials.importers.assemble import (
     trial_of,
 )
 from finssim.trials.trial import Array, Trial, column_of
-from finssim.trials.trial_files import Table, read_table, write_trial
+from finssim.trials.trial_files import ColumnTable, read_table, write_trial
 from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
 
@@ -59,7 +59,7 @@ def read_stream(path: Path, source: SourceMap | None) -> Stream:
     return table_stream(table, source, path.name)
 
 
-def table_stream(table: Table, source: SourceMap | None, label: str) -> Stream:
+def table_stream(table: ColumnTable, source: SourceMap | None, label: str) -> Stream:
     """Return the columns of a table as a stream.
 
     Args:
@@ -123,7 +123,7 @@ def _stream(
     return in_our_axes(Stream(source=name, t=t, channels=channels, words=labels), source.frame)
 
 
-def _by_names(table: Table, label: str) -> SourceMap:
+def _by_names(table: ColumnTable, label: str) -> SourceMap:
     """A map of the columns that have canonical names."""
     time = next((name for name in TIME_NAMES if name in table.numbers), None)
     recognised = [name for name in table.numbers if column_of(name) is not None]
@@ -138,14 +138,14 @@ def _by_names(table: Table, label: str) -> SourceMap:
     )
 
 
-def _require_column(table: Table, name: str, label: str) -> None:
+def _require_column(table: ColumnTable, name: str, label: str) -> None:
     if name not in table.columns:
         raise CalibrationError(
             f"{label}: no column '{name}'{did_you_mean(name, table.columns)} its columns are {_column_list(table)}"
         )
 
 
-def _numbers(table: Table, name: str, label: str) -> Array:
+def _numbers(table: ColumnTable, name: str, label: str) -> Array:
     _require_column(table, name, label)
     if name not in table.numbers:
         example = next((word for word in table.words[name] if word), "")
@@ -153,12 +153,12 @@ def _numbers(table: Table, name: str, label: str) -> Array:
     return table.numbers[name]
 
 
-def _text(table: Table, name: str, label: str) -> list[str]:
+def _text(table: ColumnTable, name: str, label: str) -> list[str]:
     _require_column(table, name, label)
     return table.words[name] if name in table.words else [f"{x:g}" for x in table.numbers[name]]
 
 
-def _time(table: Table, time: TimeColumn, label: str) -> Array:
+def _time(table: ColumnTable, time: TimeColumn, label: str) -> Array:
     """Seconds on the clock of the log."""
     _require_column(table, time.column, label)
     if time.unit != "date" and time.column in table.numbers:
@@ -183,7 +183,7 @@ def _date(word: str) -> str:
     return f"1970-01-01T{word}" if re.match(r"\d\d:\d", word) else word or "NaT"
 
 
-def _column_list(table: Table) -> str:
+def _column_list(table: ColumnTable) -> str:
     return listed(table.columns, 40)
 
 

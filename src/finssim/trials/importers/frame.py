@@ -13,7 +13,7 @@ from finssim.trials.findings import CalibrationError, finding
 from finssim.trials.importers.assemble import ColumnMap, SourceMap, merge, trial_of
 from finssim.trials.importers.dispatch import table_stream
 from finssim.trials.trial import Trial, column_of
-from finssim.trials.trial_files import Table
+from finssim.trials.trial_files import ColumnTable
 from finssim.vehicles.part import did_you_mean, sentence_of
 
 
@@ -78,7 +78,7 @@ def trial_from_frame(
     return trial_of(name, merge([table_stream(table, source, name)]), mapped.header_of(name, None), mapped)
 
 
-def _table(frame: Any, time: str, name: str) -> Table:
+def _table(frame: Any, time: str, name: str) -> ColumnTable:
     """Return the columns of a DataFrame, its index of times included, or of a mapping."""
     if hasattr(frame, "columns") and hasattr(frame, "index"):
         index = frame.index
@@ -101,7 +101,7 @@ def _table(frame: Any, time: str, name: str) -> Table:
         raise CalibrationError(
             f"{name}: columns {listed or 'none'}, expected one-dimensional ones of one length"
         )
-    table = Table()
+    table = ColumnTable()
     for column, array in arrays.items():
         if np.issubdtype(array.dtype, np.datetime64):
             table.words[column] = np.datetime_as_string(array.astype("datetime64[us]")).tolist()

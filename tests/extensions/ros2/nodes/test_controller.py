@@ -20,7 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from finssim.agents.controllers import controller
 from finssim.control.allocation import Allocator
 from finssim.control.guidance import Station, goal_at
-from finssim.extensions.ros2.nodes.controller import Controller
+from finssim.extensions.ros2.nodes.controller import ControllerNode
 from finssim.extensions.ros2.nodes.conversions import RosMessages, force_of, nanoseconds, ros_type
 from finssim.extensions.ros2.nodes.teleop import Teleop
 from finssim.extensions.ros2.topics import TOPICS, quality_profile
@@ -133,7 +133,7 @@ def pid_force(goal):
 
 def test_it_is_silent_until_the_bridge_is_armed(wire):
     """Then it asks for what the PID asks for, towards the goal of its parameter; disarmed, it is silent again."""
-    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'", "-p", "use_sim_time:=true")
+    stage = wire(ControllerNode, "-p", "goal:='0.6,0.1,-0.5,0'", "-p", "use_sim_time:=true")
     stage.clock = 10 * 10**9  # one decision a turn at most, so that none is overwritten unheard
     assert stage.until(lambda: stage.node.state.reading(stage.node.now()).ready)
     stage.turns(20)
@@ -152,7 +152,7 @@ def test_it_is_silent_until_the_bridge_is_armed(wire):
 
 def test_without_a_goal_it_keeps_the_place_where_it_was_armed(wire):
     """And a goal by topic moves it, one outside the workspace or not level does not."""
-    stage = wire(Controller)
+    stage = wire(ControllerNode)
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["command"])
     assert stage.node.runtime.guide.name == "here"
@@ -171,7 +171,7 @@ def test_without_a_goal_it_keeps_the_place_where_it_was_armed(wire):
 @pytest.mark.parametrize("durability", ["VOLATILE", "TRANSIENT_LOCAL"])
 def test_a_goal_that_is_given_again_is_followed_again(wire, capfd, durability):
     """From publishers of either durability, as RViz and `ros2 topic pub` are, and no policy is said not to fit."""
-    stage = wire(Controller)
+    stage = wire(ControllerNode)
     policies = QoSProfile(depth=1, durability=DurabilityPolicy[durability])
     publisher = stage.peer.create_publisher(ros_type(TOPICS["goal"].type), "goal", policies)
     assert stage.until(lambda: publisher.get_subscription_count() == 1), "one subscription, not two"
@@ -184,7 +184,7 @@ def test_a_goal_that_is_given_again_is_followed_again(wire, capfd, durability):
 
 def test_commands_say_who_asks_and_in_which_mode(wire):
     """The node is one commander whatever its mode."""
-    stage = wire(Controller)
+    stage = wire(ControllerNode)
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["command"])
     assert stage.heard["command"][-1].source == "controller/pid"
@@ -194,7 +194,7 @@ def test_commands_say_who_asks_and_in_which_mode(wire):
 
 def test_a_path_with_times_is_followed_and_shown_with_times(wire):
     """Times count from the first pose; what is shown is stamped with when each pose is due."""
-    stage = wire(Controller)
+    stage = wire(ControllerNode)
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["path"] and stage.heard["command"])
     rows = [(0.0, (0.2, 0.1, -0.5), 0.0), (4.0, (0.4, 0.1, -0.5), 0.5), (10.0, (0.4, -0.3, -0.6), 1.0)]
@@ -214,7 +214,7 @@ def test_a_path_with_times_is_followed_and_shown_with_times(wire):
 
 def test_a_way_is_shown_again_when_it_begins(wire):
     """Arming is when its time begins."""
-    stage = wire(Controller, "-p", "trajectory:=lemniscate")
+    stage = wire(ControllerNode, "-p", "trajectory:=lemniscate")
     assert stage.until(lambda: stage.heard["path"])
     stage.turns(5)
     stage.state = "armed"
@@ -250,7 +250,7 @@ def leap(path):
 )
 def test_a_path_that_cannot_be_followed_is_refused(wire, change, words):
     """In a sentence on `events`, and the way before it is kept."""
-    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'")
+    stage = wire(ControllerNode, "-p", "goal:='0.6,0.1,-0.5,0'")
     path = stage.make.path(0, (0, 10**9), [(0.2, 0.1, -0.5), (0.3, 0.1, -0.5)], (0.0, 0.0))
     change(path)
     stage.send("follow", path)
@@ -260,14 +260,14 @@ def test_a_path_that_cannot_be_followed_is_refused(wire, change, words):
 
 def test_parameters_of_a_running_node_stay_as_they_are(wire):
     """`ros2 param set` says so, in place of a success without effect."""
-    stage = wire(Controller, "-p", "policy:=pid-paper")
+    stage = wire(ControllerNode, "-p", "policy:=pid-paper")
     (result,) = stage.node.set_parameters([Parameter("policy", value="pid")])
     assert not result.successful and "read-only: set it at the start" in result.reason
 
 
 def test_a_node_keeps_its_clock(wire):
     """use_sim_time on an armed robot would put its time elsewhere: refused with the reason, and nothing happens."""
-    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'")
+    stage = wire(ControllerNode, "-p", "goal:='0.6,0.1,-0.5,0'")
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["command"])
     (result,) = stage.node.set_parameters([Parameter("use_sim_time", value=True)])
@@ -281,7 +281,7 @@ def test_a_node_keeps_its_clock(wire):
 
 def test_a_silent_estimator_ends_commands(wire):
     """Half a second after its last word."""
-    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'")
+    stage = wire(ControllerNode, "-p", "goal:='0.6,0.1,-0.5,0'")
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["command"])
     stage.silent = True
@@ -294,7 +294,7 @@ def test_a_silent_estimator_ends_commands(wire):
 
 def test_a_silent_bridge_ends_commands_but_begins_nothing_anew(wire):
     """A trajectory goes on where its time is when the bridge speaks again; only disarming starts it over."""
-    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'")
+    stage = wire(ControllerNode, "-p", "goal:='0.6,0.1,-0.5,0'")
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["command"])
     began, publish = stage.node.runtime.started, stage.send
@@ -316,7 +316,7 @@ def test_a_silent_bridge_ends_commands_but_begins_nothing_anew(wire):
 
 def test_a_person_takes_over_by_mode_and_wrench(wire):
     """The wrench becomes thrusts; one that is not finite, or has grown stale, is none; unknown modes are refused."""
-    stage = wire(Controller)
+    stage = wire(ControllerNode)
     stage.state = "armed"
     stage.send("mode", data="autopilot")
     assert stage.until(lambda: any("autopilot" in text for text in stage.events("refused")))
@@ -343,7 +343,7 @@ def joy(**held):
 @pytest.mark.parametrize("kind", ["fault", "refused", "error"])
 def test_a_grave_event_may_follow_an_ordinary_one(wire, kind, capfd):
     """And the other way round, as after an emergency stop: each is told and logged with its severity."""
-    stage = wire(Controller)
+    stage = wire(ControllerNode)
     for name in ("start", kind, "stop", kind):
         stage.node.event(name, "of the test")
     assert stage.until(lambda: len(stage.events(kind)) >= 2 and stage.events("stop"))
@@ -353,7 +353,7 @@ def test_a_grave_event_may_follow_an_ordinary_one(wire, kind, capfd):
 
 def test_a_clock_of_somebody_else_does_not_end_an_armed_controller(wire):
     """Simulated time that leaps from 10 s to the wall's is 1.7e10 missed decisions, more than the message's uint32."""
-    stage = wire(Controller, "-p", "use_sim_time:=true")
+    stage = wire(ControllerNode, "-p", "use_sim_time:=true")
     stage.clock, stage.state = 10 * 10**9, "armed"
     assert stage.until(lambda: stage.heard["policy"])
     assert stage.heard["policy"][-1].missed < 2**32 - 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.core.rotations import quat_from_euler, quat_rotate, quat_to_euler
-from finssim.extensions.ros2.nodes.frames import OPTICAL, Odometer, Pose
+from finssim.extensions.ros2.nodes.frames import OPTICAL, FramePose, Odometer
 from finssim.robot.reading import Reading
 
 DT = 1.0 / 60.0
@@ -41,7 +41,7 @@ def test_odom_does_not_jump_when_a_fix_does():
         moved = {"yaw": 0.4, "shift": (0.3, -0.2, 0.1)} if i >= 60 else {}
         reading = circle(i * DT, **moved)
         odom = odometer.take(reading)
-        drift = Pose(reading.position, reading.quaternion).times(odom.inverse())
+        drift = FramePose(reading.position, reading.quaternion).times(odom.inverse())
         made = drift.times(odom)
         assert made.position == pytest.approx(reading.position)
         assert abs(made.orientation @ reading.quaternion) == pytest.approx(1.0)

@@ -18,8 +18,8 @@ from rclpy.node import Node
 
 from finssim.core.rotations import quat_conjugate, quat_rotate
 from finssim.extensions.perception.rays import cones, fan
-from finssim.extensions.ros2.nodes.camera import Camera
-from finssim.extensions.ros2.nodes.controller import MOST_PICTURES, Controller
+from finssim.extensions.ros2.nodes.camera import CameraNode
+from finssim.extensions.ros2.nodes.controller import MOST_PICTURES, ControllerNode
 from finssim.extensions.ros2.nodes.conversions import (
     RosMessages,
     image_of,
@@ -135,7 +135,7 @@ def test_the_camera_node_sends_what_comes_over_the_wire(tmp_path):
     words = [word for setting in own for word in ("-p", setting)]
     rclpy.init(args=["--ros-args", "-r", "__ns:=/finsrov", *words])
     try:
-        camera, peer, heard = Camera(), Node("peer"), {}
+        camera, peer, heard = CameraNode(), Node("peer"), {}
         plain = load_vehicle("finsrov")
         for key, topic in own_topics(plain).items():
             heard[key] = []
@@ -163,7 +163,7 @@ def test_a_controller_hears_the_pictures_that_its_policy_sees(tmp_path):
     """In colour, with the time of their exposure; none while nobody arms it, but the latest few."""
     rclpy.init(args=["--ros-args", "-r", "__ns:=/finsrov", "-p", f"policy:={seeing(tmp_path / 'policy')}"])
     try:
-        controller, peer, end = Controller(), Node("peer"), time.monotonic() + 30.0
+        controller, peer, end = ControllerNode(), Node("peer"), time.monotonic() + 30.0
         topic = own_topics(load_vehicle("finsrov"))["front_camera/image"]
         out = peer.create_publisher(ros_type(topic.type), topic.name, quality_profile(topic.quality))
         message = MAKE.image(controller.ns(1.5), COLOURS, topic.frame)

@@ -17,7 +17,7 @@ from rclpy.node import Node
 
 from finssim.core.rotations import quat_from_euler, quat_to_matrix, quat_yaw
 from finssim.extensions.ros2.nodes.conversions import RosMessages, nanoseconds, ros_type, tags_of, xyz, xyzw
-from finssim.extensions.ros2.nodes.frames import Pose, urdf_of
+from finssim.extensions.ros2.nodes.frames import FramePose, urdf_of
 from finssim.extensions.ros2.nodes.localizer import Localizer
 from finssim.extensions.ros2.nodes.state_estimation import StateEstimation
 from finssim.extensions.ros2.topics import TOPICS, quality_profile
@@ -38,7 +38,7 @@ SENT = ("telemetry", "image", "picture", "tags")
 def chained(first, second):
     """Position and quaternion of the second transform's child in the first one's parent."""
     first, second = (
-        Pose(np.array(xyz(t.translation)), np.array(xyzw(t.rotation)))
+        FramePose(np.array(xyz(t.translation)), np.array(xyzw(t.rotation)))
         for t in (first.transform, second.transform)
     )
     return first.times(second)

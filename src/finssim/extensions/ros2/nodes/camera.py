@@ -12,7 +12,7 @@ POLL = 90.0
 """Looks for a new picture [Hz]."""
 
 
-class Camera(RobotNode):
+class CameraNode(RobotNode):
     """Publishes pictures, stamped with the middle of their exposure; each form only while there is a subscriber."""
 
     def __init__(self) -> None:

@@ -126,7 +126,7 @@ MOST_PICTURES = 16
 """Greatest number of pictures that wait while the bridge is not armed; the oldest is dropped."""
 
 
-class Controller(RobotNode):
+class ControllerNode(RobotNode):
     """Silent until the bridge is armed; a trajectory's time begins then, and without a goal the place is kept."""
 
     def __init__(self) -> None:

@@ -176,7 +176,7 @@ GAP = 0.5
 """Silence after which the way between two readings is not known, and odom is constant over it [s]."""
 
 
-class Pose(NamedTuple):
+class FramePose(NamedTuple):
     """Pose of one frame in another."""
 
     position: Array
@@ -184,15 +184,15 @@ class Pose(NamedTuple):
     orientation: Array
     """xyzw, (4,)"""
 
-    def times(self, other: Pose) -> Pose:
+    def times(self, other: FramePose) -> FramePose:
         """Return the pose of a frame of the second pose in that of the first."""
         position = self.position + np.asarray(quat_rotate(self.orientation, other.position))
-        return Pose(position, np.asarray(quat_multiply(self.orientation, other.orientation)))
+        return FramePose(position, np.asarray(quat_multiply(self.orientation, other.orientation)))
 
-    def inverse(self) -> Pose:
+    def inverse(self) -> FramePose:
         """The other way round."""
         q = np.asarray(quat_conjugate(self.orientation))
-        return Pose(-np.asarray(quat_rotate(q, self.position)), q)
+        return FramePose(-np.asarray(quat_rotate(q, self.position)), q)
 
 
 class Odometer:
@@ -205,7 +205,7 @@ class Odometer:
         self._before: Reading | None = None
         self._place, self._yaw = np.zeros(3), 0.0
 
-    def take(self, reading: Reading) -> Pose:
+    def take(self, reading: Reading) -> FramePose:
         """The pose at a reading whose position is known; later ones follow in time."""
         roll, pitch, yaw = (float(a) for a in quat_to_euler(reading.quaternion))
         before, self._before = self._before, reading
@@ -219,7 +219,7 @@ class Odometer:
                 middle = quat_from_euler(roll, pitch, self._yaw + 0.5 * dt * turn)
                 self._place = self._place + dt * np.asarray(quat_rotate(middle, nu[:3]))
                 self._yaw += dt * turn
-        return Pose(self._place, np.asarray(quat_from_euler(roll, pitch, self._yaw)))
+        return FramePose(self._place, np.asarray(quat_from_euler(roll, pitch, self._yaw)))
 
 
 class Frames:
@@ -233,15 +233,15 @@ class Frames:
         """
         self._node, self._odometer = node, Odometer()
         node.sends("transform", "fixed_transform", "robot")
-        parts = [(BASE, name, Pose(position, q)) for name, position, q in mounts(node.vehicle)]
+        parts = [(BASE, name, FramePose(position, q)) for name, position, q in mounts(node.vehicle)]
         if pool is not None:
             T = pool.T_wp
-            pool_in_map = Pose(T[:3, 3], np.asarray(matrix_to_quat(T[:3, :3])))
-            optical = pool_in_map.times(Pose(pool.camera.position, pool.camera.orientation))
-            link = optical.times(Pose(np.zeros(3), OPTICAL).inverse())
+            pool_in_map = FramePose(T[:3, 3], np.asarray(matrix_to_quat(T[:3, :3])))
+            optical = pool_in_map.times(FramePose(pool.camera.position, pool.camera.orientation))
+            link = optical.times(FramePose(np.zeros(3), OPTICAL).inverse())
             parts += [
                 ("map", "camera_link", link),
-                ("camera_link", "camera_optical", Pose(np.zeros(3), OPTICAL)),
+                ("camera_link", "camera_optical", FramePose(np.zeros(3), OPTICAL)),
             ]
         stamp = node.ns(node.now())
         node.send("fixed_transform", node.make.transforms(stamp, parts))
@@ -250,6 +250,6 @@ class Frames:
     def tell(self, stamp: int, reading: Reading) -> None:
         """Publish map to odom and odom to base_link of a reading whose position is known."""
         odom = self._odometer.take(reading)
-        drift = Pose(np.asarray(reading.position), np.asarray(reading.quaternion)).times(odom.inverse())
+        drift = FramePose(np.asarray(reading.position), np.asarray(reading.quaternion)).times(odom.inverse())
         parts = [("map", "odom", drift), ("odom", BASE, odom)]
         self._node.send("transform", self._node.make.transforms(stamp, parts))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from finssim.extensions.ros2.nodes.conversions import force_of, ros_type
-from finssim.extensions.ros2.nodes.remote import Readings
+from finssim.extensions.ros2.nodes.remote import RemoteReadings
 from finssim.extensions.ros2.nodes.robot_node import RobotNode, matched_callbacks
 from finssim.extensions.ros2.topics import SERVICES
 from finssim.robot.bridge import Bridge, BridgeSettings
@@ -45,7 +45,7 @@ class BridgeTopics:
         node.hears("stop", lambda message: bridge.stop(node.now(), "emergency stop by topic"))
         node.hears("acknowledge", lambda message: bridge.acknowledge(node.now()))
         if readings:
-            Readings(node, self._on_reading)
+            RemoteReadings(node, self._on_reading)
         node.create_timer(LOOK, self._count)
         service = SERVICES["set_armed"]
         node.create_service(ros_type(service.type), node.below(service.name), self._on_service)

@@ -26,7 +26,7 @@ SILENT = 0.5
 """A bridge that has not been heard for so long does nothing that we know of [s]."""
 
 
-class Readings:
+class RemoteReadings:
     """Puts Odometry and EstimatorStatus of one stamp together; calls back with each reading."""
 
     def __init__(self, node: RobotNode, take: Any) -> None:
@@ -73,7 +73,7 @@ class RemoteState:
         self._oldest = oldest
         nothing = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0]), np.full(6, math.nan)
         self._newest = Reading(-math.inf, *nothing, False, "uninitialized", "the estimator is silent")
-        Readings(node, self._take)
+        RemoteReadings(node, self._take)
 
     def reading(self, now: float) -> Reading:
         """The state. `now` is the time [s]."""
@@ -197,7 +197,7 @@ class Watcher(RobotNode):
         self.state = self.bridge.state
         """Of the bridge, as it was seen last while nodes lived."""
         self.ready = False
-        Readings(self, self._on_reading)
+        RemoteReadings(self, self._on_reading)
 
     def turn(self, timeout: float) -> None:
         """Process the received messages, waiting for them no longer than that [s]."""

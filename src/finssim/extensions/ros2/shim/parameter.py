@@ -23,7 +23,7 @@ from finssim.extensions.ros2.shim.qos import qos_profile_parameters
 PARAMETER_SEPARATOR_STRING = DOT = "."
 
 
-class _Type(Enum):
+class _ParameterType(Enum):
     """Types of parameters, numbered as in rcl_interfaces; no integers, as in rclpy."""
 
     NOT_SET = 0
@@ -38,7 +38,7 @@ class _Type(Enum):
     STRING_ARRAY = 9
 
     @classmethod
-    def from_parameter_value(cls, value: Any) -> _Type:
+    def from_parameter_value(cls, value: Any) -> _ParameterType:
         """The type of a Python value; lists are of one type throughout, and an empty one is of bytes.
 
         Raises:
@@ -59,7 +59,7 @@ class _Type(Enum):
 
     def check(self, value: Any) -> bool:
         """Return whether a value is of this type."""
-        if self is _Type.NOT_SET:
+        if self is _ParameterType.NOT_SET:
             return value is None
         for kind, single, many in _KINDS:
             if self is single:
@@ -72,11 +72,11 @@ class _Type(Enum):
 
 
 _KINDS = (
-    (bytes, None, _Type.BYTE_ARRAY),
-    (bool, _Type.BOOL, _Type.BOOL_ARRAY),
-    (int, _Type.INTEGER, _Type.INTEGER_ARRAY),
-    (float, _Type.DOUBLE, _Type.DOUBLE_ARRAY),
-    (str, _Type.STRING, _Type.STRING_ARRAY),
+    (bytes, None, _ParameterType.BYTE_ARRAY),
+    (bool, _ParameterType.BOOL, _ParameterType.BOOL_ARRAY),
+    (int, _ParameterType.INTEGER, _ParameterType.INTEGER_ARRAY),
+    (float, _ParameterType.DOUBLE, _ParameterType.DOUBLE_ARRAY),
+    (str, _ParameterType.STRING, _ParameterType.STRING_ARRAY),
 )
 
 
@@ -93,11 +93,11 @@ class Parameter:
         ValueError: Value and type disagree.
     """
 
-    Type = _Type
+    Type = _ParameterType
 
-    def __init__(self, name: str, type_: _Type | None = None, value: Any = None) -> None:
-        type_ = _Type.from_parameter_value(value) if type_ is None else type_
-        if not isinstance(type_, _Type):
+    def __init__(self, name: str, type_: _ParameterType | None = None, value: Any = None) -> None:
+        type_ = _ParameterType.from_parameter_value(value) if type_ is None else type_
+        if not isinstance(type_, _ParameterType):
             raise TypeError(f"parameter '{name}': {type_!r} is no Parameter.Type")
         if not type_.check(value):
             raise ValueError(
@@ -111,7 +111,7 @@ class Parameter:
         return self._name
 
     @property
-    def type_(self) -> _Type:
+    def type_(self) -> _ParameterType:
         """Return the type of the value."""
         return self._type
 
@@ -126,7 +126,7 @@ class Parameter:
     def get_parameter_value(self) -> Any:
         """Return it as rcl_interfaces/ParameterValue."""
         message = codec_of().message("rcl_interfaces/msg/ParameterValue")(type=self.type_.value)
-        if self.type_ is not _Type.NOT_SET:
+        if self.type_ is not _ParameterType.NOT_SET:
             setattr(message, f"{self.type_.name.lower()}_value", self.value)
         return message
 
@@ -138,16 +138,16 @@ class Parameter:
     @classmethod
     def from_parameter_msg(cls, message: Any) -> Parameter:
         """Return a parameter from rcl_interfaces/Parameter."""
-        return cls(message.name, _Type(message.value.type), parameter_value_to_python(message.value))
+        return cls(message.name, _ParameterType(message.value.type), parameter_value_to_python(message.value))
 
 
 def parameter_value_to_python(message: Any) -> Any:
     """Return the value of a rcl_interfaces/ParameterValue."""
-    kind = _Type(message.type)
-    if kind is _Type.NOT_SET:
+    kind = _ParameterType(message.type)
+    if kind is _ParameterType.NOT_SET:
         return None
     value = getattr(message, f"{kind.name.lower()}_value")
-    if kind is _Type.BYTE_ARRAY:
+    if kind is _ParameterType.BYTE_ARRAY:
         return [bytes([v]) for v in value]
     return value.tolist() if hasattr(value, "tolist") else value
 
